@@ -1,8 +1,10 @@
-"""A batch on a Ray cluster of two machines, one of which dies: nothing lost, the maps of an undisturbed run."""
+"""A batch on a Ray cluster of which a machine dies, or its head: nothing lost, the maps of an undisturbed run."""
 
 import os
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -10,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from batch_flights import another, content
 
@@ -18,8 +21,18 @@ from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import FlightWish, Order
-from sorvolo.cluster.ray_executor import _demand_fit, _demand_same, _probe_of, _why_not, ray_executor
+from sorvolo.cluster.ray_executor import (
+    _demand_fit,
+    _demand_same,
+    _probe_of,
+    _why_not,
+    _with_detector,
+    ray_executor,
+)
+from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.table import LOCK, State
+from sorvolo.detection.models import find_model
+from sorvolo.detection.sharing import shared_engine
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
@@ -28,19 +41,24 @@ from sorvolo.store.site.files import LOCK as SITE_LOCK
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'sorvolo[fleet]'")
 
 
-@pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
-    """A head without cores and two machines of a core each, on this one."""
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """A head without cores and two machines of a core each, on this one; the last test kills the head."""
     from ray.cluster_utils import Cluster
 
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # this cluster is seen by nobody else for a few seconds
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
-    monkeypatch.setenv("RAY_ADDRESS", made.address)
-    for _ in range(2):
-        made.add_node(num_cpus=1)
-    yield made
-    made.shutdown()
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_AUTH_MODE", "disabled")  # this cluster is seen by nobody else for a few seconds
+        head = {"num_cpus": 0, "include_dashboard": False, "ray_client_server_port": port}
+        made = Cluster(initialize_head=True, head_node_args=head)
+        made.client_address = f"ray://127.0.0.1:{port}"
+        patch.setenv("RAY_ADDRESS", made.address)
+        for cards in (0, 1):  # Ray believes what it is told of graphics cards
+            made.add_node(num_cpus=1, num_gpus=cards)
+        yield made
+        made.shutdown()
 
 
 def _kill_a_machine_at_work(cluster: Any, root: Path) -> None:
@@ -79,7 +97,25 @@ def _written_sites(pid: int, root: Path) -> set[Path]:
     return sites
 
 
-def test_a_machine_that_dies_loses_nothing(cluster: object, flown: Path, tmp_path: Path) -> None:
+def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: Any, tmp_path: Path) -> None:
+    order = Order("in", "site", FlightWish())
+    with ray_executor("ray", None, 60.0, tmp_path, SharingSettings(True, 0.25)) as executor:
+        detectors = executor._detectors
+        assert detectors is not None
+        addresses = detectors.addresses()
+        assert addresses.keys() == {each["NodeID"] for each in ray.nodes() if each["Resources"].get("CPU")}
+        assert len(set(addresses.values())) == 2 and detectors.addresses() == addresses
+        assert ray.available_resources()["GPU"] == 0.75
+        for address in addresses.values():  # on the processor: there is no card that anything runs on
+            engine = shared_engine(address, find_model("thermal"))
+            assert "CPU" in engine.provider
+            assert len(engine.run(np.zeros((1, 3, 64, 64), np.uint8))) == 3
+        given = ray.get(ray.remote(_with_detector).remote(order, addresses))
+        assert given.detector in addresses.values()
+        assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order
+
+
+def test_a_machine_that_dies_loses_nothing(cluster: Any, flown: Path, tmp_path: Path) -> None:
     for name in ("one", "two"):
         another(flown, tmp_path / "in" / name)
     root = tmp_path / "maps"
@@ -178,3 +214,61 @@ def test_a_machine_with_another_sorvolo_is_named(tmp_path: Path) -> None:
         _demand_same("far", "")
     with pytest.raises(InputError, match=rf"{os.uname().nodename} has Sorvolo .*, the batch 0\.0\.9"):
         _demand_fit(str(tmp_path), "0.0.9")
+
+
+def _started(executor: str, flown: Path, folder: Path) -> "subprocess.Popen[str]":
+    """A batch of the flight in `folder`, whose first try has begun."""
+    another(flown, folder / "in" / "one")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sorvolo", "batch", str(folder / "in"), "--root", str(folder / "maps"), "--camera",
+         str(flown / "camera.xml"), "--model", "none", "--executor", executor],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+    )
+    table, end_s = folder / "maps" / "batch.jsonl", time.monotonic() + 90
+    while not (table.exists() and '"running"' in table.read_text()):
+        assert process.poll() is None and time.monotonic() < end_s
+        time.sleep(0.02)
+    return process
+
+
+def _held_missions(cluster: Any) -> list[int]:
+    """Wait for the processes that do missions on the machines, and hold them."""
+    end_s = time.monotonic() + 90
+    while time.monotonic() < end_s:
+        held = []
+        for node in cluster.worker_nodes:
+            for pid in _descendants(node.all_processes["raylet"][0].process.pid):
+                with suppress(OSError):  # it has ended
+                    if b"sorvolo.cluster.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                        os.kill(pid, signal.SIGSTOP)
+                        held.append(pid)
+        if held:
+            return held
+        time.sleep(0.02)
+    raise AssertionError("no mission runs")
+
+
+def test_a_head_that_dies_ends_the_batch_and_the_same_command_goes_on(
+    cluster: Any, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # the one machine that is left has one core: the second flight waits for it while the first is held
+    executors = {"outside": cluster.client_address, "inside": "ray"}
+    batches = {"outside": _started(executors["outside"], flown, tmp_path / "outside")}
+    held = _held_missions(cluster)
+    batches["inside"] = _started(executors["inside"], flown, tmp_path / "inside")
+    for processes in cluster.head_node.all_processes.values():
+        for each in processes:
+            each.process.kill()
+    for pid in held:
+        os.kill(pid, signal.SIGCONT)
+    for name, process in batches.items():
+        _, printed = process.communicate(timeout=120)
+        assert process.returncode == 1, printed
+        (error,) = [line for line in printed.splitlines() if line.startswith("error: ")] or [printed]
+        assert error.startswith(f"error: --executor {executors[name]}: the cluster is gone ("), printed
+        assert error.endswith("; when it is back, the same command goes on")
+    # and with another executor as well
+    places = [str(tmp_path / "outside" / "in"), "--root", str(tmp_path / "outside" / "maps")]
+    assert main(["batch", *places, "--camera", str(flown / "camera.xml"), "--model", "none"]) == 0
+    assert (tmp_path / "outside" / "maps" / "one" / "mosaic.tif").is_file()
+    capsys.readouterr()

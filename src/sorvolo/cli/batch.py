@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, closing
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -78,6 +78,17 @@ Blocks = Annotated[
     int,
     typer.Option(help="Divide each flight of photos into so many blocks of ground, joined to one map."),
 ]
+Shares = Annotated[
+    bool | None,
+    typer.Option(
+        "--share-detector/--own-detectors",
+        help="One detector for all flights of a machine, or one for each.", show_default="shared by live sources",
+    ),
+]
+Gpus = Annotated[
+    float,
+    typer.Option(help="Share of a graphics card that a machine's shared detector takes in a Ray cluster: 0.25, 1."),
+]
 Retry = Annotated[bool, typer.Option("--retry", help="Also try flights again that were set aside.")]
 
 
@@ -97,6 +108,8 @@ def batch(
     stall: Stall = 300.0,
     retry: Retry = False,
     blocks: Blocks = 1,
+    share_detector: Shares = None,
+    gpus: Gpus = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """Map, compare or search many flights. After a stop or a kill, the same command continues.
@@ -125,7 +138,7 @@ def batch(
     by = site_by or (SiteByName.PLACE if mission is MissionName.COMPARE else SiteByName.FLIGHT)
     wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up)
     settings = BatchSettings(wish, SiteBy(by.value), tries, stall, retry, blocks)
-    report = _run(places, root, settings, executor, workers)
+    report = _run(places, root, settings, _Running(executor, workers, share_detector, gpus))
     if as_json:
         typer.echo(json.dumps(_plain(report, root), indent=1))
     else:
@@ -137,19 +150,30 @@ def batch(
         raise typer.Exit(TO_CHECK)
 
 
-def _run(
-    places: Sequence[str], root: Path, settings: "BatchSettings", executor: str, workers: int | None
-) -> "BatchReport":
+@dataclass(frozen=True)
+class _Running:
+    """Where flights run, how many at once, and with whose detector, as the options have it."""
+
+    executor: str
+    workers: int | None
+    shares_detector: bool | None
+    gpus: float
+
+
+def _run(places: Sequence[str], root: Path, settings: "BatchSettings", wish: _Running) -> "BatchReport":
     """The batch of folders, or of live sources, with its progress."""
     from sorvolo.cluster.batch import run_batch
     from sorvolo.cluster.streams import is_stream, run_streams, streams_of
 
     live = [each for each in places if is_stream(each)]
-    _check_live(live, places, workers, settings.blocks)
+    _check_live(live, places, wish.workers, settings.blocks)
     if live:  # one that waits for its drone does nothing, and gives up by itself
         settings = replace(settings, stall_s=settings.stall_s + settings.wish.give_up_s)
-    most = len(live) if live and workers is None else workers
-    executors = _executor_of(executor, most, settings)
+        wish = replace(
+            wish, workers=wish.workers or len(live),
+            shares_detector=len(live) > 1 if wish.shares_detector is None else wish.shares_detector,
+        )
+    executors = _executor_of(wish, settings)
     streams = streams_of(live)
     with ended_by_signal([each.address for each in streams]) as until:
         running = (
@@ -177,19 +201,26 @@ def _absolute(name: str) -> str:
 
 
 def _executor_of(
-    name: str, workers: int | None, settings: "BatchSettings"
+    wish: _Running, settings: "BatchSettings"
 ) -> "Callable[[BatchTable], AbstractContextManager[Executor]]":
     from sorvolo.cluster.local_executor import LocalExecutor, default_workers
+    from sorvolo.cluster.shared_detector import SharingSettings
 
+    name, workers = wish.executor, wish.workers
+    sharing = SharingSettings(bool(wish.shares_detector), wish.gpus)
     if workers is not None and workers < 1:
         raise SettingsError(f"--workers {workers}: at least 1 is needed")
     if name == "local":
-        count = workers or default_workers()
-        return lambda table: LocalExecutor(count, settings.stall_s, table.lock, settings.costs)
+        if wish.gpus:
+            raise SettingsError("--gpus divides the graphics cards of a Ray cluster: give --executor ray as well")
+        count, is_shared = workers or default_workers(), sharing.is_shared
+        return lambda table: LocalExecutor(
+            count, settings.stall_s, table.lock, settings.costs, shares_detector=is_shared
+        )
     if name == "ray" or name.startswith("ray://"):
         from sorvolo.cluster.ray_executor import ray_executor
 
-        return lambda table: ray_executor(name, workers, settings.stall_s, table.root)
+        return lambda table: ray_executor(name, workers, settings.stall_s, table.root, sharing)
     raise SettingsError(f"--executor {name}: give local, ray, or ray://HOST:PORT")
 
 

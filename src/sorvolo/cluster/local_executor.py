@@ -4,11 +4,13 @@ import os
 import queue
 import threading
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Self
 
 from sorvolo.cluster.cost import Cost, CostSettings
 from sorvolo.cluster.orders import Ending, Order
 from sorvolo.cluster.process import WorkerProcess, run_order
+from sorvolo.cluster.shared_detector import SharedDetector, searches
 from sorvolo.missions.flight.memory import MemorySettings, available_bytes, memory_budget_bytes
 
 Key = tuple[str, str]
@@ -17,11 +19,16 @@ Key = tuple[str, str]
 class LocalExecutor:
     """At most `workers` processes at once, and no more than the memory holds. A context manager: leaving ends them.
 
-    `lock` is the batch's, which the processes keep until they are gone.
+    `lock` is the batch's, which the processes keep until they are gone. With `shares_detector` one process holds the
+    detector for all of them.
     """
 
-    def __init__(self, workers: int, stall_s: float, lock: int, costs: CostSettings = CostSettings()) -> None:  # noqa: B008
+    def __init__(
+        self, workers: int, stall_s: float, lock: int, costs: CostSettings = CostSettings(), *,  # noqa: B008
+        shares_detector: bool = False,
+    ) -> None:
         self.workers, self._share = workers, costs.machine_share
+        self._detector = SharedDetector() if shares_detector else None
         self._stall_s, self._lock = stall_s, lock
         self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
         self._ended: queue.SimpleQueue[tuple[Key, Ending]] = queue.SimpleQueue()
@@ -34,6 +41,8 @@ class LocalExecutor:
             worker.kill()
         while self._running:  # each is waited for by its thread
             self.next_ended()
+        if self._detector is not None:
+            self._detector.end()
 
     @property
     def running(self) -> Mapping[Key, object]:
@@ -55,6 +64,8 @@ class LocalExecutor:
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
         """Start a try."""
+        if self._detector is not None and searches(order):
+            order = replace(order, detector=self._detector.address)
         worker = WorkerProcess(order, [self._lock])
         self._running[key] = (worker, cost)
         threading.Thread(target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}").start()

@@ -63,13 +63,14 @@ class Part:
 @dataclass(frozen=True)
 class Order:
     """One try at one flight, or at a `part` of one: the file, folder or address, the site's folder, and how much its
-    caches may take, MB."""
+    caches may take, MB. `detector` is the socket of one that the flights of its machine share; "" for its own."""
 
     source: str
     site: str
     wish: FlightWish
     memory_mb: float | None = None
     part: Part | None = None
+    detector: str = ""
 
     def line(self) -> bytes:
         """The order as it goes to the worker."""

@@ -8,24 +8,28 @@ import importlib.util
 import os
 import secrets
 import socket
+import threading
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import sorvolo
 from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import Ending, Order, Outcome
 from sorvolo.cluster.process import WorkerProcess, run_order
+from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
 from sorvolo.cluster.table import LOCK
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.memory import MemorySettings
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
 
+T = TypeVar("T")
 Key = tuple[str, str]
 _SCHEME = "ray://"
 
@@ -37,7 +41,8 @@ class WaitSettings:
     reach_s: float = 8.0  # a connection to the head, which takes milliseconds
     probe_s: float = 90.0  # the first task on every machine: Ray starts a process for it before
     again_s: float = 0.5  # between two questions which machines are there
-    ending_s: float = 2.0  # in one wait for a try to end, between which Ctrl-C is noticed
+    ending_s: float = 2.0  # in one wait for a try to end, between which Ctrl-C and a dead head are noticed
+    head_s: float = 10.0  # for a head that stopped answering; Ray itself would end this process after 60 s
     cancel_s: float = 10.0  # tasks that are cancelled
 
 
@@ -45,7 +50,9 @@ _WAITS = WaitSettings()
 
 
 @contextmanager
-def ray_executor(name: str, workers: int | None, stall_s: float, root: Path) -> "Iterator[RayExecutor]":
+def ray_executor(
+    name: str, workers: int | None, stall_s: float, root: Path, sharing: SharingSettings = SharingSettings()  # noqa: B008
+) -> "Iterator[RayExecutor]":
     """The executor on the cluster at `ray://HOST:PORT`, or for "ray" on this machine's, which is started if need be.
 
     At most `workers` flights at once (None: as many as the cluster's cores hold). Leaving ends what runs. Raises
@@ -55,6 +62,7 @@ def ray_executor(name: str, workers: int | None, stall_s: float, root: Path) -> 
     if importlib.util.find_spec("ray") is None or importlib.util.find_spec("grpc") is None:
         raise SettingsError(f"--executor {name} needs Ray; install it: pip install 'sorvolo[fleet]'")
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
+    os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")  # what asks a cluster that is gone would start another one
     os.environ.setdefault("RAY_CLIENT_MAX_CONNECTION_TIMEOUT_S", "5")  # thrice: it listens
     if name == "ray" and not _started():
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # its own listens on loopback alone
@@ -63,7 +71,7 @@ def ray_executor(name: str, workers: int | None, stall_s: float, root: Path) -> 
 
     try:
         _check_machines(root)
-        executor = RayExecutor(name, workers, stall_s, root)
+        executor = RayExecutor(name, workers, stall_s, root, sharing)
         try:
             yield executor
         finally:
@@ -75,13 +83,20 @@ def ray_executor(name: str, workers: int | None, stall_s: float, root: Path) -> 
 class RayExecutor:
     """Tries as tasks of the cluster that this process is connected to; see `ray_executor`."""
 
-    def __init__(self, name: str, workers: int | None, stall_s: float, root: Path) -> None:
+    def __init__(
+        self, name: str, workers: int | None, stall_s: float, root: Path,
+        sharing: SharingSettings = SharingSettings(),  # noqa: B008 (frozen)
+    ) -> None:
         import ray
 
         self._ray: Any = ray
         self._name, self._workers, self._stall_s, self._root = name, workers, stall_s, str(root.resolve())
         self._running: dict[Key, Any] = {}
         self._actors: dict[Key, Any] = {}  # of those that are live
+        self._detectors = MachineDetectors(ray, sharing.gpus) if sharing.is_shared else None
+        self._is_gone = False
+        # through ray:// the head's own client server is asked, and raises what `_cluster` knows
+        self._head = "" if name.startswith(_SCHEME) else str(ray.get_runtime_context().gcs_address)
 
     @property
     def running(self) -> Mapping[Key, object]:
@@ -91,8 +106,7 @@ class RayExecutor:
     @property
     def cache_mb(self) -> float:
         """Memory that a try may take for what it could also read again: of the smallest machine, a core's share."""
-        with self._cluster():
-            shares = [each["memory"] / each["CPU"] for each in self._machines()]
+        shares = [each["memory"] / each["CPU"] for each in self._asked(self._machines)]
         memory = MemorySettings()
         return max(memory.least_mb, memory.share * min(shares) / 1e6)
 
@@ -100,31 +114,16 @@ class RayExecutor:
         """Whether another try may start."""
         if self._workers is not None:
             return len(self._running) < self._workers
-        with self._cluster():
-            slots = sum(each["CPU"] // min(cost.cpus, each["CPU"]) for each in self._machines())
+        slots = sum(each["CPU"] // min(cost.cpus, each["CPU"]) for each in self._asked(self._machines))
         return len(self._running) < slots
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
         """Begin a try, on a machine with so many cores and so much memory; no more than the largest one has."""
-        with self._cluster():
-            machines = self._machines()
-            asked = {
-                "num_cpus": min(cost.cpus, max(each["CPU"] for each in machines)),
-                "memory": int(min(cost.memory_mb * 1e6, max(each["memory"] for each in machines))),
-                "scheduling_strategy": "SPREAD",
-            }
-            given = (order, self._stall_s, self._root, sorvolo.__version__)
-            if is_live_address(order.source):
-                actor = self._ray.remote(_LiveTry).options(max_concurrency=2, max_restarts=0, **asked).remote()
-                self._actors[key], self._running[key] = actor, actor.run.remote(*given)
-                return
-            name = f"sorvolo {Path(order.source).name}"
-            self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
+        self._asked(lambda: self._submit(key, order, cost))
 
     def finish(self, key: Key) -> None:
         """End a live flight, and have its map finished."""
-        with self._cluster():
-            self._actors[key].finish.remote()
+        self._asked(lambda: self._actors[key].finish.remote())
 
     def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
         """Wait until a try has ended; None where none did for so long. Raises SettingsError if the cluster is gone."""
@@ -132,18 +131,24 @@ class RayExecutor:
         with self._cluster():
             while not ended:
                 wait_s = timeout_s or _WAITS.ending_s
+                _demand_head(self._head)
                 ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=wait_s)
                 if not ended and timeout_s is not None:
                     return None
             key = next(each for each, task in self._running.items() if task == ended[0])
-            ending = self._ending(ended[0])
+        ending = self._asked(lambda: self._ending(ended[0]))
         del self._running[key]
         if (actor := self._actors.pop(key, None)) is not None:
             self._ray.kill(actor)
         return key, ending
 
     def end(self) -> None:
-        """End what runs; a mapping goes on from its journal when it is asked for again."""
+        """End what runs; a mapping goes on from its journal when it is asked for again.
+
+        What a cluster ran that is gone ends with its machines' Ray, at the latest a minute after the head.
+        """
+        if self._is_gone:
+            return
         with suppress(Exception):  # of a cluster that is gone, nothing runs
             for actor in self._actors.values():
                 self._ray.kill(actor)
@@ -151,6 +156,22 @@ class RayExecutor:
                 if key not in self._actors:
                     self._ray.cancel(task, force=True)
             self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=_WAITS.cancel_s)
+
+    def _submit(self, key: Key, order: Order, cost: Cost) -> None:
+        machines = self._machines()
+        asked = {
+            "num_cpus": min(cost.cpus, max(each["CPU"] for each in machines)),
+            "memory": int(min(cost.memory_mb * 1e6, max(each["memory"] for each in machines))),
+            "scheduling_strategy": "SPREAD",
+        }
+        shared = self._detectors.addresses() if self._detectors is not None and searches(order) else {}
+        given = (order, self._stall_s, self._root, sorvolo.__version__, shared)
+        if is_live_address(order.source):
+            actor = self._ray.remote(_LiveTry).options(max_concurrency=2, max_restarts=0, **asked).remote()
+            self._actors[key], self._running[key] = actor, actor.run.remote(*given)
+            return
+        name = f"sorvolo {Path(order.source).name}"
+        self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
 
     def _ending(self, task: Any) -> Ending:
         try:
@@ -171,6 +192,26 @@ class RayExecutor:
             raise ConnectionError("no machine with a core is left")
         return machines
 
+    def _asked(self, call: Callable[[], T]) -> T:
+        """What the cluster answers to a call, which is given up where the head dies meanwhile: see `_demand_head`."""
+        answer: Future[T] = Future()
+
+        def ask() -> None:
+            try:
+                answer.set_result(call())
+            except BaseException as error:  # whoever waits is to have it
+                answer.set_exception(error)
+
+        with self._cluster():
+            threading.Thread(target=ask, daemon=True, name="ray").start()
+            while True:
+                try:
+                    return answer.result(timeout=_WAITS.ending_s)
+                except TimeoutError:
+                    if answer.done():
+                        raise
+                    _demand_head(self._head)
+
     @contextmanager
     def _cluster(self) -> Iterator[None]:
         """Turn what Ray raises of a cluster that is gone into an error that states what to do."""
@@ -178,12 +219,71 @@ class RayExecutor:
 
         errors = self._ray.exceptions
         try:
+            _demand_head(self._head)
             yield
         except (ConnectionError, grpc.RpcError, errors.RaySystemError, errors.RpcError) as error:
+            self._is_gone = True
             raise SettingsError(
                 f"--executor {self._name}: the cluster is gone ({_first_line(error)}); when it is back, the same "
                 "command goes on"
             ) from error
+
+
+class MachineDetectors:
+    """One detector for each machine of the cluster, which the flights there share. Only `addresses` changes it.
+
+    Each is an actor that holds the process; it ends with the batch. It asks for `gpus` of a graphics card where its
+    machine has so much of one, and runs on the processor of any other.
+    """
+
+    def __init__(self, ray: Any, gpus: float) -> None:
+        self._ray, self._gpus = ray, gpus
+        self._actors: dict[str, Any] = {}  # by the machine's id
+
+    def addresses(self) -> dict[str, str]:
+        """The sockets by machine, of those that are there and answer. Raises SettingsError where a card is not free."""
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        there = {each["NodeID"]: each["Resources"] for each in _working(self._ray)}
+        self._actors = {node: actor for node, actor in self._actors.items() if node in there}
+        for node in there.keys() - self._actors.keys():
+            self._actors[node] = self._ray.remote(_Detector).options(
+                num_cpus=0, num_gpus=self._gpus if there[node].get("GPU", 0) >= self._gpus else 0,
+                scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False),
+            ).remote()
+        asked = {node: actor.address.remote() for node, actor in self._actors.items()}
+        return {node: address for node, task in asked.items() if (address := self._answer(node, task))}
+
+    def _answer(self, node: str, task: Any) -> str:
+        """The socket on a machine; "" where its actor was lost, which the next flight there has anew."""
+        try:
+            return str(self._ray.get(task, timeout=_WAITS.probe_s))
+        except self._ray.exceptions.GetTimeoutError as error:
+            raise SettingsError(
+                f"--gpus {self._gpus:g}: a machine has no such share of its graphics card free within "
+                f"{_WAITS.probe_s:.0f} s; another batch may hold it: give a smaller share"
+            ) from error
+        except self._ray.exceptions.RayActorError:
+            del self._actors[node]
+            return ""
+
+
+class _Detector:
+    """On a machine of the cluster: the process that holds its detector, started again where it died."""
+
+    def __init__(self) -> None:
+        self._shared = SharedDetector()
+
+    def address(self) -> str:
+        """Its socket."""
+        return self._shared.address
+
+
+def _with_detector(order: Order, shared: Mapping[str, str]) -> Order:
+    """The order with the socket of this machine's detector, by machine; with its own where it has none yet."""
+    import ray
+
+    return replace(order, detector=shared.get(ray.get_runtime_context().get_node_id(), "")) if shared else order
 
 
 class _LiveTry:
@@ -192,10 +292,10 @@ class _LiveTry:
     def __init__(self) -> None:
         self._worker: WorkerProcess | None = None
 
-    def run(self, order: Order, stall_s: float, root: str, version: str) -> Ending:
+    def run(self, order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]) -> Ending:
         """The try in a process of its own, which ends with this one."""
         _demand_fit(root, version)
-        self._worker = WorkerProcess(order)
+        self._worker = WorkerProcess(_with_detector(order, shared))
         return run_order(self._worker, stall_s)
 
     def finish(self) -> None:
@@ -204,13 +304,13 @@ class _LiveTry:
             self._worker.finish()
 
 
-def _try(order: Order, stall_s: float, root: str, version: str) -> Ending:
+def _try(order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]) -> Ending:
     """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker."""
     _demand_fit(root, version)
     if not Path(order.source).exists():
         host = socket.gethostname()
         raise StoreError(f"the machine {host} does not have {order.source}; flights need the same path on all machines")
-    return run_order(WorkerProcess(order), stall_s)
+    return run_order(WorkerProcess(_with_detector(order, shared)), stall_s)
 
 
 def _demand_fit(root: str, version: str) -> None:
@@ -292,6 +392,25 @@ def _demand_reachable(name: str) -> None:
             grpc.channel_ready_future(channel).result(timeout=_WAITS.reach_s)
     except grpc.FutureTimeoutError:
         raise SettingsError(f"--executor {name}: {address} is not a Ray cluster") from None
+
+
+def _demand_head(address: str) -> None:
+    """Raise ConnectionError where the head at HOST:PORT ("": not to be asked) does not listen for `head_s`.
+
+    Ray waits for a head that died, whatever is asked of it, and ends the process after 60 s with words of its own.
+    """
+    if not address:
+        return
+    host, _, port = address.rpartition(":")
+    end_s = time.monotonic() + _WAITS.head_s
+    while True:
+        try:
+            socket.create_connection((host.strip("[]"), int(port)), timeout=_WAITS.reach_s).close()
+            return
+        except OSError as error:
+            if time.monotonic() > end_s:
+                raise ConnectionError(f"its head at {address} does not answer: {_first_line(error)}") from error
+            time.sleep(_WAITS.again_s)
 
 
 def _demand_listening(name: str, address: str) -> None:

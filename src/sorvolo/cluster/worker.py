@@ -15,15 +15,18 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cluster.orders import FINISH, Mission, Order, Outcome, Part, PartKind, Scouted, answer_line
 from sorvolo.errors import SorvoloError
 
+if TYPE_CHECKING:
+    from sorvolo.missions.flight.detects import Detects
+
 _ALIVE_EVERY_S = 0.5
-_SITE_BUSY_S = 30.0  # a worker that was killed on another machine holds its site's lock for a while
+_SITE_BUSY_S = 90.0  # a worker of a cluster that is gone holds its site's lock until Ray ends it, after a minute
 _FIRST_TO_GO = 500  # for the kernel that looks for memory: the worker, not the batch
 
 
@@ -131,6 +134,13 @@ def _scout(source: str, camera: str, answers: Answers) -> None:
     answers.add("scouted", vars(Scouted(flight.fingerprint, flight.frame_count, start_ns, box)))
 
 
+def _detector(order: Order) -> "Detects | None":
+    """The detector that the flights of this machine share; None where the mission is to open its own."""
+    from sorvolo.missions.flight.map_objects import open_detector
+
+    return open_detector(order.wish.model, order.detector) if order.detector else None
+
+
 def _live(order: Order) -> LiveSettings:
     return LiveSettings(keeps_all=True, give_up_s=order.wish.give_up_s)
 
@@ -144,7 +154,8 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
     site, wish = Path(order.site), order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
     updates = map_flights(
-        [order.source], site, settings, camera=wish.camera or None, live=_live(order), until=until
+        [order.source], site, settings, camera=wish.camera or None, detector=_detector(order), live=_live(order),
+        until=until,
     )
     flight = _run(updates, site, alive)
     return flight, *headline_of(site, flight)
@@ -161,8 +172,8 @@ def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -
     if not founder or _is_flight(order.source, site, founder):
         return _map(order, alive, until)
     updates = compare_flights(
-        [order.source], site, CompareSettings(model=wish.model), camera=wish.camera or None, live=_live(order),
-        until=until,
+        [order.source], site, CompareSettings(model=wish.model), camera=wish.camera or None, detector=_detector(order),
+        live=_live(order), until=until,
     )
     flight = _run(updates, site, alive)
     with Archive.open(site, write=False) as archive:
@@ -182,7 +193,8 @@ def _search(order: Order, alive: Callable[..., None], until: threading.Event) ->
     site = Path(order.site)
     outputs = SearchOutputs(site.with_name(f"{site.name}-search") / flight, flights=(flight,))
     report: Mapping[str, Any] = {}
-    with closing(search_site(site, SearchSettings(model=order.wish.model), outputs)) as measuring:
+    settings = SearchSettings(model=order.wish.model)
+    with closing(search_site(site, settings, outputs, _detector(order))) as measuring:
         for each in measuring:
             alive()
             if isinstance(each, dict):

@@ -1,14 +1,10 @@
-"""A model of unknown origin in a process of its own, with a limit on its memory: a kilobyte can ask for gigabytes.
+"""A model of unknown origin in a process of its own, with a limit on its memory: a kilobyte can ask for gigabytes."""
 
-Between the two processes go lengths, JSON and the bytes of arrays, nothing that could be run.
-"""
-
-import json
 import os
-import struct
 import subprocess
 import sys
 import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -16,7 +12,8 @@ from typing import IO, Any
 import numpy as np
 
 from sorvolo.detection.contract import METADATA_KEY, info_from_metadata
-from sorvolo.detection.engine import CUDA, OUTPUTS, Engine, Planes, Provider, describe, open_engine
+from sorvolo.detection.engine import CUDA, Engine, Planes, Provider, Run, describe, open_engine, output_names
+from sorvolo.detection.messages import outputs_from, read_message, write_message, write_outputs
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Numbers
 
@@ -24,10 +21,8 @@ MOST_BYTES = 6 << 30
 """Of memory that such a process may map on Linux: twice what the package's own models take for the largest tile."""
 
 _PER_THREAD_BYTES = 160 << 20  # that a thread maps and hardly uses: its stack and its share of the heap
-_MOST_MESSAGE_BYTES = 1 << 28
-_MOST_ROWS = 100_000
-_TYPES = {"boxes": np.float32, "scores": np.float32, "labels": np.int64}
-_ERRORS = {"InputError": InputError, "SettingsError": SettingsError}
+ERRORS = {"InputError": InputError, "SettingsError": SettingsError}
+"""Those that opening and running a model raise, as they are named between processes."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +59,7 @@ class _Process:
     """The other process, as seen from here. It ends with this object."""
 
     def __init__(self, model: bytes, wish: _Wish) -> None:
-        self._wish = wish
+        self._wish, self._names = wish, output_names(takes_many=False)
         package = str(Path(__file__).parents[2])
         paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
         self._child = subprocess.Popen(
@@ -77,36 +72,32 @@ class _Process:
     def engine(self) -> Engine:
         """What runs the model there."""
         about, _ = self._receive()
-        info = info_from_metadata({METADATA_KEY: str(about["metadata"])}, self._wish.where)
-        fixed = about["fixed_px"]
-        return Engine(
-            self._run, str(about["provider"]), str(about["metadata"]), info,
-            None if fixed is None else (int(fixed[0]), int(fixed[1])),
-        )
+        self._names = output_names(takes_many=bool(about["takes_many"]))
+        return engine_from(about, self._wish.where, self._run)
 
     def _run(self, batch: Planes) -> tuple[Numbers, ...]:
         self._send({"shape": list(batch.shape)}, np.ascontiguousarray(batch, np.uint8).tobytes())
         head, data = self._receive()
         try:
-            return _arrays(head, data)
+            return outputs_from(head, data, self._names)
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"{self._wish.where} answers with no boxes, scores and labels ({error})") from error
 
     def _send(self, head: dict[str, Any], data: bytes) -> None:
         assert self._child.stdin is not None
         try:
-            _write(self._child.stdin, head, data)
+            write_message(self._child.stdin, head, data)
         except (BrokenPipeError, OSError) as error:
             raise self._ended() from error
 
     def _receive(self) -> tuple[dict[str, Any], bytes]:
         assert self._child.stdout is not None
         try:
-            head, data = _read(self._child.stdout)
+            head, data = read_message(self._child.stdout)
         except EOFError as error:
             raise self._ended() from error
         if (kind := head.get("error")) is not None:
-            raise _ERRORS.get(kind, InputError)(str(head["text"]))
+            raise ERRORS.get(kind, InputError)(str(head["text"]))
         return head, data
 
     def _ended(self) -> InputError:
@@ -115,6 +106,25 @@ class _Process:
             f"{self._wish.where}: the process that ran this model ended; it asks for more than "
             f"{self._wish.most_bytes / (1 << 30):.0f} GB of memory or is damaged. Show it smaller tiles, or get another"
         )
+
+
+def about_engine(engine: Engine) -> dict[str, Any]:
+    """What another process has to know of an engine."""
+    return {
+        "provider": engine.provider, "metadata": engine.metadata, "fixed_px": engine.fixed_px,
+        "takes_many": engine.takes_many,
+    }
+
+
+def engine_from(about: Mapping[str, Any], where: str, run: Run) -> Engine:
+    """The engine of another process, by what `about_engine` gave of it there. Raises InputError for one of a model
+    that breaks the contract."""
+    fixed = about["fixed_px"]
+    return Engine(
+        run, str(about["provider"]), str(about["metadata"]),
+        info_from_metadata({METADATA_KEY: str(about["metadata"])}, where),
+        None if fixed is None else (int(fixed[0]), int(fixed[1])), bool(about["takes_many"]),
+    )
 
 
 def _end(child: "subprocess.Popen[bytes]") -> None:
@@ -128,48 +138,9 @@ def _end(child: "subprocess.Popen[bytes]") -> None:
     child.wait()
 
 
-def _arrays(head: dict[str, Any], data: bytes) -> tuple[Numbers, ...]:
-    """Boxes, scores and labels from their shapes and bytes. Raises ValueError where they do not fit."""
-    out, start = [], 0
-    for name in OUTPUTS:
-        shape = [int(each) for each in head["shapes"][name]]
-        if len(shape) > 2 or min(shape, default=0) < 0 or max(shape, default=0) > _MOST_ROWS:
-            raise ValueError(f"{name} of shape {shape}")
-        kind = np.dtype(_TYPES[name])
-        count = int(np.prod(shape, dtype=np.int64))
-        out.append(np.frombuffer(data, kind, count, start).reshape(shape))
-        start += count * kind.itemsize
-    return tuple(out)
-
-
-def _write(stream: IO[bytes], head: dict[str, Any], data: bytes) -> None:
-    text = json.dumps(head).encode()
-    stream.write(struct.pack("<II", len(text), len(data)) + text)
-    stream.write(data)
-    stream.flush()
-
-
-def _read(stream: IO[bytes]) -> tuple[dict[str, Any], bytes]:
-    """Head and data of one message. Raises EOFError where the other side has ended or sends what is no message."""
-    lengths = stream.read(8)
-    if len(lengths) < 8:
-        raise EOFError
-    text_bytes, data_bytes = struct.unpack("<II", lengths)
-    if max(text_bytes, data_bytes) > max(_MOST_MESSAGE_BYTES, MOST_BYTES >> 2):
-        raise EOFError
-    text, data = stream.read(text_bytes), stream.read(data_bytes)
-    if len(text) < text_bytes or len(data) < data_bytes:
-        raise EOFError
-    try:
-        head = json.loads(text)
-    except ValueError as error:
-        raise EOFError from error
-    return (head, data) if isinstance(head, dict) else ({}, data)
-
-
 def serve(source: IO[bytes], sink: IO[bytes]) -> None:
     """The other process: open the model that comes first, then answer pictures until there are no more."""
-    head, model = _read(source)
+    head, model = read_message(source)
     wish = _Wish(**head)
     try:
         _limit(wish)
@@ -177,15 +148,13 @@ def serve(source: IO[bytes], sink: IO[bytes]) -> None:
             describe(model, wish.where) if wish.describes
             else open_engine(model, wish.where, wish.provider, wish.threads)
         )
-        _write(sink, {"provider": engine.provider, "metadata": engine.metadata, "fixed_px": engine.fixed_px}, b"")
+        write_message(sink, about_engine(engine))
         while not wish.describes:
-            head, data = _read(source)
+            head, data = read_message(source)
             found = engine.run(np.frombuffer(data, np.uint8).reshape(head["shape"]))
-            arrays = [np.ascontiguousarray(each, _TYPES[name]) for name, each in zip(OUTPUTS, found)]
-            shapes = {name: list(each.shape) for name, each in zip(OUTPUTS, arrays)}
-            _write(sink, {"shapes": shapes}, b"".join(each.tobytes() for each in arrays))
+            write_outputs(sink, output_names(takes_many=engine.takes_many), found)
     except (InputError, SettingsError) as error:
-        _write(sink, {"error": type(error).__name__, "text": str(error)}, b"")
+        write_message(sink, {"error": type(error).__name__, "text": str(error)})
     except EOFError:
         return  # nobody asks any more
     except Exception as error:
@@ -194,7 +163,7 @@ def serve(source: IO[bytes], sink: IO[bytes]) -> None:
             f"{wish.where}: the model cannot be run ({reason or type(error).__name__}); it may ask for more than "
             f"{wish.most_bytes / (1 << 30):.0f} GB of memory: show it smaller tiles, or get another"
         )
-        _write(sink, {"error": "InputError", "text": text}, b"")
+        write_message(sink, {"error": "InputError", "text": text})
 
 
 def _limit(wish: _Wish) -> None:

@@ -26,9 +26,10 @@ class Detector:
     """A model that is ready to look at pictures. `load` opens one; `detect` is called after, by any threads."""
 
     def __init__(
-        self, session: Session, *, provider: Provider = "auto", threads: int | None = None, stand_in: bool = True
+        self, session: Session, *, provider: Provider = "auto", threads: int | None = None, stand_in: bool = True,
+        shared: str = "",
     ) -> None:
-        self._session, self._wanted_provider, self._threads = session, provider, threads
+        self._session, self._wanted_provider, self._threads, self._shared = session, provider, threads, shared
         self._any_may_stand_in = stand_in
         self._at_night: Session | None = None
         self._night_was_sought = False
@@ -38,18 +39,19 @@ class Detector:
     @classmethod
     def load(
         cls, name_or_path: str | Path = "default", *, provider: Provider = "auto", threads: int | None = None,
-        stand_in: bool = True,
+        stand_in: bool = True, shared: str = "",
     ) -> "Detector":
         """Open an installed model by its name (`sorvolo models list`), or a model file.
 
         `provider` "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU; `threads`
         None takes as many as the process may use. `stand_in`: where a model knows daylight alone and names no other,
-        any installed one that knows thermal frames looks at those; False to measure the model itself. Raises InputError
-        for a name that is not installed and for a file that is missing, damaged or no model of Sorvolo's, SettingsError
-        for a provider that is not there.
+        any installed one that knows thermal frames looks at those; False to measure the model itself. `shared`: the
+        socket of a process that holds the models for several, see `Session`. Raises InputError for a name that is not
+        installed and for a file that is missing, damaged or no model of Sorvolo's, SettingsError for a provider that
+        is not there.
         """
-        session = Session(find_model(name_or_path), provider, threads)
-        return cls(session, provider=provider, threads=threads, stand_in=stand_in)
+        session = Session(find_model(name_or_path), provider, threads, shared)
+        return cls(session, provider=provider, threads=threads, stand_in=stand_in, shared=shared)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -185,9 +187,12 @@ class Detector:
             if not self._night_was_sought:
                 named = self.info.thermal_by
                 found = thermal_model(self.classes, named) if named or self._any_may_stand_in else None
-                self._at_night = None if found is None else Session(found, self._wanted_provider, self._threads)
+                self._at_night = None if found is None else self._opened(found)
                 self._night_was_sought = True
         return self._at_night or self._session
+
+    def _opened(self, path: Path) -> Session:
+        return Session(path, self._wanted_provider, self._threads, self._shared)
 
 
 def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:

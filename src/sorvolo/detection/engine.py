@@ -15,12 +15,13 @@ Provider = Literal["auto", "cpu", "cuda", "openvino"]
 """Where a model runs; "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU."""
 
 Planes: TypeAlias = NDArray[np.uint8]
-"""(1, 3, H, W): a picture as a model takes it."""
+"""(1, 3, H, W): a picture as a model takes it; (N, 3, H, W) for a model that takes many."""
 
 Run = Callable[[Planes], tuple[Numbers, ...]]
-"""A picture's planes to boxes, scores and labels."""
+"""A picture's planes to boxes, scores and labels; of many also which picture each of these is of, from 0."""
 
 INPUT, OUTPUTS = "image", ("boxes", "scores", "labels")
+PICTURES = "pictures"
 CUDA = "CUDAExecutionProvider"
 _OPENVINO_PRECISION = "f32"
 
@@ -29,7 +30,8 @@ _OPENVINO_PRECISION = "f32"
 class Engine:
     """A model that runs: `provider` in words, its `metadata` as it stands in the file, and what that means.
 
-    `fixed_px` is the (height, width) of its input where the model takes only one size, else None.
+    `fixed_px` is the (height, width) of its input where the model takes only one size, else None; `takes_many`
+    whether it takes several pictures of one size at once.
     """
 
     run: Run
@@ -37,6 +39,12 @@ class Engine:
     metadata: str
     info: ModelInfo
     fixed_px: tuple[int, int] | None
+    takes_many: bool = False
+
+
+def output_names(*, takes_many: bool) -> tuple[str, ...]:
+    """What a model gives, in this order."""
+    return (*OUTPUTS, PICTURES) if takes_many else OUTPUTS
 
 
 def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> Engine:
@@ -54,7 +62,7 @@ def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> E
         # before OpenVINO sees it: that crashes on some models that break the contract
         described = describe(model, where)
         try:
-            run = _openvino_runner(model, threads)
+            run = _openvino_runner(model, threads, output_names(takes_many=described.takes_many))
         except ImportError as error:
             if provider == "openvino":
                 raise SettingsError(
@@ -68,13 +76,13 @@ def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> E
         else:
             return replace(described, run=run, provider=f"OpenVINO on the CPU, {_count(threads)}")
     session = _onnx_session(model, where, threads, ["CPUExecutionProvider"])
-    return _engine(_runner(session), f"ONNX Runtime on the CPU, {_count(threads)}{refused}", session, where)
+    return _engine(f"ONNX Runtime on the CPU, {_count(threads)}{refused}", session, where)
 
 
 def describe(model: bytes, where: str) -> Engine:
     """The model opened only to be asked what it is like: quick, since nothing is optimised."""
     session = _onnx_session(model, where, 1, ["CPUExecutionProvider"], optimise=False)
-    return _engine(_runner(session), "nowhere yet", session, where)
+    return _engine("nowhere yet", session, where)
 
 
 def _cuda_engine(model: bytes, where: str, threads: int) -> Engine | None:
@@ -86,13 +94,16 @@ def _cuda_engine(model: bytes, where: str, threads: int) -> Engine | None:
     session = _onnx_session(model, where, threads, [CUDA, "CPUExecutionProvider"])
     if session.get_providers()[0] != CUDA:
         return None
-    return _engine(_runner(session), "ONNX Runtime on the GPU (CUDA)", session, where)
+    return _engine("ONNX Runtime on the GPU (CUDA)", session, where)
 
 
-def _engine(run: Run, provider: str, session: Any, where: str) -> Engine:
+def _engine(provider: str, session: Any, where: str) -> Engine:
     metadata = session.get_modelmeta().custom_metadata_map
     info = info_from_metadata(metadata, where)
-    return Engine(run, provider, metadata[METADATA_KEY], info, _input_size(session, where, info.stride))
+    fixed_px = _input_size(session, where, info.stride)
+    takes_many = PICTURES in {each.name for each in session.get_outputs()}
+    run = _runner(session, output_names(takes_many=takes_many))
+    return Engine(run, provider, metadata[METADATA_KEY], info, fixed_px, takes_many)
 
 
 def _count(threads: int) -> str:
@@ -133,14 +144,14 @@ def _refusal(message: str) -> str:
     return f"{runtime} refuses it ({first}); export it again with opset 17"
 
 
-def _runner(session: Any) -> Run:
+def _runner(session: Any, names: Sequence[str]) -> Run:
     def run(batch: Planes) -> tuple[Numbers, ...]:
-        return tuple(session.run(list(OUTPUTS), {INPUT: batch}))
+        return tuple(session.run(list(names), {INPUT: batch}))
 
     return run
 
 
-def _openvino_runner(model: bytes, threads: int) -> Run:
+def _openvino_runner(model: bytes, threads: int, names: Sequence[str]) -> Run:
     import openvino
 
     core = openvino.Core()
@@ -153,7 +164,7 @@ def _openvino_runner(model: bytes, threads: int) -> Run:
 
     def run(batch: Planes) -> tuple[Numbers, ...]:
         request.infer({INPUT: batch}, share_inputs=True)
-        return tuple(request.get_tensor(name).data.copy() for name in OUTPUTS)
+        return tuple(request.get_tensor(name).data.copy() for name in names)
 
     return run
 
@@ -172,6 +183,8 @@ def _input_size(session: Any, where: str, stride: int) -> tuple[int, int] | None
     shape = inputs[0].shape
     if not _is_one_picture(shape):
         raise InputError(f"{where} takes {found}; needed is {needed}")
+    if PICTURES in outputs and isinstance(shape[0], int):
+        raise InputError(f"{where} gives '{PICTURES}' but takes one picture; leave the number of pictures free")
     return _fixed_size(shape, stride, f"{where} takes {found}")
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from sorvolo.detection.confined import confined_engine, described_confined
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Engine, Planes, Provider, describe, open_engine
+from sorvolo.detection.sharing import shared_engine
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Labels, Numbers
 
@@ -39,19 +40,20 @@ class Session:
     letterboxed. Pictures given from several threads are seen one after another.
     """
 
-    def __init__(self, path: Path, provider: Provider = "auto", threads: int | None = None) -> None:
+    def __init__(
+        self, path: Path, provider: Provider = "auto", threads: int | None = None, shared: str = ""
+    ) -> None:
         """Open a model file on `threads` cores, None for as many as this process may use.
 
-        Raises InputError for a file that is missing, damaged or none of ours, SettingsError for a provider that is
-        not installed.
+        `shared` is the socket of a process that holds the model for several (`sharing`); provider and threads are then
+        its own. Raises InputError for a file that is missing, damaged or none of ours, SettingsError for a provider
+        that is not installed.
         """
         if provider not in get_args(Provider):
             raise SettingsError(f"no provider {provider!r}; there are {', '.join(get_args(Provider))}")
         if threads is not None and threads < 1:
             raise SettingsError(f"a model needs at least one thread, not {threads}")
-        model = read_model(path)
-        self._threads = threads or usable_cores()
-        engine = _engine(model, path, provider, self._threads)
+        engine = shared_engine(shared, path) if shared else opened_engine(path, provider, threads)
         self._run, self.provider, self.info, self.fixed_px = engine.run, engine.provider, engine.info, engine.fixed_px
         self._path = path
         self._buffer: Planes = np.zeros((1, 3, 0, 0), np.uint8)
@@ -66,7 +68,7 @@ class Session:
         height, width = picture.shape[:2]
         with self._lock:
             shown = self._shown(picture, scale)
-            boxes, scores, labels = self._run(self._padded(shown))
+            boxes, scores, labels = self._run(self._padded(shown))[:3]
         back = np.array([width / shown.shape[1], height / shown.shape[0]] * 2, np.float32)
         return self._checked(boxes, scores, labels, back, width, height)
 
@@ -141,9 +143,13 @@ def read_model(path: Path) -> bytes:
         raise InputError(f"the model file {path} cannot be read ({error.strerror}); check its permissions") from error
 
 
-def _engine(model: bytes, path: Path, provider: Provider, threads: int) -> Engine:
-    """A packaged model runs in this process, any other beside it, where it cannot take all memory."""
-    return (open_engine if _is_packaged(path) else confined_engine)(model, str(path), provider, threads)
+def opened_engine(path: Path, provider: Provider = "auto", threads: int | None = None) -> Engine:
+    """A packaged model runs in this process, any other beside it, where it cannot take all memory.
+
+    Raises as `Session` does.
+    """
+    opens = open_engine if _is_packaged(path) else confined_engine
+    return opens(read_model(path), str(path), provider, threads or usable_cores())
 
 
 def _is_packaged(path: Path) -> bool:

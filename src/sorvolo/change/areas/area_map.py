@@ -12,13 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
+from sorvolo.change.areas.ground_pictures import GroundPictureSettings
 from sorvolo.change.areas.ground_sums import GroundSums
 from sorvolo.change.areas.segments import AreaSettings, GroundSigns, segments
 from sorvolo.change.areas.signs import AreaSigns, SignSettings, area_signs
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.geometry.arrays import Mask, PointsM
-from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
 _SUMS = ("seen", "agree", "likeness", "blue", "red", "detail", "blue_now", "red_now")
@@ -63,21 +62,14 @@ class AreaMap:
 
     def __init__(self, settings: AreaMapSettings = AreaMapSettings()) -> None:
         self._settings = settings
-        self._ground = GroundSums(_SUMS, 0.0, settings.most_cells)
-        self._times_ns: list[int] = []
-        self._residuals_m: list[float] = []
-        self._pictures = GroundPictures(1.0, settings.pictures)
+        self._ground = GroundSums(_SUMS, settings.most_cells, settings.pictures)
 
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
         settings = self._settings
-        if not self._ground.cell_m:
-            coarser = max(1.0, max(view.valid.shape) / settings.signs.side_px)
-            cell_m = settings.cell_px * view.m_per_px * coarser
-            self._ground = GroundSums(_SUMS, cell_m, settings.most_cells)
-            self._pictures = GroundPictures(cell_m / settings.picture_px, settings.pictures)
-        window = self._ground.window_of(view)
-        if not self._ground.make_room(window):
+        cell_m = settings.cell_px * view.m_per_px * max(1.0, max(view.valid.shape) / settings.signs.side_px)
+        window = self._ground.window_of(view, cell_m, cell_m / settings.picture_px)
+        if window is None:
             return
         signs = area_signs(view, leans, settings.signs)
         planes = {
@@ -86,14 +78,8 @@ class AreaMap:
             "blue_now": signs.surface[..., 0], "red_now": signs.surface[..., 1],
         }
         known = signs.known.astype(np.float32)
-        laid = self._ground.add(window, view.site_from_image @ signs.view_from_signs, planes, known)
-        self._times_ns.append(view.time_ns)
-        if np.isfinite(view.residual_px):
-            self._residuals_m.append(view.residual_px * view.m_per_px)
-        rows, columns = np.nonzero(laid["agree"])
-        if len(rows):
-            cells = np.column_stack([columns, rows]).astype(float)
-            self._pictures.show(view, apply_homography(window.site_from_cell(self._ground.cell_m), cells))
+        laid = self._ground.add(view, window, view.site_from_image @ signs.view_from_signs, planes, known)
+        self._ground.show(view, window, laid["agree"] != 0)
 
     def conclude(self, id_prefix: str, first_number: int) -> tuple[Change, ...]:
         """After the last view: all areas, the largest first, numbered from `first_number` on."""
@@ -127,11 +113,11 @@ class AreaMap:
         if outline_m is None:
             raise AssertionError("an area has cells")
         size = measures(outline_m)
-        residual_m = float(np.mean(self._residuals_m)) if self._residuals_m else 0.0
         return Change(
-            "", ChangeKind.AREA, score, outline_m, min(self._times_ns), max(self._times_ns),
+            "", ChangeKind.AREA, score, outline_m, *self._ground.span_ns,
             round(float(self._ground.sums["agree"][cells].mean())), float(np.count_nonzero(cells)) * cell_m**2,
-            size.length_m, float(np.hypot(residual_m, cell_m / np.sqrt(12))), self._pictures.patch(outline_m),
+            size.length_m, float(np.hypot(self._ground.residual_m, cell_m / np.sqrt(12))),
+            self._ground.patch(outline_m),
         )
 
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
-from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
+from sorvolo.change.areas.ground_pictures import GroundPictureSettings
 from sorvolo.change.areas.ground_sums import GroundSums
 from sorvolo.change.pair.learned_difference import LearnedSettings, learned_difference
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.geometry.arrays import Mask
-from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ComparedView, Shade
 
 _SUMS = ("seen", "apart", "agree", "dark")
@@ -43,19 +42,13 @@ class GatheredThings:
 
     def __init__(self, settings: GatherThingSettings = GatherThingSettings()) -> None:
         self._settings = settings
-        self._ground = GroundSums(_SUMS, 0.0, settings.most_cells)
-        self._pictures = GroundPictures(1.0, settings.pictures)
-        self._times_ns: list[int] = []
-        self._residuals_m: list[float] = []
+        self._ground = GroundSums(_SUMS, settings.most_cells, settings.pictures)
 
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
         settings = self._settings
-        if not self._ground.cell_m:
-            self._ground = GroundSums(_SUMS, settings.cell_px * view.m_per_px, settings.most_cells)
-            self._pictures = GroundPictures(view.m_per_px, settings.pictures)
-        window = self._ground.window_of(view)
-        if not self._ground.make_room(window):
+        window = self._ground.window_of(view, settings.cell_px * view.m_per_px, view.m_per_px)
+        if window is None:
             return
         before, after = (np.ascontiguousarray(each[..., ::-1]) for each in (view.reference, view.image))
         apart = learned_difference(before, after, view.valid, settings.learned)
@@ -65,18 +58,12 @@ class GatheredThings:
             "apart": apart, "agree": (apart > settings.own_spreads).astype(np.float32),
             "dark": ((view.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0).astype(np.float32),
         }
-        laid = self._ground.add(window, view.site_from_image, planes, view.valid.astype(np.float32))
-        self._times_ns.append(view.time_ns)
-        if np.isfinite(view.residual_px):
-            self._residuals_m.append(view.residual_px * view.m_per_px)
-        rows, columns = np.nonzero(laid["apart"] > settings.spreads)
-        if len(rows):
-            cells = np.column_stack([columns, rows]).astype(float)
-            self._pictures.show(view, apply_homography(window.site_from_cell(self._ground.cell_m), cells))
+        laid = self._ground.add(view, window, view.site_from_image, planes, view.valid.astype(np.float32))
+        self._ground.show(view, window, laid["apart"] > settings.spreads)
 
     def conclude(self, id_prefix: str, first_number: int, others: Sequence[Change]) -> list[Change]:
         """After the last view: the things that `others` do not hold, numbered from `first_number` on."""
-        if not self._times_ns:
+        if self._ground.is_empty:
             return []
         explained = self._settings.explained
         found = [each for each in self._things() if _explained(each, others) < explained]
@@ -111,13 +98,12 @@ class GatheredThings:
         outline_m = outline_of(cells, self._ground.window.site_from_cell(cell_m) @ cell_from_own, 0.5, 1.0)
         if outline_m is None:
             return None
-        patch, size = self._pictures.patch(outline_m), measures(outline_m)
+        patch, size = self._ground.patch(outline_m), measures(outline_m)
         rows, columns = np.nonzero(cells)
         views = float(self._ground.sums["agree"][rows + corner[1], columns + corner[0]].mean())
-        residual_m = float(np.mean(self._residuals_m)) if self._residuals_m else 0.0
         return Change(
-            "", kind_of(patch), score, outline_m, min(self._times_ns), max(self._times_ns), max(round(views), 1),
-            size.area_m2, size.length_m, float(np.hypot(residual_m, cell_m)), patch,
+            "", kind_of(patch), score, outline_m, *self._ground.span_ns, max(round(views), 1), size.area_m2,
+            size.length_m, float(np.hypot(self._ground.residual_m, cell_m)), patch,
         )
 
 

@@ -35,16 +35,17 @@ _CROP_PX = 256
 _MOST_CROPS = 60  # of one frame, the surest
 
 
-def open_detector(model: str) -> Detects | None:
+def open_detector(model: str, shared: str = "") -> Detects | None:
     """The detector of this name or file; None for "none", and for "default" where no default model is installed.
 
-    Raises InputError for any other model that is not there or cannot be used.
+    `shared` is the socket of a process that holds it for several, "" for one of its own. Raises InputError for any
+    other model that is not there or cannot be used.
     """
     if model == NO_MODEL:
         return None
     if model == DEFAULT_MODEL and all(each.name != DEFAULT_MODEL for each in installed_models()):
         return None
-    return Detector.load(model)
+    return Detector.load(model, shared=shared)
 
 
 def check_classes(detector: Detects | None, classes: Sequence[str]) -> None:

@@ -41,7 +41,7 @@ class Picture:
 
 
 class SmallMap:
-    """A map made small while its tiles pass by, in any order; only `take` and `take_from` change it.
+    """A map made small while its tiles pass by, in any order; only those methods change it whose name begins with take.
 
     The tiles are `tile_px` wide and lie at `indexes`. The map is halved until no side exceeds `max_px`, and memory
     depends on that alone.
@@ -67,9 +67,14 @@ class SmallMap:
         return len(self._shown_px)
 
     def take(self, index: TileIndex, tile: ImageRGBA) -> None:
-        """Draw a tile, (tile_px, tile_px, 4), or what `shrink` made of it."""
+        """Draw a tile, (tile_px, tile_px, 4)."""
         self._part(index)[:] = shrink(tile, self._side, self._side)
         self._shown_px[index] = int(np.count_nonzero(tile[..., 3]))
+
+    def take_shrunk(self, index: TileIndex, small: ImageRGBA) -> None:
+        """Draw what `shrink` made of a tile, (side_px, side_px, 4); each of its pixels counts as shown whole."""
+        self._part(index)[:] = small
+        self._shown_px[index] = int(np.count_nonzero(small[..., 3])) * self._step**2
 
     def take_from(self, other: "SmallMap", index: TileIndex) -> None:
         """Draw a tile that another map of the same tiles shows alike."""
@@ -112,7 +117,7 @@ class LivePreview:
         for index in tiles:
             if index not in self._shrunk or index in changed:
                 self._shrunk[index] = shrink(tiles[index], self._side, self._side)
-            small.take(index, self._shrunk[index])
+            small.take_shrunk(index, self._shrunk[index])
         atomic_write_bytes(path, png_from_rgba(small.picture().rgba), durable=False)
 
 

@@ -1,0 +1,85 @@
+"""Flights that share one detector: the maps of flights with their own, also when its process dies."""
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from batch_flights import another, content
+
+from ended_work import ended
+from sorvolo.cli.main import main
+from sorvolo.cluster.batch import BatchSettings, run_batch
+from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.local_executor import LocalExecutor
+from sorvolo.cluster.orders import FlightWish, Order, Part, PartKind
+from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
+from sorvolo.cluster.table import BatchTable, State
+from sorvolo.errors import SettingsError, StoreError
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+
+
+class Disturbed(LocalExecutor):
+    """A local executor that kills the shared detector as the first try begins."""
+
+    pids: tuple[int, ...] = ()
+
+    def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
+        super().start(key, order, cost)
+        assert self._detector is not None
+        self.pids = (*self.pids, self._detector.pid)
+        if len(self.pids) == 1:
+            os.kill(self._detector.pid, signal.SIGKILL)
+
+
+def test_a_shared_detector_that_dies_is_started_again_and_finds_the_same(flown: Path, tmp_path: Path) -> None:
+    flight = another(flown, tmp_path / "in" / "one")
+    made: list[Disturbed] = []
+
+    @contextmanager
+    def executor(table: BatchTable) -> Iterator[LocalExecutor]:
+        with Disturbed(2, 60.0, table.lock, shares_detector=True) as one:
+            made.append(one)
+            yield one
+
+    settings = BatchSettings(FlightWish(camera=str(flown / "camera.xml")))
+    report = ended(run_batch([tmp_path / "in"], tmp_path / "maps", settings, executor))
+    (row,) = report.rows
+    assert row.state is State.DONE and (row.tries, report.crashes) == (2, 1)
+    assert len(set(made[0].pids)) == 2
+    for pid in made[0].pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    own = tmp_path / "own" / "one"
+    for _ in map_flights([flight], own, MapSettings(), camera=flown / "camera.xml"):
+        pass
+    assert content(tmp_path / "maps" / "one") == content(own)
+
+
+def test_what_shows_nothing_to_a_detector_shares_none() -> None:
+    order = Order("in", "site", FlightWish())
+    assert searches(order)
+    assert not searches(Order("in", "site", FlightWish(model="none")))
+    assert not searches(Order("in", "site", FlightWish(), part=Part(PartKind.BLOCK, 0, 2, "blocks")))
+
+
+def test_a_socket_that_cannot_be_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    deep = tmp_path / ("x" * 100)  # longer than a socket's path may be
+    deep.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(deep))
+    with SharedDetector() as shared, pytest.raises(StoreError, match="set TMPDIR to a folder of this machine"):
+        _ = shared.address
+
+
+def test_shares_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SettingsError, match="a share of one graphics card, 0 to 1"):
+        SharingSettings(True, 1.5)
+    (tmp_path / "1.mp4").write_text("no video")
+    common = ["batch", str(tmp_path / "1.mp4"), "--root", str(tmp_path / "maps"), "--gpus", "0.5"]
+    assert main(common) == 1
+    assert "give --share-detector as well" in capsys.readouterr().err
+    assert main([*common, "--share-detector"]) == 1
+    assert "give --executor ray as well" in capsys.readouterr().err
