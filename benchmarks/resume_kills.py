@@ -5,7 +5,8 @@
 Two small simulated flights; `map` makes the map of the first, `compare` compares the second with it, `watch` searches
 the second, two frames a second, with the model that is installed, and runs a program for each object. Each round starts
 the command in a process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from 0
-to 1, and runs the same command again to its end. All files are compared with those of the undisturbed run, byte by
+to 1, and runs the same command again to its end. A run that was through before its kill counts for nothing, and another
+moment is drawn. All files are compared with those of the undisturbed run, byte by
 byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report says of the time and the
 memory that it took (docs/formats.md). Of a watch, each alert must have been sent once: one that was sent in the moment
 of the kill, before that was noted, may come twice, and is counted.
@@ -22,7 +23,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from provenance import commit, machine
@@ -61,19 +62,29 @@ def content(site: Path) -> dict[str, bytes]:
     return found
 
 
-def run(command: list[str], kill_s: float | None = None) -> tuple[float, str]:
-    """Run it, or kill it after so many seconds: how long it ran, and what it printed."""
-    started_s = time.monotonic()
+@dataclass(frozen=True)
+class Ran:
+    """A run: how long it took, what it printed, and whether it was killed."""
+
+    seconds: float
+    printed: str
+    killed: bool
+
+
+def run(command: list[str], kill_s: float | None = None) -> Ran:
+    """Run it, or kill it after so many seconds."""
+    started_s, killed = time.monotonic(), False
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         try:
             _, printed = process.communicate(timeout=kill_s)
         except subprocess.TimeoutExpired:
             process.kill()
+            killed = True
             _, printed = process.communicate()
         else:
             if process.returncode not in (0, 3):
                 raise SystemExit(printed)
-    return time.monotonic() - started_s, printed
+    return Ran(time.monotonic() - started_s, printed, killed)
 
 
 class Trial:
@@ -99,7 +110,7 @@ class Trial:
             shutil.copytree(self._base, place)
         return place
 
-    def run(self, place: Path, kill_s: float | None = None) -> tuple[float, str]:
+    def run(self, place: Path, kill_s: float | None = None) -> Ran:
         """The mission, perhaps killed: see `run`."""
         return run(self._command(self._options.mission, place), kill_s)
 
@@ -122,23 +133,24 @@ def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, obje
     """The result so far, after each killed run."""
     trial = Trial(options, folder)
     whole = trial.begin("undisturbed")
-    whole_s, _ = trial.run(whole)
+    whole_s = trial.run(whole).seconds
     wanted, announced = content(whole), trial.alerts()
     draw, rows = random.Random(options.seed), []
-    for number in range(options.kills):
+    while len(rows) < options.kills:
         place = trial.begin("killed")
         kill_s = draw.random() * whole_s
-        trial.run(place, kill_s)
-        again_s, printed = trial.run(place)
+        if not trial.run(place, kill_s).killed:
+            continue
+        again = trial.run(place)
         found = content(place)
         differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
-        resumed = re.search(r"continuing after (\d+) frame", printed)
+        resumed = re.search(r"continuing after (\d+) frame", again.printed)
         rows.append({
-            "kill_s": round(kill_s, 2), "again_s": round(again_s, 2), "same": not differing,
+            "kill_s": round(kill_s, 2), "again_s": round(again.seconds, 2), "same": not differing,
             "frames_taken_over": int(resumed[1]) if resumed else 0, "differing": differing[:10],
             "alerts_lost": len(announced - trial.alerts()), "alerts_twice": len(trial.alerts() - announced),
         })
-        print(number + 1, rows[-1], flush=True)
+        print(len(rows), rows[-1], flush=True)
         yield {
             "mission": options.mission, "seed": options.seed, "width_px": options.width, "model": options.model,
             "undisturbed_s": round(whole_s, 2), "alerts": announced.total(), "kills": len(rows),

@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -168,3 +169,13 @@ def test_what_cannot_be_divided_is_named(flight: Flown, tmp_path: Path) -> None:
         cv2.imwrite(str(bare / f"{number}.jpg"), np.full((180, 320, 3), number, np.uint8))
     with pytest.raises(SettingsError, match="the photos of bare have no GPS, by which they would be divided"):
         plan_blocks(bare, tmp_path / "site", settings, flight.camera, 2, tmp_path / "blocks")
+    video = tmp_path / "flight.mp4"
+    with av.open(str(video), "w") as made:
+        stream = made.add_stream("libx264", rate=10)
+        stream.width, stream.height, stream.pix_fmt = 320, 180, "yuv420p"
+        for value in range(4):
+            picture = np.full((180, 320, 3), 50 * value, np.uint8)
+            made.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        made.mux(stream.encode())
+    with pytest.raises(SettingsError, match=r"flight is a video: which of its frames .* run the batch again without"):
+        plan_blocks(video, tmp_path / "site", settings, flight.camera, 2, tmp_path / "blocks")

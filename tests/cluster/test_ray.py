@@ -21,14 +21,8 @@ from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import FlightWish, Order
-from sorvolo.cluster.ray_executor import (
-    _demand_fit,
-    _demand_same,
-    _probe_of,
-    _why_not,
-    _with_detector,
-    ray_executor,
-)
+from sorvolo.cluster.ray_cluster import demand_same, probe_of, why_not
+from sorvolo.cluster.ray_executor import _demand_fit, _with_detector, ray_executor
 from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.table import LOCK, State
 from sorvolo.detection.models import find_model
@@ -184,7 +178,7 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
     ],
 )
 def test_what_ray_says_of_a_cluster_that_takes_no_batch_is_put_in_words(error: Exception, words: str) -> None:
-    assert words in _why_not("ray://10.0.0.1:10001", error)
+    assert words in why_not("ray://10.0.0.1:10001", error)
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,7 +190,7 @@ def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_machine_that_does_not_share_the_disk_is_named(tmp_path: Path) -> None:
-    probe = _probe_of(str(tmp_path / "word"), "word of the batch")
+    probe = probe_of(str(tmp_path / "word"), "word of the batch")
     assert probe()[2] is False
     (tmp_path / "word").write_text("word of the batch")
     assert probe()[2] is True
@@ -209,9 +203,9 @@ def test_a_machine_that_does_not_share_the_disk_is_named(tmp_path: Path) -> None
 
 def test_a_machine_with_another_sorvolo_is_named(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"the machine far has Sorvolo 0\.0\.9, this one"):
-        _demand_same("far", "0.0.9")
+        demand_same("far", "0.0.9")
     with pytest.raises(SettingsError, match="the machine far has no Sorvolo, this one"):
-        _demand_same("far", "")
+        demand_same("far", "")
     with pytest.raises(InputError, match=rf"{os.uname().nodename} has Sorvolo .*, the batch 0\.0\.9"):
         _demand_fit(str(tmp_path), "0.0.9")
 

@@ -1,4 +1,4 @@
-"""Flights of a batch on a Ray cluster whose machines share a disk; the only place that knows Ray.
+"""Flights of a batch on a Ray cluster whose machines share a disk.
 
 Ray places tasks and notices machines that die. The batch itself counts tries and keeps results: Ray's own retries are
 off.
@@ -6,15 +6,12 @@ off.
 
 import importlib.util
 import os
-import secrets
 import socket
 import threading
-import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,30 +20,24 @@ from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import Ending, Order, Outcome
 from sorvolo.cluster.process import WorkerProcess, run_order
+from sorvolo.cluster.ray_cluster import (
+    SCHEME,
+    WAITS,
+    check_machines,
+    connect,
+    demand_head,
+    first_line,
+    started_cluster,
+    unshared,
+    working_machines,
+)
 from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
 from sorvolo.cluster.table import LOCK
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.memory import MemorySettings
-from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
 
 T = TypeVar("T")
 Key = tuple[str, str]
-_SCHEME = "ray://"
-
-
-@dataclass(frozen=True)
-class WaitSettings:
-    """How long a cluster's answers are waited for, s. Chosen, not measured, for machines in one network."""
-
-    reach_s: float = 8.0  # a connection to the head, which takes milliseconds
-    probe_s: float = 90.0  # the first task on every machine: Ray starts a process for it before
-    again_s: float = 0.5  # between two questions which machines are there
-    ending_s: float = 2.0  # in one wait for a try to end, between which Ctrl-C and a dead head are noticed
-    head_s: float = 10.0  # for a head that stopped answering; Ray itself would end this process after 60 s
-    cancel_s: float = 10.0  # tasks that are cancelled
-
-
-_WAITS = WaitSettings()
 
 
 @contextmanager
@@ -64,13 +55,13 @@ def ray_executor(
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
     os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")  # what asks a cluster that is gone would start another one
     os.environ.setdefault("RAY_CLIENT_MAX_CONNECTION_TIMEOUT_S", "5")  # thrice: it listens
-    if name == "ray" and not _started():
+    if name == "ray" and not started_cluster():
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # its own listens on loopback alone
-    _connect(name, workers)
+    connect(name, workers)
     import ray
 
     try:
-        _check_machines(root)
+        check_machines(root)
         executor = RayExecutor(name, workers, stall_s, root, sharing)
         try:
             yield executor
@@ -96,7 +87,7 @@ class RayExecutor:
         self._detectors = MachineDetectors(ray, sharing.gpus) if sharing.is_shared else None
         self._is_gone = False
         # through ray:// the head's own client server is asked, and raises what `_cluster` knows
-        self._head = "" if name.startswith(_SCHEME) else str(ray.get_runtime_context().gcs_address)
+        self._head = "" if name.startswith(SCHEME) else str(ray.get_runtime_context().gcs_address)
 
     @property
     def running(self) -> Mapping[Key, object]:
@@ -130,8 +121,8 @@ class RayExecutor:
         ended: list[Any] = []
         with self._cluster():
             while not ended:
-                wait_s = timeout_s or _WAITS.ending_s
-                _demand_head(self._head)
+                wait_s = timeout_s or WAITS.ending_s
+                demand_head(self._head)
                 ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=wait_s)
                 if not ended and timeout_s is not None:
                     return None
@@ -155,7 +146,7 @@ class RayExecutor:
             for key, task in self._running.items():
                 if key not in self._actors:
                     self._ray.cancel(task, force=True)
-            self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=_WAITS.cancel_s)
+            self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=WAITS.cancel_s)
 
     def _submit(self, key: Key, order: Order, cost: Cost) -> None:
         machines = self._machines()
@@ -186,14 +177,14 @@ class RayExecutor:
 
     def _machines(self) -> list[dict[str, float]]:
         """What the machines have that are there; those without cores run nothing."""
-        found = [each["Resources"] for each in _working(self._ray)]
+        found = [each["Resources"] for each in working_machines(self._ray)]
         machines = [{"CPU": each["CPU"], "memory": each.get("memory", 0.0)} for each in found]
         if not machines:
             raise ConnectionError("no machine with a core is left")
         return machines
 
     def _asked(self, call: Callable[[], T]) -> T:
-        """What the cluster answers to a call, which is given up where the head dies meanwhile: see `_demand_head`."""
+        """What the cluster answers to a call, which is given up where the head dies meanwhile: see `demand_head`."""
         answer: Future[T] = Future()
 
         def ask() -> None:
@@ -206,11 +197,11 @@ class RayExecutor:
             threading.Thread(target=ask, daemon=True, name="ray").start()
             while True:
                 try:
-                    return answer.result(timeout=_WAITS.ending_s)
+                    return answer.result(timeout=WAITS.ending_s)
                 except TimeoutError:
                     if answer.done():
                         raise
-                    _demand_head(self._head)
+                    demand_head(self._head)
 
     @contextmanager
     def _cluster(self) -> Iterator[None]:
@@ -219,12 +210,12 @@ class RayExecutor:
 
         errors = self._ray.exceptions
         try:
-            _demand_head(self._head)
+            demand_head(self._head)
             yield
         except (ConnectionError, grpc.RpcError, errors.RaySystemError, errors.RpcError) as error:
             self._is_gone = True
             raise SettingsError(
-                f"--executor {self._name}: the cluster is gone ({_first_line(error)}); when it is back, the same "
+                f"--executor {self._name}: the cluster is gone ({first_line(error)}); when it is back, the same "
                 "command goes on"
             ) from error
 
@@ -244,7 +235,7 @@ class MachineDetectors:
         """The sockets by machine, of those that are there and answer. Raises SettingsError where a card is not free."""
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        there = {each["NodeID"]: each["Resources"] for each in _working(self._ray)}
+        there = {each["NodeID"]: each["Resources"] for each in working_machines(self._ray)}
         self._actors = {node: actor for node, actor in self._actors.items() if node in there}
         for node in there.keys() - self._actors.keys():
             self._actors[node] = self._ray.remote(_Detector).options(
@@ -257,11 +248,11 @@ class MachineDetectors:
     def _answer(self, node: str, task: Any) -> str:
         """The socket on a machine; "" where its actor was lost, which the next flight there has anew."""
         try:
-            return str(self._ray.get(task, timeout=_WAITS.probe_s))
+            return str(self._ray.get(task, timeout=WAITS.probe_s))
         except self._ray.exceptions.GetTimeoutError as error:
             raise SettingsError(
                 f"--gpus {self._gpus:g}: a machine has no such share of its graphics card free within "
-                f"{_WAITS.probe_s:.0f} s; another batch may hold it: give a smaller share"
+                f"{WAITS.probe_s:.0f} s; another batch may hold it: give a smaller share"
             ) from error
         except self._ray.exceptions.RayActorError:
             del self._actors[node]
@@ -321,214 +312,4 @@ def _demand_fit(root: str, version: str) -> None:
             f"the machine {host} has Sorvolo {sorvolo.__version__}, the batch {version}; install the same one"
         )
     if not (Path(root) / LOCK).exists():
-        raise StoreError(_unshared(host, root))
-
-
-def _unshared(host: str, root: str) -> str:
-    return (
-        f"the machine {host} does not see the files of this one in {root}; put ROOT on a disk that all machines have "
-        "under the same path (NFS, for example)"
-    )
-
-
-def _started() -> str:
-    """HOST:PORT of the cluster that this machine is part of, as RAY_ADDRESS or `ray start` names it; "" for none."""
-    named = os.environ.get("RAY_ADDRESS", "")
-    noted = Path(os.environ.get("RAY_TMPDIR", "/tmp"), "ray", "ray_current_cluster")
-    return named if named or not noted.is_file() else noted.read_text().strip()
-
-
-def _connect(name: str, workers: int | None) -> None:
-    import ray
-
-    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
-    try:
-        if name.startswith(_SCHEME):
-            _demand_reachable(name)
-            with warnings.catch_warnings(action="ignore"):  # of what the error states
-                ray.init(address=name, **options)
-        elif address := _started():
-            _demand_listening(name, address)
-            ray.init(address=address, **options)
-        else:
-            ray.init(address="local", num_cpus=workers, include_dashboard=False, **options)
-    except ray.exceptions.AuthenticationError as error:
-        raise SettingsError(
-            f"--executor {name}: the cluster needs another token; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH to "
-            "the file of the token that it was started with"
-        ) from error
-    except (ConnectionError, RuntimeError, ValueError) as error:
-        raise SettingsError(f"--executor {name}: {_why_not(name, error)}") from error
-
-
-def _why_not(name: str, error: Exception) -> str:
-    import ray
-
-    words = _first_line(error)
-    if "ersion" in str(error):
-        both = " ".join(str(error).split())[:300]
-        return f"the cluster has another version of Ray or Python than this machine (Ray {ray.__version__}): {both}"
-    if "oken" in str(error) or "nauthenticated" in str(error):
-        return f"the cluster needs another token: {words}; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH"
-    if name.startswith(_SCHEME):
-        return (
-            f"what listens there accepts no Ray client ({words}): a cluster with a token (set RAY_AUTH_MODE=token and "
-            "RAY_AUTH_TOKEN_PATH), or no Ray"
-        )
-    return f"no Ray cluster answers: {words}"
-
-
-def _demand_reachable(name: str) -> None:
-    """Raise SettingsError within seconds where no gRPC answers at ray://HOST:PORT; Ray itself waits for minutes."""
-    import grpc
-
-    address = name.removeprefix(_SCHEME)
-    host, colon, port = address.rpartition(":")
-    if not (host and colon and port.isdecimal()):
-        raise SettingsError(f"--executor {name}: give ray://HOST:PORT, such as ray://192.168.1.10:10001")
-    _demand_listening(name, address)
-    try:
-        with grpc.insecure_channel(address) as channel:  # it may be something else that listens there
-            grpc.channel_ready_future(channel).result(timeout=_WAITS.reach_s)
-    except grpc.FutureTimeoutError:
-        raise SettingsError(f"--executor {name}: {address} is not a Ray cluster") from None
-
-
-def _demand_head(address: str) -> None:
-    """Raise ConnectionError where the head at HOST:PORT ("": not to be asked) does not listen for `head_s`.
-
-    Ray waits for a head that died, whatever is asked of it, and ends the process after 60 s with words of its own.
-    """
-    if not address:
-        return
-    host, _, port = address.rpartition(":")
-    end_s = time.monotonic() + _WAITS.head_s
-    while True:
-        try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=_WAITS.reach_s).close()
-            return
-        except OSError as error:
-            if time.monotonic() > end_s:
-                raise ConnectionError(f"its head at {address} does not answer: {_first_line(error)}") from error
-            time.sleep(_WAITS.again_s)
-
-
-def _demand_listening(name: str, address: str) -> None:
-    """Raise SettingsError where nothing listens at HOST:PORT."""
-    host, _, port = address.rpartition(":")
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=_WAITS.reach_s).close()
-    except (OSError, OverflowError, ValueError) as error:
-        how = (
-            f"start one on that machine: ray start --head --ray-client-server-port {port}" if name.startswith(_SCHEME)
-            else "`ray start` noted it, or RAY_ADDRESS names it: `ray stop` forgets one that is gone"
-        )
-        raise SettingsError(
-            f"--executor {name}: no Ray cluster answers at {address} ({_first_line(error)}); {how} (docs/cluster.md)"
-        ) from None
-
-
-def _check_machines(root: Path) -> None:
-    """Have each machine read what is written here, and answer beside it. Raises SettingsError, StoreError."""
-    name, word = f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-probe", secrets.token_hex(16)
-    path = root.resolve() / name
-    atomic_write_bytes(path, word.encode())
-    try:
-        answers = _answers_of_machines(str(path), word)
-        for host, version, sees in answers:
-            _demand_same(host, version)
-            if not sees or not (root / f"{name}-{host}").is_file():
-                raise StoreError(_unshared(host, str(root.resolve())))
-    finally:
-        path.unlink(missing_ok=True)
-        for left in root.glob(f"{name}-*"):
-            left.unlink(missing_ok=True)
-    if not answers:
-        raise SettingsError("the cluster has no machine with a core")
-
-
-def _answers_of_machines(path: str, word: str) -> list[tuple[str, str, bool]]:
-    """What the probe finds on each machine that stays. Raises SettingsError where one runs no tasks.
-
-    A machine that has just joined, or just died, is known to some of Ray's processes and not yet to others: a probe
-    that could not be placed is placed again while the machine is there.
-    """
-    import ray
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-    probe: Any = ray.remote(_probe_of(path, word))
-    end_s, answers = time.monotonic() + _WAITS.probe_s, []
-    waiting = {each["NodeID"] for each in _working(ray)}
-    while waiting:
-        asked = {
-            node: probe.options(
-                num_cpus=0, max_retries=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
-            ).remote()
-            for node in waiting
-        }
-        for node, task in asked.items():
-            try:
-                answers.append(ray.get(task, timeout=max(0.0, end_s - time.monotonic())))
-                waiting.remove(node)
-            except _passing(ray) as error:
-                if time.monotonic() > end_s:
-                    raise _no_tasks(error) from error
-            except ray.exceptions.RayError as error:
-                raise _no_tasks(error) from error
-        if waiting:
-            time.sleep(_WAITS.again_s)
-            waiting &= {each["NodeID"] for each in _working(ray)}
-    return answers
-
-
-def _passing(ray: Any) -> tuple[type[Exception], ...]:
-    """What Ray raises where a machine was not known yet, or is no longer there."""
-    errors = ray.exceptions
-    return (errors.TaskUnschedulableError, errors.WorkerCrashedError, errors.NodeDiedError)
-
-
-def _no_tasks(error: Exception) -> SettingsError:
-    return SettingsError(f"a machine of the cluster does not run tasks: {_first_line(error)}")
-
-
-def _working(ray: Any) -> list[dict[str, Any]]:
-    """The machines of the cluster that are there and have a core."""
-    return [each for each in ray.nodes() if each["Alive"] and each["Resources"].get("CPU", 0) > 0]
-
-
-def _demand_same(host: str, version: str) -> None:
-    if version != sorvolo.__version__:
-        has = f"Sorvolo {version}" if version else "no Sorvolo"
-        raise SettingsError(
-            f"the machine {host} has {has}, this one {sorvolo.__version__}; install the same one on all machines"
-        )
-
-
-def _probe_of(path: str, word: str) -> Any:
-    """A function that travels whole, as a machine may not have this module: its host, its Sorvolo, whether it sees."""
-
-    def probe() -> tuple[str, str, bool]:
-        import socket
-
-        host = socket.gethostname()
-        try:
-            import sorvolo
-
-            version = sorvolo.__version__
-        except ImportError:
-            version = ""
-        try:
-            with open(path) as file:
-                sees = file.read() == word
-            with open(f"{path}-{host}", "w") as file:
-                file.write(word)
-        except OSError:
-            sees = False
-        return host, version, sees
-
-    return probe
-
-
-def _first_line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).split("\n") if line.strip()]
-    return (lines or [type(error).__name__])[0][:300]
+        raise StoreError(unshared(host, root))

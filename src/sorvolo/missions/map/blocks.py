@@ -117,7 +117,10 @@ def map_block(
 def prepare_divided(source: Source, settings: MapSettings) -> FlightSetup:
     """A flight that is to be divided, laid as the first of its site. Raises SettingsError where it cannot be."""
     if not isinstance(source, PhotoSource):
-        raise SettingsError(f"{source.name} is a video, which is not divided into blocks; leave --blocks out for it")
+        raise SettingsError(
+            f"{source.name} is a video: which of its frames are mapped depends on those before, so it is not divided into "
+            "blocks; run the batch again without --blocks: what is mapped stays, the video is mapped whole"
+        )
     if not source.telemetry.has_fixes:
         raise SettingsError(
             f"the photos of {source.name} have no GPS, by which they would be divided into blocks; leave --blocks out"
