@@ -118,8 +118,8 @@ def prepare_divided(source: Source, settings: MapSettings) -> FlightSetup:
     """A flight that is to be divided, laid as the first of its site. Raises SettingsError where it cannot be."""
     if not isinstance(source, PhotoSource):
         raise SettingsError(
-            f"{source.name} is a video: which of its frames are mapped depends on those before, so it is not divided into "
-            "blocks; run the batch again without --blocks: what is mapped stays, the video is mapped whole"
+            f"{source.name} is a video: which of its frames are mapped depends on those before, so it is not divided "
+            "into blocks; run the batch again without --blocks: what is mapped stays, the video is mapped whole"
         )
     if not source.telemetry.has_fixes:
         raise SettingsError(
