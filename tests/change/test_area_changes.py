@@ -101,7 +101,7 @@ def test_the_pictures_of_an_area_show_its_ground_where_it_lies(grass, most_px, c
     view = view_of(grass[:480, :640].copy(), painted(GroundKind.SAND, 2)[:480, :640].copy())
     pictures = GroundPictures(0.1, GroundPictureSettings(side_px=32, most_patch_px=most_px))
     west, south, east, north = 3.3, -20.7, 28.1, -2.9
-    squares_m = np.stack(np.meshgrid(np.arange(1.6, 32, 3.2), np.arange(-1.6, -24, -3.2)), axis=-1).reshape(-1, 2)
+    squares_m = np.stack(np.meshgrid(np.arange(1.6, 32, 3.2), np.arange(-1.6, -27, -3.2)), axis=-1).reshape(-1, 2)
     pictures.show(view, squares_m[3:])  # all but three in the north west
     patch = pictures.patch(np.array([[west, south], [east, south], [east, north], [west, north]]))
     rows, columns = patch.after.shape[:2]
