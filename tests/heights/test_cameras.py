@@ -134,6 +134,8 @@ def test_cameras_are_solved_from_pictures(survey) -> None:
     assert (shape**2).sum() < 0.3 * (before**2).sum()
     assert solved.residual_px < 0.5
     assert not camera_warnings(solved)
+    loose = replace(solved, residual_px=0.6)  # as of a rolling shutter
+    assert any("fit each other in space to 0.60 px only" in each for each in camera_warnings(loose))
 
 
 def test_one_strip_is_named_as_weak(survey) -> None:

@@ -85,6 +85,11 @@ def test_heights_name_what_is_missing(mapped: Path, tmp_path: Path) -> None:
         HeightSettings(cell_m=0.0)
 
 
+def test_more_cells_than_can_be_handled_are_refused_before_the_work_begins(mapped: Path) -> None:
+    with pytest.raises(GeometryError, match="give cells larger than"):
+        next(make_heights(mapped, HeightSettings(cell_m=0.001)))
+
+
 def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:
     silent = replace(_SURVEY, seed=13, output=replace(_SURVEY.output, telemetry="none"))
     simulate_into(tmp_path / "made", silent)

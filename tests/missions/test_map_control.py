@@ -117,7 +117,9 @@ def absolute_m(site: Path, surveyed: Surveyed) -> float:
     return float(np.sqrt((np.concatenate(misses) ** 2).sum(axis=1).mean()))
 
 
-def test_control_alone_places_photos_without_gps(surveyed: Surveyed, blind: Path, tmp_path: Path) -> None:
+def test_control_alone_places_photos_without_gps(
+    surveyed: Surveyed, blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     gcp = surveyed.write(tmp_path / "gcp_list.txt")
     assert run(tmp_path / "site", blind, surveyed, gcp, "--check", "CP*") == 0
     control = control_of(tmp_path / "site")
@@ -125,6 +127,7 @@ def test_control_alone_places_photos_without_gps(surveyed: Surveyed, blind: Path
     assert all(role == ("check" if label.startswith("CP") else "control") for label, role in roles.items())
     assert control["check_rms_m"] < 0.05 and control["control_rms_m"] < 0.05
     assert absolute_m(tmp_path / "site", surveyed) < 0.1
+    assert re.search(r"flight height .* \d+ m above the ground, by the control points", capsys.readouterr().out)
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
     assert report["georeferenced"] and report["headline"]["quality"] == "map"
     listed = json.loads(next((tmp_path / "site").glob("flights/*/control.geojson")).read_text())
@@ -180,13 +183,17 @@ def exchanged(text: str, first: int, second: int) -> str:
     (_UTM, lambda text: text.replace(_UTM, "+proj=pipeline +nadgrids=@/etc/passwd"), "nadgrids"),
     (_UTM, lambda text: text.replace(" G0", " G0\nhalf a line"), "columns"),
     (_UTM, lambda text: exchanged(text, 3, 4), "px and py"),
+    ("EPSG:4326", lambda text: text.replace("EPSG:4326", _UTM), "x and y are degrees (longitude, latitude)"),
+    (_UTM, lambda text: text.replace(_UTM, "EPSG:4326"), "for metres name their CRS, as"),
+    ("EPSG:3857", lambda text: text.replace("EPSG:3857", _UTM), "web maps (EPSG:3857)"),
+    ("+proj=utm +zone=33 +units=ft", lambda text: text.replace(" +units=ft", ""), "in feet"),
 ])
 def test_a_wrong_file_ends_in_one_clear_error(
     surveyed: Surveyed, blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], has_gps: bool, crs: str,
     change: Callable[[str], str], words: str,
 ) -> None:
-    if words == "UTM zone 33N" and not has_gps:
-        pytest.skip("nothing shows a wrong zone where there is no GPS")
+    if words in ("UTM zone 33N", "web maps (EPSG:3857)", "in feet") and not has_gps:
+        pytest.skip("nothing shows a wrong zone or scale where there is no GPS")
     gcp = surveyed.write(tmp_path / "gcp_list.txt", crs)
     gcp.write_text(change(gcp.read_text()))
     assert run(tmp_path / "site", surveyed.photos if has_gps else blind, surveyed, gcp) == 1

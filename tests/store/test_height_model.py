@@ -69,7 +69,37 @@ def test_degrees_whole_numbers_and_holes(tmp_path: Path) -> None:
     assert np.isnan(model.at(np.array([12.605]), np.array([41.898]))[0])
 
 
+@pytest.mark.parametrize(("unit", "crs", "in_m"), [
+    ("metre", "EPSG:32633", 1.0), ("ft", "EPSG:32633", 0.3048), ("US survey foot", "EPSG:32633", 1200 / 3937),
+    ("", "EPSG:32633+5703", 1.0), ("", "EPSG:32633+6360", 1200 / 3937),  # NAVD88 in metres and in feet
+])
+def test_feet_are_read_as_feet_where_the_file_names_them(tmp_path: Path, unit: str, crs: str, in_m: float) -> None:
+    path = written(
+        tmp_path / "model.tif", crs, Affine(10, 0, 299_500, 0, -10, 4_642_500), np.full((300, 300), 330, np.float32)
+    )
+    with rasterio.open(path, "r+") as file:
+        file.units = (unit,)
+    assert read_height_model(path, _BOUNDS_DEG).at(_LONGITUDES, _LATITUDES) == pytest.approx(330 * in_m, abs=1e-3)
+
+
+def test_heights_of_no_ground_on_earth_are_holes(tmp_path: Path) -> None:
+    heights = np.full((300, 300), 55, np.float32)
+    heights[:, :180] = -9999
+    heights[:, 299:] = np.inf
+    path = written(tmp_path / "model.tif", "EPSG:32633", Affine(10, 0, 299_500, 0, -10, 4_642_500), heights)
+    found = read_height_model(path, _BOUNDS_DEG).at(np.array([12.602, 12.6095]), np.array([41.895, 41.895]))
+    assert np.isnan(found[0]) and found[1] == pytest.approx(55)
+
+
+def in_fathoms(path: Path) -> Path:
+    with rasterio.open(slope(path), "r+") as file:
+        file.units = ("fathom",)
+    return path
+
+
 @pytest.mark.parametrize(("make", "words"), [
+    (in_fathoms, "heights in 'fathom'"),
+    (lambda path: written(path, "EPSG:4326", Affine(0.01, 0, 12, 0, -0.01, 42), np.zeros((2, 9, 9))), "terrain.tif"),
     (lambda path: path, "no such file"),
     (lambda path: path.write_text("heights") and path, "no readable GeoTIFF"),
     (lambda path: written(path, "", Affine.scale(2.0, -2.0), np.zeros((9, 9), np.float32)), "coordinate reference"),

@@ -18,6 +18,8 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.survey.control import ControlMark, ControlPoint, GroundControl
 from sorvolo.survey.flight import Notice
 
+_FOOT_M = 0.3048
+
 LEAST_POINTS = 3
 """Fewer cannot show that one of them is wrong."""
 
@@ -43,6 +45,16 @@ class _Line:
 
 
 @dataclass(frozen=True)
+class _Reading:
+    """A way to read the file: its CRS, which columns are exchanged, and the CRS's units in one of x and y."""
+
+    crs_words: str
+    swaps_xy: bool = False
+    swaps_px: bool = False
+    units: float = 1.0
+
+
+@dataclass(frozen=True)
 class ControlFile:
     """A control point file as it was read; `control` takes it at its word."""
 
@@ -53,43 +65,58 @@ class ControlFile:
     @property
     def control(self) -> GroundControl:
         """Points and marks. Raises InputError for places that the CRS does not have."""
-        return self._control(self.crs_words, swaps_xy=False, swaps_px=False)
+        return self._control(_Reading(self.crs_words))
 
     def other_readings(self) -> Iterator[tuple[str, GroundControl]]:
         """Other ways to read the file, each with the mistake it stands for: to name that where the file is wrong."""
-        for words, crs_words, swaps_xy, swaps_px in self._mistakes():
+        for words, reading in self._mistakes():
             try:
-                yield words, self._control(crs_words, swaps_xy=swaps_xy, swaps_px=swaps_px)
+                yield words, self._control(reading)
             except InputError:
                 continue
 
-    def _mistakes(self) -> Iterator[tuple[str, str, bool, bool]]:
-        yield "x and y are exchanged (easting or longitude comes first)", self.crs_words, True, False
-        yield "px and py are exchanged (the column comes before the row)", self.crs_words, False, True
-        yield "x and y are exchanged, and px and py as well", self.crs_words, True, True
-        utm = _utm_zone(_parsed_crs(self.crs_words, self.path))
+    def _mistakes(self) -> Iterator[tuple[str, _Reading]]:
+        own = _Reading(self.crs_words)
+        yield "x and y are exchanged (easting or longitude comes first)", replace(own, swaps_xy=True)
+        yield "px and py are exchanged (the column comes before the row)", replace(own, swaps_px=True)
+        yield "x and y are exchanged, and px and py as well", replace(own, swaps_xy=True, swaps_px=True)
+        crs = _parsed_crs(self.crs_words, self.path)
+        if not crs.is_projected:
+            return
+        degrees = _Reading("WGS84")
+        yield "x and y are degrees (longitude, latitude): the CRS is WGS84", degrees
+        yield "x and y are degrees, latitude before longitude: the CRS is WGS84", replace(degrees, swaps_xy=True)
+        unit_m = _height_unit_m(crs)
+        if unit_m == 1.0:
+            yield "x, y and z are in feet: give them in metres", replace(own, units=_FOOT_M)
+        else:
+            yield "x, y and z are in metres: the CRS counts in feet", replace(own, units=1 / unit_m)
+        yield "the CRS is that of web maps (EPSG:3857)", _Reading("EPSG:3857")
+        utm = _utm_zone(crs)
         for zone in range(1, 61) if utm else ():
             for side in "NS":
                 if (zone, side) != utm:
-                    yield f"the CRS is UTM zone {zone}{side}", f"WGS84 UTM {zone}{side}", False, False
+                    yield f"the CRS is UTM zone {zone}{side}", _Reading(f"WGS84 UTM {zone}{side}")
 
-    def _control(self, crs_words: str, *, swaps_xy: bool, swaps_px: bool) -> GroundControl:
+    def _control(self, reading: _Reading) -> GroundControl:
+        crs_words = reading.crs_words
         crs = _parsed_crs(crs_words, self.path)
         to_m = _height_unit_m(crs)
         transformer = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
         points: dict[str, ControlPoint] = {}
         marks = []
         for line in self.lines:
-            x, y = (line.y, line.x) if swaps_xy else (line.x, line.y)
+            x, y = (line.y, line.x) if reading.swaps_xy else (line.x, line.y)
             if line.label not in points:
-                longitude_deg, latitude_deg = transformer.transform(x, y)
+                longitude_deg, latitude_deg = transformer.transform(x * reading.units, y * reading.units)
                 if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 360):
                     raise InputError(
                         f"{self.path}, line {line.number}: {line.x:g} {line.y:g} is no place in {crs_words} "
-                        f"({crs.name}); give x (easting, longitude) before y, in the CRS of the first line"
+                        f"({crs.name}); {_no_place(crs)}"
                     )
-                points[line.label] = ControlPoint(line.label, latitude_deg, longitude_deg, line.z * to_m)
-            x_px, y_px = (line.y_px, line.x_px) if swaps_px else (line.x_px, line.y_px)
+                height_m = line.z * reading.units * to_m
+                points[line.label] = ControlPoint(line.label, latitude_deg, longitude_deg, height_m)
+            x_px, y_px = (line.y_px, line.x_px) if reading.swaps_px else (line.x_px, line.y_px)
             marks.append(ControlMark(line.label, line.image, x_px, y_px))
         return GroundControl(self.path.name, f"{crs_words} ({crs.name})", tuple(points.values()), tuple(marks))
 
@@ -255,6 +282,13 @@ def _utm_zone(crs: CRS) -> tuple[int, str] | None:
 def _height_unit_m(crs: CRS) -> float:
     """Metres in a unit of the points' heights: that of their other coordinates, where those are lengths."""
     return float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected and crs.axis_info else 1.0
+
+
+def _no_place(crs: CRS) -> str:
+    """What to do about coordinates that a CRS does not have."""
+    if crs.is_geographic:
+        return "it is in degrees, longitude before latitude: for metres name their CRS, as WGS84 UTM 32N"
+    return "give x (easting, longitude) before y, in the CRS of the first line"
 
 
 def _number(text: str) -> float:

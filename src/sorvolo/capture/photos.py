@@ -327,7 +327,8 @@ def _size_notices(
     shown = f"{size_px[0]}x{size_px[1]}"
     return [
         *notice("other_size", sum(photo.problem.startswith("size") for photo in photos),
-                f"photos of another shape than the flight's {shown}, not used: {{}}"),
+                f"photos of another shape than the flight's {shown}, not used (map another camera's photos as a flight "
+                "of their own): {}"),
         *notice("rotated_photo", turned, "photos that lay across the others, turned by 90 deg: {}"),
         *notice("resized_photo", len(other) - turned, f"photos of another size, resampled to {shown}: {{}}"),
         *notice("reduced_photo", sum(metadata.reduction > 1 for metadata in used),

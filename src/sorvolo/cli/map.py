@@ -315,6 +315,7 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [("match error", _with_unit("{:.2f} px (median distance of matched points)", residual_px))]
     if report["georeferenced"]:
         rows += [
+            ("flight height", _height_by_known_ground(report)),
             ("distance to GPS", _with_unit("{:.2f} m (median)", report["gps_residual_m"]["median"])),
             ("position accuracy", _with_unit(
                 f"{{:.2f}} m (1 sigma, including the error shared by all {_placed_by(report)})", report["sigma_m"]
@@ -330,6 +331,13 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("clock offset", _clock_offset(report["time_offset"])),
         ("took", f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB"),
     ]
+
+
+def _height_by_known_ground(report: Mapping[str, Any]) -> str:
+    """The height that a flight without GPS has by its control points or its base map: a wrong unit or scale shows."""
+    if report["gps_residual_m"]["median"] is not None or report["height_above_ground_m"] is None:
+        return ""
+    return f"{report['height_above_ground_m']:.0f} m above the ground, by the {_placed_by(report)} alone"
 
 
 def _seen(seen: Mapping[str, Any] | None, *, has_metres: bool) -> str:

@@ -18,6 +18,8 @@ class WarningSettings:
     oblique_deg: float = 25.0  # off the vertical, the median photo
     one_strip: float = 0.08  # how wide a path is, as a share of its length, below which it is one strip
     most_holes: float = 0.1  # share of the ground that two photos see
+    bad_fit_px: float = 0.45  # rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
+    fit_side_px: int = 1600  # larger ones are matched at this size
 
 
 def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
@@ -72,6 +74,13 @@ def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettin
         said.append(
             f"the photos look {np.median(tilt):.0f} degrees off the vertical: walls and what lies behind things have "
             "heights of their surroundings"
+        )
+    camera = solved.views[0].camera
+    fit_px = solved.residual_px * min(1.0, settings.fit_side_px / max(camera.width_px, camera.height_px))
+    if fit_px > settings.bad_fit_px:
+        said.append(
+            f"the photos fit each other in space to {solved.residual_px:.2f} px only: a rolling shutter, blur, things "
+            "that move or a zoomed lens; the heights may be off by several times their stated error"
         )
     if not np.isfinite(solved.fix_rms_m).all():
         said.append("no GPS position: the heights have the map's own scale")

@@ -27,6 +27,7 @@ class ControlSettings:
     excluded_sigmas: float = 5.0  # beyond which a point may be wrong ...
     excluded_times: float = 4.0  # ... if it also misses so many times as much as the others
     most_misfit: float = 0.12  # of the points' spread: more, and the points are not those in the pictures
+    least_spread_m: float = 0.1  # rms: closer together they give no scale and no north
     most_off_gps_m: float = 60.0  # no receiver errs so far: the points' CRS is another
     most_scale: float = 1.3  # between GPS and the points
 
@@ -198,9 +199,11 @@ def _disagreement(
         for each in (ties.place_m[:, :2], places_m)
     )
     spread_m = float(np.linalg.norm(a.std(axis=0)))
-    change = similarity_of_most(a, b) if spread_m > 0 and np.isfinite(b).all() else None
+    if spread_m < settings.least_spread_m:
+        return f"the control points all lie within {4 * spread_m:.2g} m of each other"
+    change = similarity_of_most(a, b) if np.isfinite(b).all() else None
     if change is None:
-        return "the control points all lie in one place"
+        return "the control points are marked where no picture shows the ground"
     miss_m = np.sort(np.linalg.norm(apply_homography(change, b) - a, axis=1))[(len(a) + 1) // 2]
     if miss_m > settings.most_misfit * spread_m:
         return f"the control points miss those marked by {miss_m:.1f} m on ground {2 * spread_m:.0f} m wide"

@@ -25,7 +25,7 @@ class PlaceSettings:
     turn_deg: float = 30.0  # learned features bear half of it
     step: float = 1.35  # from scale to scale, of which they bear half as well
     least_side_px: int = 64  # of the picture at such a scale: less shows too little
-    most_side_px: int = 4000  # more takes minutes
+    most_side_px: int = 2800  # more takes minutes and gigabytes (3.6 at 4000)
 
 
 def find_place(

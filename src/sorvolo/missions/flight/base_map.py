@@ -4,11 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from sorvolo.capture.source import Source
 from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.arrays import ImageRGB, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame, utm_epsg
 from sorvolo.mosaic.base_ties import (
@@ -31,6 +33,7 @@ _COARSEST = 8.0  # times the photos' own pixels
 _OVERVIEW_PX = 1400
 _GPS_SIGMA_M = 5.0
 _LEAST_FRAMES, _LEAST_SHARE = 3, 0.2
+_ANOTHER_PLACE_M = 500.0  # beyond what oblique frames show and what GPS errs
 _MARGIN = 1.5  # heights around the cameras
 _APART_NS = 60_000_000_000  # frames are looked for one by one: none foretells the next
 
@@ -69,13 +72,7 @@ class FlightBase:
         site_grid = base_grid(frame, crs, self.base.m_per_px, native_m, camera.width_px)
         tiles = self.base.tiles(site_grid, around(mapper, _MARGIN))
         if not tiles:
-            west, south, east, north = self.base.bounds_deg
-            place = frame.origin
-            raise InputError(
-                f"{self.base.path} shows ground from {south:.5f}, {west:.5f} to {north:.5f}, {east:.5f}, and the "
-                f"flight {self.source.name} is at {place.latitude_deg:.5f}, {place.longitude_deg:.5f}: give a map of "
-                "its ground"
-            )
+            raise self._of_another_place(frame)
         aligner = Aligner(ReferenceMap(tiles, site_grid.grid), site_grid)
         sought, found = sought_keyframes(mapper), []
         for number, each in enumerate(sought):
@@ -99,6 +96,24 @@ class FlightBase:
         return BaseReport(
             self.base.path.name, self.base.m_per_px, len(sought), len(found), left_out, residual_m,
             float("nan") if self.is_datum else mapper.median_move_m(before),
+        )
+
+    def check_place(self, fixes_m: PointsM, frame: LocalFrame) -> None:
+        """Raise InputError where all the flight's fixes, (N, 2) site metres, lie far beside the map: before it is
+        mapped."""
+        west, south, east, north = self.base.bounds_deg
+        corners_m = frame.ground_from_lonlat([(west, south), (east, south), (east, north), (west, north)])
+        beside_m = np.maximum(np.maximum(corners_m.min(axis=0) - fixes_m, fixes_m - corners_m.max(axis=0)), 0.0)
+        if np.linalg.norm(beside_m, axis=1).min() > _ANOTHER_PLACE_M:
+            raise self._of_another_place(frame)
+
+    def _of_another_place(self, frame: LocalFrame) -> InputError:
+        west, south, east, north = self.base.bounds_deg
+        place = frame.origin
+        return InputError(
+            f"{self.base.path} shows ground from {south:.5f}, {west:.5f} to {north:.5f}, {east:.5f}, and the "
+            f"flight {self.source.name} is at {place.latitude_deg:.5f}, {place.longitude_deg:.5f}: give a map of "
+            "its ground"
         )
 
     def _find_all(self, mapper: PlanarMapper, camera: Camera, frame: LocalFrame, crs: str) -> float:

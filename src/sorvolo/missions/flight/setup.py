@@ -13,6 +13,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame, utm_epsg
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
+from sorvolo.geometry.track import known_points
 from sorvolo.missions.flight.base_map import FlightBase
 from sorvolo.missions.flight.control import FlightControl
 from sorvolo.missions.flight.settings import MapSettings
@@ -125,8 +126,11 @@ def prepare(
 
 def _with_known_ground(setup: FlightSetup, known_ground: KnownGround) -> FlightSetup:
     """A flight with GPS that is tied to known ground as well."""
+    assert setup.track is not None
     if isinstance(known_ground, FlightControl):
         _check_control(setup, known_ground)
+    elif not isinstance(setup.source, LiveSource):
+        known_ground.check_place(known_points(setup.track.east_north_m), setup.frame)
     return replace(setup, known_ground=known_ground, notices=(*setup.notices, *known_ground.notices))
 
 

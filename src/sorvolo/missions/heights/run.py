@@ -2,7 +2,7 @@
 
 import resource
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
 from sorvolo.heights.relief import relief_picture
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
-from sorvolo.heights.views import ground_outlines_m
+from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.heights.flight_views import flight_views, run_of
 from sorvolo.missions.heights.pictures import FlightPictures
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
@@ -72,6 +72,7 @@ def make_heights(
         keyframes = [each for each in archive.keyframes(flight_id) if each.site_from_camera is not None]
         started_s = time.monotonic()
         views = flight_views(archive, flight_id, keyframes)
+        _lattice(archive.site(), views, settings)  # too many cells end here, before minutes of work
         yield HeightsUpdate(flight_id, "cameras", 0.0)
         plain = FlightPictures(archive, keyframes)
         solved = solve_cameras(views, plain.gray, settings.cameras)
@@ -113,10 +114,7 @@ def height_grid(site: Site, cell_m: float) -> SiteGrid:
 def _sweep(
     archive: Archive, solved: Cameras3D, pictures: FlightPictures, settings: HeightSettings, flight_id: str
 ) -> Generator[HeightsUpdate, None, Surface]:
-    site = archive.site()
-    outlines_m = ground_outlines_m(solved.views)
-    cell_m = settings.cell_m or Lattice.cell_for(outlines_m, site.m_per_px, settings.cells)
-    lattice = Lattice.over(outlines_m, height_grid(site, cell_m))
+    lattice = _lattice(archive.site(), solved.views, settings)
 
     def gray(number: int, size_m: float) -> Any:
         return pictures.gray_of_size(solved.views[number], number, size_m)
@@ -129,6 +127,13 @@ def _sweep(
             return each
         yield HeightsUpdate(flight_id, "heights", each)
     raise AssertionError("a sweep ends with a surface")
+
+
+def _lattice(site: Site, views: Sequence[View], settings: HeightSettings) -> Lattice:
+    """The cells over the ground that the views show. Raises GeometryError for more of them than can be handled."""
+    outlines_m = ground_outlines_m(views)
+    cell_m = settings.cell_m or Lattice.cell_for(outlines_m, site.m_per_px, settings.cells)
+    return Lattice.over(outlines_m, height_grid(site, cell_m))
 
 
 def _write_models(archive: Archive, flight_id: str, surface: Surface, ground: Any) -> None:

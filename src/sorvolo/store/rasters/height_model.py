@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import rasterio
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from rasterio.enums import Resampling
 from rasterio.errors import CRSError, RasterioError
 from rasterio.transform import Affine
@@ -20,6 +20,13 @@ from sorvolo.geometry.arrays import Floats
 from sorvolo.store.rasters.gdal import open_raster
 
 _WGS84 = "EPSG:4326"
+_LOWEST_M, _HIGHEST_M = -1_000.0, 10_000.0  # no ground on Earth lies beyond: a hole that its file does not declare
+_FOOT_M, _SURVEY_FOOT_M = 0.3048, 1200 / 3937
+_UNITS_M = (
+    dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0)
+    | dict.fromkeys(("ft", "foot", "feet", "international foot"), _FOOT_M)
+    | dict.fromkeys(("us-ft", "ftus", "us survey foot", "us survey feet", "foot_us"), _SURVEY_FOOT_M)
+)
 _MOST_PX = 4096  # a side that is kept: finer models are averaged
 
 
@@ -58,7 +65,11 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
             if source.crs is None:
                 raise InputError(f"{path} has no coordinate reference system; export it with one")
             if source.count != 1:
-                raise InputError(f"{path} has {source.count} bands; a height model has one, of heights in metres")
+                raise InputError(
+                    f"{path} has {source.count} bands; a height model has one, of heights (of `sorvolo heights`: "
+                    "terrain.tif)"
+                )
+            to_m = _metres_in_unit(source, path)
             window = _window(source, bounds_deg)
             if window is None:
                 west, south, east, north = transform_bounds(source.crs, _WGS84, *source.bounds)
@@ -70,7 +81,8 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
             shape = math.ceil(window.height / step), math.ceil(window.width / step)
             read = source.read(1, window=window, out_shape=shape, masked=True, resampling=Resampling.average)
             heights_m = np.where(np.ma.getmaskarray(read), np.nan, np.asarray(read.data, np.float64))
-            heights_m = heights_m * source.scales[0] + source.offsets[0]
+            heights_m = (heights_m * source.scales[0] + source.offsets[0]) * to_m
+            heights_m[(heights_m < _LOWEST_M) | (heights_m > _HIGHEST_M)] = np.nan
             transform = source.window_transform(window)
             wide, high = window.width / shape[1], window.height / shape[0]
             crs_from_pixels = Affine(
@@ -79,6 +91,17 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
             return HeightModel(heights_m, crs_from_pixels, source.crs.to_wkt())
     except (RasterioError, CRSError) as error:
         raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
+
+
+def _metres_in_unit(source: rasterio.DatasetReader, path: Path) -> float:
+    """Of the heights' unit, by the band or by the vertical part of the CRS; metres where neither names one."""
+    named = (source.units[0] or "").strip().lower()
+    if named:
+        if named not in _UNITS_M:
+            raise InputError(f"{path} has heights in {named!r}; metres or feet were needed: convert it (gdal_calc)")
+        return _UNITS_M[named]
+    vertical = [each for each in CRS.from_user_input(source.crs).sub_crs_list if each.is_vertical]
+    return float(vertical[0].axis_info[0].unit_conversion_factor) if vertical else 1.0
 
 
 def _window(source: rasterio.DatasetReader, bounds_deg: tuple[float, float, float, float]) -> Window | None:
