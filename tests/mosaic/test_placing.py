@@ -1,6 +1,7 @@
 """Placed frames as the canvas and the records need them."""
 
 import numpy as np
+import pytest
 
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
@@ -8,7 +9,7 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.mosaic.placing import canvas_frame
+from sorvolo.mosaic.placing import canvas_frame, map_m_per_px
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 CAMERA = Camera.from_angle_of_view(320, 240, 60)
@@ -27,6 +28,11 @@ def test_a_picture_is_laid_where_its_corners_are():
     pose, frame = laid(-80)
     assert (frame.id, frame.rank, frame.width_px, frame.height_px) == (4, 1, 320, 240)
     assert np.abs(frame.outline_px - SITE_GRID.grid_from_site(footprint(CAMERA, pose))).max() < 0.01
+
+
+def test_a_map_is_as_fine_as_the_survey_and_not_as_the_climb_before_it():
+    assert map_m_per_px([20.1, 19.8, 20.4, 19.9], 1000.0) == 0.02
+    assert map_m_per_px([0.2, 0.3, 2.0, 6.0, 11.0, 20.1, 19.8], 1000.0) == pytest.approx(0.02, rel=0.05)
 
 
 def test_a_picture_that_sees_the_horizon_is_not_laid():

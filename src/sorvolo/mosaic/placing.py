@@ -11,6 +11,7 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.survey.flight import CameraPrior
 
+_CLIMBING = 1.5  # times the usual height of the first frames: they show the climb
 _HORIZON_MARGIN_DEG = 5.0
 _KNOWN_ATTITUDE_DEG = 4.0  # one sigma of a gimbal's tilt
 
@@ -43,5 +44,9 @@ def sees_horizon(camera: Camera, prior: CameraPrior) -> bool:
 
 
 def map_m_per_px(heights_m: Sequence[float], focal_px: float) -> float:
-    """The ground sampling distance of pictures taken from these heights, to three digits: a new map's."""
-    return float(f"{np.median(heights_m) / focal_px:.3g}")
+    """The ground sampling distance of pictures taken from these heights, to three digits: a new map's.
+
+    The first pictures may show the climb from the ground: then the highest so far are nearest to the flight's height.
+    """
+    usual_m, high_m = np.percentile(heights_m, [50, 90])
+    return float(f"{(high_m if high_m > _CLIMBING * usual_m else usual_m) / focal_px:.3g}")

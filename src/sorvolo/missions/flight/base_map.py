@@ -4,8 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from sorvolo.capture.source import Source
 from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.reference import ReferenceMap
@@ -101,10 +99,7 @@ class FlightBase:
     def check_place(self, fixes_m: PointsM, frame: LocalFrame) -> None:
         """Raise InputError where all the flight's fixes, (N, 2) site metres, lie far beside the map: before it is
         mapped."""
-        west, south, east, north = self.base.bounds_deg
-        corners_m = frame.ground_from_lonlat([(west, south), (east, south), (east, north), (west, north)])
-        beside_m = np.maximum(np.maximum(corners_m.min(axis=0) - fixes_m, fixes_m - corners_m.max(axis=0)), 0.0)
-        if np.linalg.norm(beside_m, axis=1).min() > _ANOTHER_PLACE_M:
+        if self.base.beside_m(fixes_m, frame) > _ANOTHER_PLACE_M:
             raise self._of_another_place(frame)
 
     def _of_another_place(self, frame: LocalFrame) -> InputError:

@@ -59,6 +59,13 @@ class BaseMap:
         frame = LocalFrame(self.middle)
         return float(np.ptp(frame.ground_from_lonlat([(west, south), (east, north)]), axis=0).max())
 
+    def beside_m(self, places_m: PointsM, frame: LocalFrame) -> float:
+        """How far the nearest of places, (N, 2) metres of a site, lies beside the map's bounds; 0 within."""
+        west, south, east, north = self.bounds_deg
+        corners_m = frame.ground_from_lonlat([(west, south), (east, south), (east, north), (west, north)])
+        beside_m = np.maximum(np.maximum(corners_m.min(axis=0) - places_m, places_m - corners_m.max(axis=0)), 0.0)
+        return float(np.linalg.norm(beside_m, axis=1).min())
+
     def overview(self, site_grid: SiteGrid) -> tuple[ImageRGBA, PointsM]:
         """The whole map in the grid's CRS and pixels, (H, W, 4), and easting, northing of its first pixel's centre."""
         low, high = self._bounds_in(site_grid.grid.crs)
