@@ -197,6 +197,8 @@ def summarise(runs: list[dict]) -> dict:
         "error_median_m": median(errors) if errors else None,
         "sigma_median_m": middle([each["sigma_median_m"] for each in events]),
         "within_two_sigma": ratio(sum(share * count for share, count in within), sum(count for _, count in within)),
+        "world_sigma_median_m": middle([each["world_sigma_median_m"] for each in events]),
+        "world_within_two_sigma": middle([each["world_within_two_sigma"] for each in events]),
         "pixel_f1": pooled_f1([run["pixels"] for run in good]), "frame_f1": pooled_f1([run["frames"] for run in good]),
         "frame_f1_range": spread([run["frames"]["f1"] for run in good if run["frames"]]),
         "by_kind": {

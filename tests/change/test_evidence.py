@@ -8,6 +8,7 @@ from blob_world import CAMERA_HEIGHT_M, M_PER_PX, START_NS, Thing, flight, view_
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sorvolo.change.earlier_pictures import Vantage
 from sorvolo.change.evidence.announcing import AnnounceSettings, Reason
 from sorvolo.change.evidence.candidate import Candidate, KeptView
 from sorvolo.change.evidence.cells import CellWindow, LaidView
@@ -344,3 +345,39 @@ def test_a_thing_that_two_early_photos_show_is_not_forgotten_for_many_uncertain_
         gathering = replace(EvidenceSettings().gathering, candidates=settings_)
         evidence, reported = collect(views, gathering=gathering)
         assert not reported and [each.id for each in evidence.conclude()] == ids
+
+
+@pytest.mark.parametrize(("vantage", "sizes"), [
+    (Vantage(0.5, 0.0), [1, 9]),  # a picture from near
+    (Vantage(3.0, 0.0), [9]),  # one from afar: a wall of 6 m would differ as well, all over what is small
+    (Vantage(3.0, 3.0), [1, 9]),  # several from afar, which show the place from different sides
+    (None, [1, 9]),
+])
+def test_what_earlier_pictures_show_from_one_other_side_only_is_no_evidence(vantage, sizes):
+    things = [Thing(0, 0), Thing(3, 1.5, (3.0, 3.0))]
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f", lambda outline_m, cameras_m: vantage)
+    reported = [change for view in flight(things) for change in evidence.add(view)]
+    assert sorted(round(each.area_m2) for each in evidence.conclude()) == sizes
+    assert len(reported) == len(sizes)
+    assert evidence.outcomes()["never_announced"].get(Reason.FROM_ASIDE.value, 0) == 2 - len(sizes)
+
+
+def test_what_came_during_the_flight_counts_unless_relief_explains_it():
+    """A thing that the last third of the views of its ground shows, beside one that was there from the beginning."""
+    beside, came = Thing(1.2, 1.2), Thing(3.2, 1.2)
+    passes = [[*flight(things)] for things in ([beside], [beside], [beside, came])]
+    views = [
+        replace(view, index=view.index + 1000 * number, time_ns=view.time_ns + 60_000_000_000 * number)
+        for number, each in enumerate(passes) for view in each
+    ]
+    for vantage, count in ((Vantage(0.0, 0.0), 2), (Vantage(3.0, 3.0), 1)):
+        evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f", lambda outline_m, cameras_m, here=vantage: here)
+        for view in views:
+            evidence.add(view)
+        assert len(evidence.conclude()) == count
+
+
+def test_sigma_knows_that_a_thing_seen_from_aside_leans():
+    above, aside = Thing(0, 0), Thing(0, 3.4)
+    first, second = (collect(flight([each]))[0].conclude()[0] for each in (above, aside))
+    assert 0.03 < first.sigma_m < 0.08 < second.sigma_m < 0.3

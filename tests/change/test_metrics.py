@@ -1,6 +1,7 @@
 """Counts as in the thesis's tables, and events: each found once, on time, in its place."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -182,6 +183,20 @@ def test_errors_and_what_sigma_claims():
     assert scores.error_median_m == pytest.approx(0.2)
     assert scores.within_two_sigma == pytest.approx(5 / 6)  # one of six axes is 0.3 off
     assert scores.sigma_median_m == pytest.approx(0.1)
+    assert math.isnan(scores.world_within_two_sigma)
+
+
+def test_errors_in_the_world_include_what_the_map_is_off_by():
+    on_map = [true(str(i), (10 * i, 0)) for i in range(2)]
+    off = [replace(each, map_off_m=np.array([0.7, 0.0])) for each in on_map]
+    reports = [
+        replace(found(str(i), (10 * i + 0.05, 0.0), sigma_m=0.1), world_sigma_m=sigma_m)
+        for i, sigma_m in enumerate((0.3, 0.5))
+    ]
+    scores = score_events(match_events(reports, off), 1e4)
+    assert scores.within_two_sigma == 1.0 and scores.error_median_m == pytest.approx(0.05)
+    assert scores.world_within_two_sigma == pytest.approx(3 / 4)  # 0.75 m are more than twice 0.3 m
+    assert scores.world_sigma_median_m == pytest.approx(0.4)
 
 
 def test_scores_by_kind():

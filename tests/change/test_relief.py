@@ -7,7 +7,7 @@ import pytest
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.relief import Relief
 from sorvolo.geometry.camera import Camera
-from sorvolo.geometry.homography import site_from_image_homography
+from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 
 CAMERA = Camera.from_angle_of_view(320, 240, 62.0)
@@ -64,6 +64,22 @@ def rendered(over: Relief | None):
 @pytest.fixture(scope="module")
 def truth():
     return seen(LATER)
+
+
+def test_from_where_earlier_pictures_show_a_place() -> None:
+    pictures = []
+    for east_m in (0.0, 6.0):
+        pose = Pose(NADIR_CAMERA_NORTH_UP, EARLIER + np.array([east_m, 0, 0]))
+        pictures.append(EarlierPicture(CAMERA, site_from_image_homography(CAMERA, pose), pose))
+    earlier = EarlierPictures(pictures, lambda _: with_known_pixels(seen(EARLIER)[0]))
+    place = EARLIER[:2] + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    cameras = EARLIER + np.array([[3.5, 4.0, 0], [9.0, 0, 5.0]])
+    assert earlier.vantage(place + np.array([1.0, 0]), cameras) == pytest.approx((3.0, 6.0))
+    corners_m = apply_homography(pictures[0].site_from_image, np.array([[0.0, 0], [CAMERA.width_px, 0]]))
+    # 1.5 m from the west edge of the first, which the second one does not reach
+    first_alone = place - np.array([np.ptp(corners_m[:, 0]) / 2 - 1.5, 0])
+    assert earlier.vantage(first_alone, cameras) == pytest.approx((np.hypot(3.5, 4.0), 0.0))
+    assert earlier.vantage(place + np.array([1000.0, 0]), cameras) is None
 
 
 def test_a_roof_is_rendered_where_the_later_camera_sees_it(truth) -> None:

@@ -9,7 +9,7 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.contours import contours
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import MOST_SIDE, CellSettings, Lattice
-from sorvolo.heights.volumes import above_rim, between, tie
+from sorvolo.heights.volumes import above_rim, between, height_changes, tie
 
 GRID = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.2, "EPSG:32615")
 COARSE = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.25, "EPSG:32615")
@@ -118,3 +118,23 @@ def test_heights_at_more_places_than_a_picture_has_rows() -> None:
     np.testing.assert_allclose(heights[inside], points[inside, 0] / 10, atol=0.12)
     np.testing.assert_allclose(sigmas[inside], 0.05, rtol=1e-5)
     assert np.isnan(heights[points[:, 0] < -21]).all()
+
+
+def test_areas_get_the_height_by_which_their_ground_rose_where_both_dates_have_it() -> None:
+    """A heap of 1.2 m on 4 x 4 m and ground taken away, 0.5 m; the later model lies 0.3, -0.2 and 0.7 m off."""
+
+    def later(x, y):
+        x, y = x - 0.3, y + 0.2
+        heap, pit = (np.hypot(x + 10, y) < 4), (np.hypot(x - 10, y) < 4)
+        return rolling(x, y) + heap * 1.2 - pit * 0.5 + 0.7
+
+    around = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    ring = 3.5 * np.column_stack([np.cos(around), np.sin(around)])
+    heap, pit, outside = (ring + np.array([east_m, 0.0]) for east_m in (-10, 10, 100))
+    first, second = field(GRID, rolling), field(COARSE, later, seed=1)
+    rose, sank, unknown = height_changes(first, second, [heap, pit, outside], [heap, pit, outside])
+    assert rose is not None and sank is not None and unknown is None
+    assert abs(rose.rise_m - 1.2) < 2 * rose.sigma_m < 0.3
+    assert abs(sank.rise_m + 0.5) < 2 * sank.sigma_m < 0.3
+    holes = HeightField(second.lattice, np.full_like(second.up_m, np.nan), second.sigma_m)
+    assert height_changes(first, holes, [heap, pit], [heap, pit]) == [None, None]

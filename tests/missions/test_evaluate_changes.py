@@ -97,6 +97,7 @@ def test_a_perfect_report_is_perfect(site, simulated):
     assert scores.named_right == scores.found
     assert scores.error_median_m < 0.02
     assert scores.within_two_sigma > 0.9
+    assert scores.world_within_two_sigma < 0.6  # to the north all of it is 0.44 m off, and 0.05 m is stated
     assert measured.map_shift_m == pytest.approx(0.444, abs=0.01)
     assert measured.masks is None
     assert any("--masks" in remark for remark in measured.remarks)

@@ -1,21 +1,30 @@
 """`sorvolo heights` on a mapped flight: files that fit each other, and refusals that name what to do."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rasterio
+from fake_changes import fake_change
 
 from real_data import real_data
 from small_flights import simulate_into
 from sorvolo.cli.main import main
 from sorvolo.errors import GeometryError, InputError, SettingsError, StoreError
+from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.flights import _without_heights
 from sorvolo.missions.compare.run import _earlier_pictures
 from sorvolo.missions.flight.settings import MapSettings
-from sorvolo.missions.heights.measure import heights_stamp, measure_profile, measure_volume, write_contours
+from sorvolo.missions.heights.measure import (
+    heights_stamp,
+    measure_profile,
+    measure_volume,
+    read_field,
+    write_contours,
+)
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.simulation.settings import (
@@ -27,6 +36,8 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
 )
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import HeightFile
+from sorvolo.survey.findings import ChangeKind
 
 _SURVEY = SimulationSettings(
     seed=12, flights=1, scene=SceneSettings(people=0, cars=2, small_objects=2, has_scenery=True),
@@ -194,3 +205,33 @@ def test_brighton_beach_has_heights(tmp_path: Path) -> None:
     report = json.loads(next((tmp_path / "site").glob("flights/*/heights.json")).read_text())
     assert report["cameras"]["views"] == 18 and report["cameras"]["residual_rms_px"] < 1.5
     assert 8 < report["surface"]["up_m"]["p99"] - report["surface"]["up_m"]["median"] < 20  # the trees
+
+
+def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(with_heights: Path) -> None:
+    """The later flight's heights: those of the first, a heap of 0.8 m on them, the whole 0.3 m higher."""
+    folder = next(with_heights.glob("flights/*/heights.json")).parent
+    other = folder.with_name("other")
+    other.mkdir()
+    try:
+        with rasterio.open(folder / "heights.tif") as earlier:
+            profile, (up_m, sigma_m) = earlier.profile, earlier.read()
+            rows, columns = up_m.shape
+        with Archive.open(with_heights, write=False) as archive:
+            cell_m = json.loads((folder / "heights.json").read_text())["cell_m"]
+            middle = read_field(archive, folder.name, HeightFile.SURFACE).lattice.points_m()[rows // 2, columns // 2]
+        side = np.hypot(*np.mgrid[-(rows // 2):rows - rows // 2, -(columns // 2):columns - columns // 2]) * cell_m
+        with rasterio.open(other / "heights.tif", "w", **profile) as later:
+            later.write(np.stack([up_m + 0.3 + 0.8 * (side < 3.0), sigma_m]))
+        (other / "heights.json").write_text((folder / "heights.json").read_text())
+        around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+        heap = middle + 2.5 * np.column_stack([np.cos(around), np.sin(around)])
+        area = replace(fake_change(1, kind=ChangeKind.AREA), outline_m=heap)
+        with Archive.open(with_heights, write=False) as archive:
+            risen, thing = with_height_changes(archive, "other", [area, fake_change(2)])
+            assert thing.height_change is None and risen.height_change is not None
+            assert abs(risen.height_change.rise_m - 0.8) < 2 * risen.height_change.sigma_m
+            assert risen.height_change.rise_m == pytest.approx(0.8, abs=0.1)
+            (unknown,) = with_height_changes(archive, "third", [area])
+            assert unknown.height_change is None
+    finally:
+        shutil.rmtree(other)

@@ -2,6 +2,7 @@
 
 import json
 import sqlite3
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from xml.etree import ElementTree
@@ -23,7 +24,7 @@ from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.change_records import StoredChange, stored_changes
-from sorvolo.survey.findings import Change, ChangeKind, Verdict
+from sorvolo.survey.findings import Change, ChangeKind, HeightChange, Verdict
 
 
 @pytest.fixture
@@ -63,7 +64,10 @@ def same(one: StoredChange, other: Change) -> bool:
 @pytest.mark.usefixtures("kind")
 def test_changes_come_back_as_they_were_found(folder: Path) -> None:
     made = [
-        fake_change(2, kind=ChangeKind.MOVING, velocity_m_s=(1.0, -0.5)), fake_change(1, kind=ChangeKind.DISAPPEARED),
+        fake_change(2, kind=ChangeKind.MOVING, velocity_m_s=(1.0, -0.5)),
+        replace(
+            fake_change(1, kind=ChangeKind.DISAPPEARED), sigma_in_map_m=0.03, height_change=HeightChange(-0.4, 0.1)
+        ),
     ]
     with Archive.open(folder, write=True) as archive:
         compare(archive, "b", made, colour=90)
@@ -72,12 +76,18 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
         assert same(first, made[1]) and same(second, made[0])
         assert (first.number, second.number, first.flight_id, first.verdict) == (1, 2, "b", None)
         assert list(second.velocity_m_s) == [1.0, -0.5]
+        assert (first.sigma_in_map_m, first.height_change) == (0.03, HeightChange(-0.4, 0.1))
+        assert np.isnan(second.sigma_in_map_m) and second.height_change is None
         assert first.crop.width_px == 64 and first.crop.m_per_px == made[1].patch.m_per_px
         assert archive.changes("a") == []
         assert archive.comparisons() == {2: {"appeared": 0, "disappeared": 1, "replaced": 0, "moving": 1, "area": 0}}
     written = cv2.imread(str(folder / "flights/b/changes/b-1-before.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGRA2RGBA), made[1].patch.before)
     page = (folder / "flights/b/changes.html").read_text()
+    assert "-0.40 m (accuracy 0.10 m, 1 sigma)" in page and "position on this map (1 sigma)" in page
+    reported, other = properties(folder)
+    names = "sigma_in_map_m", "height_change_m", "height_change_sigma_m"
+    assert [reported[name] for name in names] == [0.03, -0.4, 0.1] and not any(other[name] for name in names)
     assert "2 changes" not in page and "1 change " in page and "1 moving object" in page
     assert "version 1: flight a, flown 2023-11-14" in page and "version 2: flight b" in page
 

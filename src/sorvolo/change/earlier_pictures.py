@@ -13,6 +13,7 @@ from sorvolo.geometry.homography import apply_homography, pose_from_homography
 from sorvolo.geometry.pose import Pose
 
 _EDGE = 0.01  # of a stored picture: the lens's correction repeats pixels there
+_INNER = 0.8  # of an outline, about its middle, that a picture shows which shows it
 
 
 class EarlierPicture(NamedTuple):
@@ -21,6 +22,14 @@ class EarlierPicture(NamedTuple):
     camera: Camera
     site_from_image: Matrix3
     site_from_camera: Pose | None
+
+
+class Vantage(NamedTuple):
+    """From where earlier pictures show a place, level metres: the least way between one of them and a later one, and
+    how far apart they lie themselves."""
+
+    nearest_m: float
+    spread_m: float
 
 
 class EarlierPictures:
@@ -66,6 +75,23 @@ class EarlierPictures:
             bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
             yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
 
+    @property
+    def knows_relief(self) -> bool:
+        """Whether what stands on the ground is known."""
+        return self._relief is not None
+
+    def vantage(self, outline_m: PointsM, cameras_m: PointsM) -> "Vantage | None":
+        """From where the pictures that show an outline, (N, 2), were taken, beside cameras, (V, 3), that show it
+        later; None where none shows it."""
+        shows = np.array([_shows(each, outline_m) for each in self._pictures], bool)
+        shows &= np.isfinite(self._cameras_m).all(axis=1)
+        places_m = self._cameras_m[shows, :2]
+        if not len(places_m) or not len(cameras_m):
+            return None
+        apart_m = np.linalg.norm(places_m[:, None] - cameras_m[None, :, :2], axis=-1)
+        among_m = np.linalg.norm(places_m - places_m.mean(axis=0), axis=1)
+        return Vantage(float(apart_m.min()), 2 * float(among_m.max()))
+
     def _rendered(
         self, picture: ImageRGBA, site_from_picture: Matrix3, earlier_m: Vector3, site_from_image: Matrix3,
         camera_m: Vector3, size: tuple[int, int],
@@ -99,6 +125,17 @@ class EarlierPictures:
                 chosen.append(each)
         chosen += [each for each in order if each not in chosen][: most - len(chosen)]
         return chosen
+
+
+def _shows(picture: EarlierPicture, outline_m: PointsM) -> bool:
+    """Whether a picture shows an outline, (N, 2) site metres, but for a rim: at the map's edge it ends where the
+    picture that the map was made of ends."""
+    middle_m = outline_m.mean(axis=0)
+    inner_m = middle_m + _INNER * (outline_m - middle_m)
+    x, y = apply_homography(np.linalg.inv(picture.site_from_image), inner_m).T
+    with np.errstate(invalid="ignore"):
+        inside = (x >= 0) & (x < picture.camera.width_px) & (y >= 0) & (y < picture.camera.height_px)
+    return bool(inside.all())
 
 
 def with_known_pixels(rgb: ImageRGB) -> ImageRGBA:

@@ -95,13 +95,17 @@ def frame_counts(found: Mask, truth: Mask, unknown: Mask | None = None, least_px
 
 @dataclass(frozen=True, eq=False)
 class FoundEvent:
-    """A change as it was reported: outline (N, 2) in metres; NaN and None where the report is silent."""
+    """A change as it was reported: outline (N, 2) in metres; NaN and None where the report is silent.
+
+    `sigma_m` is that of its place on the map, `world_sigma_m` that of its place in the world.
+    """
 
     id: str
     kind: ChangeKind
     outline_m: PointsM
     sigma_m: float = math.nan
     announced_ns: int | None = None
+    world_sigma_m: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +113,8 @@ class TrueEvent:
     """What really happened: the thing's outline on the ground, (N, 2) metres, and `length_m`, its longer side.
 
     `clear_ns` (V,) are the times of the views that show it well, `path_m` (V, 2) where it was then, if it moves. An
-    event that need not be found (`must_find` False) is neither missed nor false.
+    event that need not be found (`must_find` False) is neither missed nor false. All places are those on the map, which
+    lies `map_off_m` (2,) off there: what was taken out of them.
     """
 
     id: str
@@ -119,8 +124,10 @@ class TrueEvent:
     clear_ns: TimesNs | Sequence[int]
     path_m: PointsM = field(default_factory=lambda: np.zeros((0, 2)))
     must_find: bool = True
+    map_off_m: Floats = field(default_factory=lambda: np.zeros(2))
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "map_off_m", frozen(self.map_off_m))
         object.__setattr__(self, "clear_ns", frozen(self.clear_ns, np.int64))
         object.__setattr__(self, "path_m", frozen(self.path_m).reshape(-1, 2))
 
@@ -196,8 +203,9 @@ class EventScores:
     """What a list of reported events is worth.
 
     `late` of `judged_late` found events were announced late. Errors are of things that stand still; `within_two_sigma`
-    is the share of their single-axis errors that are under twice the stated sigma (0.954 if it is honest and errors
-    are normal). Rates without a denominator are NaN.
+    is the share of their single-axis errors on the map that are under twice the stated sigma (0.954 if it is honest and
+    errors are normal), `world_within_two_sigma` the same of errors in the world and the sigma stated for that: of one
+    flight, whose changes share the map's shift, it is all or nothing. Rates without a denominator are NaN.
     """
 
     must_find: int
@@ -214,6 +222,8 @@ class EventScores:
     sigma_median_m: float
     within_two_sigma: float
     by_kind: dict[str, KindScore]
+    world_sigma_median_m: float = math.nan
+    world_within_two_sigma: float = math.nan
 
     @property
     def found_share(self) -> float:
@@ -277,10 +287,10 @@ def score_events(
 ) -> EventScores:
     """The numbers of a match; `compared_m2` is the ground that was compared with the map."""
     still = [pair for pair in match.pairs if pair.true.kind != ChangeKind.MOVING]
-    stated = [pair for pair in still if math.isfinite(pair.found.sigma_m)]
-    within = np.array([np.abs(pair.offset_m) <= 2 * pair.found.sigma_m for pair in stated])
+    on_map = [(pair.offset_m, pair.found.sigma_m) for pair in still]
+    in_world = [(pair.offset_m + pair.true.map_off_m, pair.found.world_sigma_m) for pair in still]
     delays_s = np.array([pair.delay_s for pair in match.pairs])
-    errors_m, sigmas_m = [pair.error_m for pair in still], [pair.found.sigma_m for pair in stated]
+    errors_m = [pair.error_m for pair in still]
     return EventScores(
         must_find=len(match.pairs) + len(match.missed), found=len(match.pairs),
         judged_late=int(np.isfinite(delays_s).sum()), late=_late(match.pairs, settings),
@@ -288,10 +298,20 @@ def score_events(
         named_right=_named_right(match.pairs), compared_m2=compared_m2,
         error_median_m=_percentile(errors_m, 50),
         error_p95_m=_percentile(errors_m, 95),
-        sigma_median_m=_percentile(sigmas_m, 50),
-        within_two_sigma=float(within.mean()) if stated else math.nan,
+        sigma_median_m=_sigma_median_m(on_map), within_two_sigma=_within_two_sigma(on_map),
+        world_sigma_median_m=_sigma_median_m(in_world), world_within_two_sigma=_within_two_sigma(in_world),
         by_kind={str(kind): _kind_score(match, kind, settings) for kind in ChangeKind},
     )
+
+
+def _sigma_median_m(offsets: Sequence[tuple[Floats, float]]) -> float:
+    return _percentile([sigma_m for _, sigma_m in offsets if math.isfinite(sigma_m)], 50)
+
+
+def _within_two_sigma(offsets: Sequence[tuple[Floats, float]]) -> float:
+    """The share of the axes of offsets, (2,) each, that are under twice the sigma stated with it."""
+    within = [np.abs(offset_m) <= 2 * sigma_m for offset_m, sigma_m in offsets if math.isfinite(sigma_m)]
+    return float(np.mean(within)) if within else math.nan
 
 
 def _percentile(values: Sequence[float], share: float) -> float:

@@ -185,8 +185,9 @@ def _show_events(console: Console, flight: str, scores: "EventScores", map_shift
         shift = f" (the map's own shift of {map_shift_m:.2f} m taken out)" if math.isfinite(map_shift_m) else ""
         console.print(
             f"{flight}: position error {scores.error_median_m:.2f} m median, {scores.error_p95_m:.2f} m at "
-            f"95 %{shift}; {_share(scores.within_two_sigma)} within twice the reported accuracy (1 sigma, median "
-            f"{scores.sigma_median_m:.2f} m)", highlight=False,
+            f"95 %{shift}; {_share(scores.within_two_sigma)} within twice the reported accuracy on the map (1 sigma, "
+            f"median {scores.sigma_median_m:.2f} m), {_share(scores.world_within_two_sigma)} in the world (median "
+            f"{scores.world_sigma_median_m:.2f} m)", highlight=False,
         )
 
 

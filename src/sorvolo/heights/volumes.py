@@ -1,13 +1,15 @@
 """Volumes: what was dug and heaped between two dates, and what stands above the ground around it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, Floats32, Mask
+from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.terrain import filled
+from sorvolo.survey.findings import HeightChange
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,33 @@ def between(
     rise = np.asarray(moved.up_m + tied.shift_m[2] - earlier.up_m, np.float32)
     sigma = np.asarray(np.hypot(earlier.sigma_m, moved.sigma_m), np.float32)
     return _added_up(rise, sigma, inside, earlier.lattice.cell_m, tied.sigma_m, settings)
+
+
+def height_changes(
+    earlier: HeightField, later: HeightField, outlines_m: Sequence[PointsM], changed_m: Sequence[PointsM],
+    settings: VolumeSettings = VolumeSettings(),
+) -> list[HeightChange | None]:
+    """How much higher the ground within each outline, (N, 2) site metres, lies on the mean than before.
+
+    The later heights are tied to the earlier ones outside of `changed_m`, outlines too. None where less than half of
+    an outline has heights on both dates; for all of them where the two share too little unchanged ground.
+    """
+    try:
+        tied = tie(earlier, later, ~earlier.inside([[each] for each in changed_m]), settings)
+    except InputError:
+        return [None] * len(outlines_m)
+    return [_height_change(earlier, later, earlier.inside([[each]]), tied, settings) for each in outlines_m]
+
+
+def _height_change(
+    earlier: HeightField, later: HeightField, inside: Mask, tied: Tie, settings: VolumeSettings
+) -> HeightChange | None:
+    try:
+        volume = between(earlier, later, inside, tied, settings)
+    except InputError:
+        return None
+    known_m2 = volume.area_m2 * volume.known_share
+    return HeightChange(volume.net_m3 / known_m2, volume.sigma_m3 / known_m2)
 
 
 def above_rim(surface: HeightField, inside: Mask, settings: VolumeSettings = VolumeSettings()) -> Volume:

@@ -139,13 +139,22 @@ class Patch:
         return np.array([[s, 0.0, self.west_m + s / 2], [0.0, -s, self.north_m - s / 2], [0.0, 0.0, 1.0]])
 
 
+@dataclass(frozen=True)
+class HeightChange:
+    """How much higher the ground of a change lies than before, its mean, and the one-sigma error of that."""
+
+    rise_m: float
+    sigma_m: float
+
+
 @dataclass(frozen=True, eq=False)
 class ChangeFacts:
     """What is known of a change, whether it was just found or is read from a site.
 
     `id` is the flight's name and a number, the same whenever the flight is compared again. `outline_m` (N, 2), N >= 3,
     is its outline on the ground in site metres, not closed. `length_m` is the longer side of the smallest rectangle
-    around it. `sigma_m` is the one-sigma error of its place, per axis. `views` counts the frames that showed it.
+    around it. `sigma_m` is the one-sigma error of its place in the world, per axis, the map's own included. `views`
+    counts the frames that showed it.
     """
 
     id: str
@@ -164,7 +173,9 @@ class ChangeFacts:
 class Change(ChangeFacts):
     """One thing that happened to the ground, however many frames saw it, with its pictures.
 
-    `velocity_m_s` (2,) east, north: zero unless it moves. Classes are "" where nobody looked.
+    `velocity_m_s` (2,) east, north: zero unless it moves. Classes are "" where nobody looked. `sigma_in_map_m` is the
+    one-sigma error of its place on the map, per axis: NaN until the change is reported, for then `sigma_m` has
+    nothing of the map's in it. `height_change` is None where it was not measured.
     """
 
     patch: Patch
@@ -172,6 +183,8 @@ class Change(ChangeFacts):
     class_before: str = ""
     class_after: str = ""
     announced_ns: int = -1  # when it was announced; -1: only after the last frame
+    sigma_in_map_m: float = float("nan")
+    height_change: HeightChange | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outline_m", frozen(self.outline_m))

@@ -13,6 +13,7 @@ from sorvolo.change.evidence.cells import CellEvidence, CellGrid, CellReport, Ce
 from sorvolo.change.evidence.pictures import Pictures, PictureSettings
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import measures
+from sorvolo.change.shape.place_sigma import aside_of, place_sigma_m
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
@@ -25,6 +26,7 @@ class CandidateSettings:
     seen: float = 0.5  # a view that sees less is not asked
     all_seen: float = 0.99  # a view that sees more knows its place
     most_places: int = 64  # of views, for the spread of its place
+    most_cameras: int = 256  # of views that show it; of more every second one is kept
     most_seeds: int = 256  # uncertain candidates that are kept in any case ...
     most_seeds_px: int = 8_000_000  # ... and while their pictures have no more pixels (110 MB); the oldest go first
 
@@ -60,6 +62,7 @@ class Candidate:
         self._cells = cells
         self._tally = Tally(first_seen_ns, first_seen_ns)
         self._places: list[Floats] = []
+        self._cameras: list[Floats] = []
         self._kind: ChangeKind | None = None
         self._kind_outline: PointsM | None = None
 
@@ -72,6 +75,11 @@ class Candidate:
     def tally(self) -> Tally:
         """What the views reported so far."""
         return self._tally
+
+    @property
+    def cameras_m(self) -> PointsM:
+        """(N, 3) where views that show it were taken, of many a part."""
+        return np.array(self._cameras).reshape(-1, 3)
 
     def extend(self, window: CellWindow) -> None:
         """It reaches into this window, too."""
@@ -138,9 +146,8 @@ class Candidate:
     ) -> Change:
         """What is known of it.
 
-        `sigma_m` is the root of the sum of squares of: the mean alignment residual on the ground; a cell's rounding,
-        its side / sqrt(12); and the spread of its middle over the views, per axis, / sqrt(views). Raises GeometryError
-        if it has no pictures.
+        `sigma_m` is that of `place_sigma_m`, and the spread of its middle over the views, per axis, / sqrt(views).
+        Raises GeometryError if it has no pictures.
         """
         patch, tally = self.pictures.patch(outline_m), self._tally
         if self._kind is None or self._kind_outline is not outline_m:
@@ -148,7 +155,8 @@ class Candidate:
         size = measures(outline_m)
         residual_m = tally.residual_m_sum / max(tally.views, 1)
         spread_m = float(np.sqrt(np.mean(np.var(self._places, axis=0)))) if len(self._places) > 1 else 0.0
-        sigma_m = np.sqrt(residual_m**2 + cell_m**2 / 12 + spread_m**2 / max(len(self._places), 1))
+        placed_m = place_sigma_m(residual_m, cell_m, size.length_m, aside_of(outline_m, self.cameras_m))
+        sigma_m = np.hypot(placed_m, spread_m / np.sqrt(max(len(self._places), 1)))
         return Change(
             f"{id_prefix}-{self.number}", self._kind, score, outline_m, tally.first_seen_ns, tally.last_seen_ns,
             tally.views, size.area_m2, size.length_m, float(sigma_m), patch, announced_ns=announced_ns,
@@ -169,6 +177,9 @@ class Candidate:
 
     def _count(self, view: KeptView, report: CellReport, residual_m: float, *, knows_place: bool) -> None:
         self._tally = self._tally.with_view(view.time_ns, report.score, residual_m, view.camera_m)
+        self._cameras.append(view.camera_m)
+        if len(self._cameras) > self._settings.most_cameras:
+            del self._cameras[1::2]
         if knows_place and len(self._places) < self._settings.most_places:
             self._places.append(report.place_m)
 

@@ -6,13 +6,14 @@ of them gathers k votes out of n in the same cell. Unknown ground counts neither
 """
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.earlier_pictures import Vantage
 from sorvolo.change.evidence.announcing import (
     Announce,
     AnnounceSettings,
@@ -20,6 +21,7 @@ from sorvolo.change.evidence.announcing import (
     Reason,
     Verdict,
     judge,
+    leaning_m,
     sureness,
     views_score,
 )
@@ -38,7 +40,7 @@ from sorvolo.change.motion.moving_changes import Movers
 from sorvolo.change.shape.shadows import ThingSettings, shade_share
 from sorvolo.change.shape.things import Parts
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.survey.findings import Change, ComparedView
 
 
@@ -103,13 +105,17 @@ class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` settles what is left.
 
     `m_per_px` is a pixel of changes' pictures, `id_prefix` begins every change's id: the flight's name. Views must come
-    in order of time; the same views give the same changes and ids.
+    in order of time; the same views give the same changes and ids. `vantage` gives for an outline (N, 2) and cameras
+    (V, 3) from where earlier pictures show it; None where what stands on the ground is known, or there are none.
     """
 
-    def __init__(self, m_per_px: float, settings: EvidenceSettings, id_prefix: str) -> None:
+    def __init__(
+        self, m_per_px: float, settings: EvidenceSettings, id_prefix: str,
+        vantage: Callable[[PointsM, PointsM], Vantage | None] | None = None,
+    ) -> None:
         self._settings, self._prefix = settings, id_prefix
         self._rules, self._gathering = settings.announcing, settings.gathering
-        self._m_per_px = m_per_px
+        self._m_per_px, self._vantage = m_per_px, vantage
         self._cell_m = self._gathering.cells.side_m(m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
         self._gap = int(np.ceil(self._join_m / self._cell_m))
@@ -419,8 +425,22 @@ class EvidenceMap:
         whole = self._record(candidate) if isinstance(verdict, Announce) else None
         if whole is None:
             return verdict, None
+        tally = replace(candidate.tally, look=self._look(candidate, whole))
+        return judge(tally.of_all_views(self._seen(candidate)), rules, is_over=is_over), whole
+
+    def _look(self, candidate: Candidate, whole: Change) -> Look:
         look = Look(whole.area_m2, whole.length_m, shade_share(whole.patch))
-        return judge(replace(candidate.tally, look=look), rules, is_over=is_over), whole
+        vantage = None if self._vantage is None else self._vantage(whole.outline_m, candidate.cameras_m)
+        if vantage is None:
+            return look
+        leans = (leaning_m(each, candidate.tally.flying_height_m, self._rules) for each in vantage)
+        is_from_aside, is_shown_apart = (each > np.sqrt(whole.area_m2) for each in leans)
+        return replace(look, is_from_aside=bool(is_from_aside), is_shown_apart=bool(is_shown_apart))
+
+    def _seen(self, candidate: Candidate) -> int:
+        """The views of the candidate's ground, those before it was noticed too."""
+        own = self._cells_of(candidate)
+        return int(np.median(self._grid.read(candidate.cells).seen[own])) if own.any() else 0
 
     def _restlessness(self, candidate: Candidate) -> float:
         return restlessness(

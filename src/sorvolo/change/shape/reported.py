@@ -11,12 +11,14 @@ from sorvolo.survey.findings import Change, ChangeKind
 
 
 def reported(changes: Iterable[Change], map_sigma_m: float, rejected: Sequence[KnownPlace]) -> list[Change]:
-    """The changes without their shadows, their sigmas joined with the map's own, m per axis.
+    """The changes without their shadows, with their sigmas in the map, and in the world, the map's own joined; m per
+    axis.
 
     Those at places in `rejected` are left out: a person rejected them on an earlier flight.
     """
     finished = [each if each.kind is ChangeKind.AREA else without_shadow(each) for each in changes]
     return [
-        replace(each, sigma_m=float(np.hypot(each.sigma_m, map_sigma_m))) for each in finished
+        replace(each, sigma_in_map_m=each.sigma_m, sigma_m=float(np.hypot(each.sigma_m, map_sigma_m)))
+        for each in finished
         if not is_known(each.outline_m, each.kind, rejected)
     ]

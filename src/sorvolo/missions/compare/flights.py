@@ -21,7 +21,7 @@ from sorvolo.missions.flight.map_objects import check_classes, open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
-from sorvolo.missions.heights.measure import damaged_heights, heights_stamp
+from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
 from sorvolo.missions.map.journal import begun_journal, go_on_live
 from sorvolo.mosaic.selection import every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
@@ -71,7 +71,8 @@ def compare_flights(
         known = []
         for source in sources:
             base, is_newest = _base_version(archive, source)
-            asked = settings, wanted, looks, base, _reviews(archive), heights_stamp(archive, but=source.name), steps
+            stamps = heights_stamp(archive, but=source.name), own_heights_stamp(archive, source.name)
+            asked = settings, wanted, looks, base, _reviews(archive), stamps, steps
             samples = go_on_live(source, archive, asked, live.same_flight_s, anew=again)
             setup = prepare(
                 source, settings.mapping, archive.site(), telemetry_named=telemetry is not None, finds_itself=True,

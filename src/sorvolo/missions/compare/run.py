@@ -23,6 +23,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
 from sorvolo.heights.field import standing
+from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal, KeptFrame
 from sorvolo.missions.compare.objects import ComparisonObjects
@@ -212,6 +213,7 @@ class CompareRun:
         placed = [self._placed[index] for index in sorted(self._placed)]
         with self._log.stage(Stage.DETECT):
             search, changes = self._objects.conclude(placed, changes)
+            changes = with_height_changes(self._archive, self._setup.source.name, changes)
         with self._log.stage(Stage.REPORT):
             shown = picture(self._writer.tiles, 800)  # a day without change should cost little
         ground = self._counts.ground.parts()
@@ -247,6 +249,7 @@ class CompareRun:
                 self._evidence = EvidenceMap(
                     self._views.change_m_per_px(view),
                     EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._setup.source.name,
+                    self._views.vantage,
                 )
             announced: Sequence[Change] = self._reported(self._evidence.add(view))
             if self._settings.method != "thesis":

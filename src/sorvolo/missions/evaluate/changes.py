@@ -296,12 +296,14 @@ def _true_event(
     feature: Mapping[str, Any], described: Site, map_from_truth: Matrix3, ground: ComparedGround, views: int, path: Path
 ) -> TrueEvent:
     properties = feature["properties"]
-    outline_m = apply_homography(map_from_truth, _ring(feature, described, path))
+    true_m = _ring(feature, described, path)
+    outline_m = apply_homography(map_from_truth, true_m)
     places = properties["path"]
     path_m = apply_homography(map_from_truth, described.frame.ground_from_lonlat(places)) if places else floats(())
     event = TrueEvent(
         _event_name(properties), ChangeKind(properties["kind"]), outline_m, float(properties["length_m"]),
         [time_ns_of(text) for text in properties["clear_views"]], path_m,
+        map_off_m=outline_m.mean(axis=0) - true_m.mean(axis=0),
     )
     return replace(event, must_find=event.is_shown(ground, views, max(views, VIDEO_VIEWS)))
 
@@ -317,14 +319,19 @@ def _read_found(path: Path, described: Site, clock: tuple[int, int]) -> list[Fou
             if "announced" in properties:
                 announced = properties["announced"]
                 announced_ns = behind_ns + (time_ns_of(announced) if announced else ended_ns)
-            sigma_m = math.nan if properties.get("sigma_m") is None else float(properties["sigma_m"])
+            world_sigma_m = _known(properties.get("sigma_m"))
+            sigma_m = _known(properties.get("sigma_in_map_m", world_sigma_m))  # earlier versions stated one for both
             events.append(FoundEvent(
                 str(properties["id"]), ChangeKind(properties["kind"]), _ring(feature, described, path), sigma_m,
-                announced_ns,
+                announced_ns, world_sigma_m,
             ))
         except (KeyError, TypeError, ValueError, IndexError) as error:
             raise InputError(f"{path}: a change is not as docs/formats.md has it ({error!r})") from error
     return events
+
+
+def _known(stated: float | None) -> float:
+    return math.nan if stated is None else float(stated)
 
 
 def _ring(feature: Mapping[str, Any], described: Site, path: Path) -> PointsM:

@@ -111,10 +111,36 @@ def read_field(archive: Archive, flight_id: str, file: HeightFile) -> HeightFiel
             f"the heights of flight {flight_id} are of an earlier map of it; make them again: "
             f"sorvolo heights {archive.folder} --flight {flight_id}"
         )
-    site_grid = height_grid(archive.site(), float(report["cell_m"]))
+    return _read(archive, flight_id, file, float(report["cell_m"]))
+
+
+def _read(archive: Archive, flight_id: str, file: HeightFile, cell_m: float) -> HeightField:
+    site_grid = height_grid(archive.site(), cell_m)
     read = read_height_cog(archive.height_path(flight_id, file), site_grid.grid)
     rows, columns = read.bands[0].shape
     return HeightField(Lattice.at(site_grid, read.first, columns, rows), read.bands[0], read.bands[-1])
+
+
+def own_surface(archive: Archive, flight_id: str) -> HeightField | None:
+    """The surface that a flight has from whichever map was made of it; None without any that can be read.
+
+    A comparison replaces the map of its flight and leaves the heights: they no longer fit the site to a centimetre,
+    and are to be tied to other heights before they are used.
+    """
+    report = _read_report(archive, flight_id)
+    if report is None:
+        return None
+    try:
+        return _read(archive, flight_id, HeightFile.SURFACE, float(report["cell_m"]))
+    except InputError:
+        return None
+
+
+def own_heights_stamp(archive: Archive, flight_id: str) -> int | None:
+    """When the heights that `own_surface` reads were written (ns); None without any."""
+    if _read_report(archive, flight_id) is None:
+        return None
+    return archive.height_path(flight_id, HeightFile.REPORT).stat().st_mtime_ns
 
 
 def flight_with_heights(archive: Archive, but: str) -> str | None:

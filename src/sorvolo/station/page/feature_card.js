@@ -61,12 +61,20 @@ export function picture(src, alt) {
   return image;
 }
 
+/** How much higher its ground lies than before, with the accuracy; null where that was not measured. */
+function risenWords({ height_change_m: risen, height_change_sigma_m: sigma }) {
+  if (risen === undefined || risen === null) return null;
+  return `${risen > 0 ? "+" : ""}${risen.toFixed(2)} m (accuracy ${words.length(sigma)}, 1 sigma)`;
+}
+
 /** What is known of a feature, as a list of terms. */
 export function facts(feature, local) {
   const values = feature.properties;
   const rows = [
     ["Place", words.place(middleOf(feature.geometry), { local })],
     ["Position accuracy", values.sigma_m === undefined || values.sigma_m === null ? null : `${words.length(values.sigma_m)} (1 sigma)`],
+    ["Position on this map", values.sigma_in_map_m ? `${words.length(values.sigma_in_map_m)} (1 sigma)` : null],
+    ["Height change", risenWords(values)],
     ["Score", words.percent(values.score)],
     ["Seen", values.views ? `in ${words.counted(values.views, "frame")}${values.possible_views ? ` of ${values.possible_views}` : ""}` : null],
     ["Size", values.length_m ? (values.width_m ? `${words.length(values.length_m)} × ${words.length(values.width_m)}` : words.length(values.length_m)) : null],

@@ -107,6 +107,9 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
         "area_m2": rounded(change.area_m2, 4),
         "length_m": rounded(change.length_m, 4),
         "sigma_m": rounded(change.sigma_m, 4),
+        "sigma_in_map_m": rounded(change.sigma_in_map_m, 4),
+        "height_change_m": None if change.height_change is None else rounded(change.height_change.rise_m, 3),
+        "height_change_sigma_m": None if change.height_change is None else rounded(change.height_change.sigma_m, 3),
         "class_before": change.class_before or None,
         "class_after": change.class_after or None,
         "east_m": rounded(east_m, 4),
@@ -131,6 +134,9 @@ def _description(change: StoredChange) -> str:
         f"length {change.length_m:.2f} m, area {change.area_m2:.2f} m2",
         f"position accuracy {change.sigma_m:.2f} m (1 sigma)",
     ]
+    if change.height_change is not None:
+        risen = change.height_change
+        lines.append(f"height change {risen.rise_m:+.2f} m, accuracy {risen.sigma_m:.2f} m (1 sigma)")
     lines += [
         f"{words}: {name}" for words, name in (("before", change.class_before), ("now", change.class_after)) if name
     ]

@@ -261,6 +261,11 @@ def _details(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
     details += [
         (name, label) for name, label in (("was", change.class_before), ("is now", change.class_after)) if label
     ]
+    if not site.is_local and np.isfinite(change.sigma_in_map_m):
+        details.append(("position on this map (1 sigma)", _length(change.sigma_in_map_m)))
+    if change.height_change is not None:
+        risen = change.height_change
+        details.append(("height change", f"{risen.rise_m:+.2f} m (accuracy {risen.sigma_m:.2f} m, 1 sigma)"))
     if change.kind is ChangeKind.MOVING:
         details.append(("moves", _velocity(change.velocity_m_s, site)))
     if change.note:

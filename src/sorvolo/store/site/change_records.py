@@ -13,7 +13,7 @@ from sorvolo.geometry.arrays import Floats, PointsM, frozen
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows, utc_now
 from sorvolo.store.site.names import checked_name, is_plain_name
-from sorvolo.survey.findings import Change, ChangeFacts, ChangeKind, Verdict
+from sorvolo.survey.findings import Change, ChangeFacts, ChangeKind, HeightChange, Verdict
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,8 @@ class StoredChange(ChangeFacts):
     crop: CropPlace
     verdict: Verdict | None = None
     note: str = ""
+    sigma_in_map_m: float = float("nan")
+    height_change: HeightChange | None = None
 
     @property
     def centre_m(self) -> PointsM:
@@ -204,11 +206,12 @@ def _stored(flight_id: str, number: int, change: Change) -> StoredChange:
         change.views, change.area_m2, change.length_m, change.sigma_m, flight_id, number, change.velocity_m_s,
         change.class_before, change.class_after, change.announced_ns,
         CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
+        sigma_in_map_m=change.sigma_in_map_m, height_change=change.height_change,
     )
 
 
 def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
-    crop = change.crop
+    crop, risen = change.crop, change.height_change
     return {
         "id": change.id, "run_id": run_id, "number": change.number, "kind": change.kind.value,
         "properties": {
@@ -216,7 +219,9 @@ def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
             "first_seen_ns": int(change.first_seen_ns), "last_seen_ns": int(change.last_seen_ns),
             "announced_ns": int(change.announced_ns), "views": int(change.views),
             "area_m2": _finite(change.area_m2), "length_m": _finite(change.length_m),
-            "sigma_m": _finite(change.sigma_m), "velocity_m_s": change.velocity_m_s.tolist(),
+            "sigma_m": _finite(change.sigma_m), "sigma_in_map_m": _finite(change.sigma_in_map_m),
+            "height_change": None if risen is None else [float(risen.rise_m), float(risen.sigma_m)],
+            "velocity_m_s": change.velocity_m_s.tolist(),
             "class_before": change.class_before, "class_after": change.class_after,
             "crop": [*map(float, (crop.west_m, crop.north_m, crop.m_per_px)), crop.width_px, crop.height_px],
         },
@@ -239,6 +244,8 @@ def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
             values["announced_ns"], CropPlace(west_m, north_m, m_per_px, width_px, height_px),
             review.verdict if review is not None and is_reviewed else None,
             review.note if review is not None and is_reviewed else "",
+            _number(values.get("sigma_in_map_m")),  # sites of earlier versions have neither
+            HeightChange(*risen) if (risen := values.get("height_change")) else None,
         )
 
 
