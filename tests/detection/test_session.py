@@ -1,6 +1,7 @@
 """Model files that are foreign, damaged or of another contract are refused in words; where models run."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import onnxruntime
 import pytest
 from toy_models import METADATA, draw, onnx, rectangle_model, write_model
 
+from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session, read_info, usable_cores
 from sorvolo.errors import InputError, SettingsError
 
@@ -168,3 +170,22 @@ def test_seen_from_several_threads(tmp_path: Path) -> None:
     with ThreadPoolExecutor(4) as pool:
         seen = list(pool.map(opened.see, [draw((80 + x % 7, 90), [box]) for x, box in enumerate(boxes)]))
     np.testing.assert_allclose(np.concatenate([each.boxes_px for each in seen]), boxes)
+
+
+def test_a_session_that_rests_gives_memory_back_and_sees_as_before(tmp_path: Path) -> None:
+    session = Session(find_model("default"), "cpu", 1)
+    picture = np.random.default_rng(5).integers(0, 255, (480, 640, 3), np.uint8)
+    before = session.see(picture)
+    full_mb = _resident_mb()
+    session.rest()
+    assert _resident_mb() < full_mb - 30
+    after = session.see(picture)
+    assert after.boxes_px.tolist() == before.boxes_px.tolist() and after.scores.tolist() == before.scores.tolist()
+    fixed = Session(rectangle_model(tmp_path / "fixed.onnx", fixed=(64, 96)), "cpu", 1)
+    fixed.rest()
+    assert len(fixed.see(draw((64, 96), [(10, 20, 30, 50)])).scores) == 1
+
+
+def _resident_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

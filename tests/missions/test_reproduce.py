@@ -18,12 +18,14 @@ from sorvolo.missions.evaluate.mask_folders import frames_against_times
 from sorvolo.missions.reproduce.published import TABLE_4_3
 from sorvolo.missions.reproduce.report import MARKDOWN, NUMBERS, PAGE, write_reproduction
 from sorvolo.missions.reproduce.rows import Row
-from sorvolo.missions.reproduce.run import ReproductionUpdate, reproduce
+from sorvolo.missions.reproduce.run import ReproductionUpdate, _Work, reproduce
 from sorvolo.missions.reproduce.settings import DetectorSettings, ReproductionSettings, SimulatedSize, quick
 from sorvolo.missions.reproduce.simulated import simulated_dataset
+from sorvolo.missions.reproduce.tables import tables_of
 from sorvolo.store.datasets.umcd import read_umcd_metadata
 from sorvolo.store.datasets.umcd_folder import CHANGES, MOSAICKING, WITH, read_umcd_folder
 from sorvolo.store.exports.flight_files import write_mask
+from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 
 SETTINGS, SIZE = quick(
     ReproductionSettings(views_per_second=2.5, detector=DetectorSettings(steps=0)), SimulatedSize(bare_videos=0)
@@ -106,6 +108,35 @@ def test_tables_have_the_printed_figures_beside_ours(
     rows = list(csv.reader(io.StringIO((out / "tables" / "table_4_5.csv").read_text())))
     assert rows[3][0] == "thesis, printed" and len(rows) == 8
     assert not document["missing"]
+
+
+def test_npus_flights_are_mapped_and_compared_with_the_published_mosaics(
+    dataset: Path, reproduced: tuple[Path, list[ReproductionUpdate]], tmp_path: Path
+) -> None:
+    umcd = read_umcd_folder(dataset)
+    (flown,) = umcd.mosaicking
+    own = tmp_path / "npu" / "phantom3-npu"
+    own.mkdir(parents=True)
+    for each in (flown.video, *flown.texts):
+        shutil.copy(each, own / f"DJI_0007{each.suffix}")
+    shutil.copy(reproduced[0] / "sites" / "countryside-path1" / "planar" / "mosaic.tif", own / "bu-et-al.tif")
+    (tmp_path / "npu" / "phantom3-village.mp4").write_bytes(b"no video")
+    work = _Work(umcd, tmp_path / "out", replace(SETTINGS, videos=None))
+    rows = {row.id: row for row, _ in map(work.done, work.npu_tasks(tmp_path / "npu"))}
+    assert len(rows) == 8
+    made = [rows[f"mosaic/with/npu/phantom3-npu/{method}"].values for method in ("thesis", "planar")]
+    assert [(each["sequence"], each["camera"]) for each in made] == [("npu/phantom3-npu", "guessed")] * 2
+    assert rows["published/npu/phantom3-npu/planar"].values["correlation_after_shift"] > 0.5
+    assert "no mosaic (.tif) of Bu et al." in rows["published/npu/phantom3-village/planar"].missing
+    assert "phantom3-village.mp4" in rows["mosaic/without/npu/phantom3-village/planar"].missing
+    tables = tables_of([each.row for each in reproduced[1]] + list(rows.values()))
+    assert {each["sequence"] for each in tables["table_4_1"]["ours"]} == {"countryside/path1", "npu/phantom3-npu"}
+    assert [(each["videos"], each["published"]) for each in tables["section_4_1_1"]["ours"]] == [(1, 1), (1, 1)]
+    sheets = {each.name: each for each in reproduction_sheets(tables)}
+    assert "planar here, with the mosaics of [17]" in {row[0] for row in sheets["section_4_1_1"].rows}
+    assert list(work.npu_tasks(None)) == []
+    with pytest.raises(InputError, match="no videos; give the folder of the NPU Drone-Map dataset"):
+        list(work.npu_tasks(own.parent.parent / "out" / "sites" / "npu-phantom3-npu" / "planar" / "flights"))
 
 
 def test_a_changed_pair_without_anything_to_judge_it_by_is_named(

@@ -39,6 +39,9 @@ class Comparing:
             self._frames = [archive.image(each) for each in archive.keyframes()]
         self._sees = sees
 
+    def rest(self) -> None:
+        """There is nothing to give back."""
+
     def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
         """The same for all pictures."""
         return self.info.thresholds

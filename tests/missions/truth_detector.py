@@ -47,6 +47,9 @@ class TruthDetector:
         )
         self.asked = 0
 
+    def rest(self) -> None:
+        """There is nothing to give back."""
+
     def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
         """The same for all pictures."""
         return self.info.thresholds

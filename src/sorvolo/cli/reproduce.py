@@ -32,6 +32,7 @@ PathLength = Annotated[float, typer.Option(help="With --simulated: length of eac
 PictureSize = Annotated[str, typer.Option(help="With --simulated: picture size, such as 1280x720.")]
 ViewRate = Annotated[float, typer.Option(help="Frames compared per second of video.")]
 Okutama = Annotated[Path | None, typer.Option(help="Okutama-Action's folder, for its column of Table 4.6.")]
+Npu = Annotated[Path | None, typer.Option(help="The NPU Drone-Map dataset's folder, for Table 4.1.")]
 TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.6; 0: train none.")]
 NetworkPreset = Annotated[Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")]
 Weights = Annotated[str, typer.Option(help="Weights to start from: auto (ImageNet), none, or a file.")]
@@ -50,6 +51,7 @@ def reproduce(
     size: PictureSize = "1280x720",
     views_per_second: ViewRate = 5.0,
     okutama: Okutama = None,
+    npu: Npu = None,
     train_steps: TrainSteps = 400,
     preset: NetworkPreset = Preset.FAST,
     weights: Weights = "auto",
@@ -86,7 +88,7 @@ def reproduce(
         dataset = out / "dataset"
         _simulate(dataset, simulation, settings)
     assert dataset is not None
-    rows = _rows(dataset, out, settings, okutama, is_whole=not simulated)
+    rows = _rows(dataset, out, settings, {"okutama": okutama, "npu": npu}, is_whole=not simulated)
     document = _written(out, rows, dataset, settings, simulation if simulated else None)
     if as_json:
         typer.echo(json.dumps(document, indent=1, ensure_ascii=False))
@@ -106,7 +108,7 @@ def _simulate(place: Path, size: "SimulatedSize", settings: "ReproductionSetting
 
 
 def _rows(
-    place: Path, out: Path, settings: "ReproductionSettings", okutama: Path | None, *, is_whole: bool
+    place: Path, out: Path, settings: "ReproductionSettings", others: "dict[str, Path | None]", *, is_whole: bool
 ) -> "list[Row]":
     from sorvolo.missions.reproduce.run import reproduce as reproduced
 
@@ -114,7 +116,7 @@ def _rows(
     rows = []
     with ProgressReport(console) as progress:
         progress.show("reproducing, row")
-        for update in reproduced(place, out, settings, okutama=okutama, is_whole=is_whole):
+        for update in reproduced(place, out, settings, **others, is_whole=is_whole):
             rows.append(update.row)
             progress.show("reproducing, row", update.done, update.total, update.row.id)
             if update.row.missing:

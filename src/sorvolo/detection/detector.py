@@ -131,6 +131,12 @@ class Detector:
             return _thresholds(self.info, from_above)
         return {**self.info.thresholds, **_thresholds(self._night_session().info, from_above)}
 
+    def rest(self) -> None:
+        """Give back memory that is kept for the next picture: before work that needs it, and after the last picture."""
+        for each in (self._session, self._at_night):
+            if each is not None:
+                each.rest()
+
     def _wanted(self, classes: Sequence[str] | None) -> tuple[str, ...]:
         if classes is None:
             return self.classes

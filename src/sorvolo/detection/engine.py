@@ -31,7 +31,7 @@ class Engine:
     """A model that runs: `provider` in words, its `metadata` as it stands in the file, and what that means.
 
     `fixed_px` is the (height, width) of its input where the model takes only one size, else None; `takes_many`
-    whether it takes several pictures of one size at once.
+    whether it takes several pictures of one size at once. `rest` gives back memory that it keeps between pictures.
     """
 
     run: Run
@@ -40,6 +40,7 @@ class Engine:
     info: ModelInfo
     fixed_px: tuple[int, int] | None
     takes_many: bool = False
+    rest: Callable[[], None] = lambda: None
 
 
 def output_names(*, takes_many: bool) -> tuple[str, ...]:
@@ -74,7 +75,9 @@ def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> E
                 raise InputError(f"{where}: OpenVINO refuses it ({reason}); choose the provider cpu") from error
             refused = ", since OpenVINO refuses the model"
         else:
-            return replace(described, run=run, provider=f"OpenVINO on the CPU, {_count(threads)}")
+            return replace(
+                described, run=run, provider=f"OpenVINO on the CPU, {_count(threads)}", rest=lambda: None
+            )
     session = _onnx_session(model, where, threads, ["CPUExecutionProvider"])
     return _engine(f"ONNX Runtime on the CPU, {_count(threads)}{refused}", session, where)
 
@@ -103,7 +106,22 @@ def _engine(provider: str, session: Any, where: str) -> Engine:
     fixed_px = _input_size(session, where, info.stride)
     takes_many = PICTURES in {each.name for each in session.get_outputs()}
     run = _runner(session, output_names(takes_many=takes_many))
-    return Engine(run, provider, metadata[METADATA_KEY], info, fixed_px, takes_many)
+    side_px = fixed_px or (info.stride, info.stride)
+    return Engine(
+        run, provider, metadata[METADATA_KEY], info, fixed_px, takes_many, lambda: _shrink(session, side_px)
+    )
+
+
+def _shrink(session: Any, side_px: tuple[int, int]) -> None:
+    """Have ONNX Runtime free the memory that it holds for pictures as large as those so far; 300 MB for 1080p.
+
+    It does so only at the end of a run: of a picture as small as the model takes, in 0.06 s of processor time.
+    """
+    import onnxruntime
+
+    options = onnxruntime.RunOptions()
+    options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+    session.run([OUTPUTS[0]], {INPUT: np.zeros((1, 3, *side_px), np.uint8)}, options)
 
 
 def _count(threads: int) -> str:

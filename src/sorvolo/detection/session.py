@@ -55,7 +55,7 @@ class Session:
             raise SettingsError(f"a model needs at least one thread, not {threads}")
         engine = shared_engine(shared, path) if shared else opened_engine(path, provider, threads)
         self._run, self.provider, self.info, self.fixed_px = engine.run, engine.provider, engine.info, engine.fixed_px
-        self._path = path
+        self._rest, self._path = engine.rest, path
         self._buffer: Planes = np.zeros((1, 3, 0, 0), np.uint8)
         self._lock = threading.Lock()
 
@@ -71,6 +71,12 @@ class Session:
             boxes, scores, labels = self._run(self._padded(shown))[:3]
         back = np.array([width / shown.shape[1], height / shown.shape[0]] * 2, np.float32)
         return self._checked(boxes, scores, labels, back, width, height)
+
+    def rest(self) -> None:
+        """Give back memory that is kept for the next picture: before work that needs it, and after the last picture."""
+        with self._lock:
+            self._rest()
+            self._buffer = np.zeros((1, 3, 0, 0), np.uint8)
 
     def input_from(self, picture: ImageRGB) -> Planes:
         """(1, 3, H, W) what the model is given for a picture, (H, W, 3): a size of its own, padded."""

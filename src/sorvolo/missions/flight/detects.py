@@ -31,6 +31,9 @@ class Detects(Protocol):
     def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
         """From which score on each class is reported in a picture (H, W, 3) like this."""
 
+    def rest(self) -> None:
+        """Give back memory that is kept for the next picture; it may be asked for more pictures later."""
+
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,

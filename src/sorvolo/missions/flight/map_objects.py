@@ -116,6 +116,11 @@ class ObjectFinder:
         news, self._news = self._news, []
         return news
 
+    def rest(self) -> None:
+        """Wait until all frames so far are searched, and have the detector give its memory back."""
+        self._take(0)
+        self._detector.rest()
+
     def take_over(self, seen: FrameDetections) -> None:
         """Take what an earlier process found in a frame."""
         self._seen[seen.index] = seen

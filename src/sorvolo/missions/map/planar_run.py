@@ -182,6 +182,7 @@ class PlanarRun(FlightRun):
                 self._mapper.settle()
                 self._offset = self._find_offset()
                 self._tie_to_ground()
+            self._end_search()
             self._started_painter().finish()
         return self._placed()
 

@@ -139,6 +139,13 @@ class FlightRun(ABC):
         as it was, when no frame has a place.
         """
 
+    def _end_search(self) -> None:
+        """Have all frames searched: the detector's memory is then free for the final painting and for the files."""
+        if self._finder is not None:
+            with self._log.stage(Stage.DETECT):
+                self._finder.rest()
+            self._keep_detections()
+
     def _search(self, placed: Sequence[PlacedFrame]) -> ObjectSearch | None:
         """What stands on the ground by the frames' final places; None where nobody looked."""
         if self._finder is None:

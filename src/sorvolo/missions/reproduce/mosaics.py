@@ -80,13 +80,12 @@ def distortion_of(site: Path) -> dict[str, Any]:
     }
 
 
-def correlation_of(site: Path, other: Path) -> dict[str, Any]:
-    """Eq. 4.1 of two maps of one flight, as they lie and after the shift between them.
+def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
+    """Eq. 4.1 of a flight's map and another mosaic of it, a GeoTIFF, as they lie and after the shift between them.
 
     Raises InputError as `evaluate_mosaic`.
     """
-    with Archive.open(other, write=False) as archive:
-        reference = evaluate_mosaic(site, reference=archive.mosaic_path).reference
+    reference = evaluate_mosaic(site, reference=mosaic).reference
     assert reference is not None
     return {
         "correlation": reference.correlation, "correlation_after_shift": reference.correlation_after_shift,

@@ -14,7 +14,8 @@ from sorvolo.missions.reproduce import comparisons, detectors, mosaics
 from sorvolo.missions.reproduce.inputs import VideoInput, video_input
 from sorvolo.missions.reproduce.published import VIDEOS
 from sorvolo.missions.reproduce.rows import Row, RowStore
-from sorvolo.missions.reproduce.settings import COMPARISONS, MAP_METHODS, ReproductionSettings
+from sorvolo.missions.reproduce.settings import COMPARISONS, MAP_METHODS, PUBLISHED, ReproductionSettings
+from sorvolo.store.datasets.npu_folder import ENVIRONMENT, read_npu_folder
 from sorvolo.store.datasets.umcd_folder import UmcdFolder, UmcdVideo, read_umcd_folder
 from sorvolo.store.site.journal import content_sha256
 
@@ -45,18 +46,23 @@ class _Task:
 
 
 def reproduce(
-    place: Path, out: Path, settings: ReproductionSettings, *, okutama: Path | None = None, is_whole: bool = True
+    place: Path, out: Path, settings: ReproductionSettings, *, okutama: Path | None = None, npu: Path | None = None,
+    is_whole: bool = True,
 ) -> Iterator[ReproductionUpdate]:
     """Do the experiments of chapter 4 on the dataset in `place`, yielding each row of the tables as it is there.
 
-    Rows, pictures and maps are left in `out`; a row that an earlier run made of the same files and settings is taken
-    from there. What cannot be used costs its rows alone, which come back `missing` with the reason. With `is_whole` the
-    videos of Tables 2.1, 2.3 and 2.4 that are not there are such rows, too.
-    Raises InputError for a folder that is no UMCD dataset, StoreError on a full disk, SettingsError for options.
+    `okutama` and `npu` are the folders of the other two datasets. Rows, pictures and maps are left in `out`; a row that
+    an earlier run made of the same files and settings is taken from there. What cannot be used costs its rows alone,
+    which come back `missing` with the reason. With `is_whole` the videos of Tables 2.1, 2.3 and 2.4 that are not there
+    are such rows, too. Raises InputError for a folder that is no such dataset, StoreError on a full disk, SettingsError
+    for options.
     """
     started_s = time.monotonic()
     work = _Work(read_umcd_folder(place), out, settings)
-    tasks = [*work.absent(is_whole), *work.mosaic_tasks(), *work.change_tasks(), *work.detector_tasks(okutama)]
+    tasks = [
+        *work.absent(is_whole), *work.mosaic_tasks(), *work.npu_tasks(npu), *work.change_tasks(),
+        *work.detector_tasks(okutama),
+    ]
     for number, task in enumerate(tasks, start=1):
         row, is_known = work.done(task)
         yield ReproductionUpdate(row, is_known, number, len(tasks), time.monotonic() - started_s)
@@ -112,6 +118,20 @@ class _Work:
             yield self._task("example", first.key, (first,), partial(self._example, first))
         for each in self._chosen(self._dataset.without_telemetry):
             yield from self._tasks_of_map(each, has_telemetry=False)
+
+    def npu_tasks(self, place: Path | None) -> Iterator[_Task]:
+        """Table 4.1 on its own dataset, and the correlation with the mosaics of Bu et al."""
+        sequences = {each.video.key: each for each in read_npu_folder(place)} if place is not None else {}
+        for video in self._chosen([each.video for each in sequences.values()]):
+            yield from self._tasks_of_map(video, has_telemetry=bool(video.texts))
+            mosaic = sequences[video.key].mosaic
+            for method in MAP_METHODS:
+                row_id = f"{PUBLISHED}/{video.key}/{method}"
+                if mosaic is None:
+                    yield _Task(row_id, PUBLISHED, missing=f"{video.video}: no mosaic (.tif) of Bu et al. beside it")
+                    continue
+                make = partial(self._correlate_published, video, mosaic, method)
+                yield _Task(row_id, PUBLISHED, (*_files_of(video), mosaic), make)
 
     def change_tasks(self) -> Iterator[_Task]:
         """Section 4.2: Tables 4.3 to 4.5, the times, Figures 4.4 and 4.5."""
@@ -176,7 +196,8 @@ class _Work:
         return str(path.relative_to(place) if path.is_relative_to(place) else path)
 
     def _look_into(self, each: UmcdVideo, needs_telemetry: bool) -> VideoInput:
-        return video_input(each, self._dataset.camera, needs_telemetry=needs_telemetry)
+        camera = None if each.environment == ENVIRONMENT else self._dataset.camera  # another drone flew those
+        return video_input(each, camera, needs_telemetry=needs_telemetry)
 
     def _site(self, each: UmcdVideo, name: str) -> Path:
         return self._out / "sites" / each.key.replace("/", "-") / name
@@ -205,7 +226,11 @@ class _Work:
 
     def _correlate(self, each: UmcdVideo) -> _Made:
         one, other = (self._mapped(each, method) for method in MAP_METHODS)
-        return {"sequence": each.key, **mosaics.correlation_of(one, other)}, {}
+        return {"sequence": each.key, **mosaics.correlation_of(one, other / "mosaic.tif")}, {}
+
+    def _correlate_published(self, each: UmcdVideo, mosaic: Path, method: str) -> _Made:
+        named = {"sequence": each.key, "method": method}
+        return {**named, **mosaics.correlation_of(self._mapped(each, method), mosaic)}, {}
 
     def _transform(self, each: UmcdVideo, transform: mosaics.Transform) -> _Made:
         if transform == "similarity":

@@ -10,6 +10,8 @@ FIGURE_PX = 960
 """The longer side of a picture in the figures."""
 
 MAP_METHODS = ("thesis", "planar")
+PUBLISHED = "published"
+"""The kind of rows that compare a map with a published mosaic of the NPU Drone-Map dataset."""
 COMPARISONS: dict[str, tuple[Literal["thesis", "robust"], tuple[str, ...]]] = {
     "thesis": ("thesis", ()),
     "thesis, eq. 3.21 as printed": ("thesis", ("eq3.21=printed",)),

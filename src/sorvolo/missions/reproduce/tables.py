@@ -17,7 +17,8 @@ from sorvolo.missions.reproduce.published import (
     TABLE_4_6,
 )
 from sorvolo.missions.reproduce.rows import Row
-from sorvolo.missions.reproduce.settings import COMPARISONS, MAP_METHODS
+from sorvolo.missions.reproduce.settings import COMPARISONS, MAP_METHODS, PUBLISHED
+from sorvolo.store.datasets.npu_folder import ENVIRONMENT
 
 _COUNTS = ("tp", "fp", "fn", "tn")
 
@@ -56,20 +57,29 @@ def _mosaics(rows: Iterable[Row]) -> list[dict[str, Any]]:
 
 
 def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """By method: the mean deviation over its videos; the correlation of the methods' maps, over those that have one."""
+    """By method: the mean deviation over its videos of UMCD; the correlation of the methods' maps with each other, and
+    with the published mosaics of the NPU Drone-Map dataset, over those that have one."""
     found = []
     alike = [row.values["correlation"] for row in rows if row.kind == "correlation"]
     for method in MAP_METHODS:
         shares = [
             row.values["deviation"] for row in rows
             if row.kind == "mosaic" and row.values["method"] == method and row.values["deviation"] is not None
+            and row.values["environment"] != ENVIRONMENT
         ]
-        if shares:
+        published = [
+            row.values["correlation"] for row in rows if row.kind == PUBLISHED and row.values["method"] == method
+        ]
+        if shares or published:
             found.append({
-                "method": method, "videos": len(shares), "deviation": sum(shares) / len(shares),
-                "correlation": sum(alike) / len(alike) if alike else None, "correlated": len(alike),
+                "method": method, "videos": len(shares), "deviation": _mean(shares), "correlation": _mean(alike),
+                "correlated": len(alike), "published_correlation": _mean(published), "published": len(published),
             })
     return found
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return sum(values) / len(values) if values else None
 
 
 def _pooled(rows: Iterable[Row], kind: str) -> list[dict[str, Any]]:

@@ -68,13 +68,21 @@ def read_umcd_folder(place: Path) -> UmcdFolder:
     parts = {name: _folder(place, name) for name in (WITHOUT, WITH, CALIBRATION)}
     mosaicking, changes = (_folder(parts[WITH], name) for name in (MOSAICKING, CHANGES))
     bare = _folder(parts[WITHOUT], MOSAICKING) or parts[WITHOUT]
-    videos, maps, later = (_videos(part) for part in (bare, mosaicking, changes))
+    videos, maps, later = (videos_in(part) for part in (bare, mosaicking, changes))
     if not (videos or maps or later):
         raise InputError(
             f"{place}: not the UMCD dataset: no videos in '{WITHOUT}', nor in '{MOSAICKING}' or '{CHANGES}' of "
             f"'{WITH}' (thesis, chapter 2); give the folder that holds these"
         )
     return UmcdFolder(place, videos, maps, later, _camera(parts[CALIBRATION]))
+
+
+def videos_in(part: Path | None) -> tuple[UmcdVideo, ...]:
+    """All videos in a folder and below it, with the files that belong to each; none of None."""
+    if part is None:
+        return ()
+    found = sorted(path for path in part.rglob("*") if path.suffix.lower() in _VIDEO_ENDINGS and path.is_file())
+    return tuple(_video(path, part) for path in found)
 
 
 def _folder(place: Path | None, name: str) -> Path | None:
@@ -87,13 +95,6 @@ def _folder(place: Path | None, name: str) -> Path | None:
 
 def _letters(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", name.lower())
-
-
-def _videos(part: Path | None) -> tuple[UmcdVideo, ...]:
-    if part is None:
-        return ()
-    found = sorted(path for path in part.rglob("*") if path.suffix.lower() in _VIDEO_ENDINGS and path.is_file())
-    return tuple(_video(path, part) for path in found)
 
 
 def _video(path: Path, part: Path) -> UmcdVideo:

@@ -119,6 +119,13 @@ def _deviations(table: Mapping[str, Any]) -> Sheet:
         )
         for each in table["ours"]
     ]
+    rows += [
+        (
+            f"{each['method']} here, with the mosaics of [17]", f"{each['published']}", "-",
+            f"{percent(each['published_correlation'])} ({counted_videos(each['published'])})",
+        )
+        for each in table["ours"] if each["published"]
+    ]
     columns = ("method", "videos", "deviation from the frames, %", "correlation with another map (eq. 4.1), %")
     title = "Section 4.1.1: how good the mosaics are"
     return Sheet("section_4_1_1", title, columns, tuple(rows), tuple(table["differences"]))
