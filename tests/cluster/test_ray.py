@@ -44,6 +44,7 @@ def cluster() -> Iterator[Any]:
         port = free.getsockname()[1]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        patch.setenv("RAY_CLIENT_RECONNECT_GRACE_PERIOD", "5")  # seconds; 30 of its own
         patch.setenv("RAY_AUTH_MODE", "disabled")  # this cluster is seen by nobody else for a few seconds
         head = {"num_cpus": 0, "include_dashboard": False, "ray_client_server_port": port}
         made = Cluster(initialize_head=True, head_node_args=head)

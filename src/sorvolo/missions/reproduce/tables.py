@@ -59,23 +59,23 @@ def _mosaics(rows: Iterable[Row]) -> list[dict[str, Any]]:
 def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """By method: the mean deviation over its videos of UMCD; the correlation of the methods' maps with each other, and
     with the published mosaics of the NPU Drone-Map dataset, over those that have one."""
+    alike = _values(rows, "correlation", "correlation")
     found = []
-    alike = [row.values["correlation"] for row in rows if row.kind == "correlation"]
     for method in MAP_METHODS:
-        shares = [
-            row.values["deviation"] for row in rows
-            if row.kind == "mosaic" and row.values["method"] == method and row.values["deviation"] is not None
-            and row.values["environment"] != ENVIRONMENT
-        ]
-        published = [
-            row.values["correlation"] for row in rows if row.kind == PUBLISHED and row.values["method"] == method
-        ]
+        own = [row for row in rows if row.values.get("method") == method]
+        shares = _values([row for row in own if row.values.get("environment") != ENVIRONMENT], "mosaic", "deviation")
+        published = _values(own, PUBLISHED, "correlation")
         if shares or published:
             found.append({
                 "method": method, "videos": len(shares), "deviation": _mean(shares), "correlation": _mean(alike),
                 "correlated": len(alike), "published_correlation": _mean(published), "published": len(published),
             })
     return found
+
+
+def _values(rows: Iterable[Row], kind: str, name: str) -> list[float]:
+    """One value of all rows of a kind that have it."""
+    return [row.values[name] for row in rows if row.kind == kind and row.values[name] is not None]
 
 
 def _mean(values: Sequence[float]) -> float | None:
