@@ -16,7 +16,7 @@ test: check $(TRAINS)
 
 check: $(TRAINS)
 	$(BIN)/ruff check
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 	$(BIN)/lint-imports
 
 bench: $(READY)

@@ -2,7 +2,7 @@
 
 import sys
 
-from pybind11.setup_helpers import Pybind11Extension
+from pybind11.setup_helpers import ParallelCompile, Pybind11Extension
 from setuptools import setup
 
 # No -march: the sources choose the processor's instructions at run time. No contraction: the same sums everywhere.
@@ -20,4 +20,5 @@ native = Pybind11Extension(
 )
 native.optional = True  # without a compiler sorvolo works all the same, on kernels/numpy_*.py
 
+ParallelCompile(default=0).install()  # on all cores
 setup(ext_modules=[native])
