@@ -12,7 +12,7 @@ from small_flights import simulate_into, small_flight
 from sorvolo.simulation.settings import OutputSettings
 
 _SMALL = small_flight(
-    31, length_m=30, spacing_m=6, size_px=(480, 270), fps=6, people=1, cars=1, small_objects=2
+    31, length_m=30, spacing_m=6, size_px=(320, 180), fps=6, people=1, cars=1, small_objects=2
 )
 
 
@@ -55,7 +55,7 @@ def keyed(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with av.open(str(flight / "flight1.mp4")) as source, av.open(str(folder / "flight1.mp4"), "w") as target:
         target.metadata.update(source.metadata)
         stream = target.add_stream("libx264", rate=6, options={"crf": "18", "x264-params": "keyint=3:scenecut=0"})
-        stream.width, stream.height = 480, 270
+        stream.width, stream.height = _SMALL.imaging.width_px, _SMALL.imaging.height_px
         for frame in source.decode(video=0):
             frame.pict_type = av.video.frame.PictureType.NONE  # the encoder chooses
             target.mux(stream.encode(frame))

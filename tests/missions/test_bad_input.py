@@ -219,7 +219,7 @@ def test_a_broken_calibration(
     focal = good.partition("<data>")[2].split()[0]
     for text, words in (
         (good.replace(focal, "0.0"), "focal length"),
-        (good.replace("<image_height>270", "<image_height>480"), "480x480"),
+        (good.replace("<image_height>180", "<image_height>320"), "320x320"),
         (good.replace(focal, "nan"), "no number"),
         (good[: len(good) // 2], "broken XML"),
     ):
@@ -331,7 +331,7 @@ def test_water_is_placed_by_gps_alone(photos: Path, photographed: Path, tmp_path
     files = sorted(photos.iterdir())
     for path in files[5:7]:
         with Image.open(path) as image:
-            water = np.clip(rng.normal((40, 90, 120), 2, (270, 480, 3)), 0, 255).astype(np.uint8)
+            water = np.clip(rng.normal((40, 90, 120), 2, (180, 320, 3)), 0, 255).astype(np.uint8)
             Image.fromarray(water).save(path, exif=image.getexif(), xmp=image.info["xmp"], quality=95)
     mapped(tmp_path / "site", photos, "--camera", photographed / "camera.xml", code=3)
     ended = endings(tmp_path / "site")

@@ -49,17 +49,24 @@ _SURVEY = SimulationSettings(
 
 
 @pytest.fixture(scope="module")
-def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A site with one small photo survey."""
+def with_heights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A site with one small photo survey, and heights of it from `map --heights`."""
     folder = tmp_path_factory.mktemp("heights")
     simulate_into(folder / "made", _SURVEY)
     photos = folder / "made" / "flight1" / "photos"
     assert main(["map", str(photos), "--site", str(folder / "site"), "--model", "none", "--heights", "--json"]) == 0
-    made = list((folder / "site").glob("flights/*/heights.tif"))
-    assert made, "map --heights makes heights"
-    for name in ("heights.tif", "terrain.tif", "orthophoto.tif", "heights.json"):
-        (made[0].parent / name).unlink()
+    assert list((folder / "site").glob("flights/*/heights.tif")), "map --heights makes heights"
     return folder / "site"
+
+
+@pytest.fixture(scope="module")
+def mapped(with_heights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same site without its heights."""
+    site = Path(shutil.copytree(with_heights, tmp_path_factory.mktemp("heights") / "site"))
+    (made,) = site.glob("flights/*/heights.tif")
+    for name in ("heights.tif", "terrain.tif", "orthophoto.tif", "heights.json"):
+        (made.parent / name).unlink()
+    return site
 
 
 def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
@@ -102,18 +109,12 @@ def test_more_cells_than_can_be_handled_are_refused_before_the_work_begins(mappe
 
 
 def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:
-    silent = replace(_SURVEY, seed=13, output=replace(_SURVEY.output, telemetry="none"))
+    imaging, path = replace(_SURVEY.imaging, width_px=240, height_px=180), replace(_SURVEY.path, length_m=12, strips=1)
+    silent = replace(_SURVEY, seed=13, imaging=imaging, path=path, output=replace(_SURVEY.output, telemetry="none"))
     simulate_into(tmp_path / "made", silent)
     list(map_flights([tmp_path / "made" / "flight1" / "photos"], tmp_path / "site", MapSettings(model="none")))
     with pytest.raises(InputError, match="no GPS"):
         list(make_heights(tmp_path / "site"))
-
-
-@pytest.fixture(scope="module")
-def with_heights(mapped: Path) -> Path:
-    """The site with heights of its flight."""
-    list(make_heights(mapped, HeightSettings(has_orthophoto=False)))
-    return mapped
 
 
 def _area(site: Path, path: Path) -> Path:
@@ -200,7 +201,7 @@ def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
 @pytest.mark.slow
 def test_brighton_beach_has_heights(tmp_path: Path) -> None:
     photos = real_data("flights/brighton_beach")
-    list(map_flights([photos], tmp_path / "site", MapSettings(model="none")))
+    list(map_flights([photos], tmp_path / "site", MapSettings(model="none", m_per_px=0.2)))  # heights use the photos
     list(make_heights(tmp_path / "site", HeightSettings(cell_m=0.3, has_orthophoto=False)))
     report = json.loads(next((tmp_path / "site").glob("flights/*/heights.json")).read_text())
     assert report["cameras"]["views"] == 18 and report["cameras"]["residual_rms_px"] < 1.5

@@ -249,7 +249,7 @@ def test_a_stream_is_inspected(flight: FilmedFlight) -> None:
     with drone.sent():
         (found,) = inspect_input([drone.address])
     assert (found.kind, found.frames.width_px, found.frames.codec, found.frames.container) == (
-        "video", 480, "h264", "mpegts"
+        "video", 320, "h264", "mpegts"
     )
     assert 1.0 < found.frames.duration_s < 5 and found.telemetry.format == "klv" and found.telemetry.positions > 5
     assert found.telemetry.tie == "the metadata came with the frames"
