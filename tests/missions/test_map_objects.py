@@ -316,6 +316,9 @@ def test_large_photos_wait_for_the_detector_one_by_one(side_px: int, at_once: in
         classes, notices, provider = ("person",), (), "nowhere"
         info = SimpleNamespace(usual_classes=("person",), name="slow")
 
+        def thresholds_for(self, image: ImageRGB, **_: object) -> dict[str, float]:
+            return {"person": 0.5}
+
         def detect(self, image: ImageRGB, **_: object) -> Detections:
             time.sleep(0.01)
             done.append(1)

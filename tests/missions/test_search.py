@@ -42,7 +42,7 @@ class Comparing:
     def rest(self) -> None:
         """There is nothing to give back."""
 
-    def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
+    def thresholds_for(self, picture: ImageRGB, *, from_above: bool = False) -> Mapping[str, float]:
         """The same for all pictures."""
         return self.info.thresholds
 

@@ -162,7 +162,31 @@ def test_what_one_frame_alone_shows_must_be_sure(score: float, count: int) -> No
     frames = [placed(0, 0.0, 0.0), placed(1, 60.0, 0.0)]
     seen = Detections(np.array([[400.0, 200.0, 416.0, 215.0]]), np.array([score]), np.array([2]), CLASSES)
     laid = [each for each in lay_on_ground(seen, frames[0]) if each is not None]
-    assert len(fuse(laid, frames).objects) == count
+    assert len(fuse(laid, frames, {"small object": 0.55}).objects) == count
+
+
+def seen_with(scores: list[float]) -> list[LaidSighting]:
+    """A car in the middle of the survey's first strip, seen with these scores by the frames that show it."""
+    laid: list[LaidSighting] = []
+    for frame in survey()[:10]:
+        box = box_of(frame, "car", 18.0, 2.0, 90.0)
+        if box is not None:
+            seen = Detections(box[None], np.array([scores[len(laid) % len(scores)]]), np.array([1]), CLASSES)
+            laid += [each for each in lay_on_ground(seen, frame) if each is not None]
+    assert len(laid) >= 4
+    return laid
+
+
+def test_weak_views_are_evidence() -> None:
+    """Half of the views score 0.85: with 0.8 in the others it is a car, with 0.3 nothing; neither is a mover."""
+    least = {"car": 0.72}
+    (car,) = fuse(seen_with([0.85, 0.8]), survey()[:10], least).objects
+    assert car.score < 0.82 and car.possible_views == len(car.members)
+    doubtful = fuse(seen_with([0.85, 0.3]), survey()[:10], least)
+    assert doubtful.objects == ()
+    strong = [each for each in seen_with([0.85, 0.3]) if each.sighting.score >= 0.72]
+    assert doubtful.dropped == len(strong)
+    assert fuse(seen_with([0.6]), survey()[:10], least) == Fused((), 0)
 
 
 def test_what_few_frames_saw_is_left_out() -> None:

@@ -15,7 +15,8 @@ class MapObject:
     """One object on the map of one flight.
 
     `id` is the flight's name and a number, "flight1-o3". `label` is the class with the most of the summed scores,
-    `score` that class's mean score where it was seen, `class_scores` the share of each class. `position_m` (2,) east,
+    `score` that of its being there, by all frames that could show it (of what moves the mean where it was seen),
+    `class_scores` the share of each class. `position_m` (2,) east,
     north in the site frame is the middle of its foot; of what moves, where it was last seen. `sigma_m` is the one-sigma
     error of the place per axis, what the whole flight errs in common included; NaN where unknown. `length_m` and
     `width_m` are its longer and shorter side seen from above, NaN on a site without metres. `views` frames saw it of

@@ -24,9 +24,10 @@ class ObjectsOnMap:
 
 def objects_on_map(
     laid: Sequence[LaidSighting], crops: Sequence[bytes], frames: Sequence[PlacedFrame], flight_id: str, *,
-    has_metres: bool,
+    has_metres: bool, least: Mapping[str, float] | None = None,
 ) -> ObjectsOnMap:
-    """Each object once. `crops` are the pictures, JPEG, around each sighting.
+    """Each object once. `crops` are the pictures, JPEG, around each sighting; `least` is the score from which on each
+    class is reported: weaker sightings are evidence only.
 
     Without metres sizes are left out, and so are sightings of a size that their class cannot have beside the cars.
     """
@@ -37,7 +38,7 @@ def objects_on_map(
         )
         kept = np.flatnonzero(~out).tolist()
         laid, crops = [laid[k] for k in kept], [crops[k] for k in kept]
-    fused = fuse(laid, frames)
+    fused = fuse(laid, frames, least)
     flight_sigma_m = _gps_sigma_m(frames)
     sigmas_m = {each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m for each in frames}
     objects = (

@@ -13,14 +13,16 @@ _AROUND = 0.3  # of a plant's sides: so far beside its box the middle of a detec
 
 
 def reported_plants(
-    laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame], boxes_px: Mapping[int, BoxesPx], labels: Sequence[str]
+    laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame], boxes_px: Mapping[int, BoxesPx], labels: Sequence[str],
+    least: Mapping[str, float] | None = None,
 ) -> set[int]:
     """Which plants (rows) are reported as an object of their class, at least half of whose sightings are theirs.
 
-    `boxes_px` has each frame's boxes of the plants, (N, 4), by the frame's index; NaN where a plant is out of sight.
+    `least` as `fuse` takes it. `boxes_px` has each frame's boxes of the plants, (N, 4), by the frame's index; NaN where
+    a plant is out of sight.
     """
     reported: set[int] = set()
-    for each in fuse(laid, frames).objects:
+    for each in fuse(laid, frames, least).objects:
         owners = [_owner(laid[k], boxes_px) for k in each.members]
         known = [owner for owner in owners if owner is not None]
         if known and 2 * len(known) >= len(owners):

@@ -6,19 +6,20 @@ which the drone came by; only what moves is followed through time (`walking`).
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.joining import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
 from sorvolo.tracking.plausible import usual_length_m
+from sorvolo.tracking.view_evidence import EvidenceSettings, score_from_views
 from sorvolo.tracking.walking import Walk, WalkSettings, walks
 
 _TURNS = np.radians(np.arange(0.0, 180.0, 5.0))
@@ -46,11 +47,11 @@ class BodySettings:
 
 @dataclass(frozen=True)
 class StandingSettings:
-    """When enough frames saw an object where it stands."""
+    """When an object stands where frames saw it, and which sightings are of it."""
 
-    least_share: float = 0.3  # of the frames that show its place: what fewer saw does not stand there
-    least_cut_share: float = 0.7  # of both, where those that saw it all cut it and the others would show it whole
-    sure_score: float = 0.8  # from which one sighting alone is reported, where no more than two frames show the place
+    least_score: float = 0.3  # of a class for which none is given
+    standing_share: float = 0.3  # of the frames that show a place: what so many saw there is no part of a way
+    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     matches: MatchSettings = field(default_factory=MatchSettings)
     bodies: BodySettings = field(default_factory=BodySettings)
     walks: WalkSettings = field(default_factory=WalkSettings)
@@ -60,6 +61,7 @@ class StandingSettings:
 class Standing:
     """One object; `members` are the indices of its sightings, in order of time, `best` that of its clearest.
 
+    `score` counts all frames that could show it (`view_evidence`); of what moves it is the mean where it was seen.
     `position_m` (2,) is its foot, where it was last seen if it moves, with `sigma_m`, per axis, against other objects
     of the same map. `size_m` (2,) are the longer and the shorter side, NaN of what the picture's edge always cut.
     `velocity_m_s` (2,) is zero unless it moves. `possible_views` counts the frames that show its place and what stands
@@ -85,35 +87,33 @@ class Standing:
 
 @dataclass(frozen=True)
 class Fused:
-    """All objects, and how many sightings belong to none: seen in too few of the frames that show their place."""
+    """All objects, and how many sightings that are reported belong to none, by the frames that show their place."""
 
     objects: tuple[Standing, ...]
     dropped: int
 
 
 def fuse(
-    laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame], settings: StandingSettings = StandingSettings()
+    laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame], least: Mapping[str, float] | None = None,
+    settings: StandingSettings = StandingSettings(),
 ) -> Fused:
     """The objects that the sightings of these frames show, each once, the surest first.
 
-    What too few of the frames saw that show its place is dropped, unless several such sightings lie on the way of
-    something that walks or drives: that is reported once, as moving.
+    `least` is the score from which on each class is reported. Weaker sightings count as evidence: what all frames that
+    show its place leave below it is dropped, unless several sightings of that score lie on the way of something that
+    walks or drives: that is reported once, as moving.
     """
     if not laid:
         return Fused((), 0)
-    groups = _merged(_gathered(laid, settings.matches), laid, settings.matches)
-    counts = _possible_views(groups, laid, frames)
-    standing, left = [], []
-    for group, possible in zip(groups, counts):
-        if _stands(group, possible, laid, settings):
-            standing.append((group, possible))
-        else:
-            left += group
+    least = least or {}
+    strong = np.array([each.sighting.score >= least.get(each.sighting.label, 0.0) for each in laid])
+    groups = _reported(_merged(_gathered(laid, settings.matches), laid, settings.matches), strong)
+    objects, unlikely = _standing_or_not(groups, laid, frames, least, settings)
+    left = [k for k in unlikely if strong[k]]
     moving = walks([laid[k] for k in left], settings.walks)
-    objects = [_standing(group, laid, possible, settings) for group, possible in standing]
     objects += [_moving([left[k] for k in walk.members], walk, laid) for walk in moving]
-    used = sum(len(each.members) for each in objects)
-    return Fused(tuple(sorted(objects, key=lambda each: -each.score)), len(laid) - used)
+    used = sum(int(strong[list(each.members)].sum()) for each in objects)
+    return Fused(tuple(sorted(objects, key=lambda each: -each.score)), int(strong.sum()) - used)
 
 
 def without_twins(
@@ -354,16 +354,40 @@ def _open_m(group: Sequence[LaidSighting]) -> float:
     return float(np.sqrt(min(np.trace(each.beyond_m2) for each in group) / 2))
 
 
-def _stands(
-    group: Sequence[int], possible: int, laid: Sequence[LaidSighting], settings: StandingSettings
-) -> bool:
-    """Whether enough of the frames that show the place saw it there."""
-    views = len(_frames_of(group, laid))
-    if views < possible and _open_m([laid[k] for k in group]) > 0:
-        return views >= settings.least_cut_share * possible
-    if views == 1:
-        return possible <= 2 and laid[group[0]].sighting.score >= settings.sure_score
-    return views >= settings.least_share * possible
+def _reported(groups: Sequence[list[int]], strong: Mask) -> list[list[int]]:
+    """The groups of which a frame alone would report at least one sighting."""
+    return [group for group in groups if strong[group].any()]
+
+
+def _standing_or_not(
+    groups: Sequence[Sequence[int]], laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame],
+    least: Mapping[str, float], settings: StandingSettings,
+) -> tuple[list[Standing], list[int]]:
+    """The objects that stand, and the sightings of other groups that may be on the way of something that moves."""
+    if not groups:
+        return [], []
+    objects: list[Standing] = []
+    unlikely: list[int] = []
+    for group, possible in zip(groups, _possible_views(groups, laid, frames)):
+        label, score = _score(group, possible, laid, settings.evidence)
+        if score >= least.get(label, settings.least_score):
+            objects.append(_standing(group, laid, possible, score, settings))
+        elif len(_frames_of(group, laid)) < max(2.0, settings.standing_share * possible):
+            unlikely += group
+    return objects, unlikely
+
+
+def _score(
+    group: Sequence[int], possible: int, laid: Sequence[LaidSighting], settings: EvidenceSettings
+) -> tuple[str, float]:
+    """What these sightings show, and the score of its being there: each frame's best score of that class counts."""
+    label, _, _ = _named(group, laid)
+    best: dict[int, float] = {}
+    for k in group:
+        seen = laid[k].sighting
+        if seen.label == label:
+            best[seen.frame_index] = max(seen.score, best.get(seen.frame_index, 0.0))
+    return label, score_from_views(list(best.values()), possible, settings)
 
 
 def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, float, dict[str, float]]:
@@ -379,10 +403,10 @@ def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, f
 
 
 def _standing(
-    members: Sequence[int], laid: Sequence[LaidSighting], possible: int, settings: StandingSettings
+    members: Sequence[int], laid: Sequence[LaidSighting], possible: int, score: float, settings: StandingSettings
 ) -> Standing:
     """One object that stands, from all its sightings."""
-    label, score, shares = _named(members, laid)
+    label, _, shares = _named(members, laid)
     chosen = [laid[k] for k in members]
     whole = [each for each in chosen if not each.is_cut] or chosen
     has_metres = any(each.middle_up_m for each in chosen)

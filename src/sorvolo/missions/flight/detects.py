@@ -28,7 +28,7 @@ class Detects(Protocol):
     def notices(self) -> tuple[Notice, ...]:
         """What a user should know of the pictures seen so far."""
 
-    def thresholds_for(self, picture: ImageRGB) -> Mapping[str, float]:
+    def thresholds_for(self, picture: ImageRGB, *, from_above: bool = False) -> Mapping[str, float]:
         """From which score on each class is reported in a picture (H, W, 3) like this."""
 
     def rest(self) -> None:

@@ -3,7 +3,7 @@
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +26,7 @@ from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import Detections, Sighting
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground
 from sorvolo.tracking.map_objects import objects_on_map
+from sorvolo.tracking.view_evidence import least_seen
 
 NO_MODEL, DEFAULT_MODEL = "none", "default"
 """The model that looks for nothing, and the one that comes with the package."""
@@ -56,12 +57,16 @@ def check_classes(detector: Detects | None, classes: Sequence[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class FrameDetections:
-    """What the detector found in the frame `index`, the crops (JPEG) around the surest, and how long it took."""
+    """What the detector saw in the frame `index`, the crops (JPEG) around it, and how long it took.
+
+    `least` is the score from which on each class is reported; `found` holds weaker detections too, as evidence.
+    """
 
     index: int
     found: Detections
     crops: tuple[bytes, ...]
     seconds: float
+    least: Mapping[str, float]
 
 
 class ObjectFinder:
@@ -92,7 +97,7 @@ class ObjectFinder:
 
     @property
     def sightings(self) -> tuple[Sighting, ...]:
-        """All detections, by the frames' final places, once that is concluded."""
+        """All detections that are reported, by the frames' final places, once that is concluded."""
         return self._sightings
 
     @property
@@ -141,12 +146,19 @@ class ObjectFinder:
                 if each is not None:
                     laid.append(each)
                     crops.append(crop)
-        self._sightings = tuple(each.sighting for each in laid)
-        found = objects_on_map(laid, crops, frames, flight_id, has_metres=has_metres)
+        least = self._least(frames)
+        sightings = (each.sighting for each in laid)
+        self._sightings = tuple(each for each in sightings if each.score >= least[each.label])
+        found = objects_on_map(laid, crops, frames, flight_id, has_metres=has_metres, least=least)
         return ObjectSearch.over(
-            frames, self._detector.info.name, self._classes, found.objects, len(self._seen), len(laid),
+            frames, self._detector.info.name, self._classes, found.objects, len(self._seen), len(self._sightings),
             found.dropped,
         )
+
+    def _least(self, frames: Sequence[PlacedFrame]) -> dict[str, float]:
+        """From which score on each class is reported: where frames of two lights differ, the higher."""
+        of_frames = [self._detector.info.thresholds, *(self._seen[each.index].least for each in frames)]
+        return {name: max(each.get(name, 0.0) for each in of_frames) for name in self._detector.classes}
 
     def _take(self, left: int) -> None:
         """Collect what was seen until so many frames still wait."""
@@ -157,12 +169,14 @@ class ObjectFinder:
 
     def _look(self, frame: Frame, m_per_px: float | None, from_above: bool) -> FrameDetections:
         started_s = time.monotonic()
+        least = self._detector.thresholds_for(frame.image, from_above=from_above)
         found = self._detector.detect(
-            frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes, from_above=from_above
+            frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes, from_above=from_above,
+            least_score=least_seen(least),
         )
         surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
-        return FrameDetections(frame.index, surest, crops, time.monotonic() - started_s)
+        return FrameDetections(frame.index, surest, crops, time.monotonic() - started_s, dict(least))
 
 
 def search_summary(search: ObjectSearch | None, seconds: float, why_not: str = "") -> dict[str, Any]:

@@ -118,7 +118,7 @@ class MapJournal:
         """Note what was detected in a frame."""
         self.file.append(Entry("seen", {
             "index": seen.index, "classes": seen.found.classes, "seconds": seen.seconds,
-            "crops": [len(each) for each in seen.crops],
+            "crops": [len(each) for each in seen.crops], "least": dict(seen.least),
         }, {
             "boxes_px": seen.found.boxes_px, "scores": seen.found.scores, "labels": seen.found.labels,
             "jpegs": array_from_bytes(b"".join(seen.crops)),
@@ -256,7 +256,8 @@ def detections_in(entry: Entry) -> FrameDetections:
     for length in values["crops"]:
         crops.append(jpegs[at : at + int(length)])
         at += int(length)
-    return FrameDetections(int(values["index"]), found, tuple(crops), float(values["seconds"]))
+    least = {str(name): float(score) for name, score in values["least"].items()}
+    return FrameDetections(int(values["index"]), found, tuple(crops), float(values["seconds"]), least)
 
 
 def _check_picture(gray: Any, size: tuple[int, int]) -> None:

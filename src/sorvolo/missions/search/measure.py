@@ -23,6 +23,7 @@ from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
 from sorvolo.tracking.planted import reported_plants
+from sorvolo.tracking.view_evidence import least_seen
 
 _KEEP_OFF_M = 4.0  # plants from what a map shows already
 _MOST_DETECTIONS = 60  # of one frame, as maps take them
@@ -125,6 +126,7 @@ class _Round:
         self._shown = [settings.through_crowns if hidden else 1.0 for hidden in under]
         self._laid: list[LaidSighting] = []
         self._boxes_px: dict[int, BoxesPx] = {}
+        self._least: dict[str, float] = {}
         self.looked = 0
 
     def search(
@@ -140,9 +142,12 @@ class _Round:
                 self._settings.seed + number,
             )
             if any_of(planted.boxes_px):
+                from_above = is_from_above(pose.rotation)
+                least = detector.thresholds_for(planted.image, from_above=from_above)
+                self._least = {name: max(score, self._least.get(name, 0.0)) for name, score in least.items()}
                 found = detector.detect(
                     planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / each.placed.camera.fx_px,
-                    classes=wanted, from_above=is_from_above(pose.rotation),
+                    classes=wanted, from_above=from_above, least_score=least_seen(least),
                 ).surest(_MOST_DETECTIONS)
                 self._boxes_px[each.placed.index] = planted.boxes_px
                 self._laid += [laid for laid in lay_on_ground(found, each.placed) if laid is not None]
@@ -153,7 +158,8 @@ class _Round:
     def reported(self) -> set[int]:
         """Which of the plants a map of these frames would report."""
         placed = [each.placed for each in self._frames]
-        return reported_plants(self._laid, placed, self._boxes_px, [str(each.label) for each in self._things])
+        labels = [str(each.label) for each in self._things]
+        return reported_plants(self._laid, placed, self._boxes_px, labels, self._least)
 
 
 def _looks(frames: Sequence[SearchFrame]) -> tuple[list[FrameLight], list[FrameLook]]:
