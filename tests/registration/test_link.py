@@ -1,11 +1,21 @@
 """Links: right to a fraction of a pixel where two views share ground, a reason in words where they do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pictured import HEIGHT, WIDTH, ground, keyframe, photographed, placed
 
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link, refine
+from sorvolo.simulation.flight import simulate_flight
+from sorvolo.simulation.settings import (
+    ImagingSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SimulationSettings,
+)
 from sorvolo.survey.mosaic import Link, NoLink
 
 SCENE = ground(1)
@@ -87,6 +97,28 @@ def test_bare_sand_links():
 
 def placed_off(new_from_old: np.ndarray, off_px: float) -> np.ndarray:
     return np.array([[1, 0, off_px], [0, 1, -off_px / 2], [0, 0, 1.0]]) @ new_from_old
+
+
+def test_faint_sand_under_noise_links_by_learned_features():
+    """Half of each picture is shared, three gray levels of texture under nine of noise: all else fails."""
+    flight = simulate_flight(SimulationSettings(
+        seed=7104, flights=1, scene=SceneSettings("sand", 0, 0, 0, has_scenery=False),
+        path=PathSettings(height_m=25, length_m=22, strips=1),
+        imaging=ImagingSettings(width_px=640, height_px=480, distortion=(0.0,) * 5, noise=9.0),
+        output=OutputSettings(photos=True, photo_overlap=0.5),
+    ))
+    site_from = [site_from_image_homography(flight.camera, pose) for pose in flight.true_poses[:2]]
+    truth = np.linalg.inv(site_from[1]) @ site_from[0]
+    old, new = (
+        replace(keyframe(number, flight.frame(number).image), camera=flight.camera) for number in (0, 1)
+    )
+    turned = truth @ np.linalg.inv(placed(240, 180)) @ placed(245, 170, turn_deg=3, scale=1.04)  # as a compass errs
+    prediction, settings = LinkPrediction(turned, 60.0), LinkSettings()
+    found = link(new, old, prediction, settings, LinkCache(settings.features))
+    assert isinstance(found, Link)
+    assert median_miss_px(found, truth) < 2.0 and found.sigma_px > 0.3
+    elsewhere = LinkPrediction(placed_off(truth, 200), 40.0)
+    assert isinstance(link(new, old, elsewhere, settings, LinkCache(settings.features)), NoLink)
 
 
 @pytest.mark.parametrize("off_px", [0.0, 2.0, 4.0])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.registration.features import FeatureSettings, corners, sift_features
+from sorvolo.registration.learned import learned_features, match_learned
 from sorvolo.registration.matching import match
 from sorvolo.registration.robust import fit_homography, is_believable
 from sorvolo.survey.mosaic import Features, Keyframe, Link, NoLink
@@ -29,6 +30,7 @@ class LinkSettings:
     refine_reach_px: float = 8.0  # a refined point may leave the first fit by this much
     max_pairs: int = 40  # pairs kept per link, spread over the overlap
     min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit
+    least_learned: float = 0.35  # share of learned pairs that agree, for them to link by themselves
     most_shared: float = 0.4  # of a picture: what is known to share less is searched with SIFT there alone
 
 
@@ -51,6 +53,7 @@ class LinkCache:
         self._settings, self._capacity = settings, capacity
         self._corners: dict[int, PointsPx] = {}
         self._sift: dict[int, Features] = {}
+        self._learned: dict[int, Features] = {}
 
     def corners(self, keyframe: Keyframe) -> PointsPx:
         """Well-textured points of the keyframe, (N, 2)."""
@@ -70,6 +73,13 @@ class LinkCache:
             _trim(self._sift, self._capacity)
         return self._sift[keyframe.id]
 
+    def learned(self, keyframe: Keyframe) -> Features:
+        """The keyframe's learned features."""
+        if keyframe.id not in self._learned:
+            self._learned[keyframe.id] = learned_features(keyframe.gray)
+            _trim(self._learned, self._capacity)
+        return self._learned[keyframe.id]
+
 
 class Effort(StrEnum):
     """Which fits `link` tries, for a caller with several pictures to ask: the dear ones cost fifty times the cheap."""
@@ -86,8 +96,9 @@ def link(
     """How `new` fits `old`.
 
     Fits are tried from cheap to dear: a tight prediction as it is, ORB, then SIFT, then, where a prediction exists,
-    correlation of the images laid over each other as predicted. The first believable one is refined to sub-pixel
-    pairs (Lucas-Kanade on the old image warped into the new one) and must make the overlaid images correlate.
+    correlation of the images laid over each other as predicted, and learned features. The first believable one is
+    refined to sub-pixel pairs (Lucas-Kanade on the old image warped into the new one) and must make the overlaid images
+    correlate; where it cannot be, pairs of SIFT and learned features of which enough agree are a link as they are.
     """
     reason = "too few matching points"
     for found in _candidates(new, old, prediction, settings, cache, effort):
@@ -114,26 +125,34 @@ def _candidates(
     new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache,
     effort: Effort,
 ) -> Iterator[_Fit]:
-    nothing = np.zeros((0, 2))
     if effort is not Effort.DEAR:
         if prediction is not None and prediction.is_tight:
-            yield _Fit(prediction.new_from_old, nothing, nothing)
+            yield _Fit(prediction.new_from_old, np.zeros((0, 2)), np.zeros((0, 2)))
         fitted = _fit(new.features, old.features, prediction, settings)
         if fitted is not None:
             yield fitted
-    if effort is Effort.CHEAP:
-        return
+    if effort is not Effort.CHEAP:
+        yield from _dear_candidates(new, old, prediction, settings, cache)
+
+
+def _dear_candidates(
+    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+) -> Iterator[_Fit]:
+    """SIFT where a shared part is known, SIFT of all (the prediction may have been wrong), what a prediction allows."""
     shared = _shared_sift(new, old, prediction, settings, cache)
-    fitted = _fit(*shared, prediction, settings) if shared is not None else None
+    if shared is not None and (fitted := _fit(*shared, prediction, settings)) is not None:
+        yield fitted
+    fitted = _fit(cache.sift(new), cache.sift(old), prediction, settings)
     if fitted is not None:
         yield fitted
-    fitted = _fit(cache.sift(new), cache.sift(old), prediction, settings)  # the prediction may have been wrong
+    if prediction is None:
+        return
+    shifted = _correlate(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
+    if shifted is not None:
+        yield _Fit(shifted, np.zeros((0, 2)), np.zeros((0, 2)))
+    fitted = _fit_learned(new, old, prediction, settings, cache)
     if fitted is not None:
         yield fitted
-    if prediction is not None:
-        shifted = _correlate(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
-        if shifted is not None:
-            yield _Fit(shifted, nothing, nothing)
 
 
 def _fit(
@@ -149,6 +168,37 @@ def _fit(
         return None
     agree = found[1]
     return _Fit(found[0], new_px[agree], old_px[agree], is_sub_pixel=new.kind == "sift" and agree.mean() > 0.25)
+
+
+def _fit_learned(
+    new: Keyframe, old: Keyframe, prediction: LinkPrediction, settings: LinkSettings, cache: LinkCache
+) -> _Fit | None:
+    """By learned features of the old picture laid as predicted: they bear faint ground and noise, but no turn."""
+    size = (new.gray.shape[1], new.gray.shape[0])
+    laid = np.asarray(cv2.warpPerspective(old.gray, prediction.new_from_old, size, borderValue=128), np.uint8)
+    seen = cv2.warpPerspective(np.full(old.gray.shape, 255, np.uint8), prediction.new_from_old, size)
+    seen = cv2.erode(seen, np.ones((9, 9), np.uint8))
+    theirs = learned_features(laid)
+    at = theirs.points_px.astype(int)
+    inside = seen[at[:, 1], at[:, 0]] > 0
+    theirs = Features(theirs.kind, theirs.points_px[inside], theirs.descriptors[inside])
+    ours = cache.learned(new)
+    pairs = match_learned(ours, theirs, np.eye(3), prediction.search_px)
+    if len(pairs) < settings.min_inliers:
+        return None
+    new_px, laid_px = ours.points_px[pairs[:, 0]], theirs.points_px[pairs[:, 1]]
+    found = fit_homography(new_px, laid_px, settings.threshold_px)
+    if found is None or found[1].sum() < settings.min_inliers:
+        return None
+    agree = found[1]
+    old_px = apply_homography(np.linalg.inv(prediction.new_from_old), laid_px[agree])
+    is_sure = agree.mean() > settings.least_learned and _are_spread(new_px[agree], size)
+    return _Fit(found[0] @ prediction.new_from_old, new_px[agree], old_px, is_sub_pixel=bool(is_sure))
+
+
+def _are_spread(points_px: PointsPx, size: tuple[int, int]) -> bool:
+    """Whether points span enough of a picture to hold it."""
+    return bool((points_px.std(axis=0) > 0.05 * np.array(size)).all())
 
 
 def _shared_sift(
