@@ -53,7 +53,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("objects") / "simulated"
     settings = replace(
         small_flight(
-            5, speed_m_s=6, length_m=24, spacing_m=6, size_px=(480, 270), fps=4, noise_m=0.2,
+            5, speed_m_s=6, length_m=24, spacing_m=6, size_px=(320, 180), fps=4, noise_m=0.2,
             people=3, cars=3, small_objects=3, output=OutputSettings(truth_step=1),
         ),
         flights=2,

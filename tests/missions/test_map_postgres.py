@@ -27,7 +27,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
         demo, flights=2,
         scene=replace(demo.scene, people=0, cars=1, small_objects=4, has_scenery=False),
         path=replace(demo.path, length_m=16, strips=1),
-        imaging=replace(demo.imaging, width_px=480, height_px=270, fps=4),
+        imaging=replace(demo.imaging, width_px=320, height_px=180, fps=4),
     )
     return simulate_into(folder, settings)
 

@@ -30,7 +30,7 @@ def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A filmed flight whose log turns the compass by 7 degrees, lags by 0.4 s, and is 6 m too high."""
     folder = tmp_path_factory.mktemp("faulty") / "flight"
     settings = small_flight(
-        77, height_m=30, length_m=40, spacing_m=9, size_px=(480, 360), fps=6, output=OutputSettings(telemetry="csv")
+        77, height_m=30, length_m=40, spacing_m=9, size_px=(320, 240), fps=6, output=OutputSettings(telemetry="csv")
     )
     settings = replace(settings, sensor=replace(settings.sensor, clock_offset_s=CLOCK_S))
     simulate_into(folder, settings)
