@@ -13,6 +13,8 @@ from sorvolo.change.evidence.announcing import AnnounceSettings, Reason
 from sorvolo.change.evidence.candidate import Candidate, KeptView
 from sorvolo.change.evidence.cells import CellWindow, LaidView
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.shape.outlines import Measures
+from sorvolo.change.shape.place_sigma import area_sigma_m, thing_sigma_m
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import Change, ChangeKind
 
@@ -380,4 +382,10 @@ def test_what_came_during_the_flight_counts_unless_relief_explains_it():
 def test_sigma_knows_that_a_thing_seen_from_aside_leans():
     above, aside = Thing(0, 0), Thing(0, 3.4)
     first, second = (collect(flight([each]))[0].conclude()[0] for each in (above, aside))
-    assert 0.03 < first.sigma_m < 0.08 < second.sigma_m < 0.3
+    assert 0.04 < first.sigma_m < 0.08 < second.sigma_m < 0.3
+
+
+def test_sigma_knows_that_a_thin_outline_holds_a_part_of_a_shadow():
+    car, with_shadow = Measures(8.0, 4.5, (0.0, 0.0)), Measures(0.66, 1.9, (0.0, 0.0))
+    assert thing_sigma_m(car) < 0.03 and 0.3 < thing_sigma_m(with_shadow) < 0.6
+    assert area_sigma_m(Measures(1000.0, 200.0, (0.0, 0.0))) == pytest.approx(6.0)
