@@ -45,8 +45,6 @@ model: $(TRAINS)
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model --steps $(STEPS) \
 	  $(if $(START),--start $(START),--weights $(LITE0))
 	$(BIN)/python benchmarks/pack_default_model.py build/model/weights.pt $(DATA) --steps $(STEPS) --out $(AERIAL)
-	$(BIN)/python benchmarks/pack_int8_model.py $(DATA) --home $(AERIAL)
-	cp $(AERIAL)/default-int8.* src/sorvolo/detection/data/
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model/thermal --steps $(THERMAL_STEPS) \
 	  --thermal --start $(AERIAL)/default.onnx --simulated build/model/simulated
 	$(BIN)/python benchmarks/pack_thermal_model.py build/model/thermal/weights.pt $(DATA) --steps $(THERMAL_STEPS)
@@ -54,6 +52,7 @@ model: $(TRAINS)
 	  --aerial $(AERIAL)/default.onnx
 	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
 	  --aerial $(AERIAL)/default.onnx
+	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
 
 # The libraries of the station's page, from npm, with their hashes and licences (needs npm; an install does not).
 page-vendor:

@@ -121,6 +121,18 @@ def test_convolutions_of_the_head_before_a_fully_connected_layer_are_whole_numbe
     assert len(found) >= 2
 
 
+def test_a_leaky_unit_carries_features_on(model: Path, tmp_path: Path) -> None:
+    """NanoDet's convolutions are followed by such units: in eight bits as those with plain ones."""
+    own = onnx.load_model(model)
+    units = [node for node in own.graph.node if node.op_type == "Relu"]
+    assert units
+    for node in units:
+        node.op_type = "LeakyRelu"
+    onnx.save(own, tmp_path / "leaky.onnx")
+    made = quantise(tmp_path / "leaky.onnx", _pictures(8), weight_bits=7)
+    assert (made.convolutions, made.of) == (2, 3)
+
+
 def test_parts_that_are_named_stay_in_float(model: Path) -> None:
     packaged = find_model("thermal")
     whole = quantise(packaged, _pictures(8))

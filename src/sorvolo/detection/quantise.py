@@ -21,7 +21,8 @@ LEAST_PICTURES = 8
 """With fewer pictures the ranges of the numbers are a matter of chance."""
 
 _CARRIERS = frozenset({
-    "Conv", "Relu", "Clip", "Add", "Concat", "MaxPool", "AveragePool", "Resize", "RoiAlign", "ReduceMean",
+    "Conv", "Relu", "LeakyRelu", "Clip", "Add", "Concat", "MaxPool", "AveragePool", "Resize", "RoiAlign",
+    "ReduceMean",
 })
 # carry features on, but one interpolates at places that eight bits cannot name, the other means away their rounding
 _FLOAT = frozenset({"RoiAlign", "ReduceMean"})
