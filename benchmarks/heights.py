@@ -1,12 +1,13 @@
 """Heights and true orthophotos: how right they are on simulated sites with houses, and what a real flight costs.
 
-python benchmarks/heights.py [--seeds 301] [--flight DATA/flights/brighton_beach] [--colmap cameras.json]
+python benchmarks/heights.py [--seeds 301] [--relief 8 --output results/heights_relief.json] [--flight DATA/flights/brighton_beach] [--colmap cameras.json]
 
 Simulated: three strips of photos over a site with houses and trees, GPS noise 0.3 m; mapped, then heights. What all GPS
 fixes err in common is taken out: in height by the median, on the ground by the median shift of patches of bare ground
 against the simulator's own picture from above (phase correlation). Then: error of bare ground and of roofs (away from
 edges), also with the tilt out that GPS fixes leave, the share of cells within 2 sigma, and how far roofs lie from their
-place in the flat map and in the true orthophoto. In pixels of the map.
+place in the flat map and in the true orthophoto. In pixels of the map. With --relief the site lies on hills so many
+metres high.
 Real: seconds of the processor and memory of `sorvolo map` and `sorvolo heights`, each a process of its own, and, with
 the cameras of COLMAP (benchmarks/peers.py writes them), the distance of cameras after the best similarity.
 Written to results/heights.json.
@@ -34,6 +35,7 @@ from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.simulation.flight import simulate_flights
 from sorvolo.simulation.objects import Label
+from sorvolo.simulation.relief import Relief
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -42,7 +44,7 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.simulation.truth import surface_heights
+from sorvolo.simulation.truth import ground_heights, surface_heights
 from sorvolo.simulation.view import map_view
 from sorvolo.simulation.world import orthophoto
 from sorvolo.store.site.archive import Archive
@@ -62,6 +64,7 @@ def main() -> None:
     """Measure and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="*", default=[], help="without: two that nobody has scored")
+    parser.add_argument("--relief", type=float, default=0.0, help="of hills under the sites, m")
     parser.add_argument("--flight", type=Path, nargs="*", default=[])
     parser.add_argument("--colmap", type=Path)
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -70,16 +73,17 @@ def main() -> None:
     seeds = seeds_or_drawn("heights", options.seeds, 2)
     if not options.seeds:
         result |= note_scoring(f"heights, seeds {seeds}")
-    result["simulated"] = {str(seed): simulated(seed) for seed in seeds}
+    result["relief_m"] = options.relief
+    result["simulated"] = {str(seed): simulated(seed, options.relief) for seed in seeds}
     result["real"] = {folder.name: real(folder, options.colmap) for folder in options.flight}
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
 
 
-def simulated(seed: int) -> dict[str, Any]:
+def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
     """One simulated site: errors of heights, and of roofs in both pictures."""
-    settings = replace(_SURVEY, seed=seed)
+    settings = replace(_SURVEY, seed=seed, scene=replace(_SURVEY.scene, relief_m=relief_m))
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         for _ in simulate_site(folder / "made", settings):
@@ -96,7 +100,7 @@ def simulated(seed: int) -> dict[str, Any]:
         ground = orthophoto(day)
         size = tuple(int(side / _M_PER_PX) for side in ground.area.size_m)
         view = map_view(ground.area.west_m, ground.area.north_m, (_M_PER_PX, _M_PER_PX), size)
-        true = surface_heights(day.things, day.bodies, view)
+        true = surface_heights(day.things, day.bodies, view, day.relief) - ground_heights(view, day.relief)
         houses = [thing for thing in day.things if thing.label is Label.HOUSE]
         paths = {
             "flat": folder / "site" / "mosaic.tif", "true": folder / "site" / "flights" / flight / "orthophoto.tif",
@@ -110,7 +114,7 @@ def simulated(seed: int) -> dict[str, Any]:
         return {
             "photos": report["cameras"]["views"], "m_per_px": m_per_px, "cell_m": report["cell_m"],
             "common_px": {name: each.tolist() for name, each in common_px.items()},
-            **_height_errors(field, true, view, moved_m, m_per_px),
+            **_height_errors(field, true, view, moved_m, m_per_px, day.relief),
             "roofs": _roofs(pictures, houses, shift_m, bare, bare_px, field),
             "holes_share": report["surface"]["holes_share"], "seconds": report["seconds"],
         }
@@ -124,11 +128,14 @@ def _site_shift(archive: Archive, settings: SimulationSettings) -> np.ndarray:
     return -place[0, :2]
 
 
-def _height_errors(field: HeightField, true: Any, view: Any, shift_m: Any, m_per_px: float) -> dict[str, float]:
+def _height_errors(
+    field: HeightField, true: Any, view: Any, shift_m: Any, m_per_px: float, relief: Relief
+) -> dict[str, float]:
     points = field.lattice.points_m().reshape(-1, 2)
     at = _true_at(true, view, points + shift_m).reshape(field.up_m.shape)
     bare = np.isfinite(field.up_m) & (at == 0)
-    off = field.up_m - at - np.median(field.up_m[bare])
+    off = field.up_m - at - relief.up_m(points + shift_m).reshape(at.shape)
+    off -= np.median(off[bare])
     level = _without_tilt(points.reshape(*bare.shape, 2), off, bare)
     known = np.isfinite(off)
     around = np.ones((9, 9), np.uint8)
