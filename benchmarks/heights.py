@@ -1,6 +1,7 @@
 """Heights and true orthophotos: how right they are on simulated sites with houses, and what a real flight costs.
 
-python benchmarks/heights.py [--seeds 301] [--relief 8 --output results/heights_relief.json] [--flight DATA/flights/brighton_beach] [--colmap cameras.json]
+python benchmarks/heights.py [--seeds 301] [--flight DATA/flights/brighton_beach] [--colmap cameras.json]
+python benchmarks/heights.py --relief 8 --output benchmarks/results/heights_relief.json
 
 Simulated: three strips of photos over a site with houses and trees, GPS noise 0.3 m; mapped, then heights. What all GPS
 fixes err in common is taken out: in height by the median, on the ground by the median shift of patches of bare ground
