@@ -138,6 +138,23 @@ def test_cameras_are_solved_from_pictures(survey) -> None:
     assert any("fit each other in space to 0.60 px only" in each for each in camera_warnings(loose))
 
 
+def test_a_map_that_leans_on_a_slope_does_not_tilt_the_heights(survey) -> None:
+    """A level map of a slope turns all cameras alike and puts them up and down: the fixes decide, not they."""
+    views, pictures = survey
+    lean = rotation_from_vector(np.array([[0.0, np.radians(6), 0.0]]))[0]
+    off = [
+        replace(view, site_from_camera=Pose(
+            lean @ view.site_from_camera.rotation, [*view.site_from_camera.translation_m, 0, 0, 1.2 * (number % 3 - 1)]
+        )) for number, view in enumerate(views)
+    ]
+    solved = solve_cameras(off, lambda number: pictures[number])
+    axes = np.array([
+        (view.site_from_camera.rotation - true.site_from_camera.rotation)[:, 2]
+        for view, true in zip(solved.views, views, strict=True)
+    ])
+    assert np.degrees(np.linalg.norm(axes.mean(axis=0))) < 1.0
+
+
 def test_one_strip_is_named_as_weak(survey) -> None:
     views, pictures = survey
     solved = solve_cameras(views[:4], lambda number: pictures[number])

@@ -57,12 +57,16 @@ def solve_cameras(
             f"only {int(held.sum())} of {len(views)} photos share enough points for heights, 3 were needed; "
             "fly with at least 70 % overlap along and 60 % across the strips"
         )
+    # the attitudes lean alike on a slope: N of them know no more of its tilt than one
+    alike_deg = settings.adjustment.attitude_sigma_deg * float(np.sqrt(len(views)))
+    settings = replace(settings, adjustment=replace(settings.adjustment, attitude_sigma_deg=alike_deg))
     priors = _priors(views, settings)
     scene = _first(views, tracks)
     for limit_px in (*settings.rejected_px, None):
         scene = adjust(scene, priors, settings.adjustment)
         if limit_px is not None:
             scene = scene.keeping(_fitting(scene, limit_px))
+            priors = _reweighed(scene, priors, settings)
     return _solved(views, scene, priors, held, settings)
 
 
@@ -100,6 +104,24 @@ def _priors(views: Sequence[View], settings: CameraSettings) -> Priors:
     spread = 1.4826 * np.nanmedian(np.abs(miss - middle), axis=0)
     sigmas = np.broadcast_to(np.maximum(spread, settings.least_sigma_m), fixes.shape)
     return Priors(fixes + middle, sigmas, rotations)
+
+
+def _reweighed(scene: Scene, priors: Priors, settings: CameraSettings) -> Priors:
+    """The fixes weighed by how they scatter about the cameras in space, what these may lean or stretch left out.
+
+    The map's own cameras, which `_priors` begins with, are off in height where the ground is not level.
+    """
+    miss = scene.centres_m - priors.fixes_m
+    known = np.asarray(np.isfinite(miss).all(axis=1))
+    if known.sum() < 2 * 3:
+        return priors
+    terms = np.column_stack([scene.centres_m[known, :2], np.ones(known.sum())])
+    terms[:, :2] -= terms[:, :2].mean(axis=0)
+    left = miss[known] - terms @ np.linalg.lstsq(terms, miss[known], rcond=None)[0]
+    freedom = len(left) / (len(left) - 3)
+    spread = 1.4826 * np.median(np.abs(left), axis=0) * np.sqrt(freedom)
+    sigmas = np.broadcast_to(np.maximum(spread, settings.least_sigma_m), miss.shape)
+    return replace(priors, sigmas_m=sigmas)
 
 
 def _solved(
