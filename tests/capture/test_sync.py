@@ -274,6 +274,13 @@ def test_a_take_off_in_the_telemetry_shows_the_ground():
     assert notices == () and "begins" in track.height_words
 
 
+def test_how_far_a_flight_climbs_after_its_first_frames_is_known():
+    heights = np.concatenate([np.linspace(80, 92, 7), np.full(14, 140.0)])
+    track, _ = track_of(straight(ONE_HZ, orthometric_height_m=heights))
+    assert track.climb_after_m([0.0, 1.0, 2.0, 3.0]) == pytest.approx(140 - 83)
+    assert track.climb_after_m([12.0, 15.0]) == track.climb_after_m([]) == 0.0
+
+
 def test_a_height_of_zero_is_not_believed():
     track, notices = track_of(straight(ONE_HZ, height_above_takeoff_m=0.0))
     assert [each.code for each in notices] == ["height_of_zero", "height_unknown"]

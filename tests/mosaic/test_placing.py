@@ -33,6 +33,8 @@ def test_a_picture_is_laid_where_its_corners_are():
 def test_a_map_is_as_fine_as_the_survey_and_not_as_the_climb_before_it():
     assert map_m_per_px([20.1, 19.8, 20.4, 19.9], 1000.0) == 0.02
     assert map_m_per_px([0.2, 0.3, 2.0, 6.0, 11.0, 20.1, 19.8], 1000.0) == pytest.approx(0.02, rel=0.05)
+    assert map_m_per_px([1.0, 2.0, 3.0, 4.0], 1000.0, climb_m=18.0) == pytest.approx(0.0205)
+    assert map_m_per_px([20.1, 19.8, 20.4, 19.9], 1000.0, climb_m=0.4) == 0.02
 
 
 def test_a_picture_that_sees_the_horizon_is_not_laid():

@@ -1,5 +1,6 @@
 """Frames and telemetry on one clock: the tie, telemetry at a frame's time, the offset that motion shows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -139,6 +140,14 @@ class Track:
     def counts_from_takeoff(self) -> bool:
         """Whether heights are those above take-off, wherever in the world that is."""
         return self.height_words.startswith("above take-off")
+
+    def climb_after_m(self, seconds: Sequence[float]) -> float:
+        """By how much its usual height is above that at these seconds of the frames' clock; 0 where one is unknown."""
+        known = np.isfinite(self.up_m)
+        if not known.any() or not len(seconds):
+            return 0.0
+        then_m = np.interp(seconds, self.sample_s[known], self.up_m[known])
+        return float(np.median(self.up_m[known]) - np.median(then_m))
 
     def prior(self, time_s: float, *, smooth_s: float = 0.0) -> CameraPrior:
         """The camera's position and attitude from telemetry at `time_s` on the frames' clock.

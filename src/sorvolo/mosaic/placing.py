@@ -43,10 +43,12 @@ def sees_horizon(camera: Camera, prior: CameraPrior) -> bool:
     return bool(np.degrees(np.arcsin(down.min())) < _HORIZON_MARGIN_DEG)
 
 
-def map_m_per_px(heights_m: Sequence[float], focal_px: float) -> float:
+def map_m_per_px(heights_m: Sequence[float], focal_px: float, climb_m: float = 0.0) -> float:
     """The ground sampling distance of pictures taken from these heights, to three digits: a new map's.
 
-    The first pictures may show the climb from the ground: then the highest so far are nearest to the flight's height.
+    The first pictures may show the climb from the ground. Then the flight's height counts: `climb_m` above that of
+    these pictures, as far as telemetry states it, or else that of the highest so far.
     """
     usual_m, high_m = np.percentile(heights_m, [50, 90])
+    high_m = max(high_m, usual_m + climb_m)
     return float(f"{(high_m if high_m > _CLIMBING * usual_m else usual_m) / focal_px:.3g}")

@@ -272,7 +272,10 @@ class PlanarRun(FlightRun):
         if self._setup.track is None and not self._setup.is_placed_late:
             return _LOCAL_M_PER_PX
         heights = [float(self._mapper.pose(each).translation_m[2]) for each in self._mapper.placed()]
-        return map_m_per_px(heights, self._refined(self._lens.camera).fx_px)
+        telemetry = self._setup.telemetry
+        seconds = [self._setup.seconds(time_ns) for time_ns in self._times_ns.values()]
+        climb_m = 0.0 if telemetry is None else telemetry.track.climb_after_m(seconds)
+        return map_m_per_px(heights, self._refined(self._lens.camera).fx_px, climb_m)
 
     def _refined(self, camera: Camera) -> Camera:
         return refined_camera(camera, self._mapper.focal_scale, self._mapper.radial)
