@@ -144,7 +144,8 @@ def test_a_map_that_leans_on_a_slope_does_not_tilt_the_heights(survey) -> None:
     lean = rotation_from_vector(np.array([[0.0, np.radians(6), 0.0]]))[0]
     off = [
         replace(view, site_from_camera=Pose(
-            lean @ view.site_from_camera.rotation, [*view.site_from_camera.translation_m, 0, 0, 1.2 * (number % 3 - 1)]
+            lean @ view.site_from_camera.rotation,
+            view.site_from_camera.translation_m + np.array([0.0, 0.0, 1.2 * (number % 3 - 1)]),
         )) for number, view in enumerate(views)
     ]
     solved = solve_cameras(off, lambda number: pictures[number])
