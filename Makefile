@@ -1,4 +1,5 @@
-# make demo: a map of a simulated flight. make test: what has to pass. Both make their own environment in .venv.
+# make demo: a map of a simulated flight. make test: what has to pass, in 15 minutes; make test-long: seven tests of
+# much work beside it. They make their own environment in .venv.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -6,13 +7,16 @@ READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
 SEEDS ?=  # of the flights that `make bench` simulates; else drawn from the commit
 
-.PHONY: demo test check bench model page-vendor wheel docs
+.PHONY: demo test test-long check bench model page-vendor wheel docs
 
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
 
 test: check $(TRAINS)
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not long"
+
+test-long: $(TRAINS)
+	$(BIN)/python -m pytest -m long
 
 check: $(TRAINS)
 	$(BIN)/ruff check

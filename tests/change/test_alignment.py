@@ -177,6 +177,7 @@ def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(tiles, yaw_o
     assert error_px(found, pose) * 30 / CAMERA.fx_px < 0.6  # m
 
 
+@pytest.mark.long
 def test_neighbours_hold_a_frame_of_ground_that_hardly_stayed(tiles):
     reference = ReferenceMap(tiles, SITE_GRID.grid)
     aligner, alone_px, beside_px = Aligner(reference, SITE_GRID), [], []
@@ -302,6 +303,7 @@ def test_a_frame_without_gps_is_placed_beside_one_that_was_on_rebuilt_ground(til
     assert isinstance(alone, NotAligned)
 
 
+@pytest.mark.long
 def test_one_strip_that_is_not_found_does_not_lose_the_flight(tiles):
     """Photos of other ground between two strips: those before and after are placed as if it had not been."""
     along, ground = aligner(tiles), rebuilt(0.3)

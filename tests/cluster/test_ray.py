@@ -243,6 +243,7 @@ def _held_missions(cluster: Any) -> list[int]:
     raise AssertionError("no mission runs")
 
 
+@pytest.mark.long
 def test_a_head_that_dies_ends_the_batch_and_the_same_command_goes_on(
     cluster: Any, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -121,6 +121,7 @@ def test_a_sampling_distance_of_nan_is_one_that_is_not_known(detector: Detector,
         assert unsaid.names == nan.names and len(nan) == 3
 
 
+@pytest.mark.long
 def test_a_picture_of_a_hundred_megapixels_is_searched_to_its_last_corner(detector: Detector) -> None:
     boxes = [(0, 0, 30, 40), (6380, 4400, 6420, 4450), (11960, 8970, 12000, 9000)]
     picture = draw((9000, 12000), boxes)

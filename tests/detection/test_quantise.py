@@ -133,6 +133,7 @@ def test_a_leaky_unit_carries_features_on(model: Path, tmp_path: Path) -> None:
     assert (made.convolutions, made.of) == (2, 3)
 
 
+@pytest.mark.long
 def test_parts_that_are_named_stay_in_float(model: Path) -> None:
     packaged = find_model("thermal")
     whole = quantise(packaged, _pictures(8))

@@ -69,6 +69,7 @@ def test_a_tuned_model_knows_at_once_what_its_beginning_knew(
     assert report["weights"] == "the model squares" and report["export"]["good"]
 
 
+@pytest.mark.long
 def test_a_tuned_run_goes_on_from_its_own_model_only(learnt: Path, tuned: Path, data: Path, tmp_path: Path) -> None:
     out = shutil.copytree(tuned, tmp_path / "out")
     command = ["train", str(data), "--out", str(out), "--steps", "3", *_BRIEFLY]
@@ -91,6 +92,7 @@ def test_new_classes_are_learnt_from_the_beginning_and_reported(
     assert Detector.load(out / "model.onnx").classes == ("car", "boat")
 
 
+@pytest.mark.long
 def test_the_four_steps_begin_from_a_model_too(learnt: Path, data: Path, tmp_path: Path) -> None:
     command = ["train", str(data), "--out", str(tmp_path / "out"), "--weights", str(learnt), "--steps", "4", *_BRIEFLY]
     assert main([*command, "--schedule", "four-steps"]) == 0
