@@ -8,13 +8,13 @@ import numpy as np
 
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import ImageGray, Mask, Matrix3, PointsM, PointsPx, Vector3
+from sorvolo.geometry.arrays import ImageGray, Matrix3, PointsM, PointsPx, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.registration.camera_fit import CameraFit, PosePrior, fit_camera, similar
-from sorvolo.registration.features import FeatureSettings, gray_from_rgb, orb_features
+from sorvolo.registration.features import FeatureSettings, filled, gray_from_rgb, known_only, orb_features
 from sorvolo.registration.learned import LEARNED, learned_features, match_learned
 from sorvolo.registration.matching import match
 from sorvolo.registration.robust import fit_homography
@@ -32,6 +32,7 @@ class SearchSettings:
     margin: float = 0.25  # of the frame's size: map searched beyond each side
     frame_points: int = 2048
     map_points: int = 4096
+    rim_px: int = 15  # window of known ground that a point of the map stands in
     most_scale: float = 1.35  # heights of consumer drones err by a fifth
     coarse_px: float = 6.0  # band of the first fit
     near_px: float = 24.0  # pairs around the first fit that compete for the second
@@ -280,9 +281,9 @@ class MapSearch:
         )
         if not known.any():
             return None
-        found = learned_features(_filled(gray_from_rgb(rgb), known), self._settings.map_points)
-        keep = _well_inside(found.points_px, known)
-        return site_from_image, Features(LEARNED, found.points_px[keep] - spare, found.descriptors[keep])
+        found = learned_features(filled(gray_from_rgb(rgb), known), self._settings.map_points)
+        found = known_only(found, known, self._settings.rim_px)
+        return site_from_image, Features(LEARNED, found.points_px - spare, found.descriptors)
 
     def _beside(self, sought: _Sought) -> _Pairs:
         """Pairs of the frame's points and the ground where placed neighbours show them."""
@@ -315,17 +316,3 @@ class MapSearch:
             self._orb = {key: each for key, each in self._orb.items() if key in alive}
             self._orb[id(placed)] = orb_features(placed.even, self._features)
         return self._orb[id(placed)]
-
-
-def _filled(gray: ImageGray, known: Mask) -> ImageGray:
-    """The picture with its holes in even gray."""
-    result = gray.copy()
-    result[~known] = np.uint8(gray[known].mean())
-    return result
-
-
-def _well_inside(points_px: PointsPx, known: Mask) -> Mask:
-    """(N,) whether points lie on known ground and not at its rim."""
-    safe = cv2.erode(known.astype(np.uint8), np.ones((15, 15), np.uint8))
-    at = np.rint(points_px).astype(int)
-    return np.asarray(safe[at[:, 1], at[:, 0]] > 0)

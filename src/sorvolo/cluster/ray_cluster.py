@@ -111,11 +111,10 @@ def demand_head(address: str) -> None:
     """
     if not address:
         return
-    host, _, port = address.rpartition(":")
     end_s = time.monotonic() + WAITS.head_s
     while True:
         try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=WAITS.reach_s).close()
+            _reach(address)
             return
         except OSError as error:
             if time.monotonic() > end_s:
@@ -123,12 +122,18 @@ def demand_head(address: str) -> None:
             time.sleep(WAITS.again_s)
 
 
+def _reach(address: str) -> None:
+    """Connect to HOST:PORT and hang up. Raises OSError where nothing listens, ValueError for what is no address."""
+    host, _, port = address.rpartition(":")
+    socket.create_connection((host.strip("[]"), int(port)), timeout=WAITS.reach_s).close()
+
+
 def _demand_listening(name: str, address: str) -> None:
     """Raise SettingsError where nothing listens at HOST:PORT."""
-    host, _, port = address.rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=WAITS.reach_s).close()
+        _reach(address)
     except (OSError, OverflowError, ValueError) as error:
+        port = address.rpartition(":")[2]
         how = (
             f"start one on that machine: ray start --head --ray-client-server-port {port}" if name.startswith(SCHEME)
             else "`ray start` noted it, or RAY_ADDRESS names it: `ray stop` forgets one that is gone"

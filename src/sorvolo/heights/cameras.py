@@ -101,9 +101,7 @@ def _priors(views: Sequence[View], settings: CameraSettings) -> Priors:
     if not np.isfinite(miss).any():
         return Priors(centres, np.full_like(centres, 0.5), rotations)
     middle = np.nanmedian(miss, axis=0)
-    spread = 1.4826 * np.nanmedian(np.abs(miss - middle), axis=0)
-    sigmas = np.broadcast_to(np.maximum(spread, settings.least_sigma_m), fixes.shape)
-    return Priors(fixes + middle, sigmas, rotations)
+    return Priors(fixes + middle, _sigmas_m(miss - middle, len(fixes), 1.0, settings), rotations)
 
 
 def _reweighed(scene: Scene, priors: Priors, settings: CameraSettings) -> Priors:
@@ -119,9 +117,14 @@ def _reweighed(scene: Scene, priors: Priors, settings: CameraSettings) -> Priors
     terms[:, :2] -= terms[:, :2].mean(axis=0)
     left = miss[known] - terms @ np.linalg.lstsq(terms, miss[known], rcond=None)[0]
     freedom = len(left) / (len(left) - 3)
-    spread = 1.4826 * np.median(np.abs(left), axis=0) * np.sqrt(freedom)
-    sigmas = np.broadcast_to(np.maximum(spread, settings.least_sigma_m), miss.shape)
-    return replace(priors, sigmas_m=sigmas)
+    return replace(priors, sigmas_m=_sigmas_m(left, len(miss), freedom, settings))
+
+
+def _sigmas_m(scatter_m: Floats, count: int, freedom: float, settings: CameraSettings) -> Floats:
+    """(count, 3) the sigma of each fix from how known ones scatter, (N, 3), by its median; `freedom` is N over what is
+    left of it."""
+    spread = 1.4826 * np.nanmedian(np.abs(scatter_m), axis=0) * np.sqrt(freedom)
+    return np.asarray(np.broadcast_to(np.maximum(spread, settings.least_sigma_m), (count, 3)))
 
 
 def _solved(

@@ -9,6 +9,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Mask
 from sorvolo.heights.cameras import Cameras3D
 from sorvolo.heights.surface import Surface
+from sorvolo.heights.tracks import TrackSettings
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,7 @@ class WarningSettings:
     one_strip: float = 0.08  # how wide a path is, as a share of its length, below which it is one strip
     most_holes: float = 0.1  # share of the ground that two photos see
     bad_fit_px: float = 0.45  # rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
-    fit_side_px: int = 1600  # larger ones are matched at this size
+    fit_side_px: int = TrackSettings.side_px  # larger ones are matched at this size
 
 
 def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:

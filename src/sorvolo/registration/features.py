@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from cv2.typing import MatLike
 
-from sorvolo.geometry.arrays import Descriptors, ImageGray, ImageRGB, PointsPx
+from sorvolo.geometry.arrays import Descriptors, ImageGray, ImageRGB, Mask, PointsPx
 from sorvolo.survey.mosaic import Features
 
 _TEXTURE_SIDE_PX = 960
@@ -122,3 +122,25 @@ def _features(kind: str, keypoints: Sequence[cv2.KeyPoint], descriptors: MatLike
     as_bytes = kind == "orb"
     packed: Descriptors = np.asarray(descriptors, np.uint8) if as_bytes else np.asarray(descriptors, np.float32)
     return Features(kind, (points + 0.5) / scale - 0.5, packed)
+
+
+def known_only(features: Features, known: Mask, rim_px: int = 9) -> Features:
+    """The features on known ground, (H, W) in their picture, and not at its rim."""
+    keep = well_inside(features.points_px, known, rim_px)
+    return Features(features.kind, features.points_px[keep], features.descriptors[keep])
+
+
+def well_inside(points_px: PointsPx, known: Mask, rim_px: int) -> Mask:
+    """(N,) whether points lie on known ground, (H, W), with only such around them in a window `rim_px` wide."""
+    safe = cv2.erode(known.astype(np.uint8), np.ones((rim_px, rim_px), np.uint8))
+    at = np.rint(points_px).astype(int)
+    height, width = known.shape
+    return np.asarray(safe[at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)] > 0)
+
+
+def filled(gray: ImageGray, known: Mask) -> ImageGray:
+    """The picture, even gray where nothing is known."""
+    result = gray.copy()
+    if known.any():
+        result[~known] = np.uint8(gray[known].mean())
+    return result

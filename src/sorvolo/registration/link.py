@@ -1,7 +1,7 @@
 """Two keyframes to a Link or a NoLink: the registration room's one front door."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.registration.features import FeatureSettings, corners, sift_features
+from sorvolo.registration.features import FeatureSettings, corners, known_only, sift_features
 from sorvolo.registration.learned import learned_features, match_learned
 from sorvolo.registration.matching import match
 from sorvolo.registration.robust import fit_homography, is_believable
@@ -160,14 +160,11 @@ def _fit(
 ) -> _Fit | None:
     predicted = prediction.new_from_old if prediction else None
     pairs = match(new, old, predicted, prediction.search_px if prediction else 0.0)
-    if len(pairs) < settings.min_inliers:
+    found = _agreed(new, old, pairs, settings)
+    if found is None:
         return None
-    new_px, old_px = new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]]
-    found = fit_homography(new_px, old_px, settings.threshold_px)
-    if found is None or found[1].sum() < settings.min_inliers:
-        return None
-    agree = found[1]
-    return _Fit(found[0], new_px[agree], old_px[agree], is_sub_pixel=new.kind == "sift" and agree.mean() > 0.25)
+    fit, share = found
+    return replace(fit, is_sub_pixel=new.kind == "sift" and share > 0.25)
 
 
 def _fit_learned(
@@ -176,24 +173,31 @@ def _fit_learned(
     """By learned features of the old picture laid as predicted: they bear faint ground and noise, but no turn."""
     size = (new.gray.shape[1], new.gray.shape[0])
     laid = np.asarray(cv2.warpPerspective(old.gray, prediction.new_from_old, size, borderValue=128), np.uint8)
-    seen = cv2.warpPerspective(np.full(old.gray.shape, 255, np.uint8), prediction.new_from_old, size)
-    seen = cv2.erode(seen, np.ones((9, 9), np.uint8))
-    theirs = learned_features(laid)
-    at = theirs.points_px.astype(int)
-    inside = seen[at[:, 1], at[:, 0]] > 0
-    theirs = Features(theirs.kind, theirs.points_px[inside], theirs.descriptors[inside])
-    ours = cache.learned(new)
-    pairs = match_learned(ours, theirs, np.eye(3), prediction.search_px)
+    seen = cv2.warpPerspective(np.full(old.gray.shape, 255, np.uint8), prediction.new_from_old, size) > 0
+    ours, theirs = cache.learned(new), known_only(learned_features(laid), np.asarray(seen))
+    found = _agreed(ours, theirs, match_learned(ours, theirs, np.eye(3), prediction.search_px), settings)
+    if found is None:
+        return None
+    fit, share = found
+    return _Fit(
+        fit.new_from_old @ prediction.new_from_old, fit.new_px,
+        apply_homography(np.linalg.inv(prediction.new_from_old), fit.old_px),
+        is_sub_pixel=bool(share > settings.least_learned and _are_spread(fit.new_px, size)),
+    )
+
+
+def _agreed(
+    new: Features, old: Features, pairs: NDArray[np.int64], settings: LinkSettings
+) -> tuple[_Fit, float] | None:
+    """The fit to index pairs, (N, 2), and the share of them that agree with it; None where too few do."""
     if len(pairs) < settings.min_inliers:
         return None
-    new_px, laid_px = ours.points_px[pairs[:, 0]], theirs.points_px[pairs[:, 1]]
-    found = fit_homography(new_px, laid_px, settings.threshold_px)
+    new_px, old_px = new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]]
+    found = fit_homography(new_px, old_px, settings.threshold_px)
     if found is None or found[1].sum() < settings.min_inliers:
         return None
     agree = found[1]
-    old_px = apply_homography(np.linalg.inv(prediction.new_from_old), laid_px[agree])
-    is_sure = agree.mean() > settings.least_learned and _are_spread(new_px[agree], size)
-    return _Fit(found[0] @ prediction.new_from_old, new_px[agree], old_px, is_sub_pixel=bool(is_sure))
+    return _Fit(found[0], new_px[agree], old_px[agree]), float(agree.mean())
 
 
 def _are_spread(points_px: PointsPx, size: tuple[int, int]) -> bool:

@@ -8,10 +8,9 @@ import numpy as np
 
 from sorvolo.geometry.arrays import ImageGray, Mask, Matrix3, PointsPx
 from sorvolo.registration.camera_fit import similar
-from sorvolo.registration.features import FeatureSettings, normalise_contrast, sift_features
+from sorvolo.registration.features import FeatureSettings, filled, known_only, normalise_contrast, sift_features
 from sorvolo.registration.learned import learned_features, match_learned
 from sorvolo.registration.matching import match
-from sorvolo.survey.mosaic import Features
 
 
 @dataclass(frozen=True)
@@ -40,14 +39,14 @@ def find_place(
     found = _by_sift(picture, ground, settings)
     if found is not None:
         return found
-    old = _known_only(learned_features(_even(*ground), 6000), ground[1])
+    old = known_only(learned_features(filled(*ground), 6000), ground[1])
     best: tuple[int, Matrix3] | None = None
     # a larger picture would lie beside the ground with more of itself than may disagree
     most_px = min(settings.most_side_px, max(ground[0].shape) / settings.least_share**0.5)
     for turned_from_picture, size in _turns(picture[0].shape, scales, most_px, settings):
-        gray = cv2.warpPerspective(_even(*picture), turned_from_picture, size, flags=cv2.INTER_AREA)
+        gray = cv2.warpPerspective(filled(*picture), turned_from_picture, size, flags=cv2.INTER_AREA)
         known = cv2.warpPerspective(picture[1].astype(np.uint8), turned_from_picture, size) > 0
-        new = _known_only(learned_features(gray, 3000), known)  # type: ignore[arg-type]
+        new = known_only(learned_features(gray, 3000), known)  # type: ignore[arg-type]
         pairs = match_learned(new, old)
         agreed = _agreed(new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings, settings.step**2)
         if agreed is not None and (best is None or agreed[1] > best[0]):
@@ -60,7 +59,7 @@ def _by_sift(
 ) -> Matrix3 | None:
     wanted = FeatureSettings(sift_count=4000, detection_side_px=4000)
     new, old = (
-        _known_only(sift_features(normalise_contrast(_even(*each)), wanted), each[1]) for each in (picture, ground)
+        known_only(sift_features(normalise_contrast(filled(*each)), wanted), each[1]) for each in (picture, ground)
     )
     if min(len(new), len(old)) < settings.least_pairs:
         return None
@@ -100,23 +99,6 @@ def _turns(
             size = np.ceil(high - low).astype(int)
             if size.min() >= settings.least_side_px and size.max() <= most_px:
                 yield matrix, (int(size[0]), int(size[1]))
-
-
-def _even(gray: ImageGray, known: Mask) -> ImageGray:
-    """The picture, even gray where nothing is known."""
-    result = gray.copy()
-    if known.any():
-        result[~known] = np.uint8(gray[known].mean())
-    return result
-
-
-def _known_only(features: Features, known: Mask) -> Features:
-    """Features on known ground, not at its rim."""
-    safe = cv2.erode(known.astype(np.uint8), np.ones((9, 9), np.uint8))
-    at = np.rint(features.points_px).astype(int)
-    height, width = known.shape
-    keep = safe[at[:, 1].clip(0, height - 1), at[:, 0].clip(0, width - 1)] > 0
-    return Features(features.kind, features.points_px[keep], features.descriptors[keep])
 
 
 def scale_steps(low: float, high: float, settings: PlaceSettings = PlaceSettings()) -> list[float]:
