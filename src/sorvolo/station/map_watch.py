@@ -14,7 +14,7 @@ from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tiles import WebTiles
 from sorvolo.store.site.archive import Archive
 
-_LOOK_EVERY_S = 0.2
+_LOOK_EVERY_S = 0.1
 _SETTLE_EVERY_S = 2.0
 
 

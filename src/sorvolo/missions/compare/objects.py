@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from sorvolo.capture.source import LiveSource
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.flight.detects import Detects
@@ -35,7 +36,9 @@ class ComparisonObjects:
             before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
             known = archive.newest_objects(before - {self._name})
             self._classes = ChangeClasses(detector, [each.thing for each in known], settings.classes)
-            self._finder = ObjectFinder(detector, setup.source.camera.camera, settings.classes)
+            self._finder = ObjectFinder(
+                detector, setup.source.camera.camera, settings.classes, is_live=isinstance(setup.source, LiveSource)
+            )
 
     def close(self) -> None:
         """End the detector's thread."""

@@ -31,7 +31,7 @@ from sorvolo.tracking.view_evidence import least_seen
 NO_MODEL, DEFAULT_MODEL = "none", "default"
 """The model that looks for nothing, and the one that comes with the package."""
 
-_AHEAD = 3  # frames that may wait for the detector before the mapping waits for it
+_AHEAD = 3  # frames of a recorded flight that may wait for the detector before the mapping waits for it
 _CROP_PX = 256
 _MOST_CROPS = 60  # of one frame, the surest
 
@@ -73,12 +73,16 @@ class ObjectFinder:
     """Searches the frames of one flight for objects, one frame after another, in a thread beside the mapping.
 
     A context manager: leaving it ends the thread. No `classes` means those that the detector usually reports; raises
-    SettingsError for one that it does not know.
+    SettingsError for one that it does not know. Of an `is_live` flight as many frames wait as memory holds: a detector
+    that is slow for a moment must not delay the map.
     """
 
-    def __init__(self, detector: Detects, camera: Camera, classes: Sequence[str] = ()) -> None:
+    def __init__(
+        self, detector: Detects, camera: Camera, classes: Sequence[str] = (), *, is_live: bool = False
+    ) -> None:
         check_classes(detector, classes)
         self._detector, self._camera = detector, camera
+        self._ahead = math.inf if is_live else _AHEAD
         self._classes = tuple(classes) or detector.info.usual_classes
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")
         self._waiting: deque[Future[FrameDetections]] = deque()
@@ -113,11 +117,11 @@ class ObjectFinder:
         from_above = is_from_above(posed.prior.rotation)
         self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px, from_above))
         most_bytes = 1e6 * MemorySettings().waiting_mb
-        self._take(min(_AHEAD, max(1, int(most_bytes // posed.frame.image.nbytes))))
+        self._take(min(self._ahead, max(1, int(most_bytes // posed.frame.image.nbytes))))
 
     def news(self, *, waits: bool = False) -> list[FrameDetections]:
         """What was found since this was asked last, in the frames' order; `waits`: in all frames so far."""
-        self._take(0 if waits else _AHEAD)
+        self._take(0 if waits else self._ahead)
         news, self._news = self._news, []
         return news
 
@@ -160,7 +164,7 @@ class ObjectFinder:
         of_frames = [self._detector.info.thresholds, *(self._seen[each.index].least for each in frames)]
         return {name: max(each.get(name, 0.0) for each in of_frames) for name in self._detector.classes}
 
-    def _take(self, left: int) -> None:
+    def _take(self, left: float) -> None:
         """Collect what was seen until so many frames still wait."""
         while self._waiting and (len(self._waiting) > left or self._waiting[0].done()):
             seen = self._waiting.popleft().result()

@@ -130,7 +130,9 @@ def _map_one(
     refuse_without_texture(source)
     check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
-    finder = None if detector is None else ObjectFinder(detector, source.camera.camera, settings.classes)
+    finder = None if detector is None else ObjectFinder(
+        detector, source.camera.camera, settings.classes, is_live=isinstance(source, LiveSource)
+    )
     with _begun(setup, archive, settings, finder, request, coverage, anew=anew, samples=samples) as run:
 
         def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
