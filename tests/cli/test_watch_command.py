@@ -126,7 +126,7 @@ def long_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _fly(tmp_path_factory.mktemp("long") / "flight", 1500)
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_a_stop_ends_well_with_everything_written(
     model: Path, long_flight: Path, tmp_path: Path, signal_number: int
 ) -> None:

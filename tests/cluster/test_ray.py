@@ -92,6 +92,7 @@ def _written_sites(pid: int, root: Path) -> set[Path]:
     return sites
 
 
+@pytest.mark.long
 def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: Any, tmp_path: Path) -> None:
     order = Order("in", "site", FlightWish())
     with ray_executor("ray", None, 60.0, tmp_path, SharingSettings(True, 0.25)) as executor:
@@ -159,6 +160,7 @@ def test_a_cluster_that_is_not_there_is_an_error_within_seconds(
     assert time.monotonic() - started_s < 30
 
 
+@pytest.mark.long  # it waits for Ray to give up
 def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         (tmp_path / "1.mp4").write_text("no video")

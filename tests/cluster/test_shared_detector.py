@@ -35,6 +35,7 @@ class Disturbed(LocalExecutor):
             os.kill(self._detector.pid, signal.SIGKILL)
 
 
+@pytest.mark.long
 def test_a_shared_detector_that_dies_is_started_again_and_finds_the_same(flown: Path, tmp_path: Path) -> None:
     flight = another(flown, tmp_path / "in" / "one")
     made: list[Disturbed] = []

@@ -442,7 +442,10 @@ def is_the_same(path: Path) -> bool:
     return path.is_file() and not path.name.startswith(("site.", "report."))
 
 
-@pytest.mark.parametrize("sign", ["site.db", "flights/*/keyframes/*/000004.jpg", "tiles/*/*", "mosaic.tif"])
+@pytest.mark.parametrize("sign", [
+    "site.db", "flights/*/keyframes/*/000004.jpg",
+    pytest.param("tiles/*/*", marks=pytest.mark.long), pytest.param("mosaic.tif", marks=pytest.mark.long),
+])
 def test_kill_at_any_moment_and_the_same_command_again(
     photos: Path, photographed: Path, undisturbed: Path, tmp_path: Path, sign: str
 ) -> None:

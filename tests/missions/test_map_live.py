@@ -204,6 +204,7 @@ def test_a_later_flight_is_compared_live(flight: FilmedFlight, mapped_live: tupl
     assert not announced  # the same flight again
 
 
+@pytest.mark.long  # a stream in real time; receivers and streams have tests of their own
 def test_a_receiver_beside_a_stream_places_the_map(flight: FilmedFlight, tmp_path: Path) -> None:
     """Neither states more than it must: pictures without times, positions without the camera's angles."""
     site, drone, gps = tmp_path / "site", Drone(flight, metadata=False, speed=1.0, count=42), free_port()

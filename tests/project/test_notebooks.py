@@ -20,7 +20,10 @@ def test_every_notebook_is_tried_and_kept_without_output() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NEEDS)
+@pytest.mark.parametrize("name", [
+    "map_and_changes",
+    pytest.param("tune_detector", marks=pytest.mark.long),  # `train` has tests of its own
+])
 def test_notebook_runs(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

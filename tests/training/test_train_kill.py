@@ -26,6 +26,7 @@ def _command(data: Path, out: Path, *more: str) -> list[str]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs a signal that cannot be caught")
 def test_a_killed_training_goes_on_and_ends_with_a_whole_model(tmp_path: Path) -> None:
     data, out = labelled_squares(tmp_path / "squares", 4, 3), tmp_path / "out"
