@@ -21,5 +21,9 @@ class StoreError(SorvoloError):
     """The site folder cannot be read or written."""
 
 
+class UnavailableError(StoreError):
+    """A database or store cannot be reached, or somebody else writes: later the same may succeed."""
+
+
 class SorvoloWarning(RuntimeWarning):
     """What works, but worse than it could; commands print it as one line."""

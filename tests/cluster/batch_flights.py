@@ -4,7 +4,9 @@ import json
 import shutil
 from pathlib import Path
 
-_EFFORT = ("seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb")  # of report.json
+_EFFORT = (  # of report.json
+    "seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb", "latency_s", "frames_per_second",
+)
 _TIMED = {"report.html", "changes.html"}  # which show it
 
 
@@ -17,7 +19,7 @@ def another(flown: Path, folder: Path) -> Path:
 
 
 def content(site: Path) -> dict[str, bytes]:
-    """A site's files by name, less the catalogue and what states how long it took."""
+    """The files of a site, or of a watch, by name, less the catalogue and what states how long it took."""
     found = {}
     for path in sorted(site.rglob("*")):
         if not path.is_file() or path.name.startswith("site.") or path.name in _TIMED:

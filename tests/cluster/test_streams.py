@@ -90,4 +90,4 @@ def test_streams_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert main(["batch", "udp://:5000", "udp://:5001", "--workers", "1", *root]) == 1
     assert "--workers 1: 2 live sources need a worker each" in capsys.readouterr().err
     assert main(["batch", "udp://:5000", "--mission", "search", *root]) == 1
-    assert "give map or compare for live streams" in capsys.readouterr().err
+    assert "give map, compare or watch for live streams" in capsys.readouterr().err

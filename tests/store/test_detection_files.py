@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.store.exports.annotated import AnnotatedVideo, annotated, write_annotated
 from sorvolo.store.exports.detection_files import (
     DetectionLines,
-    claim_folder,
+    claimed_folder,
     crop_around,
     detection_row,
     track_placemarks,
@@ -52,29 +52,48 @@ def _track(**changes: Any) -> Track:
     return replace(track, **changes)
 
 
+def claimed(folder: Path, source: str, fingerprint: str, *, replaces: bool = True) -> None:
+    with claimed_folder(folder, source, fingerprint, replaces=replaces):
+        pass
+
+
+def test_a_folder_has_one_writer(tmp_path: Path) -> None:
+    folder = tmp_path / "watch"
+    with claimed_folder(folder, "DJI_1", "abc"):
+        (folder / "detections.jsonl").write_text("{}\n")
+        with pytest.raises(UnavailableError, match="another process writes its watch into"):
+            claimed(folder, "DJI_1", "abc")
+        assert (folder / "detections.jsonl").exists()
+    (folder / "watch.json").unlink()
+    (folder / "detections.jsonl").unlink()
+    (folder / "watch.lock").touch()  # of one that was killed
+    claimed(folder, "DJI_2", "abd")
+    assert [path.name for path in folder.iterdir()] == ["watch.json"]
+
+
 def test_a_folder_belongs_to_one_source(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "watch"
-    claim_folder(folder, "DJI_1", "abc")
+    claimed(folder, "DJI_1", "abc")
     (folder / "detections.jsonl").write_text("{}\n")
     (folder / "objects").mkdir()
     (folder / "objects" / "1.jpg").write_bytes(b"x")
     (folder / "my notes.txt").write_text("keep")
-    claim_folder(folder, "DJI_1", "abc")
+    claimed(folder, "DJI_1", "abc")
     assert sorted(path.name for path in folder.iterdir()) == ["my notes.txt", "watch.json"]
     for source, fingerprint, replaces in (("DJI_2", "abc", True), ("DJI_1", "abd", True), ("DJI_1", "abc", False)):
         with pytest.raises(StoreError, match="holds a watch of DJI_1"):
-            claim_folder(folder, source, fingerprint, replaces=replaces)
+            claimed(folder, source, fingerprint, replaces=replaces)
 
 
 def test_other_peoples_folders_and_files_stay(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("years of work")
     with pytest.raises(StoreError, match="no earlier watch"):
-        claim_folder(tmp_path, "DJI_1", "abc")
+        claimed(tmp_path, "DJI_1", "abc")
     with pytest.raises(StoreError, match="is a file"):
-        claim_folder(tmp_path / "thesis.txt", "DJI_1", "abc")
+        claimed(tmp_path / "thesis.txt", "DJI_1", "abc")
     (tmp_path / "watch.json").write_text('["not ours"]')
     with pytest.raises(StoreError, match="no earlier watch"):
-        claim_folder(tmp_path, "DJI_1", "abc")
+        claimed(tmp_path, "DJI_1", "abc")
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
 
 

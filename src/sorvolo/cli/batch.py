@@ -15,15 +15,27 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.map import TO_CHECK, ended_by_signal
-from sorvolo.cli.options import AsJson, Camera, GiveUp
+from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate, GiveUp, names
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import show_path
+from sorvolo.cli.watch import (
+    AlertCommand,
+    AlertUrl,
+    Cot,
+    LeastScore,
+    Save,
+    SaveOption,
+    SearchedClasses,
+    SearchRate,
+    warn_of_interpreted,
+)
 from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate
     from sorvolo.cluster.executor import Executor
+    from sorvolo.cluster.sites import SiteBy
     from sorvolo.cluster.table import BatchTable, Row
 
 _FAILED = 1
@@ -37,6 +49,7 @@ class MissionName(StrEnum):
     MAP = "map"
     COMPARE = "compare"
     SEARCH = "search"
+    WATCH = "watch"
 
 
 class SiteByName(StrEnum):
@@ -50,7 +63,7 @@ Places = Annotated[
     list[str],
     typer.Argument(help="Folders with flights, however deep; or live sources, as ADDRESS or SITE=ADDRESS."),
 ]
-Root = Annotated[Path, typer.Option(help="Folder for the maps, one folder for each site.")]
+Root = Annotated[Path, typer.Option(help="Folder for the results: one folder for each site, or for each watch.")]
 MissionOption = Annotated[MissionName, typer.Option(help="What to do with each flight.")]
 SiteByOption = Annotated[
     SiteByName | None,
@@ -110,44 +123,63 @@ def batch(
     blocks: Blocks = 1,
     share_detector: Shares = None,
     gpus: Gpus = 0.0,
+    classes: SearchedClasses = "",
+    least_score: LeastScore = None,
+    fps: SearchRate = None,
+    save: SaveOption = Save.NONE,
+    cot: Cot = "",
+    cot_ca: CotAuthority = None,
+    cot_cert: CotCertificate = None,
+    alert_command: AlertCommand = "",
+    alert_url: AlertUrl = "",
     as_json: AsJson = False,
 ) -> None:
-    """Map, compare or search many flights. After a stop or a kill, the same command continues.
+    """Map, compare, search or watch many flights. After a stop or a kill, the same command continues.
 
     A flight whose process dies is tried again; one that cannot be used, or that crashes every time, is listed.
-    Live sources are mapped side by side until they end; Ctrl-C ends them and finishes their maps.
+    Live sources run side by side until they end; Ctrl-C ends them and finishes their results. The options from
+    --classes to --alert-url are for --mission watch. ROOT/batch.jsonl holds what became of each.
 
-    ROOT/batch.jsonl holds what became of each. Ends with exit code 1 where a flight failed or was set aside, with 3
-    where a result is to be checked before use.
+    Ends with exit code 1 where a flight failed or was set aside, with 3 where a result is to be checked before use.
 
     Example: sorvolo batch flights/ --root maps
 
-    Example: sorvolo batch monday/ tuesday/ --root maps --mission compare
-
-    Example: sorvolo batch north=rtsp://192.168.1.10/live south=udp://:5000 --root maps
+    Example: sorvolo batch north=rtsp://192.168.1.10/live south=udp://:5000 --root found --mission watch
 
     Example: sorvolo batch /mnt/shared/flights --root /mnt/shared/maps --executor ray://head:10001
 
     Example: sorvolo batch /mnt/shared/valley --root /mnt/shared/maps --blocks 16 --executor ray://head:10001
     """
     from sorvolo.cluster.batch import BatchSettings
-    from sorvolo.cluster.orders import FlightWish, Mission
-    from sorvolo.cluster.sites import SiteBy
+    from sorvolo.cluster.orders import FlightWish, Mission, WatchWish
 
     context.obj.stop_words = f"stopped; run the same command to continue: {root} holds what is done"
-    by = site_by or (SiteByName.PLACE if mission is MissionName.COMPARE else SiteByName.FLIGHT)
-    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up)
-    settings = BatchSettings(wish, SiteBy(by.value), tries, stall, retry, blocks)
+    watch = WatchWish(
+        names(classes), least_score, fps, save.value, cot, _whole(cot_ca), _whole(cot_cert), alert_command, alert_url,
+    )
+    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch)
+    settings = BatchSettings(wish, _site_by(site_by, mission), tries, stall, retry, blocks)
     report = _run(places, root, settings, _Running(executor, workers, share_detector, gpus))
     if as_json:
         typer.echo(json.dumps(_plain(report, root), indent=1))
     else:
         _show(report, [Path(each) for each in places], root, Console())
+    raise typer.Exit(_exit_code(report))
+
+
+def _exit_code(report: "BatchReport") -> int:
     counts = report.counts()
     if counts.get("failed") or counts.get("set aside"):
-        raise typer.Exit(_FAILED)
-    if counts.get("doubtful"):
-        raise typer.Exit(TO_CHECK)
+        return _FAILED
+    return TO_CHECK if counts.get("doubtful") else 0
+
+
+def _site_by(wished: SiteByName | None, mission: MissionName) -> "SiteBy":
+    """What makes flights belong to one site: by place where flights are compared, unless something else is asked."""
+    from sorvolo.cluster.sites import SiteBy
+
+    by = wished or (SiteByName.PLACE if mission is MissionName.COMPARE else SiteByName.FLIGHT)
+    return SiteBy(by.value)
 
 
 @dataclass(frozen=True)
@@ -165,6 +197,7 @@ def _run(places: Sequence[str], root: Path, settings: "BatchSettings", wish: _Ru
     from sorvolo.cluster.batch import run_batch
     from sorvolo.cluster.streams import is_stream, run_streams, streams_of
 
+    warn_of_interpreted(settings.wish.watch.alert_command)
     live = [each for each in places if is_stream(each)]
     _check_live(live, places, wish.workers, settings.blocks)
     if live:  # one that waits for its drone does nothing, and gives up by itself
@@ -200,6 +233,11 @@ def _absolute(name: str) -> str:
     return str(Path(name).resolve()) if name and Path(name).is_file() else name
 
 
+def _whole(path: Path | None) -> str:
+    """The whole path of a file, "" for none."""
+    return "" if path is None else str(path.resolve())
+
+
 def _executor_of(
     wish: _Running, settings: "BatchSettings"
 ) -> "Callable[[BatchTable], AbstractContextManager[Executor]]":
@@ -232,7 +270,12 @@ def _show_progress(running: "Generator[BatchUpdate, None, BatchReport]", console
 
     with ProgressReport(console) as progress:
         for update in noted():
-            if update.row is not None:
+            if update.row is not None and update.found:
+                console.print(
+                    f"    [bold]found[/bold]  {escape(update.row.site)}: {escape(update.found)}", highlight=False,
+                    soft_wrap=True,
+                )
+            elif update.row is not None:
                 _show_row(update.row, update.is_known, console)
             words = f"at {', '.join(update.running[:4])}" if update.running else ""
             progress.show(update.task, update.done, update.total, words)
@@ -279,7 +322,7 @@ def _show(report: "BatchReport", places: Sequence[Path], root: Path, console: Co
     if len(rows) > _MOST_ROWS:
         rows = tuple(row for row in rows if row.state != "done")
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in ("flight", "site", "state", "tries", "s", "CPU s", "MB", ""):
+    for name in ("flight", "folder", "state", "tries", "s", "CPU s", "MB", ""):
         table.add_column(name, justify="right" if name in ("tries", "s", "CPU s", "MB") else "left", overflow="fold")
     for row in rows[:_MOST_ROWS]:
         state = _state(row, row.key in report.known)

@@ -26,7 +26,7 @@ from sorvolo.cli.options import (
     PlaceFormatOption,
     names,
 )
-from sorvolo.cli.places import place_heading, place_words
+from sorvolo.cli.places import place_heading
 from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
 from sorvolo.cli.shown import read_json, show_notices_and_warnings, show_path
 from sorvolo.errors import SettingsError
@@ -67,7 +67,9 @@ CotType = Annotated[
 ]
 AlertCommand = Annotated[
     str,
-    typer.Option(help="Program to run for each object; {id} {class} {score} {latitude} {longitude} {time} {crop}."),
+    typer.Option(
+        help="Program to run for each object; {flight} {id} {class} {score} {latitude} {longitude} {time} {crop}."
+    ),
 ]
 AlertUrl = Annotated[str, typer.Option(help="Post each new object to this web address as JSON.")]
 EveryNth = Annotated[int | None, typer.Option(help="Search every N-th frame only.")]
@@ -138,7 +140,7 @@ def watch_command(
         out, save.value, names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
         alert_url=alert_url, cot_tls=CotTls(cot_ca, cot_cert),
     )
-    _warn_of_interpreted(alert_command)
+    warn_of_interpreted(alert_command)
     stop = _Stop()
     watching = watch(
         source, settings, outputs, telemetry=telemetry or None, camera=camera or None,
@@ -158,7 +160,7 @@ def _show_results(results: Sequence[Mapping[str, Any]], coordinates: PlaceFormat
         Console(stderr=True).print("stopped before the first frame was searched")
 
 
-def _warn_of_interpreted(alert_command: str) -> None:
+def warn_of_interpreted(alert_command: str) -> None:
     """Print a warning where an alert's program would run a placeholder's text as code of its own."""
     from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
 
@@ -227,11 +229,11 @@ def _show_progress(
 
 
 def _words_of(track: "Track", site: "Site", form: PlaceFormat) -> str:
-    name = f"[bold]{escape(track.label)} {track.id}[/bold]"
-    seen = f"score {track.score:.2f}, {counted(track.views, 'view')}"
-    if site.is_local:
-        return f"{name}  {seen}"
-    return f"{name}  at {place_words(site, form)(track.position_m)} (accuracy {track.sigma_m:.1f} m), {seen}"
+    from sorvolo.geometry.coordinates import Coordinates
+    from sorvolo.missions.watch.report import found_words
+
+    name, rest = found_words(track, site, Coordinates(form.value))
+    return f"[bold]{escape(name)}[/bold]  {rest}"
 
 
 def _result(folder: Path) -> dict[str, Any]:

@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, TypeGuard
 import sorvolo
 from sorvolo.cluster.cost import Cost, CostSettings, cost_of
 from sorvolo.cluster.executor import Executor, Key
-from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, Scouted
+from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, Scouted, WatchWish
 from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
 from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites, sites_of
 from sorvolo.cluster.table import FINAL, BatchTable, Row, State
+from sorvolo.cluster.watches import ENDING, existing_watches, is_watched, watch_outputs, watch_settings
 from sorvolo.detection.models import find_model
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.software import software
@@ -26,10 +27,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RestartSettings:
-    """When the process of a live stream that died is started again."""
+    """When the process of a live stream that died is started again, and a flight whose database was out of reach."""
 
     settled_s: float = 60.0  # one that lived so long did not die of its beginning: its tries are counted anew
     longest_wait_s: float = 60.0  # before the next start; the waits are 1 s, 2 s, 4 s and so on
+    patience_s: float = 900.0  # a database or store that is restored from its backup; then the flight has failed
+
+    def wait_s(self, starts: int) -> float:
+        """The wait after so many starts in a row that ended badly."""
+        return min(self.longest_wait_s, 2.0 ** (starts - 1))
 
 
 @dataclass(frozen=True)
@@ -55,6 +61,7 @@ class BatchSettings:
             raise SettingsError(f"--blocks divides flights to be mapped; --mission {self.wish.mission} takes none")
         if not self.stall_s > 0:
             raise SettingsError(f"--stall {self.stall_s:g}: more than 0 seconds are needed")
+        self._check_watch()
         if self.wish.m_per_px is not None:
             from sorvolo.missions.flight.settings import MapSettings  # which takes long to import
 
@@ -62,10 +69,31 @@ class BatchSettings:
         if self.wish.model not in ("none", "default"):
             find_model(self.wish.model)
 
+    def _check_watch(self) -> None:
+        wish = self.wish
+        if wish.mission is not Mission.WATCH:
+            if wish.watch != WatchWish():
+                raise SettingsError(
+                    "--classes, --least-score, --fps, --save, --cot and --alert-... are for --mission watch; leave "
+                    f"them out, --mission {wish.mission} takes none"
+                )
+            return
+        if self.site_by is not SiteBy.FLIGHT:
+            raise SettingsError("--mission watch makes no sites: leave --site-by out")
+        if wish.model == "none":
+            raise SettingsError("--mission watch needs a detector: leave --model none out")
+        if wish.m_per_px is not None:
+            raise SettingsError("--gsd is for maps; --mission watch makes none")
+        watch_settings(wish.model, wish.watch)
+        watch_outputs(wish.watch, Path())
+
 
 @dataclass(frozen=True)
 class BatchUpdate:
-    """One event of a batch: its flight, how many of how many are finished, and the names of those that run."""
+    """One event of a batch: its flight, how many of how many are finished, and the names of those that run.
+
+    `found` is what the row's watch has just found, in words.
+    """
 
     task: str
     done: int
@@ -73,6 +101,7 @@ class BatchUpdate:
     row: Row | None = None
     is_known: bool = False  # it was finished before this batch
     running: tuple[str, ...] = ()
+    found: str = ""
 
 
 @dataclass(frozen=True)
@@ -131,6 +160,7 @@ class _Run:
         self.rows = {row.key: row for row in rows}
         self.tries = self.crashes = 0
         self._table, self._settings, self._executor = table, settings, executor
+        self._late = _Latecomers(settings.restarts)
         self._waiting: dict[str, list[Row]] = {}  # by site, in order of time
         for row in sorted(rows, key=_moment):
             if row.state is State.WAITING:
@@ -146,27 +176,39 @@ class _Run:
         """Try each flight until it is through. Closed on the way, those that run are marked as waiting again."""
         try:
             while self._waiting or self._executor.running:
-                if self._settings.blocks > 1:
-                    yield from self._divided(self._take(max(self._waiting.values(), key=_all_frames)[0]))
-                    continue
-                while (row := self._next()) is not None:
-                    self._start(row)
-                    yield self.update()
-                if (ended := self._executor.next_ended()) is not None:
-                    key, ending = ended
-                    yield self.update(self._end(self.rows[key], ending))
+                if not self._executor.running and not self._due():  # all that wait are out of reach
+                    time.sleep(self._late.wait_s or 0.0)
+                elif self._settings.blocks > 1:
+                    yield from self._divided(self._take(self._due()[0]))
+                else:
+                    yield from self._side_by_side()
         finally:
             for row in [each for each in self.rows.values() if each.state is State.RUNNING]:
                 self._keep(replace(row, state=State.WAITING, words="the batch was stopped"))
 
+    def _side_by_side(self) -> Generator[BatchUpdate]:
+        """Begin what there is room for; one flight, at most, is over when this ends."""
+        while (row := self._next()) is not None:
+            self._start(row)
+            yield self.update()
+        if (ended := self._executor.next_ended(self._late.wait_s)) is not None:
+            key, ending = ended
+            yield self.update(self._end(self.rows[key], ending))
+
     def _next(self) -> Row | None:
-        """The flight to begin: of a site that nobody writes, and of these the one with most frames before it."""
+        """The flight to begin, if there is room for it."""
+        due = self._due()
+        has_room = bool(due) and self._executor.has_room(cost_of(due[0], self._table, self._settings.costs))
+        return due[0] if has_room else None
+
+    def _due(self) -> list[Row]:
+        """The next flight of each site that nobody writes and that is in reach, that with most frames before it first.
+        """
         busy = {self.rows[key].site for key in self._executor.running}
-        free = [queue for site, queue in self._waiting.items() if site not in busy]
-        if not free:
-            return None
-        row = max(free, key=_all_frames)[0]
-        return row if self._executor.has_room(cost_of(row, self._table, self._settings.costs)) else None
+        free = [
+            queue for site, queue in self._waiting.items() if site not in busy and self._late.is_due(queue[0].key)
+        ]
+        return [queue[0] for queue in sorted(free, key=_all_frames, reverse=True)]
 
     def _divided(self, row: Row) -> Generator[BatchUpdate]:
         """One flight in blocks, with all workers: another is begun when it is through."""
@@ -215,6 +257,11 @@ class _Run:
         self._executor.start(row.key, self._order(row), cost)
 
     def _end(self, row: Row, ending: Ending) -> Row:
+        if ending.outcome is Outcome.WAITS:
+            if self._late.put_off(row.key):
+                return self._again(row.after(ending, State.WAITING, ending.words))
+            return self._keep(row.after(ending, State.FAILED, ending.words))
+        self._late.forget(row.key)
         if ending.outcome is not Outcome.CRASHED:
             return self._keep(row.after(ending, State(ending.outcome.value), ending.words))
         self.crashes += 1
@@ -222,7 +269,11 @@ class _Run:
         if row.crashes >= self._settings.most_tries:
             words = f"set aside after {row.crashes} tries: {ending.words}"
             return self._keep(row.after(ending, State.SET_ASIDE, words))
-        row = self._keep(row.after(ending, State.WAITING, ending.words))
+        return self._again(row.after(ending, State.WAITING, ending.words))
+
+    def _again(self, row: Row) -> Row:
+        """The row, waiting before the others of its site."""
+        row = self._keep(row)
         self._waiting.setdefault(row.site, []).insert(0, row)
         return row
 
@@ -230,6 +281,41 @@ class _Run:
         row = self._table.put(row)
         self.rows[row.key] = row
         return row
+
+
+class _Latecomers:
+    """Flights whose database, store or site was out of reach: when each is due again. `put_off`, `forget` change it."""
+
+    def __init__(self, settings: RestartSettings) -> None:
+        self._settings = settings
+        self._since_s: dict[Key, float] = {}
+        self._starts: Counter[Key] = Counter()
+        self._due_s: dict[Key, float] = {}
+
+    def put_off(self, key: Key) -> bool:
+        """Have a flight wait longer than the last time; False where it has waited long enough."""
+        now_s = time.monotonic()
+        if now_s - self._since_s.setdefault(key, now_s) > self._settings.patience_s:
+            self.forget(key)
+            return False
+        self._starts[key] += 1
+        self._due_s[key] = now_s + self._settings.wait_s(self._starts[key])
+        return True
+
+    def forget(self, key: Key) -> None:
+        """It was in reach."""
+        for each in (self._since_s, self._starts, self._due_s):
+            each.pop(key, None)
+
+    def is_due(self, key: Key) -> bool:
+        """Whether the flight may begin."""
+        return self._due_s.get(key, 0.0) <= time.monotonic()
+
+    @property
+    def wait_s(self) -> float | None:
+        """How long until the next of them is due; None where none waits for that."""
+        now_s = time.monotonic()
+        return min((due_s - now_s for due_s in self._due_s.values() if due_s > now_s), default=None)
 
 
 def _listed(
@@ -289,15 +375,20 @@ def _continued(fresh: Row, before: Row, root: Path, settings: BatchSettings) -> 
         return replace(fresh, site=before.site)
     if before.state is State.SET_ASIDE and settings.retries:
         return replace(moved, state=State.WAITING, crashes=0)
-    if before.state in FINAL and (before.state is State.SET_ASIDE or _is_in_site(before, root)):
+    if before.state in FINAL and (before.state is State.SET_ASIDE or _has_results(before, root)):
         return moved
     crashes = 0 if before.state is State.FAILED else before.crashes
     return replace(moved, state=State.WAITING, crashes=crashes)
 
 
-def _is_in_site(row: Row, root: Path) -> bool:
+def _has_results(row: Row, root: Path) -> bool:
+    """Whether the site has the flight, or the folder a complete watch of it."""
+    if row.scouted is None:
+        return False
+    if row.mission == Mission.WATCH:
+        return is_watched(root / row.site, row.scouted.fingerprint)
     found = existing_site(root / row.site)
-    return found is not None and row.scouted is not None and row.scouted.fingerprint in found.flights
+    return found is not None and row.scouted.fingerprint in found.flights
 
 
 def _without_duplicates(rows: Sequence[Row], table: BatchTable) -> list[Row]:
@@ -336,15 +427,26 @@ def _is_used(row: Row | None) -> TypeGuard[Row]:
 
 
 def _with_sites(rows: Sequence[Row], table: BatchTable, settings: BatchSettings) -> list[Row]:
-    """The rows with the site of each flight; one that is in a site already stays there."""
-    by_place = settings.site_by is SiteBy.PLACE
-    there = existing_sites(table.root, with_ground=by_place)
-    known = {fingerprint: name for name, site in there.items() for fingerprint in site.flights}
-    known |= {row.scouted.fingerprint: row.site for row in table if row.scouted is not None and row.site}
-    grounds = {name: site.ground for name, site in there.items() if site.ground is not None}
-    names = [each.name for each in table.root.iterdir()]
-    sites = sites_of(_placed(rows), settings.site_by, known, grounds, names, settings.near_m)
+    """The rows with the site of each flight, or the folder of its watch; one that has a place already stays there."""
+    placed, names = _placed(rows), [each.name for each in table.root.iterdir()]
+    if settings.wish.mission is Mission.WATCH:
+        known = existing_watches(table.root) | _placed_before(table, are_watches=True)
+        sites = sites_of(placed, SiteBy.FLIGHT, known, {}, names, ending=ENDING)
+    else:
+        there = existing_sites(table.root, with_ground=settings.site_by is SiteBy.PLACE)
+        known = {fingerprint: name for name, site in there.items() for fingerprint in site.flights}
+        grounds = {name: site.ground for name, site in there.items() if site.ground is not None}
+        known |= _placed_before(table, are_watches=False)
+        sites = sites_of(placed, settings.site_by, known, grounds, names, settings.near_m)
     return [_at_site(row, sites, table) for row in rows]
+
+
+def _placed_before(table: BatchTable, *, are_watches: bool) -> dict[str, str]:
+    """The sites, or the folders of watches, of flights that the table knows, by the flight's fingerprint."""
+    return {
+        row.scouted.fingerprint: row.site for row in table
+        if row.scouted is not None and row.site and (row.mission == Mission.WATCH) == are_watches
+    }
 
 
 def _placed(rows: Sequence[Row]) -> list[Placed]:

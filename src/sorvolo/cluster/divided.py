@@ -50,7 +50,7 @@ def map_divided(
     except SetAside:
         raise
     except SorvoloError as error:
-        ending = Ending(Outcome.FAILED, str(error))
+        ending = Ending(Outcome.of(error), str(error))
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return ending.with_effort(
         round(time.monotonic() - started_s, 3), round(parts.cpu_s + time.process_time() - cpu_s, 3),
@@ -146,7 +146,7 @@ class _Parts:
         name = f"{part.kind} {part.number + 1} of {part.count}"
         if ending.outcome is Outcome.FAILED:
             raise PartFailed(ending.words)
-        if ending.outcome is not Outcome.CRASHED:
+        if ending.outcome in (Outcome.DONE, Outcome.DOUBTFUL):
             return None
         self._crashes[part] += 1
         if self._crashes[part] >= self._most_tries:

@@ -1,6 +1,6 @@
 """What runs the tries of a batch: this machine's processes, or a cluster's."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from sorvolo.cluster.cost import Cost
@@ -28,7 +28,10 @@ class Executor(Protocol):
         """Start a try."""
 
     def finish(self, key: Key) -> None:
-        """End a live flight, and have its map finished."""
+        """End a live flight, and have its map or watch finished."""
+
+    def take_found(self) -> Sequence[tuple[Key, str]]:
+        """What live watches found since this was last asked, in words."""
 
     def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
         """Wait until a try has ended; None where none did for so long. Raises SorvoloError if the executor is gone."""

@@ -3,7 +3,7 @@
 import os
 import queue
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Self
 
@@ -32,6 +32,7 @@ class LocalExecutor:
         self._stall_s, self._lock = stall_s, lock
         self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
         self._ended: queue.SimpleQueue[tuple[Key, Ending]] = queue.SimpleQueue()
+        self._found: queue.SimpleQueue[tuple[Key, str]] = queue.SimpleQueue()
 
     def __enter__(self) -> Self:
         return self
@@ -71,8 +72,12 @@ class LocalExecutor:
         threading.Thread(target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}").start()
 
     def finish(self, key: Key) -> None:
-        """End a live flight, and have its map finished."""
+        """End a live flight, and have its map or watch finished."""
         self._running[key][0].finish()
+
+    def take_found(self) -> Sequence[tuple[Key, str]]:
+        """What watches found since this was last asked, in words."""
+        return [self._found.get() for _ in range(self._found.qsize())]
 
     def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
         """Wait until a try has ended; None where none did for so long."""
@@ -84,7 +89,8 @@ class LocalExecutor:
         return key, ending
 
     def _wait(self, key: Key, worker: WorkerProcess) -> None:
-        self._ended.put((key, run_order(worker, self._stall_s)))
+        ending = run_order(worker, self._stall_s, lambda words: self._found.put((key, words)))
+        self._ended.put((key, ending))
 
 
 def default_workers() -> int:

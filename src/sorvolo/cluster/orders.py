@@ -4,7 +4,9 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from typing import Any, Self
+from typing import Any, Literal, Self
+
+from sorvolo.errors import SorvoloError, UnavailableError
 
 FINISH = b"finish\n"
 """What a worker is sent to end a live flight, which is then finished like any other's."""
@@ -16,6 +18,7 @@ class Mission(StrEnum):
     MAP = "map"
     COMPARE = "compare"
     SEARCH = "search"
+    WATCH = "watch"
 
 
 class Outcome(StrEnum):
@@ -25,6 +28,30 @@ class Outcome(StrEnum):
     DOUBTFUL = "doubtful"  # the flight was used, its result is to be checked: exit code 3 of the mission
     FAILED = "failed"  # the flight cannot be used as it is; another try would end alike
     CRASHED = "crashed"  # its process was killed, ran out of memory, stood still or broke
+    WAITS = "waits"  # its database, store or site was out of reach: another try may end well
+
+    @classmethod
+    def of(cls, error: SorvoloError) -> Self:
+        """How a try ended that an error ended."""
+        return cls.WAITS if isinstance(error, UnavailableError) else cls.FAILED
+
+
+@dataclass(frozen=True)
+class WatchWish:
+    """What is asked for of watches: what is searched for in how many frames a second, what is kept, who is alerted.
+
+    As `WatchSettings` and `WatchOutputs` have it; "" is nobody, and no file.
+    """
+
+    classes: tuple[str, ...] = ()
+    least_score: float | None = None
+    frames_per_second: float | None = None
+    save: Literal["none", "video", "pictures"] = "none"
+    cot: str = ""
+    cot_ca: str = ""
+    cot_cert: str = ""
+    alert_command: str = ""
+    alert_url: str = ""
 
 
 @dataclass(frozen=True)
@@ -32,7 +59,7 @@ class FlightWish:
     """What a batch asks for of each flight; everything else is as the mission's own defaults.
 
     `camera` is what --camera takes ("" for none), `m_per_px` the ground resolution of a new map (None: the frames'
-    own); a live source has ended when nothing came for `give_up_s`.
+    own); a live source has ended when nothing came for `give_up_s`. `watch` is for watches alone.
     """
 
     mission: Mission = Mission.MAP
@@ -40,6 +67,13 @@ class FlightWish:
     model: str = "default"
     m_per_px: float | None = None
     give_up_s: float = 30.0
+    watch: WatchWish = WatchWish()
+
+    @classmethod
+    def of(cls, plain: Mapping[str, Any]) -> Self:
+        """The wish that a worker received."""
+        watch = WatchWish(**{**plain["watch"], "classes": tuple(plain["watch"]["classes"])})
+        return cls(**{**plain, "mission": Mission(plain["mission"]), "watch": watch})
 
 
 class PartKind(StrEnum):
@@ -62,8 +96,9 @@ class Part:
 
 @dataclass(frozen=True)
 class Order:
-    """One try at one flight, or at a `part` of one: the file, folder or address, the site's folder, and how much its
-    caches may take, MB. `detector` is the socket of one that the flights of its machine share; "" for its own."""
+    """One try at one flight, or at a `part` of one: the file, folder or address, the folder of the site, or of a
+    watch's results, and how much its caches may take, MB. `detector` is the socket of one that the flights of its
+    machine share; "" for its own."""
 
     source: str
     site: str
@@ -79,11 +114,10 @@ class Order:
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Self:
         """The order that a worker received."""
-        wish = dict(plain["wish"])
         part = plain.get("part")
         if part is not None:
             part = Part(**{**part, "kind": PartKind(part["kind"])})
-        return cls(**{**plain, "wish": FlightWish(**{**wish, "mission": Mission(wish["mission"])}), "part": part})
+        return cls(**{**plain, "wish": FlightWish.of(plain["wish"]), "part": part})
 
 
 @dataclass(frozen=True)
@@ -130,7 +164,7 @@ class Ending:
 
 
 def answer_line(kind: str, data: Mapping[str, Any]) -> bytes:
-    """One answer of a worker: "alive", "scouted", "unreadable", "ended" or "failed"."""
+    """One answer of a worker: "alive", "found", "scouted", "unreadable", "ended" or "failed"."""
     return _line({kind: dict(data)})
 
 

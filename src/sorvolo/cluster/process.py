@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from sorvolo.cluster.orders import FINISH, Ending, Order, Outcome, ScoutOrder, answer_of
@@ -139,11 +139,13 @@ class _Life:
         return time.monotonic() - self._shown_s > self._stall_s
 
 
-def run_order(worker: WorkerProcess, stall_s: float) -> Ending:
-    """Wait until a worker has done its order."""
+def run_order(worker: WorkerProcess, stall_s: float, found: Callable[[str], None] = lambda _: None) -> Ending:
+    """Wait until a worker has done its order; `found` gets what a watch found, in words."""
     last = None
     for answer in worker.answers(stall_s):
         last = answer
+        if answer[0] == "found":
+            found(str(answer[1]["words"]))
     return worker.end(last)
 
 

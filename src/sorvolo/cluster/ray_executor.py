@@ -8,11 +8,12 @@ import importlib.util
 import os
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 import sorvolo
@@ -84,6 +85,7 @@ class RayExecutor:
         self._name, self._workers, self._stall_s, self._root = name, workers, stall_s, str(root.resolve())
         self._running: dict[Key, Any] = {}
         self._actors: dict[Key, Any] = {}  # of those that are live
+        self._asked_found: dict[Key, Any] = {}  # answers of theirs that are on their way
         self._detectors = MachineDetectors(ray, sharing.gpus) if sharing.is_shared else None
         self._is_gone = False
         # through ray:// the head's own client server is asked, and raises what `_cluster` knows
@@ -113,8 +115,12 @@ class RayExecutor:
         self._asked(lambda: self._submit(key, order, cost))
 
     def finish(self, key: Key) -> None:
-        """End a live flight, and have its map finished."""
+        """End a live flight, and have its map or watch finished."""
         self._asked(lambda: self._actors[key].finish.remote())
+
+    def take_found(self) -> Sequence[tuple[Key, str]]:
+        """What live watches found since this was last asked, in words."""
+        return self._asked(self._taken_found) if self._actors else ()
 
     def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
         """Wait until a try has ended; None where none did for so long. Raises SettingsError if the cluster is gone."""
@@ -129,6 +135,7 @@ class RayExecutor:
             key = next(each for each, task in self._running.items() if task == ended[0])
         ending = self._asked(lambda: self._ending(ended[0]))
         del self._running[key]
+        self._asked_found.pop(key, None)
         if (actor := self._actors.pop(key, None)) is not None:
             self._ray.kill(actor)
         return key, ending
@@ -158,11 +165,21 @@ class RayExecutor:
         shared = self._detectors.addresses() if self._detectors is not None and searches(order) else {}
         given = (order, self._stall_s, self._root, sorvolo.__version__, shared)
         if is_live_address(order.source):
-            actor = self._ray.remote(_LiveTry).options(max_concurrency=2, max_restarts=0, **asked).remote()
+            actor = self._ray.remote(_LiveTry).options(max_concurrency=3, max_restarts=0, **asked).remote()
             self._actors[key], self._running[key] = actor, actor.run.remote(*given)
             return
         name = f"sorvolo {Path(order.source).name}"
         self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
+
+    def _taken_found(self) -> list[tuple[Key, str]]:
+        found: list[tuple[Key, str]] = []
+        for key, actor in self._actors.items():
+            task = self._asked_found.setdefault(key, actor.take_found.remote())
+            if self._ray.wait([task], timeout=0)[0]:
+                del self._asked_found[key]
+                with suppress(self._ray.exceptions.RayActorError):  # its end is another's to state
+                    found += [(key, words) for words in self._ray.get(task)]
+        return found
 
     def _ending(self, task: Any) -> Ending:
         try:
@@ -278,16 +295,21 @@ def _with_detector(order: Order, shared: Mapping[str, str]) -> Order:
 
 
 class _LiveTry:
-    """On a machine of the cluster: a try at a live flight, which `finish` ends. Ray calls both in threads."""
+    """On a machine of the cluster: a try at a live flight, which `finish` ends. Ray calls its methods in threads."""
 
     def __init__(self) -> None:
         self._worker: WorkerProcess | None = None
+        self._found: SimpleQueue[str] = SimpleQueue()
 
     def run(self, order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]) -> Ending:
         """The try in a process of its own, which ends with this one."""
         _demand_fit(root, version)
         self._worker = WorkerProcess(_with_detector(order, shared))
-        return run_order(self._worker, stall_s)
+        return run_order(self._worker, stall_s, self._found.put)
+
+    def take_found(self) -> list[str]:
+        """What its watch found since this was last asked."""
+        return [self._found.get() for _ in range(self._found.qsize())]
 
     def finish(self) -> None:
         """Have the flight end."""

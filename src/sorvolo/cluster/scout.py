@@ -12,6 +12,7 @@ from sorvolo.capture.video import VIDEO_SUFFIXES
 from sorvolo.cluster.orders import Scouted, ScoutOrder
 from sorvolo.cluster.process import WorkerProcess
 from sorvolo.errors import InputError
+from sorvolo.store.exports.detection_files import find_watched
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.wording import counted
 
@@ -44,7 +45,7 @@ class Unreadable:
 def find_flights(places: Sequence[Path], root: Path) -> list[FoundFlight]:
     """Every video and every folder of photos in these folders and below, by path; one with a single photo is no flight.
 
-    Hidden folders, links to folders, site folders and `root`, where maps are made, are passed over. A place may also be
+    Hidden folders, links to folders, folders of sites and watches, and `root` are passed over. A place may also be
     a video. Raises InputError for a place that is not there, or when there is no flight at all.
     """
     found: dict[Path, FoundFlight] = {}
@@ -69,7 +70,7 @@ def find_flights(places: Sequence[Path], root: Path) -> list[FoundFlight]:
 
 def _folders(place: Path, root: Path) -> Iterator[tuple[Path, list[str]]]:
     for folder, folders, names in os.walk(place):
-        if is_site(Path(folder)) or Path(folder) == root:
+        if is_site(Path(folder)) or Path(folder) == root or find_watched(Path(folder)) is not None:
             folders.clear()
             continue
         folders[:] = sorted(name for name in folders if not name.startswith("."))

@@ -35,14 +35,14 @@ class Placed:
 
 def sites_of(
     flights: Sequence[Placed], by: SiteBy, known: Mapping[str, str], ground: Mapping[str, Box],
-    taken: Sequence[str] = (), near_m: float = 50.0,
+    taken: Sequence[str] = (), near_m: float = 50.0, ending: str = "",
 ) -> dict[str, str]:
     """The site of each flight, by the flight's fingerprint.
 
     `known` are the sites of flights that have one, by fingerprint: they keep it. `ground` is where sites are that
     exist. `taken` are further names that no new site may have. By place, a flight in order of time joins the first site
     whose ground lies within `near_m` of its fixes, and the site's ground then reaches as far as the flight's; one that
-    has no fixes, or lies near no site, founds a site named after it.
+    has no fixes, or lies near no site, founds a site named after it, with `ending` after the name.
     """
     found = dict(known)
     grounds = dict(ground)
@@ -53,7 +53,7 @@ def sites_of(
     for each in sorted((each for each in flights if each.scouted.fingerprint not in found), key=_moment):
         box = each.scouted.box
         near = _near(box, grounds, near_m) if by is SiteBy.PLACE and box is not None else ""
-        site = near or _new_name(each.path, used)
+        site = near or _new_name(each.path, used, ending)
         used.add(site)
         _extend(grounds, site, box)
         found[each.scouted.fingerprint] = site
@@ -125,11 +125,11 @@ def _extend(grounds: dict[str, Box], site: str, box: Box | None) -> None:
         grounds[site] = (min(one[0], box[0]), min(one[1], box[1]), max(one[2], box[2]), max(one[3], box[3]))
 
 
-def _new_name(path: Path, used: set[str]) -> str:
+def _new_name(path: Path, used: set[str], ending: str) -> str:
     """The flight's own name; with its folder's before it, or a number after it, where another site has it."""
     own = path.name if path.is_dir() else path.stem
     name = safe_name(own)
-    if name in used:
+    if f"{name}{ending}" in used:
         name = safe_name(f"{path.parent.name}_{own}")
-    names = [name, *(f"{name}-{number}" for number in range(2, len(used) + 3))]
+    names = [f"{name}{ending}", *(f"{name}-{number}{ending}" for number in range(2, len(used) + 3))]
     return next(each for each in names if each not in used)

@@ -1,9 +1,10 @@
-"""Live streams side by side: each is mapped into a site of its own by a process that is started again when it dies."""
+"""Live streams side by side, mapped, compared or watched, each by a process that is started again when it dies."""
 
 import hashlib
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -16,6 +17,7 @@ from sorvolo.cluster.cost import cost_of
 from sorvolo.cluster.executor import Executor, Key
 from sorvolo.cluster.orders import Ending, Mission, Order, Outcome, Scouted
 from sorvolo.cluster.table import BatchTable, Row, State
+from sorvolo.cluster.watches import ENDING
 from sorvolo.errors import SettingsError
 
 _LOOK_S = 0.5
@@ -23,7 +25,7 @@ _LOOK_S = 0.5
 
 @dataclass(frozen=True)
 class Stream:
-    """A live source, and the site that it is mapped into. `shown` has no password."""
+    """A live source, and the site that it is mapped into, or whose name its watches have. `shown` has no password."""
 
     address: str
     site: str
@@ -63,14 +65,17 @@ def run_streams(
     streams: Sequence[Stream], root: Path, settings: BatchSettings,
     executor_of: Callable[[BatchTable], AbstractContextManager[Executor]], until: threading.Event,
 ) -> Generator[BatchUpdate, None, BatchReport]:
-    """Map, or compare, each stream until it ends or `until` is set; then its flight is finished like any other's.
+    """Map, compare or watch each stream until it ends or `until` is set; then its flight is finished like any other's.
 
     A process that dies is started again, after a second and ever longer: it goes on with the flight as another segment
     where the stream is back in time (`LiveSettings.same_flight_s`), else with a flight of its own. One that dies
-    `most_tries` times in a row within a minute of its start is set aside; the others go on. Raises as `run_batch`.
+    `most_tries` times in a row within a minute of its start is set aside; the others go on. One whose database or site
+    is out of reach is started again as often as need be. Raises as `run_batch`.
     """
     if settings.wish.mission is Mission.SEARCH:
-        raise SettingsError("--mission search measures flights that are over: give map or compare for live streams")
+        raise SettingsError(
+            "--mission search measures flights that are over: give map, compare or watch for live streams"
+        )
     started_s = time.monotonic()
     with BatchTable.open(root) as table, executor_of(table) as executor:
         run = _Streams(streams, table, settings, executor, until)
@@ -92,6 +97,7 @@ class _Streams:
         self.rows = {row.key: row for row in rows}
         self._addresses = {row.key: each.address for row, each in zip(rows, streams)}
         self._due_s: dict[Key, float] = dict.fromkeys(self.rows, 0.0)  # those that wait for their start
+        self._put_off: Counter[Key] = Counter()  # how often in a row it was out of reach
         self._is_finishing = False
         self.tries = self.crashes = 0
 
@@ -104,7 +110,10 @@ class _Streams:
                 for key in self._executor.running:
                     self._executor.finish(key)
             if self._executor.running:
-                if (ended := self._executor.next_ended(_LOOK_S)) is not None:
+                ended = self._executor.next_ended(_LOOK_S)
+                for key, words in self._executor.take_found():
+                    yield replace(self._update(self.rows[key]), found=words)
+                if ended is not None:
                     yield self._update(self._end(*ended))
             else:
                 self._until.wait(_LOOK_S)
@@ -131,6 +140,10 @@ class _Streams:
 
     def _end(self, key: Key, ending: Ending) -> Row:
         row = self.rows[key]
+        if ending.outcome is Outcome.WAITS:
+            self._put_off[key] += 1
+            return self._start_later(row.after(ending, State.WAITING, ending.words), self._put_off[key])
+        del self._put_off[key]
         if ending.outcome is not Outcome.CRASHED:
             return self._keep(row.after(ending, State(ending.outcome.value), ending.words))
         self.crashes += 1
@@ -138,9 +151,12 @@ class _Streams:
         if row.crashes >= self._settings.most_tries:
             words = f"set aside after {row.crashes} tries: {ending.words}"
             return self._keep(row.after(ending, State.SET_ASIDE, words))
-        wait_s = min(self._settings.restarts.longest_wait_s, 2.0 ** (row.crashes - 1))
-        self._due_s[key] = time.monotonic() + wait_s
-        return self._keep(row.after(ending, State.WAITING, ending.words))
+        return self._start_later(row.after(ending, State.WAITING, ending.words), row.crashes)
+
+    def _start_later(self, row: Row, starts: int) -> Row:
+        """The row, which waits longer the more starts in a row ended badly."""
+        self._due_s[row.key] = time.monotonic() + self._settings.restarts.wait_s(starts)
+        return self._keep(row)
 
     def _keep(self, row: Row) -> Row:
         row = self._table.put(row)
@@ -156,5 +172,6 @@ class _Streams:
 def _row(stream: Stream, settings: BatchSettings) -> Row:
     """A stream's row: every time a new one, since a stream is another flight each time."""
     name = hashlib.sha256(f"stream {stream.site}".encode()).hexdigest()
-    scouted = Scouted(name, 0, 0, None)
-    return Row(stream.shown, settings.wish.mission.value, "", "", scouted, stream.site)
+    scouted, mission = Scouted(name, 0, 0, None), settings.wish.mission
+    site = f"{stream.site}{ENDING}" if mission is Mission.WATCH else stream.site
+    return Row(stream.shown, mission.value, "", "", scouted, site)

@@ -49,6 +49,10 @@ class Answers:
             self._alive_s = time.monotonic()
             self.add("alive", {})
 
+    def found(self, words: str) -> None:
+        """Something that a watch found, in words."""
+        self.add("found", {"words": words})
+
 
 def main() -> int:
     """Do the one order of standard input. 0 also for a flight that cannot be used: that is an answer."""
@@ -63,22 +67,26 @@ def main() -> int:
         return 0
     order = Order.of(content["order"])
     try:
-        flight, words, is_good = _done(order, answers.alive, until)
+        flight, words, is_good = _done(order, answers, until)
     except SorvoloError as error:
-        answers.add("ended", {"outcome": Outcome.FAILED, "words": without_secret(str(error), order.source)})
+        answers.add("ended", {"outcome": Outcome.of(error), "words": without_secret(str(error), order.source)})
         return 0
     outcome = Outcome.DONE if is_good else Outcome.DOUBTFUL
     answers.add("ended", {"outcome": outcome, "words": words, "flight": flight})
     return 0
 
 
-def _done(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
+def _done(order: Order, answers: Answers, until: threading.Event) -> tuple[str, str, bool]:
     """Do the order: the flight's name in the site, words about it, and whether its result is one to use."""
     if order.part is not None:
-        _PARTS[order.part.kind](order, order.part, alive)
+        _PARTS[order.part.kind](order, order.part, answers.alive)
         return "", "", True
+    if order.wish.mission is Mission.WATCH:
+        from sorvolo.cluster.watches import watch_flight
+
+        return *watch_flight(order, _detector(order), answers.alive, answers.found, until), True
     _wait_for_site(Path(order.site))
-    return _MISSIONS[order.wish.mission](order, alive, until)
+    return _MISSIONS[order.wish.mission](order, answers.alive, until)
 
 
 def _block(order: Order, part: Part, alive: Callable[..., None]) -> None:

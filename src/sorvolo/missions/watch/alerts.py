@@ -21,7 +21,7 @@ from sorvolo.errors import SettingsError, StoreError
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.wording import counted
 
-PLACEHOLDERS = ("id", "class", "score", "latitude", "longitude", "time", "crop")
+PLACEHOLDERS = ("flight", "id", "class", "score", "latitude", "longitude", "time", "crop")
 """What an alert command's words may hold in braces."""
 
 _MOST_WAITING = 1000

@@ -2,8 +2,8 @@
 
 import threading
 import time
-from collections.abc import Callable, Generator
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Generator, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,12 +19,12 @@ from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.ground import over_heights
 from sorvolo.missions.watch.journal import StoppedWatch, WatchJournal, WatchOrder
-from sorvolo.missions.watch.places import places_of
+from sorvolo.missions.watch.places import Places, places_of
 from sorvolo.missions.watch.run import WatchRun, WatchUpdate
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
 from sorvolo.store.exports.cursor_on_target import COT_TYPES
-from sorvolo.store.exports.detection_files import claim_folder, keep_annotated
+from sorvolo.store.exports.detection_files import claimed_folder
 from sorvolo.survey.flight import Frame, LostFrame
 
 _AHEAD = 4  # decoded frames that wait for the detector
@@ -70,10 +70,19 @@ def watch(
 
 
 def _folder_of(source: Source, outputs: WatchOutputs, *, is_only: bool) -> Path:
-    """Where a watch's files go: each of several sources has a folder of its own."""
+    """Where a watch's files go: each of several sources has a folder of its own, and each flight of a live one."""
+    if outputs.folder is None and outputs.below is not None:
+        folder = outputs.below / source.name
+        return _free_folder(folder) if isinstance(source, LiveSource) else folder
     if outputs.folder is None:
         return Path(f"{source.name}-watch")
     return outputs.folder if is_only else outputs.folder / source.name
+
+
+def _free_folder(folder: Path) -> Path:
+    """The folder, with a number where there is one of this name."""
+    names = (folder, *(folder.with_name(f"{folder.name}-{number}") for number in range(2, 10_000)))
+    return next(each for each in names if not each.exists())
 
 
 def _checked_detector(detector: Detects | None, settings: WatchSettings, outputs: WatchOutputs) -> Detects:
@@ -98,19 +107,11 @@ def _watch_one(
     telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
     settings, outputs, detector = order.settings, order.outputs, order.detector
-    mapping = MapSettings(offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m)
-
-    def prepared(mapping: MapSettings) -> FlightSetup:
-        return prepare(source, mapping, None, telemetry_named=telemetry_named)
-
-    if settings.height_model:
-        setup, ground = over_heights(prepared, mapping, Path(settings.height_model))
-    else:
-        setup, ground = prepared(mapping), None
-    least = settings.least_score if settings.least_score is not None else min(detector.info.thresholds.values())
-    places = places_of(setup, least, ground)
-    journal = _begun(source, order, setup, folder, goes_on)
-    with closing(journal.file), WatchRun(setup, places, detector, settings, outputs, folder, journal) as run:
+    setup, places = _prepared(source, order, telemetry_named=telemetry_named)
+    with (
+        _begun(source, order, setup, folder, goes_on) as journal,
+        WatchRun(setup, places, detector, settings, outputs, folder, journal) as run,
+    ):
         for searched in journal.frames() if goes_on is not None else ():
             yield run.recall(searched)
         ended = _STOPPED
@@ -125,23 +126,47 @@ def _watch_one(
         finally:
             if run.log.detected or ended == _STOPPED:
                 run.finish(ended=ended, skipped=source.skipped if isinstance(source, LiveSource) else 0)
-        if not run.log.detected and ended != _STOPPED:
-            reason = next(iter(run.log.lost), "the source holds none")
-            raise InputError(f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`")
+        if ended != _STOPPED:
+            _demand_searched(run, source)
 
 
+def _demand_searched(run: WatchRun, source: Source) -> None:
+    if not run.log.detected:
+        reason = next(iter(run.log.lost), "the source holds none")
+        raise InputError(f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`")
+
+
+def _prepared(source: Source, order: WatchOrder, *, telemetry_named: bool) -> tuple[FlightSetup, Places]:
+    """The flight as it is set up, and where what is found in it will lie."""
+    settings = order.settings
+    mapping = MapSettings(offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m)
+
+    def prepared(mapping: MapSettings) -> FlightSetup:
+        return prepare(source, mapping, None, telemetry_named=telemetry_named)
+
+    if settings.height_model:
+        setup, ground = over_heights(prepared, mapping, Path(settings.height_model))
+    else:
+        setup, ground = prepared(mapping), None
+    thresholds = order.detector.info.thresholds
+    least = settings.least_score if settings.least_score is not None else min(thresholds.values())
+    return setup, places_of(setup, least, ground)
+
+
+@contextmanager
 def _begun(
     source: Source, order: WatchOrder, setup: FlightSetup, folder: Path, goes_on: StoppedWatch | None
-) -> WatchJournal:
+) -> Iterator[WatchJournal]:
     """The journal of a watch, whose folder is claimed: as a killed watch left it where that goes on, else empty."""
-    file = order.journal(setup, folder)
-    if not isinstance(source, LiveSource):
-        claim_folder(folder, source.name, source.fingerprint, goes_on=file.is_begun)
-        return WatchJournal(file)
-    if goes_on is not None:
-        keep_annotated(folder)
-    claim_folder(folder, source.name, source.fingerprint, replaces=False, goes_on=goes_on is not None)
-    return WatchJournal(file, SourceNotes(file, source, 0 if goes_on is None else goes_on.samples))
+    file, is_live = order.journal(setup, folder), isinstance(source, LiveSource)
+    goes = goes_on is not None if is_live else file.is_begun
+    with (
+        claimed_folder(folder, source.name, source.fingerprint, replaces=not is_live, goes_on=goes), closing(file)
+    ):
+        if isinstance(source, LiveSource):
+            yield WatchJournal(file, SourceNotes(file, source, 0 if goes_on is None else goes_on.samples))
+        else:
+            yield WatchJournal(file)
 
 
 def _search(

@@ -132,8 +132,9 @@ class WatchOrder:
         """Have a live source go on with the flight of a watch that was killed; None where no such watch was asked for
         the same."""
         request = live_request(source, self.settings, None, self.detector, *self._more)
-        named = self.outputs.folder
-        found = sorted(each.parent for each in Path().glob(f"*-watch/{JOURNAL}"))
+        named, below = self.outputs.folder, self.outputs.below
+        names = Path().glob(f"*-watch/{JOURNAL}") if below is None else below.glob(f"*/{JOURNAL}")
+        found = sorted(each.parent for each in names)
         for folder in found if named is None else [named]:
             journal = self._at(folder, request)
             so_far = go_on(source, journal, most_gap_s) if journal.is_begun else None
@@ -145,7 +146,7 @@ class WatchOrder:
     def _more(self) -> tuple[Any, ...]:
         heights = Path(self.settings.height_model)
         stamp = (heights.stat().st_size, heights.stat().st_mtime_ns) if self.settings.height_model else ()
-        return replace(self.outputs, folder=None), stamp
+        return replace(self.outputs, folder=None, below=None), stamp
 
     def _at(self, folder: Path, request: str) -> RunJournal:
         return RunJournal(folder / JOURNAL, content_sha256(request), 0, sorvolo.__version__)

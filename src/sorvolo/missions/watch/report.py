@@ -14,10 +14,11 @@ from typing import Any
 import sorvolo
 from sorvolo.capture.source import Source
 from sorvolo.detection.contract import ModelInfo
+from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.exports.plain import utc_text
-from sorvolo.survey.flight import Notice
+from sorvolo.survey.flight import Notice, Site
 from sorvolo.survey.objects import Detections, Track
 from sorvolo.survey.wording import counted
 
@@ -63,6 +64,16 @@ class WatchLog:
     def seconds(self) -> float:
         """Since the watch began."""
         return time.monotonic() - self.started_s
+
+
+def found_words(track: Track, site: Site, form: Coordinates = Coordinates.LATLON) -> tuple[str, str]:
+    """A new object's name, and where it is (none of a local site) and how sure that is."""
+    name, seen = f"{track.label} {track.id}", f"score {track.score:.2f}, {counted(track.views, 'view')}"
+    if site.is_local:
+        return name, seen
+    latitude, longitude, _ = site.frame.wgs84_from_site(track.position_m[None])
+    place = place_text(float(latitude[0]), float(longitude[0]), form)
+    return name, f"at {place} (accuracy {track.sigma_m:.1f} m), {seen}"
 
 
 def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:

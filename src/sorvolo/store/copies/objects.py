@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 from urllib.parse import urlsplit
 
-from sorvolo.errors import SettingsError, StoreError
+from sorvolo.errors import SettingsError, StoreError, UnavailableError
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -207,11 +207,10 @@ class Objects:
             text = str(error)
             if isinstance(error, FileNotFoundError) and "NoSuchBucket" not in text:
                 raise FileNotFoundError(2, "no such object", self.name) from None
-            kind = StoreError if _CODE.search(text) or _STATUS.search(text) else _CutError
-            raise kind(f"cannot {action} at {self.name}: {_words_of(text)}") from None
+            raise _kind_of(text)(f"cannot {action} at {self.name}: {_words_of(text)}") from None
 
 
-class _CutError(StoreError):
+class _CutError(UnavailableError):
     """There was no answer, or only part of one."""
 
 
@@ -328,6 +327,15 @@ def _section(path: Path, *names: str) -> dict[str, str]:
     except (OSError, ConfigError, UnicodeDecodeError):
         raise SettingsError(f"{path} cannot be read; mend it, or set AWS_ACCESS_KEY_ID instead") from None
     return next((dict(parser[name]) for name in names if parser.has_section(name)), {})
+
+
+def _kind_of(text: str) -> type[StoreError]:
+    """What a library's error is: no answer, one that may be another later (5xx), or a refusal."""
+    status, code = _STATUS.search(text), _CODE.search(text)
+    if status is None and code is None:
+        return _CutError
+    is_busy = (status is not None and status[1].startswith("5")) or (code is not None and code[1] == "SlowDown")
+    return UnavailableError if is_busy else StoreError
 
 
 def _words_of(text: str) -> str:

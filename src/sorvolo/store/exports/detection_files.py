@@ -1,15 +1,18 @@
 """The folder of a watch: a line for each detection as it is made, places and tracks as GeoJSON, crops of tracks."""
 
+import fcntl
 import json
+import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.geometry.arrays import Floats, ImageRGB, TimesNs
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_path, atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.placemarks import Placemark
@@ -37,14 +40,17 @@ DETECTIONS, TRACKS = "detections", "tracks"
 TRACKS_KML, TRACKS_GPX = "tracks.kml", "tracks.gpx"
 ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS = "annotated.mp4", "annotated", "labels"
 
-JOURNAL = "run.journal"
-"""How far a watch is, until it is complete."""
+JOURNAL, REPORT = "run.journal", "report.json"
+"""How far a watch is, until it is complete; what it found."""
+
+_LOCK = "watch.lock"
+"""Held by the one process that writes into the folder, while it does."""
 
 _OURS = (
     JOURNAL, LINES,
     *(features_name(name, is_local=is_local) for name in (DETECTIONS, TRACKS) for is_local in (False, True)),
     TRACKS_KML, TRACKS_GPX, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS,
-    "report.json", "report.html",
+    REPORT, "report.html",
 )
 _MADE_BY = "sorvolo watch"
 _OF_FIRST_PICTURE = (
@@ -53,35 +59,39 @@ _OF_FIRST_PICTURE = (
 )
 
 
-def claim_folder(
+@contextmanager
+def claimed_folder(
     folder: Path, source: str, fingerprint: str, *, replaces: bool = True, goes_on: bool = False
-) -> None:
-    """Make the folder, or empty it of an earlier watch of the very same source, and mark it.
+) -> Iterator[None]:
+    """Make the folder, or empty it of an earlier watch of the very same source, and mark it; nobody else writes into
+    it until the end of the block.
 
     Other files in it stay, and all of a watch that `goes_on`. Raises StoreError for a folder with anything but such a
-    watch; without `replaces` (a live stream is never the same twice) for one with any watch that does not go on.
+    watch; without `replaces` (a live stream is never the same twice) for one with any watch that does not go on;
+    UnavailableError while another process writes it.
     """
-    if folder.exists() and not folder.is_dir():
-        raise StoreError(f"{folder} is a file; give a folder with --out")
-    if folder.is_dir() and any(folder.iterdir()):
-        earlier = _mark_of(folder)
-        if earlier is None:
-            raise StoreError(f"{folder} is not empty and holds no earlier watch; give another folder with --out")
-        if not (replaces or goes_on) or (earlier.get("source"), earlier.get("fingerprint")) != (source, fingerprint):
-            raise StoreError(
-                f"{folder} holds a watch of {earlier.get('source')}, which stays; give another folder with --out"
-            )
+    _refuse_others(folder, source, fingerprint, may_be_there=replaces or goes_on)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        remove_leftovers([folder])
-        for name in () if goes_on else _OURS:
-            if (folder / name).is_dir():
-                shutil.rmtree(folder / name)
-            else:
-                (folder / name).unlink(missing_ok=True)
-    atomic_write_bytes(
-        folder / MARK, json_bytes({"made_by": _MADE_BY, "source": source, "fingerprint": fingerprint})
-    )
+    with _held(folder):
+        with writing(folder):
+            if goes_on and not replaces:
+                _keep_annotated(folder)
+            remove_leftovers([folder])
+            for name in () if goes_on else _OURS:
+                if (folder / name).is_dir():
+                    shutil.rmtree(folder / name)
+                else:
+                    (folder / name).unlink(missing_ok=True)
+        mark = {"made_by": _MADE_BY, "source": source, "fingerprint": fingerprint}
+        atomic_write_bytes(folder / MARK, json_bytes(mark))
+        yield
+
+
+def find_watched(folder: Path) -> str | None:
+    """The fingerprint of the source whose watch the folder holds, complete or not; None where it holds none."""
+    mark = _mark_of(folder)
+    return None if mark is None else str(mark.get("fingerprint"))
 
 
 class DetectionLines:
@@ -221,7 +231,46 @@ def written_crop(folder: Path, track_id: int) -> str | None:
     return name if (folder / name).is_file() else None
 
 
-def keep_annotated(folder: Path) -> None:
+def _refuse_others(folder: Path, source: str, fingerprint: str, *, may_be_there: bool) -> None:
+    """Raise StoreError for a folder with anything but a watch of this source, which `may_be_there`."""
+    if folder.exists() and not folder.is_dir():
+        raise StoreError(f"{folder} is a file; give a folder with --out")
+    if not folder.is_dir() or all(each.name == _LOCK for each in folder.iterdir()):
+        return
+    earlier = _mark_of(folder)
+    if earlier is None:
+        raise StoreError(f"{folder} is not empty and holds no earlier watch; give another folder with --out")
+    if not may_be_there or (earlier.get("source"), earlier.get("fingerprint")) != (source, fingerprint):
+        raise StoreError(
+            f"{folder} holds a watch of {earlier.get('source')}, which stays; give another folder with --out"
+        )
+
+
+@contextmanager
+def _held(folder: Path) -> Iterator[None]:
+    """Keep others from writing into the folder. Raises UnavailableError while another process does."""
+    path = folder / _LOCK
+    while True:
+        with writing(path):
+            lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if path.exists() and os.path.samestat(os.fstat(lock), path.stat()):
+                break  # else its former holder removed it meanwhile
+        except BlockingIOError as error:
+            os.close(lock)
+            raise UnavailableError(
+                f"another process writes its watch into {folder}; wait until it has ended, or give another folder"
+            ) from error
+        os.close(lock)
+    try:
+        yield
+    finally:
+        path.unlink(missing_ok=True)
+        os.close(lock)
+
+
+def _keep_annotated(folder: Path) -> None:
     """Keep the annotated video of a watch that was killed beside the one that is about to begin."""
     cut_off = folder / f"{TEMPORARY_PREFIX}{ANNOTATED_VIDEO}"
     if cut_off.is_file():

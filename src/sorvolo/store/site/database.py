@@ -8,7 +8,7 @@ from typing import Protocol
 
 from sqlalchemy import Connection
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import StoreError, UnavailableError
 
 numbers = itertools.count()
 """One for each catalogue opened, so that no two have a change mark in common."""
@@ -28,7 +28,7 @@ class Layout:
     page_bytes: int = 4096
 
 
-class ConnectionLostError(StoreError):
+class ConnectionLostError(UnavailableError):
     """The connection to the database was lost: what was not committed is rolled back, the rest is kept."""
 
 

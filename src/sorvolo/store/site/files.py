@@ -8,7 +8,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Self
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.store.atomic import TEMPORARY_PREFIX, writing
@@ -40,7 +40,7 @@ COPYING = "copying.json"
 _MOST_REPORT_BYTES = 256_000_000  # of a report.json: an hour's track takes a hundredth
 
 
-class BusyError(StoreError):
+class BusyError(UnavailableError):
     """Another process writes the site."""
 
 

@@ -11,7 +11,7 @@ from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, func, s
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import QueuePool
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.store.site import schema
 from sorvolo.store.site.database import ConnectionLostError, Layout, damaged, numbers
 from sorvolo.store.site.sqlite_database import CATALOGUE_LAYOUT
@@ -161,7 +161,7 @@ class PostgresDatabase:
                 if connection.execute(select(func.pg_try_advisory_lock(key))).scalar_one():
                     return
             if time.monotonic() >= until_s:
-                raise StoreError(f"another process is mapping into {self.place}; wait until it has finished")
+                raise UnavailableError(f"another process is mapping into {self.place}; wait until it has finished")
             time.sleep(_LOOK_AGAIN_S)
 
     def _drop_writer(self) -> None:
