@@ -1,11 +1,15 @@
 """Whether a batch loses or doubles anything while its workers, and the batch itself, are killed at random.
 
     python benchmarks/batch_faults.py --flights 40 --kills 2 --seed 1
+    python benchmarks/batch_faults.py --flights 12 --outages 30 --stall 90 --out benchmarks/results/batch_outages.json
 
 Small simulated photo flights, some of them poisoned (their worker is killed at every try), one broken, one there twice.
 Other workers are killed (SIGKILL), crashed (SIGSEGV) or stopped (SIGSTOP) at random moments, each flight's at most
 twice; the batch's own process is killed `--kills` times and started again. In the end each map is compared, byte by
 byte, with one that `map_flights` makes undisturbed, but for what states when it was made and how long it took.
+
+With `--outages S` the sites' catalogues lie in PostgreSQL, each site is copied to an object store as well, and both are
+killed, cut off or stalled at random, for up to S seconds. The copies are then verified, too.
 """
 
 import argparse
@@ -21,38 +25,51 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from unittest import mock
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "cluster"))
 
 from batch_flights import another, content
 
+from ended_work import ended
+from outages import PLACE, outages
 from provenance import commit, machine
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.local_executor import LocalExecutor
-from sorvolo.cluster.orders import FlightWish, Order
+from sorvolo.cluster.orders import Ending, FlightWish, Order
 from sorvolo.cluster.table import BatchTable, State
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
+from sorvolo.missions.site.copy import verify_copy
 from sorvolo.simulation.presets import preset
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import POINTER, VARIABLE
 
 FAULTS = (signal.SIGKILL, signal.SIGSEGV, signal.SIGSTOP)
 MOST_FAULTS = 2  # of a flight that is not poisoned: three would set it aside
-STALL_S = 8.0
 
 
 class Disturbed(LocalExecutor):
     """A local executor whose workers are struck at random moments."""
 
     def __init__(self, options: argparse.Namespace, lock: int, faults: Path) -> None:
-        super().__init__(options.workers, STALL_S, lock)
+        super().__init__(options.workers, options.stall, lock)
         self._options, self._faults = options, faults
         self._draw = random.Random(f"{options.seed} {time.time()}")
+
+    def next_ended(self, timeout_s: float | None = None) -> tuple[tuple[str, str], Ending] | None:
+        """Note how each try ends."""
+        ended = super().next_ended(timeout_s)
+        if ended is not None:
+            with self._faults.with_name("endings.txt").open("a") as file:
+                file.write(f"{ended[1].outcome.value}\n")
+        return ended
 
     def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
         """Begin a try, and perhaps strike its worker later."""
@@ -86,7 +103,10 @@ def batch(folder: Path, options: argparse.Namespace) -> None:
         with Disturbed(options, table.lock, folder / "faults.txt") as made:
             yield made
 
-    settings = BatchSettings(FlightWish(camera=str(folder / "flown-0" / "camera.xml"), model="none"), stall_s=STALL_S)
+    wish = FlightWish(
+        camera=str(folder / "flown-0" / "camera.xml"), model="none", copy_to=PLACE if options.outages else ""
+    )
+    settings = BatchSettings(wish, stall_s=options.stall)
     running = run_batch([folder / "in"], folder / "maps", settings, executor)
     while True:
         try:
@@ -95,7 +115,7 @@ def batch(folder: Path, options: argparse.Namespace) -> None:
             (folder / "report.json").write_text(json.dumps({"seconds": end.value.seconds, **end.value.counts()}))
             return
         if update.row is not None:
-            print(update.done, update.row.state, update.row.source, update.row.words[:80], flush=True)
+            print(update.done, update.row.state, update.row.source, update.row.words[:160], flush=True)
 
 
 def flown(folder: Path, options: argparse.Namespace) -> None:
@@ -119,14 +139,16 @@ def flown(folder: Path, options: argparse.Namespace) -> None:
 
 def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
     """The maps against undisturbed ones, flight by flight."""
-    same, differing, doubled = 0, [], []
+    same, differing, doubled, faulty_copies = 0, [], [], []
     for flight in sorted((folder / "in").glob("flight-*")):
         site, wanted = folder / "maps" / flight.name, folder / "wanted" / flight.name
-        for _ in map_flights(
-            [flight], wanted, MapSettings(model="none"), camera=folder / "flown-0" / "camera.xml"
-        ):
-            pass
+        with mock.patch.dict(os.environ, {VARIABLE: ""}):
+            for _ in map_flights(
+                [flight], wanted, MapSettings(model="none"), camera=folder / "flown-0" / "camera.xml"
+            ):
+                pass
         found, expected = content(site), content(wanted)
+        found.pop(POINTER, None)
         wrong = sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
         same += not wrong
         if wrong:
@@ -134,13 +156,26 @@ def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
         with Archive.open(site, write=False) as archive:
             if len(archive.flights()) != 1 or len(archive.versions()) != 1:
                 doubled.append(flight.name)
+        if options.outages and ended(verify_copy(str(site), f"{PLACE}/{site.name}")).faults:
+            faulty_copies.append(flight.name)
         shutil.rmtree(wanted)
-    return {"same_bytes": same, "differing": differing, "doubled": doubled}
+    copies = {"faulty_copies": faulty_copies} if options.outages else {}
+    return {"same_bytes": same, "differing": differing, "doubled": doubled, **copies}
 
 
 def measured(folder: Path, options: argparse.Namespace) -> dict[str, object]:
     """The batch through all its faults, and what came of it."""
     flown(folder, options)
+    with outages(options.seed, options.outages) if options.outages else nullcontext() as striking:
+        result = struck(folder, options)
+        if striking is not None:
+            striking.end()
+            result |= {"outages": dict(striking.counts), "outage_s": round(striking.seconds, 1)}
+        return {**result, **compared(folder, options)}
+
+
+def struck(folder: Path, options: argparse.Namespace) -> dict[str, object]:
+    """The batch, killed and started again, and its table."""
     draw, started_s, killed = random.Random(options.seed), time.monotonic(), 0
     context = multiprocessing.get_context("spawn")
     while True:
@@ -159,18 +194,23 @@ def measured(folder: Path, options: argparse.Namespace) -> dict[str, object]:
     with BatchTable.open(folder / "maps") as table:
         rows = list(table)
     through = [row for row in rows if row.state in (State.DONE, State.DOUBTFUL)]
-    faults = Counter(line.split()[1] for line in (folder / "faults.txt").read_text().splitlines())
+    faults = Counter(line.split()[1] for line in lines_of(folder / "faults.txt"))
     return {
         "flights": options.flights, "poisoned": options.poisoned, "workers": options.workers, "seed": options.seed,
         "batch_killed": killed, "faults": dict(faults), "seconds": round(seconds, 1),
+        "endings": dict(Counter(lines_of(folder / "endings.txt"))),
         "states": dict(Counter(row.state.value for row in rows)), "tries": sum(row.tries for row in rows),
         "crashes": sum(row.crashes for row in rows), "cpu_s": round(sum(row.cpu_s for row in rows), 1),
         "set_aside": sorted(Path(row.source).name for row in rows if row.state is State.SET_ASIDE),
         "not_through": sorted(
             Path(row.source).name for row in rows if Path(row.source).name.startswith("flight-") and row not in through
         ),
-        **compared(folder, options),
     }
+
+
+def lines_of(file: Path) -> list[str]:
+    """The lines of a file that need not be there."""
+    return file.read_text().splitlines() if file.exists() else []
 
 
 def main() -> None:
@@ -184,6 +224,8 @@ def main() -> None:
     parser.add_argument("--within", type=float, default=12.0, help="of a try's start, s")
     parser.add_argument("--kills", type=int, default=2)
     parser.add_argument("--kill-within", type=float, default=120.0, help="of the batch's start, s")
+    parser.add_argument("--stall", type=float, default=8.0, help="after which a worker that does nothing is ended, s")
+    parser.add_argument("--outages", type=float, default=0.0, help="of database and store, s at most; 0: none")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "batch_faults.json")
     options = parser.parse_args()

@@ -20,10 +20,11 @@ from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
-from sorvolo.cluster.orders import FlightWish, Order
+from sorvolo.cluster.orders import FlightWish, Mission, Order
 from sorvolo.cluster.ray_cluster import demand_same, probe_of, why_not
 from sorvolo.cluster.ray_executor import _demand_fit, _with_detector, ray_executor
 from sorvolo.cluster.shared_detector import SharingSettings
+from sorvolo.cluster.streams import run_streams, streams_of
 from sorvolo.cluster.table import LOCK, State
 from sorvolo.detection.models import find_model
 from sorvolo.detection.sharing import shared_engine
@@ -102,6 +103,8 @@ def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: An
         assert addresses.keys() == {each["NodeID"] for each in ray.nodes() if each["Resources"].get("CPU")}
         assert len(set(addresses.values())) == 2 and detectors.addresses() == addresses
         assert ray.available_resources()["GPU"] == 0.75
+        kept = sum(min(1e9, each["Resources"]["memory"]) for each in ray.nodes() if each["Resources"].get("CPU"))
+        assert ray.cluster_resources()["memory"] - ray.available_resources()["memory"] == pytest.approx(kept, abs=10)
         for address in addresses.values():  # on the processor: there is no card that anything runs on
             engine = shared_engine(address, find_model("thermal"))
             assert "CPU" in engine.provider
@@ -109,6 +112,24 @@ def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: An
         given = ray.get(ray.remote(_with_detector).remote(order, addresses))
         assert given.detector in addresses.values()
         assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order
+
+
+def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
+    cluster: Any, flown: Path, tmp_path: Path
+) -> None:
+    another(flown, tmp_path / "in" / "one")
+    wish = FlightWish(Mission.WATCH, camera=str(flown / "camera.xml"), give_up_s=2.0)
+    running = run_streams(
+        streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]), tmp_path / "out", BatchSettings(wish),
+        lambda table: ray_executor("ray", 1, 60.0, table.root), threading.Event(),
+    )
+    updates = list(running)
+    assert {each.found.partition(" at ")[0] for each in updates if each.found} == {"car 1", "person 2"}
+    last = updates[-1].row
+    assert last is not None and (last.state, last.tries, last.words) == (
+        State.DONE, 1, "1 car, 1 person found in 4 frames"
+    )
+    assert (tmp_path / "out" / "north-watch" / "one" / "report.html").is_file()
 
 
 def test_a_machine_that_dies_loses_nothing(cluster: Any, flown: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from batch_flights import another, content
@@ -12,12 +13,13 @@ from batch_flights import another, content
 from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, run_batch
-from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.cost import Cost, CostSettings
 from sorvolo.cluster.local_executor import LocalExecutor
 from sorvolo.cluster.orders import FlightWish, Order, Part, PartKind
 from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
 from sorvolo.cluster.table import BatchTable, State
 from sorvolo.errors import SettingsError, StoreError
+from sorvolo.missions.flight.memory import available_bytes
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 
@@ -26,11 +28,13 @@ class Disturbed(LocalExecutor):
     """A local executor that kills the shared detector as the first try begins."""
 
     pids: tuple[int, ...] = ()
+    memory_mb = 0.0
 
     def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
         super().start(key, order, cost)
         assert self._detector is not None
         self.pids = (*self.pids, self._detector.pid)
+        self.memory_mb = max(self.memory_mb, self._detector.memory_mb)
         if len(self.pids) == 1:
             os.kill(self._detector.pid, signal.SIGKILL)
 
@@ -51,6 +55,7 @@ def test_a_shared_detector_that_dies_is_started_again_and_finds_the_same(flown: 
     (row,) = report.rows
     assert row.state is State.DONE and (row.tries, report.crashes) == (2, 1)
     assert len(set(made[0].pids)) == 2
+    assert 30 < made[0].memory_mb < 5_000
     for pid in made[0].pids:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
@@ -58,6 +63,27 @@ def test_a_shared_detector_that_dies_is_started_again_and_finds_the_same(flown: 
     for _ in map_flights([flight], own, MapSettings(), camera=flown / "camera.xml"):
         pass
     assert content(tmp_path / "maps" / "one") == content(own)
+
+
+@pytest.mark.parametrize(("shares", "fits"), [(False, True), (True, False)])
+def test_the_shared_detector_counts_in_the_memory(shares: bool, fits: bool) -> None:
+    costs = CostSettings(detector_mb=1000.0, machine_share=1500e6 / available_bytes())
+    with LocalExecutor(2, 60.0, 0, costs, shares_detector=shares) as executor:
+        assert executor.has_room(Cost(1.0, 9000.0))  # nothing else runs
+        executor._running["map", "a"] = None, Cost(1.0, 500.0)  # type: ignore[assignment]
+        assert executor.has_room(Cost(1.0, 500.0)) is fits
+        executor._running.clear()
+
+
+def test_a_stream_is_budgeted_what_it_takes_once_that_is_known() -> None:
+    costs = CostSettings(machine_share=20_000e6 / available_bytes())
+    with LocalExecutor(9, 60.0, 0, costs) as executor:
+        for seconds, is_live, fits in ((90.0, True, True), (30.0, True, False), (90.0, False, False)):
+            running = SimpleNamespace(pid=os.getpid(), seconds=seconds)
+            executor._running["map", "a"] = running, Cost(1.0, 15_000.0)  # type: ignore[assignment]
+            executor._live = {("map", "a")} if is_live else set()
+            assert executor.has_room(Cost(1.0, 10_000.0)) is fits
+        executor._running.clear()
 
 
 def test_what_shows_nothing_to_a_detector_shares_none() -> None:

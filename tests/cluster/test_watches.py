@@ -14,6 +14,7 @@ from batch_flights import another, content
 from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, BatchUpdate, run_batch
+from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.executor import Executor
 from sorvolo.cluster.local_executor import LocalExecutor
 from sorvolo.cluster.orders import FlightWish, Mission, Order, WatchWish
@@ -39,10 +40,22 @@ def wished(flown: Path, **watch_wish: str) -> BatchSettings:
     ))
 
 
-def local(*, shares_detector: bool = False) -> Callable[[BatchTable], AbstractContextManager[Executor]]:
+class Crowded(LocalExecutor):
+    """A local executor that has room only when asked for the third time."""
+
+    asked = 0
+
+    def has_room(self, cost: Cost) -> bool:
+        self.asked += 1
+        return self.asked > 2 and super().has_room(cost)
+
+
+def local(
+    kind: type[LocalExecutor] = LocalExecutor, *, shares_detector: bool = False
+) -> Callable[[BatchTable], AbstractContextManager[Executor]]:
     @contextmanager
     def executor(table: BatchTable) -> Iterator[Executor]:
-        with LocalExecutor(2, 60.0, table.lock, shares_detector=shares_detector) as made:
+        with kind(2, 60.0, table.lock, shares_detector=shares_detector) as made:
             yield made
 
     return executor
@@ -75,7 +88,8 @@ def test_a_stream_whose_watch_dies_goes_on_in_the_same_folder(flown: Path, tmp_p
     settings = wished(flown, alert_command=killing_once(tmp_path / "killed", tmp_path / "alerts"))
     streams = streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"])
     updates: list[BatchUpdate] = []
-    running = run_streams(streams, tmp_path / "out", settings, local(shares_detector=True), threading.Event())
+    executor = local(Crowded, shares_detector=True)
+    running = run_streams(streams, tmp_path / "out", settings, executor, threading.Event())
     with closing(running):
         while True:
             try:
@@ -83,6 +97,9 @@ def test_a_stream_whose_watch_dies_goes_on_in_the_same_folder(flown: Path, tmp_p
             except StopIteration as end:
                 (row,) = end.value.rows
                 break
+    assert [each.row.words for each in updates[:2] if each.row] == [
+        "waits for memory that others have; it starts when it is known to be free", ""
+    ]
     assert (row.state, row.tries, row.site, row.flight) == (State.DONE, 2, "north-watch", "one")
     assert row.words == "1 car, 1 person found in 4 frames"
     assert [path.name for path in (tmp_path / "out" / "north-watch").iterdir()] == ["one"]

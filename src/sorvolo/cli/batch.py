@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 _FAILED = 1
 _MOST_ROWS = 40
+_STORE_HANGS_S = 300.0  # two requests of `ObjectSettings.request_s`
 _COLOURS = {"done": "green", "known": "green", "doubtful": "yellow", "duplicate": "blue", "skipped": "blue"}
 
 
@@ -102,6 +103,9 @@ Gpus = Annotated[
     float,
     typer.Option(help="Share of a graphics card that a machine's shared detector takes in a Ray cluster: 0.25, 1."),
 ]
+CopyTo = Annotated[
+    str, typer.Option(help="Copy each flight's site to this place as well: a folder, or s3://BUCKET/PREFIX.")
+]
 Retry = Annotated[bool, typer.Option("--retry", help="Also try flights again that were set aside.")]
 
 
@@ -120,6 +124,7 @@ def batch(
     tries: Tries = 3,
     stall: Stall = 300.0,
     retry: Retry = False,
+    copy_to: CopyTo = "",
     blocks: Blocks = 1,
     share_detector: Shares = None,
     gpus: Gpus = 0.0,
@@ -146,8 +151,6 @@ def batch(
 
     Example: sorvolo batch north=rtsp://192.168.1.10/live south=udp://:5000 --root found --mission watch
 
-    Example: sorvolo batch /mnt/shared/flights --root /mnt/shared/maps --executor ray://head:10001
-
     Example: sorvolo batch /mnt/shared/valley --root /mnt/shared/maps --blocks 16 --executor ray://head:10001
     """
     from sorvolo.cluster.batch import BatchSettings
@@ -157,7 +160,8 @@ def batch(
     watch = WatchWish(
         names(classes), least_score, fps, save.value, cot, _whole(cot_ca), _whole(cot_cert), alert_command, alert_url,
     )
-    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch)
+    place = _place(copy_to, root)
+    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch, place)
     settings = BatchSettings(wish, _site_by(site_by, mission), tries, stall, retry, blocks)
     report = _run(places, root, settings, _Running(executor, workers, share_detector, gpus))
     if as_json:
@@ -198,6 +202,8 @@ def _run(places: Sequence[str], root: Path, settings: "BatchSettings", wish: _Ru
     from sorvolo.cluster.streams import is_stream, run_streams, streams_of
 
     warn_of_interpreted(settings.wish.watch.alert_command)
+    if settings.wish.copy_to:  # a store that hangs is given up by the copy, not by the batch
+        settings = replace(settings, stall_s=settings.stall_s + _STORE_HANGS_S)
     live = [each for each in places if is_stream(each)]
     _check_live(live, places, wish.workers, settings.blocks)
     if live:  # one that waits for its drone does nothing, and gives up by itself
@@ -231,6 +237,17 @@ def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None,
 def _absolute(name: str) -> str:
     """The whole path of a file that is there; any other name as it is."""
     return str(Path(name).resolve()) if name and Path(name).is_file() else name
+
+
+def _place(text: str, root: Path) -> str:
+    """The place that sites are copied to, a folder by its whole path. Raises SettingsError for a root in a store."""
+    if str(root).startswith("s3:"):
+        raise SettingsError(f"--root {root}: a batch works in a folder; give one, and --copy-to s3://BUCKET/PREFIX")
+    if not text or "://" in text:
+        return text.rstrip("/")
+    if Path(text).resolve() == root.resolve():
+        raise SettingsError(f"--copy-to {text} is --root itself; give another folder")
+    return str(Path(text).resolve())
 
 
 def _whole(path: Path | None) -> str:
@@ -284,7 +301,7 @@ def _show_progress(running: "Generator[BatchUpdate, None, BatchReport]", console
 
 def _show_row(row: "Row", is_known: bool, console: Console) -> None:
     state = _state(row, is_known)
-    words = f"try {row.tries} failed: {row.words}" if row.state == "waiting" else row.words
+    words = f"try {row.tries} failed: {row.words}" if row.state == "waiting" and row.tries else row.words
     colour = _COLOURS.get(state, "red")
     console.print(
         f"[{colour}]{state:>9}[/{colour}]  {escape(row.source)}: {escape(words)}", highlight=False, soft_wrap=True
@@ -293,7 +310,7 @@ def _show_row(row: "Row", is_known: bool, console: Console) -> None:
 
 def _state(row: "Row", is_known: bool) -> str:
     if row.state == "waiting":
-        return "again"
+        return "again" if row.tries else "waiting"
     return "known" if is_known and row.state == "done" else row.state.value
 
 

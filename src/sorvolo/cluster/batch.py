@@ -68,6 +68,10 @@ class BatchSettings:
             MapSettings(m_per_px=self.wish.m_per_px)  # states what is out of range
         if self.wish.model not in ("none", "default"):
             find_model(self.wish.model)
+        if self.wish.copy_to:
+            from sorvolo.missions.site.copy import open_end
+
+            open_end(f"{self.wish.copy_to}/site")
 
     def _check_watch(self) -> None:
         wish = self.wish
@@ -82,8 +86,8 @@ class BatchSettings:
             raise SettingsError("--mission watch makes no sites: leave --site-by out")
         if wish.model == "none":
             raise SettingsError("--mission watch needs a detector: leave --model none out")
-        if wish.m_per_px is not None:
-            raise SettingsError("--gsd is for maps; --mission watch makes none")
+        if wish.m_per_px is not None or wish.copy_to:
+            raise SettingsError("--gsd and --copy-to are for maps; --mission watch makes none")
         watch_settings(wish.model, wish.watch)
         watch_outputs(wish.watch, Path())
 

@@ -13,6 +13,8 @@ class CostSettings:
 
     unknown_mb: float = 1000.0  # before any flight was measured; 4,000 frames of 1080p peak at 634 MB
     reserve: float = 1.2  # times the largest flight so far
+    detector_mb: float = 1000.0  # of the detector that flights share, at least: what it adds to a map of 1080p frames
+    settled_s: float = 60.0  # after which a live flight is budgeted what it has had, and a reserve
     machine_share: float = 0.8  # of a machine's memory: the rest is for the system, the batch and the files' cache
 
 

@@ -9,6 +9,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+from sorvolo.cluster.copying import copy_result
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.executor import Executor, Key
 from sorvolo.cluster.orders import Ending, Order, Outcome, Part, PartKind
@@ -46,6 +47,8 @@ def map_divided(
     parts = _Parts(key, order, executor, cost_of, most_tries)
     try:
         flight, words, is_good = yield from _mapped(order, count, parts)
+        if order.wish.copy_to:
+            copy_result(Path(order.site), order.wish.copy_to)
         ending = Ending(Outcome.DONE if is_good else Outcome.DOUBTFUL, words, flight)
     except SetAside:
         raise

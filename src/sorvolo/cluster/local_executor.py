@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Self
 
+from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.cluster.cost import Cost, CostSettings
 from sorvolo.cluster.orders import Ending, Order
-from sorvolo.cluster.process import WorkerProcess, run_order
+from sorvolo.cluster.process import WorkerProcess, most_memory_mb, run_order
 from sorvolo.cluster.shared_detector import SharedDetector, searches
 from sorvolo.missions.flight.memory import MemorySettings, available_bytes, memory_budget_bytes
 
@@ -17,7 +18,8 @@ Key = tuple[str, str]
 
 
 class LocalExecutor:
-    """At most `workers` processes at once, and no more than the memory holds. A context manager: leaving ends them.
+    """At most `workers` processes at once, and no more than the memory holds, with the detector that they share. A
+    context manager: leaving ends them.
 
     `lock` is the batch's, which the processes keep until they are gone. With `shares_detector` one process holds the
     detector for all of them.
@@ -27,10 +29,11 @@ class LocalExecutor:
         self, workers: int, stall_s: float, lock: int, costs: CostSettings = CostSettings(), *,  # noqa: B008
         shares_detector: bool = False,
     ) -> None:
-        self.workers, self._share = workers, costs.machine_share
+        self.workers, self._costs = workers, costs
         self._detector = SharedDetector() if shares_detector else None
         self._stall_s, self._lock = stall_s, lock
         self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
+        self._live: set[Key] = set()
         self._ended: queue.SimpleQueue[tuple[Key, Ending]] = queue.SimpleQueue()
         self._found: queue.SimpleQueue[tuple[Key, str]] = queue.SimpleQueue()
 
@@ -54,9 +57,24 @@ class LocalExecutor:
         """Whether another try may start."""
         if not self._running:
             return True
-        taken_mb = sum(each.memory_mb for _, each in self._running.values())
-        most_mb = self._share * available_bytes() / 1e6
+        taken_mb = self._detector_mb + sum(map(self._memory_mb, self._running))
+        most_mb = self._costs.machine_share * available_bytes() / 1e6
         return len(self._running) < self.workers and taken_mb + cost.memory_mb <= most_mb
+
+    def _memory_mb(self, key: Key) -> float:
+        """What a running try is budgeted: what it was given; a live one, which may never end, what it needs if known.
+        """
+        worker, cost = self._running[key]
+        if key not in self._live or worker.seconds < self._costs.settled_s:
+            return cost.memory_mb
+        return self._costs.reserve * most_memory_mb(worker.pid) or cost.memory_mb
+
+    @property
+    def _detector_mb(self) -> float:
+        """What the shared detector is budgeted: as much as it had so far and a reserve, or what it usually takes."""
+        if self._detector is None:
+            return 0.0
+        return max(self._costs.detector_mb, self._costs.reserve * self._detector.memory_mb)
 
     @property
     def cache_mb(self) -> float:
@@ -69,6 +87,8 @@ class LocalExecutor:
             order = replace(order, detector=self._detector.address)
         worker = WorkerProcess(order, [self._lock])
         self._running[key] = (worker, cost)
+        if is_live_address(order.source):
+            self._live.add(key)
         threading.Thread(target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}").start()
 
     def finish(self, key: Key) -> None:
@@ -86,6 +106,7 @@ class LocalExecutor:
         except queue.Empty:
             return None
         del self._running[key]
+        self._live.discard(key)
         return key, ending
 
     def _wait(self, key: Key, worker: WorkerProcess) -> None:

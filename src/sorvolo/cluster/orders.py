@@ -59,7 +59,8 @@ class FlightWish:
     """What a batch asks for of each flight; everything else is as the mission's own defaults.
 
     `camera` is what --camera takes ("" for none), `m_per_px` the ground resolution of a new map (None: the frames'
-    own); a live source has ended when nothing came for `give_up_s`. `watch` is for watches alone.
+    own); a live source has ended when nothing came for `give_up_s`. `watch` is for watches alone. `copy_to` is the
+    folder, or the place in an object store, below which the site of each flight is copied ("": nowhere).
     """
 
     mission: Mission = Mission.MAP
@@ -68,6 +69,7 @@ class FlightWish:
     m_per_px: float | None = None
     give_up_s: float = 30.0
     watch: WatchWish = WatchWish()
+    copy_to: str = ""
 
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Self:

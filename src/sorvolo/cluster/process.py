@@ -9,6 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from sorvolo.cluster.orders import FINISH, Ending, Order, Outcome, ScoutOrder, answer_of
@@ -46,6 +47,11 @@ class WorkerProcess:
     def pid(self) -> int:
         """The process's number."""
         return self._process.pid
+
+    @property
+    def seconds(self) -> float:
+        """How long ago it was started."""
+        return time.monotonic() - self._started_s
 
     def kill(self) -> None:
         """End it at once; a mapping goes on from its journal when it is asked for again."""
@@ -93,7 +99,7 @@ class WorkerProcess:
         with self._log:
             ending = self._ending(last, code)
         return ending.with_effort(
-            round(time.monotonic() - self._started_s, 3), round(usage.ru_utime + usage.ru_stime, 3),
+            round(self.seconds, 3), round(usage.ru_utime + usage.ru_stime, 3),
             round(usage.ru_maxrss / (_MB_BYTES if sys.platform == "darwin" else _MB), 1), socket.gethostname(),
         )
 
@@ -147,6 +153,16 @@ def run_order(worker: WorkerProcess, stall_s: float, found: Callable[[str], None
         if answer[0] == "found":
             found(str(answer[1]["words"]))
     return worker.end(last)
+
+
+def most_memory_mb(pid: int) -> float:
+    """The most memory that a running process has had, MB; 0 where the system does not state it."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return 0.0
+    fields = dict(line.partition(":")[::2] for line in status.splitlines())
+    return int(fields.get("VmHWM", "0 kB").split()[0]) / 1000
 
 
 def _cpu_seconds(pid: int) -> float | None:

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import sorvolo
 from sorvolo.capture.live.addresses import is_live_address
-from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.cost import Cost, CostSettings
 from sorvolo.cluster.orders import Ending, Order, Outcome
 from sorvolo.cluster.process import WorkerProcess, run_order
 from sorvolo.cluster.ray_cluster import (
@@ -157,12 +157,13 @@ class RayExecutor:
 
     def _submit(self, key: Key, order: Order, cost: Cost) -> None:
         machines = self._machines()
+        shared = self._detectors.addresses() if self._detectors is not None and searches(order) else {}
+        taken = self._detectors.memory_bytes if self._detectors is not None else 0.0
+        most = max(each["memory"] - min(taken, each["memory"]) for each in machines)
         asked = {
             "num_cpus": min(cost.cpus, max(each["CPU"] for each in machines)),
-            "memory": int(min(cost.memory_mb * 1e6, max(each["memory"] for each in machines))),
-            "scheduling_strategy": "SPREAD",
+            "memory": int(min(cost.memory_mb * 1e6, most)), "scheduling_strategy": "SPREAD",
         }
-        shared = self._detectors.addresses() if self._detectors is not None and searches(order) else {}
         given = (order, self._stall_s, self._root, sorvolo.__version__, shared)
         if is_live_address(order.source):
             actor = self._ray.remote(_LiveTry).options(max_concurrency=3, max_restarts=0, **asked).remote()
@@ -241,15 +242,18 @@ class MachineDetectors:
     """One detector for each machine of the cluster, which the flights there share. Only `addresses` changes it.
 
     Each is an actor that holds the process; it ends with the batch. It asks for `gpus` of a graphics card where its
-    machine has so much of one, and runs on the processor of any other.
+    machine has so much of one, and runs on the processor of any other; and for the memory that flights then do without.
     """
 
-    def __init__(self, ray: Any, gpus: float) -> None:
-        self._ray, self._gpus = ray, gpus
+    def __init__(self, ray: Any, gpus: float, memory_mb: float = CostSettings().detector_mb) -> None:
+        self._ray, self._gpus, self.memory_bytes = ray, gpus, 1e6 * memory_mb
         self._actors: dict[str, Any] = {}  # by the machine's id
 
     def addresses(self) -> dict[str, str]:
-        """The sockets by machine, of those that are there and answer. Raises SettingsError where a card is not free."""
+        """The sockets by machine, of those that are there and answer.
+
+        Raises SettingsError where the card or the memory is not free.
+        """
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         there = {each["NodeID"]: each["Resources"] for each in working_machines(self._ray)}
@@ -257,6 +261,7 @@ class MachineDetectors:
         for node in there.keys() - self._actors.keys():
             self._actors[node] = self._ray.remote(_Detector).options(
                 num_cpus=0, num_gpus=self._gpus if there[node].get("GPU", 0) >= self._gpus else 0,
+                memory=int(min(self.memory_bytes, there[node].get("memory", 0.0))),
                 scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False),
             ).remote()
         asked = {node: actor.address.remote() for node, actor in self._actors.items()}
@@ -267,9 +272,11 @@ class MachineDetectors:
         try:
             return str(self._ray.get(task, timeout=WAITS.probe_s))
         except self._ray.exceptions.GetTimeoutError as error:
+            wanted = f"{self._gpus:g} of its graphics card and " if self._gpus else ""
             raise SettingsError(
-                f"--gpus {self._gpus:g}: a machine has no such share of its graphics card free within "
-                f"{WAITS.probe_s:.0f} s; another batch may hold it: give a smaller share"
+                f"--share-detector: a machine does not have {wanted}{self.memory_bytes / 1e6:,.0f} MB of memory free "
+                f"within {WAITS.probe_s:.0f} s; another batch may hold it: wait until it ends, "
+                f"{'give a smaller --gpus, ' if self._gpus else ''}or give --own-detectors"
             ) from error
         except self._ray.exceptions.RayActorError:
             del self._actors[node]

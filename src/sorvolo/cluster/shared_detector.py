@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from sorvolo.cluster.orders import Order
+from sorvolo.cluster.process import most_memory_mb
 from sorvolo.detection.sharing import READY
 from sorvolo.errors import SettingsError, StoreError
 
@@ -57,6 +58,11 @@ class SharedDetector:
     def pid(self) -> int:
         """The process's number; 0 before it is asked for."""
         return 0 if self._process is None else self._process.pid
+
+    @property
+    def memory_mb(self) -> float:
+        """The most memory that it has had, MB; 0 before it is asked for, and where the system does not state it."""
+        return most_memory_mb(self.pid)
 
     def end(self) -> None:
         """End it, and whoever still asks it."""

@@ -21,6 +21,7 @@ from sorvolo.cluster.watches import ENDING
 from sorvolo.errors import SettingsError
 
 _LOOK_S = 0.5
+_NO_ROOM = "waits for memory that others have; it starts when it is known to be free"
 
 
 @dataclass(frozen=True)
@@ -129,6 +130,8 @@ class _Streams:
             row = self.rows[key]
             cost = cost_of(replace(row, crashes=0), self._table, self._settings.costs)
             if not self._executor.has_room(cost):
+                if not row.tries and row.words != _NO_ROOM:
+                    yield self._update(self._keep(replace(row, words=_NO_ROOM)))
                 return
             del self._due_s[key]
             site = str((self._table.root / row.site).resolve())

@@ -86,7 +86,12 @@ def _done(order: Order, answers: Answers, until: threading.Event) -> tuple[str, 
 
         return *watch_flight(order, _detector(order), answers.alive, answers.found, until), True
     _wait_for_site(Path(order.site))
-    return _MISSIONS[order.wish.mission](order, answers.alive, until)
+    result = _MISSIONS[order.wish.mission](order, answers.alive, until)
+    if order.wish.copy_to:
+        from sorvolo.cluster.copying import copy_result
+
+        copy_result(Path(order.site), order.wish.copy_to, answers.alive)
+    return result
 
 
 def _block(order: Order, part: Part, alive: Callable[..., None]) -> None:

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
@@ -24,7 +24,6 @@ from sorvolo.store.rasters.geotiff import parse_crs
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site import change_records, object_records
 from sorvolo.store.site.catalogue import StoredKeyframe
-from sorvolo.store.site.database import ConnectionLostError
 from sorvolo.store.site.derived import STAGED_FOLDERS
 from sorvolo.store.site.files import SiteFiles
 from sorvolo.store.site.tiles import GrowingTiles
@@ -71,7 +70,7 @@ class FlightWriter:
         if not self._is_open:
             return
         self._is_open = False
-        if isinstance(error, ConnectionLostError):  # as after a kill: the same command goes on from the journal
+        if isinstance(error, UnavailableError):  # as after a kill: the same command goes on from the journal
             return
         try:
             # files that no reader can see go first: on a full disk, forgetting the run needs their space

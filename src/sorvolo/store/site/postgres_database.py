@@ -146,7 +146,9 @@ class PostgresDatabase:
             with connection.begin():
                 writes = _writes(connection)
             if self._writes not in (-1, writes):
-                raise StoreError(f"another process wrote to {self.place} while the connection was lost; run it again")
+                raise UnavailableError(
+                    f"another process wrote to {self.place} while the connection was lost; run it again"
+                )
         except BaseException:
             connection.close()
             raise
