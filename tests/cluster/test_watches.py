@@ -164,7 +164,7 @@ def test_what_nobody_was_told_stands_in_the_headline() -> None:
         (["--cot", "udp://tak:6969"], "are for --mission watch; leave them out, --mission map takes none"),
         (["--mission", "watch", "--site-by", "place"], "--mission watch makes no sites: leave --site-by out"),
         (["--mission", "watch", "--model", "none"], "--mission watch needs a detector"),
-        (["--mission", "watch", "--gsd", "0.1"], "--gsd is for maps"),
+        (["--mission", "watch", "--gsd", "0.1"], "--gsd and --copy-to are for maps"),
         (["--mission", "watch", "--cot", "tak.local"], "udp://host:port"),
         (["--mission", "watch", "--alert-command", "no-such-program"], "no program"),
         (["--mission", "watch", "--fps", "0"], "frames a second"),
