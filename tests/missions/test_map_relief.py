@@ -1,13 +1,16 @@
-"""`sorvolo map` over hills: the flat map reports that the ground is not level, and over level ground it does not."""
+"""`sorvolo map` over hills: the flat map is reported as one to check, and its accuracy holds; level ground is a map."""
 
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
+from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.simulation.settings import OutputSettings
 
 _LEVEL = small_flight(
@@ -15,11 +18,31 @@ _LEVEL = small_flight(
 )
 
 
-@pytest.mark.parametrize("relief_m", [0.0, 7.0])
+@pytest.mark.parametrize("relief_m", [0.0, 12.0])
 def test_the_report_names_ground_that_is_not_level(relief_m: float, tmp_path: Path) -> None:
     simulate_into(tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=relief_m)))
     photos = tmp_path / "made" / "flight1" / "photos"
     camera = str(tmp_path / "made" / "camera.xml")
-    assert main(["map", str(photos), "--site", str(tmp_path / "site"), "--model", "none", "--camera", camera]) == 0
+    exit_code = main(["map", str(photos), "--site", str(tmp_path / "site"), "--model", "none", "--camera", camera])
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
     assert any("the ground is not level" in each for each in report["warnings"]) == (relief_m > 0)
+    assert exit_code == (3 if relief_m else 0)
+    assert ("the ground is not level" in report["headline"]["text"]) == (relief_m > 0)
+    off_m = _off_m(tmp_path)
+    assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
+
+
+def _off_m(folder: Path) -> np.ndarray:
+    """(N,) how far each picture's corners lie from where they are, m, the mean."""
+    truth = json.loads((folder / "made" / "truth" / "frames.geojson").read_text())
+    frame = LocalFrame(Geodetic(**truth["site"]))
+    found = json.loads(next((folder / "site").glob("flights/*/frames.geojson")).read_text())
+    true = {each["properties"]["frame"]: _corners_m(each, frame) for each in truth["features"]}
+    return np.array([
+        np.linalg.norm((_corners_m(each, frame) - true[each["properties"]["frame"]]).mean(axis=0))
+        for each in found["features"]
+    ])
+
+
+def _corners_m(feature: dict[str, Any], frame: LocalFrame) -> np.ndarray:
+    return frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:4])

@@ -8,6 +8,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.mosaic.flight_figures import FlightFigures
+from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.wording import counted
 
@@ -68,7 +69,7 @@ NOTHING_KNOWN = Consistency((), (), (), ())
 
 def consistency(
     placed: Sequence[PlacedFrame], pieces: Sequence[Sequence[int]], figures: FlightFigures, stated: Stated,
-    settings: ConsistencySettings = ConsistencySettings(),
+    graph: GraphReport | None = None, settings: ConsistencySettings = ConsistencySettings(),
 ) -> Consistency:
     """Hold a map against itself and against telemetry. `pieces` are the frames, by index, that links tie together."""
     by_index = {each.index: each for each in placed if each.status is not Status.REJECTED}
@@ -80,7 +81,10 @@ def consistency(
         *_scale_faults(known, settings), *_gps_faults(frames, figures, stated, settings),
         *_height_faults(frames, figures, settings),
     ]
-    steps = [*_steps(groups[: len(known)], figures), *(_gps_doubts(figures, settings) if not faults else [])]
+    steps = [
+        *_steps(groups[: len(known)], figures), *(_gps_doubts(figures, settings) if not faults else []),
+        *_relief_doubts(figures, graph),
+    ]
     return Consistency(known, tuple(faults), tuple(steps), tuple(_height_remarks(figures, stated, settings)))
 
 
@@ -99,6 +103,20 @@ def _steps(groups: Sequence[Sequence[PlacedFrame]], figures: FlightFigures) -> l
     return [
         f"the map is in {len(beside) + 1} pieces that no picture ties together ({listed}): expect steps of some metres "
         "between them; fly with more overlap, or give control points (--gcp)"
+    ]
+
+
+def _relief_doubts(figures: FlightFigures, graph: GraphReport | None) -> list[str]:
+    """Slopes that may move the map by more than all else does, and by more than stated angles usually err."""
+    if graph is None or figures.sigma_m is None:
+        return []
+    otherwise_m = float(np.sqrt(max(figures.sigma_m**2 - graph.lean_m**2, 0.0)))
+    if graph.lean_m <= max(otherwise_m, graph.lean_stated_m):
+        return []
+    return [
+        f"the ground is not level: over its slopes the flat map may lie {figures.sigma_m:.1f} m off (1 sigma), "
+        f"{otherwise_m:.1f} m if it were level; give control points (--gcp), or use `sorvolo heights`, which measures "
+        "the ground and makes a true orthophoto"
     ]
 
 

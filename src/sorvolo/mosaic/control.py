@@ -30,6 +30,8 @@ class ControlSettings:
     least_spread_m: float = 0.1  # rms: closer together they give no scale and no north
     most_off_gps_m: float = 60.0  # no receiver errs so far: the points' CRS is another
     most_scale: float = 1.3  # between GPS and the points
+    on_line: float = 0.1  # spread across over spread along, or over that of a picture's ground: less is one line
+    in_corner: float = 0.3  # their spread over that of the flight's cameras, below which they hold a corner of it
 
     def holds_back(self, label: str) -> bool:
         """Whether this point measures the map in place of tying it."""
@@ -95,9 +97,43 @@ def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: Control
         used.remove(wrong)
         excluded.add(wrong)
     rows = {label: (misses[k], scatter[k], int((seen.point == k).sum())) for k, label in enumerate(seen.labels)}
-    return ControlReport(problem.control.name, problem.control.crs, settings.sigma_m, tuple(
+    residuals = tuple(
         _residual(problem.control, number, rows, used, excluded) for number in range(len(problem.control.points))
-    ))
+    )
+    places_m = np.array([seen.ties.place_m[seen.point == k][0, :2] for k in range(len(seen.labels))])
+    cameras_m = np.array([mapper.pose(each).translation_m for each in mapper.placed()])
+    picture_m = float(np.median(cameras_m[:, 2])) * problem.camera.width_px / problem.camera.fx_px
+    remarks = layout_remarks(
+        places_m[[label in used for label in seen.labels]], cameras_m[:, :2], picture_m, settings
+    )
+    return ControlReport(problem.control.name, problem.control.crs, settings.sigma_m, residuals, remarks)
+
+
+def layout_remarks(
+    places_m: PointsM, cameras_m: PointsM, picture_m: float, settings: ControlSettings
+) -> tuple[str, ...]:
+    """In words, how control points at (P, 2) lie badly for a flight with cameras over (N, 2), whose pictures are
+    `picture_m` wide on the ground: on one line, or all in one corner. Their residuals are small, however far off the
+    map is elsewhere."""
+    along_m, across_m = _spreads_m(places_m)
+    if across_m < settings.on_line * min(along_m, picture_m / np.sqrt(12)):
+        return (
+            f"the control points lie on one line ({4 * along_m:.0f} m long, {4 * across_m:.1f} m wide): they do not "
+            "show how the map lies beside it; add points to both sides, or hold some back there (--check)",
+        )
+    reach_m = _spreads_m(cameras_m)[0]
+    if along_m < settings.in_corner * reach_m:
+        return (
+            f"the control points reach over {4 * along_m:.0f} m of a flight of {4 * reach_m:.0f} m: they do not show "
+            "how the map lies away from them; spread them over the whole area",
+        )
+    return ()
+
+
+def _spreads_m(places_m: PointsM) -> tuple[float, float]:
+    """The standard deviations of places, (N, 2), along the line that fits them best, and across it."""
+    along, across = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)[:2] / np.sqrt(len(places_m))
+    return float(along), float(across)
 
 
 def _residual(

@@ -22,6 +22,19 @@ class GraphReport:
     rms_px: float
     angles_contradicted: int = 0  # frames whose stated angles the pictures rule out: these angles are not used
     turned_deg: tuple[float, float] = (0.0, 0.0)  # tilt and heading that all stated angles are off by
+    is_uneven: bool = False  # pictures fit each other as over ground that is not level
+    lean_m: float = 0.0  # median of `leans_m`, and how far stated angles leave the ground open themselves
+    lean_stated_m: float = 0.0
+
+
+def leans_m(rotations: Floats, stated: Floats, heights_m: Floats) -> Floats:
+    """(N,) how far cameras of (N, 3, 3) rotations see the ground from where stated ones have it, per axis, m.
+
+    Over a slope a camera that looks straight down takes the same pictures, but for their fixes, as one that leans over
+    level ground. Pictures over ground that is not level cannot show which it is: this is what the map errs by then.
+    """
+    here, there = (each[:, :2, 2] / -np.minimum(each[:, 2:, 2], -0.1) for each in (rotations, stated))
+    return np.asarray(heights_m * np.linalg.norm(here - there, axis=1) / np.sqrt(2))
 
 
 def ground_sigma_m(rotation: Matrix3, height_m: float, start: int, factors: SuperLU) -> float:

@@ -37,6 +37,7 @@ class PoseGraphSettings:
     sigma_px: float = 0.3  # floor of a match's noise; calibration and rolling shutter never are better
     window: int = 6  # recent keyframes freed by each local solve
     region: int = 120  # keyframes; a larger flight is solved around its newest ones only, until it ends or is strained
+    uneven: float = 0.002  # relief left between linked pictures over the height: level ground 0.0003, hills 0.004
     strained: float = 3.0  # times a link's believed noise: the ground around it cannot be laid without bending more
     focal_sigma: float = 0.0  # relative; 0 holds the focal length
     radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it

@@ -270,11 +270,16 @@ class PlanarMapper:
     def sigmas_m(self) -> dict[int, float]:
         """One-sigma error on the ground of each keyframe, per axis: its own and what all of the flight err in common.
 
-        What a flight errs in common is its receiver's, or that of the known map it is tied to.
+        What a flight errs in common is its receiver's, or that of the known map it is tied to. Over ground that is not
+        level what its slopes may move the map by is added.
         """
         tied_to = [self._known[each].sigma_m for each in self._known if each in self._graph]
         common_m = float(np.nanmedian(tied_to)) if np.isfinite(tied_to).any() else self._graph.common_sigma_m()
-        return {each: float(np.hypot(sigma_m, common_m)) for each, sigma_m in self._graph.sigmas_m().items()}
+        leans_m = self._graph.leans_m()
+        return {
+            each: float(np.sqrt(sigma_m**2 + common_m**2 + leans_m[each]**2))
+            for each, sigma_m in self._graph.sigmas_m().items()
+        }
 
     def gps_residuals_m(self) -> dict[int, Floats]:
         """Camera position minus fix, (3,)."""

@@ -16,7 +16,7 @@ from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.bundle import NO_GROUND, SHARED, Ground, Nodes, Solution, linearise_ground, solve
 from sorvolo.mosaic.graph_alignment import change_to_fixes, change_to_ground, move_all
 from sorvolo.mosaic.graph_offsets import shared_sigma, unconfirmed
-from sorvolo.mosaic.graph_report import GraphReport, ground_sigma_m
+from sorvolo.mosaic.graph_report import GraphReport, ground_sigma_m, leans_m
 from sorvolo.mosaic.graph_rows import LinkRows, NodeRows
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.graph_weights import LinkNoise, Trust, link_noise, miss_px, telemetry_trust
@@ -211,12 +211,28 @@ class PoseGraph:
             unit[size - len(SHARED)] = 1.0
             sigma = float(np.sqrt(max(0.0, factorised(solution.normal).solve(unit)[size - len(SHARED)])))
         rms = np.array([value for value in self.residuals_px().values() if np.isfinite(value)])
+        leans = list(self.leans_m().values())
+        tilts_rad, heights_m = self._rows.stated_sigma_rad[self._own(), 0], self._rows.centres_m[self._own(), 2]
         return GraphReport(
             float(np.exp(self._shared[0])), sigma, float(self._shared[1]), float(self._shared[2]), len(self._links),
-            self._dropped, float(np.median(self._links.relief_m)) if len(self._links) else 0.0,
+            self._dropped, self._relief_m(),
             float(np.sqrt(np.mean(rms**2))) if len(rms) else float("nan"), len(self._trust.contradicted),
             (float(np.degrees(np.linalg.norm(self._shared[5:7]))), float(np.degrees(self._shared[7]))),
+            self._is_uneven(), float(np.median(leans)) if leans else 0.0,
+            float(np.median(tilts_rad * heights_m)) if leans else 0.0,
         )
+
+    def leans_m(self) -> dict[int, float]:
+        """What the ground's own slopes may move own keyframes by, per axis: see graph_report. 0 on level ground, for
+        frames without stated angles or with contradicted ones, and where known ground holds the map."""
+        own = np.flatnonzero(self._own())
+        leans = np.zeros(len(own))
+        if self._is_uneven() and len(own) == len(self._nodes) and not len(self._ground.node):
+            rows = self._rows
+            leans = leans_m(rows.rotations[own], rows.prior_rotations[own], rows.centres_m[own, 2])
+            is_stated = np.isfinite(rows.stated_sigma_rad[own]).all(axis=1)
+            leans[~is_stated | np.isin(own, self._trust.contradicted)] = 0.0
+        return {self._names[at]: float(lean) for at, lean in zip(own, leans, strict=True)}
 
     def residuals_px(self) -> dict[int, float]:
         """Each keyframe's median transfer residual over its links, px at registration size; NaN without links."""
@@ -295,6 +311,14 @@ class PoseGraph:
 
     def _gps_miss_m(self) -> Floats:
         return self._rows.centres_m + self._shared[[3, 4, 2]] - self._rows.prior_centres_m
+
+    def _relief_m(self) -> float:
+        """Relief left between linked pictures, the median link's."""
+        return float(np.median(self._links.relief_m)) if len(self._links) else 0.0
+
+    def _is_uneven(self) -> bool:
+        own = self._own()
+        return bool(own.any()) and self._relief_m() > self._settings.uneven * np.median(self._rows.centres_m[own, 2])
 
     def _solve(self, free: NDArray[np.bool_], *, shared: bool, iterations: int) -> Solution:
         pairs = self._links.pairs()

@@ -85,6 +85,7 @@ class ControlReport:
     crs: str
     sigma_m: float  # stated for the points
     residuals: tuple[ControlResidual, ...] = field(default=())
+    remarks: tuple[str, ...] = ()  # in words: how the points that tie the map lie badly for it
 
     def of(self, role: ControlRole) -> list[ControlResidual]:
         """The points that had this role."""

@@ -61,7 +61,7 @@ def build_report(
     """
     source, placed, graph = setup.source, result.placed, result.graph
     figures = flight_figures(placed, result.camera.fx_px)
-    agreement = consistency(placed, result.pieces, figures, _stated(setup, result))
+    agreement = consistency(placed, result.pieces, figures, _stated(setup, result), graph)
     return {
         "sorvolo": sorvolo.__version__,
         "flight": source.name,
@@ -90,7 +90,10 @@ def build_report(
         "delay_s": delay_figures(log.delays_s),
         **_effort(log, seconds, max(1, len(placed))),
         "notices": [asdict(each) for each in (*source.telemetry.notices, *setup.notices, *notices)],
-        "warnings": flight_warnings(placed, figures, setup, log, agreement, graph),
+        "warnings": [
+            *flight_warnings(placed, figures, setup, log, agreement, graph),
+            *(result.control.remarks if result.control else ()),
+        ],
         "settings": asdict(settings),
         "versions": software(),
         "track": [track_row(each) for each in placed],

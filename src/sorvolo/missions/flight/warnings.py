@@ -13,7 +13,6 @@ from sorvolo.survey.wording import counted, plural
 OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
 _MANY = 0.1  # share of the frames
 _BAD_FIT_PX = 3.0
-_UNEVEN = 0.002  # relief left between linked pictures, over the height: 0.0003 on level ground, 0.004 on hills
 _TURNED_DEG = 6.0  # by which all stated angles may be off without a word
 _GUESSED = 0.1  # relative: a focal length that is hardly known
 
@@ -57,14 +56,12 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
 
 def _relief_warnings(figures: FlightFigures, graph: GraphReport | None) -> list[str]:
     """Ground that is not level, where the pictures still fit each other; where they do not, `doubts` reports it."""
-    height_m, residual_px = figures.height_m, figures.residual_median_px
-    if graph is None or height_m is None or residual_px is None or residual_px > _BAD_FIT_PX:
-        return []
-    if graph.relief_m <= _UNEVEN * height_m:
+    residual_px = figures.residual_median_px
+    if graph is None or not graph.is_uneven or residual_px is None or residual_px > _BAD_FIT_PX:
         return []
     return [
-        "the ground is not level, or tall things cover much of it: the flat map is off by more than it states; "
-        "`sorvolo heights` measures the ground and makes a true orthophoto"
+        "the ground is not level, or tall things cover much of it: slopes and tall things lie off their place in the "
+        "flat map; `sorvolo heights` measures the ground and makes a true orthophoto"
     ]
 
 
