@@ -10,6 +10,7 @@ from sorvolo.capture.intrinsics import check_lens
 from sorvolo.errors import GeometryError, InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, PointsM, PointsPx
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
 FEWEST_VIEWS = 8
 MOST_VIEWS = 40
@@ -188,7 +189,7 @@ def _fit(views: Sequence[BoardView], board: Board, width_px: int, height_px: int
 def _outliers(view_errors_px: Floats) -> list[int]:
     """Views that fit far worse than the usual one: a bent board, motion blur, a wrong corner."""
     middle = float(np.median(view_errors_px))
-    spread = 1.4826 * float(np.median(np.abs(view_errors_px - middle)))
+    spread = SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(view_errors_px - middle)))
     return [int(index) for index in np.flatnonzero(view_errors_px > middle + max(4 * spread, middle))]
 
 

@@ -15,10 +15,9 @@ from sorvolo.capture.source import Source
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.units import FOOT_M
 from sorvolo.survey.control import ControlMark, ControlPoint, GroundControl
 from sorvolo.survey.flight import Notice
-
-_FOOT_M = 0.3048
 
 LEAST_POINTS = 3
 """Fewer cannot show that one of them is wrong."""
@@ -88,7 +87,7 @@ class ControlFile:
         yield "x and y are degrees, latitude before longitude: the CRS is WGS84", replace(degrees, swaps_xy=True)
         unit_m = _height_unit_m(crs)
         if unit_m == 1.0:
-            yield "x, y and z are in feet: give them in metres", replace(own, units=_FOOT_M)
+            yield "x, y and z are in feet: give them in metres", replace(own, units=FOOT_M)
         else:
             yield "x, y and z are in metres: the CRS counts in feet", replace(own, units=1 / unit_m)
         yield "the CRS is that of web maps (EPSG:3857)", _Reading("EPSG:3857")

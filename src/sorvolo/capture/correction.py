@@ -7,10 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.pose import Pose
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.corrected import Bias, TelemetryFaults
 from sorvolo.survey.flight import CameraPrior
 
-_NORMAL = 1.4826  # a normal error's sigma over its median absolute deviation
 _FIXES_ALIKE = 1.5  # neighbouring fixes err alike: they are fewer than they look
 _LEAST_SCALE = 0.01  # a change of scale that matters: 30 cm in 30 m of height
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
@@ -36,7 +36,7 @@ def path_scale(priors: Sequence[CameraPrior], poses: Sequence[Pose]) -> Bias:
         scale = np.vdot(a[kept], b[kept]) / max(float(np.vdot(a[kept], a[kept]).real), 1e-9)
         miss = np.abs(b - scale * a)
         scatter = float(np.sqrt(np.mean(miss[kept] ** 2) / 2))
-        kept = miss <= 3 * max(_NORMAL * float(np.median(miss)), 1e-6)
+        kept = miss <= 3 * max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(miss)), 1e-6)
     reach = float(np.sqrt(np.sum(np.abs(seen[kept] - seen[kept].mean()) ** 2)))
     return Bias(float(abs(scale)), _FIXES_ALIKE * scatter / max(reach, 1e-6), scatter)
 
@@ -119,7 +119,7 @@ def _bias(values: Floats) -> Bias:
     if not len(values):
         return _UNKNOWN
     middle = float(np.median(values))
-    scatter = _NORMAL * float(np.median(np.abs(values - middle)))
+    scatter = SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(values - middle)))
     return Bias(middle, 1.2533 * scatter / float(np.sqrt(len(values))), scatter)
 
 

@@ -25,13 +25,14 @@ from sorvolo.capture.decoding import (
 )
 from sorvolo.capture.telemetry.cleaning import sigma_from_hdop_m
 from sorvolo.errors import InputError
+from sorvolo.geometry.units import KM_AN_HOUR_M_S, KNOT_M_S, MILE_AN_HOUR_M_S
 
 _Tags: TypeAlias = Mapping[int, Any]
 _XMP_TAG = 700
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # the EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-_M_S_PER_SPEED_UNIT = {"K": 1 / 3.6, "M": 0.44704, "N": 1852 / 3600}
+_M_S_PER_SPEED_UNIT = {"K": KM_AN_HOUR_M_S, "M": MILE_AN_HOUR_M_S, "N": KNOT_M_S}
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.planning import footprint_size_m, minimum_frame_rate, px_per_m
 from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.registration.features import sharpness_and_texture
 from sorvolo.registration.shared_view import shared_view
 from sorvolo.survey.flight import Frame, Telemetry
@@ -22,7 +23,6 @@ from sorvolo.survey.flight import Frame, Telemetry
 WANTED_OVERLAP = 0.7
 """Of consecutive frames, for a good map."""
 
-_SECOND_NS = 1_000_000_000
 _MOVING_M_S = 0.5
 _FEWEST_GLIMPSES = 3
 
@@ -125,9 +125,9 @@ def _file_facts(source: Source) -> tuple[str, str, int]:
 def _times_s(source: Source, glimpses: Sequence[Frame]) -> Floats:
     """(N,) when photos were taken, or when a live source's glimpses came; none where a source has no such times."""
     if isinstance(source, LiveSource):
-        return np.array([frame.time_ns for frame in glimpses]) / _SECOND_NS
+        return np.array([frame.time_ns for frame in glimpses]) / SECOND_NS
     if isinstance(source, PhotoSource):
-        return np.array([photo.time_ns for photo in source.album.photos]) / _SECOND_NS
+        return np.array([photo.time_ns for photo in source.album.photos]) / SECOND_NS
     return np.zeros(0)
 
 
@@ -151,7 +151,7 @@ def telemetry_facts(source: Source, frames: FrameFacts) -> TelemetryFacts:
     """What the telemetry holds, and how it fits the frames in time."""
     telemetry = source.telemetry
     placed = telemetry.time_ns[np.isfinite(telemetry["latitude_deg"])]
-    steps_s = np.diff(placed) / _SECOND_NS
+    steps_s = np.diff(placed) / SECOND_NS
     tie, covered_s = _tie(source, frames)
     return TelemetryFacts(
         telemetry.format, len(telemetry), len(placed),
@@ -172,19 +172,19 @@ def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
         return "in each photo", frames.duration_s
     tied_ns = telemetry.video_time_ns[telemetry.video_time_ns >= 0]
     if len(tied_ns) and source.kind == "video":
-        return "by time since the video's start", max(0.0, min(frames.duration_s, tied_ns[-1] / _SECOND_NS))
+        return "by time since the video's start", max(0.0, min(frames.duration_s, tied_ns[-1] / SECOND_NS))
     if any(notice.code == "no_date" for notice in telemetry.notices):
         return "unknown: the telemetry has no date", math.nan
     if not source.start_ns:
         return "unknown: the video does not state when it began", math.nan
     both_ns = common_ns(telemetry, source.start_ns, frames.duration_s)
-    return "by UTC", both_ns / _SECOND_NS
+    return "by UTC", both_ns / SECOND_NS
 
 
 def while_filming(source: Source, frames: FrameFacts) -> Telemetry:
     """The telemetry between the first and the last frame; all of it where that is unknown."""
     telemetry = source.telemetry
-    duration_ns = round(frames.duration_s * _SECOND_NS) if frames.duration_s > 0 else 0
+    duration_ns = round(frames.duration_s * SECOND_NS) if frames.duration_s > 0 else 0
     since_start_ns = telemetry.video_time_ns
     if not (since_start_ns >= 0).any() and source.start_ns:
         since_start_ns = telemetry.time_ns - source.start_ns
@@ -197,7 +197,7 @@ def while_filming(source: Source, frames: FrameFacts) -> Telemetry:
 
 def common_ns(telemetry: Telemetry, start_ns: int, duration_s: float) -> int:
     """For how long telemetry and frames from `start_ns` on run both."""
-    end_ns = start_ns + round(duration_s * _SECOND_NS)
+    end_ns = start_ns + round(duration_s * SECOND_NS)
     return max(0, min(end_ns, int(telemetry.time_ns[-1])) - max(start_ns, int(telemetry.time_ns[0])))
 
 
@@ -205,7 +205,7 @@ def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> Fl
     """How the drone flew while it filmed, as far as telemetry and camera give it."""
     placed = np.isfinite(telemetry["latitude_deg"])
     points_m = _track_m(telemetry["latitude_deg"][placed], telemetry["longitude_deg"][placed])
-    times_s = (telemetry.time_ns[placed] - telemetry.time_ns[placed][:1]) / _SECOND_NS
+    times_s = (telemetry.time_ns[placed] - telemetry.time_ns[placed][:1]) / SECOND_NS
     height_m, spread_m, reference = _height(telemetry)
     speed_m_s = _speed(telemetry, points_m, times_s)
     footprint_m, gsd_m = (math.nan, math.nan), math.nan

@@ -25,6 +25,7 @@ from sorvolo.capture.video_stream import (
 )
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 VIDEO_SUFFIXES = frozenset({
@@ -33,7 +34,6 @@ VIDEO_SUFFIXES = frozenset({
 })
 """How videos in a folder are recognised; a file given by name may have any name."""
 
-_SECOND_NS = 1_000_000_000
 _FALLBACK_RATE_HZ = 25.0
 
 
@@ -143,7 +143,7 @@ class VideoSource:
 
     def _ends_before(self, last_ns: int) -> bool:
         """Whether the video is shorter than its header states."""
-        missing_s = self.info.duration_s - last_ns / _SECOND_NS
+        missing_s = self.info.duration_s - last_ns / SECOND_NS
         return self.info.is_cut or missing_s > max(1.0, 0.05 * self.info.duration_s)
 
     def _delivered(
@@ -197,7 +197,7 @@ class VideoSource:
                     continue  # a glimpse at a damaged place is of no use; `frames` counts the damage
                 time_s = max(0.0, decoded.time - first_s) if decoded.time is not None else 0.0
                 index = round(time_s * self.info.frame_rate_hz)
-                found.append(Frame(index, str(index), self.start_ns + round(time_s * _SECOND_NS), image))
+                found.append(Frame(index, str(index), self.start_ns + round(time_s * SECOND_NS), image))
         return found
 
 

@@ -10,12 +10,12 @@ import av
 from sorvolo.capture.containers import top_boxes
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.errors import InputError
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice
 
 PIXEL_LIMIT = 64_000_000
 """A video of larger frames is refused before it is decoded."""
 
-_SECOND_NS = 1_000_000_000
 _GAP_S = 2.0
 _CLOCK_RETURNS_WITHIN = 25  # frames after a backward step in which the old clock may come back
 _DEMUX_RETRIES = 20
@@ -25,7 +25,7 @@ class VideoClock:
     """Frames' times since the first one, strictly increasing whatever the PTS do. `time_ns` changes it."""
 
     def __init__(self, frame_rate_hz: float) -> None:
-        self._step_ns = max(1, round(_SECOND_NS / frame_rate_hz))
+        self._step_ns = max(1, round(SECOND_NS / frame_rate_hz))
         self._last_ns = -1
         self._origin_ns = self._former_origin_ns = 0
         self._since_backward = _CLOCK_RETURNS_WITHIN
@@ -56,7 +56,7 @@ class VideoClock:
             returned = abs(former_ns - expected_ns) < abs(time_ns - expected_ns)
             if self._since_backward <= _CLOCK_RETURNS_WITHIN and former_ns > self._last_ns and returned:
                 time_ns, self._origin_ns = former_ns, self._former_origin_ns
-        if (gap_ns := time_ns - self._last_ns) > max(_GAP_S * _SECOND_NS, 5 * self._step_ns):
+        if (gap_ns := time_ns - self._last_ns) > max(_GAP_S * SECOND_NS, 5 * self._step_ns):
             self._gaps += 1
             self._longest_gap_ns = max(self._longest_gap_ns, gap_ns)
         self._last_ns = time_ns
@@ -64,7 +64,7 @@ class VideoClock:
 
     def notices(self) -> list[Notice]:
         """What was wrong with the time stamps so far."""
-        longest_s = self._longest_gap_ns / _SECOND_NS
+        longest_s = self._longest_gap_ns / SECOND_NS
         return [
             *notice("missing_pts", self._missing, "frames without a time stamp, set by the usual step: {}"),
             *notice("backward_pts", self._backward, "times that the video's clock runs backward: {}"),
@@ -111,7 +111,7 @@ def stamp_of(picture: "av.VideoFrame | av.Packet[Any]") -> int | None:
     if picture.pts is None or not base:
         return None
     # as `round` of the fraction, which takes ten times as long, and there is one for each picture of a video
-    whole, rest = divmod(picture.pts * base.numerator * _SECOND_NS, base.denominator)
+    whole, rest = divmod(picture.pts * base.numerator * SECOND_NS, base.denominator)
     return whole + (2 * rest + whole % 2 > base.denominator)
 
 

@@ -6,6 +6,9 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats
 
+SIGMA_PER_MEDIAN_DEVIATION = 1.4826
+"""A normal error's sigma over its median absolute deviation, which outliers leave alone: 1 / 0.6745."""
+
 
 def median_of_known(values: Floats | Sequence[float]) -> float | None:
     """The median of the known numbers."""

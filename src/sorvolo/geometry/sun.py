@@ -5,9 +5,9 @@ import math
 import numpy as np
 
 from sorvolo.geometry.arrays import Vector3
+from sorvolo.geometry.units import DAY_NS
 
 _J2000_NS = 946_728_000_000_000_000  # 2000-01-01 12:00 UTC
-_DAY_NS = 86_400_000_000_000
 
 
 def sun_direction(time_ns: int, latitude_deg: float, longitude_deg: float) -> Vector3:
@@ -15,7 +15,7 @@ def sun_direction(time_ns: int, latitude_deg: float, longitude_deg: float) -> Ve
 
     `time_ns` is UTC since 1970. Refraction is left out. Source: the low-precision formulas of the Astronomical Almanac.
     """
-    days = (time_ns - _J2000_NS) / _DAY_NS
+    days = (time_ns - _J2000_NS) / DAY_NS
     mean_deg = (280.460 + 0.9856474 * days) % 360
     anomaly = math.radians((357.528 + 0.9856003 * days) % 360)
     ecliptic = math.radians(mean_deg + 1.915 * math.sin(anomaly) + 0.020 * math.sin(2 * anomaly))

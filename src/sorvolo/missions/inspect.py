@@ -18,11 +18,11 @@ from sorvolo.capture.preflight import (
     while_filming,
 )
 from sorvolo.capture.source import Source, opened_sources
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.missions.flight.glimpses import glimpses_of
 from sorvolo.survey.flight import CameraModel, Notice
 
-_SECOND_NS = 1_000_000_000
-_ZONE_NS = 900 * _SECOND_NS  # time zones differ by quarters of an hour
+_ZONE_NS = 900 * SECOND_NS  # time zones differ by quarters of an hour
 _BLURRED = 1.5  # registration.features.sharpness at 960 px falls below this when blurred by two pixels
 _BARE_LEVELS = 1.5
 _STILL_SHARE = 0.7  # of the first picture that all others show: the drone hovers, all flight long
@@ -187,7 +187,7 @@ def _telemetry_findings(source: Source, frames: FrameFacts, facts: TelemetryFact
 def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -> list[Finding]:
     """Whether the telemetry is of the same time as the frames."""
     share = facts.covered_s / frames.duration_s
-    beyond_s = float(source.telemetry.video_time_ns.max(initial=0)) / _SECOND_NS - frames.duration_s
+    beyond_s = float(source.telemetry.video_time_ns.max(initial=0)) / SECOND_NS - frames.duration_s
     if source.kind == "video" and beyond_s > max(5.0, 0.2 * frames.duration_s):
         return [Finding(
             Level.WARNING, f"the telemetry continues for {beyond_s:.0f} s after the video's end",
@@ -202,10 +202,10 @@ def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -
         )]
     apart_ns = facts.start_ns - source.start_ns
     zone_ns = round(apart_ns / _ZONE_NS) * _ZONE_NS
-    if abs(zone_ns) <= 14 * 3600 * _SECOND_NS and common_ns(
+    if abs(zone_ns) <= 14 * 3600 * SECOND_NS and common_ns(
         source.telemetry, source.start_ns + zone_ns, frames.duration_s
     ):
-        hours = abs(zone_ns) / (3600 * _SECOND_NS)
+        hours = abs(zone_ns) / (3600 * SECOND_NS)
         way = "behind" if zone_ns > 0 else "ahead of"
         return [Finding(
             Level.PROBLEM, f"the frames' clock is about {hours:g} h {way} the telemetry's: a time zone?",
@@ -213,7 +213,7 @@ def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -
         )]
     return [Finding(
         Level.PROBLEM,
-        f"the telemetry is of another time: it begins {apart_ns / _SECOND_NS:+.0f} s from the frames",
+        f"the telemetry is of another time: it begins {apart_ns / SECOND_NS:+.0f} s from the frames",
         "give the telemetry of this flight, or --offset if a clock was wrong",
     )]
 

@@ -3,11 +3,12 @@
 from collections import deque
 from enum import IntEnum
 
-_SECOND_NS = 1_000_000_000
-_WINDOW_NS = 15 * _SECOND_NS
+from sorvolo.geometry.units import SECOND_NS
+
+_WINDOW_NS = 15 * SECOND_NS
 _SLEW = 0.005  # seconds of correction a second of stream: a clock's drift is 1000 times slower
-_JUMP_NS = 2 * _SECOND_NS  # a tie that is further off than this was set anew
-_YOUNG_NS = 2 * _SECOND_NS  # the first frames come in a burst: until then the offset follows at once
+_JUMP_NS = 2 * SECOND_NS  # a tie that is further off than this was set anew
+_YOUNG_NS = 2 * SECOND_NS  # the first frames come in a burst: until then the offset follows at once
 _STATED_KEPT = 9
 
 

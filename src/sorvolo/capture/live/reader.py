@@ -16,12 +16,12 @@ from sorvolo.capture.live.klv_telemetry import klv_streams
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.video_stream import PIXEL_LIMIT
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice
 
-_SECOND_NS = 1_000_000_000
 _OPEN_S = 6.0  # to be dialled and looked at
 _LISTEN_S = 3.0  # a listener that nobody speaks to is opened anew so often, so that it can be stopped
-_STAMP_JUMP_NS = 10 * _SECOND_NS
+_STAMP_JUMP_NS = 10 * SECOND_NS
 _REFUSED = (
     av.error.ProtocolNotFoundError, av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError,
     av.error.HTTPNotFoundError, av.error.PermissionError,
@@ -84,7 +84,7 @@ class StreamReader:
         self._heard_s = time.monotonic()
         self._has_spoken = False
         self._stamp_ns = -1
-        self._step_ns = _SECOND_NS // 25
+        self._step_ns = SECOND_NS // 25
         self._thread = threading.Thread(target=self._run, name=f"reading {address.shown}", daemon=True)
 
     def start(self) -> None:
@@ -143,7 +143,7 @@ class StreamReader:
                 self._listener.opened(_facts_of(container, video, metadata))
                 self._listener.restarted()
                 self._stamp_ns = -1
-                self._step_ns = round(_SECOND_NS / float(video.average_rate or video.guessed_rate or 25))
+                self._step_ns = round(SECOND_NS / float(video.average_rate or video.guessed_rate or 25))
                 # frames in threads would hold several back; a stripe each does not
                 video.thread_type = "SLICE"
                 for packet in container.demux([video, *metadata]):
@@ -245,4 +245,4 @@ def _facts_of(container: Any, video: Any, metadata: list[Any]) -> StreamFacts:
 
 def _stamp_of(timed: Any, time_base: Any) -> int | None:
     stamp = timed.pts if timed.pts is not None else timed.dts
-    return None if stamp is None or not time_base else round(stamp * time_base * _SECOND_NS)
+    return None if stamp is None or not time_base else round(stamp * time_base * SECOND_NS)

@@ -9,10 +9,9 @@ import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Mask, Rows, TimesNs
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
-SECOND_NS = 1_000_000_000
-DAY_NS = 86_400 * SECOND_NS
 M_PER_HDOP = 1.5
 """Horizontal sigma (m, per axis) of one unit of HDOP: a receiver's range error without corrections."""
 

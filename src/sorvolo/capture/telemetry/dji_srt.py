@@ -10,7 +10,6 @@ import numpy as np
 
 from sorvolo.capture.telemetry.cleaning import (
     NO_TIME_NS,
-    SECOND_NS,
     clean,
     decimals_of,
     fill_stamps,
@@ -21,6 +20,7 @@ from sorvolo.capture.telemetry.cleaning import (
 )
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
 SMALLEST_SIGMA_M = 1.5

@@ -10,7 +10,6 @@ import numpy as np
 
 from sorvolo.capture.telemetry.cleaning import (
     NO_TIME_NS,
-    SECOND_NS,
     clean,
     decimals_of,
     fill_stamps,
@@ -23,6 +22,7 @@ from sorvolo.capture.telemetry.cleaning import (
 from sorvolo.capture.telemetry.table_columns import COLUMN_NAMES, COUNTERS, plain_name, unit_factor
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Mask, TimesNs
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
 _HEADER_LINES = 40  # some programs write a preamble before the header

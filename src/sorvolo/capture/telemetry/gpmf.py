@@ -19,13 +19,13 @@ from av.stream import Discard
 
 from sorvolo.capture.telemetry.cleaning import (
     NO_TIME_NS,
-    SECOND_NS,
     SMALLEST_HDOP_SIGMA_M,
     clean,
     notice,
     sigma_from_hdop_m,
 )
 from sorvolo.errors import InputError
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Telemetry
 
 FORMAT = "gpmf"

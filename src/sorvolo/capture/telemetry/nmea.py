@@ -11,18 +11,11 @@ from typing import Any
 from pynmeagps import VALNONE, NMEAReader
 from pynmeagps.exceptions import NMEAMessageError, NMEAParseError, NMEATypeError
 
-from sorvolo.capture.telemetry.cleaning import (
-    DAY_NS,
-    SECOND_NS,
-    clean,
-    decimals_of,
-    notice,
-    sigma_from_hdop_m,
-)
+from sorvolo.capture.telemetry.cleaning import clean, decimals_of, notice, sigma_from_hdop_m
 from sorvolo.errors import InputError
+from sorvolo.geometry.units import DAY_NS, KNOT_M_S, SECOND_NS
 from sorvolo.survey.flight import Telemetry
 
-_M_S_PER_KNOT = 1852 / 3600
 # talkers differ by satellite system (GP, GN, GL, GA ...); a log may write anything before the dollar
 _SENTENCE = re.compile(rb"\$([A-Z][A-Z0-9])(GGA|RMC),([^$*\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
 _FINISHED = re.compile(rb"[\r\n]|\*[0-9A-Fa-f]{2}")
@@ -149,7 +142,7 @@ def _add(epoch: Epoch, message: Any) -> None:
     else:
         epoch.has_fix &= message.status == "A"
         values = {
-            "speed_m_s": _number(message, "spd") * _M_S_PER_KNOT,
+            "speed_m_s": _number(message, "spd") * KNOT_M_S,
             "course_deg": _number(message, "cog"),
         }
         if "GGA" not in epoch.kinds:

@@ -9,6 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from sorvolo.geometry.units import FOOT_M, KM_AN_HOUR_M_S, KNOT_M_S, MILE_AN_HOUR_M_S
+
 COLUMN_NAMES: Mapping[str, tuple[str, ...]] = {
     "latitude": ("latitude", "lat", "gpslat", "gpslatitude", "osdlatitude"),
     "longitude": ("longitude", "lon", "long", "lng", "gpslon", "gpslong", "gpslongitude", "osdlongitude"),
@@ -46,11 +48,11 @@ COUNTERS = ("offset_time", "flight_time", "flown_time", "time", "tick")
 _DEGREES = {"": 1.0, "degrees": 1.0, "degree": 1.0, "deg": 1.0, "°": 1.0,
             "radians": 180 / np.pi, "radian": 180 / np.pi, "rad": 180 / np.pi}
 _METRES = {"": 1.0, "m": 1.0, "meters": 1.0, "metres": 1.0, "meter": 1.0, "metre": 1.0,
-           "feet": 0.3048, "foot": 0.3048, "ft": 0.3048, "cm": 0.01, "centimeters": 0.01, "mm": 0.001,
+           "feet": FOOT_M, "foot": FOOT_M, "ft": FOOT_M, "cm": 0.01, "centimeters": 0.01, "mm": 0.001,
            "km": 1000.0, "kilometers": 1000.0}
-_METRES_A_SECOND = {"": 1.0, "m/s": 1.0, "mps": 1.0, "meters/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6,
-                    "kph": 1 / 3.6, "mph": 0.44704, "knots": 1852 / 3600, "kn": 1852 / 3600,
-                    "kt": 1852 / 3600, "feet/s": 0.3048, "ft/s": 0.3048, "cm/s": 0.01}
+_METRES_A_SECOND = {"": 1.0, "m/s": 1.0, "mps": 1.0, "meters/s": 1.0, "km/h": KM_AN_HOUR_M_S, "kmh": KM_AN_HOUR_M_S,
+                    "kph": KM_AN_HOUR_M_S, "mph": MILE_AN_HOUR_M_S, "knots": KNOT_M_S, "kn": KNOT_M_S,
+                    "kt": KNOT_M_S, "feet/s": FOOT_M, "ft/s": FOOT_M, "cm/s": 0.01}
 _SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "second": 1.0, "msec": 1e-3, "ms": 1e-3,
             "millisecond": 1e-3, "milliseconds": 1e-3, "usec": 1e-6, "us": 1e-6,
             "microseconds": 1e-6, "nsec": 1e-9, "ns": 1e-9, "minutes": 60.0, "min": 60.0}

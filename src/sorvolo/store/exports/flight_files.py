@@ -22,6 +22,7 @@ from PIL.TiffImagePlugin import IFDRational
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.units import KNOT_M_S
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes
 from sorvolo.store.rasters.gdal import open_raster
 from sorvolo.survey.flight import Frame, Telemetry
@@ -93,7 +94,6 @@ UMCD_COLUMNS = (
 _UMCD_IDLE_INSTRUMENTS = ("0.0", "0.0", "-9.81", *["0.0"] * 3, *["0"] * 4)  # acceleration, rotation, magnetometer
 _UMCD_IDLE_ERRORS = (*["0.0"] * 4, "9.81", "0.0")  # errors, size of the acceleration and of the rotation
 _UMCD_MOTORS = (*["5200"] * 4, *["38"] * 4)  # speed and load of the four motors
-_KNOTS_PER_M_S = 3600 / 1852
 _GPX = "http://www.topografix.com/GPX/1/1"
 _DJI = "http://www.dji.com/drone-dji/1.0/"
 _SENSOR_WIDTH_MM = 6.3  # what a small drone's 1/2.3 inch sensor measures
@@ -366,7 +366,7 @@ def _nmea(telemetry: Telemetry, corrupt: Set[int], geoid_height_m: float) -> str
             f"{_degrees_minutes(longitude, 3)},{'E' if longitude >= 0 else 'W'}"
         )
         height_m = telemetry["orthometric_height_m"][i]
-        knots = telemetry["speed_m_s"][i] * _KNOTS_PER_M_S
+        knots = telemetry["speed_m_s"][i] / KNOT_M_S
         for body in (
             f"GPGGA,{clock},{place},1,12,0.8,{height_m:.3f},M,{geoid_height_m:.1f},M,,",
             f"GPRMC,{clock},A,{place},{knots:.3f},{telemetry['course_deg'][i]:.2f},{moment:%d%m%y},,,A",

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 import gpxpy.gpx
 import simplekml
 
-_DAY_NS = 86_400_000_000_000
+from sorvolo.geometry.units import DAY_NS
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
         folder.style.polystyle.fill = 0
         folder.style.linestyle.width = 3
         folder.style.linestyle.color = simplekml.Color.red
-        if each.seen_ns >= _DAY_NS:
+        if each.seen_ns >= DAY_NS:
             folder.timestamp.when = _moment(each.seen_ns).strftime("%Y-%m-%dT%H:%M:%SZ")
     return str(document.kml()).encode()
 
@@ -48,7 +48,7 @@ def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
         document.waypoints.append(gpxpy.gpx.GPXWaypoint(
             latitude=round(each.latitude_deg, 8), longitude=round((each.longitude_deg + 180) % 360 - 180, 8),
             name=_printable(each.name), description=_printable(each.description),
-            time=_moment(each.seen_ns) if each.seen_ns >= _DAY_NS else None,
+            time=_moment(each.seen_ns) if each.seen_ns >= DAY_NS else None,
         ))
     return document.to_xml(version="1.1").encode()
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-_DAY_NS = 86_400_000_000_000
+from sorvolo.geometry.units import DAY_NS
+
 NO_PLACE_FILES = "No GeoJSON, KML or GPX is written, since these hold places on Earth."
 _OF_OWN_MAP = (
     "The flight has no GPS: coordinates are pixels of its own map, x to the right and y up, without metres and north. "
@@ -99,7 +100,7 @@ def utc_text(time_ns: int) -> str:
 
 def time_words(time_ns: int) -> str:
     """UTC to the second for people; the time into the flight where no clock knew the date."""
-    if 0 <= time_ns < _DAY_NS:
+    if 0 <= time_ns < DAY_NS:
         return f"{time_ns // 60_000_000_000}:{time_ns // 1_000_000_000 % 60:02d} into the flight"
     return utc_text(time_ns)[:19].replace("T", " ")
 

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from sorvolo.geometry.units import DAY_NS
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.exports.object_files import crop_name
 from sorvolo.store.exports.places import longitude_latitude
@@ -25,7 +26,6 @@ PROPERTIES = {
 }
 """The items' own properties (docs/archive-search.md) and their types."""
 
-_DAY_NS = 86_400_000_000_000
 _TYPES = {
     ".tif": "image/tiff; application=geotiff; profile=cloud-optimized", ".png": "image/png", ".jpg": "image/jpeg",
     ".html": "text/html", ".geojson": "application/geo+json",
@@ -99,7 +99,7 @@ def _flight_items(
     """A flight, its changes and its objects; what has no place on the ground is left out."""
     common = {"sorvolo:site": name, "sorvolo:flight": rows.flight, "sorvolo:version": version.id}
     folder = f"flights/{rows.flight}/"
-    is_dated = rows.first_ns >= _DAY_NS
+    is_dated = rows.first_ns >= DAY_NS
     place = rows.frames.place
     if place is not None:
         yield StacItem(
@@ -130,7 +130,7 @@ def _thing(
     properties: Mapping[str, Any], assets: Mapping[str, StacAsset],
 ) -> StacItem:
     """A change or an object, with when it was seen."""
-    is_dated = row["first_ns"] >= _DAY_NS
+    is_dated = row["first_ns"] >= DAY_NS
     return StacItem(
         f"{name}/{id}", name, f"{row['label']} ({id})", place,
         row["first_ns"] if is_dated else _moment_ns(version), row["first_ns"] if is_dated else None,

@@ -17,7 +17,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGBA, PointsM
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster
+from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, transform_on_grid
 
 _WGS84 = CRS.from_epsg(4326)
 _SITE_MAP = "mosaic.tif"
@@ -103,8 +103,7 @@ class BaseMap:
         if max(width, height) > _MOST_PX:
             raise InputError(f"{self.path}: {width} x {height} pixels of it lie under the flight; give a smaller part")
         first_m = grid.projected_from_grid(np.array([[x0, y0]]))[0]
-        outer_m = grid.projected_from_grid(np.array([[x0 - 0.5, y0 - 0.5]]))[0]
-        target = Affine(grid.m_per_px, 0, outer_m[0], 0, -grid.m_per_px, outer_m[1])
+        target = transform_on_grid(grid, int(x0), int(y0))
         with open_raster(self.path, "a GeoTIFF") as source:
             return _read(source, target, width, height, crs_of_epsg(grid.crs), self.m_per_px / grid.m_per_px), first_m
 

@@ -1,15 +1,18 @@
-"""GDAL behind a locked door: one driver, plain local files, no network, no neighbours of a file."""
+"""GDAL behind a locked door: one driver, plain local files, no network, no neighbours of a file; and its half pixel."""
 
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import rasterio
 from rasterio.crs import CRS
 from rasterio.errors import CRSError, RasterioIOError
+from rasterio.transform import Affine
 
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.grid import Grid
 
 # a small cache keeps memory flat; no directory listing keeps GDAL from opening neighbours of a user's file; a curl name
 # that nothing has keeps /vsicurl/ and its kin from fetching anything
@@ -45,6 +48,15 @@ def open_raster(
         raise InputError(f"{path}: GDAL would take this for one of its virtual files; move it to another folder")
     with quiet_gdal(), _opened(whole, drivers) as source:
         yield source
+
+
+def transform_on_grid(grid: Grid, column: int, row: int) -> Affine:
+    """The transform of a raster whose top-left pixel is this column and row of the grid.
+
+    GDAL counts from a pixel's outer corner, our grids from its centre: half a pixel lies between them.
+    """
+    outer_m = grid.projected_from_grid(np.array([[column - 0.5, row - 0.5]]))[0]
+    return Affine(grid.m_per_px, 0, outer_m[0], 0, -grid.m_per_px, outer_m[1])
 
 
 def _opened(path: Path, drivers: Sequence[str]) -> rasterio.DatasetReader:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import RasterioError
-from rasterio.transform import Affine
 from rasterio.warp import calculate_default_transform, reproject
 from rasterio.windows import Window
 
@@ -29,7 +28,7 @@ from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, scratch_folder, writing
 from sorvolo.store.images import shrink
-from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal
+from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal, transform_on_grid
 
 _BLOCK_PX = 512
 _VERIFIED_BLOCKS = 64
@@ -126,12 +125,11 @@ def _write_plain(
     columns, rows = np.array(sorted(tiles)).T
     left, top = columns.min() * grid.tile_px, rows.min() * grid.tile_px
     width, height = (columns.max() + 1) * grid.tile_px - left, (rows.max() + 1) * grid.tile_px - top
-    outer_corner_m = grid.projected_from_grid(np.array([[left - 0.5, top - 0.5]]))[0]
     profile = _SCRATCH | {
         "width": width, "height": height, "count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "YES",
         "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "bigtiff": "IF_SAFER",
         "crs": crs_of_epsg(grid.crs) if grid.crs else None,
-        "transform": Affine(grid.m_per_px, 0, outer_corner_m[0], 0, -grid.m_per_px, outer_corner_m[1]),
+        "transform": transform_on_grid(grid, left, top),
     }
     verified = dict.fromkeys(_spread(sorted(tiles), _VERIFIED_BLOCKS), 0)  # and the CRC-32 of their pixels
     with rasterio.open(path, "w", **profile) as sink:

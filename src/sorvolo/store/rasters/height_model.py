@@ -17,15 +17,15 @@ from scipy.ndimage import map_coordinates
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.units import FOOT_M, SURVEY_FOOT_M
 from sorvolo.store.rasters.gdal import open_raster
 
 _WGS84 = "EPSG:4326"
 _LOWEST_M, _HIGHEST_M = -1_000.0, 10_000.0  # no ground on Earth lies beyond: a hole that its file does not declare
-_FOOT_M, _SURVEY_FOOT_M = 0.3048, 1200 / 3937
 _UNITS_M = (
     dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0)
-    | dict.fromkeys(("ft", "foot", "feet", "international foot"), _FOOT_M)
-    | dict.fromkeys(("us-ft", "ftus", "us survey foot", "us survey feet", "foot_us"), _SURVEY_FOOT_M)
+    | dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M)
+    | dict.fromkeys(("us-ft", "ftus", "us survey foot", "us survey feet", "foot_us"), SURVEY_FOOT_M)
 )
 _MOST_PX = 4096  # a side that is kept: finer models are averaged
 

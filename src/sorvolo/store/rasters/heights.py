@@ -8,13 +8,12 @@ import numpy as np
 import rasterio
 import rasterio.shutil
 from rasterio.errors import RasterioError
-from rasterio.transform import Affine
 
 from sorvolo.errors import InputError, StoreError
 from sorvolo.geometry.arrays import Floats32
 from sorvolo.geometry.grid import Grid
 from sorvolo.store.atomic import atomic_path, scratch_folder
-from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal
+from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal, transform_on_grid
 
 _PLAIN = {"driver": "GTiff", "tiled": True, "compress": "zstd", "zstd_level": 1, "bigtiff": "IF_SAFER"}
 _COG = {
@@ -37,12 +36,11 @@ def write_height_cog(bands: Sequence[Floats32], names: Sequence[str], first: tup
 
     Raises StoreError on a full disk or for a file that reads back differently.
     """
-    outer_m = grid.projected_from_grid(np.array([[first[0] - 0.5, first[1] - 0.5]]))[0]
     height, width = bands[0].shape
     profile = _PLAIN | {
         "width": width, "height": height, "count": len(bands), "dtype": "float32", "nodata": float("nan"),
         "blockxsize": 512, "blockysize": 512, "crs": crs_of_epsg(grid.crs) if grid.crs else None,
-        "transform": Affine(grid.m_per_px, 0, outer_m[0], 0, -grid.m_per_px, outer_m[1]),
+        "transform": transform_on_grid(grid, *first),
     }
     with scratch_folder(path.parent) as scratch, atomic_path(path) as temporary, quiet_gdal():
         try:

@@ -28,6 +28,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.geometry.pose import Pose
+from sorvolo.geometry.units import DAY_NS
 from sorvolo.store.rasters.geotiff import COMPRESSIONS
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue_place import Catalogues, open_database
@@ -37,8 +38,6 @@ from sorvolo.store.site.schema import SCHEMA_VERSION
 from sorvolo.store.site.sqlite_database import SqliteDatabase
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
-
-_DAY_NS = 86_400_000_000_000
 
 
 @dataclass(frozen=True)
@@ -83,12 +82,12 @@ class VersionEntry:
     @property
     def flown_utc(self) -> str:
         """When its flight's first frame was taken, ISO 8601 UTC to the second; "" where no clock has a date."""
-        return self.moment.strftime("%Y-%m-%dT%H:%M:%SZ") if self.flown_ns >= _DAY_NS else ""
+        return self.moment.strftime("%Y-%m-%dT%H:%M:%SZ") if self.flown_ns >= DAY_NS else ""
 
     @property
     def moment(self) -> datetime:
         """Which moment the map shows: the flight's; where no clock has a date, that at which it was made."""
-        if self.flown_ns >= _DAY_NS:
+        if self.flown_ns >= DAY_NS:
             return datetime.fromtimestamp(self.flown_ns / 1e9, UTC)
         return datetime.fromisoformat(self.created_utc)
 
