@@ -151,6 +151,11 @@ def test_simulate_leaves_no_option_unheard(
     assert not (tmp_path / "made").exists()
 
 
+def test_presets_are_listed_without_a_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["simulate", "--list-presets"]) == 0
+    assert capsys.readouterr().out.split()[:2] == ["demo", "survey"]
+
+
 def test_json_is_pure(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["plan", "--camera", "aov=62", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["height_m"] > 0

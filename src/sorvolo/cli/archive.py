@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.archive_table import export_command
+from sorvolo.cli.exit_codes import FAILED
 from sorvolo.cli.options import AsJson, names
 from sorvolo.cli.progress import shown_work
 from sorvolo.survey.wording import counted
@@ -67,7 +68,7 @@ def index_command(
         for path, fault in outcome.faults.items():
             typer.echo(f"{path}: {fault}", err=True)
     if outcome.faults:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
 
 
 @archive_app.command("find")

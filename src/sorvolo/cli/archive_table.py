@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from sorvolo.cli.exit_codes import FAILED
 from sorvolo.cli.options import AsJson
 from sorvolo.cli.progress import shown_work
 from sorvolo.survey.wording import counted_list
@@ -39,4 +40,4 @@ def export_command(
         for name, fault in outcome.faults.items():
             typer.echo(f"{name}: {fault}", err=True)
     if outcome.faults:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)

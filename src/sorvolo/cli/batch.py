@@ -14,7 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.map import TO_CHECK, ended_by_signal
+from sorvolo.cli.exit_codes import FAILED, TO_CHECK
+from sorvolo.cli.map import ended_by_signal
 from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate, GiveUp, names
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import show_path
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from sorvolo.cluster.sites import SiteBy
     from sorvolo.cluster.table import BatchTable, Row
 
-_FAILED = 1
 _MOST_ROWS = 40
 _STORE_HANGS_S = 300.0  # two requests of `ObjectSettings.request_s`
 _COLOURS = {"done": "green", "known": "green", "doubtful": "yellow", "duplicate": "blue", "skipped": "blue"}
@@ -174,7 +174,7 @@ def batch(
 def _exit_code(report: "BatchReport") -> int:
     counts = report.counts()
     if counts.get("failed") or counts.get("set aside"):
-        return _FAILED
+        return FAILED
     return TO_CHECK if counts.get("doubtful") else 0
 
 

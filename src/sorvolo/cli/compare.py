@@ -13,7 +13,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sorvolo.cli.map import TO_CHECK, ended_by_signal
+from sorvolo.cli.exit_codes import TO_CHECK
+from sorvolo.cli.map import ended_by_signal
 from sorvolo.cli.options import (
     Again,
     Area,
@@ -57,6 +58,7 @@ class ChangeMethod(StrEnum):
 
     ROBUST = "robust"
     THESIS = "thesis"
+
 
 LaterFlights = Annotated[
     list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight.")

@@ -21,6 +21,7 @@ from sorvolo.cli.calibrate import calibrate
 from sorvolo.cli.compare import compare
 from sorvolo.cli.demo import demo
 from sorvolo.cli.evaluate import evaluate_app
+from sorvolo.cli.exit_codes import FAILED, STOPPED
 from sorvolo.cli.heights import heights
 from sorvolo.cli.history import history
 from sorvolo.cli.inspect import inspect
@@ -50,7 +51,6 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "heights": heights, "serve": serve, "stream": stream, "token": token, "batch": batch,
     "reproduce": reproduce,
 }
-_FAILED, _STOPPED = 1, 130
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _ASKED_AGAIN_S = 0.02
 
@@ -79,15 +79,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         with _interrupts_repeated(), _warnings_in_one_line():
             app(args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes)
     except SystemExit as stop:
-        code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else _FAILED
-        if code == _STOPPED:
+        code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else FAILED
+        if code == STOPPED:
             _print_line(wishes.stop_words)
         return code
     except Exception as error:
         if wishes.debug:
             traceback.print_exc()
         _print_line(f"error: {_words_of(error)}")
-        return _FAILED
+        return FAILED
     return 0
 
 

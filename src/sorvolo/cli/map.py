@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.exit_codes import TO_CHECK
 from sorvolo.cli.heights import make_and_read, show_heights
 from sorvolo.cli.options import (
     Again,
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
     from sorvolo.survey.mosaic import MosaicUpdate
 
 _MOST_REASONS = 6
-TO_CHECK = 3
-"""Exit code of a flight that was used, but whose result is to be checked before use."""
 
 
 class Method(StrEnum):

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.exit_codes import FAILED
 from sorvolo.errors import InputError
 
 if TYPE_CHECKING:
@@ -154,7 +155,7 @@ def verify(
     if not model:
         _show_hidden()
     if not all_good:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
 
 
 def _chosen(model: str) -> Sequence["InstalledModel"]:

@@ -44,6 +44,7 @@ class PlaceFormat(StrEnum):
     UTM = "utm"
     MGRS = "mgrs"
 
+
 class Compression(StrEnum):
     """How a GeoTIFF is compressed: the names of `store.rasters.geotiff.COMPRESSIONS`."""
 

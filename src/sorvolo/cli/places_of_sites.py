@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from sorvolo.store.copies.transfer import CopyUpdate
 
 SiteArgument = Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")]
-SiteOption = Annotated[str, typer.Option(help="Folder of the map, or s3://BUCKET/NAME.")]
 
 
 class _Timed(Protocol):

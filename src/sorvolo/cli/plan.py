@@ -33,6 +33,7 @@ class Facing(StrEnum):
     FRONT = "front"
     BOTTOM = "bottom"
 
+
 FocalLength = Annotated[float, typer.Option(help="Focal length, mm.", show_default="of --camera")]
 PixelSize = Annotated[float, typer.Option(help="Sensor pixel, um.", show_default="of --camera")]
 TaskOption = Annotated[

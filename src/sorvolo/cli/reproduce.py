@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.exit_codes import TO_CHECK
 from sorvolo.cli.options import size_px
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.train import Preset
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from sorvolo.missions.reproduce.settings import ReproductionSettings, SimulatedSize
 
 _DEFAULT_OUT = Path("reproduction")
-_PARTIAL = 3  # the exit code of a result that lacks something
 
 Dataset = Annotated[Path | None, typer.Argument(help="The UMCD dataset's folder, in the thesis's layout.")]
 OutFolder = Annotated[Path, typer.Option(help="Folder for tables, figures, maps and models.")]
@@ -95,7 +95,7 @@ def reproduce(
     else:
         _show(document, out / PAGE)
     if document["missing"]:
-        raise typer.Exit(_PARTIAL)
+        raise typer.Exit(TO_CHECK)
 
 
 def _simulate(place: Path, size: "SimulatedSize", settings: "ReproductionSettings") -> None:

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.exit_codes import TO_CHECK
 from sorvolo.cli.options import AsJson, Camera, names
 from sorvolo.cli.places_of_sites import opened_site
 from sorvolo.cli.progress import ProgressReport
@@ -20,8 +21,6 @@ from sorvolo.errors import SettingsError
 if TYPE_CHECKING:
     from sorvolo.missions.search.flights import SearchOutputs
     from sorvolo.missions.search.settings import SearchSettings
-
-_HOLES = 3  # exit code of a search that could not see all of its area
 
 
 Inputs = Annotated[
@@ -106,7 +105,7 @@ def search_command(
     else:
         _show(report, outputs.folder, outputs.refly, Console())
     if not report["headline"]["complete"]:
-        raise typer.Exit(_HOLES)
+        raise typer.Exit(TO_CHECK)
 
 
 def _map_of(inputs: Sequence[str]) -> str:

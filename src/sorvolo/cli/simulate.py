@@ -48,7 +48,19 @@ PictureCount = Annotated[
     typer.Option(help="Make this many single labelled pictures (COCO) of different sites instead of flights."),
 ]
 ThermalShare = Annotated[float, typer.Option(help="With --pictures: share of thermal pictures, 0 to 1.")]
-ListPresets = Annotated[bool, typer.Option("--list-presets", help="List the presets and stop.")]
+
+
+def _print_presets(wanted: bool) -> None:
+    from sorvolo.simulation.presets import preset_names
+
+    if wanted:
+        typer.echo("\n".join(preset_names()))
+        raise typer.Exit
+
+
+ListPresets = Annotated[
+    bool, typer.Option("--list-presets", callback=_print_presets, is_eager=True, help="List the presets and stop.")
+]
 
 
 def simulate(
@@ -85,10 +97,8 @@ def simulate(
 
     Example: sorvolo simulate labelled --pictures 500 --thermal 0.3 --seed 7
     """
-    from sorvolo.simulation.presets import preset, preset_names
+    from sorvolo.simulation.presets import preset
 
-    if list_presets:
-        return typer.echo("\n".join(preset_names()))
     ground_file = _ground_file(ground)
     ground_kind = ground if ground_file is None else "orthophoto"
     if pictures is None and thermal:
@@ -101,7 +111,8 @@ def simulate(
             "--size": size, "--photos": photos,
         })
         asked = _picture_settings(pictures, seed, ground_kind, thermal, height)
-        return _simulate_pictures(folder, asked, ground_file, ground_gsd, as_json)
+        _simulate_pictures(folder, asked, ground_file, ground_gsd, as_json)
+        return
     settings = _with_options(
         preset(preset_name),
         top={"seed": seed, "flights": flights}, scene={"ground": ground_kind or None, "relief_m": relief},

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from sorvolo.cli.exit_codes import FAILED
 from sorvolo.cli.options import AsJson
 from sorvolo.cli.places_of_sites import show_copy
 from sorvolo.survey.wording import counted
@@ -52,7 +53,7 @@ def copy_command(
     else:
         _print(outcome, target, verified=verify)
     if outcome.faults:
-        raise typer.Exit(1)
+        raise typer.Exit(FAILED)
 
 
 @site_app.command("prune")

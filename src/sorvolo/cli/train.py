@@ -44,6 +44,7 @@ class Schedule(StrEnum):
     JOINT = "joint"
     FOUR_STEPS = "four-steps"
 
+
 LabelledSets = Annotated[list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")]
 RunFolder = Annotated[Path, typer.Option(help="Folder for the model, the report and the checkpoints.")]
 PresetOption = Annotated[

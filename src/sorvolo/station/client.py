@@ -66,7 +66,6 @@ class StreamReport:
     late: int = 0
     overflowed: int = 0
     spooled: int = 0  # pictures that still wait
-    spooled_bytes: int = 0
     outages: int = 0
     outage_s: float = 0.0
     is_linked: bool = False
@@ -337,7 +336,7 @@ class StreamClient:
     def _count(self) -> StreamReport:
         counts: Any = self._spool.counts()
         self.report.late, self.report.overflowed = counts.late, counts.overflowed
-        self.report.spooled, self.report.spooled_bytes = counts.waiting, counts.waiting_bytes
+        self.report.spooled = counts.waiting
         return self.report
 
 

@@ -11,8 +11,10 @@ STATE_FOLDER = "station"
 """The folder below the root that holds the station's own files: state, uploads, runs."""
 
 STREAMS_FOLDER = "streams"
-RUNS_FOLDER = "runs"
 """The folder below the root that holds what drones send, a folder for each stream."""
+
+RUNS_FOLDER = "runs"
+"""The folder below the station's own that holds what missions leave, a folder for each run."""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class BodySettings:
 class StandingSettings:
     """When an object stands where frames saw it, and which sightings are of it."""
 
-    least_score: float = 0.3  # of a class for which none is given
+    least_score: float = 0.3  # from which on a class is reported for which none is given
     standing_share: float = 0.3  # of the frames that show a place: what so many saw there is no part of a way
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     matches: MatchSettings = field(default_factory=MatchSettings)
@@ -99,14 +99,14 @@ def fuse(
 ) -> Fused:
     """The objects that the sightings of these frames show, each once, the surest first.
 
-    `least` is the score from which on each class is reported. Weaker sightings count as evidence: what all frames that
-    show its place leave below it is dropped, unless several sightings of that score lie on the way of something that
-    walks or drives: that is reported once, as moving.
+    `least` is the score from which on each class is reported, `settings.least_score` that of a class it lacks. Weaker
+    sightings count as evidence: what all frames that show its place leave below it is dropped, unless several sightings
+    of that score lie on the way of something that walks or drives: that is reported once, as moving.
     """
     if not laid:
         return Fused((), 0)
     least = least or {}
-    strong = np.array([each.sighting.score >= least.get(each.sighting.label, 0.0) for each in laid])
+    strong = np.array([each.sighting.score >= least.get(each.sighting.label, settings.least_score) for each in laid])
     groups = _reported(_merged(_gathered(laid, settings.matches), laid, settings.matches), strong)
     objects, unlikely = _standing_or_not(groups, laid, frames, least, settings)
     left = [k for k in unlikely if strong[k]]
