@@ -58,10 +58,9 @@ class Day:
 
 
 def needed_area(settings: SimulationSettings, waypoints_m: Floats, margin_m: float = 4.0) -> Area:
-    """The ground that can come into sight when flying these waypoints, all flights' height and tilt
-    included."""
-    margin_m += 4 * settings.motion.drift_rms_m
-    reach_m = margin_m + max(_reach_m(settings.of_flight(flight), flight) for flight in (1, 2))
+    """The ground that can come into sight from these waypoints, (N, 2), all flights' height and tilt included."""
+    farthest_m = max(_reach_m(settings.of_flight(flight), flight) for flight in (1, 2))
+    reach_m = margin_m + 4 * settings.motion.drift_rms_m + farthest_m
     low, high = waypoints_m.min(axis=0) - reach_m, waypoints_m.max(axis=0) + reach_m
     return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
@@ -122,8 +121,7 @@ def _on_hills(thing: Thing, relief: Relief) -> Thing:
 
 
 def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px: float) -> Day:
-    """The site as one flight, counted from 1, finds it, fine enough for pictures of `m_per_px` on the
-    ground."""
+    """The site as one flight, counted from 1, finds it, fine enough for pictures of `m_per_px` on the ground."""
     rng = np.random.default_rng([settings.seed, 3, flight])
     weather = settings.later.weather if flight > 1 else WeatherSettings(False, False, 0.0)
     light, gains = _daylight(weather, rng)
@@ -200,8 +198,7 @@ def _furnish(scene: SceneSettings, layout: Layout, waypoints_m: Floats, settings
 
 def _next_day(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
               flight: int) -> tuple[Thing, ...]:
-    """The things of a later flight: some targets of the first are gone, some moved, some are new, some
-    move."""
+    """The things of a later flight: some targets of the first are gone, some moved, some are new, some move."""
     rng = np.random.default_rng([settings.seed, 4, flight])
     today = _left_and_moved(first, layout, waypoints_m, settings, rng)
     next_id = 1000 * flight
@@ -258,8 +255,7 @@ def _place(label: Label, thing_id: int, others: list[Thing], layout: Layout, way
 
 
 def _set_off(thing: Thing, others: list[Thing], rng: np.random.Generator) -> Thing:
-    """The thing on its way: a person walks anywhere, a car drives straight on, where no scenery is in
-    the way."""
+    """The thing on its way: a person walks anywhere, a car drives straight on, where no scenery is in the way."""
     is_car = thing.label is Label.CAR
     speed = rng.uniform(2.0, 4.0) if is_car else rng.uniform(0.7, 1.5)
     for _ in range(30):

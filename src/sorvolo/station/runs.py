@@ -195,7 +195,7 @@ class Runs:
     # ---- inside -----------------------------------------------------------------------------------------------
 
     def _begin(self, run: Run) -> None:
-        with self._events.appending([_event("run.started", run, _public(run))]) as connection:
+        with self._events.appending([_event("run.started", run, run_row(run))]) as connection:
             connection.execute(
                 "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, ?, ?, ?, ?, ?)",
                 (run.id, run.started_at, run.site, run.mission, run.state, compact_json(asdict(run))),
@@ -269,7 +269,7 @@ class Runs:
         code = process.poll() if process is not None else None
         if run.stop_asked:
             run = replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, headline="stopped; nothing was kept")
-            return run, _event("run.stopped", run, _public(run))
+            return run, _event("run.stopped", run, run_row(run))
         last = _tail(folder / LOG_FILE)
         words = "its process ended without a word"
         if code is not None and code < 0:
@@ -278,7 +278,7 @@ class Runs:
             run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code,
             error=f"{words}; the site is as it was before{': ' + last if last else ''}",
         )
-        return run, _event("run.failed", run, _public(run))
+        return run, _event("run.failed", run, run_row(run))
 
     def _keep(self, run: Run, events: list[NewEvent], offset: int | None = None) -> None:
         with self._events.appending(events) as connection:
@@ -319,13 +319,9 @@ class Runs:
         )
 
 
-def _public(run: Run) -> dict[str, Any]:
-    """A run without what is of no use to a browser."""
+def run_row(run: Run) -> dict[str, Any]:
+    """A run as the API gives it: without what is of no use to a browser."""
     return {name: value for name, value in asdict(run).items() if name not in ("pid", "kill_at")}
-
-
-run_row = _public
-"""A run as the API gives it."""
 
 
 def _event(kind: str, run: Run, data: Mapping[str, Any]) -> NewEvent:
@@ -342,7 +338,7 @@ def _taken(run: Run, line: Mapping[str, Any]) -> tuple[Run, NewEvent]:
             run, state=_ENDS[kind], ended_at=utc_now(), headline=data["headline"], exit_code=data["exit_code"],
             error=data["error"],
         )
-        return run, _event(kind, run, _public(run))
+        return run, _event(kind, run, run_row(run))
     return run, _event(kind, run, data)
 
 

@@ -135,7 +135,8 @@ def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
         views_per_second=wish.views_per_second, votes=wish.votes, voters=wish.voters, updates_map=wish.updates_map,
         model=wish.model or "default", ground_elevation_m=wish.ground_elevation_m, classes=tuple(wish.classes),
     )
-    before, announced = _newest(site), dict[str, None]()
+    before = _newest(site)
+    announced: dict[str, None] = {}  # their ids, in order
     with Archive.open(site, write=False) as archive:
         place = archive.site()
     updates = compare_flights(
@@ -145,7 +146,8 @@ def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
     with closing(updates):
         for update in updates:
             _placed(journal, update.view, update.frame_name, update.status.value)
-            _announce(journal, update, place, announced)
+            announced |= dict.fromkeys(each.id for each in update.announced)
+            _announce(journal, update, place)
             journal.progress(_compare_progress(update, len(announced)))
     with Archive.open(site, write=False) as archive:
         flights = {each.flight_id for each in archive.versions() if each.id > before}
@@ -226,11 +228,11 @@ def _placed(journal: Journal, view: FrameView | None, name: str, status: str) ->
     })
 
 
-def _announce(journal: Journal, update: CompareUpdate, site: Site, announced: dict[str, None]) -> None:
+def _announce(journal: Journal, update: CompareUpdate, site: Site) -> None:
+    """Write each change that was announced just now; of a run that was killed, it has written them."""
+    if update.is_resumed:
+        return
     for change in update.announced:
-        announced[change.id] = None
-        if update.is_resumed:
-            continue  # the run that was killed announced it
         stored = stored_changes(change.id.rpartition("-")[0], [change])
         feature = changes_geojson(stored, on_earth(site))["features"][0]
         journal.add("change.announced", {"feature": feature})

@@ -108,7 +108,7 @@ def predicted(motions: Motions, elapsed_s: Floats, settings: TurnSettings = Turn
     apart = motions.means[:, :, None, :] - means[:, None, :, :]  # (N, from, to, 4)
     covariances = np.einsum("njk,njab->nkab", shares, motions.covariances)
     covariances += np.einsum("njk,njka,njkb->nkab", shares, apart, apart)
-    _move_on(means, covariances, elapsed_s, motions.habits)
+    means, covariances = _moved_on(means, covariances, elapsed_s, motions.habits)
     return Motions(means, covariances, weights, motions.habits)
 
 
@@ -132,8 +132,11 @@ def log_density(gaps: Floats, spread: Floats) -> Floats:
     return np.asarray(-0.5 * (squared + np.log(np.linalg.det(spread)) + size * np.log(2 * np.pi)))
 
 
-def _move_on(means: Floats, covariances: Floats, elapsed_s: Floats, habits: Floats) -> None:
-    """Move each model on, in place."""
+def _moved_on(
+    means: Floats, covariances: Floats, elapsed_s: Floats, habits: Floats
+) -> tuple[Floats, Floats]:
+    """The means (N, 2, 4) and covariances (N, 2, 4, 4) of both models so much later, each by its own motion."""
+    means, covariances = means.copy(), covariances.copy()
     t = elapsed_s[:, None, None]
     means[:, STANDS, 2:] = 0.0
     covariances[:, STANDS, :2, 2:] = 0.0
@@ -150,3 +153,4 @@ def _move_on(means: Floats, covariances: Floats, elapsed_s: Floats, habits: Floa
     moved[:, 2:, :2] += noise * t**2 / 2 * _EYE
     moved[:, 2:, 2:] += noise * t * _EYE
     covariances[:, MOVES] = moved
+    return means, covariances

@@ -132,15 +132,17 @@ class Tracker:
         near = self._near(seen, time_ns, footprint_m)
         motions = _stacked(near, time_ns)
         pairs, motions = self._matched(near, motions, seen)
-        ids = np.zeros(len(sightings), np.int64)
-        new = self._prolong(near, motions, pairs, seen, time_ns, ids)
+        new = self._prolong(near, motions, pairs, seen, time_ns)
+        prolonged = [near[row] for row in pairs.tracks]
         unmatched = np.setdiff1d(np.arange(len(near)), pairs.tracks)
-        begun_now = self._begin(seen, ids)
+        fresh = seen.fresh_rows(pairs.sightings, self._settings.sure_score)
+        started = self._begin(seen, fresh)
         missing, ended = self._missed(near, motions, unmatched, time_ns, elapsed_s, footprint_m)
-        seen.write_ids_of_doubles(ids)
-        now = [near[row] for row in pairs.tracks] + begun_now
-        merged = self._join(now, missing)
-        ids = np.array([merged.get(each, each) for each in ids.tolist()], np.int64)
+        ids = np.zeros(len(sightings), np.int64)
+        ids[pairs.sightings] = [each.id for each in prolonged]
+        ids[fresh] = [each.id for each in started]
+        merged = self._join(prolonged + started, missing)
+        ids = np.array([merged.get(each, each) for each in seen.with_doubles(ids).tolist()], np.int64)
         return TrackUpdate(
             tuple(ids.tolist()), tuple(each for each in new if each not in merged),
             tuple(sorted(set(ids.tolist()) - {0})), tuple(each for each in ended if each not in merged), merged,
@@ -173,9 +175,9 @@ class Tracker:
         return time_ns, elapsed_s
 
     def _prolong(
-        self, near: list[Followed], motions: Motions, pairs: Pairs, seen: "_Seen", time_ns: int, ids: Labels
+        self, near: list[Followed], motions: Motions, pairs: Pairs, seen: "_Seen", time_ns: int
     ) -> list[int]:
-        """Give matched tracks their sightings, and the sightings the tracks' ids; the ids confirmed by it."""
+        """Give matched tracks their sightings; the ids confirmed by it."""
         new: list[int] = []
         for row, column in zip(pairs.tracks, pairs.sightings):
             followed = near[row]
@@ -183,7 +185,6 @@ class Tracker:
             weight = min(1.0, (time_ns - followed.last_ns) / 1e9 / self._settings.evidence.usual_step_s)
             if self._record(followed, seen, int(column), weight):
                 new.append(followed.id)
-            ids[column] = followed.id
         return new
 
     def _near(self, seen: "_Seen", time_ns: int, footprint_m: PointsM | None) -> list[Followed]:
@@ -315,12 +316,8 @@ class Tracker:
         followed.confirmed = True
         return True
 
-    def _begin(self, seen: "_Seen", ids: Labels) -> list[Followed]:
-        """Tracks for sure sightings that are none of those known; writes their ids."""
-        fresh = [
-            row for row in range(len(ids))
-            if ids[row] == 0 and seen.scores[row] >= self._settings.sure_score and row not in seen.doubles
-        ]
+    def _begin(self, seen: "_Seen", fresh: list[int]) -> list[Followed]:
+        """New tracks, one for each of these rows of sightings."""
         if not fresh:
             return []
         habits = np.array([habits_of(seen.labels[row], self._settings.unit_m) for row in fresh])
@@ -336,7 +333,6 @@ class Tracker:
             self.next_id += 1
             self._record(followed, seen, row, 1.0)
             started.append(followed)
-            ids[row] = followed.id
         self._followed += started
         shift.begin([each.id for each in started])
         return started
@@ -481,11 +477,17 @@ class _Seen:
             return None
         return self.looks[row]
 
-    def write_ids_of_doubles(self, ids: Labels) -> None:
-        """Give each double the id of the stronger sighting, where that has one."""
+    def fresh_rows(self, matched: Rows, sure_score: float) -> list[int]:
+        """The sure sightings that are neither matched nor doubles: each begins a track."""
+        known = {*matched.tolist(), *self.doubles}
+        return [row for row, score in enumerate(self.scores) if row not in known and score >= sure_score]
+
+    def with_doubles(self, ids: Labels) -> Labels:
+        """(sightings,) the ids, those of doubles being the stronger sighting's, where that has one."""
+        whole = ids.copy()
         for row, stronger in self.doubles.items():
-            if ids[stronger]:
-                ids[row] = ids[stronger]
+            whole[row] = whole[stronger] or whole[row]
+        return whole
 
 
 def _count_meetings(now: list[Followed], missing: list[Followed], reach_m: float) -> None:

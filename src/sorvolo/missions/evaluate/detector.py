@@ -129,14 +129,15 @@ def evaluate_detector(
     """
     settings = settings or EvaluationSettings()
     _demand_distinct(labelled)
-    damaged: dict[str, str] = {}
-    seen = _seen_by_all(arms, labelled, settings, progress, damaged)
-    labelled = [_readable(each, damaged) for each in labelled]
+    reader = _PictureReader()
+    seen = _seen_by_all(arms, labelled, settings, progress, reader)
+    labelled = [_readable(each, reader.damaged) for each in labelled]
     first = seen[0][0]
     scores = tuple(_scores(each, first, settings) for each in labelled)
     comparisons = tuple(_side_by_side(each, seen, settings) for each in labelled if len(seen) > 1)
     worst = {each.name: tuple(_worst(each, score, first.sets[each.name])) for each, score in zip(labelled, scores)}
-    return DetectorEvaluation(first, scores, comparisons, worst, (*_damage_notices(damaged), *_model_notices(seen)))
+    notices = (*_damage_notices(reader.damaged), *_model_notices(seen))
+    return DetectorEvaluation(first, scores, comparisons, worst, notices)
 
 
 def _scores(labelled: LabelledSet, found: FoundSets, settings: EvaluationSettings) -> SetScores:
@@ -148,11 +149,11 @@ def _scores(labelled: LabelledSet, found: FoundSets, settings: EvaluationSetting
 
 def _seen_by_all(
     arms: Sequence[Sequence[str]], labelled: Sequence[LabelledSet], settings: EvaluationSettings,
-    progress: Callable[[EvaluationProgress], None], damaged: dict[str, str],
+    progress: Callable[[EvaluationProgress], None], reader: "_PictureReader",
 ) -> list[list[FoundSets]]:
-    """What every model of every arm finds in the pictures that can be read; the others join `damaged`."""
-    seen = [[_found(place, labelled, settings, progress, damaged) for place in arm] for arm in arms]
-    return [[_without(each, labelled, damaged) for each in arm] for arm in seen]
+    """What every model of every arm finds in the pictures that can be read."""
+    seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in arms]
+    return [[_without(each, labelled, reader.damaged) for each in arm] for arm in seen]
 
 
 def _demand_distinct(labelled: Sequence[LabelledSet]) -> None:
@@ -206,15 +207,12 @@ def _held_out(labelled: LabelledSet, share: float, seed: int) -> LabelledSet:
 
 def _found(
     place: str, labelled: Sequence[LabelledSet], settings: EvaluationSettings,
-    progress: Callable[[EvaluationProgress], None], damaged: dict[str, str],
+    progress: Callable[[EvaluationProgress], None], reader: "_PictureReader",
 ) -> FoundSets:
-    """What the model of this name or file finds, or what it found by an earlier file.
-
-    Pictures that cannot be read join `damaged`, by path with the reason; of them nothing is found.
-    """
+    """What the model of this name or file finds, or what it found by an earlier file; nothing in damaged pictures."""
     if Path(place).suffix == ".json":
         found = read_found(Path(place))
-        return replace(found, sets={each.name: _same_pictures(place, found, each, damaged) for each in labelled})
+        return replace(found, sets={each.name: _same_pictures(place, found, each, reader) for each in labelled})
     detector = Detector.load(place, stand_in=False)
     for each in labelled:
         judged_classes(each, detector.classes)  # before an hour of looking
@@ -225,7 +223,7 @@ def _found(
         detections = []
         lights: list[Mapping[str, float]] = []
         for picture in each.pictures:
-            image = _picture(picture.path, damaged)
+            image = reader.read(picture.path)
             if image is None:
                 detections.append(no_detections(detector.classes))
             else:
@@ -251,15 +249,21 @@ def _found(
     )
 
 
-def _picture(path: str, damaged: dict[str, str]) -> ImageRGB | None:
-    """The picture, or None where it cannot be read, which is then noted in `damaged`."""
-    if path in damaged:
-        return None
-    try:
-        return read_picture(Path(path))
-    except (InputError, OSError) as error:
-        damaged[path] = str(error)
-        return None
+class _PictureReader:
+    """Reads pictures. Those that cannot be read are `damaged`, by path with the reason, and are not tried again."""
+
+    def __init__(self) -> None:
+        self.damaged: dict[str, str] = {}
+
+    def read(self, path: str) -> ImageRGB | None:
+        """The picture; None where it cannot be read."""
+        if path in self.damaged:
+            return None
+        try:
+            return read_picture(Path(path))
+        except (InputError, OSError) as error:
+            self.damaged[path] = str(error)
+            return None
 
 
 def _readable(labelled: LabelledSet, damaged: Mapping[str, str]) -> LabelledSet:
@@ -301,7 +305,7 @@ def _names(labelled: LabelledSet) -> tuple[str, ...]:
 
 
 def _same_pictures(
-    place: str, found: FoundSets, labelled: LabelledSet, damaged: dict[str, str]
+    place: str, found: FoundSets, labelled: LabelledSet, reader: _PictureReader
 ) -> FoundSet:
     """The file's detections in the order of the set's pictures; those that it lacks must be damaged ones."""
     if labelled.name not in found.sets:
@@ -311,7 +315,7 @@ def _same_pictures(
     if one.files == wanted:
         return one
     by_name = dict(zip(one.files, one.detections))
-    missing = _readable_beside(labelled, by_name, damaged)
+    missing = _readable_beside(labelled, by_name, reader)
     repeats = len(by_name) < len(one.files) or len(set(wanted)) < len(wanted)
     if missing or repeats:
         raise InputError(
@@ -322,11 +326,11 @@ def _same_pictures(
     return replace(one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted))
 
 
-def _readable_beside(labelled: LabelledSet, known: Container[str], damaged: dict[str, str]) -> list[str]:
+def _readable_beside(labelled: LabelledSet, known: Container[str], reader: _PictureReader) -> list[str]:
     """The set's pictures that are not known by name, and can be read."""
     return [
         name for name, picture in zip(_names(labelled), labelled.pictures)
-        if name not in known and _picture(picture.path, damaged) is not None
+        if name not in known and reader.read(picture.path) is not None
     ]
 
 
@@ -352,13 +356,14 @@ def _worst(
     labelled: LabelledSet, scores: SetScores, found: FoundSet
 ) -> Iterator[tuple[Mistake, str, ImageRGB]]:
     """The surest false alarms and confusions and the largest misses, with the picture's name and a crop."""
+    reader = _PictureReader()
     for kind in _KINDS:
         mistakes = [each for each in scores.mistakes if each.kind == kind]
         mistakes.sort(key=_area_px if kind == "miss" else lambda each: each.score, reverse=True)
         for mistake in _few_of_each_picture(mistakes):
             picture = labelled.pictures[mistake.picture]
             reported = _reported(found.detections[mistake.picture], found.thresholds)
-            image = _picture(picture.path, {})
+            image = reader.read(picture.path)
             if image is not None:  # of detections.json the pictures were not needed so far
                 crop = mistake_picture(image, mistake.box_px, _judged_boxes(picture, labelled, scores), reported)
                 yield mistake, Path(picture.path).name, crop

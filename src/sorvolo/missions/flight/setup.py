@@ -147,10 +147,9 @@ def _by_known_ground(source: Source, settings: MapSettings, site: Site | None, k
     if site is not None:
         raise InputError(
             f"the flight {source.name} has no GPS, and {known.words} alone cannot join it to a map that exists: map it "
-            " into a site folder of its own"
+            "into a site folder of its own"
         )
-    if settings.offset_s is not None:
-        raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
+    _refuse_offset(settings)
     notice = Notice("no_telemetry", 1, f"no GPS: {known.words} alone gives the map its place, scale and north")
     return FlightSetup(
         source, known.frame, _untimed(source), None, (notice, *known.notices), known_ground=known
@@ -182,8 +181,7 @@ def _without_gps(
             f"the site is geo-referenced, but the flight {source.name} has no GPS: give --telemetry, or map it "
             "into a site folder of its own"
         )
-    if settings.offset_s is not None:
-        raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
+    _refuse_offset(settings)
     if settings.crs is not None:
         raise SettingsError(
             f"--crs {settings.crs} was given, but {source.name} has no GPS, so its map has no place on Earth; give "
@@ -195,6 +193,12 @@ def _without_gps(
     return FlightSetup(
         source, LocalFrame(Geodetic(0.0, 0.0)), _untimed(source), site, (Notice("no_telemetry", 1, text),)
     )
+
+
+def _refuse_offset(settings: MapSettings) -> None:
+    """Raise SettingsError where an offset was given to a flight whose telemetry places nothing."""
+    if settings.offset_s is not None:
+        raise SettingsError("--offset was given, but the flight has no telemetry with fixes")
 
 
 def _laid(site: Site | None, source: Source, *, founds_site: bool) -> Geodetic | None:

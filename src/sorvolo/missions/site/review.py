@@ -42,11 +42,11 @@ def review_changes(
 
 
 def withdraw_reviews(site: Path, ids: Sequence[str]) -> None:
-    """Take verdicts on changes back, as if none had been given; the flights' change files follow.
+    """Withdraw verdicts on changes, as if none had been given; the flights' change files follow.
 
     Raises InputError for an unknown id, StoreError when the folder is no site or another process is writing.
     """
-    with Archive.open(site, write=False):  # without a site there is nothing to take back: do not make one
+    with Archive.open(site, write=False):  # without a site there is nothing to withdraw: do not make one
         pass
     with Archive.open(site, write=True) as archive:
         archive.withdraw_review(ids)

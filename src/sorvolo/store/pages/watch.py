@@ -91,9 +91,6 @@ class _Spot:
 def _maps(report: Mapping[str, Any], tracks: Sequence[_Track], drone_m: Floats) -> list[dict[str, Any]]:
     """One map, or one for each segment of a flight that was followed in the picture: their pixels are not the same."""
     is_local = not report.get("georeferenced")
-    segments = sorted({each.get("segment", 0) for each in tracks})
-    parts = [(f"Where, segment {name}", [each for each in tracks if each.get("segment", 0) == name])
-             for name in segments] if len(segments) > 1 else [("Where", list(tracks))]
     note = (
         "Pixels of the first frame, or the first after a cut, with the camera's own motion removed: nothing places "
         "this flight on the ground."
@@ -101,12 +98,22 @@ def _maps(report: Mapping[str, Any], tracks: Sequence[_Track], drone_m: Floats) 
         "North is up. The dashed line is the path of the camera. The pale discs show the position accuracy (1 sigma)."
     )
     maps = []
-    for title, of_one in parts:
+    for title, of_one in _by_segment(tracks):
         drawing = _drawing(of_one, drone_m, is_local=is_local)
         if drawing:
             keys = [(f"c{k % _COLOURS}", name) for k, name in enumerate(_classes(of_one))]
             maps.append({"title": title, "legend": keys, "drawing": drawing, "note": note})
     return maps
+
+
+def _by_segment(tracks: Sequence[_Track]) -> list[tuple[str, list[_Track]]]:
+    """A title and the objects of each segment; all of them under one title where there is one segment."""
+    segments = sorted({each.get("segment", 0) for each in tracks})
+    if len(segments) < 2:
+        return [("Where", list(tracks))]
+    return [
+        (f"Where, segment {name}", [each for each in tracks if each.get("segment", 0) == name]) for name in segments
+    ]
 
 
 def _drawing(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> Markup:

@@ -226,7 +226,7 @@ class Archive:
         )
 
     def review(self, change_ids: str | Iterable[str], verdict: Verdict, note: str = "") -> None:
-        """Say of one change, or of several, that it is real or not; the flights' change files follow.
+        """Record a person's verdict on one change, or on several; the flights' change files follow.
 
         A later review replaces an earlier one. Raises InputError, and stores nothing, when an id is unknown.
         """
@@ -236,7 +236,7 @@ class Archive:
         ))
 
     def withdraw_review(self, change_ids: Iterable[str]) -> None:
-        """Take the reviews of changes back. Raises InputError, and changes nothing, when an id is unknown."""
+        """Withdraw the reviews of changes. Raises InputError, and changes nothing, when an id is unknown."""
         self._change_reviews(set(change_ids), change_records.drop_reviews)
 
     def _change_reviews(
