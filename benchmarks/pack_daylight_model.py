@@ -1,9 +1,11 @@
-"""The packaged daylight model: benchmarks/pack_daylight_model.py DATA --nanodet NANODET.json --judge FOLDER
+"""The packaged daylight model: benchmarks/pack_daylight_model.py DATA --nanodet NANODET.json [--judge FOLDER]
 
-Joins NanoDet (`convert_nanodet.py`), the aerial network of a model file (--aerial) and what `train_judge.py` left in
-FOLDER, checks the file against torch, and writes default.onnx and its card. What the card says of accuracy and false
-alarms comes from the files of `detector_accuracy.py` (--measured) and `false_alarms.py` (--alarms), made with this very
-file: without them the card says nothing of either. Run it again with them; the model's bytes stay the same.
+Joins NanoDet (`convert_nanodet.py`), the aerial network of a model file (--aerial) and the judge: what `train_judge.py`
+left in a folder, or else that of the model file with its probabilities. With --people FOLDER, people are found by the
+head that `train_people.py` and `fit_people.py` left there. It checks the file against torch, and writes default.onnx
+and its card. What the card says of accuracy and false alarms comes from the files of `detector_accuracy.py`
+(--measured) and `false_alarms.py` (--alarms), made with this very file: without them the card says nothing of either.
+Run it again with them; the model's bytes stay the same.
 """
 
 import argparse
@@ -18,13 +20,15 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from detection_data import aerial_cars, tinyperson
+from fit_people import people_head
 from pack_default_model import BEST_PX, HOME, TRAINED_ON, measured
+from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.daylight import Calibration, Daylight
 from sorvolo.training.export import onnx_from_module
 from train_default_model import reader
-from train_judge import CAR, untrained
+from train_judge import CAR, odds, untrained
 
 VERSION, CREATED = "5", "2026-11-22"
 SMALL_THRESHOLD = 0.44  # as before: the aerial network's own (pack_default_model.py)
@@ -53,14 +57,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--nanodet", type=Path, required=True)
-    parser.add_argument("--judge", type=Path, required=True, help="folder of judge.pt and daylight.json")
+    parser.add_argument("--judge", type=Path, help="folder of judge.pt and daylight.json")
+    parser.add_argument("--people", type=Path, help="folder of people.pt and people.json")
     parser.add_argument("--aerial", default="default")
     parser.add_argument("--measured", type=Path, help="detector_accuracy.json")
     parser.add_argument("--alarms", type=Path, help="false_alarms.json")
     parser.add_argument("--out", type=Path, default=HOME)
     wishes = parser.parse_args()
-    learnt = json.loads((wishes.judge / "daylight.json").read_text())
-    model = joined(wishes.nanodet, wishes.aerial, wishes.judge / "judge.pt", learnt)
+    learnt, judge = judge_and_probabilities(wishes.judge, wishes.aerial)
+    if wishes.people is not None:
+        learnt = with_people(learnt, json.loads((wishes.people / "people.json").read_text()))
+    model = joined(wishes.nanodet, wishes.aerial, judge, learnt)
+    if wishes.people is not None:
+        model.people = people_head(wishes.people / "people.pt")
     sources = (*SOURCES, *TRAINED_ON)
     info: dict[str, Any] = {
         "name": "default", "version": VERSION, "preset": "fast", "classes": list(CLASSES), "thermal": False,
@@ -92,10 +101,38 @@ def main() -> None:
     (wishes.out / "default.json").write_text(json.dumps(card, indent=1) + "\n")
 
 
-def joined(nanodet: Path, aerial: str, judge: Path, learnt: dict[str, Any]) -> Daylight:
+def judge_and_probabilities(folder: Path | None, packed: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+    """What `train_judge.py` wrote, from its folder or out of a packed model and its card."""
+    if folder is not None:
+        return json.loads((folder / "daylight.json").read_text()), torch.load(folder / "judge.pt", weights_only=True)
+    path = find_model(packed)
+    weights = {each.name: each for each in onnx.load(path).graph.initializer if each.name.startswith("judge.")}
+    judge = {
+        name.removeprefix("judge."): torch.from_numpy(numpy_helper.to_array(each).copy())
+        for name, each in weights.items()
+    }
+    return json.loads(path.with_suffix(".json").read_text())["calibration"], judge
+
+
+def with_people(learnt: dict[str, Any], people: dict[str, Any]) -> dict[str, Any]:
+    """The probabilities with those of people from above.
+
+    An aerial candidate for a person needs as high a score as before, counted from the threshold, to be reported.
+    """
+    before, threshold = learnt["thresholds"]["person"], people["threshold"]
+    moved = float(odds(np.array(threshold)) - odds(np.array(before)))
+    aerial = learnt["aerial_person"] | {"shift": learnt["aerial_person"]["shift"] + moved}
+    return {
+        **learnt, "person": people["person"], "aerial_person": aerial,
+        "thresholds": {**learnt["thresholds"], "person": threshold},
+        "reliability": {**learnt["reliability"], "person": people["reliability"]},
+    }
+
+
+def joined(nanodet: Path, aerial: str, judge: dict[str, torch.Tensor], learnt: dict[str, Any]) -> Daylight:
     """All parts, with what was learnt."""
     model = untrained(nanodet, aerial)
-    model.judge.load_state_dict(torch.load(judge, weights_only=True))
+    model.judge.load_state_dict(judge)
     model.judged = {CAR: Calibration(**learnt["car"])}
     model.person, model.aerial_person = Calibration(**learnt["person"]), Calibration(**learnt["aerial_person"])
     return model.eval()

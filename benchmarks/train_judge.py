@@ -120,6 +120,14 @@ def looked_at(
     rng: np.random.Generator,
 ) -> Iterator[Look]:
     """A picture at a scale, in at most three tiles drawn by chance."""
+    for planes, truth in tiles(labelled, picture, whole, scale, rng):
+        yield seen(model, planes, truth)
+
+
+def tiles(
+    labelled: LabelledSet, picture: LabelledPicture, whole: np.ndarray, scale: float, rng: np.random.Generator
+) -> Iterator[tuple[torch.Tensor, "Truth"]]:
+    """At most three tiles (1, 3, H, W) of a picture at a scale, drawn by chance, and what is labelled in each."""
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     shown = cv2.resize(whole, None, fx=scale, fy=scale, interpolation=way)
     half = SIDE_PX // 2
@@ -130,11 +138,10 @@ def looked_at(
     for index in rng.permutation(len(corners))[:MOST_TILES]:
         left, top = corners[index]
         tile = shown[top : top + SIDE_PX, left : left + SIDE_PX]
-        height, width = (side // model.stride * model.stride for side in tile.shape[:2])
+        height, width = (side // Daylight.stride * Daylight.stride for side in tile.shape[:2])
         planes = torch.from_numpy(np.ascontiguousarray(tile[:height, :width].transpose(2, 0, 1)))[None]
         corner = np.array([left, top, left, top])
-        truth = Truth(labelled, picture, picture.boxes_px * scale - corner, picture.ignored_px * scale - corner)
-        yield seen(model, planes, truth)
+        yield planes, Truth(labelled, picture, picture.boxes_px * scale - corner, picture.ignored_px * scale - corner)
 
 
 @dataclass(frozen=True, eq=False)

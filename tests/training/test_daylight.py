@@ -113,12 +113,26 @@ def test_odds_are_bounded_and_one_hot_marks_labels() -> None:
     assert one_hot(torch.tensor([2, 0]), 3).tolist() == [[0, 0, 1], [1, 0, 0]]
 
 
-def test_its_onnx_file_says_what_torch_says_and_can_be_learnt_on_from(tmp_path: Path) -> None:
+def test_a_head_for_people_finds_them_and_nanodet_supports_it() -> None:
+    head = NanoDetHead(1, deeper=True)
+    for layer, bias in zip(head.outputs, (-9.0, -9.0, 2.0)):  # sure of a person in each cell of 32 px
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.constant_(layer.bias, bias)
+    supported = Calibration(1.0, -1.0, support=0.5)
+    model = _model(_Coco(THE_SAME, 0.99, support=-4.0), person=supported)
+    model.aerial.forward = lambda images: (torch.zeros(1, 4), torch.tensor([0.01]), torch.tensor([1]))
+    model.people = head
+    assert _found(model)["person"] == pytest.approx([_sigmoid(2 - 1 - 2)], abs=1e-3)
+
+
+@pytest.mark.parametrize("has_people", [False, True])
+def test_its_onnx_file_says_what_torch_says_and_can_be_learnt_on_from(tmp_path: Path, has_people: bool) -> None:
     torch.manual_seed(2)
     aerial = fast(CLASSES).eval()
     torch.nn.init.normal_(aerial.head.scores.weight, std=0.3)
     coco = CocoDetector(NanoDetBackbone(), NanoDetHead(), ((0,),))
-    model = Daylight(aerial, coco, Judge(3), {1: Calibration()}, Calibration()).eval()
+    people = NanoDetHead(1, deeper=True) if has_people else None
+    model = Daylight(aerial, coco, Judge(3), {1: Calibration()}, Calibration(support=0.3), people=people).eval()
     path = tmp_path / "toy.onnx"
     path.write_bytes(onnx_from_module(model, INFO))
     picture = np.random.default_rng(1).integers(0, 256, (128, 192, 3), dtype=np.uint8)

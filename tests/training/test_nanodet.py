@@ -21,6 +21,7 @@ from sorvolo.training.nanodet import (  # noqa: E402
     NanoDetHead,
     boxes_from_bins,
     cells,
+    head_of_class,
     nanodet_from_graph,
 )
 from sorvolo.training.tfjs_graph import read_graph, run_graph  # noqa: E402
@@ -130,6 +131,20 @@ def test_weights_of_a_graph_reach_their_layers_and_the_first_takes_rgb(tmp_path:
     assert head.sideways[0].bias.unique().tolist() == [-25]
     with pytest.raises(InputError, match="no NanoDet-g"):
         nanodet_from_graph(read_graph(_write(tmp_path, nodes[2:], {k: v for k, v in values.items() if k[1:] != "0"})))
+
+
+def test_a_head_of_one_class_sees_what_the_whole_head_sees_until_it_learns() -> None:
+    torch.manual_seed(5)
+    whole = NanoDetHead(6)
+    own = head_of_class(whole, 3)
+    levels = [torch.randn(1, width, 64 // stride, 96 // stride) for width, stride in zip((128, 256, 512), (8, 16, 32))]
+    with torch.no_grad():
+        for one, all_classes in zip(own(levels), whole(levels)):
+            np.testing.assert_allclose(one[:, 0], all_classes[:, 3], atol=1e-6)
+            np.testing.assert_allclose(one[:, 1:], all_classes[:, 6:], atol=1e-6)
+        own.more[0].bias.fill_(1.0)
+        assert not np.allclose(own(levels)[0][:, 0], whole(levels)[0][:, 3], atol=1e-3)
+    assert [len(each.bias) for each in own.outputs] == [1 + 4 * BINS] * 3
 
 
 def test_bins_and_cells_are_boxes_around_the_cells_centre() -> None:

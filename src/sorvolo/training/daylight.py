@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from sorvolo.training.boxes import at_most, suppress
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.heads import roi_means
-from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone
+from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
 
 _SUPPORT_CELLS = 3  # a side, over a candidate's box
 
@@ -83,19 +83,23 @@ class Daylight(nn.Module):
     def __init__(
         self, aerial: FasterRCNN, coco: CocoDetector, judge: Judge, judged: Mapping[int, Calibration],
         person: Calibration, aerial_person: Calibration = Calibration(),
-        settings: DaylightSettings = DaylightSettings(),
+        settings: DaylightSettings = DaylightSettings(), people: NanoDetHead | None = None,
     ) -> None:
-        """`coco` finds people alone. `judged`: classes whose aerial candidates the judge scores again."""
+        """`coco` finds people alone. `judged`: classes whose aerial candidates the judge scores again.
+
+        `people`, a head of one class on NanoDet's features, finds people instead, supported by NanoDet's own scores.
+        """
         super().__init__()
         self.aerial, self.coco, self.judge, self.settings = aerial, coco, judge, settings
+        self.people = people
         self.judged, self.person, self.aerial_person = dict(judged), person, aerial_person
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
         levels = self.coco.backbone(images)
         outputs = self.coco.head(levels)
-        people, people_scores, _ = self.coco.found(outputs, (images.shape[2], images.shape[3]))
-        people_scores = _calibrated(odds_from_scores(people_scores), self.person)
+        people, opinions, supporting = self.people_of(levels, outputs, (images.shape[2], images.shape[3]))
+        people_scores = _calibrated(opinions, self.person, supporting)
         boxes, scores, labels = self.aerial(images)
         scores = self._scored(levels, outputs, boxes, scores, labels)
         boxes, scores = torch.cat([people, boxes]), torch.cat([people_scores, scores])
@@ -106,6 +110,18 @@ class Daylight(nn.Module):
         rows = kept[:, 1]
         best, order = torch.topk(scores[rows], at_most(reach.most, scores[rows]))
         return boxes[rows][order], best, kept[:, 0][order]
+
+    def people_of(
+        self, levels: Sequence[Tensor], outputs: Sequence[Tensor], size_px: tuple[int, int]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """People (K, 4) px in a picture of this (height, width), the opinions of them and NanoDet's support (K,)."""
+        if self.people is None:
+            boxes, scores, _ = self.coco.found(outputs, size_px)
+            return boxes, odds_from_scores(scores), torch.zeros_like(scores)
+        finder = CocoDetector(self.coco.backbone, self.people, ((0,),))
+        boxes, scores, _ = finder.found(self.people(levels), size_px)
+        row = self.coco.coco_of_class[0][0]
+        return boxes, odds_from_scores(scores), support(outputs, self.coco.head.strides, boxes, row)
 
     def _scored(
         self, levels: Sequence[Tensor], outputs: Sequence[Tensor], boxes: Tensor, scores: Tensor, labels: Tensor

@@ -57,14 +57,21 @@ class NanoDetBackbone(nn.Module):
 
 
 class NanoDetHead(nn.Module):
-    """A path aggregation network of 128 channels and a head a level; of strides 8, 16 and 32."""
+    """A path aggregation network of 128 channels and a head a level; of strides 8, 16 and 32.
+
+    A `deeper` one has a convolution more a level, which adds to what comes in and at first adds nothing.
+    """
 
     strides = (8, 16, 32)
 
-    def __init__(self, classes: int = COCO_CLASSES, width: int = 128) -> None:
+    def __init__(self, classes: int = COCO_CLASSES, width: int = 128, *, deeper: bool = False) -> None:
         super().__init__()
         self.classes = classes
         self.sideways = nn.ModuleList(nn.Conv2d(each, width, 1) for each in NanoDetBackbone.channels[1:])
+        self.more = nn.ModuleList(_convolution(width, width) for _ in self.strides if deeper)
+        for each in self.more:
+            nn.init.zeros_(each.weight)  # type: ignore[arg-type]
+            nn.init.zeros_(each.bias)  # type: ignore[arg-type]
         self.towers = nn.ModuleList(_convolution(width, width) for _ in self.strides)
         self.outputs = nn.ModuleList(nn.Conv2d(width, classes + 4 * BINS, 1) for _ in self.strides)
 
@@ -75,8 +82,22 @@ class NanoDetHead(nn.Module):
         p3 = c3 + _resized(p4, 2.0)
         n4 = p4 + _resized(p3, 0.5)
         n5 = c5 + _resized(n4, 0.5)
-        towers = [functional.leaky_relu(tower(each), _SLOPE) for tower, each in zip(self.towers, (p3, n4, n5))]
+        paths = [p3, n4, n5]
+        for index, layer in enumerate(self.more):
+            paths[index] = paths[index] + functional.leaky_relu(layer(paths[index]), _SLOPE)
+        towers = [functional.leaky_relu(tower(each), _SLOPE) for tower, each in zip(self.towers, paths)]
         return [layer(each) for layer, each in zip(self.outputs, towers)]
+
+
+def head_of_class(head: NanoDetHead, row: int) -> NanoDetHead:
+    """A deeper head for one class alone, which sees what `head` sees for its class `row` until it learns more."""
+    own = NanoDetHead(1, deeper=True).eval()
+    known = head.state_dict()
+    rows = torch.tensor([row, *range(head.classes, head.classes + 4 * BINS)])
+    for name, values in known.items():
+        known[name] = values[rows] if name.startswith("outputs.") else values
+    own.load_state_dict(own.state_dict() | known)
+    return own
 
 
 def cells(outputs: Sequence[Tensor], strides: Sequence[int], classes: int) -> tuple[Tensor, Tensor, Tensor]:
