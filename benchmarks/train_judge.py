@@ -320,10 +320,10 @@ def fitted(inputs: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.asarray(minimize(loss, np.zeros(columns.shape[1])).x)
 
 
-def least_threshold(logits: np.ndarray, looks: int) -> float:
-    """The least score from 0.5 on, in steps of 0.02, that bare ground reaches at most once in 20 looks."""
+def least_threshold(logits: np.ndarray, looks: int, alarms: float = BARE_ALARMS) -> float:
+    """The least score from 0.5 on, in steps of 0.02, that bare ground reaches at most `alarms` times a look."""
     for score in np.arange(0.5, 0.97, 0.02):
-        if np.count_nonzero(logits >= odds(np.array(score))) <= BARE_ALARMS * looks:
+        if np.count_nonzero(logits >= odds(np.array(score))) <= alarms * looks:
             return round(float(score), 2)
     return 0.98
 

@@ -13,6 +13,7 @@ Writes OUT/people.pt (the head's averaged weights), OUT/checkpoint.pt and OUT/lo
 
 import argparse
 import json
+import math
 import time
 from copy import deepcopy
 from dataclasses import replace
@@ -111,7 +112,7 @@ class Run:
             Wanted(torch.from_numpy(each.boxes).float(), torch.from_numpy(each.ignored).float()) for each in shown
         ]
         loss = people_loss(outputs, self.head.strides, wanted)
-        falling = 0.5 + 0.5 * np.cos(np.pi * min(self.step / self.steps, 1.0))
+        falling = 0.5 + 0.5 * math.cos(math.pi * min(self.step / self.steps, 1.0))
         self.optimiser.param_groups[0]["lr"] = self.rate * min((self.step + 1) / WARM, 0.02 + 0.98 * falling)
         self.optimiser.zero_grad()
         loss.backward()
