@@ -46,8 +46,10 @@ class Outages:
 
     def _run(self) -> None:
         kinds = [("database", "killed"), *((name, how) for name in self._links for how in ("cut", "stalled"))]
+        waiting: list[tuple[str, str]] = []
         while not self._is_over.wait(self._draw.uniform(4.0, 15.0)):
-            name, how = self._draw.choice(kinds)
+            waiting = waiting or self._draw.sample(kinds, len(kinds))  # each kind once before the first comes again
+            name, how = waiting.pop()
             wait_s = self._draw.uniform(0.5, self._longest_s)
             self.counts[f"{name} {how}"] += 1
             self.seconds += wait_s

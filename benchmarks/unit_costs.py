@@ -9,7 +9,8 @@ difference of their units is the unit cost; what remains of the short run is the
 photo, and of a video a key frame (map), a view (compare) or a searched frame (watch); decoding is a row of its own and
 taken off the others. Bytes and files are what the site, or the watch's folder, has more. One thread of OpenMP. Inputs
 are simulated: 1080p video at 10 frames a second from 30 m, photos of `--megapixels` from 40 m with 70 % overlap; or
-the photos are real ones, `--photos DIR`, of which a quarter and a half are mapped and watched, not compared.
+the photos are real ones, `--photos DIR`, of which a quarter and a half are mapped and watched, not compared; those of
+another size are made as large as `--megapixels`, so that the same ground is measured in several sizes.
 `--flights` keeps them. Written to results/unit_costs.json; `--only` measures those rows anew and keeps the others.
 """
 
@@ -26,6 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
@@ -134,7 +136,7 @@ def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
     """
     folder = place / f"{kind}{size}"
     if options.photos is not None and kind != "video":
-        return copied(folder / "flight1" / "photos", options.photos, size).parents[1]
+        return copied(folder / "flight1" / "photos", options.photos, size, options.megapixels).parents[1]
     if not folder.is_dir():
         place.mkdir(parents=True, exist_ok=True)
         subprocess.run(
@@ -145,12 +147,18 @@ def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
     return folder
 
 
-def copied(folder: Path, photos: Path, size: int) -> Path:
-    """A folder with copies of the first quarter (size 0) or half (1) of a flight's photos."""
+def copied(folder: Path, photos: Path, size: int, megapixels: float) -> Path:
+    """A folder with copies of the first quarter (size 0) or half (1) of a flight's photos, of so many megapixels."""
     found = sorted(path for path in photos.iterdir() if path.suffix.lower() in (".jpg", ".jpeg"))
     folder.mkdir(parents=True, exist_ok=True)
     for path in found[: max(2, len(found) // (4 if size == 0 else 2))]:
-        shutil.copy(path, folder / path.name)
+        with Image.open(path) as photo:
+            scale = math.sqrt(megapixels * 1e6 / (photo.width * photo.height))
+            if abs(scale - 1) < 0.02:
+                shutil.copy(path, folder / path.name)
+                continue
+            resized = photo.resize((round(photo.width * scale), round(photo.height * scale)), Image.Resampling.BICUBIC)
+            resized.save(folder / path.name, quality=92, exif=photo.info["exif"], xmp=photo.info.get("xmp", b""))
     return folder
 
 

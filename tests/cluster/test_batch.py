@@ -125,9 +125,13 @@ def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Pat
         time.sleep(0.02)
     with pytest.raises(StoreError, match=f"another batch is running in .*: process {first.pid} on "):
         BatchTable.open(tmp_path / "maps")
+    (worker,) = map(int, Path(f"/proc/{first.pid}/task/{first.pid}/children").read_text().split())
+    os.kill(worker, signal.SIGSTOP)  # it cannot end by itself
     first.kill()
     first.wait()
     BatchTable.open(tmp_path / "maps").close()  # not before its worker is gone
+    stat = Path(f"/proc/{worker}/stat")
+    assert not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX"  # dead, if not yet reaped
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads(done.stdout)["flights"]

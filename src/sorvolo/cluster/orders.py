@@ -8,6 +8,9 @@ from typing import Any, Literal, Self
 
 from sorvolo.errors import SorvoloError, UnavailableError
 
+WORKER = "sorvolo.cluster.worker"
+"""The module that a worker's process runs."""
+
 FINISH = b"finish\n"
 """What a worker is sent to end a live flight, which is then finished like any other's."""
 

@@ -7,15 +7,17 @@ a batch begins. `docs/formats.md` has its fields.
 import fcntl
 import json
 import os
+import signal
 import socket
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from sorvolo.cluster.orders import Ending, Scouted
+from sorvolo.cluster.orders import WORKER, Ending, Scouted
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.site.catalogue import utc_now
@@ -23,7 +25,8 @@ from sorvolo.store.site.catalogue_place import is_site
 
 TABLE, LOCK = "batch.jsonl", "batch.lock"
 _FORMAT = 1
-_ENDING_S = 10.0  # how long workers of a batch that was killed may take to end
+_ENDING_S = 10.0  # how long workers of a batch that was killed may take to end, and
+_PATIENCE_S = 2.0  # to end by themselves: then they are killed
 
 
 class State(StrEnum):
@@ -160,21 +163,38 @@ def _locked(root: Path) -> int:
     path = root / LOCK
     with writing(path):
         lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-    end_s = time.monotonic() + _ENDING_S
+    began_s = time.monotonic()
     while True:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             break
         except BlockingIOError:
             holder = _holder(lock)
-            if _is_alive(holder) or time.monotonic() > end_s:
+            waited_s = time.monotonic() - began_s
+            if _is_alive(holder) or waited_s > _ENDING_S:
                 os.close(lock)
                 who = holder or "its name is not known"
                 raise StoreError(f"another batch is running in {root}: {who}; wait until it ends, or stop it") from None
+            if waited_s > _PATIENCE_S:
+                _kill_orphans(path)
             time.sleep(0.1)
     os.ftruncate(lock, 0)
     os.pwrite(lock, f"process {os.getpid()} on {socket.gethostname()}, since {utc_now()}".encode(), 0)
     return lock
+
+
+def _kill_orphans(lock: Path) -> None:
+    """Kill the workers of a batch that is gone which do not end by themselves: stopped ones, and those that hang.
+
+    None where the system does not state which files processes have open (there is no /proc).
+    """
+    own = lock.stat()
+    for process in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):  # it has ended, or is another user's
+            if WORKER.encode() not in (process / "cmdline").read_bytes().split(b"\0"):
+                continue
+            if any(os.path.samestat(each.stat(), own) for each in (process / "fd").iterdir()):
+                os.kill(int(process.name), signal.SIGKILL)
 
 
 def _holder(lock: int) -> str:
