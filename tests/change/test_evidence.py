@@ -4,11 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blob_world import CAMERA_HEIGHT_M, M_PER_PX, START_NS, Thing, flight, view_of
+from blob_world import (
+    CAMERA_HEIGHT_M,
+    HEIGHT,
+    M_PER_PX,
+    START_NS,
+    WIDTH,
+    Thing,
+    flight,
+    picture,
+    site_from_image,
+    view_of,
+)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.earlier_pictures import Vantage
+from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.evidence.announcing import AnnounceSettings, Reason
 from sorvolo.change.evidence.candidate import Candidate, KeptView
 from sorvolo.change.evidence.cells import CellWindow, LaidView
@@ -16,7 +27,21 @@ from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.shape.outlines import Measures
 from sorvolo.change.shape.place_sigma import area_sigma_m, thing_sigma_m
 from sorvolo.errors import SettingsError
+from sorvolo.geometry.camera import Camera
 from sorvolo.survey.findings import Change, ChangeKind
+
+FOCAL_PX = CAMERA_HEIGHT_M / M_PER_PX
+CAMERA = Camera(WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+
+
+def earlier_pictures(eyes, things):
+    """The pictures of an earlier flight, taken from places (east, north)."""
+    cameras_m = [(*each, CAMERA_HEIGHT_M) for each in eyes]
+    shown = [each for each in things if each.on_map]
+    return EarlierPictures(
+        [EarlierPicture(CAMERA, site_from_image(each), None) for each in cameras_m],
+        lambda index: with_known_pixels(picture(cameras_m[index], shown, 0.0)),
+    )
 
 
 def collect(views, rules: AnnounceSettings | None = None, **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
@@ -349,34 +374,25 @@ def test_a_thing_that_two_early_photos_show_is_not_forgotten_for_many_uncertain_
         assert not reported and [each.id for each in evidence.conclude()] == ids
 
 
-@pytest.mark.parametrize(("vantage", "sizes"), [
-    (Vantage(0.5, 0.0), [1, 9]),  # a picture from near
-    (Vantage(3.0, 0.0), [9]),  # one from afar: a wall of 6 m would differ as well, all over what is small
-    (Vantage(3.0, 3.0), [1, 9]),  # several from afar, which show the place from different sides
-    (None, [1, 9]),
+WALL = Thing(0, 2.0, (2.0, 0.4), 3.0, (90, 90, 140), on_map=True)
+STANDING = Thing(0, 1.5, height_m=2.5)
+
+
+@pytest.mark.parametrize(("thing", "eyes", "is_reported"), [
+    (WALL, [(0.0, 0.3)], True),  # an earlier picture from near: nothing is asked for
+    (WALL, [(0.0, 3.0)], False),
+    (WALL, [(0.0, 3.0), (0.0, 4.5)], False),
+    (Thing(0, 1.5), [(0.0, 3.0)], True),  # later pictures show that it lies flat
+    (STANDING, [(0.0, 3.0)], False),
+    (STANDING, [(0.0, 3.0), (3.0, 3.0)], True),  # earlier pictures show that the ground was level
 ])
-def test_what_earlier_pictures_show_from_one_other_side_only_is_no_evidence(vantage, sizes):
-    things = [Thing(0, 0), Thing(3, 1.5, (3.0, 3.0))]
-    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f", lambda outline_m, cameras_m: vantage)
-    reported = [change for view in flight(things) for change in evidence.add(view)]
-    assert sorted(round(each.area_m2) for each in evidence.conclude()) == sizes
-    assert len(reported) == len(sizes)
-    assert evidence.outcomes()["never_announced"].get(Reason.FROM_ASIDE.value, 0) == 2 - len(sizes)
-
-
-def test_what_came_during_the_flight_counts_unless_relief_explains_it():
-    """A thing that the last third of the views of its ground shows, beside one that was there from the beginning."""
-    beside, came = Thing(1.2, 1.2), Thing(3.2, 1.2)
-    passes = [[*flight(things)] for things in ([beside], [beside], [beside, came])]
-    views = [
-        replace(view, index=view.index + 1000 * number, time_ns=view.time_ns + 60_000_000_000 * number)
-        for number, each in enumerate(passes) for view in each
-    ]
-    for vantage, count in ((Vantage(0.0, 0.0), 2), (Vantage(3.0, 3.0), 1)):
-        evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f", lambda outline_m, cameras_m, here=vantage: here)
-        for view in views:
-            evidence.add(view)
-        assert len(evidence.conclude()) == count
+def test_what_differs_where_earlier_pictures_look_from_aside_is_a_change_if_the_ground_is_level(
+    thing, eyes, is_reported
+):
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f", earlier_pictures(eyes, [thing]))
+    reported = [change for view in flight([thing]) for change in evidence.add(view)]
+    assert bool(evidence.conclude()) is bool(reported) is is_reported
+    assert bool(evidence.outcomes()["never_announced"].get(Reason.RELIEF.value)) is not is_reported
 
 
 def test_sigma_knows_that_a_thing_seen_from_aside_leans():

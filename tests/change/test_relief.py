@@ -74,11 +74,15 @@ def test_from_where_earlier_pictures_show_a_place() -> None:
     earlier = EarlierPictures(pictures, lambda _: with_known_pixels(seen(EARLIER)[0]))
     place = EARLIER[:2] + np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     cameras = EARLIER + np.array([[3.5, 4.0, 0], [9.0, 0, 5.0]])
-    assert earlier.vantage(place + np.array([1.0, 0]), cameras) == pytest.approx((3.0, 6.0))
+    both = earlier.vantage(place + np.array([1.0, 0]), cameras)
+    assert both is not None and both.shows == (1, 0) and both.apart_m == pytest.approx(3.0)
+    assert both.earlier_m == pytest.approx(EARLIER + np.array([6.0, 0, 0]))
+    assert both.later_m == pytest.approx(cameras[1])
     corners_m = apply_homography(pictures[0].site_from_image, np.array([[0.0, 0], [CAMERA.width_px, 0]]))
     # 1.5 m from the west edge of the first, which the second one does not reach
     first_alone = place - np.array([np.ptp(corners_m[:, 0]) / 2 - 1.5, 0])
-    assert earlier.vantage(first_alone, cameras) == pytest.approx((np.hypot(3.5, 4.0), 0.0))
+    alone = earlier.vantage(first_alone, cameras)
+    assert alone is not None and alone.shows == (0,) and alone.apart_m == pytest.approx(np.hypot(3.5, 4.0))
     assert earlier.vantage(place + np.array([1000.0, 0]), cameras) is None
 
 

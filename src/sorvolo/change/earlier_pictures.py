@@ -6,7 +6,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
+from sorvolo.change.evidence.level_ground import LaidPicture, LevelSettings, apart
 from sorvolo.change.relief import Relief
+from sorvolo.change.shape.patches import PatchWindow
 from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
@@ -25,11 +27,17 @@ class EarlierPicture(NamedTuple):
 
 
 class Vantage(NamedTuple):
-    """From where earlier pictures show a place, level metres: the least way between one of them and a later one, and
-    how far apart they lie themselves."""
+    """From where earlier pictures show a place: of their cameras and the later ones the two that lie nearest to each
+    other, (3,) each, and `shows`, the pictures that show it, the nearest one first."""
 
-    nearest_m: float
-    spread_m: float
+    earlier_m: Vector3
+    later_m: Vector3
+    shows: tuple[int, ...]
+
+    @property
+    def apart_m(self) -> float:
+        """The level way between both cameras."""
+        return float(np.hypot(*(self.later_m - self.earlier_m)[:2]))
 
 
 class EarlierPictures:
@@ -57,18 +65,10 @@ class EarlierPictures:
         """The `most` pictures taken nearest to `camera_m`, one from each side along the way, in an image's pixels:
         BGR (`height_px`, `width_px`, 3), and where they see."""
         for index in self._nearest(camera_m, most):
-            keyframe = self._pictures[index]
-            picture = self._load(index)
-            site_from_picture = keyframe.site_from_image
-            image_from_picture = np.linalg.inv(site_from_image) @ site_from_picture
-            centre = image_from_picture @ np.array([keyframe.camera.cx_px, keyframe.camera.cy_px, 1.0])
-            scale = _scale(image_from_picture, (keyframe.camera.cx_px, keyframe.camera.cy_px))
-            while scale < 0.6:  # a mere interpolation would skip pixels
-                picture = _known_inside(np.asarray(cv2.pyrDown(picture), np.uint8))
-                site_from_picture = site_from_picture @ np.diag([2.0, 2.0, 1.0])
-                scale *= 2
-            if centre[2] == 0:
+            found = self._as_coarse(index, site_from_image)
+            if found is None:
                 continue
+            picture, site_from_picture = found
             seen = self._rendered(
                 picture, site_from_picture, self._cameras_m[index], site_from_image, camera_m, (width_px, height_px)
             )
@@ -80,17 +80,46 @@ class EarlierPictures:
         """Whether what stands on the ground is known."""
         return self._relief is not None
 
-    def vantage(self, outline_m: PointsM, cameras_m: PointsM) -> "Vantage | None":
+    def vantage(self, outline_m: PointsM, cameras_m: PointsM) -> Vantage | None:
         """From where the pictures that show an outline, (N, 2), were taken, beside cameras, (V, 3), that show it
         later; None where none shows it."""
         shows = np.array([_shows(each, outline_m) for each in self._pictures], bool)
-        shows &= np.isfinite(self._cameras_m).all(axis=1)
-        places_m = self._cameras_m[shows, :2]
-        if not len(places_m) or not len(cameras_m):
+        (shown,) = np.nonzero(shows & np.isfinite(self._cameras_m).all(axis=1))
+        if not len(shown) or not len(cameras_m):
             return None
-        apart_m = np.linalg.norm(places_m[:, None] - cameras_m[None, :, :2], axis=-1)
-        among_m = np.linalg.norm(places_m - places_m.mean(axis=0), axis=1)
-        return Vantage(float(apart_m.min()), 2 * float(among_m.max()))
+        apart_m = np.linalg.norm(self._cameras_m[shown, None, :2] - cameras_m[None, :, :2], axis=-1)
+        order = np.argsort(apart_m.min(axis=1), kind="stable")
+        later_m = cameras_m[int(apart_m[order[0]].argmin())]
+        nearest = [int(shown[each]) for each in order]
+        return Vantage(self._cameras_m[nearest[0]], later_m, tuple(nearest))
+
+    def laid(self, vantage: Vantage, window: PatchWindow, settings: LevelSettings) -> list[LaidPicture]:
+        """A few of the pictures that show a place, taken apart from each other, laid on a window of level ground."""
+        found: list[LaidPicture] = []
+        for index in apart(self._cameras_m, vantage.shows, settings):
+            picture = self._as_coarse(index, window.site_from_patch)
+            if picture is not None:
+                rgba, site_from_picture = picture
+                patch_from_picture = np.linalg.inv(window.site_from_patch) @ site_from_picture
+                seen = np.asarray(cv2.warpPerspective(rgba, patch_from_picture, window.size_px), np.uint8)
+                found.append(LaidPicture.of(seen[..., :3], seen[..., 3] == 255, window, self._cameras_m[index]))
+        return found
+
+    def _as_coarse(self, index: int, site_from_other: Matrix3) -> tuple[ImageRGBA, Matrix3] | None:
+        """A picture, and its (3, 3) place, made so much smaller that resampling it for another raster skips no pixels;
+        None where its middle is not in front of that."""
+        keyframe = self._pictures[index]
+        picture, site_from_picture = self._load(index), keyframe.site_from_image
+        middle = keyframe.camera.cx_px, keyframe.camera.cy_px
+        other_from_picture = np.linalg.inv(site_from_other) @ site_from_picture
+        if (other_from_picture @ np.array([*middle, 1.0]))[2] == 0:
+            return None
+        scale = _scale(other_from_picture, middle)
+        while scale < 0.6:  # a mere interpolation would skip pixels
+            picture = _known_inside(np.asarray(cv2.pyrDown(picture), np.uint8))
+            site_from_picture = site_from_picture @ np.diag([2.0, 2.0, 1.0])
+            scale *= 2
+        return picture, site_from_picture
 
     def _rendered(
         self, picture: ImageRGBA, site_from_picture: Matrix3, earlier_m: Vector3, site_from_image: Matrix3,

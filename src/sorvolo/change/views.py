@@ -10,7 +10,7 @@ import numpy as np
 from sorvolo.change.alignment import Aligned, Aligner, AlignStep
 from sorvolo.change.areas.signs import leaning
 from sorvolo.change.coverage.planting import Planted, Planting
-from sorvolo.change.earlier_pictures import EarlierPictures, Vantage
+from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
 from sorvolo.change.pair.corroboration import CorroborationSettings, Difference, believed, is_whole, unwitnessed
 from sorvolo.change.pair.flight_tuning import FlightTuning, PairMeasures
@@ -19,7 +19,7 @@ from sorvolo.change.pair.shade import shade_of_view
 from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, ImageRGB, Mask, Matrix3, PointsM
+from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.registration.lens import Undistorter
@@ -259,11 +259,10 @@ class ViewMaker:
         return float("nan") if self._tuning is None else self._tuning.brightness
 
     @property
-    def vantage(self) -> Callable[[PointsM, PointsM], Vantage | None] | None:
-        """From where earlier pictures show a place (`EarlierPictures.vantage`); None where there are none, or what
-        stands on the ground is known."""
+    def level_pictures(self) -> EarlierPictures | None:
+        """The earlier pictures; None where there are none, or what stands on the ground is known."""
         pictures = self._pictures
-        return None if pictures is None or pictures.knows_relief else pictures.vantage
+        return None if pictures is None or pictures.knows_relief else pictures
 
     @property
     def times_coarser(self) -> float:

@@ -16,7 +16,7 @@ class Reason(StrEnum):
     UNSURE = "its score is too low"
     LARGE_AND_UNSURE = "it is large and its score is low, like a wall that leans"
     SHADE = "it is ground in another shade"
-    FROM_ASIDE = "earlier pictures show it from one other side only, where a wall or a roof would differ as well"
+    RELIEF = "earlier pictures show it from another side, where a wall or a roof would differ as well"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,6 @@ class AnnounceSettings:
     doubt: float = 2.0  # 0007: restless ground counts in full where half of the score is missing
     cut_off: float = 0.5  # 0007: of the score is left where no view shows all of it
     one_place: float = 0.05  # flying heights: views no wider apart see the same ghost, and count half
-    tallest_m: float = 6.0  # 0038: what stands so high (eaves of two storeys) may be anywhere, unless heights are known
 
     def __post_init__(self) -> None:
         if not 0 <= self.least_score <= 1:
@@ -68,15 +67,13 @@ class AnnounceSettings:
 class Look:
     """What a candidate's pictures and outline show.
 
-    `is_from_aside`: earlier pictures were all taken so far from the views that show it that the tallest thing that may
-    stand there unchanged would differ all over it. `is_shown_apart`: so far from each other as well.
+    `may_be_relief`: something tall that stands there unchanged would differ as well (`ReliefDoubt`).
     """
 
     area_m2: float
     length_m: float
     shade_share: float  # of it is ground in another shade, 0 to 1
-    is_from_aside: bool = False
-    is_shown_apart: bool = False
+    may_be_relief: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,12 +111,6 @@ class Tally:
         """One more view of its ground, or several, do not show it."""
         return replace(self, asked=self.asked + times)
 
-    def of_all_views(self, seen: int) -> "Tally":
-        """Where relief explains as well what is shown, all `seen` views of its ground count, also those from before
-        it was noticed; else it is a change even if it came while the flight went on."""
-        is_from_aside = self.look is not None and self.look.is_from_aside
-        return replace(self, asked=max(self.asked, seen)) if is_from_aside else self
-
     def recounted(self, views: int, asked: int) -> "Tally":
         """As if `views` of `asked` had shown it: what is left of it after it lost ground."""
         views, asked = max(views, 1), max(asked, views, 1)
@@ -143,13 +134,6 @@ class Tally:
     def is_from_one_place(self, settings: AnnounceSettings) -> bool:
         """Whether several views show it, all from one place, as from a drone that hovers."""
         return self.views > 1 and self.heights_apart < settings.one_place
-
-
-def leaning_m(apart_m: float, height_m: float, settings: AnnounceSettings) -> float:
-    """How far on level ground the top of the tallest thing lies apart for two cameras that are `apart_m` from each
-    other, `height_m` above the ground."""
-    tallest_m = min(settings.tallest_m, height_m / 2)
-    return apart_m * tallest_m / max(height_m - tallest_m, 1e-6)
 
 
 def judge(tally: Tally, settings: AnnounceSettings, *, is_over: bool) -> Verdict:
@@ -191,8 +175,8 @@ def _objection(tally: Tally, settings: AnnounceSettings) -> Reason | None:
 
 def _objection_to_look(look: Look, score: float, tally: Tally, settings: AnnounceSettings) -> Reason | None:
     """The first rule that what its pictures and outline show fails."""
-    if look.is_from_aside and not look.is_shown_apart:
-        return Reason.FROM_ASIDE
+    if look.may_be_relief:
+        return Reason.RELIEF
     is_speck_of_shade = look.area_m2 < settings.speck_m2 and look.shade_share >= settings.shade_share
     if is_speck_of_shade and score < settings.shade_score:
         return Reason.SHADE

@@ -10,6 +10,7 @@ import numpy as np
 
 from sorvolo.change.evidence.announcing import Tally
 from sorvolo.change.evidence.cells import CellEvidence, CellGrid, CellReport, CellWindow, LaidView, pieces
+from sorvolo.change.evidence.level_ground import Sights
 from sorvolo.change.evidence.pictures import Pictures, PictureSettings
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import measures
@@ -58,6 +59,7 @@ class Candidate:
     ) -> None:
         self.number = number
         self.pictures = Pictures(pictures)
+        self.sights = Sights()
         self._settings = settings
         self._cells = cells
         self._tally = Tally(first_seen_ns, first_seen_ns)
@@ -110,15 +112,17 @@ class Candidate:
         self._note_rim(view, cells)
         return True
 
-    def ask(self, view: KeptView, cells: Mask, cell_m: float) -> None:
-        """Count this view as for a seed: whatever shows some of it shows it; and its mask."""
+    def ask(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
+        """Count this view as for a seed: whatever shows some of it shows it; and its mask. Whether it does."""
         report = view.laid.report(self._cells, cells, cell_m)
         if report.flagged >= max(self._settings.shows * report.seen, 1e-9):
             self._count(view, report, view.residual_m, knows_place=report.seen > self._settings.all_seen)
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
             self._note_rim(view, cells)
-        elif report.seen >= self._settings.seen:
+            return True
+        if report.seen >= self._settings.seen:
             self.miss()
+        return False
 
     def miss(self, times: int = 1) -> None:
         """One more view that could have shown it, or several, do not."""
@@ -205,6 +209,12 @@ class Seeds:
     def __iter__(self) -> Iterator[Candidate]:
         return iter(self._seeds)
 
+    def sights_at(self, window: CellWindow) -> Sights | None:
+        """The pictures of the surroundings that a seed in a window has, of several the most; None where there is no
+        seed."""
+        there = (each.sights for each in self._seeds if 0 not in each.cells.overlap(window).shape)
+        return max(there, key=lambda each: len(each.pictures), default=None)
+
     def keep(self, view: ComparedView, kept_view: KeptView, evidence: CellEvidence, most_pictures: int) -> None:
         """Ask the view about the seeds, forget those that no view flags any more or that a candidate owns by now, and
         keep what the view flags besides, the surest first, with at most `most_pictures`."""
@@ -218,7 +228,7 @@ class Seeds:
                 kept.append(seed)
             elif (votes > 0).any() and not (owner > 0).any():
                 kept.append(seed)
-                self._ask(seed, kept_view)
+                self._ask(seed, view, kept_view)
                 weak[here] = False
         self._seeds = kept
         if most_pictures <= 0 or not weak.any():
@@ -226,12 +236,13 @@ class Seeds:
         for window in self._new(laid, weak)[:most_pictures]:
             seed = Candidate(0, window, view.time_ns, self._settings, self._pictures)
             seed.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
-            self._ask(seed, kept_view)
+            self._ask(seed, view, kept_view)
             self._seeds.append(seed)
         self._forget()
 
-    def _ask(self, seed: Candidate, kept_view: KeptView) -> None:
-        seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m)
+    def _ask(self, seed: Candidate, view: ComparedView, kept_view: KeptView) -> None:
+        if seed.ask(kept_view, self._grid.read(seed.cells).changed > 0, self._cell_m):
+            seed.sights.show(view, *seed.cells.box_m(self._cell_m), self._m_per_px)
 
     def _forget(self) -> None:
         """Let the oldest go where there are too many: a large site has hundreds that only its first photos show."""

@@ -52,6 +52,12 @@ class CellWindow:
             min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1)
         )
 
+    def overlap(self, other: "CellWindow") -> "CellWindow":
+        """The cells that lie in both; its shape has a 0 where there are none."""
+        return CellWindow(
+            max(self.x0, other.x0), max(self.y0, other.y0), min(self.x1, other.x1), min(self.y1, other.y1)
+        )
+
     def grown(self, cells: int) -> "CellWindow":
         """The window with so many cells more on each side."""
         return CellWindow(self.x0 - cells, self.y0 - cells, self.x1 + cells, self.y1 + cells)
@@ -123,10 +129,7 @@ class LaidView:
 
     def report(self, window: CellWindow, cells: Mask, cell_m: float) -> "CellReport":
         """What the view reports of some `cells` of a window."""
-        inner = CellWindow(
-            max(window.x0, self.window.x0), max(window.y0, self.window.y0),
-            min(window.x1, self.window.x1), min(window.y1, self.window.y1),
-        )
+        inner = window.overlap(self.window)
         if 0 in inner.shape:
             return CellReport(0.0, 0.0, 0.0, np.zeros(2))
         here, there = inner.within(window), inner.within(self.window)

@@ -6,14 +6,14 @@ of them gathers k votes out of n in the same cell. Unknown ground counts neither
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.earlier_pictures import Vantage
+from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.evidence.announcing import (
     Announce,
     AnnounceSettings,
@@ -21,7 +21,6 @@ from sorvolo.change.evidence.announcing import (
     Reason,
     Verdict,
     judge,
-    leaning_m,
     sureness,
     views_score,
 )
@@ -35,12 +34,13 @@ from sorvolo.change.evidence.cells import (
     pieces,
 )
 from sorvolo.change.evidence.pictures import PictureSettings
+from sorvolo.change.evidence.relief_doubt import ReliefDoubt
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingBlobs, MovingSettings
 from sorvolo.change.motion.moving_changes import Movers
 from sorvolo.change.shape.shadows import ThingSettings, shade_share
 from sorvolo.change.shape.things import Parts
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.survey.findings import Change, ComparedView
 
 
@@ -105,17 +105,17 @@ class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` settles what is left.
 
     `m_per_px` is a pixel of changes' pictures, `id_prefix` begins every change's id: the flight's name. Views must come
-    in order of time; the same views give the same changes and ids. `vantage` gives for an outline (N, 2) and cameras
-    (V, 3) from where earlier pictures show it; None where what stands on the ground is known, or there are none.
+    in order of time; the same views give the same changes and ids. `earlier` are the pictures of earlier flights; None
+    where what stands on the ground is known, or there are none.
     """
 
     def __init__(
-        self, m_per_px: float, settings: EvidenceSettings, id_prefix: str,
-        vantage: Callable[[PointsM, PointsM], Vantage | None] | None = None,
+        self, m_per_px: float, settings: EvidenceSettings, id_prefix: str, earlier: EarlierPictures | None = None
     ) -> None:
         self._settings, self._prefix = settings, id_prefix
         self._rules, self._gathering = settings.announcing, settings.gathering
-        self._m_per_px, self._vantage = m_per_px, vantage
+        self._m_per_px = m_per_px
+        self._relief = None if earlier is None else ReliefDoubt(earlier, m_per_px)
         self._cell_m = self._gathering.cells.side_m(m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
         self._gap = int(np.ceil(self._join_m / self._cell_m))
@@ -307,6 +307,7 @@ class EvidenceMap:
             self._next_number(), window, view.time_ns, self._gathering.candidates, self._gathering.pictures
         )
         self._found[candidate.number] = candidate
+        candidate.sights = self._seeds.sights_at(window) or candidate.sights
         candidate.pictures.show(view, *window.box_m(self._cell_m), self._m_per_px)
         for each in earlier:
             candidate.recall(each, cells, self._cell_m)
@@ -359,6 +360,7 @@ class EvidenceMap:
             candidate = self._found[number]
             if candidate.see(kept_view, self._without_passing(candidate, kept_view), self._cell_m):
                 shown.append(candidate)
+                candidate.sights.show(view, *candidate.cells.box_m(self._cell_m), self._m_per_px)
                 if candidate.pictures.wants_votes and number not in new:
                     candidate.pictures.vote(view.site_from_image, view.changed, view.valid)
         pictures = self._cut_pictures(view, shown, most_pictures)
@@ -426,21 +428,13 @@ class EvidenceMap:
         if whole is None:
             return verdict, None
         tally = replace(candidate.tally, look=self._look(candidate, whole))
-        return judge(tally.of_all_views(self._seen(candidate)), rules, is_over=is_over), whole
+        return judge(tally, rules, is_over=is_over), whole
 
     def _look(self, candidate: Candidate, whole: Change) -> Look:
-        look = Look(whole.area_m2, whole.length_m, shade_share(whole.patch))
-        vantage = None if self._vantage is None else self._vantage(whole.outline_m, candidate.cameras_m)
-        if vantage is None:
-            return look
-        leans = (leaning_m(each, candidate.tally.flying_height_m, self._rules) for each in vantage)
-        is_from_aside, is_shown_apart = (each > np.sqrt(whole.area_m2) for each in leans)
-        return replace(look, is_from_aside=bool(is_from_aside), is_shown_apart=bool(is_shown_apart))
-
-    def _seen(self, candidate: Candidate) -> int:
-        """The views of the candidate's ground, those before it was noticed too."""
-        own = self._cells_of(candidate)
-        return int(np.median(self._grid.read(candidate.cells).seen[own])) if own.any() else 0
+        may_be_relief = self._relief is not None and self._relief.explains(
+            candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
+        )
+        return Look(whole.area_m2, whole.length_m, shade_share(whole.patch), may_be_relief)
 
     def _restlessness(self, candidate: Candidate) -> float:
         return restlessness(

@@ -249,7 +249,7 @@ class CompareRun:
                 self._evidence = EvidenceMap(
                     self._views.change_m_per_px(view),
                     EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._setup.source.name,
-                    self._views.vantage,
+                    self._views.level_pictures,
                 )
             announced: Sequence[Change] = self._reported(self._evidence.add(view))
             if self._settings.method != "thesis":
