@@ -29,13 +29,14 @@ class OrthophotoSettings:
 
     hidden_cells: float = 3.0  # a height this much above the line of sight, in cells, hides what is behind
     hidden_merit: float = 0.02  # of a photo that does not see the ground, against one that does
+    block_tiles: int = 2  # painted together, to a side: what is painted around them is a smaller share
 
 
 def paint_orthophoto(
     surface: Surface, site_grid: SiteGrid, views: Sequence[View], pictures: Callable[[int], ImageRGB],
     settings: OrthophotoSettings = OrthophotoSettings(),
 ) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
-    """The tiles of the true orthophoto, row by row, each with the share that is done; those unseen are left out.
+    """The tiles of the true orthophoto, block by block, each with the share that is done; those unseen are left out.
 
     `pictures(i)` is view i's picture without distortion, its exposure corrected; holes of the surface are closed from
     the ground around.
@@ -43,11 +44,17 @@ def paint_orthophoto(
     ground = filled(surface.up_m, np.isfinite(surface.up_m))
     painter = _Painter(surface.lattice, ground, choose_photos(surface.lattice, ground, views, settings), site_grid,
                        views, pictures)
-    tiles = sorted(painter.tiles(), key=lambda index: (index[1], index[0]))
-    for number, tile in enumerate(tiles, start=1):
-        rgba = painter.tile(tile)
-        if rgba is not None:
-            yield tile, rgba, number / len(tiles)
+    count, side = settings.block_tiles, site_grid.grid.tile_px
+    blocks = sorted({(row // count, column // count) for column, row in painter.tiles()})
+    for number, (down, across) in enumerate(blocks, start=1):
+        first = across * count, down * count
+        rgba = painter.block(first, count)
+        if rgba is None:
+            continue
+        for y, x in np.ndindex(count, count):
+            tile = np.ascontiguousarray(rgba[y * side:(y + 1) * side, x * side:(x + 1) * side])
+            if tile[..., 3].any():
+                yield (first[0] + x, first[1] + y), tile, number / len(blocks)
 
 
 def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View], settings: OrthophotoSettings) -> Winners:
@@ -113,11 +120,11 @@ class _Painter:
         """The tiles over the height model."""
         return self._grid.tiles_touched(self._outline)
 
-    def tile(self, tile: TileIndex) -> ImageRGBA | None:
-        """(tile_px, tile_px, 4) a tile's picture; None where no photo sees it."""
+    def block(self, first: TileIndex, count: int) -> ImageRGBA | None:
+        """(count tile_px, count tile_px, 4) the picture of `count` x `count` tiles; None where no photo sees them."""
         apron = -(-LAYER_APRON_PX // ALIGN_PX) * ALIGN_PX
-        side = self._grid.tile_px + 2 * apron
-        shift = _shift(tile[0] * self._grid.tile_px - apron, tile[1] * self._grid.tile_px - apron)
+        side = count * self._grid.tile_px + 2 * apron
+        shift = _shift(first[0] * self._grid.tile_px - apron, first[1] * self._grid.tile_px - apron)
         labels = self._fine_labels(self._cells_from_grid @ shift, side)
         inner = slice(apron, side - apron)
         if (labels[inner, inner] < 0).all():

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
+from sorvolo.heights.islands import IslandSettings, islands
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.semiglobal import SmoothingSettings
 from sorvolo.heights.smooth_sigma import SmoothSigma
@@ -26,9 +27,12 @@ class SurfaceSettings:
     coarser: int = 2  # cells of the first sweep, in those of the model
     tile_cells: int = 320
     tile_share: float = 0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
-    apron_cells: int = 12  # beyond a tile, so that neighbouring tiles agree
+    apron_cells: int = 10  # beyond a tile, so that neighbouring tiles agree: more than half a patch
+    coarse_apron_cells: int = 5  # of the first sweep, whose patches are smaller
     margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
+    least_slope: float = 0.03  # of a tile's ground; on a gentler one patches agree on level planes as well
     match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
+    islands: IslandSettings = field(default_factory=IslandSettings)
     relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
 
 
@@ -63,7 +67,7 @@ def sweep_surface(
     side = _tile_cells(lattice.cell_m, views, settings)
     coarse = _coarse(lattice.coarser(settings.coarser), views, pictures, everywhere, settings)
     up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
-    covered = np.zeros(lattice.shape, bool)
+    covered, seen_by = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, np.uint8)
     tiles = list(lattice.windows(side))
     for number, (x0, y0, x1, y1) in enumerate(tiles):
         apron = settings.apron_cells
@@ -76,7 +80,10 @@ def sweep_surface(
             inner = slice(apron, -apron), slice(apron, -apron)
             up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
             covered[y0:y1, x0:x1] = (swept.seen_by[inner] >= 2) | np.isfinite(found[inner])
+            seen_by[y0:y1, x0:x1] = swept.seen_by[inner]
         yield (number + 1) / len(tiles)
+    alone = islands(up_m, seen_by, lattice.cell_m, settings.islands)
+    up_m[alone], sigma_m[alone] = np.nan, np.nan
     yield Surface(lattice, up_m, sigma_m, covered)
 
 
@@ -93,7 +100,7 @@ def _coarse(
     settings: SurfaceSettings,
 ) -> Floats32:
     up_m = np.full(lattice.shape, np.nan, np.float32)
-    apron = settings.apron_cells
+    apron = settings.coarse_apron_cells
     for x0, y0, x1, y1 in lattice.windows(_tile_cells(lattice.cell_m, views, settings)):
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
         swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.coarse)
@@ -114,13 +121,31 @@ def _tile_bounds(
 ) -> Bounds | None:
     """The heights to search in a tile; None where the coarse model has a hole as large as the tile."""
     x0, y0, x1, y1 = (round(each / settings.coarser) for each in window)
-    around = coarse[max(0, y0 - 6):y1 + 7, max(0, x0 - 6):x1 + 7]
-    known = around[np.isfinite(around)]
-    if not len(known):
+    left, top = max(0, x0 - 6), max(0, y0 - 6)
+    around = coarse[top:y1 + 7, left:x1 + 7]
+    rows, columns = np.nonzero(np.isfinite(around))
+    if not len(rows):
         return None
+    middle = np.array([window[0] + window[2] - 1, window[1] + window[3] - 1]) / 2
+    places = settings.coarser * (np.column_stack([columns + left, rows + top]) + 0.5) - 0.5 - middle
+    known = around[rows, columns].astype(np.float64)
+    slope_m = _slope_m(places, known, settings.least_slope * cell_m)
+    known -= places @ slope_m
     low, high = np.percentile(known, [0.5, 99.5])
     margin = settings.margin_cells * cell_m
-    return Bounds(float(low - margin), float(high + margin), float(np.median(known)))
+    return Bounds(float(low - margin), float(high + margin), float(np.median(known)), slope_m)
+
+
+def _slope_m(places: PointsM, up_m: Floats, least_m: float) -> tuple[float, float]:
+    """How heights (N,) rise along x and y of places (N, 2), m a unit: the ground's, for what stands on it departs
+    (least absolute deviations); none where that is less than `least_m`."""
+    terms = np.column_stack([places, np.ones(len(places))])
+    weight = np.ones(len(places))
+    slope = np.zeros(3)
+    for _ in range(8):
+        slope = np.linalg.lstsq(terms * weight[:, None], up_m * weight, rcond=None)[0]
+        weight = 1 / np.sqrt(np.abs(up_m - terms @ slope) + 5 * least_m)
+    return (float(slope[0]), float(slope[1])) if np.hypot(slope[0], slope[1]) > least_m else (0.0, 0.0)
 
 
 def _calmed(swept: Swept) -> Floats32:

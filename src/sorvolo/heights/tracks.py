@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from sorvolo.geometry.arrays import Floats, ImageGray, PointsPx, Rows
+from sorvolo.geometry.arrays import Floats, ImageGray, PointsM, Rows
 from sorvolo.heights.views import View, overlaps
 from sorvolo.registration.features import FeatureSettings, normalise_contrast, sift_features
 from sorvolo.survey.mosaic import Features
@@ -26,6 +26,7 @@ class TrackSettings:
     least_inliers: int = 20
     least_overlap: float = 0.15  # of two views that are matched
     neighbours: int = 14  # views matched with each at most
+    margin: float = 0.2  # of a picture: features so far beside what two views share on level ground may be shared too
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,43 +44,37 @@ def find_tracks(
     views: Sequence[View], gray: Callable[[int], ImageGray], settings: TrackSettings
 ) -> Tracks:
     """The points that pictures have in common; `gray(i)` is the picture of view i at any size."""
-    features, rays = [], []
-    for number, view in enumerate(views):
-        found = _features(gray(number), settings)
-        features.append(found)
-        rays.append(view.camera.resized(found.width_px, found.height_px).rays_from_pixels(found.points_px)[:, :2])
-    starts = np.concatenate([[0], np.cumsum([len(each) for each in rays])])
+    found = [_features(gray(number), view, settings) for number, view in enumerate(views)]
+    starts = np.concatenate([[0], np.cumsum([len(each.rays) for each in found])])
     left, right, pairs = [], [], []
     for i, j in _pairs(views, settings):
-        matched = _matched(features[i].features, features[j].features, settings.ratio)
-        good = _agreeing(rays[i][matched[:, 0]], rays[j][matched[:, 1]],
-                         settings.inlier_px * views[i].camera.width_px / features[i].width_px
-                         / views[i].camera.fx_px)
-        if good.sum() >= settings.least_inliers:
-            left.append(starts[i] + matched[good, 0])
-            right.append(starts[j] + matched[good, 1])
+        matched = _shared(found[i], found[j], settings)
+        if len(matched):
+            left.append(starts[i] + matched[:, 0])
+            right.append(starts[j] + matched[:, 1])
             pairs.append((i, j))
-    return _joined(left, right, pairs, starts, np.concatenate(rays))
+    return _joined(left, right, pairs, starts, np.concatenate([each.rays for each in found]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
+    """A view's features; `rays` (N, 2) normalised, `ground_m` (N, 3) where they meet level ground."""
+
+    view: View
     features: Features
     width_px: int
-    height_px: int
-
-    @property
-    def points_px(self) -> PointsPx:
-        return self.features.points_px
+    rays: Floats
+    ground_m: PointsM
 
 
-def _features(gray: ImageGray, settings: TrackSettings) -> _Found:
+def _features(gray: ImageGray, view: View, settings: TrackSettings) -> _Found:
     scale = min(1.0, settings.side_px / max(gray.shape))
     if scale < 1.0:
         size = (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
     found = sift_features(normalise_contrast(gray), FeatureSettings(sift_count=settings.features))
-    return _Found(found, gray.shape[1], gray.shape[0])
+    rays = view.camera.resized(gray.shape[1], gray.shape[0]).rays_from_pixels(found.points_px)[:, :2]
+    return _Found(view, found, gray.shape[1], rays, _on_ground(rays, view))
 
 
 def _pairs(views: Sequence[View], settings: TrackSettings) -> Iterator[tuple[int, int]]:
@@ -94,20 +89,52 @@ def _pairs(views: Sequence[View], settings: TrackSettings) -> Iterator[tuple[int
     yield from sorted(chosen)
 
 
-def _matched(left: Features, right: Features, ratio: float) -> NDArray[np.int64]:
-    """(N, 2) mutual nearest neighbours of unit descriptors that pass the ratio test."""
-    if len(left) < 4 or len(right) < 4:
+def _shared(left: _Found, right: _Found, settings: TrackSettings) -> Rows:
+    """(N, 2) the features that two views share; none where they are too few to trust.
+
+    They are sought among those that the map puts near each other, else among all: the map may have a view elsewhere.
+    """
+    every = np.arange(len(left.rays)), np.arange(len(right.rays))
+    near = _near(left.ground_m, right.view, settings.margin), _near(right.ground_m, left.view, settings.margin)
+    threshold = settings.inlier_px * left.view.camera.width_px / left.width_px / left.view.camera.fx_px
+    for rows in (near, every):
+        matched = _matched(left.features, right.features, rows, settings.ratio)
+        good = _agreeing(left.rays[matched[:, 0]], right.rays[matched[:, 1]], threshold)
+        if good.sum() >= settings.least_inliers:
+            return matched[good]
+    return matched[:0]
+
+
+def _on_ground(rays: Floats, view: View) -> PointsM:
+    """(N, 3) where rays of a view meet level ground at height 0; NaN for those that never do."""
+    away = np.column_stack([rays, np.ones(len(rays))]) @ view.site_from_camera.rotation.T
+    eye = view.site_from_camera.translation_m
+    down = np.where(away[:, 2] < -0.05 * np.linalg.norm(away, axis=1), away[:, 2], np.nan)
+    return np.asarray(eye + away * (-eye[2] / down)[:, None])
+
+
+def _near(ground_m: PointsM, view: View, margin: float) -> Rows:
+    """The rows of ground points, (N, 3), that lie in a view's picture or at most a `margin` of it beside."""
+    size = np.array([view.camera.width_px, view.camera.height_px])
+    away = np.abs(view.pixels_from_site(ground_m) / size - 0.5)
+    with np.errstate(invalid="ignore"):
+        return np.flatnonzero((away < 0.5 + margin).all(axis=1))
+
+
+def _matched(left: Features, right: Features, rows: tuple[Rows, Rows], ratio: float) -> NDArray[np.int64]:
+    """(N, 2) mutual nearest neighbours, among some rows, of unit descriptors that pass the ratio test."""
+    if min(map(len, rows)) < 4:
         return np.zeros((0, 2), np.int64)
-    likeness = left.descriptors @ right.descriptors.T
+    likeness = left.descriptors[rows[0]] @ right.descriptors[rows[1]].T
     best = likeness.argmax(axis=1)
     back = likeness.argmax(axis=0)
-    rows = np.arange(len(best))
-    top = likeness[rows, best]
-    likeness[rows, best] = -1.0
+    every = np.arange(len(best))
+    top = likeness[every, best]
+    likeness[every, best] = -1.0
     second = likeness.max(axis=1)
     # unit vectors: distance^2 = 2 - 2 likeness
-    good = (back[best] == rows) & (1 - top < ratio**2 * (1 - second))
-    return np.column_stack([rows[good], best[good]])
+    good = (back[best] == every) & (1 - top < ratio**2 * (1 - second))
+    return np.column_stack([rows[0][good], rows[1][best[good]]])
 
 
 def _agreeing(left: Floats, right: Floats, threshold: float) -> NDArray[np.bool_]:
