@@ -13,7 +13,7 @@ from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_
 from sorvolo.heights.relief import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.smooth_sigma import SmoothSigma
-from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
+from sorvolo.heights.surface import Surface, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, filled, terrain
 from sorvolo.registration.features import gray_from_rgb
 
@@ -241,34 +241,3 @@ def test_a_roof_that_reaches_out_of_the_photos_is_right_or_a_hole(one_strip: Sur
     assert 0.05 < known.sum() / roof.sum() < 0.9
     assert np.median(np.abs(one_strip.up_m[known] - 6)) < 0.3
     assert (np.abs(one_strip.up_m[known] - 6) > 1).mean() < 0.2
-
-
-def hillside(x, y):
-    """Ground that rises by 0.45 m a metre to the north-east, with a shed on it."""
-    up = 0.4 * x + 0.2 * y
-    return np.where((np.abs(x - 2) < 1.5) & (np.abs(y + 1) < 1.5), up + 2.0, up)
-
-
-def test_a_hillside_is_swept_along_its_slope() -> None:
-    views, look = survey_views(strips=2, photos=3, side_px=240), texture()
-    pictures = [photo(view, hillside, look, 9.0, -9.0) for view in views]
-    gsd_m = 30 / views[0].camera.fx_px
-    lattice = Lattice.over(np.array([[-8.0, -6], [8, 6]]), SiteGrid.at(ORIGIN, gsd_m, CRS))
-
-    def gray(number: int, size_m: float):
-        picture, scale = gray_from_rgb(pictures[number]), min(1.0, gsd_m / size_m)
-        return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-
-    points = lattice.points_m().reshape(-1, 2)[::50]
-    points = np.column_stack([points, hillside(*points.T)])
-    errors = []
-    for least_slope in (0.03, 9.0):
-        settings = SurfaceSettings(least_slope=least_slope)
-        *_, found = sweep_surface(lattice, views, gray, points, SmoothSigma(), settings)
-        assert isinstance(found, Surface)
-        places = lattice.points_m()
-        true = hillside(places[..., 0], places[..., 1])
-        calm = np.isfinite(found.up_m) & away_from_edges(true)
-        errors.append(np.sqrt(((found.up_m - true)[calm] ** 2).mean()) / gsd_m)
-    print(errors)
-    assert errors[0] < 0.5 and errors[0] < 0.7 * errors[1]

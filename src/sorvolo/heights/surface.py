@@ -30,9 +30,9 @@ class SurfaceSettings:
     apron_cells: int = 10  # beyond a tile, so that neighbouring tiles agree: more than half a patch
     coarse_apron_cells: int = 5  # of the first sweep, whose patches are smaller
     margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
-    least_slope: float = 0.03  # of a tile's ground; on a gentler one patches agree on level planes as well
-    match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
+    unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which a cell stays a hole
     islands: IslandSettings = field(default_factory=IslandSettings)
+    match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
     relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
 
 
@@ -76,6 +76,7 @@ def sweep_surface(
         if bounds is not None:
             swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep)
             found = _calmed(swept)
+            found[swept.deviation_m > settings.unsure_cells * lattice.cell_m] = np.nan
             sigma = _sigma_m(swept, found, window, camera_sigma, settings)
             inner = slice(apron, -apron), slice(apron, -apron)
             up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
@@ -121,31 +122,13 @@ def _tile_bounds(
 ) -> Bounds | None:
     """The heights to search in a tile; None where the coarse model has a hole as large as the tile."""
     x0, y0, x1, y1 = (round(each / settings.coarser) for each in window)
-    left, top = max(0, x0 - 6), max(0, y0 - 6)
-    around = coarse[top:y1 + 7, left:x1 + 7]
-    rows, columns = np.nonzero(np.isfinite(around))
-    if not len(rows):
+    around = coarse[max(0, y0 - 6):y1 + 7, max(0, x0 - 6):x1 + 7]
+    known = around[np.isfinite(around)]
+    if not len(known):
         return None
-    middle = np.array([window[0] + window[2] - 1, window[1] + window[3] - 1]) / 2
-    places = settings.coarser * (np.column_stack([columns + left, rows + top]) + 0.5) - 0.5 - middle
-    known = around[rows, columns].astype(np.float64)
-    slope_m = _slope_m(places, known, settings.least_slope * cell_m)
-    known -= places @ slope_m
     low, high = np.percentile(known, [0.5, 99.5])
     margin = settings.margin_cells * cell_m
-    return Bounds(float(low - margin), float(high + margin), float(np.median(known)), slope_m)
-
-
-def _slope_m(places: PointsM, up_m: Floats, least_m: float) -> tuple[float, float]:
-    """How heights (N,) rise along x and y of places (N, 2), m a unit: the ground's, for what stands on it departs
-    (least absolute deviations); none where that is less than `least_m`."""
-    terms = np.column_stack([places, np.ones(len(places))])
-    weight = np.ones(len(places))
-    slope = np.zeros(3)
-    for _ in range(8):
-        slope = np.linalg.lstsq(terms * weight[:, None], up_m * weight, rcond=None)[0]
-        weight = 1 / np.sqrt(np.abs(up_m - terms @ slope) + 5 * least_m)
-    return (float(slope[0]), float(slope[1])) if np.hypot(slope[0], slope[1]) > least_m else (0.0, 0.0)
+    return Bounds(float(low - margin), float(high + margin), float(np.median(known)))
 
 
 def _calmed(swept: Swept) -> Floats32:

@@ -1,4 +1,4 @@
-"""Heights of cells by a sweep of parallel planes: where photos laid on a plane agree, the ground is at its height.
+"""Heights of cells by a sweep of level planes: where photos laid on a plane agree, the ground is at its height.
 
 Collins 1996, with the photos compared pair by pair (normalised cross-correlation), so that no photo is the reference
 and one that cannot see a place does not decide about it.
@@ -38,14 +38,11 @@ class SweepSettings:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Which heights are looked for, and at which most ground lies, m, above a plane through the lattice's middle that
-    rises by `slope_m` (m a cell) along columns and rows: patches of sloping ground agree on planes of its slope only.
-    """
+    """Which heights are looked for, and at which most ground lies, m."""
 
     low_m: float
     high_m: float
     usual_m: float
-    slope_m: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +88,6 @@ def sweep(
     up_m, score = _best(total, agreement, levels)
     deviation = _deviation(total, up_m, levels, settings)
     up_m[~(score >= settings.least_score)] = np.nan  # no two photos see the height that fits, or they do not agree
-    up_m += _plane_m(lattice, bounds)
     return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation)
 
 
@@ -128,12 +124,6 @@ def _usefulness(angle: Floats) -> Floats:
     return np.clip(angle / 0.35, 0.05, 1) * np.clip((1.2 - angle) / 0.5, 0.02, 1)
 
 
-def _plane_m(lattice: Lattice, bounds: Bounds) -> Floats32:
-    """(H, W) the plane that heights are looked for above."""
-    x, y = np.arange(lattice.width) - (lattice.width - 1) / 2, np.arange(lattice.height) - (lattice.height - 1) / 2
-    return np.asarray(bounds.slope_m[0] * x + bounds.slope_m[1] * y[:, None], np.float32)
-
-
 def _spreads(lattice: Lattice, views: Sequence[View], up_m: float) -> Floats:
     """(V, V) how far apart two photos stand, seen from the lattice's middle, over how high they are."""
     middle = lattice.site_from_cells @ [(lattice.width - 1) / 2, (lattice.height - 1) / 2, 1.0]
@@ -165,8 +155,6 @@ class _Laid:
         self._level = project[:, :2] @ lattice.site_from_cells[:2] + np.outer(project[:, 3], [0, 0, 1])
         self._up = np.outer(project[:, 2], [0, 0, 1])
         right, bottom = lattice.width - 1, lattice.height - 1
-        across, down = bounds.slope_m
-        self._level += np.outer(project[:, 2], [across, down, -(across * right + down * bottom) / 2])
         self._corners = np.array([[0, right, 0, right], [0, 0, bottom, bottom], [1.0, 1, 1, 1]])
         self._size = picture.shape[1], picture.shape[0]
         piece = self._crop_to(picture, bounds, settings)
