@@ -1,5 +1,7 @@
 """Heights, bare ground and orthophoto against a scene whose height is known everywhere."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -7,13 +9,14 @@ from scenes import HOUSE, hills, hills_with_houses, photo, survey_views, texture
 
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.heights.figures import surface_figures, surface_warnings
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
 from sorvolo.heights.relief import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.smooth_sigma import SmoothSigma
-from sorvolo.heights.surface import Surface, sweep_surface
+from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, filled, terrain
 from sorvolo.registration.features import gray_from_rgb
 
@@ -241,3 +244,32 @@ def test_a_roof_that_reaches_out_of_the_photos_is_right_or_a_hole(one_strip: Sur
     assert 0.05 < known.sum() / roof.sum() < 0.9
     assert np.median(np.abs(one_strip.up_m[known] - 6)) < 0.3
     assert (np.abs(one_strip.up_m[known] - 6) > 1).mean() < 0.2
+
+
+def test_a_pattern_that_repeats_fits_at_several_heights_and_is_a_hole() -> None:
+    views = [
+        replace(each, site_from_camera=Pose(NADIR_CAMERA_NORTH_UP, np.array([12.0 * k - 12, 0, 30])))
+        for k, each in enumerate(survey_views(strips=1, photos=3, side_px=240))
+    ]
+    patch = np.random.default_rng(8).uniform(40, 215, (8, 4, 3)).astype(np.float32)
+    side_m = 12 * 1.5 / (30 - 1.5)  # the photos lie alike on planes 1.5 m apart
+
+    def tiles(x, y):
+        return patch[np.floor(4 / side_m * y).astype(int) % 8, np.floor(4 / side_m * x).astype(int) % 4]
+
+    pictures = [photo(view, lambda x, y: 0 * x, tiles, 0.1, -0.1) for view in views]
+    gsd_m = 30 / views[0].camera.fx_px
+    lattice = Lattice.over(np.array([[-4.0, -4], [4, 4]]), SiteGrid.at(ORIGIN, gsd_m, CRS))
+
+    def gray(number: int, size_m: float):
+        picture, scale = gray_from_rgb(pictures[number]), min(1.0, gsd_m / size_m)
+        return cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+
+    points = np.array([[-1.0, 0, 0], [0, 1, 0], [1, -2, 0], [1, 2, 0.1]])
+    holes, wrong = [], []
+    for settings in (SurfaceSettings(), SurfaceSettings(unsure_cells=np.inf)):
+        *_, found = sweep_surface(lattice, views, gray, points, SmoothSigma(), settings)
+        assert isinstance(found, Surface)
+        holes.append(np.isnan(found.up_m).mean())
+        wrong.append((np.abs(found.up_m) > 1).mean())
+    assert holes[0] > 0.2 and holes[1] < 0.1 and wrong[0] < 0.6 * wrong[1], (holes, wrong)
