@@ -14,6 +14,7 @@ from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.planning import footprint_size_m, minimum_frame_rate, px_per_m
+from sorvolo.geometry.summary import median_or_nan
 from sorvolo.geometry.track import find_strips, length_m, speeds_m_s
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.registration.features import sharpness_and_texture
@@ -104,7 +105,7 @@ def frame_facts(source: Source, glimpses: Sequence[Frame]) -> FrameFacts:
     times_s = _times_s(source, glimpses)
     return FrameFacts(
         source.frame_count, source.frame_rate_hz,
-        _median(np.diff(times_s)) if source.kind == "photos" else math.nan,
+        median_or_nan(np.diff(times_s)) if source.kind == "photos" else math.nan,
         float(np.ptp(times_s)) if len(times_s) else math.nan, camera.width_px, camera.height_px,
         suffixes, container, size, source.start_ns, source.start_origin, sharp, texture,
         math.nan,
@@ -222,7 +223,7 @@ def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> Fl
         side = max(0.0, 1 - strips.spacing_m / across_m) if strips.spacing_m > 0 else math.nan
     return FlightFacts(
         height_m, spread_m, reference, speed_m_s, length_m(points_m), gsd_m, footprint_m, forward, interval_s,
-        strips.count, side, _median(telemetry["camera_pitch_deg"]),
+        strips.count, side, median_or_nan(telemetry["camera_pitch_deg"]),
     )
 
 
@@ -238,10 +239,10 @@ def _height(telemetry: Telemetry) -> tuple[float, float, str]:
     """Median height above ground and its spread (5 to 95 %), NaN if unknown; and above what it is."""
     above_takeoff_m = telemetry["height_above_takeoff_m"]
     if np.isfinite(above_takeoff_m).any():
-        return _median(above_takeoff_m), _spread(above_takeoff_m), "above take-off"
+        return median_or_nan(above_takeoff_m), _spread(above_takeoff_m), "above take-off"
     for column, words in (("orthometric_height_m", "sea level"), ("ellipsoidal_height_m", "the ellipsoid")):
         if np.isfinite(telemetry[column]).any():
-            usual_m = _median(telemetry[column])
+            usual_m = median_or_nan(telemetry[column])
             text = f"unknown: telemetry gives heights above {words} only, median {usual_m:.1f} m"
             return math.nan, _spread(telemetry[column]), text
     return math.nan, math.nan, "unknown: telemetry gives no height"
@@ -266,11 +267,6 @@ def _across_and_along(
     lies_across = len(turns) > 0 and float(np.cos(2 * turns).mean()) < 0
     width_m, height_m = footprint_m
     return (height_m, width_m) if lies_across else (width_m, height_m)
-
-
-def _median(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else math.nan
 
 
 def _spread(values: Floats) -> float:

@@ -10,6 +10,7 @@ from sorvolo.geometry.arrays import Floats, PointsM, Vector3
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import fit_similarity
 from sorvolo.geometry.pose import site_from_body_nadir_rotation, site_from_gimbal_rotation
+from sorvolo.geometry.summary import median_or_nan
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
 PHOTO_TIE = "each photo carries its own fix"
@@ -265,7 +266,7 @@ def track_from_telemetry(
         interval_s = 0.0
     track = Track(
         clock.sample_s, east_north, up_m, sigma, vertical_sigma_m, offset_sigma_m, words, *angles, attitude,
-        (_median_of(telemetry["tilt_sigma_deg"]), _median_of(telemetry["heading_sigma_deg"])), interval_s, gap_s,
+        (median_or_nan(telemetry["tilt_sigma_deg"]), median_or_nan(telemetry["heading_sigma_deg"])), interval_s, gap_s,
     )
     return track, notices
 
@@ -413,11 +414,6 @@ def _heights(
         return filled - typical + 40.0, f"{words}, ground found from the pictures", sigma_m, np.inf, tuple(notices)
     notices.append(Notice("height_unknown", 1, "telemetry has no height: it is found from the pictures and GPS"))
     return np.full(len(telemetry), 40.0), "none, found from the pictures", np.inf, np.inf, tuple(notices)
-
-
-def _median_of(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float("nan")
 
 
 def _angles(telemetry: Telemetry) -> tuple[str, tuple[Floats, Floats, Floats]]:

@@ -175,6 +175,8 @@ def _rate_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple
 
 
 def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
+    from sorvolo.geometry.planning import LEGAL_CEILING_M
+
     warnings = []
     if settings.task.value not in answers.fulfilled_tasks:
         warnings.append(
@@ -184,8 +186,11 @@ def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
     detector_m = answers.height_bounds_m.get("detector", math.inf)
     if answers.height_m > detector_m:
         warnings.append(f"from {answers.height_m:.1f} m the detector will miss people; fly at most {detector_m:.1f} m")
-    if settings.max_height_m > 120:
-        warnings.append("the law of most countries allows small drones 120 m above ground: to fly higher, get a permit")
+    if settings.max_height_m > LEGAL_CEILING_M:
+        warnings.append(
+            f"the law of most countries allows small drones {LEGAL_CEILING_M:.0f} m above ground: to fly higher, get a "
+            "permit"
+        )
     if answers.camera.focal_sigma > 0.1:
         sigma = answers.camera.focal_sigma
         warnings.append(f"the focal length is a guess, uncertain by {sigma:.0%}, so are the heights; calibrate once")

@@ -1,4 +1,4 @@
-"""`sorvolo site`: a site copied to another place, and the copy verified."""
+"""`sorvolo site`: a site copied to another place, the copy verified, a bucket pruned."""
 
 import json
 from dataclasses import asdict
@@ -21,7 +21,7 @@ _MOST_FAULTS = 20
 
 @site_app.callback()
 def site() -> None:
-    """Copy sites to other places, and verify the copies."""
+    """Copy sites to other places, verify the copies, and prune sites in a store."""
 
 
 @site_app.command("copy")

@@ -48,6 +48,7 @@ class Save(StrEnum):
     VIDEO = "video"
     PICTURES = "pictures"
 
+
 WatchSource = Annotated[str, typer.Argument(help="A video, a folder of photos, or a live stream's address.")]
 WatchTelemetry = Annotated[
     str, typer.Option(help="The flight's log if not beside the video; for a live source, a receiver's address.")

@@ -16,6 +16,12 @@ def median_of_known(values: Floats | Sequence[float]) -> float | None:
     return float(np.median(known)) if len(known) else None
 
 
+def median_or_nan(values: Floats | Sequence[float]) -> float:
+    """The median of the known numbers; NaN where none is known, for records whose unknown numbers are NaN."""
+    known = _known(values)
+    return float(np.median(known)) if len(known) else float("nan")
+
+
 def percentile_of_known(values: Floats | Sequence[float], share: float) -> float | None:
     """The percentile `share`, 0 to 100, of the known numbers."""
     known = _known(values)

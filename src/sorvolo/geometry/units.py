@@ -1,10 +1,13 @@
-"""Units of other systems, and of clocks, in ours: metres, metres a second, nanoseconds."""
+"""Units of other systems, of the Earth and of clocks in ours: metres, metres a second, nanoseconds."""
 
 FOOT_M = 0.3048
 """The international foot."""
 
 SURVEY_FOOT_M = 1200 / 3937
 """The US survey foot, which maps of some states still count in."""
+
+M_PER_DEG_LATITUDE = 111_320.0
+"""A degree of latitude on the ground, right to 0.6 %: enough for search distances and for how coarse a fix is."""
 
 KNOT_M_S = 1852 / 3600
 MILE_AN_HOUR_M_S = 0.44704

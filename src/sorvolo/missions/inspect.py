@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from sorvolo.capture.preflight import (
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.missions.flight.glimpses import glimpses_of
+from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.flight import CameraModel, Notice
 
 _ZONE_NS = 900 * SECOND_NS  # time zones differ by quarters of an hour
@@ -91,8 +92,7 @@ class Inspection:
 
     def as_json(self) -> dict[str, Any]:
         """Plain values for JSON; what is unknown is null."""
-        plain: dict[str, Any] = _without_nan(asdict(self))
-        return plain
+        return dict(plain_json(self))
 
 
 def inspect_input(
@@ -288,11 +288,3 @@ def _overlap_findings(kind: str, frames: FrameFacts, flight: FlightFacts) -> lis
 def _finding_of(notice: Notice) -> Finding:
     level = Level.INFO if notice.code in _INFORMATION else Level.WARNING
     return Finding(level, notice.text, _ADVICE.get(notice.code, ""))
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_without_nan(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

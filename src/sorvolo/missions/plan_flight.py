@@ -129,8 +129,7 @@ def camera_to_plan_with(
     if math.isnan(focal_mm) or math.isnan(pixel_um):
         raise SettingsError(
             "which camera? give --camera (a file, a preset such as 'Mavic 2 Pro', or aov=78.8), or both "
-            "--focal-mm "
-            "and --pixel-um"
+            "--focal-mm and --pixel-um"
         )
     focal_px = focal_px_from_mm(focal_mm, pixel_um)
     camera = Camera(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)

@@ -70,8 +70,7 @@ def _disc(size_m: tuple[float, float], texel_m: float, colour: Floats, shade: fl
 
 
 def _prism(base_m: Floats, top_m: Floats, walls: list[Floats], light: Light) -> list[Patch]:
-    """The side faces of a prism or its frustum: base and top corners (4, 3), counter-clockwise seen from
-    above."""
+    """The side faces of a prism or its frustum: base and top corners (4, 3), counter-clockwise seen from above."""
     faces = []
     for i in range(4):
         j = (i + 1) % 4

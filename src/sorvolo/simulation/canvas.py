@@ -77,8 +77,7 @@ class GroundRaster:
 
 
 class Canvas:
-    """The ground while it is painted: a coarse mix of materials first, then fine strokes on the full
-    raster."""
+    """The ground while it is painted: a coarse mix of materials first, then fine strokes on the full raster."""
 
     def __init__(
         self, area: Area, m_per_px: float, size_px: tuple[int, int], rng: np.random.Generator
@@ -106,8 +105,7 @@ class Canvas:
 
     def lay(self, cover: FieldF32, colour: tuple[float, float, float], grain: float, mottle: FieldF32,
             is_plant: bool = False) -> None:
-        """Cover the ground, where `cover` is 1, with a material of this colour, coarse mottle and fine
-        grain."""
+        """Cover the ground, where `cover` is 1, with a material of this colour, coarse mottle and fine grain."""
         share = np.clip(cover, 0, 1).astype(np.float32)
         material = np.array(colour, np.float32) * (1 + mottle[..., None])
         self.colour += (material - self.colour) * share[..., None]

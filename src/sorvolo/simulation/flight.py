@@ -100,8 +100,7 @@ class SimulatedFlight:
 
     @property
     def from_middle_s(self) -> Floats:
-        """(N,) the frames' times since the middle of the flight: moving things are where they started
-        there."""
+        """(N,) the frames' times since the middle of the flight: moving things are where they started there."""
         return self.frame_times_s - self.path.duration_s / 2
 
     def frame_name(self, index: int) -> str:
@@ -124,8 +123,7 @@ class SimulatedFlight:
             yield self.frame(index)
 
     def telemetry(self, format_name: str | None = None) -> Telemetry:
-        """What was recorded, in the format's own columns; by default that of the photos or the primary
-        format."""
+        """What was recorded, in the format's own columns; by default that of the photos or the primary format."""
         observation = self.observation(format_name)
         return no_telemetry() if observation is None else observation.telemetry
 

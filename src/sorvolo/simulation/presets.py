@@ -1,5 +1,4 @@
-"""Ready-made simulations: the demo, the benchmark flights, and the variety of the UMCD dataset (Tables
-2.1-2.4)."""
+"""Ready-made simulations: the demo, the benchmark flights, and the variety of the UMCD dataset (Tables 2.1-2.4)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -21,8 +20,7 @@ from sorvolo.simulation.settings import (
 
 @dataclass(frozen=True)
 class _Row:
-    """One video of the dataset, as its tables describe it; height, speed and size are ours where they
-    are silent."""
+    """One video of the dataset, as its tables describe it; height, speed and size are ours where they are silent."""
 
     ground: str
     length_s: float

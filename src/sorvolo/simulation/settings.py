@@ -13,8 +13,7 @@ TELEMETRY_FORMATS = ("csv", "srt", "nmea", "gpx")
 """The telemetry formats that can be written, in the order in which they are the primary one."""
 
 GEOID_HEIGHT_M = 48.3
-"""Height of the geoid above the ellipsoid at the default site; one constant, as a receiver's own table
-gives it."""
+"""Height of the geoid above the ellipsoid at the default site; one constant, as a receiver's own table gives it."""
 
 DEFAULT_ORIGIN = Geodetic(41.8923127, 12.6035418, 83.3)
 """A field east of Rome; the height is the ground's, above the ellipsoid."""
@@ -205,8 +204,7 @@ class LaterSettings:
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What is written to the folder; `crf` is x264's quality (lower is better), `truth_step` samples the
-    truth."""
+    """What is written to the folder; `crf` is x264's quality (lower is better), `truth_step` samples the truth."""
 
     telemetry: str = "csv"  # a format, "all" or "none"
     photos: bool = False  # JPEG photos instead of a video

@@ -1,5 +1,4 @@
-"""What a flight's instruments report: the true path, sampled, with noise, bias, a wrong clock and
-faults."""
+"""What a flight's instruments report: the true path, sampled, with noise, bias, a wrong clock and faults."""
 
 from dataclasses import dataclass
 

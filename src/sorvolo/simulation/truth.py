@@ -1,5 +1,4 @@
-"""The answers: where every frame lies, what stands where, and which pixels show it; plain values for
-files."""
+"""The answers: where every frame lies, what stands where, and which pixels show it; plain values for files."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime

@@ -196,7 +196,6 @@ def opaque(rgb: NDArray[np.uint8]) -> ImageRGBA:
 
 
 def cut_out(rgb: NDArray[np.uint8], alpha: NDArray[np.float32]) -> ImageRGBA:
-    """A texture with holes: `alpha` (height, width) from 0 to 1, multiplied into the colours as patches
-    need."""
+    """A texture with holes: `alpha` (height, width) from 0 to 1, multiplied into the colours as patches need."""
     alpha = np.clip(alpha, 0, 1)
     return np.dstack([rgb * alpha[..., None], alpha * 255]).round().astype(np.uint8)

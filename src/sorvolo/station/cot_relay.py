@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from math import atan2, cos, degrees, hypot, isfinite, nan, radians, sin
 from typing import Any
 
+from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.missions.watch.cot_sender import CotSender
 from sorvolo.station.relays import NotTaken, features_of
 from sorvolo.station.state import utc_now
@@ -16,7 +17,6 @@ WANTED = frozenset({"object.found", "change.announced", "change.withdrawn", "fra
 
 _DRONE_EVERY_S = 1.0
 _DRONE_STALE_S, _SPOT_STALE_S = 15.0, 3600.0
-_M_PER_DEG = 111_320.0  # of latitude
 _CHANGE_TYPE = COT_TYPES["small object"]
 
 Drones = Callable[[], Mapping[str, DroneView]]
@@ -125,8 +125,8 @@ def view_of_frame(data: Mapping[str, Any]) -> DroneView | None:
     try:
         longitude, latitude = (float(each) for each in data["position"])
         height_m, heading_deg = float(data["height_m"]), float(data["heading_deg"])
-        east_m = _M_PER_DEG * cos(radians(latitude))
-        corners = [((x - longitude) * east_m, (y - latitude) * _M_PER_DEG) for x, y in data["footprint"][:4]]
+        east_m = M_PER_DEG_LATITUDE * cos(radians(latitude))
+        corners = [((x - longitude) * east_m, (y - latitude) * M_PER_DEG_LATITUDE) for x, y in data["footprint"][:4]]
         top_left, top_right, low_right, low_left = corners
     except (KeyError, TypeError, ValueError):
         return None

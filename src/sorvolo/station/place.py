@@ -12,6 +12,7 @@ from shapely import Point
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import PointsM
+from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.station.collections import Collection, Feature, SiteCollections
 from sorvolo.station.flight_videos import FlightVideos
 from sorvolo.station.place_index import PlaceIndex
@@ -25,7 +26,6 @@ from sorvolo.store.index.finding import FoundFlight, Place
 from sorvolo.store.site.archive import Archive
 
 _NEAR_M = 1.5  # from the tapped place to what was found there
-_M_PER_DEG = 111_320.0
 _DAY_S = 86_400.0
 
 
@@ -111,7 +111,7 @@ def _near(
     site_id: str, place: Point, collections: SiteCollections, reviews: Reviews
 ) -> Mapping[str, list[dict[str, Any]]]:
     """What was found within reach of a place: changes and objects by flight, with the verdicts on them."""
-    reach_deg = _NEAR_M / _M_PER_DEG / max(0.01, float(np.cos(np.radians(place.y))))
+    reach_deg = _NEAR_M / M_PER_DEG_LATITUDE / max(0.01, float(np.cos(np.radians(place.y))))
     ring = place.buffer(reach_deg)
     result: dict[str, list[dict[str, Any]]] = {}
     for name, kind in (("changes", "change"), ("objects", "object")):

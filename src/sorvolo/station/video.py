@@ -178,7 +178,7 @@ class Viewer:
         self._needs_key = True
 
     def put_text(self, text: str) -> None:
-        """One more message; the oldest go where too many wait."""
+        """One more message; left out where too many wait already."""
         if len(self._waiting) < 4 * _MOST_WAITING:
             self._waiting.append(text)
             self._arrived.set()

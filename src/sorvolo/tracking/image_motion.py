@@ -41,7 +41,6 @@ class ImageMotionSettings:
     flow: FlowSettings = field(default_factory=FlowSettings)
 
 
-
 @dataclass(frozen=True, eq=False)
 class _View:
     """One small picture with the points followed in it, (N, 2), and where those lie in the first picture's pixels."""

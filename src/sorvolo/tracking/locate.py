@@ -22,7 +22,6 @@ IMPOSSIBLE_SIZE = "of a size that its class cannot have"
 """The words for what could be placed, and is set aside: it is not what the detector took it for."""
 
 
-
 @dataclass(frozen=True)
 class LocateSettings:
     """How well the parts of a place are known, and what is too little to call it a place."""

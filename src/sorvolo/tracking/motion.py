@@ -40,7 +40,6 @@ HABITS = {
 OTHER_HABITS = Habits(3.0, 0.3, 0.2)
 
 
-
 @dataclass(frozen=True, eq=False)
 class Motions:
     """What is known of the motion of N objects; `habits` (N, 4) as `habits_of` gives them."""

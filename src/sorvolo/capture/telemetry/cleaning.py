@@ -9,7 +9,7 @@ import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Mask, Rows, TimesNs
-from sorvolo.geometry.units import SECOND_NS
+from sorvolo.geometry.units import M_PER_DEG_LATITUDE, SECOND_NS
 from sorvolo.survey.flight import Notice, Telemetry
 
 M_PER_HDOP = 1.5
@@ -24,7 +24,6 @@ NO_TIME_NS = -(2**62)
 FASTEST_M_S = 80.0
 """No small drone flies faster over ground (the fastest in a storm reach about 60 m/s)."""
 
-_M_PER_DEG = 111_320.0
 _JUMP_SLACK_M = 10.0  # receivers step this far when their set of satellites changes
 _HELD_FIX_S = 1.0  # a receiver that repeats its fix made it at most this long ago
 _COARSE_DECIMALS = 4  # at five decimals the rounding (1.1 m) is below the receiver's own noise
@@ -206,7 +205,7 @@ def sigma_from_hdop_m(hdop: float) -> float:
 
 def rounding_sigma_m(decimals: int) -> float:
     """Sigma in m, per axis, of a position rounded to so many decimals of a degree: its step / sqrt 12."""
-    return float(10.0**-decimals * _M_PER_DEG / np.sqrt(12))
+    return float(10.0**-decimals * M_PER_DEG_LATITUDE / np.sqrt(12))
 
 
 def notice(code: str, count: int, text: str) -> list[Notice]:
@@ -259,7 +258,7 @@ def _widen_to_rounding(table: dict[str, Floats], decimals: int) -> list[Notice]:
     table["horizontal_sigma_m"] = np.where(placed, np.fmax(sigma, rounding), sigma)
     text = (
         f"positions are printed with {decimals} decimals of a degree, in steps of "
-        f"{10.0**-decimals * _M_PER_DEG:.3g} m; their uncertainty is set to at least {rounding:.2g} m"
+        f"{10.0**-decimals * M_PER_DEG_LATITUDE:.3g} m; their uncertainty is set to at least {rounding:.2g} m"
     )
     return notice("coarse_position", int(placed.sum()), text)
 
@@ -289,7 +288,7 @@ def _blank_jumps(times: TimesNs, table: dict[str, Floats]) -> list[Notice]:
     def fits(old: Rows, new: Rows) -> Mask:
         turn = (lon[starts[new]] - lon[starts[old]] + 180) % 360 - 180
         scale = np.cos(np.radians((lat[starts[new]] + lat[starts[old]]) / 2))
-        distance_m = np.hypot(lat[starts[new]] - lat[starts[old]], turn * scale) * _M_PER_DEG
+        distance_m = np.hypot(lat[starts[new]] - lat[starts[old]], turn * scale) * M_PER_DEG_LATITUDE
         made = np.maximum(seconds[starts[old]], seconds[ends[old]] - _HELD_FIX_S)
         slack_m = _JUMP_SLACK_M + 3 * (sigma[starts[new]] + sigma[starts[old]])
         return distance_m <= FASTEST_M_S * (seconds[starts[new]] - made) + slack_m

@@ -1,5 +1,4 @@
-"""Flights as files that drones leave behind: video, photos, telemetry, camera and truth; the same bytes
-each time."""
+"""Flights as files that drones leave behind: video, photos, telemetry, camera and truth; the same bytes each time."""
 
 import csv
 import io
@@ -338,8 +337,7 @@ def _srt(telemetry: Telemetry) -> str:
 
 
 def _srt_gps(telemetry: Telemetry) -> str:
-    """DJI's older subtitles: GPS(longitude, latitude, satellites) and the barometer's height above
-    take-off."""
+    """DJI's older subtitles: GPS(longitude, latitude, satellites) and the barometer's height above take-off."""
     blocks = []
     for i, (start, end) in enumerate(_srt_times(telemetry)):
         moment = _moment(int(telemetry.time_ns[i]))

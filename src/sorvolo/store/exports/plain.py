@@ -46,6 +46,11 @@ def _plain_members(value: Any) -> Any:
     raise TypeError(f"a {type(value).__name__} cannot be written as JSON")
 
 
+def number_or_null(number: float) -> float | None:
+    """The number as JSON and databases can hold it: None for NaN and infinities."""
+    return float(number) if math.isfinite(number) else None
+
+
 def json_bytes(value: Any) -> bytes:
     """The value as UTF-8 JSON text, laid out for people."""
     text = json.dumps(plain_json(value), indent=1, ensure_ascii=False, allow_nan=False)

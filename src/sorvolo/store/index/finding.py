@@ -11,9 +11,9 @@ from sqlalchemy import Connection, Row, Select, Table, column, func, literal, se
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.store.index import tables
 
-_M_PER_DEG = 111_320.0  # of latitude, good to 0.6 %: a search distance needs no more
 EARLIEST_NS, LATEST_NS = -(2**62), 2**62
 """Bounds of time, ns since 1970: the years 1824 and 2116."""
 
@@ -227,7 +227,7 @@ def _distances_m(places: Sequence[bytes], longitude_deg: float, latitude_deg: fl
 
 def _metres_per_degree(latitude_deg: float) -> Floats:
     """(2,) of longitude and of latitude."""
-    return np.array([_M_PER_DEG * max(1e-6, np.cos(np.radians(latitude_deg))), _M_PER_DEG])
+    return np.array([M_PER_DEG_LATITUDE * max(1e-6, np.cos(np.radians(latitude_deg))), M_PER_DEG_LATITUDE])
 
 
 def _turns(longitude_deg: float, reach_deg: float) -> list[float]:

@@ -15,6 +15,7 @@ from shapely.geometry.base import BaseGeometry
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.store.exports.places import longitude_latitude
+from sorvolo.store.exports.plain import number_or_null
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry, StoredKeyframe
 from sorvolo.survey.flight import Site
@@ -152,8 +153,9 @@ def _objects(archive: Archive, flight: str, site: Site) -> PlacedRows:
         list(shapely.points(longitudes, latitudes)),
         [
             {
-                "object_id": each.id, "label": each.label, "score": float(each.score), "sigma_m": _known(each.sigma_m),
-                "first_ns": int(each.first_seen_ns), "last_ns": int(each.last_seen_ns),
+                "object_id": each.id, "label": each.label, "score": float(each.score),
+                "sigma_m": number_or_null(each.sigma_m), "first_ns": int(each.first_seen_ns),
+                "last_ns": int(each.last_seen_ns),
             }
             for each in things
         ],
@@ -191,7 +193,3 @@ def _nanoseconds(text: str) -> int:
     moment = datetime.fromisoformat(text)
     utc = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
     return round(utc.timestamp() * 1e6) * 1000
-
-
-def _known(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None

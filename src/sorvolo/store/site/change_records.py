@@ -10,6 +10,7 @@ from sqlalchemy import Connection, Row, delete, func, insert, select
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
+from sorvolo.store.exports.plain import number_or_null
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows, utc_now
 from sorvolo.store.site.names import checked_name, is_plain_name
@@ -218,8 +219,8 @@ def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
             "score": float(change.score), "outline_m": change.outline_m.tolist(),
             "first_seen_ns": int(change.first_seen_ns), "last_seen_ns": int(change.last_seen_ns),
             "announced_ns": int(change.announced_ns), "views": int(change.views),
-            "area_m2": _finite(change.area_m2), "length_m": _finite(change.length_m),
-            "sigma_m": _finite(change.sigma_m), "sigma_in_map_m": _finite(change.sigma_in_map_m),
+            "area_m2": number_or_null(change.area_m2), "length_m": number_or_null(change.length_m),
+            "sigma_m": number_or_null(change.sigma_m), "sigma_in_map_m": number_or_null(change.sigma_in_map_m),
             "height_change": None if risen is None else [float(risen.rise_m), float(risen.sigma_m)],
             "velocity_m_s": change.velocity_m_s.tolist(),
             "class_before": change.class_before, "class_after": change.class_after,
@@ -251,8 +252,3 @@ def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
 
 def _number(stored: float | None) -> float:
     return np.nan if stored is None else stored
-
-
-def _finite(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None
-

@@ -9,6 +9,7 @@ import numpy as np
 from sqlalchemy import Connection, insert, select
 
 from sorvolo.geometry.arrays import Floats, PointsM, frozen
+from sorvolo.store.exports.plain import number_or_null
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows
 from sorvolo.store.site.names import checked_name
@@ -140,8 +141,9 @@ def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
 def _properties(each: MapObject) -> dict[str, Any]:
     return {
         "label": each.label, "score": each.score, "class_scores": each.class_scores,
-        "position_m": each.position_m.tolist(), "sigma_m": _finite(each.sigma_m), "length_m": _finite(each.length_m),
-        "width_m": _finite(each.width_m), "views": each.views, "possible_views": each.possible_views,
+        "position_m": each.position_m.tolist(), "sigma_m": number_or_null(each.sigma_m),
+        "length_m": number_or_null(each.length_m), "width_m": number_or_null(each.width_m),
+        "views": each.views, "possible_views": each.possible_views,
         "first_seen_ns": int(each.first_seen_ns), "last_seen_ns": int(each.last_seen_ns), "moving": each.moving,
         "velocity_m_s": each.velocity_m_s.tolist(), "best_frame": each.best_frame,
     }
@@ -153,10 +155,6 @@ def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:
             name: np.nan if values[name] is None else values[name] for name in ("sigma_m", "length_m", "width_m")
         }
         return MapObject(checked_name(object_id, "object"), **{**values, **lengths})
-
-
-def _finite(number: float) -> float | None:
-    return float(number) if np.isfinite(number) else None
 
 
 def _is_older(connection: Connection) -> bool:
