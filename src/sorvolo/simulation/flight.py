@@ -149,8 +149,11 @@ class SimulatedFlight:
             for thing in self.world.days[0]
         )
         bodies = {
-            thing.id: self.day.bodies[thing.id] if today.get(thing.id) is thing
-            else build_body(thing, self.day.light, m_per_px) for thing in first
+            thing.id: (
+                self.day.bodies[thing.id] if today.get(thing.id) is thing
+                else build_body(thing, self.day.light, m_per_px)
+            )
+            for thing in first
         }
         return first, bodies
 
@@ -169,10 +172,8 @@ class SimulatedFlight:
             return np.clip(np.round(exposed), 0, 255).astype(np.uint8)
         rng = np.random.default_rng([self.settings.seed, 6, self.number, index])
         height, width = image.shape[:2]
-        y, x = (
-            rng.integers(0, imaging.noise.shape[0] - height + 1),
-            rng.integers(0, imaging.noise.shape[1] - width + 1),
-        )
+        y = rng.integers(0, imaging.noise.shape[0] - height + 1)
+        x = rng.integers(0, imaging.noise.shape[1] - width + 1)
         noisy = cv2.add(exposed, imaging.noise[y:y + height, x:x + width], dtype=cv2.CV_8U)
         return np.asarray(noisy, np.uint8)
 
@@ -185,12 +186,8 @@ class SimulatedFlight:
         middle = np.array([[camera.cx_px, camera.cy_px]])
         ground = apply_homography(site_from_image_homography(camera, self.true_poses[index]), middle)
         point = np.column_stack([ground, [0.0]])
-        start, end = (
-            camera.pixels_from_points(self.path.pose(time_s + side * exposure_s / 2).inverse().apply(point))[
-                0
-            ]
-            for side in (-1, 1)
-        )
+        begun, ended = (self.path.pose(time_s + side * exposure_s / 2) for side in (-1, 1))
+        start, end = (camera.pixels_from_points(each.inverse().apply(point))[0] for each in (begun, ended))
         moved = end - start
         if np.hypot(*moved) < 0.3:
             return image
@@ -203,9 +200,7 @@ class SimulatedFlight:
         rays = np.dstack([rays, np.ones(rays.shape[:2], np.float32)]) @ pose.rotation.T.astype(np.float32)
         ground = pose.translation_m[:2] - rays[..., :2] / rays[..., 2:] * pose.translation_m[2]
         drift = np.array([2.2, 1.1]) * float(self.from_middle_s[index])
-        cells = ((ground - drift) / _CLOUD_CELL_M + np.array(self.imaging.clouds.shape) / 2).astype(
-            np.float32
-        )
+        cells = ((ground - drift) / _CLOUD_CELL_M + np.array(self.imaging.clouds.shape) / 2).astype(np.float32)
         thickness = remapped(self.imaging.clouds, cells, cv2.BORDER_WRAP)
         light = 1 - np.float32(self.day.cloud_shade) * np.clip(1.1 * thickness - 0.1, 0, 1)
         grown = cv2.resize(light, (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)

@@ -41,15 +41,14 @@ class Observation:
     corrupt: frozenset[int]
 
     def fix_at(self, time_s: Floats) -> tuple[Floats, Floats]:
-        """Latitude and longitude, each (N,), interpolated between sound fixes at these times: what a
-        perfect map can know; NaN without fixes."""
+        """Latitude and longitude, each (N,), interpolated between sound fixes at these times: what a perfect map can
+        know; NaN without fixes."""
         sound = self.is_sound
         if not sound.any():
             return np.full(len(time_s), np.nan), np.full(len(time_s), np.nan)
         latitude, longitude = self.telemetry["latitude_deg"][sound], self.telemetry["longitude_deg"][sound]
-        return np.interp(time_s, self.true_s[sound], latitude), np.interp(
-            time_s, self.true_s[sound], longitude
-        )
+        true_s = self.true_s[sound]
+        return np.interp(time_s, true_s, latitude), np.interp(time_s, true_s, longitude)
 
 
 def observe(

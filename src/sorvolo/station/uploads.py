@@ -54,7 +54,7 @@ class Upload:
 
     @property
     def kind(self) -> str:
-        """video | photos | text"""
+        """What it is by its name: "video", "photos" (a .zip) or "text"."""
         ending = Path(self.name).suffix.lower()
         return "video" if ending in VIDEO_ENDINGS else "photos" if ending in _ARCHIVE_ENDINGS else "text"
 

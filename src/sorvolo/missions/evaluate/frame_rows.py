@@ -68,7 +68,7 @@ def read_features(path: Path) -> list[dict[str, Any]]:
 
 
 def frame_row(feature: Mapping[str, Any], frame: LocalFrame, path: Path) -> FrameRow:
-    """One feature as a row; raises InputError, naming `path`, where it is not as docs/formats.md says."""
+    """One feature as a row; raises InputError, naming `path`, where it is not as docs/formats.md has it."""
     try:
         properties, geometry = feature["properties"], feature["geometry"]
         corners = _NO_OUTLINE if geometry is None else geometry["coordinates"][0][:4]

@@ -1,21 +1,21 @@
 """Make a folder of single simulated pictures with their boxes: what a detector learns from and is measured on."""
 
-import os
 import time
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from sorvolo.missions.simulate.ahead import in_order
 from sorvolo.missions.simulate.folder import PICTURES_MARK, simulation_description, simulation_folder
-from sorvolo.simulation.ground import PaintedGround, orthophoto_ground
+from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.pictures import PictureSettings, SimulatedPicture, simulate_picture
 from sorvolo.simulation.truth import coco_categories
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.flight_files import read_orthophoto, write_json
 from sorvolo.store.images import jpeg_from_image
+
+_MOST_THREADS = 8
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,10 @@ def simulate_pictures(
     with simulation_folder(folder, PICTURES_MARK, {"info": info}) as partial:
         with writing(folder):
             (partial / "images").mkdir()
-        for picture in _rendered(settings, ground):
+        pictures = in_order(
+            lambda index: simulate_picture(settings, index, ground), settings.pictures, most_threads=_MOST_THREADS
+        )
+        for picture in pictures:
             row = _image_row(picture, settings.seed)
             atomic_write_bytes(partial / row["file_name"], jpeg_from_image(picture.image), durable=False)
             images.append(row)
@@ -70,16 +73,3 @@ def _image_row(picture: SimulatedPicture, seed: int) -> dict[str, Any]:
         "height_above_ground_m": round(float(picture.site_from_camera.translation_m[2]), 2),
         "ground": picture.ground, "thermal": picture.is_thermal,
     }
-
-
-def _rendered(settings: PictureSettings, ground: PaintedGround | None) -> Iterator[SimulatedPicture]:
-    """The pictures in order, a few of them rendered ahead on other cores."""
-    workers = min(8, os.cpu_count() or 1)
-    waiting: deque[Future[SimulatedPicture]] = deque()
-    with ThreadPoolExecutor(workers) as executor:
-        for index in range(settings.pictures):
-            waiting.append(executor.submit(simulate_picture, settings, index, ground))
-            if len(waiting) > 2 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()

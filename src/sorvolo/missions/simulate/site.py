@@ -1,16 +1,14 @@
 """Make a folder of simulated flights with everything that drones leave behind, and the truth beside it."""
 
-import os
 import time
-from collections import deque
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.missions.simulate.ahead import in_order
 from sorvolo.missions.simulate.folder import MARK, simulation_description, simulation_folder
 from sorvolo.simulation.events import event_features
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
@@ -36,8 +34,8 @@ from sorvolo.store.exports.flight_files import (
     write_telemetry,
 )
 from sorvolo.store.rasters.geotiff import write_cog
-from sorvolo.survey.flight import Frame
 
+_MOST_THREADS = 4
 _SUFFIXES = {"csv": ".csv", "srt": ".srt", "nmea": ".nmea", "gpx": ".gpx"}
 
 
@@ -99,29 +97,16 @@ def _write_flight(flight: SimulatedFlight, folder: Path) -> Iterator[int]:
         with writing(folder):
             (folder / "photos").mkdir()
         rows = _photo_rows(flight)
-        for frame in _rendered(flight):
+        for frame in in_order(flight.frame, len(flight), most_threads=_MOST_THREADS):
             write_photo(folder / "photos" / frame.name, frame, flight.camera, rows[frame.index])
             yield frame.index + 1
         return
     size_px = flight.camera.width_px, flight.camera.height_px
     imaging, crf = flight.settings.imaging, flight.settings.output.crf
     with video_writer(folder / f"{flight.name}.mp4", size_px, imaging.fps, flight.started_ns, crf) as write:
-        for frame in _rendered(flight):
+        for frame in in_order(flight.frame, len(flight), most_threads=_MOST_THREADS):
             write(frame.image)
             yield frame.index + 1
-
-
-def _rendered(flight: SimulatedFlight) -> Iterator[Frame]:
-    """The flight's frames in order, a few of them rendered ahead on other cores."""
-    workers = min(4, os.cpu_count() or 1)
-    waiting: deque[Future[Frame]] = deque()
-    with ThreadPoolExecutor(workers) as executor:
-        for index in range(len(flight)):
-            waiting.append(executor.submit(flight.frame, index))
-            if len(waiting) > 2 * workers:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
 
 
 def _write_telemetry(flight: SimulatedFlight, folder: Path) -> None:
