@@ -10,10 +10,10 @@ import numpy as np
 
 from sorvolo.geometry.arrays import ImageBGR, ImageRGBA
 from sorvolo.store.images import shrink
+from sorvolo.survey import wording
 
 _MOST_PICTURE_BYTES = 1_450_000  # base64 makes four bytes of three: below 2 MB in the page
 _BACKGROUND = 236.0  # of what was never seen, a light grey
-_PLURALS = {"person": "people"}
 
 
 def at(report: Mapping[str, Any], *keys: str) -> Any:
@@ -40,8 +40,8 @@ def known(value: Any) -> str:
 
 
 def plural(count: float, name: str) -> str:
-    """A number of things: "1 car", "3 cars", "4 people"."""
-    return f"{count:.0f} {name if count == 1 else _PLURALS.get(name, f'{name}s')}"
+    """A number of things: "1 car", "3 buses", "4 people", "0 cars"."""
+    return f"{count:.0f} {wording.plural(name, round(count))}"
 
 
 def count_words(counts: Mapping[str, int]) -> str:
