@@ -24,6 +24,7 @@ ASSUMPTIONS: dict[str, tuple[float, str]] = {
     "compared_hz": (5, "views compared a second of each stream (the default)"),
     "mapped_hz": (1, "key frames a second of each stream: 70 % overlap at 40 m and 10 m/s"),
     "archive_tb": (1_000, "of photos: one petabyte"),
+    "photo_megapixels": (9, "of a photo: a size that was measured"),
     "photo_mb": (3.5, "of a photo of 9 megapixels"),
     "photos_per_flight": (400, "of a survey"),
     "years": (5, "that the archive is kept"),
@@ -58,6 +59,8 @@ def main() -> None:
     options = parser.parse_args()
     given = {name: value for name, (value, _) in ASSUMPTIONS.items()} | changed(parser, options.values)
     costs = json.loads((RESULTS / "unit_costs.json").read_text())["rows"]
+    if f"photo, {given['photo_megapixels']:g} MP: map" not in costs:
+        parser.error(f"photos of {given['photo_megapixels']:g} megapixels were not measured: {', '.join(costs)} were")
     station = json.loads((RESULTS / "station.json").read_text())
     print("### Assumptions\n")
     print(table(("name", "value", "what"), ((name, f"{given[name]:g}", ASSUMPTIONS[name][1]) for name in ASSUMPTIONS)))
@@ -131,7 +134,7 @@ def stream_row(need: Need, given: Mapping[str, float]) -> Sequence[str]:
 def archive_rows(costs: Mapping[str, Any], given: Mapping[str, float]) -> Iterable[Sequence[str]]:
     """An archive's photos mapped once, and kept."""
     photos = given["archive_tb"] * 1e6 / given["photo_mb"]
-    prefix = next(name for name in costs if name.startswith("photo")).partition(":")[0]
+    prefix = f"photo, {given['photo_megapixels']:g} MP"
     yield "photos", f"{photos / 1e6:,.0f} million, {photos / given['photos_per_flight'] / 1e6:.2g} million flights"
     for mission in ("map", "map with objects", "heights", "compare"):
         row = costs.get(f"{prefix}: {mission}")

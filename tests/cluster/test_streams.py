@@ -1,21 +1,23 @@
 """Live streams side by side: one whose process dies is started again, all are finished when they are asked to end."""
 
+import json
 import os
 import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
 from batch_flights import another
 
+from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.cluster.batch import BatchSettings, BatchUpdate
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.local_executor import LocalExecutor
-from sorvolo.cluster.orders import FlightWish, Order
+from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome
 from sorvolo.cluster.streams import Stream, is_stream, run_streams, streams_of
 from sorvolo.cluster.table import BatchTable, State
 from sorvolo.errors import InputError, SettingsError
@@ -76,7 +78,47 @@ def test_streams_are_named_by_site_or_by_address(tmp_path: Path) -> None:
     assert [each.site for each in found] == ["north", "5000", "cards"]
     assert found[0] == Stream(north, "north")
     assert found[0].shown == "rtsp://10.0.0.1/live"
+    found = streams_of(["north=udp://:5000", "south=udp://:5001"], ["south=udp://:10110"])
+    assert [each.telemetry for each in found] == ["", "udp://:10110"]
     assert not is_stream("flights/a=b") and is_stream("a=rtsp://10.0.0.1/live")
+
+
+class Recording:
+    """An executor that only keeps what it was given: every try is done at once."""
+
+    cache_mb = 64.0
+
+    def __init__(self) -> None:
+        self.orders: list[Order] = []
+        self.running: dict[tuple[str, str], Order] = {}
+
+    def has_room(self, cost: Cost) -> bool:
+        return True
+
+    def start(self, key: tuple[str, str], order: Order, cost: Cost) -> None:
+        self.orders.append(order)
+        self.running[key] = order
+
+    def finish(self, key: tuple[str, str]) -> None:
+        """Nothing: it is done."""
+
+    def take_found(self) -> list[tuple[tuple[str, str], str]]:
+        return []
+
+    def next_ended(self, timeout_s: float | None = None) -> tuple[tuple[str, str], Ending] | None:
+        key, _ = self.running.popitem()
+        return key, Ending(Outcome.DONE, "done")
+
+
+def test_the_receiver_of_a_stream_goes_with_its_orders(tmp_path: Path) -> None:
+    executor = Recording()
+    streams = streams_of(["north=udp://:5000", "south=udp://:5001"], ["south=udp://:10110"])
+    settings = BatchSettings(FlightWish(Mission.WATCH))
+    ended(run_streams(streams, tmp_path, settings, lambda _: nullcontext(executor), threading.Event()))
+    assert {Path(each.site).name: each.telemetry for each in executor.orders} == {
+        "north-watch": "", "south-watch": "udp://:10110"
+    }
+    assert all(Order.of(json.loads(each.line())["order"]) == each for each in executor.orders)
 
 
 def test_streams_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,7 +126,17 @@ def test_streams_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[st
         streams_of(["north=udp://:5000", "north=udp://:5001"])
     with pytest.raises(InputError, match="has no port"):
         streams_of(["udp://"])
+    for receivers, words in (
+        (["east=udp://:10110"], "--telemetry east=...: there are streams of north"),
+        (["udp://:10110"], "give each stream's receiver once, as SITE=ADDRESS"),
+        (["north=udp://:1", "north=udp://:2"], "give each stream's receiver once"),
+        (["north=flight.srt"], "flight.srt is no receiver; give serial:"),
+    ):
+        with pytest.raises(SettingsError, match=words):
+            streams_of(["north=udp://:5000"], receivers)
     root = ["--root", str(tmp_path / "maps")]
+    assert main(["batch", str(tmp_path), "--telemetry", "north=udp://:10110", *root]) == 1
+    assert "--telemetry is for live sources" in capsys.readouterr().err
     assert main(["batch", "udp://:5000", str(tmp_path), *root]) == 1
     assert "give folders of flights or live sources, not both" in capsys.readouterr().err
     assert main(["batch", "udp://:5000", "udp://:5001", "--workers", "1", *root]) == 1

@@ -86,6 +86,10 @@ Resolution = Annotated[
 Model = Annotated[
     str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
 ]
+Receivers = Annotated[
+    list[str] | None,
+    typer.Option("--telemetry", help="A live source's receiver, as SITE=ADDRESS: udp://:10110, serial:/dev/ttyUSB0."),
+]
 Tries = Annotated[int, typer.Option(help="Set a flight aside when it ended its process so many times.")]
 Stall = Annotated[float, typer.Option(help="End a process that neither answers nor computes for so many seconds.")]
 Blocks = Annotated[
@@ -121,6 +125,7 @@ def batch(
     gsd: Resolution = None,
     model: Model = "default",
     give_up: GiveUp = 30.0,
+    telemetry: Receivers = None,
     tries: Tries = 3,
     stall: Stall = 300.0,
     retry: Retry = False,
@@ -144,7 +149,6 @@ def batch(
     A flight whose process dies is tried again; one that cannot be used, or that crashes every time, is listed.
     Live sources run side by side until they end; Ctrl-C ends them and finishes their results. The options from
     --classes to --alert-url are for --mission watch. ROOT/batch.jsonl holds what became of each.
-
     Ends with exit code 1 where a flight failed or was set aside, with 3 where a result is to be checked before use.
 
     Example: sorvolo batch flights/ --root maps
@@ -163,7 +167,7 @@ def batch(
     place = _place(copy_to, root)
     wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch, place)
     settings = BatchSettings(wish, _site_by(site_by, mission), tries, stall, retry, blocks)
-    report = _run(places, root, settings, _Running(executor, workers, share_detector, gpus))
+    report = _run(places, telemetry or (), root, settings, _Running(executor, workers, share_detector, gpus))
     if as_json:
         typer.echo(json.dumps(_plain(report, root), indent=1))
     else:
@@ -196,7 +200,9 @@ class _Running:
     gpus: float
 
 
-def _run(places: Sequence[str], root: Path, settings: "BatchSettings", wish: _Running) -> "BatchReport":
+def _run(
+    places: Sequence[str], receivers: Sequence[str], root: Path, settings: "BatchSettings", wish: _Running
+) -> "BatchReport":
     """The batch of folders, or of live sources, with its progress."""
     from sorvolo.cluster.batch import run_batch
     from sorvolo.cluster.streams import is_stream, run_streams, streams_of
@@ -213,7 +219,9 @@ def _run(places: Sequence[str], root: Path, settings: "BatchSettings", wish: _Ru
             shares_detector=len(live) > 1 if wish.shares_detector is None else wish.shares_detector,
         )
     executors = _executor_of(wish, settings)
-    streams = streams_of(live)
+    if receivers and not live:
+        raise SettingsError("--telemetry is for live sources; a recorded flight's log is found beside it")
+    streams = streams_of(live, receivers)
     with ended_by_signal([each.address for each in streams]) as until:
         running = (
             run_streams(streams, root, settings, executors, until) if streams

@@ -103,7 +103,7 @@ class Part:
 class Order:
     """One try at one flight, or at a `part` of one: the file, folder or address, the folder of the site, or of a
     watch's results, and how much its caches may take, MB. `detector` is the socket of one that the flights of its
-    machine share; "" for its own."""
+    machine share; "" for its own. `telemetry` is the receiver's address of a live source; "" for none."""
 
     source: str
     site: str
@@ -111,6 +111,7 @@ class Order:
     memory_mb: float | None = None
     part: Part | None = None
     detector: str = ""
+    telemetry: str = ""
 
     def line(self) -> bytes:
         """The order as it goes to the worker."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.capture.live.addresses import is_live_address, live_address, shown_address
+from sorvolo.capture.live.links import LINK_FORMS, is_link
 from sorvolo.capture.source import safe_name
 from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate
 from sorvolo.cluster.cost import cost_of
@@ -26,10 +27,12 @@ _NO_ROOM = "waits for memory that others have; it starts when it is known to be 
 
 @dataclass(frozen=True)
 class Stream:
-    """A live source, and the site that it is mapped into, or whose name its watches have. `shown` has no password."""
+    """A live source, the site that it is mapped into, or whose name its watches have, and the address of a receiver
+    beside it ("": none). `shown` has no password."""
 
     address: str
     site: str
+    telemetry: str = ""
 
     @property
     def shown(self) -> str:
@@ -37,17 +40,38 @@ class Stream:
         return shown_address(self.address).partition("?")[0] if "://" in self.address else self.address
 
 
-def streams_of(texts: Sequence[str]) -> list[Stream]:
-    """Streams given as ADDRESS or SITE=ADDRESS. Raises SettingsError for two of one site, InputError for no address."""
+def streams_of(texts: Sequence[str], receivers: Sequence[str] = ()) -> list[Stream]:
+    """Streams given as ADDRESS or SITE=ADDRESS, and their receivers as SITE=ADDRESS.
+
+    Raises SettingsError for two streams, or receivers, of one site and for a receiver of no stream, InputError for
+    what is no address.
+    """
+    telemetry = _receivers(receivers)
     found = []
     for text in texts:
         named = re.match(r"([A-Za-z0-9][\w.-]*)=(.+)", text)
         address = named[2] if named else text
         live_address(address)
-        found.append(Stream(address, named[1] if named else _name(address)))
+        site = named[1] if named else _name(address)
+        found.append(Stream(address, site, telemetry.pop(site, "")))
     sites = [each.site for each in found]
     if twice := next((each for each in sites if sites.count(each) > 1), ""):
         raise SettingsError(f"two streams would be mapped into the site {twice}; name the site of each: SITE=ADDRESS")
+    if telemetry:
+        raise SettingsError(f"--telemetry {next(iter(telemetry))}=...: there are streams of {', '.join(sites)}")
+    return found
+
+
+def _receivers(texts: Sequence[str]) -> dict[str, str]:
+    """The addresses of receivers by the site of their stream."""
+    found: dict[str, str] = {}
+    for text in texts:
+        site, equals, address = text.partition("=")
+        if not (equals and site and address) or site in found:
+            raise SettingsError(f"--telemetry {text}: give each stream's receiver once, as SITE=ADDRESS")
+        if not is_link(address):
+            raise SettingsError(f"--telemetry {text}: {address} is no receiver; give {LINK_FORMS}")
+        found[site] = address
     return found
 
 
@@ -96,7 +120,7 @@ class _Streams:
         self._table, self._settings, self._executor, self._until = table, settings, executor, until
         rows = [_row(each, settings) for each in streams]
         self.rows = {row.key: row for row in rows}
-        self._addresses = {row.key: each.address for row, each in zip(rows, streams)}
+        self._streams = {row.key: each for row, each in zip(rows, streams)}
         self._due_s: dict[Key, float] = dict.fromkeys(self.rows, 0.0)  # those that wait for their start
         self._put_off: Counter[Key] = Counter()  # how often in a row it was out of reach
         self._is_finishing = False
@@ -137,7 +161,10 @@ class _Streams:
             site = str((self._table.root / row.site).resolve())
             row = self._keep(replace(row, state=State.RUNNING, tries=row.tries + 1, words=""))
             self.tries += 1
-            order = Order(self._addresses[key], site, self._settings.wish, self._executor.cache_mb)
+            stream = self._streams[key]
+            order = Order(
+                stream.address, site, self._settings.wish, self._executor.cache_mb, telemetry=stream.telemetry
+            )
             self._executor.start(key, order, cost)
             yield self._update(row)
 

@@ -74,8 +74,8 @@ def watch_flight(
     outputs = watch_outputs(wish.watch, Path(order.site), is_live=is_live_address(order.source))
     folder: Path | None = None
     updates = watch(
-        order.source, watch_settings(wish.model, wish.watch), outputs, camera=wish.camera or None,
-        detector=detector, live=LiveSettings(give_up_s=wish.give_up_s), until=until,
+        order.source, watch_settings(wish.model, wish.watch), outputs, telemetry=order.telemetry or None,
+        camera=wish.camera or None, detector=detector, live=LiveSettings(give_up_s=wish.give_up_s), until=until,
     )
     with closing(updates):
         for update in updates:

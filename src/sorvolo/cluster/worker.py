@@ -167,8 +167,8 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
     site, wish = Path(order.site), order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
     updates = map_flights(
-        [order.source], site, settings, camera=wish.camera or None, detector=_detector(order), live=_live(order),
-        until=until,
+        [order.source], site, settings, telemetry=order.telemetry or None, camera=wish.camera or None,
+        detector=_detector(order), live=_live(order), until=until,
     )
     flight = _run(updates, site, alive)
     return flight, *headline_of(site, flight)
@@ -185,8 +185,8 @@ def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -
     if not founder or _is_flight(order.source, site, founder):
         return _map(order, alive, until)
     updates = compare_flights(
-        [order.source], site, CompareSettings(model=wish.model), camera=wish.camera or None, detector=_detector(order),
-        live=_live(order), until=until,
+        [order.source], site, CompareSettings(model=wish.model), telemetry=order.telemetry or None,
+        camera=wish.camera or None, detector=_detector(order), live=_live(order), until=until,
     )
     flight = _run(updates, site, alive)
     with Archive.open(site, write=False) as archive:
