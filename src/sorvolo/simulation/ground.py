@@ -23,6 +23,7 @@ from sorvolo.simulation.canvas import (
 from sorvolo.simulation.noise import FieldF32
 
 _Block: TypeAlias = tuple[float, float, float, float]  # west, south, east, north, m
+_NOWHERE: Floats = np.zeros((0, 3))  # of what a ground has none
 
 
 class GroundKind(StrEnum):
@@ -36,16 +37,12 @@ class GroundKind(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Where on the ground things may stand, in site metres: rows of (east, north, yaw_deg), each (N, 3).
-
-    `blocked` (N, 3) are circles (east, north, radius) where nothing else should stand.
-    """
+    """Where on the ground things may stand, in site metres: rows of (east, north, yaw_deg), each (N, 3)."""
 
     houses: Floats
     trees: Floats
     bushes: Floats
     parkings: Floats
-    blocked: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +65,7 @@ def orthophoto_ground(rgb: ImageRGB, m_per_px: float) -> PaintedGround:
         height * m_per_px / 2,
         (m_per_px, m_per_px),
     )
-    return PaintedGround(raster, Layout(*[np.zeros((0, 3))] * 5))
+    return PaintedGround(raster, Layout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE))
 
 
 def paint_ground(kind: GroundKind, area: Area, m_per_px: float, rng: np.random.Generator) -> PaintedGround:
@@ -105,13 +102,7 @@ def _dirt(canvas: Canvas) -> Layout:
             canvas.lay(0.75 * soft(-near, -0.22, 0.16), (122, 100, 76), 0.07, 0.08 * field(2.0, 0.5, 0.25))
     canvas.develop()
     canvas.stones(1.4, (0.05, 0.4), (164, 152, 136), np.clip(0.25 + gravel, 0, 1))
-    return Layout(
-        np.zeros((0, 3)),
-        np.zeros((0, 3)),
-        scatter(canvas, 0.004, 3.0, 2.0),
-        np.zeros((0, 3)),
-        np.zeros((0, 3)),
-    )
+    return Layout(_NOWHERE, _NOWHERE, scatter(canvas, 0.004, 3.0, 2.0), _NOWHERE)
 
 
 def _countryside(canvas: Canvas) -> Layout:
@@ -153,9 +144,7 @@ def _countryside(canvas: Canvas) -> Layout:
     trees = scatter(canvas, 1 / 150, 5.0, 3.0, far_from_houses)
     hedge = soft(-np.abs(border), -0.7, 0.2) + far_from_houses * soft(field(9.0, 3.0), 1.0, 0.2)
     bushes = scatter(canvas, 1 / 90, 1.6, 1.0, hedge)
-    return Layout(
-        houses, trees, bushes, np.zeros((0, 3)), _circles((houses, 7.5), (trees, 2.4), (bushes, 1.2))
-    )
+    return Layout(houses, trees, bushes, _NOWHERE)
 
 
 def _plant_rows(canvas: Canvas, cover: FieldF32, angle_deg: float, period_m: float,
@@ -187,10 +176,8 @@ def _urban(canvas: Canvas) -> Layout:
     garden = sum((rectangle_cover(canvas, w + 3, s + 3, e - 3, n - 3) for w, s, e, n in lawns), 0 * ones)
     trees = scatter(canvas, 1 / 90, 5.0, 1.0, garden)
     kerb_parkings = [(w - 1.3, 0.5 * (s + n) + d, 90.0) for w, s, _, n in blocks for d in (-6.0, 1.0)]
-    house_places = np.array(houses).reshape(-1, 3)
     return Layout(
-        house_places, trees, np.zeros((0, 3)), np.array(parkings + kerb_parkings).reshape(-1, 3),
-        _circles((house_places, 9.0), (trees, 2.4)),
+        np.array(houses).reshape(-1, 3), trees, _NOWHERE, np.array(parkings + kerb_parkings).reshape(-1, 3),
     )
 
 
@@ -304,11 +291,4 @@ def _sand(canvas: Canvas) -> Layout:
         ones, (206, 187, 152), 0.014, 0.012 * field(20, 8) + 0.006 * field(2.5, 0.9) + 0.004 * field(0.4)
     )
     canvas.develop((0.05, 0.12, 0.3), (1.0, 1.0, 1.0))
-    return Layout(*[np.zeros((0, 3))] * 5)
-
-
-def _circles(*groups: tuple[Floats, float]) -> Floats:
-    """(N, 3) circles around all places of the groups."""
-    return np.concatenate(
-        [np.column_stack([places[:, :2], np.full(len(places), radius)]) for places, radius in groups]
-    )
+    return Layout(_NOWHERE, _NOWHERE, _NOWHERE, _NOWHERE)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.capture.correction import corrected_poses, even_times_s, path_scale, rescaled, telemetry_faults
+from sorvolo.capture.flight_telemetry import FlightTelemetry
 from sorvolo.capture.live.klv_mux import mux_klv
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.capture.video import VideoSource
@@ -47,6 +48,16 @@ class _Solved:
     seconds: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """A flight whose own telemetry was compared with its map; the map shifted its clock by `applied_s`."""
+
+    setup: FlightSetup
+    track: FlightTelemetry
+    applied_s: float
+    faults: TelemetryFaults
+
+
 def correct_telemetry(
     site_folder: Path, folder: Path, *, flight: str = "", source: Path | None = None, telemetry: str | None = None,
     camera: str | None = None, cot: CotReceiver | None = None,
@@ -65,14 +76,14 @@ def correct_telemetry(
             raise InputError(f"{site_folder} was mapped without GPS: its cameras have no place on Earth to write down")
         if source is None:
             name = _flight(archive, flight)
-            return _written(archive, site, name, folder, _solved(archive, name, 0), None, None, cot)
+            return _written(site, name, folder, _solved(archive, name, 0), None, cot)
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
             name = _flight(archive, flight or opened.name)
             setup = prepare(opened, MapSettings(), site, telemetry_named=telemetry is not None)
             solved = _solved(archive, name, _first_ns(setup))
-            solved, faults = _judged(setup, solved, archive.report(name))
-            return _written(archive, site, name, folder, solved, setup, faults, cot)
+            solved, compared = _compared(setup, solved, archive.report(name))
+            return _written(site, name, folder, solved, compared, cot)
 
 
 def _flight(archive: Archive, wanted: str) -> str:
@@ -101,9 +112,9 @@ def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
     return sorted(solved, key=lambda each: each.seconds)
 
 
-def _judged(
+def _compared(
     setup: FlightSetup, solved: Sequence[_Solved], report: Mapping[str, Any]
-) -> tuple[list[_Solved], TelemetryFaults]:
+) -> tuple[list[_Solved], _Compared]:
     """The cameras in the fixes' own scale, and what was wrong with the telemetry by the frames that pictures placed."""
     track = setup.telemetry
     seen = [number for number, each in enumerate(solved) if each.stored.status is Status.VISION]
@@ -114,7 +125,8 @@ def _judged(
     scale = path_scale(priors, [solved[k].pose for k in seen])
     poses = rescaled([each.pose for each in solved], scale)
     faults = telemetry_faults(priors, [poses[k] for k in seen], clock, scale, knows_height=track.knows_ground)
-    return [replace(each, pose=pose) for each, pose in zip(solved, poses)], faults
+    scaled = [replace(each, pose=pose) for each, pose in zip(solved, poses)]
+    return scaled, _Compared(setup, track, applied_s, faults)
 
 
 def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
@@ -125,8 +137,8 @@ def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
 
 
 def _written(
-    archive: Archive, site: Site, name: str, folder: Path, solved: Sequence[_Solved], setup: FlightSetup | None,
-    faults: TelemetryFaults | None, cot: CotReceiver | None,
+    site: Site, name: str, folder: Path, solved: Sequence[_Solved], compared: _Compared | None,
+    cot: CotReceiver | None,
 ) -> dict[str, Any]:
     frames = [_frame(each, site) for each in solved]
     with writing(folder):
@@ -139,15 +151,15 @@ def _written(
     for file, text in texts.items():
         atomic_write_bytes(folder / file, text)
     files = [*texts]
-    if setup is not None and (video := _video(setup.source)) is not None:
-        _, applied_s = _clock(archive.report(name))
+    video = None if compared is None else _video(compared.setup.source)
+    if compared is not None and video is not None:
         with atomic_path(folder / f"{name}.ts") as temporary:
-            mux_klv(video, temporary, _samples(setup, solved, site, applied_s), site.height_reference)
+            mux_klv(video, temporary, _samples(compared, solved, site), site.height_reference)
         files.append(f"{name}.ts")
     report = dict(plain_json({
         "flight": name, "site": site.name, "frames": len(frames), "height_reference": site.height_reference,
-        "faults": None if faults is None else asdict(faults),
-        "sentences": [] if faults is None else fault_sentences(faults), "files": files,
+        "faults": None if compared is None else asdict(compared.faults),
+        "sentences": [] if compared is None else fault_sentences(compared.faults), "files": files,
         "warnings": _warnings(site),
     }))
     atomic_write_bytes(folder / "telemetry.json", json_bytes(report))
@@ -160,17 +172,15 @@ def _video(source: Source) -> Path | None:
     return source.info.path if isinstance(source, VideoSource) else None
 
 
-def _samples(
-    setup: FlightSetup, solved: Sequence[_Solved], site: Site, applied_s: float
-) -> list[CorrectedFrame]:
+def _samples(compared: _Compared, solved: Sequence[_Solved], site: Site) -> list[CorrectedFrame]:
     """The corrected camera five times a second, by the telemetry between the solved frames."""
-    assert setup.telemetry is not None  # faults were found
+    smooth_s = compared.setup.plan.smooth_s
     key_s = [each.seconds for each in solved]
     times_s = even_times_s(key_s, _KLV_STEP_S)
-    key_priors = setup.telemetry.priors(key_s, applied_s, setup.plan.smooth_s)
-    priors = setup.telemetry.priors(times_s, applied_s, setup.plan.smooth_s)
+    key_priors = compared.track.priors(key_s, compared.applied_s, smooth_s)
+    priors = compared.track.priors(times_s, compared.applied_s, smooth_s)
     poses = corrected_poses(times_s, priors, key_s, key_priors, [each.pose for each in solved])
-    stored, first_ns = solved[0].stored, _first_ns(setup)
+    stored, first_ns = solved[0].stored, _first_ns(compared.setup)
     return [
         _row("", number, first_ns + round(time_s * 1e9), time_s, pose, stored.camera, nan, "interpolated", site)
         for number, (time_s, pose) in enumerate(zip(times_s, poses))
