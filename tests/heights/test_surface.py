@@ -11,6 +11,7 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.heights.figures import surface_figures, surface_warnings
+from sorvolo.heights.islands import IslandSettings
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
 from sorvolo.heights.relief import relief_picture
@@ -248,8 +249,8 @@ def test_a_roof_that_reaches_out_of_the_photos_is_right_or_a_hole(one_strip: Sur
 
 def test_a_pattern_that_repeats_fits_at_several_heights_and_is_a_hole() -> None:
     views = [
-        replace(each, site_from_camera=Pose(NADIR_CAMERA_NORTH_UP, np.array([12.0 * k - 12, 0, 30])))
-        for k, each in enumerate(survey_views(strips=1, photos=3, side_px=240))
+        replace(each, site_from_camera=Pose(NADIR_CAMERA_NORTH_UP, np.array([12.0 * k - 6, 0, 30])))
+        for k, each in enumerate(survey_views(strips=1, photos=2, side_px=240))
     ]
     patch = np.random.default_rng(8).uniform(40, 215, (8, 4, 3)).astype(np.float32)
     side_m = 12 * 1.5 / (30 - 1.5)  # the photos lie alike on planes 1.5 m apart
@@ -267,9 +268,10 @@ def test_a_pattern_that_repeats_fits_at_several_heights_and_is_a_hole() -> None:
 
     points = np.array([[-1.0, 0, 0], [0, 1, 0], [1, -2, 0], [1, 2, 0.1]])
     holes, wrong = [], []
-    for settings in (SurfaceSettings(), SurfaceSettings(unsure_cells=np.inf)):
+    for unsure_cells in (3.0, np.inf):
+        settings = SurfaceSettings(unsure_cells=unsure_cells, islands=IslandSettings(most_cells=0))
         *_, found = sweep_surface(lattice, views, gray, points, SmoothSigma(), settings)
         assert isinstance(found, Surface)
         holes.append(np.isnan(found.up_m).mean())
         wrong.append((np.abs(found.up_m) > 1).mean())
-    assert holes[0] > 0.2 and holes[1] < 0.1 and wrong[0] < 0.6 * wrong[1], (holes, wrong)
+    assert holes[0] > 0.2 and holes[1] < 0.1 and wrong[0] < 0.7 * wrong[1], (holes, wrong)

@@ -21,8 +21,8 @@ class IslandSettings:
     margin_cells: int = 48  # ... with so many around
 
 
-def islands(up_m: Floats32, seen_by: ImageGray, cell_m: float, settings: IslandSettings = IslandSettings()) -> Mask:
-    """(H, W) the cells of a height model, NaN in holes, that stand alone where `seen_by` (H, W) photos are too few."""
+def islands(up_m: Floats32, shown_by: ImageGray, cell_m: float, settings: IslandSettings = IslandSettings()) -> Mask:
+    """(H, W) the cells of a height model, NaN in holes, that stand alone where `shown_by` (H, W) photos are too few."""
     found = np.zeros(up_m.shape, bool)
     margin = settings.margin_cells
     for x0, y0, x1, y1 in _windows(up_m.shape, settings.window_cells):
@@ -30,7 +30,7 @@ def islands(up_m: Floats32, seen_by: ImageGray, cell_m: float, settings: IslandS
         here = slice(top, y1 + margin), slice(left, x1 + margin)
         alone = _alone(up_m[here], settings.step_cells * cell_m, settings.most_cells)
         found[y0:y1, x0:x1] = alone[y0 - top:y1 - top, x0 - left:x1 - left]
-    return found & (seen_by <= settings.photos)
+    return found & (shown_by <= settings.photos)
 
 
 def _windows(shape: tuple[int, ...], side: int) -> Iterator[tuple[int, int, int, int]]:

@@ -30,7 +30,7 @@ class SurfaceSettings:
     apron_cells: int = 10  # beyond a tile, so that neighbouring tiles agree: more than half a patch
     coarse_apron_cells: int = 5  # of the first sweep, whose patches are smaller
     margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
-    unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which a cell stays a hole
+    unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which one pair decides nothing
     islands: IslandSettings = field(default_factory=IslandSettings)
     match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
     relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
@@ -67,7 +67,7 @@ def sweep_surface(
     side = _tile_cells(lattice.cell_m, views, settings)
     coarse = _coarse(lattice.coarser(settings.coarser), views, pictures, everywhere, settings)
     up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
-    covered, seen_by = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, np.uint8)
+    covered, shown_by = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, np.uint8)
     tiles = list(lattice.windows(side))
     for number, (x0, y0, x1, y1) in enumerate(tiles):
         apron = settings.apron_cells
@@ -76,14 +76,15 @@ def sweep_surface(
         if bounds is not None:
             swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep)
             found = _calmed(swept)
-            found[swept.deviation_m > settings.unsure_cells * lattice.cell_m] = np.nan
+            unsure = swept.deviation_m > settings.unsure_cells * lattice.cell_m
+            found[unsure & (swept.shown_by <= settings.islands.photos)] = np.nan
             sigma = _sigma_m(swept, found, window, camera_sigma, settings)
             inner = slice(apron, -apron), slice(apron, -apron)
             up_m[y0:y1, x0:x1], sigma_m[y0:y1, x0:x1] = found[inner], sigma[inner]
             covered[y0:y1, x0:x1] = (swept.seen_by[inner] >= 2) | np.isfinite(found[inner])
-            seen_by[y0:y1, x0:x1] = swept.seen_by[inner]
+            shown_by[y0:y1, x0:x1] = swept.shown_by[inner]
         yield (number + 1) / len(tiles)
-    alone = islands(up_m, seen_by, lattice.cell_m, settings.islands)
+    alone = islands(up_m, shown_by, lattice.cell_m, settings.islands)
     up_m[alone], sigma_m[alone] = np.nan, np.nan
     yield Surface(lattice, up_m, sigma_m, covered)
 

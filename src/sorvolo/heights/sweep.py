@@ -48,14 +48,15 @@ class Bounds:
 @dataclass(frozen=True, eq=False)
 class Swept:
     """Heights of a window of cells, (H, W) each: `up_m` NaN where nothing agrees, the agreement (0 to 1), how many
-    photos see the cell, the tangent of the angle between the two of them farthest apart, and how far from the height
-    those lie that are likely too."""
+    photos see the cell, the tangent of the angle between the two of them farthest apart, how far from the height
+    those lie that are likely too, and how many photos see the cell at its height."""
 
     up_m: Floats32
     score: Floats32
     seen_by: Floats32
     spread: Floats32
     deviation_m: Floats32
+    shown_by: Floats32
 
 
 def sweep(
@@ -72,7 +73,7 @@ def sweep(
     shape = lattice.shape
     if len(chosen) < 2:
         nothing = np.full(shape, np.nan, np.float32)
-        return Swept(nothing, *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0, np.nan)))
+        return Swept(nothing, *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0, np.nan, 0.0)))
     spreads = _spreads(lattice, [views[k] for k in chosen], bounds.usual_m)
     finest_m = settings.level_px * lattice.cell_m / max(float(spreads.max()), 0.05)
     level_m = max(finest_m, (high_m - low_m) / (settings.most_levels - 1))
@@ -88,7 +89,8 @@ def sweep(
     up_m, score = _best(total, agreement, levels)
     deviation = _deviation(total, up_m, levels, settings)
     up_m[~(score >= settings.least_score)] = np.nan  # no two photos see the height that fits, or they do not agree
-    return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation)
+    shown_by = np.sum([each.shows(up_m, min(settings.window_cells)) for each in laid], axis=0).astype(np.float32)
+    return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation, shown_by)
 
 
 def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: int) -> list[int]:
@@ -196,6 +198,16 @@ class _Laid:
         for line in lines[~inside.all(axis=1)]:
             known &= line[0] * columns + (line[1] * rows + line[2]) >= 0
         return known
+
+    def shows(self, up_m: Floats32, side: int) -> Mask:
+        """(H, W) where a patch lies in the photo as a whole at each cell's own height, (H, W); nowhere for NaN."""
+        inset = 0.5 * (side * self._px_per_cell + self._apron)
+        columns, rows = np.arange(self._shape[1]), np.arange(self._shape[0])[:, None]
+        (w, h), (x, y, z) = self._size, (
+            level[0] * columns + (level[1] * rows + level[2]) + up[2] * up_m for level, up in zip(self._level, self._up)
+        )
+        left, top = x - inset * z, y - inset * z
+        return (left >= 0) & (top >= 0) & (x <= (w - 1 - inset) * z) & (y <= (h - 1 - inset) * z)
 
     def _picture_from_cells(self, up_m: float) -> Matrix3:
         return np.asarray(self._level + up_m * self._up)
