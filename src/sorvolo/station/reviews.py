@@ -200,7 +200,7 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
 
     @router.post("", status_code=201)
     def give(site: str, wish: ReviewWish, holder: Holder = Depends(needs(Role.REVIEW))) -> dict[str, Any]:  # noqa: B008
-        """Confirm or reject an object, a change or a finding, or take a verdict back. 409 where another came first."""
+        """Confirm or reject an object, a change or a finding, or withdraw a verdict. 409 where another came first."""
         return asdict(reviews.give(site, wish, holder.name))
 
     return router

@@ -125,7 +125,7 @@ function showSettings() {
       tick("Sound when something appears in an alert zone", choices.get("sound"), set("sound")),
       el("h3", {}, "Keys"),
       el("dl", { class: "keys" }, [
-        ["1 … 7", "panels"], ["J / K", "next and previous in the review"], ["C / R / U", "confirm, reject, take back"],
+        ["1 … 7", "panels"], ["J / K", "next and previous in the review"], ["C / R / U", "confirm, reject, withdraw"],
         ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["Esc", "end drawing, close"],
       ].map(([key, words]) => [el("dt", {}, key), el("dd", {}, words)])),
       who ? el("p", { class: "note" }, `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,

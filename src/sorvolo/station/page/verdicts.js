@@ -22,7 +22,7 @@ export async function judge(screen, feature, verdict, note = null) {
     const theirs = problem.more.current;
     if (theirs) screen.data.judge(theirs);
     else Object.assign(values, { review: null, revision: 0 });
-    message(theirs ? `${theirs.who} was quicker: ${wordsOf(theirs.verdict)}${theirs.note ? `, “${theirs.note}”` : ""}` : "The verdict was taken back meanwhile",
+    message(theirs ? `${theirs.who} was quicker: ${wordsOf(theirs.verdict)}${theirs.note ? `, “${theirs.note}”` : ""}` : "The verdict was withdrawn meanwhile",
       { kind: "warning", todo: "Yours was not saved. Look at it, and give it again if you still want to." });
     return false;
   }
