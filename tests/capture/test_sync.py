@@ -260,6 +260,16 @@ def test_absolute_heights_alone_leave_the_ground_unknown(column):
     assert np.allclose(np.diff(track.up_m), 0.05)
 
 
+def test_a_height_that_would_be_below_unknown_ground_counts_as_unknown():
+    """A poor receiver's height that lags behind the climb: taken as it is, it would draw the camera to the ground."""
+    heights = np.concatenate([np.linspace(30, 55, 5), np.full(16, 110.0)])
+    track, _ = track_of(straight(ONE_HZ, orthometric_height_m=heights))
+    below, above = track.prior(1.0), track.prior(10.0)
+    assert np.isinf(below.position_sigma_m[2]) and np.isfinite(below.position_sigma_m[:2]).all()
+    assert below.position_m[2] == pytest.approx(40.0) and np.allclose(below.position_m[:2], [4.0, 1.0], atol=1e-3)
+    assert above.position_m[2] == pytest.approx(40.0) and np.isfinite(above.position_sigma_m).all()
+
+
 @pytest.mark.parametrize("column", ["orthometric_height_m", "ellipsoidal_height_m"])
 def test_a_given_ground_makes_them_heights_above_it(column):
     track, notices = track_of(straight(ONE_HZ, **{column: 110.0}), ground_elevation_m=85.0)

@@ -160,7 +160,7 @@ class Track:
         """
         place, sigma_m, velocity = self._place(time_s, smooth_s)
         rotation, sigma_deg, words = self._attitude(time_s, velocity)
-        known = np.isfinite(place)
+        known = np.isfinite(place) & ~(self._is_below_ground(place[2]) & np.array([False, False, True]))
         sigma = np.where(known, sigma_m, np.inf)
         return CameraPrior(
             np.where(known, place, self._nearest(time_s)), sigma, rotation, sigma_deg, np.nan_to_num(velocity),
@@ -209,7 +209,13 @@ class Track:
         if not len(good):
             return np.array([0.0, 0.0, 40.0])
         row = good[int(np.argmin(np.abs(self.sample_s[good] - time_s)))]
-        return np.array([*self.east_north_m[row], max(self.up_m[row], 1.0)])
+        above = self.up_m[self.up_m > 0]
+        usual_m = float(np.median(above)) if self._is_below_ground(self.up_m[row]) and len(above) else 1.0
+        return np.array([*self.east_north_m[row], max(self.up_m[row], usual_m)])
+
+    def _is_below_ground(self, up_m: float) -> bool:
+        """Whether a height whose zero is not known to be the ground cannot be right: it counts as unknown."""
+        return bool(up_m <= 0 and not np.isfinite(self.altitude_offset_sigma_m))
 
     def _attitude(self, time_s: float, velocity_m_s: Vector3) -> tuple[Floats, Floats, str]:
         if self.attitude != "none" and self.sample_s[0] - 2 <= time_s <= self.sample_s[-1] + 2:
