@@ -26,6 +26,7 @@ from sorvolo.change.evidence.cells import CellWindow, LaidView
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.shape.outlines import Measures
 from sorvolo.change.shape.place_sigma import area_sigma_m, thing_sigma_m
+from sorvolo.change.shape.reported import reported
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.camera import Camera
 from sorvolo.survey.findings import Change, ChangeKind
@@ -405,3 +406,12 @@ def test_sigma_knows_that_a_thin_outline_holds_a_part_of_a_shadow():
     car, with_shadow = Measures(8.0, 4.5, (0.0, 0.0)), Measures(0.66, 1.9, (0.0, 0.0))
     assert thing_sigma_m(car) < 0.03 and 0.3 < thing_sigma_m(with_shadow) < 0.6
     assert area_sigma_m(Measures(1000.0, 200.0, (0.0, 0.0))) == pytest.approx(6.0)
+
+
+def test_what_an_outline_errs_by_is_that_of_the_one_that_is_reported():
+    """Not of a whole that it was parted from, nor of the one with its shadow."""
+    for size_m, least_m, most_m in (((1.0, 1.0), 0.0, 0.02), ((0.3, 1.9), 0.3, 0.6)):
+        found, = collect(flight([Thing(0, 0, size_m)]))[0].conclude()
+        change, = reported([found], 0.5, [])
+        assert found.sigma_m < 0.1 and change.sigma_m == pytest.approx(np.hypot(change.sigma_in_map_m, 0.5))
+        assert least_m <= np.sqrt(change.sigma_in_map_m**2 - found.sigma_m**2) < most_m

@@ -168,3 +168,11 @@ def test_a_walker_seen_from_aside_is_placed_where_the_feet_are(north_m):
     feet_m = thing.outline_m((change.last_seen_ns - flight_start_ns()) * 1e-9).mean(axis=0)
     assert np.hypot(*(change.outline_m.mean(axis=0) - feet_m)) < 0.12
     assert change.length_m < 1.0
+
+
+@pytest.mark.parametrize("speed_m_s", [0.8, 1.2])
+def test_what_is_long_and_slow_has_the_views_that_it_needs_to_go_its_length(speed_m_s):
+    lorry = Thing(-1.0, -2.7 * speed_m_s, (1.6, 3.6), colour=(60, 200, 60), velocity_m_s=(0, speed_m_s))
+    _, final = events(flight([lorry], seconds=8.0, speed_m_s=1.2, start_m=(-5.0, 0.0)))
+    assert [each.kind for each in final] == [ChangeKind.MOVING]
+    assert np.abs(final[0].velocity_m_s - [0, speed_m_s]).max() < 0.2

@@ -17,7 +17,7 @@ from sorvolo.change.areas.ground_sums import GroundSums
 from sorvolo.change.areas.segments import AreaSettings, GroundSigns, segments
 from sorvolo.change.areas.signs import AreaSigns, SignSettings, area_signs
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
-from sorvolo.change.shape.place_sigma import area_sigma_m, place_sigma_m
+from sorvolo.change.shape.place_sigma import place_sigma_m
 from sorvolo.geometry.arrays import Mask, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
@@ -117,7 +117,7 @@ class AreaMap:
         return Change(
             "", ChangeKind.AREA, score, outline_m, *self._ground.span_ns,
             round(float(self._ground.sums["agree"][cells].mean())), float(np.count_nonzero(cells)) * cell_m**2,
-            size.length_m, place_sigma_m(self._ground.residual_m, cell_m, area_sigma_m(size), 0.0),
+            size.length_m, place_sigma_m(self._ground.residual_m, cell_m, 0.0),
             self._ground.patch(outline_m),
         )
 

@@ -11,7 +11,7 @@ from sorvolo.change.areas.ground_sums import GroundSums
 from sorvolo.change.pair.learned_difference import LearnedSettings, learned_difference
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
-from sorvolo.change.shape.place_sigma import place_sigma_m, thing_sigma_m
+from sorvolo.change.shape.place_sigma import place_sigma_m
 from sorvolo.geometry.arrays import Mask
 from sorvolo.survey.findings import Change, ComparedView, Shade
 
@@ -101,7 +101,7 @@ class GatheredThings:
             return None
         patch, size = self._ground.patch(outline_m), measures(outline_m)
         rows, columns = np.nonzero(cells)
-        sigma_m = place_sigma_m(self._ground.residual_m, np.sqrt(12) * cell_m, thing_sigma_m(size), 0.0)
+        sigma_m = place_sigma_m(self._ground.residual_m, np.sqrt(12) * cell_m, 0.0)
         views = float(self._ground.sums["agree"][rows + corner[1], columns + corner[0]].mean())
         return Change(
             "", kind_of(patch), score, outline_m, *self._ground.span_ns, max(round(views), 1), size.area_m2,

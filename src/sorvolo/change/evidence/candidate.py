@@ -14,7 +14,7 @@ from sorvolo.change.evidence.level_ground import Sights
 from sorvolo.change.evidence.pictures import Pictures, PictureSettings
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import measures
-from sorvolo.change.shape.place_sigma import aside_of, place_sigma_m, thing_sigma_m
+from sorvolo.change.shape.place_sigma import aside_of, place_sigma_m
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
@@ -159,7 +159,7 @@ class Candidate:
         size = measures(outline_m)
         residual_m = tally.residual_m_sum / max(tally.views, 1)
         spread_m = float(np.sqrt(np.mean(np.var(self._places, axis=0)))) if len(self._places) > 1 else 0.0
-        placed_m = place_sigma_m(residual_m, cell_m, thing_sigma_m(size), aside_of(outline_m, self.cameras_m))
+        placed_m = place_sigma_m(residual_m, cell_m, aside_of(outline_m, self.cameras_m))
         sigma_m = np.hypot(placed_m, spread_m / np.sqrt(max(len(self._places), 1)))
         return Change(
             f"{id_prefix}-{self.number}", self._kind, score, outline_m, tally.first_seen_ns, tally.last_seen_ns,

@@ -1,7 +1,7 @@
 """What moves while it is seen: changed blobs are followed as sightings, and those that no parallax explains move."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -53,7 +53,8 @@ class MovingSettings:
     most_lengths_s: float = 4.0  # ... and lengths a second more: a car of 4 m may go 19 m/s
     forget_s: float = 2.5  # what was not seen for so long is judged anew ...
     forget_views: int = 2  # ... and for so many views
-    points: int = 12  # of a track are judged, the last ones
+    points: int = 12  # of a track are judged, the last ones ...
+    slow_points: int = 36  # ... or, as something long may need so many views to go its own length, so many
     parallax: ParallaxSettings = field(default_factory=ParallaxSettings)
     blobs: BlobSettings = field(default_factory=BlobSettings)
     sightings: SightingSettings = field(default_factory=SightingSettings)
@@ -74,7 +75,10 @@ class MovingSettings:
 
 @dataclass(frozen=True, eq=False)
 class BlobTrack:
-    """One blob over time, by its number: its first point, the last few, how many, and the sum of their scores."""
+    """One blob over time, by its number: its first point, the last few, how many, and the sum of their scores.
+
+    `older` are those before the last few.
+    """
 
     number: int
     first: TrackPoint
@@ -82,6 +86,7 @@ class BlobTrack:
     count: int
     score_sum: float
     moves: bool = False
+    older: tuple[TrackPoint, ...] = ()
 
     @property
     def last(self) -> TrackPoint:
@@ -89,26 +94,25 @@ class BlobTrack:
         return self.points[-1]
 
     @property
-    def seconds(self) -> float:
-        """The time over which its last points are spread."""
-        return (self.points[-1].time_ns - self.points[0].time_ns) * 1e-9
-
-    @property
     def velocity_m_s(self) -> Floats:
         """(2,) over its last points; zeros while there is but one."""
         return motion(self.points).velocity_m_s if len(self.points) > 1 else np.zeros(2)
 
-    def with_point(self, point: TrackPoint, oldest_ns: int, most: int) -> "BlobTrack":
+    def with_point(self, point: TrackPoint, oldest_ns: int, settings: MovingSettings) -> "BlobTrack":
         """The track, one view longer; points from before a gap, last seen before `oldest_ns`, are judged no more."""
-        points = (*self.points, point)[-most:] if self.last.time_ns >= oldest_ns else (point,)
-        return replace(self, points=points, count=self.count + 1, score_sum=self.score_sum + point.blob.score)
+        known = (*self.older, *self.points) if self.last.time_ns >= oldest_ns else ()
+        points = (*known, point)[-settings.slow_points :]
+        return replace(
+            self, points=points[-settings.points :], older=points[: -settings.points], count=self.count + 1,
+            score_sum=self.score_sum + point.blob.score,
+        )
 
     def joined(self, gone: "BlobTrack") -> "BlobTrack":
         """This track and another of the same thing; the points of the one seen last count."""
         first, last = sorted((self, gone), key=lambda each: each.last.time_ns)
         return BlobTrack(
             self.number, min(self.first, gone.first, key=lambda each: each.time_ns), last.points,
-            first.count + last.count, first.score_sum + last.score_sum, self.moves or gone.moves,
+            first.count + last.count, first.score_sum + last.score_sum, self.moves or gone.moves, last.older,
         )
 
 
@@ -171,7 +175,7 @@ class BlobTracker:
         known = self._tracks.get(number)
         if known is None:
             return BlobTrack(number, point, (point,), 1, point.blob.score)
-        track = known.with_point(point, oldest_ns, self._settings.points)
+        track = known.with_point(point, oldest_ns, self._settings)
         return replace(track, moves=track.moves or self._is_mover(track))
 
     def _forget(self, oldest_ns: int) -> None:
@@ -188,13 +192,22 @@ class BlobTracker:
         parallax = settings.parallax
         move = motion(track.points, parallax)
         length_m = float(np.median([each.blob.length_m for each in track.points]))
-        if not _is_plausible(track, move, length_m, settings) or goes_with_camera(move):
-            return False
-        needed_m = max(settings.least_move_m, settings.least_lengths * length_m)
-        is_own = move.path_m > needed_m and float(np.hypot(*move.own_m_s)) > parallax.least_own * move.speed_m_s
-        return is_own or is_rigid(track.points, length_m, parallax) or (
-            are_photos and floats(track.points, move, length_m, parallax)
+        slow = (*track.older, *track.points)
+        if self._goes_its_length(track.points, move, length_m) or (
+            track.older and self._goes_its_length(slow, motion(slow, parallax), length_m)
+        ):
+            return True
+        return _is_plausible(track.points, move, length_m, settings) and (
+            is_rigid(track.points, length_m, parallax)
+            or (are_photos and floats(track.points, move, length_m, parallax))
         )
+
+    def _goes_its_length(self, points: Sequence[TrackPoint], move: Motion, length_m: float) -> bool:
+        """Whether a thing of this length plausibly goes far enough by a motion that no parallax explains."""
+        settings = self._settings
+        needed_m = max(settings.least_move_m, settings.least_lengths * length_m)
+        is_own = float(np.hypot(*move.own_m_s)) > settings.parallax.least_own * move.speed_m_s
+        return is_own and move.path_m > needed_m and _is_plausible(points, move, length_m, settings)
 
     def _are_photos(self, track: BlobTrack) -> bool:
         """Whether the views were taken seldom while the track lasted."""
@@ -221,7 +234,9 @@ def _footprint_m(view: ComparedView) -> PointsM | None:
     return outline_m if np.isfinite(outline_m).all() else None
 
 
-def _is_plausible(track: BlobTrack, move: Motion, length_m: float, settings: MovingSettings) -> bool:
-    """Whether a thing of this length may be so fast, and its track is steady enough."""
-    is_steady = move.error_m < 0.05 + 0.03 * (move.speed_m_s * track.seconds + length_m)
-    return settings.least_length_m <= length_m and move.speed_m_s <= settings.fastest_m_s(length_m) and is_steady
+def _is_plausible(points: Sequence[TrackPoint], move: Motion, length_m: float, settings: MovingSettings) -> bool:
+    """Whether a thing of this length may be so fast, goes steadily enough, and not about as the camera does."""
+    seconds = (points[-1].time_ns - points[0].time_ns) * 1e-9
+    is_steady = move.error_m < 0.05 + 0.03 * (move.speed_m_s * seconds + length_m)
+    is_possible = settings.least_length_m <= length_m and move.speed_m_s <= settings.fastest_m_s(length_m)
+    return is_possible and is_steady and not goes_with_camera(move)

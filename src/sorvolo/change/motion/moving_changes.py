@@ -9,7 +9,7 @@ from sorvolo.change.motion.blob_tracker import BlobTrack, MovingBlobs
 from sorvolo.change.motion.blobs import standing_outline_m
 from sorvolo.change.shape.outlines import measures
 from sorvolo.change.shape.patches import PatchWindow, cut, patch_of
-from sorvolo.change.shape.place_sigma import aside_of, place_sigma_m, thing_sigma_m
+from sorvolo.change.shape.place_sigma import aside_of, place_sigma_m
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 
@@ -64,7 +64,7 @@ class Movers:
         return Change(
             change_id, ChangeKind.MOVING, float(np.clip(score, 0, 1)), outline_m, track.first.time_ns,
             track.last.time_ns, track.count, size.area_m2, size.length_m,
-            place_sigma_m(residual_m, self._cell_m, thing_sigma_m(size), aside_of(outline_m, view.camera_m[None])),
+            place_sigma_m(residual_m, self._cell_m, aside_of(outline_m, view.camera_m[None])),
             patch_of(window, cut(view, window), outline_m),
             track.velocity_m_s, announced_ns=view.time_ns,
         )

@@ -20,13 +20,14 @@ class PlaceSettings:
 
 
 def place_sigma_m(
-    residual_m: float, cell_m: float, outline_sigma_m: float, aside: float, settings: PlaceSettings = PlaceSettings()
+    residual_m: float, cell_m: float, aside: float, settings: PlaceSettings = PlaceSettings()
 ) -> float:
     """The root of the sum of squares of: the views' alignment residual on the ground; a cell's rounding, its side /
-    sqrt(12); the map's local error; the outline's; and the thing's lean, `aside` (tangent of the angle by which the
-    views together look at it from one side) times the height of its middle, per axis."""
+    sqrt(12); the map's local error; and the thing's lean, `aside` (tangent of the angle by which the views together
+    look at it from one side) times the height of its middle, per axis. What the outline errs by comes to it when that
+    is final (`reported`)."""
     lean_m = settings.middle_up_m * aside / np.sqrt(2)
-    return float(np.linalg.norm([residual_m, cell_m / np.sqrt(12), settings.map_m, outline_sigma_m, lean_m]))
+    return float(np.linalg.norm([residual_m, cell_m / np.sqrt(12), settings.map_m, lean_m]))
 
 
 def thing_sigma_m(size: Measures, settings: PlaceSettings = PlaceSettings()) -> float:
