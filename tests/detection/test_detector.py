@@ -9,6 +9,7 @@ import pytest
 from toy_models import CLASSES, draw, rectangle_model
 
 import sorvolo
+import sorvolo.detection.detector as detector_module
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
 
@@ -94,6 +95,26 @@ def test_several_pictures_of_different_sizes(detector: Detector, picture: np.nda
         assert isinstance(found, list) and len(found) == 2
         np.testing.assert_array_equal(found[0].boxes_px, alone.boxes_px)
     assert detector.detect([]) == []
+
+
+def test_large_cars_are_seen_in_a_smaller_look_and_people_in_the_picture(
+    detector: Detector, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picture = draw((900, 1200), [(10, 20, 50, 80), (300, 300, 900, 600)], labels=[0, 1], scores=[200, 250])
+    scales = []
+
+    def noted(session: object, rgb: object, place_px: object, scale: float) -> object:
+        scales.append(scale)
+        return look(session, rgb, place_px, scale)
+
+    look = detector_module._look
+    monkeypatch.setattr(detector_module, "_look", noted)
+    longest_px = detector.info.best_px["car"][1]
+    seen = detector.detect(picture, tiles="auto", m_per_px=4.4 / (1.5 * longest_px))
+    assert scales == pytest.approx([1.0, 1 / 1.5])
+    assert seen.names == ["car", "person"], "each once, best first"
+    np.testing.assert_allclose(seen.boxes_px, [(300, 300, 900, 600), (10, 20, 50, 80)], atol=2)
+    assert len(detector.detect(picture)) == 2 and scales[2:] == [1.0], "unknown ground is looked at once"
 
 
 def test_each_class_has_its_own_threshold(detector: Detector) -> None:

@@ -9,7 +9,15 @@ from toy_models import draw, rectangle_model
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.tiling import MOST_AT_ONCE_PX, MOST_WHOLE_PX, TASK, plan_tiles, scale_for, whole_m_per_px
+from sorvolo.detection.tiling import (
+    MOST_AT_ONCE_PX,
+    MOST_WHOLE_PX,
+    TASK,
+    looks_for,
+    plan_tiles,
+    scale_for,
+    whole_m_per_px,
+)
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, required_px_per_m
 from sorvolo.survey.objects import CLASSES
@@ -60,6 +68,14 @@ class TestScale:
         other = ModelInfo("m", ("boat",), {"boat": 0.5}, {"boat": (9.0, 90.0)})
         assert scale_for(other, 0.5, other.classes) == 1
 
+
+    def test_cars_much_longer_than_the_model_knows_get_a_look_of_their_own(self) -> None:
+        assert looks_for(_INFO, 4.4 / 250, CLASSES) == looks_for(_INFO, math.nan, CLASSES) == (CLASSES,)
+        people, cars = looks_for(_INFO, 4.4 / 300, CLASSES)
+        assert (people, cars) == (("person", "small object"), ("car",))
+        assert scale_for(_INFO, 4.4 / 300, people) == 1
+        assert 300 * scale_for(_INFO, 4.4 / 300, cars) == pytest.approx(_BEST_PX["car"][1])
+        assert looks_for(_INFO, 4.4 / 300, ["car"]) == (("car",),)  # alone it decides the only look
 
     def test_a_person_in_a_thermal_frame_has_twice_the_pixels(self) -> None:
         for m_per_px in (0.08, 0.12):

@@ -14,7 +14,7 @@ from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import find_model, thermal_model
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
-from sorvolo.detection.tiling import Tiles, plan_tiles
+from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles
 from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
@@ -158,9 +158,13 @@ class Detector:
         asked = [name for name in wanted if name in session.info.classes]
 
         def whole(shown: ImageRGB) -> Seen:
+            groups = looks_for(session.info, m_per_px, asked, thermal) if tiles == "auto" else (tuple(asked),)
+            return _together([look(shown, names) for names in groups], groups, session.info.classes)
+
+        def look(shown: ImageRGB, names: Sequence[str]) -> Seen:
             size_px = shown.shape[0], shown.shape[1]
             plan = plan_tiles(
-                size_px, session.info, asked, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px,
+                size_px, session.info, names, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px,
                 thermal=thermal,
             )
             looks = [SeenTile(place, _look(session, shown, place, plan.scale)) for place in plan.places_px]
@@ -199,6 +203,19 @@ class Detector:
 
     def _opened(self, path: Path) -> Session:
         return Session(path, self._wanted_provider, self._threads, self._shared)
+
+
+def _together(looks: Sequence[Seen], groups: Sequence[Sequence[str]], classes: Sequence[str]) -> Seen:
+    """What looks at one picture saw, each of its own group of classes, best first."""
+    if len(looks) == 1:
+        return looks[0]
+    kept = [np.isin(look.labels, [classes.index(name) for name in names]) for look, names in zip(looks, groups)]
+    scores = np.concatenate([look.scores[mine] for look, mine in zip(looks, kept)])
+    order = np.argsort(-scores, kind="stable")
+    return Seen(
+        np.concatenate([look.boxes_px[mine] for look, mine in zip(looks, kept)])[order], scores[order],
+        np.concatenate([look.labels[mine] for look, mine in zip(looks, kept)])[order],
+    )
 
 
 def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:

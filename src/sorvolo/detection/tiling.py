@@ -27,6 +27,7 @@ TASK = Task.RECOGNITION
 _MOST_LARGER = 3.0  # magnified further, a picture is only blurred more
 _THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal optics blur, and clothes hide limbs
 _THERMAL_LARGER = 1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
+_MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a look of its own, which costs half or less
 _LEAST_OVERLAP_PX, _SPARE = 64, 1.15
 _LEAST_SIDE_PX = 64
 
@@ -62,6 +63,25 @@ def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: 
     if least > 1:
         return min(least, _MOST_LARGER)
     return min(1.0, max(least, most))
+
+
+def looks_for(
+    info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: bool = False
+) -> tuple[tuple[str, ...], ...]:
+    """The `wanted` classes by the look that finds them, each at the `scale_for` its own classes.
+
+    One look, but where people are shown so large that another class (cars) is much longer than the model knows,
+    `best_px`: that class is then looked for in a smaller copy of the picture.
+    """
+    if not 0 < m_per_px < math.inf:
+        return (tuple(wanted),)
+    px_per_m = scale_for(info, m_per_px, wanted, thermal) / m_per_px
+    large = tuple(
+        name for name in wanted
+        if name in TYPICAL_SIZE_M and TYPICAL_SIZE_M[name][0] * px_per_m > _MUCH_LONGER * info.best_px[name][1]
+    )
+    others = tuple(name for name in wanted if name not in large)
+    return (others, large) if others and large else (tuple(wanted),)
 
 
 def needed_px_per_m(info: ModelInfo, name: str, length_m: float) -> float:
