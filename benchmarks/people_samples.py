@@ -130,7 +130,7 @@ def places(scene: Scene, px_per_m: float, side: int, rng: np.random.Generator) -
     """Which sprites are laid where, their centres (2,) px: alone or in groups, things among them."""
     count = int(rng.choice([0, 1, 2, 3, 5, 8], p=[0.12, 0.28, 0.2, 0.2, 0.12, 0.08]))
     people = rng.permutation(np.nonzero(scene.is_person)[0])[:count]
-    things = rng.permutation(np.nonzero(~np.array(scene.is_person))[0])[: int(rng.integers(0, 5))]
+    things = rng.permutation(np.nonzero(~np.array(scene.is_person))[0])[: int(rng.integers(0, 7))]
     middle, is_group = rng.uniform(0.2, 0.8, 2) * side, rng.random() < 0.4
     found = []
     for index in rng.permutation(np.concatenate([people, things])):

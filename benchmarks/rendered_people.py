@@ -31,7 +31,7 @@ class SceneSettings:
     """What one scene shows: so many people and things under one sun, seen from one height and tilt."""
 
     people: int = 12
-    things: int = 5
+    things: int = 10
     px_per_m: tuple[float, float] = (70.0, 150.0)
     height_m: tuple[float, float] = (4.0, 100.0)
     steep: float = 0.6  # this share of scenes is seen from straight above, up to 25 degrees off

@@ -13,11 +13,11 @@ _ROUND = 12  # corners of a tube or an ellipsoid
 
 def shell(
     centre: Floats, radii: Floats, colour: Floats, *, power: float = 1.0, rough: float = 0.0,
-    rng: np.random.Generator | None = None,
+    rng: np.random.Generator | None = None, fine: int = 1,
 ) -> Mesh:
     """An ellipsoid; `power` below 1 makes it a rounded box (superellipsoid, Barr 1981); `rough` dents it."""
-    along = np.linspace(-np.pi / 2, np.pi / 2, 9)[:, None]
-    around = np.linspace(0, 2 * np.pi, _ROUND, endpoint=False)[None]
+    along = np.linspace(-np.pi / 2, np.pi / 2, 8 * fine + 1)[:, None]
+    around = np.linspace(0, 2 * np.pi, _ROUND * fine, endpoint=False)[None]
 
     def bent(values: Floats) -> Floats:
         return np.asarray(np.sign(values) * np.where(np.abs(values) < 1e-9, 0, np.abs(values)) ** power)
@@ -26,8 +26,9 @@ def shell(
         bent(np.cos(along)) * bent(np.cos(around)), bent(np.cos(along)) * bent(np.sin(around)), bent(np.sin(along)),
     ), -1)
     if rough and rng is not None:
-        waves = rng.normal(0, 2.2, (4, 3))
-        unit = unit * (1 + rough * np.sin(unit @ waves.T + rng.uniform(0, 6.3, 4)).sum(-1, keepdims=True) / 2)
+        for depth, length in ((rough, 2.2), (0.35 * rough, 7.0))[:fine]:
+            waves = rng.normal(0, length, (4, 3))
+            unit = unit * (1 + depth * np.sin(unit @ waves.T + rng.uniform(0, 6.3, 4)).sum(-1, keepdims=True) / 2)
     return _grid(unit * radii + centre, colour)
 
 
@@ -63,13 +64,15 @@ def leaves(centre: Floats, radii: Floats, colour: Floats, count: int, size_m: fl
 
 def any_thing(rng: np.random.Generator) -> Mesh:
     """One thing of some kind, standing on z = 0 around the origin, turned at random."""
-    kinds = (_boulder, _boulder, _case, _post, _trunk, _table, _dog, _bush, _heap, _bicycle, _parasol, _tyre)
+    stones = (_boulder,) * 4  # what detectors of people confuse most with them
+    kinds = (*stones, _case, _post, _trunk, _table, _dog, _bush, _heap, _bicycle, _parasol, _tyre)
     made = kinds[int(rng.integers(len(kinds)))](rng)
     turn = rng.uniform(0, 2 * np.pi)
     cosine, sine = np.cos(turn), np.sin(turn)
     vertices = made.vertices @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
     colours = (made.colours * rng.normal(1, 0.05, (len(made.colours), 1))).clip(0.01, 0.95)
-    return Mesh(vertices - [0, 0, vertices[:, 2].min()], made.faces, colours, made.is_sheet)
+    lowest = vertices[made.faces.ravel(), 2].min()
+    return Mesh(vertices - [0, 0, lowest], made.faces, colours, made.is_sheet)
 
 
 def any_colour(rng: np.random.Generator) -> Floats:
@@ -88,12 +91,19 @@ def _earthy(rng: np.random.Generator) -> Floats:
 
 
 def _boulder(rng: np.random.Generator) -> Mesh:
-    size = np.exp(rng.uniform(np.log(0.15), np.log(1.1))) * rng.uniform(0.6, 1.3, 3) * [1.2, 0.9, 0.7]
-    lump = shell(np.zeros(3), size, _earthy(rng), power=rng.uniform(0.6, 1), rough=rng.uniform(0.1, 0.3), rng=rng)
-    if rng.random() < 0.4:
-        other = shell(size * rng.uniform(-1, 1, 3), size * rng.uniform(0.4, 0.9), _earthy(rng), rough=0.2, rng=rng)
-        return joined(lump, other)
-    return lump
+    """Lying or upright, half in the ground, mottled, sometimes with another beside it."""
+    size = np.exp(rng.uniform(np.log(0.15), np.log(0.9))) * rng.uniform(0.55, 1.4, 3) * [1.1, 0.8, 0.8]
+    colour = _earthy(rng)
+    shape, dents = rng.uniform(0.45, 1), rng.uniform(0.1, 0.35)
+    parts = [shell(np.zeros(3), size, colour, power=shape, rough=dents, rng=rng, fine=2)]
+    if rng.random() < 0.3:
+        aside = size * rng.uniform(-1, 1, 3)
+        parts.append(shell(aside, size * rng.uniform(0.4, 0.9), _earthy(rng), rough=0.2, rng=rng, fine=2))
+    whole = joined(*parts)
+    spots = np.sin(whole.middles @ rng.normal(0, 9, (3, 5)) + rng.uniform(0, 6.3, 5)).mean(1)
+    mottled = np.exp(rng.uniform(0.2, 0.8) * spots + rng.normal(0, rng.uniform(0.05, 0.25), len(spots)))
+    kept = whole.middles[:, 2] > -rng.uniform(0.1, 0.9) * size[2]
+    return Mesh(whole.vertices, whole.faces[kept], whole.colours[kept] * mottled[kept, None], whole.is_sheet[kept])
 
 
 def _case(rng: np.random.Generator) -> Mesh:
