@@ -71,12 +71,7 @@ def main() -> None:
     parser.add_argument("--alarms", type=Path, help="false_alarms.json")
     parser.add_argument("--out", type=Path, default=HOME)
     wishes = parser.parse_args()
-    learnt, judge = judge_and_probabilities(wishes.judge, wishes.aerial)
-    if wishes.people is not None:
-        learnt = with_people(learnt, json.loads((wishes.people / "people.json").read_text()))
-    model = joined(wishes.nanodet, wishes.aerial, judge, learnt)
-    if wishes.people is not None:
-        model.people = people_head(wishes.people / "people.pt")
+    model, learnt = model_and_probabilities(wishes)
     sources = (*SOURCES, *(OF_PEOPLE if wishes.people else ()), *TRAINED_ON)
     info: dict[str, Any] = {
         "name": "default", "version": wishes.version, "preset": "fast", "classes": list(CLASSES), "thermal": False,
@@ -107,6 +102,17 @@ def main() -> None:
     if wishes.alarms is not None:
         card["false_alarms"] = json.loads(wishes.alarms.read_text())["models"]["default"]
     (wishes.out / "default.json").write_text(json.dumps(card, indent=1) + "\n")
+
+
+def model_and_probabilities(wishes: argparse.Namespace) -> tuple[Daylight, dict[str, Any]]:
+    """The whole network, and what it learnt of scores."""
+    learnt, judge = judge_and_probabilities(wishes.judge, wishes.aerial)
+    if wishes.people is None:
+        return joined(wishes.nanodet, wishes.aerial, judge, learnt), learnt
+    learnt = with_people(learnt, json.loads((wishes.people / "people.json").read_text()))
+    model = joined(wishes.nanodet, wishes.aerial, judge, learnt)
+    model.people = people_head(wishes.people / "people.pt")
+    return model, learnt
 
 
 def judge_and_probabilities(folder: Path | None, packed: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
