@@ -45,7 +45,10 @@ def paint_orthophoto(
     painter = _Painter(surface.lattice, ground, choose_photos(surface.lattice, ground, views, settings), site_grid,
                        views, pictures)
     count, side = settings.block_tiles, site_grid.grid.tile_px
-    blocks = sorted({(row // count, column // count) for column, row in painter.tiles()})
+    blocks = sorted(
+        {(row // count, column // count) for column, row in painter.tiles()},
+        key=lambda block: (block[0] // 3, block[1] // 3, block),  # those near each other show the same few photos
+    )
     for number, (down, across) in enumerate(blocks, start=1):
         first = across * count, down * count
         rgba = painter.block(first, count)

@@ -166,6 +166,10 @@ class _Laid:
         self.channel = which.tolist()
         self._px_per_cell = lattice.cell_m * camera.fx_px / max(
             float(view.site_from_camera.translation_m[2]) - bounds.usual_m, 1e-3)
+        self._always = frozenset(  # the lines move evenly with the height: what is inside at both ends is so between
+            side for side in settings.window_cells
+            if all(self._lines(each, side)[1].all() for each in (bounds.low_m, bounds.high_m))
+        )
 
     def at(self, up_m: float) -> list[Floats32]:
         """The photo on the plane at a height, (H, W) float32, for each of the others; 0 outside of it."""
@@ -184,11 +188,9 @@ class _Laid:
 
         Beyond its border it would see the border, not the ground.
         """
-        inset = 0.5 * (side * self._px_per_cell + self._apron)
-        (w, h), (x, y, z) = self._size, self._picture_from_cells(up_m)
-        # inside is to one side of four lines, for where the picture's depth is positive
-        lines = np.array([x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y])
-        inside = lines @ self._corners >= 0
+        if side in self._always:
+            return np.ones((1, 1), bool)
+        lines, inside = self._lines(up_m, side)
         if inside.all():
             return np.ones((1, 1), bool)
         if not inside.any(axis=1).all():
@@ -198,6 +200,14 @@ class _Laid:
         for line in lines[~inside.all(axis=1)]:
             known &= line[0] * columns + (line[1] * rows + line[2]) >= 0
         return known
+
+    def _lines(self, up_m: float, side: int) -> tuple[Floats, Mask]:
+        """(4, 3) a photo's sides on a level plane, and (4, 4) to the inner side of which the window's corners lie."""
+        inset = 0.5 * (side * self._px_per_cell + self._apron)
+        (w, h), (x, y, z) = self._size, self._picture_from_cells(up_m)
+        # inside is to one side of four lines, for where the picture's depth is positive
+        lines = np.array([x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y])
+        return lines, lines @ self._corners >= 0
 
     def shows(self, up_m: Floats32, side: int) -> Mask:
         """(H, W) where a patch lies in the photo as a whole at each cell's own height, (H, W); nowhere for NaN."""

@@ -100,13 +100,18 @@ def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: Control
     residuals = tuple(
         _residual(problem.control, number, rows, used, excluded) for number in range(len(problem.control.points))
     )
-    places_m = np.array([seen.ties.place_m[seen.point == k][0, :2] for k in range(len(seen.labels))])
+    return ControlReport(
+        problem.control.name, problem.control.crs, settings.sigma_m, residuals,
+        _remarks(mapper, problem, seen.of(used), settings),
+    )
+
+
+def _remarks(
+    mapper: PlanarMapper, problem: ControlProblem, ties: GroundTies, settings: ControlSettings
+) -> tuple[str, ...]:
     cameras_m = np.array([mapper.pose(each).translation_m for each in mapper.placed()])
     picture_m = float(np.median(cameras_m[:, 2])) * problem.camera.width_px / problem.camera.fx_px
-    remarks = layout_remarks(
-        places_m[[label in used for label in seen.labels]], cameras_m[:, :2], picture_m, settings
-    )
-    return ControlReport(problem.control.name, problem.control.crs, settings.sigma_m, residuals, remarks)
+    return layout_remarks(np.unique(ties.place_m[:, :2], axis=0), cameras_m[:, :2], picture_m, settings)
 
 
 def layout_remarks(
