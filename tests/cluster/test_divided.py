@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple, Self
+from unittest.mock import create_autospec
 
 import av
 import cv2
@@ -82,7 +83,8 @@ class Here:
     def start(self, key: tuple[str, str], order: Order, _: Cost) -> None:
         received = Order.of(json.loads(order.line())["order"])
         assert received == order
-        flight, words, is_good = worker._done(received, lambda *_: None, threading.Event())
+        answers = create_autospec(worker.Answers, instance=True)
+        flight, words, is_good = worker._done(received, answers, threading.Event())
         self.orders.append(order)
         self.running[key] = Ending(Outcome.DONE if is_good else Outcome.DOUBTFUL, words, flight)
 
