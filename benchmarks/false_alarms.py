@@ -2,7 +2,7 @@
 
 FLIGHTS is the folder with `brighton_beach` (18 photos, no part of it was learnt as bare ground, cars are parked there)
 and `caliterra` (from its 47th photo on; the ground up to there taught the judge what is no car, so that its figures are
-too good; one white car and some machines). Photos are shown at half size, as they would be at half the resolution, and
+too good; one white car and some machines). Photos are shown at half size (--scale), as they would be at half the resolution, and
 counted at each model's own thresholds. As in a map, photos are shown at the scale of their ground (M_PER_PX, roughly
 known), models that ask for it look twice, and boxes of a size on the ground that their class cannot have do not count;
 with --plain each photo is shown as it is, once, and every box counts. With --out FOLDER, each report's crop
@@ -39,6 +39,7 @@ def main() -> None:
     parser.add_argument("flights", type=Path)
     parser.add_argument("models", nargs="+")
     parser.add_argument("--right", nargs="*", default=[])
+    parser.add_argument("--scale", type=float, default=SCALE, help="at which photos are shown, 1 for as they are")
     parser.add_argument("--plain", action="store_true", help="as it is, once, every box")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -50,7 +51,7 @@ def main() -> None:
         name = Path(model).stem
         out = wishes.out and wishes.out / name
         found[name] = {
-            flight: looked(detector, wishes.flights / flight, out, is_plain=wishes.plain) for flight in FIRST
+            flight: looked(detector, wishes.flights / flight, out, wishes.scale, is_plain=wishes.plain) for flight in FIRST
         }
         for flight, rows in found[name].items():
             for label in SHOWN:
@@ -59,14 +60,14 @@ def main() -> None:
                     rows[label]["false_a_photo"] = round((rows[label]["reports"] - count) / rows["photos"], 3)
         print(name, json.dumps(found[name]), flush=True)
     document = {
-        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": SCALE, "plain": wishes.plain,
+        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": wishes.scale, "plain": wishes.plain,
         **note_scoring("false_alarms, brighton_beach and caliterra"),
         "date": time.strftime("%Y-%m-%d"), "models": found,
     }
     wishes.results.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def looked(detector: Detector, folder: Path, out: Path | None, *, is_plain: bool) -> dict:
+def looked(detector: Detector, folder: Path, out: Path | None, scale: float, *, is_plain: bool) -> dict:
     """Reports of each class over a flight's photos."""
     paths = [each for each in sorted(folder.iterdir()) if each.suffix.lower() == ".jpg"]
     paths = [each for each in paths if each.name >= FIRST[folder.name]]
@@ -74,12 +75,12 @@ def looked(detector: Detector, folder: Path, out: Path | None, *, is_plain: bool
     crops: dict[str, list[np.ndarray]] = {label: [] for label in SHOWN}
     for path in paths:
         whole = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
-        shown = cv2.resize(whole, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_AREA)
+        shown = cv2.resize(whole, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         picture = np.ascontiguousarray(shown[..., ::-1])
         if is_plain:
             seen = detector.detect(picture, tiles="auto", classes=SHOWN)
         else:
-            m_per_px = M_PER_PX[folder.name]
+            m_per_px = M_PER_PX[folder.name] * SCALE / scale
             seen = detector.detect(picture, tiles="auto", m_per_px=m_per_px, classes=SHOWN, from_above=True)
             seen = possible(seen, shown, m_per_px)
         for box, score, label in zip(seen.boxes_px, seen.scores, seen.names):
