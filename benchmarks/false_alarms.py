@@ -1,12 +1,13 @@
 """What models report of real flights that hardly show anyone: python benchmarks/false_alarms.py FLIGHTS MODEL ...
 
-FLIGHTS is the folder with `brighton_beach` (18 photos, no part of it was learnt as bare ground, cars are parked there)
-and `caliterra` (from its 47th photo on; the ground up to there taught the judge what is no car, so that its figures are
-too good; one white car and some machines). Photos are shown at half size (--scale), as they would be at half the resolution, and
-counted at each model's own thresholds. As in a map, photos are shown at the scale of their ground (M_PER_PX, roughly
-known), models that ask for it look twice, and boxes of a size on the ground that their class cannot have do not count;
-with --plain each photo is shown as it is, once, and every box counts. With --out FOLDER, each report's crop
-is drawn there; how many of them are right was counted by eye, and is given with --right MODEL:FLIGHT:CLASS=COUNT.
+FLIGHTS is the folder with `brighton_beach` (18 photos, no part of it was learnt as bare ground, cars are parked
+there) and `caliterra` (from its 47th photo on; the ground up to there taught the judge what is no car, so that its
+figures are too good; one white car and some machines). Photos are shown at half size (--scale), as they would be at
+half the resolution, and counted at each model's own thresholds. As in a map, photos are shown at the scale of their
+ground (M_PER_PX, roughly known), models that ask for it look twice, and boxes of a size on the ground that their
+class cannot have do not count; with --plain each photo is shown as it is, once, and every box counts. With --out
+FOLDER, each report's crop is drawn there; how many of them are right was counted by eye, and is given with --right
+MODEL:FLIGHT:CLASS=COUNT.
 
 Writes results/false_alarms.json: reports a photo, and false ones where --right is given.
 """
@@ -51,7 +52,8 @@ def main() -> None:
         name = Path(model).stem
         out = wishes.out and wishes.out / name
         found[name] = {
-            flight: looked(detector, wishes.flights / flight, out, wishes.scale, is_plain=wishes.plain) for flight in FIRST
+            flight: looked(detector, wishes.flights / flight, out, wishes.scale, is_plain=wishes.plain)
+            for flight in FIRST
         }
         for flight, rows in found[name].items():
             for label in SHOWN:
@@ -60,7 +62,8 @@ def main() -> None:
                     rows[label]["false_a_photo"] = round((rows[label]["reports"] - count) / rows["photos"], 3)
         print(name, json.dumps(found[name]), flush=True)
     document = {
-        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": wishes.scale, "plain": wishes.plain,
+        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": wishes.scale,
+        "plain": wishes.plain,
         **note_scoring("false_alarms, brighton_beach and caliterra"),
         "date": time.strftime("%Y-%m-%d"), "models": found,
     }

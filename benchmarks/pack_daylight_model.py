@@ -3,8 +3,8 @@
 Joins NanoDet (`convert_nanodet.py`), the aerial network of a model file (--aerial) and the judge: what `train_judge.py`
 left in a folder, or else that of the model file with its probabilities. With --people FOLDER, people are found by the
 head that `train_people.py` and `fit_people.py` left there. It checks the file against torch, and writes default.onnx
-and its card. What the card says of accuracy and false alarms comes from the files of `detector_accuracy.py`
-(--measured) and `false_alarms.py` (--alarms), made with this very file: without them the card says nothing of either.
+and its card. The card's figures of accuracy and false alarms come from the files of `detector_accuracy.py`
+(--measured) and `false_alarms.py` (--alarms), made with this very file: without them the card has none.
 Run it again with them; the model's bytes stay the same.
 """
 

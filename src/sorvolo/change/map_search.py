@@ -13,6 +13,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose, rotation_from_vector
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.registration.camera_fit import CameraFit, PosePrior, fit_camera, similar
 from sorvolo.registration.features import FeatureSettings, filled, gray_from_rgb, known_only, orb_features
 from sorvolo.registration.learned import LEARNED, learned_features, match_learned
@@ -146,7 +147,7 @@ class MapSearch:
         if len(off_m) < self._settings.least_strong or not prior.knows_place:
             return False
         usual_m = np.median(off_m, axis=0)
-        spread_m = 1.4826 * np.median(np.abs(off_m - usual_m), axis=0)
+        spread_m = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(off_m - usual_m), axis=0)
         sigma_m = np.maximum(np.clip(prior.position_sigma_m, 1.0, 1e3), spread_m)
         return bool((np.abs(pose.translation_m - prior.position_m - usual_m) > self._settings.odd * sigma_m).any())
 

@@ -9,13 +9,12 @@ from pathlib import Path
 from sorvolo.capture.source import safe_name
 from sorvolo.cluster.orders import Scouted
 from sorvolo.errors import StoreError
+from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import is_site
 
 Box = tuple[float, float, float, float]
 """South, west, north and east of ground, degrees."""
-
-_M_PER_DEG = 111_320.0
 
 
 class SiteBy(StrEnum):
@@ -110,7 +109,7 @@ def _ground(archive: Archive) -> Box | None:
 
 def _are_near(one: Box, other: Box, near_m: float) -> bool:
     """Whether two boxes lie within `near_m` of each other, along each axis."""
-    north = near_m / _M_PER_DEG
+    north = near_m / M_PER_DEG_LATITUDE
     east = north / max(0.01, math.cos(math.radians(one[0])))
     return (
         one[0] - north <= other[2] and other[0] - north <= one[2]

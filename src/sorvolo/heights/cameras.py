@@ -9,6 +9,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, height_deviations, triangulate
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.tracks import Tracks, TrackSettings, find_tracks
@@ -123,7 +124,7 @@ def _reweighed(scene: Scene, priors: Priors, settings: CameraSettings) -> Priors
 def _sigmas_m(scatter_m: Floats, count: int, freedom: float, settings: CameraSettings) -> Floats:
     """(count, 3) the sigma of each fix from how known ones scatter, (N, 3), by its median; `freedom` is N over what is
     left of it."""
-    spread = 1.4826 * np.nanmedian(np.abs(scatter_m), axis=0) * np.sqrt(freedom)
+    spread = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(np.abs(scatter_m), axis=0) * np.sqrt(freedom)
     return np.asarray(np.broadcast_to(np.maximum(spread, settings.least_sigma_m), (count, 3)))
 
 
@@ -161,6 +162,6 @@ def _height_sigma(scene: Scene, priors: Priors, residual_px: Floats, settings: A
 
     The pictures weigh as they fit (their residuals' median), which is better than the settings assume.
     """
-    fit_px = 1.4826 * float(np.nanmedian(np.abs(residual_px)))
+    fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(residual_px)))
     fitting = replace(settings, sigma_px=max(fit_px, settings.least_sigma_px))
     return SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, fitting))

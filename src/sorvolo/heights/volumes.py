@@ -7,6 +7,7 @@ import numpy as np
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.terrain import filled
 from sorvolo.survey.findings import HeightChange
@@ -74,7 +75,7 @@ def tie(earlier: HeightField, later: HeightField, stable: Mask, settings: Volume
                 f"{settings.least_stable} are needed to tie them; give a smaller area, or flights that reach beyond it"
             )
         middle = float(np.median(off[usable]))
-        spread = max(1.4826 * float(np.median(np.abs(off[usable] - middle))), 1e-4)
+        spread = max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(off[usable] - middle))), 1e-4)
         usable &= np.abs(off - middle) < settings.clip_sigmas * spread
         step = _step(off[usable], east[usable], north[usable])
         shift_m += step

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, Rows
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.mosaic.bundle import Nodes, Pairs, linearise, rotation_vector
 from sorvolo.mosaic.graph_rows import NodeRows
 
@@ -74,7 +75,8 @@ def _place_factors(stated_m: Floats, tied: Mask, miss_m: Floats) -> Floats:
         place[:2] = np.clip(np.median(ratio), 0.5, 20.0)
     high = tied & np.isfinite(stated_m[:, 2])
     if high.sum() >= _ENOUGH:
-        place[2] = np.clip(1.4826 * np.median(np.abs(miss_m[high, 2]) / stated_m[high, 2]), 0.5, 20.0)
+        times = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(miss_m[high, 2]) / stated_m[high, 2])
+        place[2] = np.clip(times, 0.5, 20.0)
     return place
 
 
@@ -82,7 +84,7 @@ def _attitude_factors(stated_rad: Floats, used: Mask, error_rad: Floats) -> Floa
     if used.sum() < _ENOUGH:
         return np.ones(3)
     scatter = error_rad[used] - np.median(error_rad[used], axis=0)
-    spread = 1.4826 * np.median(np.abs(scatter), axis=0)
+    spread = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(scatter), axis=0)
     # pictures see heading well, tilt hardly: a small scatter of tilt only shows that it was believed
     return np.asarray(np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0))
 
@@ -95,7 +97,7 @@ def _noise(nodes: Nodes, pairs: Pairs, shared: Floats) -> LinkNoise:
     miss_across = np.abs(line.residual_px[..., 0] * along[..., 1] - line.residual_px[..., 1] * along[..., 0])
     unused = pairs.weight <= 0
     with np.errstate(all="ignore"):
-        across = 1.4826 * np.nanmedian(np.where(unused, np.nan, miss_across), axis=1)
-        sigma_along = 1.4826 * np.nanmedian(np.where(unused, np.nan, miss_along), axis=1)
+        across = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(np.where(unused, np.nan, miss_across), axis=1)
+        sigma_along = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(np.where(unused, np.nan, miss_along), axis=1)
         reach = np.nanmedian(np.where(unused, np.nan, length), axis=1)
     return LinkNoise(across, np.sqrt(np.maximum(sigma_along**2 - across**2, 0)) / np.maximum(reach, 1e-6))

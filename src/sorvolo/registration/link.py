@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsPx
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.registration.features import FeatureSettings, corners, known_only, sift_features
 from sorvolo.registration.learned import learned_features, match_learned
 from sorvolo.registration.matching import match
@@ -327,7 +328,8 @@ def refine(
     miss = np.linalg.norm(apply_homography(homography, old_px) - new_px, axis=1)
     near = miss < settings.refine_reach_px
     chosen = _spread(new_px, miss, near, settings.max_pairs)
-    sigma_px = float(1.4826 * np.median(miss[inliers]) / 1.1774)  # Rayleigh's median to a per-axis sigma
+    # Rayleigh's median to a per-axis sigma
+    sigma_px = float(SIGMA_PER_MEDIAN_DEVIATION * np.median(miss[inliers]) / 1.1774)
     return Link(new.id, old.id, new_px[chosen], old_px[chosen], homography, max(sigma_px, 0.05))
 
 

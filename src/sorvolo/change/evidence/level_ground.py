@@ -33,7 +33,7 @@ class LevelSettings:
     window_px: tuple[int, int] = (7, 15)  # least and largest side of what is compared; between them a thing's width
     least_move: float = 1 / 3  # of a thing's width, from one date to the other: lower relief does not explain it
     off_px: int = 4  # pictures of one date may lie off each other, where that is not taken for a height
-    least_px: float = 1.5  # what moves by less cannot be told from that
+    least_px: float = 1.5  # what moves by less cannot be distinguished from that
     detail: int = 5  # windows: what varies more slowly is light
     least_likeness: float = 0.5  # of what agrees ...
     times: float = 1.5  # ... and it differs so many times as much at any height ...

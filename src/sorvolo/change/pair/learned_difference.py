@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats32, Mask
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
 Image = NDArray[np.uint8]
 """(h, w, 3) uint8 BGR."""
@@ -90,7 +91,7 @@ def _padded(image: NDArray[np.uint8], stride: int) -> NDArray[np.uint8]:
 def _in_spreads(measure: Floats32, held: Mask, least_middle: float, least_spread: float, most: float) -> Floats32:
     """A measure (rows, columns) less its median where `held`, in spreads, at most so many."""
     median = float(np.median(measure[held]))
-    spread = max(1.4826 * float(np.median(np.abs(measure[held] - median))), least_spread)
+    spread = max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(measure[held] - median))), least_spread)
     away = (measure - np.float32(max(median, least_middle))) / np.float32(spread)
     return np.asarray(np.clip(away, -most, most), np.float32)
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sorvolo import kernels
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
 _TABLE_LEVEL, _TABLE_SHARE = 40, 0.3  # T_gray and T_H of Table 4.2
 
@@ -176,7 +177,7 @@ def light_difference(before: ThesisReference, after: ThesisReference) -> float:
     """
     apart = cv2.absdiff(before.gray, after.gray)
     known = apart if after.known is None else apart[after.known > 0]
-    return 1.4826 * float(np.median(known)) if known.size else 0.0
+    return SIGMA_PER_MEDIAN_DEVIATION * float(np.median(known)) if known.size else 0.0
 
 
 def bhattacharyya_distances(first: NDArray[np.int64], second: NDArray[np.int64]) -> Floats:

@@ -12,6 +12,7 @@ from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageRGB, ImageRGBA, Mask
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.findings import ChangeKind, Patch
 
 _SIGNS = 6
@@ -82,7 +83,7 @@ def _lab(rgb: MatLike) -> NDArray[np.uint8]:
 def _middle_and_spread(lab: NDArray[np.uint8], around: Mask) -> tuple[Floats32, Floats32]:
     """The median (3,) of the ground's colours `around` in a picture (h, w, 3), and how far they stray from it, (3,)."""
     middle, deviation = middle_and_deviation(lab, around)
-    return middle, np.float32(1.4826) * deviation + np.float32(3)
+    return middle, np.float32(SIGMA_PER_MEDIAN_DEVIATION) * deviation + np.float32(3)
 
 
 def _reach_px(changed: Mask) -> int:
