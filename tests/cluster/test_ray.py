@@ -18,6 +18,7 @@ from batch_flights import another, content
 
 from ended_work import ended
 from sorvolo.cli.main import main
+from sorvolo.cluster import streams
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import FlightWish, Mission, Order
@@ -114,9 +115,11 @@ def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: An
         assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order
 
 
+@pytest.mark.parametrize("look_s", [pytest.param(0.05, id="asked often"), pytest.param(300.0, id="asked at its end")])
 def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
-    cluster: Any, flown: Path, tmp_path: Path
+    cluster: Any, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look_s: float
 ) -> None:
+    monkeypatch.setattr(streams, "_LOOK_S", look_s)
     another(flown, tmp_path / "in" / "one")
     wish = FlightWish(Mission.WATCH, camera=str(flown / "camera.xml"), give_up_s=2.0)
     running = run_streams(

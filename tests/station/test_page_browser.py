@@ -274,6 +274,8 @@ def test_a_place_is_remembered(served: Served, opened: Watched) -> None:
 def test_what_is_drawn_is_measured_and_shared(browser: Any, served: Served, opened: Watched) -> None:
     page = opened.page
     page.keyboard.press("5")
+    before = len(served.ask("/api/sites/field/drawings")["features"])
+    expect(page.locator(".drawn li")).to_have_count(before)
     page.locator("[data-tool=interest]").click()
     box = page.locator(".map-canvas").bounding_box()
     for x, y in ((0.35, 0.35), (0.65, 0.35), (0.65, 0.65), (0.35, 0.65)):
@@ -281,7 +283,7 @@ def test_what_is_drawn_is_measured_and_shared(browser: Any, served: Served, open
         page.wait_for_timeout(350)  # two quick clicks would be a double click
     assert re.search(r"\d+(\.\d+)? m²", page.locator(".measure").inner_text())
     page.keyboard.press("Enter")
-    page.locator(".drawn li").first.wait_for()
+    expect(page.locator(".drawn li")).to_have_count(before + 1)
     kept = served.ask("/api/sites/field/drawings")["features"]
     assert "interest" in {each["properties"]["purpose"] for each in kept}
     other = Watched(browser.new_context(), served.url)

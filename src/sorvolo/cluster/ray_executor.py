@@ -86,6 +86,7 @@ class RayExecutor:
         self._running: dict[Key, Any] = {}
         self._actors: dict[Key, Any] = {}  # of those that are live
         self._asked_found: dict[Key, Any] = {}  # answers of theirs that are on their way
+        self._last_found: list[tuple[Key, str]] = []  # by those that have ended since `take_found`
         self._detectors = MachineDetectors(ray, sharing.gpus) if sharing.is_shared else None
         self._is_gone = False
         # through ray:// the head's own client server is asked, and raises what `_cluster` knows
@@ -120,7 +121,8 @@ class RayExecutor:
 
     def take_found(self) -> Sequence[tuple[Key, str]]:
         """What live watches found since this was last asked, in words."""
-        return self._asked(self._taken_found) if self._actors else ()
+        last, self._last_found = self._last_found, []
+        return [*last, *(self._asked(self._taken_found) if self._actors else ())]
 
     def next_ended(self, timeout_s: float | None = None) -> tuple[Key, Ending] | None:
         """Wait until a try has ended; None where none did for so long. Raises SettingsError if the cluster is gone."""
@@ -135,8 +137,8 @@ class RayExecutor:
             key = next(each for each, task in self._running.items() if task == ended[0])
         ending = self._asked(lambda: self._ending(ended[0]))
         del self._running[key]
-        self._asked_found.pop(key, None)
         if (actor := self._actors.pop(key, None)) is not None:
+            self._last_found += self._asked(lambda: self._found_to_the_end(key, actor))
             self._ray.kill(actor)
         return key, ending
 
@@ -181,6 +183,14 @@ class RayExecutor:
                 with suppress(self._ray.exceptions.RayActorError):  # its end is another's to state
                     found += [(key, words) for words in self._ray.get(task)]
         return found
+
+    def _found_to_the_end(self, key: Key, actor: Any) -> list[tuple[Key, str]]:
+        """What a watch that has ended found and nobody has taken yet; of one whose machine died, nothing."""
+        on_its_way = self._asked_found.pop(key, None)
+        tasks = [each for each in (on_its_way, actor.take_found.remote()) if each is not None]
+        with suppress(self._ray.exceptions.RayError):
+            return [(key, words) for each in self._ray.get(tasks, timeout=WAITS.cancel_s) for words in each]
+        return []
 
     def _ending(self, task: Any) -> Ending:
         try:
