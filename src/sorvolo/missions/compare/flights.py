@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
+from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
@@ -61,7 +62,8 @@ def compare_flights(
             raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
         if not settings.trusts_map:
             _refuse_contradictory(archive, site)
-    looks = open_detector(settings.model) if detector is None else detector
+    is_live = any(is_live_address(str(each)) for each in inputs)
+    looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
     check_classes(looks, settings.classes)
     opened = opened_sources(
         inputs, telemetry, camera, known_flights(site), live=live, until=until,

@@ -36,8 +36,9 @@ class ComparisonObjects:
             before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
             known = archive.newest_objects(before - {self._name})
             self._classes = ChangeClasses(detector, [each.thing for each in known], settings.classes)
+            live_folder = archive.folder if isinstance(setup.source, LiveSource) else None
             self._finder = ObjectFinder(
-                detector, setup.source.camera.camera, settings.classes, is_live=isinstance(setup.source, LiveSource)
+                detector, setup.source.camera.camera, settings.classes, live_folder=live_folder
             )
 
     def close(self) -> None:

@@ -6,6 +6,7 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from sorvolo.detection.detector import Detector
@@ -16,10 +17,12 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detects import Detects
 from sorvolo.missions.flight.memory import MemorySettings
+from sorvolo.missions.flight.priority import lower_priority, made_at_low_priority
 from sorvolo.registration.sizes import at_most
 from sorvolo.store.exports.detection_files import crop_around
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
+from sorvolo.store.site.spill import FrameOnDisk
 from sorvolo.survey.flight import Frame, Notice, PosedFrame
 from sorvolo.survey.map_objects import MapObject, ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame, Status
@@ -36,16 +39,18 @@ _CROP_PX = 256
 _MOST_CROPS = 60  # of one frame, the surest
 
 
-def open_detector(model: str, shared: str = "") -> Detects | None:
+def open_detector(model: str, shared: str = "", *, is_live: bool = False) -> Detects | None:
     """The detector of this name or file; None for "none", and for "default" where no default model is installed.
 
-    `shared` is the socket of a process that holds it for several, "" for one of its own. Raises InputError for any
-    other model that is not there or cannot be used.
+    `shared` is the socket of a process that holds it for several, "" for one of its own. Beside an `is_live` flight's
+    map it runs at low priority. Raises InputError for any other model that is not there or cannot be used.
     """
     if model == NO_MODEL:
         return None
     if model == DEFAULT_MODEL and all(each.name != DEFAULT_MODEL for each in installed_models()):
         return None
+    if is_live:
+        return made_at_low_priority(lambda: Detector.load(model, shared=shared))
     return Detector.load(model, shared=shared)
 
 
@@ -73,18 +78,18 @@ class ObjectFinder:
     """Searches the frames of one flight for objects, one frame after another, in a thread beside the mapping.
 
     A context manager: leaving it ends the thread. No `classes` means those that the detector usually reports; raises
-    SettingsError for one that it does not know. Of an `is_live` flight as many frames wait as memory holds: a detector
-    that is slow for a moment must not delay the map.
+    SettingsError for one that it does not know. `live_folder` is given for a live flight, whose map must not wait for
+    the detector: this works at low priority then, and pictures that memory does not hold wait in files there.
     """
 
     def __init__(
-        self, detector: Detects, camera: Camera, classes: Sequence[str] = (), *, is_live: bool = False
+        self, detector: Detects, camera: Camera, classes: Sequence[str] = (), *, live_folder: Path | None = None
     ) -> None:
         check_classes(detector, classes)
         self._detector, self._camera = detector, camera
-        self._ahead = math.inf if is_live else _AHEAD
+        self._live_folder = live_folder
         self._classes = tuple(classes) or detector.info.usual_classes
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="detector")
+        self._thread = ThreadPoolExecutor(1, "detector", lower_priority if live_folder is not None else None)
         self._waiting: deque[Future[FrameDetections]] = deque()
         self._seen: dict[int, FrameDetections] = {}
         self._news: list[FrameDetections] = []
@@ -110,18 +115,26 @@ class ObjectFinder:
         return sum(each.seconds for each in self._seen.values())
 
     def look(self, posed: PosedFrame) -> None:
-        """Have a frame searched; waits when the detector is some frames behind."""
+        """Have a frame searched; waits when the detector is some frames behind, of a live flight very many.
+
+        Raises StoreError when a picture has to wait on a disk that is full.
+        """
         height_m, sigma_m = posed.prior.position_m[2], posed.prior.position_sigma_m[2]
         knows_height = math.isfinite(sigma_m) and height_m > 1.0
         m_per_px = float(height_m) / self._camera.fx_px if knows_height else None
         from_above = is_from_above(posed.prior.rotation)
-        self._waiting.append(self._thread.submit(self._look, posed.frame, m_per_px, from_above))
-        most_bytes = 1e6 * MemorySettings().waiting_mb
-        self._take(min(self._ahead, max(1, int(most_bytes // posed.frame.image.nbytes))))
+        memory = MemorySettings()
+        given: Frame | FrameOnDisk = posed.frame
+        in_memory = max(1, int(1e6 * memory.waiting_mb // posed.frame.image.nbytes))
+        waiting = sum(not each.done() for each in self._waiting)
+        if self._live_folder is not None and waiting >= in_memory:
+            given = FrameOnDisk.of(posed.frame, self._live_folder)
+        self._waiting.append(self._thread.submit(self._look, given, m_per_px, from_above))
+        self._take(min(_AHEAD, in_memory) if self._live_folder is None else memory.waiting_on_disk)
 
     def news(self, *, waits: bool = False) -> list[FrameDetections]:
         """What was found since this was asked last, in the frames' order; `waits`: in all frames so far."""
-        self._take(0 if waits else self._ahead)
+        self._take(0 if waits else len(self._waiting))
         news, self._news = self._news, []
         return news
 
@@ -171,8 +184,9 @@ class ObjectFinder:
             self._seen[seen.index] = seen
             self._news.append(seen)
 
-    def _look(self, frame: Frame, m_per_px: float | None, from_above: bool) -> FrameDetections:
+    def _look(self, given: "Frame | FrameOnDisk", m_per_px: float | None, from_above: bool) -> FrameDetections:
         started_s = time.monotonic()
+        frame = given.taken() if isinstance(given, FrameOnDisk) else given
         least = self._detector.thresholds_for(frame.image, from_above=from_above)
         found = self._detector.detect(
             frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes, from_above=from_above,

@@ -20,6 +20,7 @@ class MemorySettings:
     least_images_mb: int = 64  # at most for pictures that are small, and
     images_mb: int = 256  # for large ones: more gains nothing
     waiting_mb: int = 64  # for frames that wait for the detector, though one may always
+    waiting_on_disk: int = 256  # frames of a live flight at most: 1.6 GB of 1080p
     pictures: int = 6  # as many of the flight's as are wanted at once, those beside each other in two strips
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from sorvolo.capture.areas import read_area
+from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.capture.video import VideoSource
@@ -73,7 +74,8 @@ def map_flights(
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
     wanted = None if area is None else read_area(area)
-    looks = open_detector(settings.model) if detector is None else detector
+    is_live = any(is_live_address(str(each)) for each in inputs)
+    looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
     opened = opened_sources(inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until)
     with opened as sources, Archive.open(site, write=True, catalogues=catalogues) as archive:
         ground = _known_ground(control, base, sources, settings)
@@ -130,8 +132,9 @@ def _map_one(
     refuse_without_texture(source)
     check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
+    live_folder = archive.folder if isinstance(source, LiveSource) else None
     finder = None if detector is None else ObjectFinder(
-        detector, source.camera.camera, settings.classes, is_live=isinstance(source, LiveSource)
+        detector, source.camera.camera, settings.classes, live_folder=live_folder
     )
     with _begun(setup, archive, settings, finder, request, coverage, anew=anew, samples=samples) as run:
 

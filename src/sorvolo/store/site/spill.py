@@ -1,10 +1,14 @@
-"""What a run cannot hold in memory, in one file beside the site's that nobody else sees and no kill leaves behind."""
+"""What a run cannot hold in memory, in files beside the site's that nobody else sees and no kill leaves behind."""
 
 import tempfile
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO, Self
+
+import numpy as np
 
 from sorvolo.store.atomic import writing
+from sorvolo.survey.flight import Frame
 
 
 class SpillFile:
@@ -42,3 +46,27 @@ class SpillFile:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+
+@dataclass(frozen=True, eq=False)
+class FrameOnDisk:
+    """A frame whose picture waits in a file without a name; `taken`, once, gives the file's space back."""
+
+    unseen: Frame
+    shape: tuple[int, ...]
+    file: IO[bytes]
+
+    @classmethod
+    def of(cls, frame: Frame, folder: Path) -> Self:
+        """Write a frame's picture into `folder`. Raises StoreError when the disk is full."""
+        file = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (lives until the frame is taken)
+        with writing(folder):
+            file.write(np.ascontiguousarray(frame.image).data)
+            file.flush()
+        return cls(Frame.unseen(frame.index, frame.name, frame.time_ns), frame.image.shape, file)
+
+    def taken(self) -> Frame:
+        """The frame as it was; its file is gone."""
+        with self.file as file:
+            file.seek(0)
+            return replace(self.unseen, image=np.frombuffer(file.read(), np.uint8).reshape(self.shape))
