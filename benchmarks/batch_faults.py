@@ -1,7 +1,8 @@
 """Whether a batch loses or doubles anything while its workers, and the batch itself, are killed at random.
 
     python benchmarks/batch_faults.py --flights 40 --kills 2 --seed 1
-    python benchmarks/batch_faults.py --flights 12 --outages 30 --stall 90 --out benchmarks/results/batch_outages.json
+    python benchmarks/batch_faults.py --outages 30 --stall 90 --out benchmarks/results/batch_outages.json
+    python benchmarks/batch_faults.py --ray --stall 20 --model default --out benchmarks/results/batch_node_faults.json
 
 Small simulated photo flights, some of them poisoned (their worker is killed at every try), one broken, one there twice.
 Other workers are killed (SIGKILL), crashed (SIGSEGV) or stopped (SIGSTOP) at random moments, each flight's at most
@@ -9,7 +10,8 @@ twice; the batch's own process is killed `--kills` times and started again. In t
 byte, with one that `map_flights` makes undisturbed, but for what states when it was made and how long it took.
 
 With `--outages S` the sites' catalogues lie in PostgreSQL, each site is copied to an object store as well, and both are
-killed, cut off or stalled at random, for up to S seconds. The copies are then verified, too.
+killed, cut off or stalled at random, for up to S seconds. The copies are then verified, too. With `--ray` the flights
+run on a Ray cluster of two machines, with a shared detector on each, and what `node_faults.py` names is struck instead.
 """
 
 import argparse
@@ -36,12 +38,16 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "cluster"))
 from batch_flights import another, content
 
 from ended_work import ended
+from node_faults import node_faults
 from outages import PLACE, outages
 from provenance import commit, machine
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
+from sorvolo.cluster.executor import Executor
 from sorvolo.cluster.local_executor import LocalExecutor
 from sorvolo.cluster.orders import Ending, FlightWish, Order
+from sorvolo.cluster.ray_executor import ray_executor
+from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.table import BatchTable, State
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
@@ -99,12 +105,16 @@ def batch(folder: Path, options: argparse.Namespace) -> None:
     """One disturbed batch over the folder's flights; prints what it does."""
 
     @contextmanager
-    def executor(table: BatchTable) -> Iterator[LocalExecutor]:
+    def executor(table: BatchTable) -> Iterator[Executor]:
+        if options.ray:
+            with ray_executor("ray", None, options.stall, table.root, SharingSettings(options.model != "none")) as made:
+                yield made
+            return
         with Disturbed(options, table.lock, folder / "faults.txt") as made:
             yield made
 
     wish = FlightWish(
-        camera=str(folder / "flown-0" / "camera.xml"), model="none", copy_to=PLACE if options.outages else ""
+        camera=str(folder / "flown-0" / "camera.xml"), model=options.model, copy_to=PLACE if options.outages else ""
     )
     settings = BatchSettings(wish, stall_s=options.stall)
     running = run_batch([folder / "in"], folder / "maps", settings, executor)
@@ -144,7 +154,7 @@ def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
         site, wanted = folder / "maps" / flight.name, folder / "wanted" / flight.name
         with mock.patch.dict(os.environ, {VARIABLE: ""}):
             for _ in map_flights(
-                [flight], wanted, MapSettings(model="none"), camera=folder / "flown-0" / "camera.xml"
+                [flight], wanted, MapSettings(model=options.model), camera=folder / "flown-0" / "camera.xml"
             ):
                 pass
         found, expected = content(site), content(wanted)
@@ -166,6 +176,10 @@ def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
 def measured(folder: Path, options: argparse.Namespace) -> dict[str, object]:
     """The batch through all its faults, and what came of it."""
     flown(folder, options)
+    if options.ray:
+        with node_faults(folder / "maps", options.seed) as strikes:
+            result = struck(folder, options)
+        return {**result, "faults": dict(strikes.counts), **compared(folder, options)}
     with outages(options.seed, options.outages) if options.outages else nullcontext() as striking:
         result = struck(folder, options)
         if striking is not None:
@@ -226,6 +240,8 @@ def main() -> None:
     parser.add_argument("--kill-within", type=float, default=120.0, help="of the batch's start, s")
     parser.add_argument("--stall", type=float, default=8.0, help="after which a worker that does nothing is ended, s")
     parser.add_argument("--outages", type=float, default=0.0, help="of database and store, s at most; 0: none")
+    parser.add_argument("--ray", action="store_true", help="on a Ray cluster of two machines")
+    parser.add_argument("--model", default="none", help="of the detector")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "batch_faults.json")
     options = parser.parse_args()

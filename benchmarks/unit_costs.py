@@ -27,7 +27,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from PIL import Image, ImageEnhance
 from rich.console import Console
 from rich.table import Table
 
@@ -45,6 +45,7 @@ from sorvolo.simulation.settings import (
 RESULTS = Path(__file__).parent / "results" / "unit_costs.json"
 FPS, VIDEO_S, SPEED_M_S = 10.0, (2.0, 8.0), 6.0
 PHOTO_STRIPS = (1, 3)
+LATER_LIGHT = 1.1
 LIMIT_S = 1500
 
 
@@ -84,7 +85,7 @@ PHOTO_JOBS = (
 
 
 REAL_JOBS = (
-    VIDEO_JOBS[1], Job("watch", ("watch", "{flight1}", "--out", "{out}"), "{out}"),
+    VIDEO_JOBS[1], Job("watch", ("watch", "{flight1}", "--out", "{out}"), "{out}"), VIDEO_JOBS[3],
 )
 
 
@@ -136,7 +137,7 @@ def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
     """
     folder = place / f"{kind}{size}"
     if options.photos is not None and kind != "video":
-        return copied(folder / "flight1" / "photos", options.photos, size, options.megapixels).parents[1]
+        return copied(folder, options.photos, size, options.megapixels)
     if not folder.is_dir():
         place.mkdir(parents=True, exist_ok=True)
         subprocess.run(
@@ -148,18 +149,29 @@ def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
 
 
 def copied(folder: Path, photos: Path, size: int, megapixels: float) -> Path:
-    """A folder with copies of the first quarter (size 0) or half (1) of a flight's photos, of so many megapixels."""
+    """Two flights of the first quarter (size 0) or half (1) of these photos, of so many megapixels; their folder.
+
+    The second flight has the same photos in other light, encoded anew.
+    """
     found = sorted(path for path in photos.iterdir() if path.suffix.lower() in (".jpg", ".jpeg"))
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in found[: max(2, len(found) // (4 if size == 0 else 2))]:
-        with Image.open(path) as photo:
-            scale = math.sqrt(megapixels * 1e6 / (photo.width * photo.height))
-            if abs(scale - 1) < 0.02:
-                shutil.copy(path, folder / path.name)
-                continue
-            resized = photo.resize((round(photo.width * scale), round(photo.height * scale)), Image.Resampling.BICUBIC)
-            resized.save(folder / path.name, quality=92, exif=photo.info["exif"], xmp=photo.info.get("xmp", b""))
+    for number, light in ((1, 1.0), (2, LATER_LIGHT)):
+        flight = folder / f"flight{number}" / "photos"
+        flight.mkdir(parents=True, exist_ok=True)
+        for path in found[: max(2, len(found) // (4 if size == 0 else 2))]:
+            copy_photo(path, flight / path.name, megapixels, light)
     return folder
+
+
+def copy_photo(path: Path, copy: Path, megapixels: float, light: float) -> None:
+    """A copy of so many megapixels, so much lighter; the file itself where it is that already."""
+    with Image.open(path) as photo:
+        scale = math.sqrt(megapixels * 1e6 / (photo.width * photo.height))
+        if abs(scale - 1) < 0.02 and light == 1.0:
+            shutil.copy(path, copy)
+            return
+        resized = photo.resize((round(photo.width * scale), round(photo.height * scale)), Image.Resampling.BICUBIC)
+        lit = ImageEnhance.Brightness(resized).enhance(light)
+        lit.save(copy, quality=92, exif=photo.info["exif"], xmp=photo.info.get("xmp", b""))
 
 
 def simulate(folder: Path, kind: str, size: int, seed: int, megapixels: float) -> None:

@@ -49,7 +49,10 @@ class PostgresServer:
     def _data(self) -> Path:
         return self.folder / "data"
 
-    def start(self) -> None:
+    def start(self, *, only_reads: bool = False) -> None:
+        """Start it; with `only_reads` as a standby, which takes no changes."""
+        standby = self._data / "standby.signal"
+        standby.touch() if only_reads else standby.unlink(missing_ok=True)
         options = " ".join(f"-c {name}='{value}'" for name, value in (_SETTINGS | {"port": str(self.port)}).items())
         self._run([program("pg_ctl"), "-D", str(self._data), "-w", "-t", "60", "-l", str(self.folder / "log"), "-o",
                    options, "start"])

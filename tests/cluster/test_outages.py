@@ -1,6 +1,7 @@
 """A batch whose database and object store go away: nothing lost, nothing doubled, the maps of an undisturbed run."""
 
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,7 +11,8 @@ from urllib.parse import urlsplit
 
 import pytest
 from batch_flights import another, content
-from fake_bucket import BUCKET, served_bucket
+from fake_bucket import BUCKET, environment, served_bucket
+from killed_bucket import KilledBucket
 
 from ended_work import ended
 from faulty_link import FaultyLink
@@ -113,6 +115,32 @@ def test_an_object_store_that_comes_late_has_every_map(
         link.cut()  # and does not come back
         (failed,) = run(tmp_path, flown, lambda _: None, f"{place}2", RestartSettings(patience_s=0.0)).rows
         assert failed.state is State.FAILED and "was not copied" in failed.words and os.fspath(tmp_path) in failed.words
+
+
+def test_an_object_store_that_is_killed_in_the_middle_of_a_copy(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It dies after its third change, of which it tells nobody, and is there again with all three."""
+    another(flown, tmp_path / "in" / "one")
+    place = f"s3://{BUCKET}/maps"
+    with KilledBucket() as bucket:
+        for name, value in environment(bucket.endpoint).items():
+            monkeypatch.setenv(name, value)
+        bucket.stop()
+        bucket.start(dies_after=3)
+        signals: list[int] = []
+
+        def restart() -> None:
+            signals.append(bucket.wait_for_its_end())
+            bucket.start()
+
+        restarting = threading.Thread(target=restart)
+        restarting.start()
+        report = run(tmp_path, flown, lambda _: None, place)
+        restarting.join()
+        (row,) = report.rows
+        assert (row.state, report.crashes, signals) == (State.DONE, 0, [signal.SIGKILL])
+        assert not ended(verify_copy(str(tmp_path / "maps" / "one"), f"{place}/one")).faults
 
 
 def test_places_that_nothing_is_copied_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 """A batch on a Ray cluster of which a machine dies, or its head: nothing lost, the maps of an undisturbed run."""
 
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -14,14 +15,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from batch_flights import another, content
+from batch_flights import another, content, descendants, written_sites
 
 from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.cluster import streams
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
-from sorvolo.cluster.orders import FlightWish, Mission, Order
+from sorvolo.cluster.orders import FlightWish, Mission, Order, WatchWish
 from sorvolo.cluster.ray_cluster import demand_same, probe_of, why_not
 from sorvolo.cluster.ray_executor import _demand_fit, _with_detector, ray_executor
 from sorvolo.cluster.shared_detector import SharingSettings
@@ -32,7 +33,6 @@ from sorvolo.detection.sharing import shared_engine
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.store.site.files import LOCK as SITE_LOCK
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'sorvolo[fleet]'")
 
@@ -63,35 +63,12 @@ def _kill_a_machine_at_work(cluster: Any, root: Path) -> None:
     while True:
         time.sleep(0.02)
         for node in list(cluster.worker_nodes):
-            for pid in _descendants(node.all_processes["raylet"][0].process.pid):
-                if any(list(site.glob("flights/*/run.journal")) for site in _written_sites(pid, root)):
+            for pid in descendants({node.all_processes["raylet"][0].process.pid}):
+                if any(list(site.glob("flights/*/run.journal")) for site in written_sites(pid, root)):
                     os.kill(pid, signal.SIGSTOP)
                     cluster.remove_node(node, allow_graceful=False)
                     os.kill(pid, signal.SIGCONT)
                     return
-
-
-def _descendants(pid: int) -> set[int]:
-    """The processes that a process started, and those that they started."""
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):  # it has ended
-            parents[int(path.parent.name)] = int(path.read_text().rpartition(")")[2].split()[1])
-    found = {pid}
-    while more := {child for child, parent in parents.items() if parent in found} - found:
-        found |= more
-    return found - {pid}
-
-
-def _written_sites(pid: int, root: Path) -> set[Path]:
-    """The sites below `root` whose lock a process has open."""
-    sites = set()
-    for link in Path(f"/proc/{pid}/fd").glob("*"):
-        with suppress(OSError):
-            opened = Path(os.readlink(link))
-            if opened.name == SITE_LOCK and root in opened.parents:
-                sites.add(opened.parent)
-    return sites
 
 
 @pytest.mark.long
@@ -133,6 +110,25 @@ def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
         State.DONE, 1, "1 car, 1 person found in 4 frames"
     )
     assert (tmp_path / "out" / "north-watch" / "one" / "report.html").is_file()
+
+
+@pytest.mark.long
+def test_a_stream_whose_actor_dies_goes_on_in_the_same_folder(cluster: Any, flown: Path, tmp_path: Path) -> None:
+    """The first alert kills the process of Ray's that holds the actor, the parent of the watch."""
+    another(flown, tmp_path / "in" / "one")
+    script = 'if mkdir "$0"; then kill -9 $(cut -d " " -f 4 /proc/$PPID/stat); else echo $2 >> "$1"; fi'
+    alert = f"sh -c {shlex.quote(script)} {tmp_path / 'killed'} {tmp_path / 'alerts'} {{class}}"
+    wish = FlightWish(
+        Mission.WATCH, camera=str(flown / "camera.xml"), give_up_s=2.0, watch=WatchWish(alert_command=alert)
+    )
+    report = ended(run_streams(
+        streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]), tmp_path / "out", BatchSettings(wish),
+        lambda table: ray_executor("ray", 1, 60.0, table.root), threading.Event(),
+    ))
+    (row,) = report.rows
+    assert (row.state, row.tries, report.crashes) == (State.DONE, 2, 1)
+    assert row.words == "1 car, 1 person found in 4 frames"
+    assert [path.name for path in (tmp_path / "out" / "north-watch").iterdir()] == ["one"]
 
 
 def test_a_machine_that_dies_loses_nothing(cluster: Any, flown: Path, tmp_path: Path) -> None:
@@ -258,7 +254,7 @@ def _held_missions(cluster: Any) -> list[int]:
     while time.monotonic() < end_s:
         held = []
         for node in cluster.worker_nodes:
-            for pid in _descendants(node.all_processes["raylet"][0].process.pid):
+            for pid in descendants({node.all_processes["raylet"][0].process.pid}):
                 with suppress(OSError):  # it has ended
                     if b"sorvolo.cluster.worker" in Path(f"/proc/{pid}/cmdline").read_bytes():
                         os.kill(pid, signal.SIGSTOP)

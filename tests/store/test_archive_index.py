@@ -72,7 +72,7 @@ def address(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.fixture(scope="session")
 def postgis(postgres: PostgresServer) -> str:
     if not postgres.sql("SELECT 1 FROM pg_available_extensions WHERE name = 'postgis'"):
-        pytest.skip("PostGIS is not installed (Debian: apt-get install postgresql-15-postgis-3)")
+        pytest.skip("PostGIS is not installed (Debian: apt-get install postgresql-postgis)")
     postgres.sql("CREATE DATABASE places")
     postgres.sql("CREATE EXTENSION IF NOT EXISTS postgis SCHEMA public", database="places")
     return postgres.url.replace("/postgres", "/places")

@@ -70,6 +70,16 @@ def test_a_site_goes_to_s3_and_back(bucket: str, site: Path, tmp_path: Path) -> 
     assert manifest["generation"] == 2 and len(manifest["versions"]) == 3
 
 
+def test_a_site_goes_from_store_to_store(bucket: str, site: Path, tmp_path: Path) -> None:
+    first, second = (BucketEnd(open_objects(f"s3://{BUCKET}/{name}/field")) for name in ("first", "second"))
+    outcome = copied(FolderEnd(site), first)
+    assert copied(first, second).copied == outcome.files
+    assert not verified(FolderEnd(site), second).faults
+    assert copied(first, second).copied == 0
+    copied(second, FolderEnd(tmp_path / "back"))
+    assert hashes(tmp_path / "back") == hashes(site)
+
+
 def test_gdal_reads_the_map_where_it_lies(bucket: str, site: Path) -> None:
     copied(FolderEnd(site), BucketEnd(open_objects(f"s3://{BUCKET}/gis")))
     options = {

@@ -279,6 +279,25 @@ def test_a_full_server_is_named(site: Path, postgres: PostgresServer) -> None:
         map_flight(archive, "b", 60, count=1)
 
 
+def test_a_standby_is_read_and_named_when_it_is_to_be_written(site: Path, postgres: PostgresServer) -> None:
+    postgres.stop()
+    postgres.start(only_reads=True)
+    try:
+        with Archive.open(site, write=False) as reader:
+            assert [each.id for each in reader.flights()] == ["a"]
+        words = r"cannot be written or read by sorvolo \(cannot execute .* in a read-only transaction\); ask for a role"
+        with pytest.raises(StoreError, match=words), Archive.open(site, write=True) as archive:
+            map_flight(archive, "b", 60, count=1)
+        with pytest.raises(StoreError, match=words):
+            Archive.open(site.parent / "new", write=True)
+        assert not (site.parent / "new" / POINTER).exists()
+    finally:
+        postgres.stop()
+        postgres.start()
+    with Archive.open(site, write=True) as archive:
+        assert map_flight(archive, "b", 60, count=1) == 2
+
+
 @pytest.fixture
 def silent() -> Iterator[int]:
     """The port of a server that takes connections and never answers."""

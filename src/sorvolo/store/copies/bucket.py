@@ -4,16 +4,18 @@ import hashlib
 import io
 import json
 import secrets
+import tempfile
 import threading
 import warnings
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
 from sorvolo.errors import SorvoloWarning, StoreError
+from sorvolo.store.atomic import writing
 from sorvolo.store.copies.folder import refuse_loss, refuse_other
 from sorvolo.store.copies.objects import ConflictError, Objects
 from sorvolo.store.copies.state import (
@@ -41,6 +43,26 @@ SHOWN = ("mosaic.tif", "preview.png")
 """The newest map, which has plain names as well, for GIS and browsers."""
 
 _MOST_SUFFIX = 10
+
+
+@contextmanager
+def _beside(stream: BinaryIO) -> Iterator[tuple[BinaryIO, Callable[[bytes], object]]]:
+    """Where a stream's bytes can be read again from this machine, and what has to be called with them: a file itself,
+    or a temporary one beside a stream of a store, from which nothing can be read while a store is written to.
+
+    Raises StoreError where the temporary folder is full.
+    """
+    if isinstance(getattr(stream, "raw", None), io.FileIO):
+        yield stream, len
+        return
+    folder = Path(tempfile.gettempdir())
+    with tempfile.TemporaryFile() as beside:
+
+        def keep(chunk: bytes) -> None:
+            with writing(folder):
+                beside.write(chunk)
+
+        yield beside, keep
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,14 +261,16 @@ class BucketEnd:
     def put(self, file: SiteFile, stream: BinaryIO) -> None:
         """Store a file under its content's name. Raises DamagedError for bytes of another SHA-256 than the file's."""
         digest, size = hashlib.sha256(), 0
-        for chunk in chunks_of(stream):
-            digest.update(chunk)
-            size += len(chunk)
-        refuse_damaged(file, digest.hexdigest())
-        named = SiteFile(file.path, size, digest.hexdigest())
-        if self._round.stored.get(key_of(named)) != size and self._round.claim(key_of(named)):
-            self._objects.write(key_of(named), stream)
-        self._round.files[file.path] = named
+        with _beside(stream) as (here, kept):
+            for chunk in chunks_of(stream):
+                digest.update(chunk)
+                size += len(chunk)
+                kept(chunk)
+            refuse_damaged(file, digest.hexdigest())
+            named = SiteFile(file.path, size, digest.hexdigest())
+            if self._round.stored.get(key_of(named)) != size and self._round.claim(key_of(named)):
+                self._objects.write(key_of(named), here)
+            self._round.files[file.path] = named
 
     def conclude(self, state: SiteState) -> None:
         """Make everything that was put the site. Raises StoreError where another writer was faster."""

@@ -145,5 +145,5 @@ def _demand_postgis(connection: Connection) -> None:
         found = "no PostGIS" if place is None else f"PostGIS in the schema {place}"
         raise StoreError(
             f"the database has {found}; the archive index needs it in the schema public: install it (Debian: "
-            "postgresql-15-postgis-3) and have an administrator run CREATE EXTENSION postgis SCHEMA public there"
+            "postgresql-postgis) and have an administrator run CREATE EXTENSION postgis SCHEMA public there"
         )
