@@ -152,6 +152,12 @@ def test_costs_are_those_of_flights_so_far_and_double_after_a_crash() -> None:
     assert cost_of(_row("d"), []).memory_mb == 1000
     assert (cost_of(_row("d"), ended).cpus, cost_of(_row("d"), ended).memory_mb) == (2.0, pytest.approx(1800))
     assert cost_of(_row("d", crashes=2), ended).memory_mb == pytest.approx(7200)
+    live = _row("e", source="rtsp://drone/live")
+    assert cost_of(live, ended).cpus == 1  # none was live
+    watched = replace(live, state=State.DONE, peak_memory_mb=230.0, cpu_s=9.0, seconds=60.0)
+    idle = replace(watched, cpu_s=0.1)
+    assert [cost_of(live, [*ended, each]).cpus for each in (watched, idle)] == [0.2, 0.1]
+    assert cost_of(_row("d"), [*ended, watched]).cpus == 2
 
 
 def test_the_tries_of_a_flight_add_up() -> None:

@@ -87,6 +87,9 @@ def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: An
             engine = shared_engine(address, find_model("thermal"))
             assert "CPU" in engine.provider
             assert len(engine.run(np.zeros((1, 3, 64, 64), np.uint8))) == 3
+        executor._running = {("watch", str(number)): None for number in range(8)}  # two cores hold ten of a fifth
+        assert executor.has_room(Cost(0.2, 100.0)) and not executor.has_room(Cost(1.0, 100.0))
+        executor._running = {}
         given = ray.get(ray.remote(_with_detector).remote(order, addresses))
         assert given.detector in addresses.values()
         assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order

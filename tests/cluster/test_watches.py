@@ -98,7 +98,7 @@ def test_a_stream_whose_watch_dies_goes_on_in_the_same_folder(flown: Path, tmp_p
                 (row,) = end.value.rows
                 break
     assert [each.row.words for each in updates[:2] if each.row] == [
-        "waits for memory that others have; it starts when it is known to be free", ""
+        "waits for memory or cores that others have; it starts when they are known to be free", ""
     ]
     assert (row.state, row.tries, row.site, row.flight) == (State.DONE, 2, "north-watch", "one")
     assert row.words == "1 car, 1 person found in 4 frames"

@@ -2,8 +2,10 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import ceil
 from statistics import median
 
+from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.cluster.table import Row, State
 
 
@@ -12,7 +14,8 @@ class CostSettings:
     """What a try is given, and what of a machine all tries may have together."""
 
     unknown_mb: float = 1000.0  # before any flight was measured; 4,000 frames of 1080p peak at 634 MB
-    reserve: float = 1.2  # times the largest flight so far
+    reserve: float = 1.2  # times the largest flight so far, and the cores of live ones
+    least_live_cpus: float = 0.1  # of a live flight: one that waited for its drone took next to nothing
     detector_mb: float = 1000.0  # of the detector that flights share, at least: what it adds to a map of 1080p frames
     settled_s: float = 60.0  # after which a live flight is budgeted what it has had, and a reserve
     machine_share: float = 0.8  # of a machine's memory: the rest is for the system, the batch and the files' cache
@@ -29,12 +32,22 @@ class Cost:
 def cost_of(row: Row, rows: Iterable[Row], settings: CostSettings = CostSettings()) -> Cost:
     """The memory of the largest flight of the same mission so far and a fifth more, the cores of the median one.
 
-    After each crash of this flight it is given twice the memory: want of it may have been the reason.
+    A recorded flight takes all of a core, or several; a live one as much of one as its pictures ask for, by the live
+    ones so far and a fifth more. After each crash of this flight it is given twice the memory: want of it may have been
+    the reason.
     """
     ended = [
         each for each in rows
         if each.mission == row.mission and each.state in (State.DONE, State.DOUBTFUL) and each.peak_memory_mb > 0
     ]
     memory_mb = settings.reserve * max((each.peak_memory_mb for each in ended), default=0.0) or settings.unknown_mb
-    cpus = median([each.cpu_s / each.seconds for each in ended if each.seconds > 0] or [1.0])
-    return Cost(max(1.0, round(cpus)), memory_mb * 2**row.crashes)
+    is_live = is_live_address(row.source)
+    shares = [
+        each.cpu_s / each.seconds for each in ended if each.seconds > 0 and is_live_address(each.source) == is_live
+    ]
+    cpus = median(shares or [1.0])
+    if is_live and shares:
+        asked = max(settings.least_live_cpus, ceil(20 * settings.reserve * cpus) / 20)  # in twentieths of a core
+    else:
+        asked = max(1.0, round(cpus))
+    return Cost(asked, memory_mb * 2**row.crashes)

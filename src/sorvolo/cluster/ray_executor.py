@@ -106,8 +106,8 @@ class RayExecutor:
 
     def has_room(self, cost: Cost) -> bool:
         """Whether another try may start."""
-        if self._workers is not None:
-            return len(self._running) < self._workers
+        if self._workers is not None and len(self._running) >= self._workers:
+            return False
         slots = sum(each["CPU"] // min(cost.cpus, each["CPU"]) for each in self._asked(self._machines))
         return len(self._running) < slots
 

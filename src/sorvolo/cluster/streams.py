@@ -22,7 +22,7 @@ from sorvolo.cluster.watches import ENDING
 from sorvolo.errors import SettingsError
 
 _LOOK_S = 0.5
-_NO_ROOM = "waits for memory that others have; it starts when it is known to be free"
+_NO_ROOM = "waits for memory or cores that others have; it starts when they are known to be free"
 
 
 @dataclass(frozen=True)
