@@ -96,7 +96,6 @@ _RESTLESS = f"{_EVIDENCE}:RestlessSettings"
 RULES: tuple[Rule, ...] = (
     # when a change is announced, and when it is withdrawn
     _decision("large must be sure", "0018", (f"{_ANNOUNCING}.large_score", 0.0)),
-    _decision("specks of shade", "0015", (f"{_ANNOUNCING}.shade_score", 0.0)),
     _decision("restless ground", "before 0014", (f"{_ANNOUNCING}.restless_half", _INFINITE)),
     _decision("restless ground, only for the unsure", "0007", (f"{_ANNOUNCING}.doubt", _INFINITE)),
     _decision("restless ground: not what changed itself", "before 0014", (f"{_RESTLESS}.changed_itself", 1.0)),

@@ -15,7 +15,7 @@ from typing import Any
 from sorvolo.change.evidence.announcing import Announce, Look, Tally, judge
 from sorvolo.change.evidence.candidate import Candidate
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.shape.shadows import shade_share, without_shadow
+from sorvolo.change.shape.shadows import without_shadow
 from sorvolo.survey.findings import Change, ComparedView
 
 
@@ -31,7 +31,7 @@ class Gatherer(EvidenceMap):
             return super()._announce(candidate, now_ns)
         candidate.note_restlessness(self._restlessness(candidate))
         whole = self._record(candidate)
-        look = None if whole is None else Look(whole.area_m2, whole.length_m, shade_share(whole.patch))
+        look = None if whole is None else Look(whole.area_m2, whole.length_m)
         self.noted.setdefault(candidate.number, []).append(replace(candidate.tally, look=look))
         return []
 

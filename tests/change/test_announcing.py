@@ -22,7 +22,7 @@ from sorvolo.change.evidence.announcing import (
 RULES = AnnounceSettings()
 SURE = Tally(
     0, 4_000_000_000, views=10, asked=10, score_sum=9.0, whole=10,
-    camera_low_m=(-10.0, 0.0, 20.0), camera_high_m=(10.0, 0.0, 20.0), look=Look(1.0, 1.2, shade_share=0.0),
+    camera_low_m=(-10.0, 0.0, 20.0), camera_high_m=(10.0, 0.0, 20.0), look=Look(1.0, 1.2),
 )
 
 
@@ -36,8 +36,9 @@ def test_what_all_views_show_surely_is_announced_with_its_score():
     ({"score_sum": 3.0}, Reason.UNSURE),
     ({"asked": 25}, Reason.UNSURE),
     ({"restless": 0.2, "score_sum": 7.0}, Reason.UNSURE),
-    ({"score_sum": 6.0, "look": Look(0.1, 0.4, shade_share=0.8)}, Reason.SHADE),
-    ({"score_sum": 5.0, "look": Look(3.0, 2.5, shade_share=0.0)}, Reason.LARGE_AND_UNSURE),
+    ({"look": Look(1.0, 1.2, is_moved_shadow=True)}, Reason.SHADOW),
+    ({"look": Look(1.0, 1.2, may_be_relief=True)}, Reason.RELIEF),
+    ({"score_sum": 5.0, "look": Look(3.0, 2.5)}, Reason.LARGE_AND_UNSURE),
 ])
 def test_each_rule_stops_a_candidate_alone_and_names_itself(reported, reason):
     tally = replace(SURE, **reported)
@@ -46,9 +47,7 @@ def test_each_rule_stops_a_candidate_alone_and_names_itself(reported, reason):
 
 
 @pytest.mark.parametrize("reported", [
-    {"score_sum": 5.0, "look": Look(3.0, 25.0, shade_share=0.0)},  # snow is longer than the flying height
-    {"score_sum": 8.0, "look": Look(0.1, 0.4, shade_share=0.8)},
-    {"score_sum": 6.0, "look": Look(0.3, 0.6, shade_share=0.8)},  # no speck
+    {"score_sum": 5.0, "look": Look(3.0, 25.0)},  # snow is longer than the flying height
     {"restless": 0.2, "views": 40, "asked": 40, "score_sum": 39.5, "whole": 40},  # restless, but sure
 ])
 def test_the_exceptions_are_announced(reported):

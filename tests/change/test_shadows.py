@@ -8,7 +8,7 @@ from blob_world import M_PER_PX, START_NS, Thing, flight
 
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.pair.shade import shade_between
-from sorvolo.change.shape.shadows import ThingSettings, shade_share, thing_of, things_of
+from sorvolo.change.shape.shadows import ThingSettings, thing_of, things_of
 from sorvolo.survey.findings import ChangeKind, Patch
 
 SHADOW = (58, 58, 58)  # of ground as bright as 110
@@ -116,12 +116,6 @@ def test_people_whose_shadows_join_them_are_two():
     shadows = [(np.s_[x : x + 46], np.s_[51:55], SHADOW) for x in (14, 64)]
     patch = patch_with(*shadows, *people)
     assert len(things_of(shaded(patch), ChangeKind.APPEARED, patch.changed)) == 2
-
-
-@pytest.mark.parametrize("colour, share", [(SHADOW, 1.0), ((200, 60, 60), 0.0)])
-def test_ground_that_all_colours_show_darker_is_shade(colour, share):
-    patch = patch_with((np.s_[40:46], np.s_[60:66], colour))
-    assert shade_share(patch) == share
 
 
 @pytest.mark.parametrize("gap_m", [1.2, 2.0])

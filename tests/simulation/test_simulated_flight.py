@@ -10,9 +10,12 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from sorvolo.errors import SettingsError
+from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import site_from_gimbal_rotation
+from sorvolo.geometry.sun import sun_direction
 from sorvolo.simulation.canvas import Area
+from sorvolo.simulation.clock import start_ns, sun_of_flight
 from sorvolo.simulation.flight import simulate_flight, simulate_flights
 from sorvolo.simulation.ground import GroundKind, orthophoto_ground, paint_ground
 from sorvolo.simulation.noise import smooth_series
@@ -25,6 +28,7 @@ from sorvolo.simulation.settings import (
     SceneSettings,
     SensorSettings,
     SimulationSettings,
+    WeatherSettings,
 )
 from sorvolo.simulation.telemetry import observe
 from sorvolo.simulation.world import needed_area
@@ -146,6 +150,23 @@ def test_later_flights_find_changes_and_other_light():
     assert before - now and now - before
     assert not np.allclose(first.day.light.sun, second.day.light.sun)
     assert second.started_ns > first.started_ns
+
+
+@pytest.mark.parametrize("place", [(41.9, 12.6), (-33.9, 151.2), (64.1, -21.9)])
+def test_the_sun_of_a_flight_stands_where_its_time_and_place_put_it(place):
+    settings = replace(QUICK, scene=replace(QUICK.scene, origin=Geodetic(*place, 80.0)))
+    suns = [sun_of_flight(settings, flight) for flight in (1, 2, 3)]
+    times_ns = [start_ns(settings, flight) for flight in (1, 2, 3)]
+    assert times_ns == sorted(set(times_ns))
+    for sun, time_ns in zip(suns, times_ns):
+        assert np.allclose(sun, sun_direction(time_ns, *place)) and sun[2] > 0.3
+    same_light = replace(settings, later=replace(settings.later, weather=WeatherSettings(has_other_light=False)))
+    assert np.degrees(np.arccos(suns[0] @ sun_of_flight(same_light, 2))) < 0.2
+
+
+def test_a_polar_night_is_given_a_low_sun():
+    settings = replace(QUICK, scene=replace(QUICK.scene, origin=Geodetic(-89.0, 0.0, 80.0)))
+    assert np.degrees(np.arcsin(sun_of_flight(settings, 1)[2])) == pytest.approx(10.0)
 
 
 def test_an_orthophoto_must_cover_the_flight():

@@ -19,11 +19,13 @@ _INNER = 0.8  # of an outline, about its middle, that a picture shows which show
 
 
 class EarlierPicture(NamedTuple):
-    """Where a picture of an earlier flight lies; `site_from_camera` is None where its method has no pose."""
+    """Where a picture of an earlier flight lies, and its time, UTC; `site_from_camera` is None where its method has no
+    pose."""
 
     camera: Camera
     site_from_image: Matrix3
     site_from_camera: Pose | None
+    time_ns: int = 0
 
 
 class Vantage(NamedTuple):
@@ -102,7 +104,9 @@ class EarlierPictures:
                 rgba, site_from_picture = picture
                 patch_from_picture = np.linalg.inv(window.site_from_patch) @ site_from_picture
                 seen = np.asarray(cv2.warpPerspective(rgba, patch_from_picture, window.size_px), np.uint8)
-                found.append(LaidPicture.of(seen[..., :3], seen[..., 3] == 255, window, self._cameras_m[index]))
+                found.append(LaidPicture.of(
+                    seen[..., :3], seen[..., 3] == 255, window, self._cameras_m[index], self._pictures[index].time_ns
+                ))
         return found
 
     def _as_coarse(self, index: int, site_from_other: Matrix3) -> tuple[ImageRGBA, Matrix3] | None:

@@ -259,10 +259,9 @@ class ViewMaker:
         return float("nan") if self._tuning is None else self._tuning.brightness
 
     @property
-    def level_pictures(self) -> EarlierPictures | None:
-        """The earlier pictures; None where there are none, or what stands on the ground is known."""
-        pictures = self._pictures
-        return None if pictures is None or pictures.knows_relief else pictures
+    def earlier_pictures(self) -> EarlierPictures | None:
+        """The pictures of earlier flights; None where they are not asked."""
+        return self._pictures
 
     @property
     def times_coarser(self) -> float:

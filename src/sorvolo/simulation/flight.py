@@ -15,6 +15,7 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
 from sorvolo.simulation.bodies import build_body
+from sorvolo.simulation.clock import start_ns
 from sorvolo.simulation.ground import PaintedGround
 from sorvolo.simulation.noise import SmoothSeries, layer, smooth_series
 from sorvolo.simulation.objects import Body, Thing
@@ -26,8 +27,6 @@ from sorvolo.simulation.view import RaysF32, View, camera_view, ray_grid, remapp
 from sorvolo.simulation.world import Day, World, build_day, build_world
 from sorvolo.survey.flight import Frame, Telemetry, no_telemetry
 
-_FIRST_START_NS = 1_778_576_400 * 10**9  # 2026-05-12 09:00:00 UTC
-_BETWEEN_FLIGHTS_NS = (7 * 86400 + 3 * 3600) * 10**9
 _CLOUD_CELL_M = 7.0
 _CLOUD_STEP_PX = 16  # clouds are soft: their shade is computed on a coarse grid of the picture
 
@@ -75,10 +74,10 @@ class SimulatedFlight:
         """WGS84 to the site's metres and back; up = 0 is the ground."""
         return LocalFrame(self.settings.scene.origin)
 
-    @property
+    @cached_property
     def started_ns(self) -> int:
         """UTC time of the first frame."""
-        return _FIRST_START_NS + (self.number - 1) * _BETWEEN_FLIGHTS_NS
+        return start_ns(self.settings, self.number)
 
     @cached_property
     def frame_times_s(self) -> Floats:
@@ -251,7 +250,7 @@ def _frame_times_s(settings: SimulationSettings, path: FlownPath) -> Floats:
 
 def _observe_all(settings: SimulationSettings, path: FlownPath, number: int) -> dict[str, Observation]:
     site = LocalFrame(settings.scene.origin)
-    started_ns = _FIRST_START_NS + (number - 1) * _BETWEEN_FLIGHTS_NS
+    started_ns = start_ns(settings, number)
     observations: dict[str, Observation] = {}
     if settings.output.photos and settings.output.telemetry != "none":
         rng = np.random.default_rng([settings.seed, 8, number, 99])

@@ -10,6 +10,7 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray
 from sorvolo.simulation.bodies import build_body
 from sorvolo.simulation.canvas import Area, GroundRaster
+from sorvolo.simulation.clock import sun_of_flight
 from sorvolo.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
 from sorvolo.simulation.noise import fractal
 from sorvolo.simulation.objects import SMALL_KINDS, Body, Label, Light, Thing, new_kind, new_size
@@ -124,7 +125,7 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     """The site as one flight, counted from 1, finds it, fine enough for pictures of `m_per_px` on the ground."""
     rng = np.random.default_rng([settings.seed, 3, flight])
     weather = settings.later.weather if flight > 1 else WeatherSettings(False, False, 0.0)
-    light, gains = _daylight(weather, rng)
+    light, gains = Light(sun_of_flight(settings, flight)), _gains(weather, rng)
     things = world.days[flight - 1]
     ground = world.ground.resampled(0.72 * m_per_px)
     if weather.snow:
@@ -142,17 +143,12 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade, world.relief)
 
 
-def _daylight(weather: WeatherSettings, rng: np.random.Generator) -> tuple[Light, Floats]:
-    """The sun and the camera's gains, (3,), of a day."""
+def _gains(weather: WeatherSettings, rng: np.random.Generator) -> Floats:
+    """The camera's gains, (3,), on a day."""
     is_other = weather.has_other_light
-    azimuth = np.radians(rng.uniform(0, 360) if is_other else 215.0)
-    elevation = np.radians(rng.uniform(28, 62) if is_other else 48.0)
-    light = Light(np.array([
-        np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)
-    ]))
     warmth = rng.uniform(-0.06, 0.06) if is_other else 0.0
     gains = np.array([1 + warmth, 1.0, 1 - warmth]) * (rng.uniform(0.82, 1.12) if is_other else 1.0)
-    return light, gains * weather.brightness
+    return np.asarray(gains * weather.brightness)
 
 
 def _swayed(things: tuple[Thing, ...], wind_m: float, rng: np.random.Generator) -> tuple[Thing, ...]:

@@ -15,8 +15,8 @@ class Reason(StrEnum):
     TOO_FEW_VIEWS = "too few views show it"
     UNSURE = "its score is too low"
     LARGE_AND_UNSURE = "it is large and its score is low, like a wall that leans"
-    SHADE = "it is ground in another shade"
     RELIEF = "earlier pictures show it from another side, where a wall or a roof would differ as well"
+    SHADOW = "it is the moved shadow of something that stays"
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,6 @@ class AnnounceSettings:
     least_score: float = 0.38  # 0007: half of what the trees asked for that had seen no flights
     large_m2: float = 2.0  # 0018: from this size on ...
     large_score: float = 0.52  # 0018: ... and shorter than the flying height, a less sure one is a wall that leans
-    shade_score: float = 0.6  # 0015: a speck that is mostly shade must be surer than this
-    speck_m2: float = 0.2  # 0015: what is smaller may be a speck of shade ...
-    shade_share: float = 0.7  # 0015: ... if so much of it is
     restless_half: float = 0.05  # share of views that flag the ground around for nothing: half the score is left
     doubt: float = 2.0  # 0007: restless ground counts in full where half of the score is missing
     cut_off: float = 0.5  # 0007: of the score is left where no view shows all of it
@@ -68,12 +65,13 @@ class Look:
     """What a candidate's pictures and outline show.
 
     `may_be_relief`: something tall that stands there unchanged would differ as well (`ReliefDoubt`).
+    `is_moved_shadow`: the shadow of something that stays lies elsewhere, and nothing else differs (`ShadowDoubt`).
     """
 
     area_m2: float
     length_m: float
-    shade_share: float  # of it is ground in another shade, 0 to 1
     may_be_relief: bool = False
+    is_moved_shadow: bool = False
 
 
 @dataclass(frozen=True)
@@ -177,9 +175,8 @@ def _objection_to_look(look: Look, score: float, tally: Tally, settings: Announc
     """The first rule that what its pictures and outline show fails."""
     if look.may_be_relief:
         return Reason.RELIEF
-    is_speck_of_shade = look.area_m2 < settings.speck_m2 and look.shade_share >= settings.shade_share
-    if is_speck_of_shade and score < settings.shade_score:
-        return Reason.SHADE
+    if look.is_moved_shadow:
+        return Reason.SHADOW
     may_be_a_wall = look.area_m2 >= settings.large_m2 and look.length_m < tally.flying_height_m  # snow is longer
     if may_be_a_wall and score < settings.large_score and not tally.is_from_one_place(settings):
         return Reason.LARGE_AND_UNSURE

@@ -35,9 +35,10 @@ from sorvolo.change.evidence.cells import (
 )
 from sorvolo.change.evidence.pictures import PictureSettings
 from sorvolo.change.evidence.relief_doubt import ReliefDoubt
+from sorvolo.change.evidence.shadow_doubt import ShadowDoubt, SunAt
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingBlobs, MovingSettings
 from sorvolo.change.motion.moving_changes import Movers
-from sorvolo.change.shape.shadows import ThingSettings, shade_share
+from sorvolo.change.shape.shadows import ThingSettings
 from sorvolo.change.shape.things import Parts
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, Mask
@@ -105,17 +106,19 @@ class EvidenceMap:
     """The changes of one flight while its views come in. `add` changes it; `conclude` settles what is left.
 
     `m_per_px` is a pixel of changes' pictures, `id_prefix` begins every change's id: the flight's name. Views must come
-    in order of time; the same views give the same changes and ids. `earlier` are the pictures of earlier flights; None
-    where what stands on the ground is known, or there are none.
+    in order of time; the same views give the same changes and ids. `earlier` are the pictures of earlier flights, None
+    where there are none; `sun_at` gives the sun of either date.
     """
 
     def __init__(
-        self, m_per_px: float, settings: EvidenceSettings, id_prefix: str, earlier: EarlierPictures | None = None
+        self, m_per_px: float, settings: EvidenceSettings, id_prefix: str, earlier: EarlierPictures | None = None,
+        sun_at: SunAt = lambda _: None,
     ) -> None:
         self._settings, self._prefix = settings, id_prefix
         self._rules, self._gathering = settings.announcing, settings.gathering
         self._m_per_px = m_per_px
-        self._relief = None if earlier is None else ReliefDoubt(earlier, m_per_px)
+        self._relief = None if earlier is None or earlier.knows_relief else ReliefDoubt(earlier, m_per_px)
+        self._shadows = None if earlier is None else ShadowDoubt(earlier, sun_at)
         self._cell_m = self._gathering.cells.side_m(m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
         self._gap = int(np.ceil(self._join_m / self._cell_m))
@@ -434,7 +437,10 @@ class EvidenceMap:
         may_be_relief = self._relief is not None and self._relief.explains(
             candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
         )
-        return Look(whole.area_m2, whole.length_m, shade_share(whole.patch), may_be_relief)
+        is_shadow = not may_be_relief and self._shadows is not None and self._shadows.explains(
+            candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
+        )
+        return Look(whole.area_m2, whole.length_m, may_be_relief, is_shadow)
 
     def _restlessness(self, candidate: Candidate) -> float:
         return restlessness(

@@ -44,18 +44,19 @@ class LevelSettings:
 
 @dataclass(frozen=True, eq=False)
 class LaidPicture:
-    """A picture laid on level ground: `gray` (h, w) uint8 of a window, 0 where it shows nothing, and where its camera
-    was, (3,)."""
+    """A picture laid on level ground: `gray` (h, w) uint8 of a window, 0 where it shows nothing, where its camera
+    was, (3,), and when, UTC."""
 
     window: PatchWindow
     gray: ImageGray
     camera_m: Vector3
+    time_ns: int = 0
 
     @classmethod
-    def of(cls, rgb: ImageRGB, known: Mask, window: PatchWindow, camera_m: Vector3) -> "LaidPicture":
+    def of(cls, rgb: ImageRGB, known: Mask, window: PatchWindow, camera_m: Vector3, time_ns: int = 0) -> "LaidPicture":
         """A picture (h, w, 3) of the window, and where (h, w) it shows anything."""
         gray = np.maximum(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), 1)
-        return cls(window, np.where(known, gray, 0).astype(np.uint8), camera_m)
+        return cls(window, np.where(known, gray, 0).astype(np.uint8), camera_m, time_ns)
 
 
 class Sights:
@@ -106,7 +107,7 @@ def _laid(view: ComparedView, window: PatchWindow) -> LaidPicture:
     valid = cv2.warpPerspective(
         view.valid.view(np.uint8), patch_from_image, window.size_px, flags=cv2.INTER_NEAREST
     )
-    return LaidPicture.of(np.asarray(rgb, np.uint8), np.asarray(valid > 0), window, view.camera_m)
+    return LaidPicture.of(np.asarray(rgb, np.uint8), np.asarray(valid > 0), window, view.camera_m, view.time_ns)
 
 
 def surroundings(

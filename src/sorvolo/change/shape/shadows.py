@@ -47,12 +47,6 @@ def without_shadow(change: Change, settings: ThingSettings = ThingSettings()) ->
     return replace(change, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m)
 
 
-def shade_share(patch: Patch) -> float:
-    """The share of what changed that all colours show clearly darker on one date: a shadow came or left."""
-    changed = max(int(np.count_nonzero(patch.changed)), 1)
-    return int(np.count_nonzero(patch.changed & _is_dark(patch))) / changed
-
-
 def shadow_of(patch: Patch, kind: ChangeKind) -> Mask:
     """Where (h, w) it is dark as a shadow is: on the later date where something came, on the earlier where it went."""
     bits = {ChangeKind.DISAPPEARED: Shade.EARLIER, ChangeKind.REPLACED: Shade.LATER | Shade.EARLIER}

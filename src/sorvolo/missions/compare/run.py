@@ -8,10 +8,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from sorvolo.capture.sync import DATED_NS
 from sorvolo.change.areas.area_map import AreaMap, with_areas
 from sorvolo.change.areas.gathered_things import GatheredThings
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.evidence.shadow_doubt import SunAt
 from sorvolo.change.map_update import paint_changes
 from sorvolo.change.pair.thesis import thesis_steps
 from sorvolo.change.reference import ReferenceMap
@@ -20,8 +22,9 @@ from sorvolo.change.shape.outlines import KnownPlace
 from sorvolo.change.shape.reported import reported
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord, as_bgr
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Mask
+from sorvolo.geometry.arrays import Mask, Vector3
 from sorvolo.geometry.summary import median_of_known
+from sorvolo.geometry.sun import sun_direction
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
@@ -47,7 +50,7 @@ from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
-from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
+from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame, Site
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 
@@ -249,7 +252,7 @@ class CompareRun:
                 self._evidence = EvidenceMap(
                     self._views.change_m_per_px(view),
                     EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._setup.source.name,
-                    self._views.level_pictures,
+                    self._views.earlier_pictures, _sun_at(self._archive.site()),
                 )
             announced: Sequence[Change] = self._reported(self._evidence.add(view))
             if self._settings.method != "thesis":
@@ -358,6 +361,19 @@ def _earlier_pictures(archive: Archive, superseded: str, sizes: ViewSizes = View
     )
     images = ImageCache(lambda index: with_known_pixels(archive.image(keyframes[index])), sizes.cache_bytes)
     return EarlierPictures(
-        [EarlierPicture(each.camera, each.site_from_image, each.site_from_camera) for each in keyframes], images.get,
-        relief,
+        [
+            EarlierPicture(each.camera, each.site_from_image, each.site_from_camera, each.time_ns)
+            for each in keyframes
+        ],
+        images.get, relief,
     )
+
+
+def _sun_at(site: Site) -> SunAt:
+    """Where the sun stands over a site; not known where a clock has no date, or the site no place on earth."""
+    def sun_at(time_ns: int) -> Vector3 | None:
+        if site.is_local or time_ns < DATED_NS:
+            return None
+        return sun_direction(time_ns, site.origin.latitude_deg, site.origin.longitude_deg)
+
+    return sun_at

@@ -1,0 +1,254 @@
+"""Whether a difference is the moved shadow of something that stays, by where the sun stood on both dates.
+
+A thing of known width and height throws a shadow on level ground of which the sun gives direction and length. Where it
+stays and the sun does not, ground is brighter along the one date's direction and darker along the other's, from one and
+the same foot. What came or left has one of both shadows, and its own pixels differ.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import product
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from cv2.typing import MatLike
+
+from sorvolo.change.earlier_pictures import EarlierPictures
+from sorvolo.change.evidence.level_ground import LaidPicture, LevelSettings, Sights
+from sorvolo.change.shape.outlines import mask_of
+from sorvolo.change.shape.patches import PatchWindow
+from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM, Vector3
+
+SunAt = Callable[[int], Vector3 | None]
+"""The unit vector to the sun (east, north, up) at a UTC time; None where it is not known."""
+
+
+@dataclass(frozen=True)
+class CasterSettings:
+    """What may throw a shadow: people, boxes, bushes; and how far shadows are followed (decision 0045)."""
+
+    radii_m: tuple[float, ...] = (0.15, 0.25, 0.4, 0.6)  # half widths
+    heights_m: tuple[float, ...] = (0.3, 0.5, 0.8, 1.2, 1.7, 2.4)
+    longest_m: float = 4.5  # longer shadows leave the pictures that are kept
+    margin_m: float = 0.25  # around a shadow, where nothing else may differ
+
+
+@dataclass(frozen=True)
+class BrighterSettings:
+    """How pictures of two dates are compared, in octaves of brightness (decision 0045)."""
+
+    side_m: float = 0.15  # of the cells that are compared, where pixels are no coarser
+    black: float = 8.0  # gray levels added before logarithms: below, a camera shows noise
+    most: float = 1.5  # no shadow is deeper
+    light_m: float = 4.0  # what varies more slowly is light; of it what differs by less than ...
+    calm: float = 0.5  # ... this
+
+
+@dataclass(frozen=True)
+class ShadowSettings:
+    """When moved shadows explain a difference (decision 0045)."""
+
+    likeness: float = 0.7  # correlation of what differs with both shadows: one of them alone has 0.71 at most
+    covered: float = 0.8  # share of what differs in the outline that the shadows, and the thing itself, cover
+    least_depth: float = 0.25  # octaves: of the shadow on either date, and ...
+    least_part: float = 0.5  # ... of the fainter one as a part of the deeper one
+    nearer: float = 0.15  # flying heights by which a later picture is taken nearer above the place: it is asked anew
+    casters: CasterSettings = field(default_factory=CasterSettings)
+    brighter: BrighterSettings = field(default_factory=BrighterSettings)
+
+
+class ShadowMatch(NamedTuple):
+    """How well the shadows of a thing that stays, `radius_m` wide to each side and `height_m` tall, explain a
+    difference: the correlation, how much brighter (octaves) ground is that the earlier shadow left, how much darker
+    where the later one came, and the share of the difference that they cover."""
+
+    likeness: float
+    brighter: float
+    darker: float
+    covered: float
+    radius_m: float
+    height_m: float
+
+
+class ShadowDoubt:
+    """What pictures of both dates show of shadows where candidates lie. `explains` keeps what it found out."""
+
+    def __init__(
+        self, earlier: EarlierPictures, sun_at: SunAt, settings: ShadowSettings = ShadowSettings(),
+    ) -> None:
+        self._earlier, self._sun_at, self._settings = earlier, sun_at, settings
+        self._known: dict[tuple[int, PatchWindow, int, int], bool] = {}
+
+    def explains(self, number: int, outline_m: PointsM, cameras_m: PointsM, sights: Sights) -> bool:
+        """Whether the moved shadow of something that stays is all that differs in an outline, (N, 2), that later
+        cameras, (V, 3), show. Where no sun or no picture of either date is known, it is not."""
+        vantage = self._earlier.vantage(outline_m, cameras_m)
+        if vantage is None or not sights.pictures:
+            return False
+        later = sights.pictures[0]
+        aside = float(np.hypot(*(outline_m.mean(axis=0) - later.camera_m[:2]))) / float(later.camera_m[2])
+        asked = number, later.window, vantage.shows[0], int(aside / self._settings.nearer)
+        if asked not in self._known:
+            pictures = self._earlier.laid(vantage, later.window, LevelSettings(most_pictures=1))
+            self._known[asked] = any(
+                is_shadow(match, self._settings) for each in pictures
+                for match in shadow_matches(each, later, outline_m, self._sun_at, self._settings)
+            )
+        return self._known[asked]
+
+
+def is_shadow(match: ShadowMatch, settings: ShadowSettings = ShadowSettings()) -> bool:
+    """Whether a match is good enough on both dates."""
+    fainter, deeper = sorted((match.brighter, match.darker))
+    return bool(
+        match.likeness >= settings.likeness and match.covered >= settings.covered
+        and fainter >= max(settings.least_depth, settings.least_part * deeper)
+    )
+
+
+def shadow_matches(
+    earlier: LaidPicture, later: LaidPicture, outline_m: PointsM, sun_at: SunAt,
+    settings: ShadowSettings = ShadowSettings(),
+) -> Iterator[ShadowMatch]:
+    """For each width and height the best match of two pictures of one window, of what differs in an outline, (N, 2)."""
+    one, other = (_slide(sun_at(each.time_ns)) for each in (earlier, later))
+    if one is None or other is None:
+        return
+    step = max(1, int(settings.brighter.side_m / later.window.m_per_px))
+    difference = _Difference.of(earlier, later, outline_m, step, settings)
+    for radius_m, height_m, pattern in _patterns(one, other, later.window.m_per_px * step, settings.casters):
+        match = difference.match(pattern, settings.covered)
+        if match is not None:
+            yield ShadowMatch(*match, radius_m, height_m)
+
+
+def _slide(sun: Vector3 | None) -> Floats | None:
+    """(2,) how far east and north the shadow of a point 1 m up lies from below it; None where there is none."""
+    return None if sun is None or sun[2] <= 0 else np.asarray(-sun[:2] / sun[2], np.float64)
+
+
+def _patterns(
+    one: Floats, other: Floats, m_per_px: float, settings: CasterSettings
+) -> Iterator[tuple[float, float, "_Pattern"]]:
+    """The half width, the height and the pattern of all that may stay; a point 1 m up throws its shadow `one`, (2,),
+    off on the earlier date and `other` on the later one."""
+    for height_m, radius_m in product(settings.heights_m, settings.radii_m):
+        if max(np.hypot(*one), np.hypot(*other)) * height_m > settings.longest_m:
+            return
+        ends_px = one * height_m / m_per_px, other * height_m / m_per_px
+        pattern = _Pattern.of(*ends_px, radius_m / m_per_px, settings.margin_m / m_per_px)
+        if pattern is not None:
+            yield radius_m, height_m, pattern
+
+
+class _Pattern(NamedTuple):
+    """What a thing that stays differs by, (h, w) each, it standing in the middle: 1 where the earlier shadow `left`
+    the ground, where the later one `came`, and where nothing but them differs (`around`); and a little wider, with
+    the thing itself, where ground may be `brighter` or `darker`."""
+
+    left: Floats32
+    came: Floats32
+    around: Floats32
+    brighter: Floats32
+    darker: Floats32
+
+    @classmethod
+    def of(cls, earlier_px: Floats, later_px: Floats, radius_px: float, margin_px: float) -> "_Pattern | None":
+        """The shadows end at (east, north) pixels from the foot; None where they hide each other."""
+        half = int(np.ceil(max(np.abs(earlier_px).max(), np.abs(later_px).max()) + radius_px + margin_px)) + 1
+        one, other = (_shadow(each, radius_px, half) for each in (earlier_px, later_px))
+        thing = _shadow(np.zeros(2), radius_px + 0.5, half)
+        left, came = (np.where(each & ~hides & ~thing, 1.0, 0.0) for each, hides in ((one, other), (other, one)))
+        if min(left.sum(), came.sum()) < max(4.0, 0.2 * one.sum()):
+            return None
+        size = 2 * round(margin_px) + 1
+        around = np.where(_grown(one | other | thing, size) & ~thing, 1.0, 0.0)
+        brighter, darker = (_grown(each | thing, 3) for each in (one, other))
+        return cls(*(np.asarray(each, np.float32) for each in (left, came, around, brighter, darker)))
+
+
+def _grown(mask: Mask, size: int) -> Mask:
+    return np.asarray(cv2.dilate(mask.view(np.uint8), np.ones((size, size), np.uint8)) > 0)
+
+
+def _shadow(end_px: Floats, radius_px: float, half: int) -> Mask:
+    """(2 half + 1, 2 half + 1) a disc in the middle, moved to where the shadow of its top lies, (2,) east and north."""
+    raster = np.zeros((2 * half + 1,) * 2, np.uint8)
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    along = np.clip((x * end_px[0] - y * end_px[1]) / max(float(end_px @ end_px), 1e-9), 0, 1)
+    off = np.hypot(x - along * end_px[0], y + along * end_px[1])
+    raster[off <= max(radius_px, 0.7)] = 1
+    return np.asarray(raster > 0)
+
+
+class _Difference(NamedTuple):
+    """By how many octaves ground is brighter on the later date, (h, w), where that is known, 1 or 0; and where, 1 or 0,
+    it is `brighter` and `darker` in the outline that is asked about."""
+
+    octaves: Floats32
+    known: Floats32
+    brighter: Floats32
+    darker: Floats32
+
+    @classmethod
+    def of(
+        cls, earlier: LaidPicture, later: LaidPicture, outline_m: PointsM, step: int, settings: ShadowSettings
+    ) -> "_Difference":
+        """Of two pictures of one window, `step` pixels of it taken together."""
+        both = (earlier.gray > 0) & (later.gray > 0)
+        one, other = (each.gray.astype(np.float32) + settings.brighter.black for each in (earlier, later))
+        change = np.log2(other / one)
+        known = _shrunk(both.astype(np.float32), step)
+        octaves = _shrunk(np.where(both, change, 0).astype(np.float32), step) / np.maximum(known, 1e-3)
+        is_known = known > 0.5
+        octaves -= np.median(octaves[is_known]) if is_known.any() else 0.0
+        calm = (is_known & (np.abs(octaves) < settings.brighter.calm)).astype(np.float32)
+        side = 2 * round(settings.brighter.light_m / (later.window.m_per_px * step) / 2) + 1
+        light = cv2.blur(octaves * calm, (side, side)) / np.maximum(cv2.blur(calm, (side, side)), 0.05)
+        most = settings.brighter.most
+        octaves = np.where(is_known, np.clip(octaves - light, -most, most), 0).astype(np.float32)
+        inside = _shrunk(mask_of(outline_m, later.window.site_from_patch, both.shape).astype(np.float32), step)
+        brighter, darker = ((inside > 0.5) & (each > settings.least_depth) for each in (octaves, -octaves))
+        return cls(octaves, *(each.astype(np.float32) for each in (is_known, brighter, darker)))
+
+    def match(self, pattern: _Pattern, enough: float) -> tuple[float, float, float, float] | None:
+        """Likeness, how much brighter, how much darker, and the covered share, at the foot where the pattern fits best
+        and covers `enough`, or most; None where nothing is asked for."""
+        covered = self._covered(pattern)
+        if covered is None:
+            return None
+        left, left_px = _sums(self.octaves, pattern.left), _sums(self.known, pattern.left)
+        came, came_px = _sums(self.octaves, pattern.came), _sums(self.known, pattern.came)
+        power = _sums(self.octaves**2, pattern.around)
+        likeness = (left - came) / np.sqrt(np.maximum(power, 1e-6) * np.maximum(left_px + came_px, 1.0))
+        shown = (left_px > 0.6 * pattern.left.sum()) & (came_px > 0.6 * pattern.came.sum())
+        worth = np.where(shown, np.minimum(covered, enough) + likeness, -1.0)
+        at = np.unravel_index(int(worth.argmax()), worth.shape)
+        if not shown[at]:
+            return None
+        return (
+            float(likeness[at]), float(left[at] / left_px[at]), float(-came[at] / came_px[at]), float(covered[at])
+        )
+
+    def _covered(self, pattern: _Pattern) -> Floats32 | None:
+        """(h, w) the share that a pattern there covers of what is brighter, or of what is darker, the lesser one; what
+        is but a few cells does not count."""
+        parts = [(self.brighter, pattern.brighter), (self.darker, pattern.darker)]
+        cells = [float(each.sum()) for each, _ in parts]
+        shares = [
+            _sums(asked, covers) / count for (asked, covers), count in zip(parts, cells) if count > 0.1 * sum(cells)
+        ]
+        return np.asarray(np.min(shares, axis=0), np.float32) if shares else None
+
+
+def _sums(raster: Floats32, pattern: Floats32) -> Floats32:
+    """(h, w) the sums of a raster times a pattern around each cell, nothing being outside."""
+    return np.asarray(cv2.filter2D(raster, cv2.CV_32F, pattern, borderType=cv2.BORDER_CONSTANT), np.float32)
+
+
+def _shrunk(raster: MatLike, step: int) -> Floats32:
+    rows, columns = raster.shape[0] // step, raster.shape[1] // step
+    return np.asarray(
+        cv2.resize(raster[: rows * step, : columns * step], (columns, rows), interpolation=cv2.INTER_AREA), np.float32
+    )
