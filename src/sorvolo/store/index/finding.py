@@ -17,6 +17,7 @@ from sorvolo.store.index import tables
 EARLIEST_NS, LATEST_NS = -(2**62), 2**62
 """Bounds of time, ns since 1970: the years 1824 and 2116."""
 
+_MOST_VALUES = 10_000  # in a query: SQLite bounds their number
 _HEAD_BYTES = 9  # of a collection: byte order, type, number of members
 _POLYGON = np.dtype([("head", "u1", 13), ("corners", "<f8", (5, 2))])  # ... of which each is a ring of five points
 _ABOUT = (tables.flights.c.flight, tables.flights.c.kind, tables.sites.c.path, tables.sites.c.name)
@@ -86,6 +87,8 @@ class FoundFlight:
 def find(connection: Connection, place: Place) -> list[FoundFlight]:
     """The flights that saw the place or found something within reach of it, in order of time."""
     things = _things(connection, place)
+    if place.classes and not things:
+        return []
     found = []
     for longitude in _turns(place.longitude_deg, 0.0):
         found += _seen(connection, place, longitude, things)
@@ -102,6 +105,8 @@ def _seen(
     c = tables.flights.c
     columns = (c.id, *_ABOUT, c.frames, c.frame_names, c.frame_times, c.frame_kept, c.outlines)
     query = _near(connection, tables.flights, columns, longitude_deg, place.latitude_deg, np.zeros(2))
+    if place.classes and len(things) <= _MOST_VALUES:  # what others saw is not asked for
+        query = query.where(c.id.in_(things))
     rows = connection.execute(_then(query, place, c.first_ns, c.last_ns).join(tables.sites)).all()
     if not rows:
         return []
@@ -238,9 +243,9 @@ def _turns(longitude_deg: float, reach_deg: float) -> list[float]:
 
 def _flights(connection: Connection, ids: Sequence[int]) -> list[Any]:
     found: list[Any] = []
-    for start in range(0, len(ids), 10_000):  # SQLite bounds the number of values in a query
+    for start in range(0, len(ids), _MOST_VALUES):
         query = select(tables.flights.c.id, *_ABOUT).select_from(tables.flights).join(tables.sites)
-        found += connection.execute(query.where(tables.flights.c.id.in_(ids[start:start + 10_000]))).all()
+        found += connection.execute(query.where(tables.flights.c.id.in_(ids[start:start + _MOST_VALUES]))).all()
     return found
 
 
