@@ -108,7 +108,8 @@ class RayExecutor:
         """Whether another try may start."""
         if self._workers is not None and len(self._running) >= self._workers:
             return False
-        slots = sum(each["CPU"] // min(cost.cpus, each["CPU"]) for each in self._asked(self._machines))
+        machines = self._asked(self._machines)
+        slots = sum(int(each["CPU"] / min(cost.cpus, each["CPU"]) + 1e-6) for each in machines)  # 1.0 // 0.2 is 4
         return len(self._running) < slots
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
