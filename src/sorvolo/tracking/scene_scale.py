@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections
 from sorvolo.tracking.cut_boxes import cut_edges
 from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size
@@ -21,6 +22,7 @@ class SceneSettings:
     least_score: float = 0.5
     least_boxes: int = 8  # of a class; fewer may be mistakes, or all of one odd kind
     most_boxes: int = 400  # the newest: a drone climbs
+    least_spread: float = 0.03  # of the sizes around the fit: boxes are no more exact
     most_spread: float = 0.35  # of the sizes around the fit, in logarithms: beyond it boxes are no one kind of thing
     fleet_sigma: float = 0.15  # by which a street's cars may be longer or shorter than the usual car
     rounds: int = 8  # of the robust fit
@@ -101,16 +103,21 @@ class SceneScale:
         size = np.log(side / TYPICAL_SIZE_M[_CAR][0])
         columns, off = np.column_stack([np.ones(len(down)), down]), size - np.median(size)
         for _ in range(settings.rounds):
-            spread = max(float(1.48 * np.median(np.abs(off))), 0.03)
+            spread = max(_spread(off), settings.least_spread)
             weight = 1.0 / (1.0 + (off / (2.0 * spread)) ** 2)
             # cars at one height in the picture know nothing of the slope: it is then taken as small
             matrix = (columns * weight[:, None]).T @ columns + np.diag([0.0, 1.0])
             middle, slope = np.linalg.solve(matrix, (columns * weight[:, None]).T @ size)
             off = size - middle - slope * down
-        spread = float(1.48 * np.median(np.abs(off)))
+        spread = _spread(off)
         if spread > settings.most_spread:
             return None
         return SceneFit(float(middle), float(slope), float(np.hypot(settings.fleet_sigma, spread / len(down) ** 0.5)))
+
+
+def _spread(off: Floats) -> float:
+    """The sigma of what lies around a fit, by the median, (N,) logarithms."""
+    return float(SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(off)))
 
 
 def impossible_beside_cars(
@@ -125,7 +132,7 @@ def impossible_beside_cars(
     cars = np.log(longest[(np.array(names, object) == _CAR) & ~is_cut & (longest > 0)] / TYPICAL_SIZE_M[_CAR][0])
     if len(cars) < settings.least_boxes:
         return np.zeros(len(names), bool)
-    spread = float(1.48 * np.median(np.abs(cars - np.median(cars))))
+    spread = _spread(cars - np.median(cars))
     if spread > settings.most_spread:
         return np.zeros(len(names), bool)
     sigma = float(np.hypot(settings.fleet_sigma, spread / len(cars) ** 0.5))

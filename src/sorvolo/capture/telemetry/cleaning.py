@@ -4,6 +4,7 @@ import re
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,6 +24,8 @@ NO_TIME_NS = -(2**62)
 
 FASTEST_M_S = 80.0
 """No small drone flies faster over ground (the fastest in a storm reach about 60 m/s)."""
+
+_Table: TypeAlias = dict[str, Floats]
 
 _JUMP_SLACK_M = 10.0  # receivers step this far when their set of satellites changes
 _HELD_FIX_S = 1.0  # a receiver that repeats its fix made it at most this long ago
@@ -83,12 +86,11 @@ def clean(
     times, video = times[keep], video[keep]
     table = {key: value[keep] for key, value in table.items()}
 
-    found += _blank_unbelievable(table)
+    table, reported = _believable(table)
+    found += reported
     if "latitude_deg" in table and "longitude_deg" in table:
-        found += _blank_null_fixes(table["latitude_deg"], table["longitude_deg"])
-        if position_decimals is not None:
-            found += _widen_to_rounding(table, position_decimals)
-        found += _blank_jumps(times, table)
+        table, reported = _cleaned_fixes(times, table, position_decimals)
+        found += reported
     if not any(np.isfinite(value).any() for key, value in table.items() if "_sigma_" not in key):
         found_text = "; ".join(notice.text for notice in found) or "it holds no samples"
         raise InputError(
@@ -97,6 +99,16 @@ def clean(
         )
     found += _gaps(times, table.get("latitude_deg"))
     return Telemetry(reader, times, table, video, tuple(found))
+
+
+def _cleaned_fixes(times: TimesNs, table: _Table, decimals: int | None) -> tuple[_Table, list[Notice]]:
+    """The table with only the fixes that the flight made, their sigma no smaller than their rounding."""
+    table, found = _without_null_fixes(table)
+    if decimals is not None and decimals <= _COARSE_DECIMALS:
+        table, rounded = _widened_to_rounding(table, decimals)
+        found += rounded
+    table, jumps = _without_jumps(times, table)
+    return table, found + jumps
 
 
 def increasing(times_ns: TimesNs) -> Mask:
@@ -224,47 +236,50 @@ def _clock_notices(times: TimesNs, keep: Mask) -> list[Notice]:
     ]
 
 
-def _blank_unbelievable(table: dict[str, Floats]) -> list[Notice]:
-    count = 0
+def _believable(table: _Table) -> tuple[_Table, list[Notice]]:
+    count, kept = 0, {}
     for key, values in table.items():
         low, high = _LIMITS[key]
         bad = ~np.isnan(values) & ~((values >= low) & (values <= high))
         count += int(bad.sum())
-        values[bad] = np.nan
-    if "longitude_deg" in table:
-        longitude = table["longitude_deg"]
-        far = np.abs(longitude) > 180
-        longitude[far] = (longitude[far] + 180) % 360 - 180
-    return notice("out_of_range", count, "{} values lie outside any possible range and are taken as unknown")
+        kept[key] = np.where(bad, np.nan, values)
+    if "longitude_deg" in kept:
+        longitude = kept["longitude_deg"]
+        kept["longitude_deg"] = np.where(np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude)
+    return kept, notice("out_of_range", count, "{} values lie outside any possible range and are taken as unknown")
 
 
-def _blank_null_fixes(latitude: Floats, longitude: Floats) -> list[Notice]:
+def _without_null_fixes(table: _Table) -> tuple[_Table, list[Notice]]:
+    latitude, longitude = table["latitude_deg"], table["longitude_deg"]
     unknown = np.isnan(latitude) | np.isnan(longitude)
     null = (np.abs(latitude) < 1e-6) & (np.abs(longitude) < 1e-6)
-    latitude[unknown | null] = np.nan
-    longitude[unknown | null] = np.nan
-    return [
+    return _without_fixes(table, unknown | null), [
         *notice("no_fix", int(unknown.sum()), "{} samples have no position"),
         *notice("null_fix", int(null.sum()), "{} positions are 0/0, written before the receiver's first fix"),
     ]
 
 
-def _widen_to_rounding(table: dict[str, Floats], decimals: int) -> list[Notice]:
-    if decimals > _COARSE_DECIMALS:
-        return []
+def _without_fixes(table: _Table, rows: Mask | Rows) -> _Table:
+    """The table with the positions of some rows unknown."""
+    latitude, longitude = table["latitude_deg"].copy(), table["longitude_deg"].copy()
+    latitude[rows] = longitude[rows] = np.nan
+    return {**table, "latitude_deg": latitude, "longitude_deg": longitude}
+
+
+def _widened_to_rounding(table: _Table, decimals: int) -> tuple[_Table, list[Notice]]:
     rounding = rounding_sigma_m(decimals)
     placed = np.isfinite(table["latitude_deg"])
     sigma = table.get("horizontal_sigma_m", np.full(len(placed), np.nan))
-    table["horizontal_sigma_m"] = np.where(placed, np.fmax(sigma, rounding), sigma)
+    widened = {**table, "horizontal_sigma_m": np.where(placed, np.fmax(sigma, rounding), sigma)}
     text = (
         f"positions are printed with {decimals} decimals of a degree, in steps of "
         f"{10.0**-decimals * M_PER_DEG_LATITUDE:.3g} m; their uncertainty is set to at least {rounding:.2g} m"
     )
-    return notice("coarse_position", int(placed.sum()), text)
+    return widened, notice("coarse_position", int(placed.sum()), text)
 
 
-def _blank_jumps(times: TimesNs, table: dict[str, Floats]) -> list[Notice]:
-    """Blank the fixes that do not belong to the largest set of fixes that one flight can have made.
+def _without_jumps(times: TimesNs, table: _Table) -> tuple[_Table, list[Notice]]:
+    """The table without the fixes that do not belong to the largest set of fixes that one flight can have made.
 
     Fixes that follow each other at less than FASTEST_M_S form segments; segments chain when the last fix of
     one and the first of the other fit the same way. The chain with most fixes is the flight, wherever it
@@ -273,7 +288,7 @@ def _blank_jumps(times: TimesNs, table: dict[str, Floats]) -> list[Notice]:
     latitude, longitude = table["latitude_deg"], table["longitude_deg"]
     fixes = np.flatnonzero(np.isfinite(latitude))
     if len(fixes) < 2:
-        return []
+        return table, []
     lat, lon, seconds = latitude[fixes], longitude[fixes], (times[fixes] - times[fixes[0]]) / SECOND_NS
     sigma = np.nan_to_num(table.get("horizontal_sigma_m", np.zeros(len(times)))[fixes])
     fresh = np.concatenate([[True], (np.diff(lat) != 0) | (np.diff(lon) != 0)])
@@ -296,7 +311,7 @@ def _blank_jumps(times: TimesNs, table: dict[str, Floats]) -> list[Notice]:
     runs = np.arange(len(starts))
     broken = np.flatnonzero(~fits(runs[:-1], runs[1:])) + 1
     if not len(broken):
-        return found
+        return table, found
     first = np.concatenate([[0], broken])  # of each segment: its first and last run
     final = np.concatenate([broken, [len(starts)]]) - 1
     size = ends[final] - starts[first] + 1
@@ -312,10 +327,8 @@ def _blank_jumps(times: TimesNs, table: dict[str, Floats]) -> list[Notice]:
     while segment >= 0:
         flight[starts[first[segment]]: ends[final[segment]] + 1] = True
         segment = int(before[segment])
-    for values in (latitude, longitude):
-        values[fixes[~flight]] = np.nan
     text = f"{{}} positions jump away faster than {FASTEST_M_S:g} m/s and are not used"
-    return found + notice("jump", int((~flight).sum()), text)
+    return _without_fixes(table, fixes[~flight]), found + notice("jump", int((~flight).sum()), text)
 
 
 def _gaps(times: TimesNs, latitude: Floats | None) -> list[Notice]:

@@ -9,7 +9,7 @@ from sorvolo.store.datasets.coco import read_coco
 from sorvolo.store.datasets.groups import compiled
 from sorvolo.store.datasets.naming import naming, plain
 from sorvolo.store.datasets.okutama import read_okutama
-from sorvolo.store.datasets.parsed import Findings, ParsedSet, Reader
+from sorvolo.store.datasets.parsed import ParsedSet, Reader
 from sorvolo.store.datasets.recognising import form_of
 from sorvolo.store.datasets.umcd import read_umcd
 from sorvolo.store.datasets.visdrone import read_visdrone
@@ -84,18 +84,17 @@ def _read(
     pattern = None if group_pattern is None else compiled(group_pattern)
     if not place.exists():
         raise InputError(f"{place} does not exist; give a folder of labelled pictures, or its label file")
-    findings = Findings()
-    parsed = _parsed(place, form, findings)
-    labelled = labelled_set(parsed, place, naming(classes, ignore), unlabelled, pattern, findings)
+    parsed = _parsed(place, form)
+    labelled = labelled_set(parsed, place, naming(classes, ignore), unlabelled, pattern)
     return labelled, parsed.names
 
 
-def _parsed(place: Path, form: str | None, findings: Findings) -> ParsedSet:
+def _parsed(place: Path, form: str | None) -> ParsedSet:
     """What the form's reader finds; an error of a form that was asked for adds what it looks like instead."""
     if form is None:
-        return _parsed_as_recognised(place, findings)
+        return _parsed_as_recognised(place)
     try:
-        return READERS[form](place, findings)
+        return READERS[form](place)
     except InputError as error:
         recognised = form_of(place)
         if recognised in (None, form):
@@ -103,14 +102,14 @@ def _parsed(place: Path, form: str | None, findings: Findings) -> ParsedSet:
         raise InputError(f"{error}; it looks like {recognised}: read it as that, or leave the form out") from error
 
 
-def _parsed_as_recognised(place: Path, findings: Findings) -> ParsedSet:
+def _parsed_as_recognised(place: Path) -> ParsedSet:
     known = ", ".join(READERS)
     recognised = form_of(place)
     if recognised is not None:
-        return READERS[recognised](place, findings)
+        return READERS[recognised](place)
     if place.is_file():
         raise InputError(f"{place} is no label file of a known form ({known}); give the folder, or its labels")
     try:
-        return read_yolo(place, findings)  # the one form in which every label file may be empty
+        return read_yolo(place)  # the one form in which every label file may be empty
     except InputError as error:
         raise InputError(f"{error} (labels of no known form were recognised: {known})") from error

@@ -11,7 +11,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.naming import Naming, nothing_maps, of_one_unnamed
-from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import SHARES, Finding, ParsedBox, ParsedPicture, ParsedSet, notices_of
 from sorvolo.store.datasets.picture_files import shown_size_px
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -22,20 +22,20 @@ _LEAST_LEFT = 0.1  # share of a box's area within the picture below which it sho
 
 
 def labelled_set(
-    parsed: ParsedSet, place: Path, names: Naming, unlabelled: Iterable[str], pattern: re.Pattern[str] | None,
-    findings: Findings,
+    parsed: ParsedSet, place: Path, names: Naming, unlabelled: Iterable[str], pattern: re.Pattern[str] | None
 ) -> LabelledSet:
     """The set in our classes. Raises InputError when no name maps, or no picture can be opened."""
     counts = Counter(box.name for picture in parsed.pictures for box in picture.boxes if not box.is_ignored)
     names, classes = _mapped(parsed, place, names, counts)
-    made = (_labelled(picture, place, names, classes, pattern, findings) for picture in parsed.pictures)
-    pictures = tuple(picture for picture in made if picture is not None)
+    made = [_labelled(picture, place, names, classes, pattern) for picture in parsed.pictures]
+    pictures = tuple(picture for picture, _ in made if picture is not None)
+    found = notices_of([*parsed.findings, *(finding for _, findings in made for finding in findings)])
     if not pictures:
         raise InputError(
             f"{place}: none of its {len(parsed.pictures)} pictures can be used: "
-            + "; ".join(each.text for each in findings.notices())
+            + "; ".join(each.text for each in found)
         )
-    notices = (*findings.notices(), *_left_out(counts, names))
+    notices = (*found, *_left_out(counts, names))
     return LabelledSet(place.stem if place.is_file() else place.name, classes, pictures, frozenset(unlabelled), notices)
 
 
@@ -53,20 +53,19 @@ def _mapped(
 
 
 def _labelled(
-    parsed: ParsedPicture, place: Path, names: Naming, classes: tuple[str, ...], pattern: re.Pattern[str] | None,
-    findings: Findings,
-) -> LabelledPicture | None:
+    parsed: ParsedPicture, place: Path, names: Naming, classes: tuple[str, ...], pattern: re.Pattern[str] | None
+) -> tuple[LabelledPicture | None, list[Finding]]:
+    """The picture in our classes, None where it cannot be used; what was wrong with it or its boxes."""
     name = parsed.path.name
     try:
         width_px, height_px, orientation = shown_size_px(parsed.path)
     except InputError:
-        findings.add("unreadable_pictures", name)
-        return None
+        return None, [Finding("unreadable_pictures", name)]
     edges = np.array([box[1:5] for box in parsed.boxes], np.float64).reshape(-1, 4)
-    fitted = _in_picture_px(edges, parsed.labelled_size, (width_px, height_px), orientation, name, findings)
+    fitted, scaling = _in_picture_px(edges, parsed.labelled_size, (width_px, height_px), orientation, name)
     if fitted is None:
-        return None
-    inside, keep = _clipped(fitted, width_px, height_px, name, findings)
+        return None, scaling
+    inside, keep, clipping = _clipped(fitted, width_px, height_px, name)
     kept = ((box, edge_px) for box, edge_px, is_kept in zip(parsed.boxes, inside, keep) if is_kept)
     boxes, labels, ignored = _targets_and_ignored(kept, names, classes)
     if parsed.is_ignored:
@@ -75,7 +74,7 @@ def _labelled(
     return LabelledPicture(
         str(parsed.path), width_px, height_px, group, np.array(boxes, np.float32), np.array(labels, np.int64),
         np.array(list(dict.fromkeys(ignored)), np.float32), parsed.m_per_px,
-    )
+    ), scaling + clipping
 
 
 def _targets_and_ignored(
@@ -93,26 +92,21 @@ def _targets_and_ignored(
 
 
 def _in_picture_px(
-    edges: Floats, labelled: tuple[float, float] | None, shown_px: tuple[int, int], orientation: int, name: str,
-    findings: Findings,
-) -> Floats | None:
+    edges: Floats, labelled: tuple[float, float] | None, shown_px: tuple[int, int], orientation: int, name: str
+) -> tuple[Floats | None, list[Finding]]:
     """Edges, (N, 4), in pixels of the picture as it is shown; None when the labels are of another shape.
 
     Labels drawn on a picture as stored, before its EXIF orientation, are turned with it.
     """
     if labelled is None or labelled == shown_px:
-        return edges
-    if labelled != SHARES:
-        if _same_shape(labelled, shown_px):
-            findings.add("scaled_labels", name)
-        elif orientation >= 5 and _same_shape(labelled, shown_px[::-1]):
-            return _in_picture_px(
-                turned(edges, labelled, orientation), labelled[::-1], shown_px, 1, name, findings
-            )
-        else:
-            findings.add("other_size", name)
-            return None
-    return edges * np.tile(np.divide(shown_px, labelled), 2)
+        return edges, []
+    is_scaled = labelled != SHARES
+    if is_scaled and not _same_shape(labelled, shown_px):
+        if orientation >= 5 and _same_shape(labelled, shown_px[::-1]):
+            return _in_picture_px(turned(edges, labelled, orientation), labelled[::-1], shown_px, 1, name)
+        return None, [Finding("other_size", name)]
+    fitted = edges * np.tile(np.divide(shown_px, labelled), 2)
+    return fitted, [Finding("scaled_labels", name)] if is_scaled else []
 
 
 def turned(edges: Floats, stored_size: tuple[float, float], orientation: int) -> Floats:
@@ -133,9 +127,9 @@ def _same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
 
 
 def _clipped(
-    edges_px: Floats, width_px: int, height_px: int, name: str, findings: Findings
-) -> tuple[Floats, list[bool]]:
-    """Edges within the picture, and which boxes are worth keeping."""
+    edges_px: Floats, width_px: int, height_px: int, name: str
+) -> tuple[Floats, list[bool], list[Finding]]:
+    """Edges within the picture, which boxes are worth keeping, and what was wrong with the others."""
     with np.errstate(invalid="ignore"):
         sides = edges_px[:, 2:] - edges_px[:, :2]
     limits = np.array([width_px, height_px] * 2, np.float64)
@@ -146,10 +140,11 @@ def _clipped(
         shows_it = (left > 0).all(axis=1) & ((left / sides).prod(axis=1) >= _LEAST_LEFT)
     outside = ~empty & ~shows_it
     moved = np.abs(inside - edges_px).max(axis=1, initial=0) > _CLIPPED_PX
-    findings.add("empty_boxes", name, int(empty.sum()))
-    findings.add("outside_boxes", name, int(outside.sum()))
-    findings.add("clipped_boxes", name, int((moved & ~empty & ~outside).sum()))
-    return inside, list(~empty & ~outside)
+    return inside, list(~empty & ~outside), [
+        Finding("empty_boxes", name, int(empty.sum())),
+        Finding("outside_boxes", name, int(outside.sum())),
+        Finding("clipped_boxes", name, int((moved & ~empty & ~outside).sum())),
+    ]
 
 
 def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:

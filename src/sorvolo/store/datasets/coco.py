@@ -2,14 +2,14 @@
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from functools import cache, partial
 from math import isfinite
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from sorvolo.errors import InputError
-from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet, joined
+from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet, joined
 from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, pictures_below
 from sorvolo.store.datasets.text_files import read_text
 
@@ -18,7 +18,7 @@ _VIDEO_FIELDS = ("video_id", "video", "flight", "sequence", "seq_id", "clip")
 _VIDEO_ENDINGS = frozenset({".mp4", ".mov", ".avi", ".mkv", ".ts"})
 
 
-def read_coco(place: Path, findings: Findings) -> ParsedSet:
+def read_coco(place: Path) -> ParsedSet:
     """The JSON file, or a folder (or its `annotations/`) with exactly one of this form.
 
     `iscrowd` and `ignore` make a box a region to ignore. Pictures are looked for beside the file, in `images/`,
@@ -33,19 +33,12 @@ def read_coco(place: Path, findings: Findings) -> ParsedSet:
         if row.get("id") is None or row["id"] in images:
             raise InputError(f"{path}: an image has no id, or that of another ({row.get('id')}); each needs its own")
         images[row["id"]] = row
-    boxes: dict[Any, list[ParsedBox]] = {}
-    for row in _rows(whole, "annotations", path):
-        box = _box(row, categories)
-        if box is None:
-            findings.add("malformed_labels", f"annotation {row.get('id')}")
-        elif row.get("image_id") not in images:
-            findings.add("labels_without_picture", f"annotation {row.get('id')}")
-        else:
-            boxes.setdefault(row["image_id"], []).append(box)
-    pictures = list(_pictures(path, images, boxes, findings))
+    boxes, wrong = _boxes(_rows(whole, "annotations", path), categories, images)
+    pictures, missing = _pictures(path, images, boxes)
     if not pictures:
         raise _no_picture(path, images)
-    return ParsedSet(FORM, joined(pictures, findings), tuple(dict.fromkeys(categories.values())))
+    each_once, twice = joined(pictures)
+    return ParsedSet(FORM, each_once, tuple(dict.fromkeys(categories.values())), (*wrong, *missing, *twice))
 
 
 def coco_file(place: Path) -> Path:
@@ -110,6 +103,23 @@ def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]
     return rows
 
 
+def _boxes(
+    rows: Iterable[Mapping[str, Any]], categories: Mapping[Any, str], images: Container[Any]
+) -> tuple[dict[Any, list[ParsedBox]], list[Finding]]:
+    """The boxes of each image, by its id; what was wrong with the others."""
+    boxes: dict[Any, list[ParsedBox]] = {}
+    findings = []
+    for row in rows:
+        box = _box(row, categories)
+        if box is None:
+            findings.append(Finding("malformed_labels", f"annotation {row.get('id')}"))
+        elif row.get("image_id") not in images:
+            findings.append(Finding("labels_without_picture", f"annotation {row.get('id')}"))
+        else:
+            boxes.setdefault(row["image_id"], []).append(box)
+    return boxes, findings
+
+
 def _box(row: Mapping[str, Any], categories: Mapping[Any, str]) -> ParsedBox | None:
     """The annotation's box, else the one around its polygons; None when it has none."""
     edges = _edges(row)
@@ -144,20 +154,23 @@ def _finite(value: Any) -> list[float]:
 
 
 def _pictures(
-    path: Path, images: Mapping[Any, Mapping[str, Any]], boxes: Mapping[Any, list[ParsedBox]], findings: Findings
-) -> Iterator[ParsedPicture]:
+    path: Path, images: Mapping[Any, Mapping[str, Any]], boxes: Mapping[Any, list[ParsedBox]]
+) -> tuple[list[ParsedPicture], list[Finding]]:
+    """The images whose picture is there, and those that have none."""
+    pictures, findings = [], []
     folders = _folders(path)
     by_name = cache(partial(_by_name, path.parent))  # for pictures that are not where the file has them
     for image_id, row in images.items():
         name = _inside(path, str(row.get("file_name", "")).replace("\\", "/"))
         found = _found(name, folders, by_name) if name else None
         if found is None:
-            findings.add("labels_without_picture", name or f"image {image_id} without file_name")
+            findings.append(Finding("labels_without_picture", name or f"image {image_id} without file_name"))
             continue
-        yield ParsedPicture(
+        pictures.append(ParsedPicture(
             found, tuple(boxes.get(image_id, ())), _labelled_size(row), _video(row),
             next(iter(_finite([row.get("m_per_px")])), float("nan")),
-        )
+        ))
+    return pictures, findings
 
 
 def _found(

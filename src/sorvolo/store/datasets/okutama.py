@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import frames_by_video, no_frames, pictures_around
-from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import read_text
 
@@ -18,7 +18,7 @@ _ORIGINAL_PX = (3840.0, 2160.0)
 _SIZE_IN_PATH = re.compile(r"(\d{3,4})x(\d{3,4})")
 
 
-def read_okutama(place: Path, findings: Findings) -> ParsedSet:
+def read_okutama(place: Path) -> ParsedSet:
     """A folder with label files (`1.1.1.txt`) and frames in folders of the videos' names (`1.1.1/0.jpg`).
 
     A line is track, xmin, ymin, xmax, ymax, frame, lost, occluded, generated, "Person" and actions. Lines marked lost
@@ -29,7 +29,9 @@ def read_okutama(place: Path, findings: Findings) -> ParsedSet:
     """
     files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_okutama_file(path)]
     files_of = {path.stem: path for path in reversed(files)}
-    labelled = {video: _boxes(path, findings) for video, path in sorted(files_of.items())}
+    read = {video: _boxes(path) for video, path in sorted(files_of.items())}
+    labelled = {video: by_frame for video, (by_frame, _) in read.items()}
+    findings = [each for _, wrong in read.values() for each in wrong]
     if not any(labelled.values()):
         raise InputError(f"{place}: no line is an {FORM} label (track, four edges, frame, three flags, \"Person\")")
     frames = frames_by_video(pictures_around(place, FORM), labelled)
@@ -38,13 +40,15 @@ def read_okutama(place: Path, findings: Findings) -> ParsedSet:
     result: list[ParsedPicture] = []
     for video, by_frame in labelled.items():
         lonely = set(by_frame) - set(frames[video])
-        findings.add("labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely))
+        findings.append(
+            Finding("labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely))
+        )
         size = _labelled_size(files_of[video])
         result += [
             ParsedPicture(path, tuple(by_frame.get(number, ())), size, video)
             for number, path in sorted(frames[video].items())
         ]
-    return ParsedSet(FORM, tuple(result), ("Person",))
+    return ParsedSet(FORM, tuple(result), ("Person",), tuple(findings))
 
 
 def looks_like_okutama(line: str) -> bool:
@@ -57,20 +61,21 @@ def is_okutama_file(path: Path) -> bool:
     return looks_like_okutama(next((line for line in read_text(path).splitlines() if line.strip()), ""))
 
 
-def _boxes(path: Path, findings: Findings) -> dict[int, list[ParsedBox]]:
-    """The file's boxes by frame; frames where all are lost have none."""
+def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[Finding]]:
+    """The file's boxes by frame; frames where all are lost have none. And its lines that are no labels."""
     found: dict[int, list[ParsedBox]] = {}
+    findings = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         match = _LINE.fullmatch(line) if len(line) < 1000 else None
         if match is None:
             if line.strip():
-                findings.add("malformed_labels", f"{path.name}, line {number}")
+                findings.append(Finding("malformed_labels", f"{path.name}, line {number}"))
             continue
         of_frame = found.setdefault(int(match["frame"]), [])
         if match["lost"] == "0":
             left, top, right, bottom = (float(match[edge]) for edge in ("left", "top", "right", "bottom"))
             of_frame.append(ParsedBox(match["name"], left, top, right, bottom))
-    return found
+    return found, findings
 
 
 def _labelled_size(path: Path) -> tuple[float, float]:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.groups import group_of
-from sorvolo.store.datasets.parsed import Findings
+from sorvolo.store.datasets.parsed import Finding
 from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, pictures_below
 from sorvolo.survey.splits import frame_number
 
@@ -30,22 +30,21 @@ def pictures_around(place: Path, form: str) -> list[Path]:
 
 
 def paired(
-    pictures: Sequence[Path], labels: Collection[Path], place: Path, form: str, findings: Findings
-) -> dict[Path, Path]:
-    """The label file of each picture that has one; files and pictures that are left over are counted.
+    pictures: Sequence[Path], labels: Collection[Path], place: Path, form: str
+) -> tuple[dict[Path, Path], list[Finding]]:
+    """The label file of each picture that has one; files and pictures that are left over.
 
     A file belongs to the picture of the same stem, of several to that with most folders in common. Raises InputError
     when no picture has one.
     """
     label_of = _labels_of_pictures(pictures, labels)
-    for path in sorted(set(labels) - set(label_of.values())):
-        findings.add("labels_without_picture", path.name)
     if not label_of:
         raise InputError(f"{place}: none of its {len(labels)} {form} files has a picture of the same name")
-    for path in pictures:
-        if path not in label_of:
-            findings.add("pictures_without_labels", path.name)
-    return label_of
+    lonely = sorted(set(labels) - set(label_of.values()))
+    return label_of, [
+        *(Finding("labels_without_picture", path.name) for path in lonely),
+        *(Finding("pictures_without_labels", path.name) for path in pictures if path not in label_of),
+    ]
 
 
 def frames_by_video(pictures: Iterable[Path], videos: Iterable[str]) -> Mapping[str, Mapping[int, Path]]:

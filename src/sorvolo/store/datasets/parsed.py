@@ -1,7 +1,8 @@
 """What a reader of one form hands over: pictures with boxes as in their files, before names and edges are checked."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -37,25 +38,12 @@ class ParsedPicture:
     is_ignored: bool = False
 
 
-@dataclass
-class Findings:
-    """What was found wrong while reading and could be left out: counts by code, with the first place each."""
+class Finding(NamedTuple):
+    """Something wrong that reading goes on without: a code of `FINDINGS`, where it is, and how often there."""
 
-    counts: dict[str, int] = field(default_factory=dict)
-    first: dict[str, str] = field(default_factory=dict)
-
-    def add(self, code: str, place: str, count: int = 1) -> None:
-        """Count something of `FINDINGS`."""
-        if count:
-            self.counts[code] = self.counts.get(code, 0) + count
-            self.first.setdefault(code, place)
-
-    def notices(self) -> tuple[Notice, ...]:
-        """One notice a code, in words."""
-        return tuple(
-            Notice(code, count, f"{count} {FINDINGS[code]}, the first: {self.first[code]}")
-            for code, count in self.counts.items()
-        )
+    code: str
+    place: str
+    count: int = 1
 
 
 FINDINGS: Mapping[str, str] = {
@@ -74,13 +62,29 @@ FINDINGS: Mapping[str, str] = {
 }
 
 
+def notices_of(findings: Iterable[Finding]) -> tuple[Notice, ...]:
+    """One notice a code, in words: how many in all, and where the first is."""
+    counts: Counter[str] = Counter()
+    first: dict[str, str] = {}
+    for code, place, count in findings:
+        if count:
+            counts[code] += count
+            first.setdefault(code, place)
+    return tuple(
+        Notice(code, count, f"{count} {FINDINGS[code]}, the first: {first[code]}") for code, count in counts.items()
+    )
+
+
 @dataclass(frozen=True)
 class ParsedSet:
-    """All of one place. `declared` are the names that the set's own list has, if any, in its order."""
+    """All of one place. `declared` are the names that the set's own list has, if any, in its order; `findings` what
+    was wrong in its files.
+    """
 
     form: str
     pictures: tuple[ParsedPicture, ...]
     declared: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -88,18 +92,19 @@ class ParsedSet:
         return tuple(dict.fromkeys([*self.declared, *(box.name for each in self.pictures for box in each.boxes)]))
 
 
-Reader: TypeAlias = Callable[[Path, Findings], ParsedSet]
+Reader: TypeAlias = Callable[[Path], ParsedSet]
 """Reads one form from a file or folder; raises InputError when it is not of that form."""
 
 
-def joined(pictures: Iterable[ParsedPicture], findings: Findings) -> tuple[ParsedPicture, ...]:
+def joined(pictures: Iterable[ParsedPicture]) -> tuple[tuple[ParsedPicture, ...], list[Finding]]:
     """Each file once: of one that is listed twice the boxes are joined."""
     by_path: dict[Path, ParsedPicture] = {}
+    findings = []
     for each in pictures:
         earlier = by_path.get(each.path)
         if earlier is not None:
-            findings.add("duplicate_pictures", each.path.name)
+            findings.append(Finding("duplicate_pictures", each.path.name))
             boxes = tuple(dict.fromkeys(earlier.boxes + each.boxes))
             each = replace(earlier, boxes=boxes)
         by_path[each.path] = each
-    return tuple(by_path.values())
+    return tuple(by_path.values()), findings

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import frames_by_video, no_frames, pictures_around
-from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import read_text
 
@@ -34,9 +34,10 @@ class _Object:
 class _Video:
     fps: float = 0.0
     objects: list[_Object] = field(default_factory=list)
+    malformed: list[Finding] = field(default_factory=list)
 
 
-def read_umcd(place: Path, findings: Findings) -> ParsedSet:
+def read_umcd(place: Path) -> ParsedSet:
     """A folder with metadata files (`path1.txt`) and frames in folders of the videos' names (`path1/000123.jpg`).
 
     The thesis (section 2.2) lists what a file holds of each object: type, shape, dimension in cm, colour, movement;
@@ -45,20 +46,23 @@ def read_umcd(place: Path, findings: Findings) -> ParsedSet:
     Lines `Box: FRAME LEFT TOP WIDTH HEIGHT` in an object's block (ours, in pixels) give its places. Raises InputError
     when nothing is of this form, times are given without `Fps:`, or no frame is there or of use.
     """
-    videos = _videos(place, findings)
+    videos = _videos(place)
     frames = frames_by_video(pictures_around(place, FORM), [path.stem for path in videos])
     if not any(frames.values()):
         raise no_frames(place, FORM, frames)
     result: list[ParsedPicture] = []
     for path, video in videos.items():
         _demand_times(path, video)
-        result += _labelled_frames(path.stem, video, frames[path.stem], findings)
+        result += _labelled_frames(path.stem, video, frames[path.stem])
     if all(each.is_ignored and not each.boxes for each in result):
         raise InputError(
             f"{place}: {FORM} metadata names what is in its videos but not where in the frames, so nothing can be "
             "learnt from them; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects, or label the frames anew"
         )
-    return ParsedSet(FORM, tuple(result), tuple(dict.fromkeys(e.name for v in videos.values() for e in v.objects)))
+    names = dict.fromkeys(each.name for video in videos.values() for each in video.objects)
+    malformed = (each for video in videos.values() for each in video.malformed)
+    unplaced = (Finding("no_boxes_for_frame", each.path.name) for each in result if each.is_ignored)
+    return ParsedSet(FORM, tuple(result), tuple(names), (*malformed, *unplaced))
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ class UmcdMetadata:
 
 def read_umcd_metadata(path: Path) -> UmcdMetadata:
     """One video's metadata file; raises InputError for one that describes no object."""
-    video = _parsed(path, Findings())
+    video = _parsed(path)
     if not video.objects:
         raise InputError(f"{path}: describes no object as {FORM}'s metadata does (Type:, Shape:, Dimension:, ...)")
     return UmcdMetadata(
@@ -100,24 +104,20 @@ def looks_like_umcd(path: Path) -> bool:
     return len(keys) >= 2 and ("type" in keys or any(key == "object" and value for key, value in fields))
 
 
-def _videos(place: Path, findings: Findings) -> dict[Path, _Video]:
+def _videos(place: Path) -> dict[Path, _Video]:
     """The videos of all metadata files that describe objects. Raises InputError when none does."""
     files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
-    videos = {path: _parsed(path, findings) for path in files}
+    videos = {path: _parsed(path) for path in files}
     videos = {path: video for path, video in videos.items() if video.objects}
     if not videos:
         raise InputError(f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)")
     return videos
 
 
-def _labelled_frames(
-    name: str, video: _Video, frames: Mapping[int, Path], findings: Findings
-) -> Iterator[ParsedPicture]:
+def _labelled_frames(name: str, video: _Video, frames: Mapping[int, Path]) -> Iterator[ParsedPicture]:
     for number, picture in sorted(frames.items()):
         boxes = [_box(each, number) for each in video.objects if number in each.boxes]
         unplaced = any(_is_in_view(each, number, video.fps) for each in video.objects if number not in each.boxes)
-        if unplaced:
-            findings.add("no_boxes_for_frame", picture.name)
         yield ParsedPicture(picture, tuple(boxes), None, name, is_ignored=unplaced)
 
 
@@ -133,7 +133,7 @@ def _field(line: str) -> tuple[str, str]:
     return (key.strip().lower(), value.strip()) if mark else ("", bare)
 
 
-def _parsed(path: Path, findings: Findings) -> _Video:
+def _parsed(path: Path) -> _Video:
     video = _Video()
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         key, value = _field(line)
@@ -143,7 +143,7 @@ def _parsed(path: Path, findings: Findings) -> _Video:
         elif key in ("fps", "frequency"):
             video.fps = next(iter(numbers), 0.0)
         elif line.strip() and not (key and _add_field(video, key, value, numbers)):
-            findings.add("malformed_labels", f"{path.name}, line {number}")
+            video.malformed.append(Finding("malformed_labels", f"{path.name}, line {number}"))
     video.objects = [each for each in video.objects if each.name]
     return video
 

@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import frames_by_video, no_frames, paired, pictures_around
-from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
 
@@ -24,7 +24,7 @@ _LINE = re.compile(r"\s*-?\d+\s*(,\s*-?\d+\s*){7}(,\s*-?\d+\s*,\s*-?\d+\s*)?,?\s
 _RowsByFile: TypeAlias = dict[Path, list[list[int]]]
 
 
-def read_visdrone(place: Path, findings: Findings) -> ParsedSet:
+def read_visdrone(place: Path) -> ParsedSet:
     """A folder with `annotations/` and `images/` (DET) or `sequences/` (VID), or one text file beside its pictures.
 
     A line of DET is left, top, width, height, score, category, truncation, occlusion; of VID the frame (from 1) and the
@@ -32,12 +32,14 @@ def read_visdrone(place: Path, findings: Findings) -> ParsedSet:
     objects count. Raises InputError when no line is of either form.
     """
     files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_label_file(path)]
-    rows = {path: _rows(path, findings) for path in files}
-    rows = {path: found for path, found in rows.items() if found or not read_text(path).strip()}
+    parsed = {path: _rows(path) for path in files}
+    malformed = [each for _, wrong in parsed.values() for each in wrong]
+    rows = {path: found for path, (found, _) in parsed.items() if found or not read_text(path).strip()}
     length = _numbers_a_line(place, rows)
     pictures = pictures_around(place, FORM)
     read = _video_frames if length == _VID else _separate_pictures
-    return ParsedSet(FORM, read(place, rows, pictures, findings), NAMES)
+    labelled, lonely = read(place, rows, pictures)
+    return ParsedSet(FORM, labelled, NAMES, (*malformed, *lonely))
 
 
 def looks_like_visdrone(line: str) -> bool:
@@ -45,14 +47,15 @@ def looks_like_visdrone(line: str) -> bool:
     return _LINE.fullmatch(line) is not None
 
 
-def _rows(path: Path, findings: Findings) -> list[list[int]]:
-    rows = []
+def _rows(path: Path) -> tuple[list[list[int]], list[Finding]]:
+    """The numbers of the file's lines, and the lines that are no labels."""
+    rows, findings = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if looks_like_visdrone(line) and len(line) < 300:
             rows.append([int(word) for word in line.strip().strip(",").split(",")])
         elif line.strip():
-            findings.add("malformed_labels", f"{path.name}, line {number}")
-    return rows
+            findings.append(Finding("malformed_labels", f"{path.name}, line {number}"))
+    return rows, findings
 
 
 def _numbers_a_line(place: Path, rows: _RowsByFile) -> int:
@@ -72,24 +75,25 @@ def _box(row: list[int]) -> ParsedBox:
 
 
 def _separate_pictures(
-    place: Path, rows: _RowsByFile, pictures: list[Path], findings: Findings
-) -> tuple[ParsedPicture, ...]:
-    label_of = paired(pictures, rows, place, FORM, findings)
+    place: Path, rows: _RowsByFile, pictures: list[Path]
+) -> tuple[tuple[ParsedPicture, ...], list[Finding]]:
+    label_of, lonely = paired(pictures, rows, place, FORM)
     result = []
     for path in pictures:
         found = rows[label_of[path]] if path in label_of else []
         sequence = re.fullmatch(r"(\d{7})_\d+_d_\d+", path.stem)  # the video it was taken from comes first
         result.append(ParsedPicture(path, tuple(map(_box, found)), None, sequence[1] if sequence else ""))
-    return tuple(result)
+    return tuple(result), lonely
 
 
 def _video_frames(
-    place: Path, rows: _RowsByFile, pictures: list[Path], findings: Findings
-) -> tuple[ParsedPicture, ...]:
+    place: Path, rows: _RowsByFile, pictures: list[Path]
+) -> tuple[tuple[ParsedPicture, ...], list[Finding]]:
     frames = frames_by_video(pictures, [path.stem for path in rows])
     if not any(frames.values()):
         raise no_frames(place, FORM, frames)
-    result = []
+    result: list[ParsedPicture] = []
+    findings = []
     for path, found in rows.items():
         boxes: dict[int, list[ParsedBox]] = {number: [] for number in frames[path.stem]}
         lonely = set()
@@ -98,8 +102,10 @@ def _video_frames(
                 boxes[row[0]].append(_box(row))
             else:
                 lonely.add(row[0])
-        findings.add("labels_without_picture", f"{path.stem}, frame {min(lonely, default=0)}", len(lonely))
+        findings.append(
+            Finding("labels_without_picture", f"{path.stem}, frame {min(lonely, default=0)}", len(lonely))
+        )
         result += [
             ParsedPicture(frames[path.stem][number], tuple(each), None, path.stem) for number, each in boxes.items()
         ]
-    return tuple(result)
+    return tuple(result), findings

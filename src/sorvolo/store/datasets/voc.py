@@ -10,34 +10,35 @@ from defusedxml.common import DefusedXmlException
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import paired, pictures_around
-from sorvolo.store.datasets.parsed import Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import read_text
 
 FORM = "Pascal VOC"
 
 
-def read_voc(place: Path, findings: Findings) -> ParsedSet:
+def read_voc(place: Path) -> ParsedSet:
     """A folder with XML files (`Annotations/`, or beside the pictures), or one such file; pictures by the same stem.
 
     Objects marked `difficult` are regions to ignore. The devkit's boxes name their first and last pixel, counted from
     1; a set with a box that starts at 0 counts edges from 0 instead, and is read so throughout. Raises InputError when
     no XML file is of this form.
     """
-    labelled = _annotations(place, findings)
+    labelled, findings = _annotations(place)
     pictures = pictures_around(place, FORM)
     if not place.is_dir():
         pictures = [path for path in pictures if path.stem == place.stem]
-    label_of = paired(pictures, labelled, place, FORM, findings)
+    label_of, lonely = paired(pictures, labelled, place, FORM)
+    findings += lonely
     from_zero = any(min(box.left, box.top) < 0 for each in labelled.values() for box in each.boxes)
     if from_zero:
-        findings.add("counted_from_zero", str(place), len(labelled))
+        findings.append(Finding("counted_from_zero", str(place), len(labelled)))
     result = []
     for path in pictures:
         found = labelled[label_of[path]] if path in label_of else ParsedPicture(path, ())
         boxes = _counted_from_zero(found.boxes) if from_zero else found.boxes
         result.append(replace(found, path=path, boxes=boxes))
-    return ParsedSet(FORM, tuple(result))
+    return ParsedSet(FORM, tuple(result), findings=tuple(findings))
 
 
 def looks_like_voc(path: Path) -> bool:
@@ -45,19 +46,20 @@ def looks_like_voc(path: Path) -> bool:
     return "<annotation" in read_text(path)[:2000]
 
 
-def _annotations(place: Path, findings: Findings) -> dict[Path, ParsedPicture]:
-    """Every XML file of this form. Raises InputError when there is none."""
+def _annotations(place: Path) -> tuple[dict[Path, ParsedPicture], list[Finding]]:
+    """Every XML file of this form, and what of them is none. Raises InputError when there is none."""
     files = [place] if place.is_file() else files_below(place, ".xml")
     labelled: dict[Path, ParsedPicture] = {}
+    findings = []
     for path in files:
-        picture = _parsed(path, findings)
-        if picture is None:
-            findings.add("malformed_labels", path.name)
-        else:
+        picture, malformed = _parsed(path)
+        if malformed:
+            findings.append(Finding("malformed_labels", path.name, malformed))
+        if picture is not None:
             labelled[path] = picture
     if not labelled:
         raise InputError(f"{place}: none of its {len(files)} XML files is a {FORM} annotation")
-    return labelled
+    return labelled, findings
 
 
 def _counted_from_zero(boxes: tuple[ParsedBox, ...]) -> tuple[ParsedBox, ...]:
@@ -65,22 +67,19 @@ def _counted_from_zero(boxes: tuple[ParsedBox, ...]) -> tuple[ParsedBox, ...]:
     return tuple(box._replace(left=box.left + 1, top=box.top + 1) for box in boxes)
 
 
-def _parsed(path: Path, findings: Findings) -> ParsedPicture | None:
+def _parsed(path: Path) -> tuple[ParsedPicture | None, int]:
+    """The annotated picture, None of a file that is no annotation; and how much of the file cannot be read."""
     try:
         root = ElementTree.fromstring(path.read_bytes())
     except (ElementTree.ParseError, DefusedXmlException, OSError, ValueError, LookupError):
-        return None
+        return None, 1
     if root.tag != "annotation":
-        return None
-    boxes = []
-    for each in root.iterfind("object"):
-        box = _box(each)
-        if box is None:
-            findings.add("malformed_labels", path.name)
-        else:
-            boxes.append(box)
+        return None, 1
+    objects = [_box(each) for each in root.iterfind("object")]
+    boxes = tuple(box for box in objects if box is not None)
     size = _number(root, "size/width"), _number(root, "size/height")
-    return ParsedPicture(path, tuple(boxes), size if size[0] > 0 and size[1] > 0 else None)
+    picture = ParsedPicture(path, boxes, size if size[0] > 0 and size[1] > 0 else None)
+    return picture, len(objects) - len(boxes)
 
 
 def _box(element: Any) -> ParsedBox | None:

@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.store.datasets.parsed import SHARES, Findings, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import SHARES, Finding, ParsedBox, ParsedPicture, ParsedSet
 from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, files_below, pictures_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
 
@@ -16,7 +16,7 @@ _PARTS = frozenset({"images", "labels", "train", "training", "val", "valid", "va
 _FARTHEST_SHARE = 2.0  # an edge farther out is no slip of a labelling tool: the file holds pixels
 
 
-def read_yolo(place: Path, findings: Findings) -> ParsedSet:
+def read_yolo(place: Path) -> ParsedSet:
     """A folder with `images/` and `labels/`, with both mixed, or with such folders for each part; or its data.yaml.
 
     Lines with a class and at least three corners (segments, turned boxes) give the box around them. Class names come
@@ -28,17 +28,12 @@ def read_yolo(place: Path, findings: Findings) -> ParsedSet:
     pictures = pictures_below(folder)
     labels = {path: found for path in pictures if (found := _label_file(path)) is not None}
     _demand_both(folder, pictures, labels)
-    _count_lonely(folder, pictures, labels, findings)
-    result = []
-    for path in pictures:
-        boxes: list[ParsedBox] = []
-        if path in labels:
-            boxes = list(_boxes(labels[path], names, findings))
-        else:
-            findings.add("pictures_without_labels", path.name)
-        result.append(ParsedPicture(path, tuple(boxes), SHARES))
-    _demand_shares(folder, [box for each in result for box in each.boxes], findings)
-    return ParsedSet(FORM, tuple(result), tuple(names))
+    read = {path: _boxes(labels[path], names) if path in labels else ([], []) for path in pictures}
+    malformed = [each for _, wrong in read.values() for each in wrong]
+    _demand_shares(folder, [box for boxes, _ in read.values() for box in boxes], malformed)
+    result = tuple(ParsedPicture(path, tuple(boxes), SHARES) for path, (boxes, _) in read.items())
+    without = (Finding("pictures_without_labels", path.name) for path in pictures if path not in labels)
+    return ParsedSet(FORM, result, tuple(names), (*_lonely(folder, labels), *malformed, *without))
 
 
 def looks_like_yolo(line: str) -> bool:
@@ -125,25 +120,26 @@ def _demand_both(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -
         )
 
 
-def _demand_shares(folder: Path, boxes: Sequence[ParsedBox], findings: Findings) -> None:
+def _demand_shares(folder: Path, boxes: Sequence[ParsedBox], malformed: Sequence[Finding]) -> None:
     far = sum(max(abs(edge) for edge in box[1:5]) > _FARTHEST_SHARE for box in boxes)
     if far > len(boxes) / 2:
         raise InputError(
             f"{folder}: {far} of {len(boxes)} boxes have numbers beyond 1, as pixels would; YOLO labels are shares of "
             "the picture's width and height: centre x, centre y, width, height"
         )
-    if not boxes and findings.counts.get("malformed_labels"):
+    if not boxes and malformed:
         raise InputError(
             f"{folder}: no line of its label files is YOLO (class, centre x, centre y, width, height; first failure in "
-            f"{findings.first['malformed_labels']}); if it is another form, name it"
+            f"{malformed[0].place}); if it is another form, name it"
         )
 
 
-def _count_lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path], findings: Findings) -> None:
+def _lonely(folder: Path, labels: dict[Path, Path]) -> Iterator[Finding]:
+    """Label files of no picture."""
     used = set(labels.values())
     for path in files_below(folder, ".txt"):
         if path not in used and is_label_file(path) and _is_label_place(path, folder):
-            findings.add("labels_without_picture", path.name)
+            yield Finding("labels_without_picture", path.name)
 
 
 def _is_label_place(path: Path, folder: Path) -> bool:
@@ -154,22 +150,25 @@ def _is_label_place(path: Path, folder: Path) -> bool:
     return looks_like_yolo(first)
 
 
-def _boxes(path: Path, names: list[str], findings: Findings) -> Iterator[ParsedBox]:
+def _boxes(path: Path, names: list[str]) -> tuple[list[ParsedBox], list[Finding]]:
+    """The file's boxes, and its lines that are no labels."""
+    boxes, findings = [], []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue
         numbers = _numbers(line)
         if len(numbers) < 5 or numbers[0] != int(numbers[0]) or numbers[0] < 0:
-            findings.add("malformed_labels", f"{path.name}, line {number}")
+            findings.append(Finding("malformed_labels", f"{path.name}, line {number}"))
             continue
         label = int(numbers[0])
         name = names[label] if label < len(names) else str(label)
         if len(numbers) >= 7 and len(numbers) % 2:
             xs, ys = numbers[1::2], numbers[2::2]
-            yield ParsedBox(name, min(xs), min(ys), max(xs), max(ys))
+            boxes.append(ParsedBox(name, min(xs), min(ys), max(xs), max(ys)))
         else:  # a sixth number is a score or a track
             x, y, width, height = numbers[1:5]
-            yield ParsedBox(name, x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+            boxes.append(ParsedBox(name, x - width / 2, y - height / 2, x + width / 2, y + height / 2))
+    return boxes, findings
 
 
 def _numbers(line: str) -> list[float]:
