@@ -91,7 +91,7 @@ _INFINITE = float("inf")
 _MAP, _CANDIDATE = "evidence.evidence_map:EvidenceMap", "evidence.candidate:CandidateSettings"
 _ANNOUNCING, _PARALLAX = "evidence.announcing:AnnounceSettings", "motion.parallax:ParallaxSettings"
 _THINGS, _EVIDENCE = "shape.shadows:ThingSettings", "evidence.evidence_map"
-_OPINIONS, _PICTURES = "pair.corroboration:CorroborationSettings", "evidence.pictures:PictureSettings"
+_OPINIONS, _PICTURES = "pair.corroboration:CorroborationSettings", "evidence.candidate_pictures:PictureSettings"
 _RESTLESS = f"{_EVIDENCE}:RestlessSettings"
 RULES: tuple[Rule, ...] = (
     # when a change is announced, and when it is withdrawn
@@ -112,7 +112,7 @@ RULES: tuple[Rule, ...] = (
     _decision("things: near ones are one", "before 0014", (f"{_THINGS}.apart_m", 0.0)),
     _decision("things: ground or shadow between them", "before 0014", ("shape.shadows:_things_of_group", _one_thing)),
     _decision("the shadow of what came", "before 0014", ("shape.shadows:_CONTRARY", {})),
-    _decision("parts at all", "before 0014", ("evidence.pictures:things_of", _all_parts_one)),
+    _decision("parts at all", "before 0014", ("evidence.candidate_pictures:things_of", _all_parts_one)),
     _decision("replaced is seldom", "before 0014", ("shape.kinds:_REPLACED_PRIOR", 1.0)),
     _decision("kinds: signs of the other date", "before 0014", ("shape.kinds:_OTHER", np.zeros(6))),
     _decision("outlines by the majority of masks", "before 0014", (f"{_PICTURES}.least_majority", _INFINITE)),

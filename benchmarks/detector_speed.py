@@ -168,7 +168,7 @@ def exported(
     """
     import torch
 
-    from sorvolo.training.export import export_onnx
+    from sorvolo.training.onnx_export import export_onnx
 
     model = untrained(spec)
     norms = [each for each in model.modules() if isinstance(each, torch.nn.BatchNorm2d)]

@@ -26,7 +26,7 @@ from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.daylight import Calibration, Daylight
-from sorvolo.training.export import onnx_from_module
+from sorvolo.training.onnx_export import onnx_from_module
 from train_default_model import reader
 from train_judge import CAR, odds, untrained
 

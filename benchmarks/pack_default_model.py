@@ -26,7 +26,7 @@ from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.export import check_export, export_onnx
+from sorvolo.training.onnx_export import check_export, export_onnx
 from sorvolo.training.presets import fast
 from train_default_model import SIMULATED_PICTURES, SIMULATED_SEED, reader
 

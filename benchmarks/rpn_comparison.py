@@ -26,9 +26,9 @@ from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.drawing import batches_from
 from sorvolo.training.faster_rcnn import FasterRCNN
+from sorvolo.training.feature_pyramid import convolution
 from sorvolo.training.joint import JointSettings, JointTraining
 from sorvolo.training.presets import fast
-from sorvolo.training.pyramid import convolution
 from sorvolo.training.samples import Augmentation, Share
 from sorvolo.training.seeing import see
 from sorvolo.training.weights import load_lite0

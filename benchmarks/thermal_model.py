@@ -26,7 +26,7 @@ from sorvolo.detection.scores import Arm, compare_arms
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.export import export_onnx
+from sorvolo.training.onnx_export import export_onnx
 from sorvolo.training.presets import fast
 from train_default_model import reader
 

@@ -25,7 +25,7 @@ from sorvolo.missions.reproduce.rows import Row
 from sorvolo.missions.reproduce.run import reproduce
 from sorvolo.missions.reproduce.settings import DetectorSettings, ReproductionSettings, SimulatedSize
 from sorvolo.missions.reproduce.simulated import simulated_dataset
-from sorvolo.missions.reproduce.tables import tables_of
+from sorvolo.missions.reproduce.thesis_tables import tables_of
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 

@@ -259,11 +259,11 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path) -> None:
         open_sources([sound])
 
 
-def test_glimpses_are_spread_over_the_video(tmp_path: Path) -> None:
+def test_sample_frames_are_spread_over_the_video(tmp_path: Path) -> None:
     source = open_video(write_video(tmp_path / "a.mp4", 60))
-    glimpses = source.glimpses(4)
-    assert len(glimpses) == 4 and len({frame.index for frame in glimpses}) >= 3
-    assert glimpses[-1].index >= 40
+    samples = source.sample_frames(4)
+    assert len(samples) == 4 and len({frame.index for frame in samples}) >= 3
+    assert samples[-1].index >= 40
 
 
 @pytest.fixture(scope="module")

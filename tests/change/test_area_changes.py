@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from sorvolo.change.areas.area_map import AreaMap, AreaMapSettings, with_areas
+from sorvolo.change.areas.connected_areas import AreaSettings
 from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
-from sorvolo.change.areas.segments import AreaSettings
 from sorvolo.change.areas.signs import leaning
 from sorvolo.change.shape.outlines import overlap
 from sorvolo.change.shape.patches import PatchWindow, cut
-from sorvolo.simulation.canvas import Area
 from sorvolo.simulation.ground import GroundKind, paint_ground
+from sorvolo.simulation.ground_painting import Area
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
 M_PER_PX = 0.05

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.coverage.ground import CoverageSettings, GroundCoverage, coverage_summary
+from sorvolo.change.coverage.ground_coverage import CoverageSettings, GroundCoverage, coverage_summary
 from sorvolo.change.coverage.planting import Planted, PlantingSettings, planted_in, recall_curve, sensitivities
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.survey.coverage import CoveredGround, Gap

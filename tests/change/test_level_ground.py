@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from blob_world import HEIGHT, M_PER_PX, WIDTH, Thing, picture, site_from_image, view_of
 
-from sorvolo.change.evidence.level_ground import LaidPicture, LevelSettings, Sights, is_level, seen_at_m, surroundings
+from sorvolo.change.evidence.levelness import LaidPicture, LevelSettings, Sights, is_level, seen_at_m, surroundings
 
 SETTINGS = replace(LevelSettings(), tallest_m=4.0)
 OUTLINE = Thing(0, 0).outline_m()

@@ -14,7 +14,7 @@ from sorvolo.heights.figures import surface_figures, surface_warnings
 from sorvolo.heights.islands import IslandSettings
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
-from sorvolo.heights.relief import relief_picture
+from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface

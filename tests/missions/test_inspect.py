@@ -79,7 +79,7 @@ def write_video(
         container.metadata.update(metadata or {})
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height, stream.pix_fmt = 160, 90, "yuv420p"
-        stream.codec_context.gop_size = rate // 2 or 1  # glimpses are at whole pictures
+        stream.codec_context.gop_size = rate // 2 or 1  # sample frames are at whole pictures
         for index in range(4 * rate):
             image = np.ascontiguousarray(ground[:90, index * step_px: index * step_px + 160])
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))

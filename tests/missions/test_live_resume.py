@@ -171,7 +171,7 @@ class Following(TruthDetector):
     """Sees one car that stands, wherever the frames are in the flight; nothing in frames that it does not know."""
 
     def detect(self, image: ImageRGB, **kwargs: Any) -> Detections:
-        """As `Detects.detect`."""
+        """As `ObjectDetector.detect`."""
         self.asked += kwargs.get("tiles") is not None
         return no_detections(self.classes) if kwargs.get("tiles") is None else Detections(
             np.array([[100, 60, 150, 100]]), np.array([0.9]), np.array([1]), self.classes

@@ -24,7 +24,7 @@ from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.evaluate.objects import evaluate_objects
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.priority import made_at_low_priority
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
@@ -337,7 +337,7 @@ def test_large_photos_wait_for_the_detector_one_by_one_but_those_of_a_live_fligh
             return no_detections(self.classes)
 
     camera = Camera.from_angle_of_view(640, 480, 60)
-    finder = ObjectFinder(cast(Detects, Slow()), camera, live_folder=tmp_path if is_live else None)
+    finder = ObjectFinder(cast(ObjectDetector, Slow()), camera, live_folder=tmp_path if is_live else None)
     prior = CameraPrior(np.array([0, 0, 40.0]), np.ones(3), np.diag([1.0, -1, -1]), np.ones(3))
     unfinished = []
     for index in range(8):

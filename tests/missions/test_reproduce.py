@@ -21,7 +21,7 @@ from sorvolo.missions.reproduce.rows import Row
 from sorvolo.missions.reproduce.run import ReproductionUpdate, _Work, reproduce
 from sorvolo.missions.reproduce.settings import DetectorSettings, ReproductionSettings, SimulatedSize, quick
 from sorvolo.missions.reproduce.simulated import simulated_dataset
-from sorvolo.missions.reproduce.tables import tables_of
+from sorvolo.missions.reproduce.thesis_tables import tables_of
 from sorvolo.store.datasets.umcd import read_umcd_metadata
 from sorvolo.store.datasets.umcd_folder import CHANGES, MOSAICKING, WITH, read_umcd_folder
 from sorvolo.store.exports.flight_files import write_mask

@@ -19,7 +19,7 @@ from sorvolo.missions.site.copy import copy_site
 from sorvolo.missions.site.history import site_history
 from sorvolo.missions.site.working_copy import fetch_site, send_site
 from sorvolo.store.copies.bucket import BucketEnd
-from sorvolo.store.copies.objects import open_objects
+from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.origin import ORIGIN, UNSENT
 

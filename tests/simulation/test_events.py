@@ -8,7 +8,6 @@ import pytest
 
 from small_flights import simulate_into
 from sorvolo.errors import SettingsError
-from sorvolo.simulation.events import JOINED_GAP_M, event_features, true_events
 from sorvolo.simulation.flight import has_changed, simulate_flights
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.rendering import render_labels
@@ -22,6 +21,7 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
     WeatherSettings,
 )
+from sorvolo.simulation.true_changes import JOINED_GAP_M, event_features, true_events
 from sorvolo.simulation.truth import change_mask
 from sorvolo.simulation.world import World, build_day
 

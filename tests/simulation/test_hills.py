@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sorvolo.errors import SettingsError
-from sorvolo.simulation.canvas import Area
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.simulation.ground_painting import Area
 from sorvolo.simulation.relief import LEVEL, Relief
 from sorvolo.simulation.settings import (
     ImagingSettings,

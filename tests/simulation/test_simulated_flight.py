@@ -14,10 +14,10 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import site_from_gimbal_rotation
 from sorvolo.geometry.sun import sun_direction
-from sorvolo.simulation.canvas import Area
 from sorvolo.simulation.clock import start_ns, sun_of_flight
 from sorvolo.simulation.flight import simulate_flight, simulate_flights
 from sorvolo.simulation.ground import GroundKind, orthophoto_ground, paint_ground
+from sorvolo.simulation.ground_painting import Area
 from sorvolo.simulation.noise import smooth_series
 from sorvolo.simulation.path import fly, planned_waypoints
 from sorvolo.simulation.settings import (

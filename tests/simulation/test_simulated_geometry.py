@@ -8,9 +8,9 @@ import pytest
 
 from sorvolo.geometry.level_ground import footprint, ground_from_pixels
 from sorvolo.simulation.bodies import build_body
-from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.simulation.ground import PaintedGround, orthophoto_ground
+from sorvolo.simulation.ground_painting import GroundRaster
 from sorvolo.simulation.objects import Label, Light, Thing
 from sorvolo.simulation.rendering import render_labels
 from sorvolo.simulation.settings import (

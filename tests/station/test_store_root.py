@@ -15,7 +15,7 @@ from sorvolo.station.app import station_app
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.store_root import StoreRoot
 from sorvolo.store.copies.bucket import BucketEnd
-from sorvolo.store.copies.objects import open_objects
+from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import lock_folder
 from sorvolo.survey.findings import Verdict

@@ -18,7 +18,7 @@ from sorvolo.cli.main import main
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.objects import Objects, ObjectSettings, open_objects
+from sorvolo.store.copies.object_store import Objects, ObjectSettings, open_objects
 
 _QUICK = ObjectSettings(connect_s=1.0, request_s=1.0, retries=1, retry_s=2.0, tries=2, part_bytes=5 << 20)
 

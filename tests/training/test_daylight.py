@@ -16,9 +16,9 @@ from sorvolo.training.daylight import (  # noqa: E402
     odds_from_scores,
     one_hot,
 )
-from sorvolo.training.export import onnx_from_module  # noqa: E402
 from sorvolo.training.exported import load_exported  # noqa: E402
 from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead  # noqa: E402
+from sorvolo.training.onnx_export import onnx_from_module  # noqa: E402
 from sorvolo.training.presets import fast  # noqa: E402
 
 INFO = {

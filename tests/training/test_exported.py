@@ -14,10 +14,10 @@ import onnxruntime  # noqa: E402
 from sorvolo.detection.quantise import quantise  # noqa: E402
 from sorvolo.errors import InputError  # noqa: E402
 from sorvolo.geometry.arrays import ImageRGB  # noqa: E402
-from sorvolo.training.export import check_export, export_onnx  # noqa: E402
 from sorvolo.training.exported import load_exported  # noqa: E402
 from sorvolo.training.faster_rcnn import FasterRCNN  # noqa: E402
 from sorvolo.training.inception import Stem  # noqa: E402
+from sorvolo.training.onnx_export import check_export, export_onnx  # noqa: E402
 from sorvolo.training.presets import accurate, fast, thesis  # noqa: E402
 from sorvolo.training.resnet import ResNet50  # noqa: E402
 

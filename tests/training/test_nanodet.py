@@ -13,7 +13,6 @@ from torch.nn import functional  # noqa: E402
 
 from sorvolo.detection.session import Session  # noqa: E402
 from sorvolo.errors import InputError  # noqa: E402
-from sorvolo.training.export import onnx_from_module  # noqa: E402
 from sorvolo.training.nanodet import (  # noqa: E402
     BINS,
     CocoDetector,
@@ -24,6 +23,7 @@ from sorvolo.training.nanodet import (  # noqa: E402
     head_of_class,
     nanodet_from_graph,
 )
+from sorvolo.training.onnx_export import onnx_from_module  # noqa: E402
 from sorvolo.training.tfjs_graph import read_graph, run_graph  # noqa: E402
 
 

@@ -17,8 +17,8 @@ from sorvolo.errors import SettingsError  # noqa: E402
 from sorvolo.survey.labels import LabelledPicture, LabelledSet  # noqa: E402
 from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
 from sorvolo.training.boxes import boxes_from_offsets, iou_matrix, offsets_from_boxes, suppress  # noqa: E402
-from sorvolo.training.export import check_export, export_onnx  # noqa: E402
 from sorvolo.training.faster_rcnn import FasterRCNN, Reach  # noqa: E402
+from sorvolo.training.feature_pyramid import Pyramid  # noqa: E402
 from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align  # noqa: E402
 from sorvolo.training.inception import ExtendedStack, ResidualStack, proposal_stem  # noqa: E402
 from sorvolo.training.joint import JointSettings, JointTraining  # noqa: E402
@@ -29,9 +29,9 @@ from sorvolo.training.losses import (  # noqa: E402
     region_loss,
     thesis_proposal_loss,
 )
+from sorvolo.training.onnx_export import check_export, export_onnx  # noqa: E402
 from sorvolo.training.presets import fast  # noqa: E402
 from sorvolo.training.proposals import AnchorSettings, ProposalNetwork, Proposed  # noqa: E402
-from sorvolo.training.pyramid import Pyramid  # noqa: E402
 from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample  # noqa: E402
 from sorvolo.training.sprites import paste_small_objects  # noqa: E402
 

@@ -25,7 +25,7 @@ WANTED_OVERLAP = 0.7
 """Of consecutive frames, for a good map."""
 
 _MOVING_M_S = 0.5
-_FEWEST_GLIMPSES = 3
+_FEWEST_SAMPLES = 3
 
 
 @dataclass(frozen=True)
@@ -89,20 +89,20 @@ class FlightFacts:
     camera_pitch_deg: float
 
 
-def frame_facts(source: Source, glimpses: Sequence[Frame]) -> FrameFacts:
+def frame_facts(source: Source, samples: Sequence[Frame]) -> FrameFacts:
     """What a source's header and a few of its frames, spread over the flight, show of its pictures."""
     camera = source.camera.camera
-    seen = [sharpness_and_texture(frame.image) for frame in glimpses]
+    seen = [sharpness_and_texture(frame.image) for frame in samples]
     sharp, texture = np.median(seen, axis=0).tolist() if seen else (math.nan, math.nan)
     if isinstance(source, VideoSource):
         info = source.info
         return FrameFacts(
             info.frame_count, info.frame_rate_hz, math.nan, info.duration_s, camera.width_px,
             camera.height_px, info.codec, info.container, info.path.stat().st_size, info.start_ns,
-            info.start_origin, sharp, texture, _shared_view(glimpses),
+            info.start_origin, sharp, texture, _shared_view(samples),
         )
     suffixes, container, size = _file_facts(source)
-    times_s = _times_s(source, glimpses)
+    times_s = _times_s(source, samples)
     return FrameFacts(
         source.frame_count, source.frame_rate_hz,
         median_or_nan(np.diff(times_s)) if source.kind == "photos" else math.nan,
@@ -123,22 +123,22 @@ def _file_facts(source: Source) -> tuple[str, str, int]:
     return suffixes, "", sum(photo.path.stat().st_size for photo in photos)
 
 
-def _times_s(source: Source, glimpses: Sequence[Frame]) -> Floats:
-    """(N,) when photos were taken, or when a live source's glimpses came; none where a source has no such times."""
+def _times_s(source: Source, samples: Sequence[Frame]) -> Floats:
+    """(N,) when photos were taken, or when a live source's samples came; none where a source has no such times."""
     if isinstance(source, LiveSource):
-        return np.array([frame.time_ns for frame in glimpses]) / SECOND_NS
+        return np.array([frame.time_ns for frame in samples]) / SECOND_NS
     if isinstance(source, PhotoSource):
         return np.array([photo.time_ns for photo in source.album.photos]) / SECOND_NS
     return np.zeros(0)
 
 
-def _shared_view(glimpses: Sequence[Frame]) -> float:
-    """The least share of the first glimpse that another one shows; 0 where one shows none.
+def _shared_view(samples: Sequence[Frame]) -> float:
+    """The least share of the first sample that another one shows; 0 where one shows none.
 
     NaN where fewer than three are of different times, as in a video with few whole pictures to seek to.
     """
-    different = list({frame.index: frame for frame in glimpses}.values())
-    if len(different) < _FEWEST_GLIMPSES:
+    different = list({frame.index: frame for frame in samples}.values())
+    if len(different) < _FEWEST_SAMPLES:
         return math.nan
     shares: list[float] = []
     for other in different[1:]:

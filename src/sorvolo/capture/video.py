@@ -177,7 +177,7 @@ class VideoSource:
             np.asarray(decoded.to_ndarray(format="rgb24", width=width_px, height=height_px), np.uint8), self.info.turn
         )
 
-    def glimpses(self, count: int) -> list[Frame]:
+    def sample_frames(self, count: int) -> list[Frame]:
         """A few frames spread over the video, found by seeking: quick, but their times are rough."""
         found: list[Frame] = []
         with opened_video(self.info.path) as container:
@@ -194,7 +194,7 @@ class VideoSource:
                         continue
                     image = self._image(decoded)
                 except (av.FFmpegError, StopIteration, ValueError, OverflowError, MemoryError):
-                    continue  # a glimpse at a damaged place is of no use; `frames` counts the damage
+                    continue  # a sample at a damaged place is of no use; `frames` counts the damage
                 time_s = max(0.0, decoded.time - first_s) if decoded.time is not None else 0.0
                 index = round(time_s * self.info.frame_rate_hz)
                 found.append(Frame(index, str(index), self.start_ns + round(time_s * SECOND_NS), image))

@@ -26,7 +26,7 @@ from sorvolo.registration.features import (
 )
 from sorvolo.registration.link import LinkCache, LinkSettings, refine
 from sorvolo.registration.matching import match
-from sorvolo.registration.robust import fit_homography
+from sorvolo.registration.robust_fit import fit_homography
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features, Keyframe, Link
 

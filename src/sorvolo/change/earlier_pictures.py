@@ -6,7 +6,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sorvolo.change.evidence.level_ground import LaidPicture, LevelSettings, apart
+from sorvolo.change.evidence.levelness import LaidPicture, LevelSettings, apart
 from sorvolo.change.relief import Relief
 from sorvolo.change.shape.patches import PatchWindow
 from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3

@@ -18,7 +18,7 @@ from sorvolo.registration.camera_fit import CameraFit, PosePrior, fit_camera, si
 from sorvolo.registration.features import FeatureSettings, filled, gray_from_rgb, known_only, orb_features
 from sorvolo.registration.learned import LEARNED, learned_features, match_learned
 from sorvolo.registration.matching import match
-from sorvolo.registration.robust import fit_homography
+from sorvolo.registration.robust_fit import fit_homography
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features
 

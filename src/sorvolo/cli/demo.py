@@ -90,7 +90,7 @@ def _simulate(folder: Path, settings: "SimulationSettings") -> None:
 
 def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
     """Whether an earlier run of this version left the very flights that are wanted."""
-    from sorvolo.missions.simulate.folder import MARK
+    from sorvolo.missions.simulate.simulation_folder import MARK
     from sorvolo.store.exports.plain import plain_json
 
     try:

@@ -19,7 +19,7 @@ from sorvolo.missions.flight.request import AlreadyDone
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.joining import join_blocks, plan_blocks
 from sorvolo.missions.map.tile_shares import PaintPlan, tile_blobs, tiles_painted, write_plan
-from sorvolo.missions.site.headlines import headline_of
+from sorvolo.missions.site.reported_headline import reported_headline
 from sorvolo.survey.mosaic import MosaicUpdate
 
 Progress = tuple[str, int, int]
@@ -68,7 +68,7 @@ def _mapped(order: Order, count: int, parts: "_Parts") -> Generator[Progress, No
     folder = site.with_name(f".{site.name}.blocks")
     division = plan_blocks(Path(order.source), site, settings, camera, count, folder)
     if isinstance(division, AlreadyDone):
-        return division.flight, *headline_of(site, division.flight)
+        return division.flight, *reported_headline(site, division.flight)
     folder.mkdir(exist_ok=True)
     waiting = [
         Part(PartKind.BLOCK, number, division.count, str(folder), division.key)
@@ -91,7 +91,7 @@ def _mapped(order: Order, count: int, parts: "_Parts") -> Generator[Progress, No
     joining = join_blocks(Path(order.source), site, settings, camera, division, painted)
     flight = yield from _shown(joining)
     division.remove()
-    return flight, *headline_of(site, flight)
+    return flight, *reported_headline(site, flight)
 
 
 def _shown(joining: Generator[MosaicUpdate, None, str]) -> Generator[Progress, None, str]:

@@ -13,7 +13,7 @@ from sorvolo.cluster.orders import Order, WatchWish
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
-    from sorvolo.missions.flight.detects import Detects
+    from sorvolo.missions.flight.detector_protocol import ObjectDetector
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 
 ENDING = "-watch"
@@ -63,7 +63,7 @@ def is_watched(folder: Path, fingerprint: str) -> bool:
 
 
 def watch_flight(
-    order: Order, detector: "Detects | None", alive: Callable[..., None], announce: Callable[[str], None],
+    order: Order, detector: "ObjectDetector | None", alive: Callable[..., None], announce: Callable[[str], None],
     until: Event,
 ) -> tuple[str, str]:
     """Watch the order's flight: its name, and what was found. `announce` gets each new object in words."""

@@ -23,7 +23,7 @@ from sorvolo.cluster.orders import FINISH, Mission, Order, Outcome, Part, PartKi
 from sorvolo.errors import SorvoloError
 
 if TYPE_CHECKING:
-    from sorvolo.missions.flight.detects import Detects
+    from sorvolo.missions.flight.detector_protocol import ObjectDetector
 
 _ALIVE_EVERY_S = 0.5
 _SITE_BUSY_S = 90.0  # a worker of a cluster that is gone holds its site's lock until Ray ends it, after a minute
@@ -147,7 +147,7 @@ def _scout(source: str, camera: str, answers: Answers) -> None:
     answers.add("scouted", vars(Scouted(flight.fingerprint, flight.frame_count, start_ns, box)))
 
 
-def _detector(order: Order) -> "Detects | None":
+def _detector(order: Order) -> "ObjectDetector | None":
     """The detector that the flights of this machine share; None where the mission is to open its own."""
     from sorvolo.missions.flight.map_objects import open_detector
 
@@ -162,7 +162,7 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
     """Map the flight: its name in the site, the headline, and whether it is a map to use."""
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
-    from sorvolo.missions.site.headlines import headline_of
+    from sorvolo.missions.site.reported_headline import reported_headline
 
     site, wish = Path(order.site), order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
@@ -171,7 +171,7 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
         detector=_detector(order), live=_live(order), until=until,
     )
     flight = _run(updates, site, alive)
-    return flight, *headline_of(site, flight)
+    return flight, *reported_headline(site, flight)
 
 
 def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sorvolo.detection.contract import METADATA_KEY, info_from_metadata
 from sorvolo.detection.engine import CUDA, Engine, Planes, Provider, Run, describe, open_engine, output_names
-from sorvolo.detection.messages import outputs_from, read_message, write_message, write_outputs
+from sorvolo.detection.process_messages import outputs_from, read_message, write_message, write_outputs
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Numbers
 

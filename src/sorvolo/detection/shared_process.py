@@ -13,7 +13,7 @@ import numpy as np
 from sorvolo.detection.batching import Batcher
 from sorvolo.detection.confined import about_engine
 from sorvolo.detection.engine import OUTPUTS, Engine
-from sorvolo.detection.messages import read_message, write_message, write_outputs
+from sorvolo.detection.process_messages import read_message, write_message, write_outputs
 from sorvolo.detection.session import opened_engine
 from sorvolo.detection.sharing import READY
 from sorvolo.errors import InputError, SettingsError

@@ -12,7 +12,7 @@ import numpy as np
 
 from sorvolo.detection.confined import ERRORS, engine_from
 from sorvolo.detection.engine import OUTPUTS, Engine, Planes
-from sorvolo.detection.messages import outputs_from, read_message, write_message
+from sorvolo.detection.process_messages import outputs_from, read_message, write_message
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Numbers
 

@@ -19,7 +19,7 @@ from sorvolo.capture.preflight import (
 )
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.geometry.units import SECOND_NS
-from sorvolo.missions.flight.glimpses import glimpses_of
+from sorvolo.missions.flight.sample_frames import sample_frames
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.flight import CameraModel, Notice
 
@@ -107,7 +107,7 @@ def inspect_input(
 
 
 def _inspect(source: Source) -> Inspection:
-    frames = frame_facts(source, glimpses_of(source))
+    frames = frame_facts(source, sample_frames(source))
     telemetry = telemetry_facts(source, frames)
     flight = flight_facts(while_filming(source, frames), source.camera.camera, frames)
     findings = [

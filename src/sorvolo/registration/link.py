@@ -16,7 +16,7 @@ from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.registration.features import FeatureSettings, corners, known_only, sift_features
 from sorvolo.registration.learned import learned_features, match_learned
 from sorvolo.registration.matching import match
-from sorvolo.registration.robust import fit_homography, is_believable
+from sorvolo.registration.robust_fit import fit_homography, is_believable
 from sorvolo.survey.mosaic import Features, Keyframe, Link, NoLink
 
 

@@ -7,7 +7,7 @@ from sorvolo.geometry.arrays import ImageGray, ImageRGB
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.registration.features import FeatureSettings, gray_from_rgb, sift_features
 from sorvolo.registration.matching import match
-from sorvolo.registration.robust import fit_homography
+from sorvolo.registration.robust_fit import fit_homography
 
 _SIDE_PX = 640  # pictures are made so small: the answer needs no sub-pixel match
 _LEAST_INLIERS = 12

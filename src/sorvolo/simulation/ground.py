@@ -10,7 +10,7 @@ import numpy as np
 
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
-from sorvolo.simulation.canvas import (
+from sorvolo.simulation.ground_painting import (
     Area,
     Canvas,
     GroundRaster,

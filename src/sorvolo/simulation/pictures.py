@@ -11,8 +11,8 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, ground_from_pixels
 from sorvolo.geometry.polygons import polygon_area
 from sorvolo.geometry.pose import Pose, site_from_body_nadir_rotation
-from sorvolo.simulation.canvas import Area, GroundRaster
 from sorvolo.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
+from sorvolo.simulation.ground_painting import Area, GroundRaster
 from sorvolo.simulation.objects import LYING, POSES, Label, Thing, new_kind, new_size
 from sorvolo.simulation.photographed import photographed
 from sorvolo.simulation.rendering import render, render_labels

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, PointsM
-from sorvolo.simulation.canvas import Area
+from sorvolo.simulation.ground_painting import Area
 from sorvolo.simulation.view import View
 
 _WAVES = 5

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.pose import Pose
-from sorvolo.simulation.canvas import GroundRaster
+from sorvolo.simulation.ground_painting import GroundRaster
 from sorvolo.simulation.objects import Body, Thing
 from sorvolo.simulation.relief import Relief
 from sorvolo.simulation.view import View, blend, remapped, sample_patches

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGB, ImageRGBA
-from sorvolo.simulation.canvas import GroundRaster
+from sorvolo.simulation.ground_painting import GroundRaster
 from sorvolo.simulation.noise import layer
 from sorvolo.simulation.objects import Body, Label, Part, Thing
 from sorvolo.simulation.photographed import recompressed

@@ -12,8 +12,8 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
-from sorvolo.simulation.canvas import GroundRaster
 from sorvolo.simulation.flight import SimulatedFlight, has_changed
+from sorvolo.simulation.ground_painting import GroundRaster
 from sorvolo.simulation.objects import Body, Label, Thing
 from sorvolo.simulation.relief import LEVEL, Relief
 from sorvolo.simulation.rendering import Labels, render_labels

@@ -9,9 +9,9 @@ import numpy as np
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageGray
 from sorvolo.simulation.bodies import build_body
-from sorvolo.simulation.canvas import Area, GroundRaster
 from sorvolo.simulation.clock import sun_of_flight
 from sorvolo.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
+from sorvolo.simulation.ground_painting import Area, GroundRaster
 from sorvolo.simulation.noise import fractal
 from sorvolo.simulation.objects import SMALL_KINDS, Body, Label, Light, Thing, new_kind, new_size
 from sorvolo.simulation.relief import LEVEL, Relief

@@ -20,18 +20,17 @@ from sorvolo.station.drawings import Drawings, drawing_routes
 from sorvolo.station.event_routes import event_routes
 from sorvolo.station.events import EventLog
 from sorvolo.station.exports import export_routes
-from sorvolo.station.features import feature_routes, landing_links
-from sorvolo.station.findings import Findings
 from sorvolo.station.flight_videos import FlightVideos, video_routes
 from sorvolo.station.ingest import Ingest, IngestLimits
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.logs import Observer
 from sorvolo.station.map_watch import MapWatch
-from sorvolo.station.metrics import StationMetrics, memory_bytes, metrics_routes
+from sorvolo.station.ogc_features import feature_routes, landing_links
 from sorvolo.station.outward import Outward, OutwardSettings
 from sorvolo.station.place import place_routes
 from sorvolo.station.place_index import PlaceIndex
 from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
+from sorvolo.station.prometheus import StationMetrics, memory_bytes, metrics_routes
 from sorvolo.station.reviews import Reviews, review_routes
 from sorvolo.station.run_routes import run_routes
 from sorvolo.station.runs import Runs
@@ -45,6 +44,7 @@ from sorvolo.station.tiles import WebTiles
 from sorvolo.station.tokens import Role
 from sorvolo.station.upload_routes import upload_routes
 from sorvolo.station.uploads import Uploads
+from sorvolo.station.watch_findings import Findings
 from sorvolo.station.wmts import wmts_routes
 
 PAGE_FOLDER = Path(__file__).parent / "page"

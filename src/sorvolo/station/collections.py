@@ -12,9 +12,9 @@ from shapely.errors import ShapelyError
 from shapely.geometry import shape
 from shapely.geometry.base import BaseGeometry
 
-from sorvolo.station.findings import Findings
 from sorvolo.station.problems import Problem
 from sorvolo.station.sites import SiteShelf
+from sorvolo.station.watch_findings import Findings
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.coverage_files import COVERAGE
 from sorvolo.store.exports.object_files import objects_geojson

@@ -6,11 +6,11 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Response
 
 from sorvolo.geometry.arrays import ImageRGB, PointsM
-from sorvolo.station.findings import Findings
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
+from sorvolo.station.watch_findings import Findings
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.exports.object_files import CROPS, crop_name
 from sorvolo.store.images import jpeg_from_image, rgba_from_png

@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends
 from fastapi.responses import JSONResponse
 
 from sorvolo.station.cogs import cogs_of, tilejson_address
-from sorvolo.station.features import GeoJsonResponse
+from sorvolo.station.ogc_features import GeoJsonResponse
 from sorvolo.station.problems import Problem
 from sorvolo.station.security import needs
 from sorvolo.station.sites import SiteShelf, bounds_lonlat

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from sorvolo.errors import SorvoloError
 from sorvolo.store.copies.bucket import OvertakenError, sites_at
-from sorvolo.store.copies.objects import open_objects
+from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.copies.transfer import CopyUpdate
 from sorvolo.store.copies.working import WorkingCopy
 from sorvolo.store.site.catalogue_place import catalogue_file

@@ -16,7 +16,7 @@ from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
-from sorvolo.tracking.joining import WITHIN
+from sorvolo.tracking.doubles import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
 from sorvolo.tracking.plausible import usual_length_m
 from sorvolo.tracking.view_evidence import EvidenceSettings, score_from_views

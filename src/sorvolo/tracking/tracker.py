@@ -20,8 +20,8 @@ from sorvolo.tracking.association import (
     voted_shift,
 )
 from sorvolo.tracking.common_shift import CommonShift, ShiftSettings
+from sorvolo.tracking.doubles import JoiningSettings, double_of, earlier_mover, frame_doubles, inward_m, neighbours
 from sorvolo.tracking.followed import Followed
-from sorvolo.tracking.joining import JoiningSettings, double_of, earlier_mover, frame_doubles, inward_m, neighbours
 from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of, predicted
 
 

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from sorvolo.errors import SettingsError
+from sorvolo.training.drawn_regions import draw_regions
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.joint import Progress, collate
 from sorvolo.training.losses import Answer, thesis_proposal_loss
 from sorvolo.training.proposals import Proposed
-from sorvolo.training.regions import draw_regions
 from sorvolo.training.samples import Sample
 
 STEP_NAMES = ("1/4 proposals", "2/4 classifier", "3/4 proposals refined", "4/4 classifier refined")

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from sorvolo.training.depthwise import Depthwise
-from sorvolo.training.pyramid import convolution, separable
+from sorvolo.training.feature_pyramid import convolution, separable
 
 Stem = Literal["standard", "extended", "extended-residual"]
 

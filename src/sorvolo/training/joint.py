@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from sorvolo.training.drawn_regions import draw_regions
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.losses import Answer, LossRow, joint_proposal_loss
 from sorvolo.training.proposals import Proposed
-from sorvolo.training.regions import draw_regions
 from sorvolo.training.samples import Sample
 
 

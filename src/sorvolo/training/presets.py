@@ -7,10 +7,10 @@ import torch
 
 from sorvolo.training.backbone import EfficientNetLite0
 from sorvolo.training.faster_rcnn import FasterRCNN, Reach
+from sorvolo.training.feature_pyramid import Pyramid
 from sorvolo.training.heads import StageHead, TwoLayerHead
 from sorvolo.training.inception import Stem
 from sorvolo.training.proposals import AnchorSettings, ProposalNetwork
-from sorvolo.training.pyramid import Pyramid
 from sorvolo.training.resnet import ResNet50, load_stage, resnet_stage
 from sorvolo.training.weights import ImageNetWeights, Net
 

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.areas.connected_areas import AreaSettings, GroundSigns, segments
 from sorvolo.change.areas.ground_pictures import GroundPictureSettings
 from sorvolo.change.areas.ground_sums import GroundSums
-from sorvolo.change.areas.segments import AreaSettings, GroundSigns, segments
 from sorvolo.change.areas.signs import AreaSigns, SignSettings, area_signs
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.change.shape.place_sigma import place_sigma_m

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.change.evidence.pictures import PictureSettings, quality
+from sorvolo.change.evidence.candidate_pictures import PictureSettings, quality
 from sorvolo.change.shape.patches import Cut, PatchWindow, cut, patch_of
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.survey.findings import ComparedView, Patch

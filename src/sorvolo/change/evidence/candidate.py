@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sorvolo.change.evidence.announcing import Tally
+from sorvolo.change.evidence.candidate_pictures import Pictures, PictureSettings
 from sorvolo.change.evidence.cells import CellEvidence, CellGrid, CellReport, CellWindow, LaidView, pieces
-from sorvolo.change.evidence.level_ground import Sights
-from sorvolo.change.evidence.pictures import Pictures, PictureSettings
+from sorvolo.change.evidence.levelness import Sights
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import measures
 from sorvolo.change.shape.place_sigma import aside_of, place_sigma_m

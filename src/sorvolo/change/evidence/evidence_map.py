@@ -25,6 +25,7 @@ from sorvolo.change.evidence.announcing import (
     views_score,
 )
 from sorvolo.change.evidence.candidate import Candidate, CandidateSettings, KeptView, Seeds
+from sorvolo.change.evidence.candidate_pictures import PictureSettings
 from sorvolo.change.evidence.cells import (
     CellEvidence,
     CellGrid,
@@ -33,7 +34,6 @@ from sorvolo.change.evidence.cells import (
     lay,
     pieces,
 )
-from sorvolo.change.evidence.pictures import PictureSettings
 from sorvolo.change.evidence.relief_doubt import ReliefDoubt
 from sorvolo.change.evidence.shadow_doubt import ShadowDoubt, SunAt
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingBlobs, MovingSettings

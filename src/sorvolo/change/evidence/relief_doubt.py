@@ -3,7 +3,7 @@
 import numpy as np
 
 from sorvolo.change.earlier_pictures import EarlierPictures, Vantage
-from sorvolo.change.evidence.level_ground import LevelSettings, Sights, is_level, seen_at_m, surroundings, width_m
+from sorvolo.change.evidence.levelness import LevelSettings, Sights, is_level, seen_at_m, surroundings, width_m
 from sorvolo.geometry.arrays import PointsM
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from cv2.typing import MatLike
 
 from sorvolo.change.earlier_pictures import EarlierPictures
-from sorvolo.change.evidence.level_ground import LaidPicture, LevelSettings, Sights
+from sorvolo.change.evidence.levelness import LaidPicture, LevelSettings, Sights
 from sorvolo.change.shape.outlines import mask_of
 from sorvolo.change.shape.patches import PatchWindow
 from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM, Vector3

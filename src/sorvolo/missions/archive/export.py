@@ -10,7 +10,7 @@ from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.archive.index import sites_below
 from sorvolo.missions.site.working_copy import fetch_site
 from sorvolo.store.copies.bucket import sites_at
-from sorvolo.store.copies.objects import open_objects
+from sorvolo.store.copies.object_store import open_objects
 from sorvolo.store.copies.working import store_address
 from sorvolo.store.exports.stac_geoparquet import StacItem, demand_pyarrow, item_table
 from sorvolo.store.index.stac_items import PROPERTIES, site_items

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from sorvolo.change.classes import LENIENT, can_show, class_of_change, enlarged, object_at, seen_at, stands_in
 from sorvolo.geometry.arrays import ImageRGBA
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.survey.findings import Change, ChangeKind
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Sighting
@@ -21,7 +21,7 @@ class ChangeClasses:
     reports on request alone: there the ground itself shows that something changed.
     """
 
-    def __init__(self, detector: Detects, known: Sequence[MapObject], classes: Sequence[str] = ()) -> None:
+    def __init__(self, detector: ObjectDetector, known: Sequence[MapObject], classes: Sequence[str] = ()) -> None:
         self._detector, self._known, self._wanted = detector, known, tuple(classes) or None
 
     def preliminary(self, change: Change) -> Change:

@@ -14,7 +14,7 @@ from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import CompareRun, Pending
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.headline import MapQuality
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.live_journal import SourceNotes
@@ -37,7 +37,7 @@ _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a 
 def compare_flights(
     inputs: Sequence[Path | str], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
-    steps: Path | None = None, detector: Detects | None = None,
+    steps: Path | None = None, detector: ObjectDetector | None = None,
     live: LiveSettings = LiveSettings(keeps_all=True), until: threading.Event | None = None,  # noqa: B008 (frozen)
     again: bool = False,
 ) -> Generator[CompareUpdate, None, tuple[AlreadyDone, ...]]:
@@ -122,7 +122,7 @@ def _without_heights(archive: Archive, flight: str) -> tuple[Notice, ...]:
 
 def _compare_one(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
-    detector: Detects | None, base: int, request: str, *, anew: bool, samples: int,
+    detector: ObjectDetector | None, base: int, request: str, *, anew: bool, samples: int,
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), setup.source
     notices = (*setup.notices, *repeated(archive, source.name, "compared"), *_without_heights(archive, source.name))

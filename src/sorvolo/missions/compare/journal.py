@@ -9,7 +9,7 @@ from sorvolo.errors import SorvoloError
 from sorvolo.geometry.arrays import Encoded
 from sorvolo.missions.flight.live_journal import BEGUN, SAMPLES, SourceNotes
 from sorvolo.missions.flight.map_objects import FrameDetections
-from sorvolo.missions.flight.replay import Replay
+from sorvolo.missions.flight.resumed_frames import ResumedFrames
 from sorvolo.missions.map.journal import MapJournal, Taken, detections_in, put_taken, taken_in
 from sorvolo.store.site.journal import Entry, RunJournal
 from sorvolo.store.site.journal_records import RecordPacker, unpacked
@@ -54,7 +54,7 @@ class CompareJournal(MapJournal):
         super().__init__(journal, notes)
         self.keeps_pictures = keeps_pictures
         self.detections = tuple(each for each in self._read() if isinstance(each, FrameDetections))
-        self._frames = Replay(iter(()) if keeps_pictures else self._taken())
+        self._frames = ResumedFrames(iter(()) if keeps_pictures else self._taken())
 
     def kept_frames(self) -> Iterator[ComparedFrame]:
         """The frames that a killed run compared and that cannot be read again."""

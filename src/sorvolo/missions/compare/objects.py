@@ -6,7 +6,7 @@ from typing import Any
 from sorvolo.capture.source import LiveSource
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, search_summary, why_not_searched
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
@@ -24,7 +24,7 @@ class ComparisonObjects:
     """A detector's part in one comparison; without a detector nothing is searched and no change has a class."""
 
     def __init__(
-        self, detector: Detects | None, setup: FlightSetup, archive: Archive, base_version: int,
+        self, detector: ObjectDetector | None, setup: FlightSetup, archive: Archive, base_version: int,
         settings: CompareSettings,
     ) -> None:
         """`settings.classes` are looked for, in frames as in the changes' own pictures."""

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sorvolo.change.coverage.ground import CoverageSettings, GroundCoverage, coverage_summary
+from sorvolo.change.coverage.ground_coverage import CoverageSettings, GroundCoverage, coverage_summary
 from sorvolo.change.coverage.planting import recall_curve
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.geometry.arrays import PointsM

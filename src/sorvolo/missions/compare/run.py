@@ -31,7 +31,7 @@ from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal, KeptFrame
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import ViewCounts, comparison_summary, comparison_warnings
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
@@ -87,7 +87,7 @@ class CompareRun:
 
     def __init__(
         self, setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, steps: Path | None,
-        detector: Detects | None = None, request: str = "", journal: CompareJournal | None = None,
+        detector: ObjectDetector | None = None, request: str = "", journal: CompareJournal | None = None,
     ) -> None:
         self._setup, self._archive, self._settings, self._steps = setup, archive, settings, steps
         self._base_version = base_version

@@ -15,7 +15,7 @@ from sorvolo.detection.turning import is_from_above
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.memory import MemorySettings
 from sorvolo.missions.flight.priority import lower_priority, made_at_low_priority
 from sorvolo.registration.sizes import at_most
@@ -39,7 +39,7 @@ _CROP_PX = 256
 _MOST_CROPS = 60  # of one frame, the surest
 
 
-def open_detector(model: str, shared: str = "", *, is_live: bool = False) -> Detects | None:
+def open_detector(model: str, shared: str = "", *, is_live: bool = False) -> ObjectDetector | None:
     """The detector of this name or file; None for "none", and for "default" where no default model is installed.
 
     `shared` is the socket of a process that holds it for several, "" for one of its own. Beside an `is_live` flight's
@@ -54,7 +54,7 @@ def open_detector(model: str, shared: str = "", *, is_live: bool = False) -> Det
     return Detector.load(model, shared=shared)
 
 
-def check_classes(detector: Detects | None, classes: Sequence[str]) -> None:
+def check_classes(detector: ObjectDetector | None, classes: Sequence[str]) -> None:
     """Raise SettingsError for a class that the detector does not know, before anything is searched."""
     if detector is not None and (unknown := sorted(set(classes) - set(detector.classes))):
         raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
@@ -83,7 +83,7 @@ class ObjectFinder:
     """
 
     def __init__(
-        self, detector: Detects, camera: Camera, classes: Sequence[str] = (), *, live_folder: Path | None = None
+        self, detector: ObjectDetector, camera: Camera, classes: Sequence[str] = (), *, live_folder: Path | None = None
     ) -> None:
         check_classes(detector, classes)
         self._detector, self._camera = detector, camera

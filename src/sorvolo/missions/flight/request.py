@@ -9,7 +9,7 @@ from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import LiveSource
 from sorvolo.capture.video import VideoSource
 from sorvolo.missions.flight.control import FlightControl
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.flight.software import software
 from sorvolo.store.site.archive import Archive
@@ -29,7 +29,7 @@ class AlreadyDone:
 
 
 def request_of(
-    setup: FlightSetup, settings: Any, area: Area | None, detector: Detects | None, *more: Any
+    setup: FlightSetup, settings: Any, area: Area | None, detector: ObjectDetector | None, *more: Any
 ) -> str:
     """What is asked for: the same command over the same files by the same version of the program gives the same.
 
@@ -46,7 +46,7 @@ def request_of(
 
 
 def live_request(
-    source: LiveSource, settings: Any, area: Area | None, detector: Detects | None, *more: Any
+    source: LiveSource, settings: Any, area: Area | None, detector: ObjectDetector | None, *more: Any
 ) -> str:
     """What is asked for of a live flight, which is known before the flight is: the same for the same address."""
     return content_sha256(

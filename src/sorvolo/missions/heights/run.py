@@ -13,7 +13,7 @@ from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
 from sorvolo.heights.figures import camera_figures, camera_warnings, surface_figures, surface_warnings
 from sorvolo.heights.lattice import CellSettings, Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
-from sorvolo.heights.relief import relief_picture
+from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
 from sorvolo.heights.views import View, ground_outlines_m

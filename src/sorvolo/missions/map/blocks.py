@@ -15,10 +15,10 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
-from sorvolo.missions.flight.glimpses import refuse_without_texture
+from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, open_detector
 from sorvolo.missions.flight.memory import memory_budget_bytes
-from sorvolo.missions.flight.reading import read_ahead
+from sorvolo.missions.flight.sample_frames import refuse_without_texture
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken

@@ -17,13 +17,13 @@ from sorvolo.capture.video_spans import SparseReading
 from sorvolo.errors import SettingsError, SorvoloWarning
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import check_room
-from sorvolo.missions.flight.glimpses import refuse_without_texture
+from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
-from sorvolo.missions.flight.reading import read_ahead
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
+from sorvolo.missions.flight.sample_frames import refuse_without_texture
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import (
     FlightSetup,
@@ -53,7 +53,7 @@ _AHEAD = 2  # decoded frames that wait to be placed
 def map_flights(
     inputs: Sequence[Path | str], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
     telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
-    detector: Detects | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
+    detector: ObjectDetector | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
     base: Path | None = None, again: bool = False, refly: Sequence[Path] = (), catalogues: Catalogues | None = None,
 ) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
@@ -125,7 +125,7 @@ def _refuse_ties(flights: int, settings: MapSettings) -> None:
 
 
 def _map_one(
-    setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: Detects | None,
+    setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: ObjectDetector | None,
     request: str, coverage: FlightCoverage, *, anew: bool, samples: int,
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source

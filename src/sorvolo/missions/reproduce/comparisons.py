@@ -19,8 +19,8 @@ from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.frame_rows import map_frames
 from sorvolo.missions.evaluate.mask_folders import ComparedMask, compared_masks, frames_against_times
 from sorvolo.missions.flight.settings import CompareSettings
-from sorvolo.missions.reproduce.inputs import VideoInput
 from sorvolo.missions.reproduce.settings import COMPARISONS, FIGURE_PX
+from sorvolo.missions.reproduce.video_input import VideoInput
 from sorvolo.mosaic.frame_deviation import MapDeviation
 from sorvolo.store.atomic import writing
 from sorvolo.store.datasets.umcd import read_umcd_metadata

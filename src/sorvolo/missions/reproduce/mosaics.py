@@ -9,8 +9,8 @@ from sorvolo.missions.evaluate.frame_rows import map_frames
 from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.reproduce.inputs import VideoInput
 from sorvolo.missions.reproduce.settings import FIGURE_PX
+from sorvolo.missions.reproduce.video_input import VideoInput
 from sorvolo.mosaic.frame_deviation import MapDeviation
 from sorvolo.mosaic.outline_distortion import outline_distortion
 from sorvolo.mosaic.roi_stitching import RoiStitchingSettings

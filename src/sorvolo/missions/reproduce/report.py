@@ -12,7 +12,7 @@ from sorvolo import __version__
 from sorvolo.missions.reproduce.published import FIGURES
 from sorvolo.missions.reproduce.rows import Row, RowStore
 from sorvolo.missions.reproduce.settings import ReproductionSettings, SimulatedSize
-from sorvolo.missions.reproduce.tables import tables_of
+from sorvolo.missions.reproduce.thesis_tables import tables_of
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.exports.reproduction_sheets import reproduction_sheets

@@ -11,10 +11,10 @@ from typing import Any
 from sorvolo import __version__
 from sorvolo.errors import GeometryError, InputError, StoreError
 from sorvolo.missions.reproduce import comparisons, detectors, mosaics
-from sorvolo.missions.reproduce.inputs import VideoInput, video_input
 from sorvolo.missions.reproduce.published import VIDEOS
 from sorvolo.missions.reproduce.rows import Row, RowStore
 from sorvolo.missions.reproduce.settings import COMPARISONS, MAP_METHODS, PUBLISHED, ReproductionSettings
+from sorvolo.missions.reproduce.video_input import VideoInput, video_input
 from sorvolo.store.datasets.npu_folder import ENVIRONMENT, read_npu_folder
 from sorvolo.store.datasets.umcd_folder import UmcdFolder, UmcdVideo, read_umcd_folder
 from sorvolo.store.site.journal import content_sha256

@@ -9,7 +9,7 @@ from sorvolo.capture.areas import read_area, read_segments
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
 from sorvolo.missions.search.frames import flights_to_search, search_frames
 from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, SearchProgress, measure_flight
@@ -45,7 +45,7 @@ class SearchOutputs:
 
 
 def search_site(
-    site_folder: Path, settings: SearchSettings, outputs: SearchOutputs, detector: Detects | None = None
+    site_folder: Path, settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector | None = None
 ) -> Generator[SearchProgress | dict[str, Any]]:
     """Measure the flights of a site, yielding progress and, at last, the report; files appear in `outputs.folder`.
 
@@ -71,7 +71,7 @@ def search_site(
 
 
 def _measured(
-    frames: Mapping[str, Sequence[SearchFrame]], cells: Cells, archive: Archive, detector: Detects,
+    frames: Mapping[str, Sequence[SearchFrame]], cells: Cells, archive: Archive, detector: ObjectDetector,
     settings: SearchSettings,
 ) -> Generator[SearchProgress, None, list[MeasuredFlight]]:
     """Each flight measured, one after the other."""
@@ -109,7 +109,7 @@ def _cells(
 
 
 def _write(
-    searched: Searched, archive: Archive, settings: SearchSettings, outputs: SearchOutputs, detector: Detects
+    searched: Searched, archive: Archive, settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector
 ) -> dict[str, Any]:
     """All files; the report."""
     site, cells = searched.site, searched.cells

@@ -8,12 +8,12 @@ from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.turning import is_from_above
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Mask, Vector3
 from sorvolo.geometry.sun import direction_from_angles, sun_direction
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import Conditions, FrameLook, gather, look_at
 from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows
-from sorvolo.search.places import PlantPlace, plant_places, seeded
+from sorvolo.search.plant_places import PlantPlace, plant_places, seeded
 from sorvolo.search.recall import Chances, Recall, fit_recall, map_chances
 from sorvolo.simulation.frame_light import FrameLight, frame_light
 from sorvolo.simulation.objects import Thing
@@ -75,8 +75,8 @@ class SearchProgress:
 
 
 def measure_flight(
-    name: str, frames: Sequence[SearchFrame], cells: Cells, site: Site, detector: Detects, settings: SearchSettings,
-    keep_off_m: Sequence[Floats],
+    name: str, frames: Sequence[SearchFrame], cells: Cells, site: Site, detector: ObjectDetector,
+    settings: SearchSettings, keep_off_m: Sequence[Floats],
 ) -> Iterator[SearchProgress | MeasuredFlight]:
     """Measure one flight over a site with metres; yields progress and, at last, what was measured.
 
@@ -130,7 +130,7 @@ class _Round:
         self.looked = 0
 
     def search(
-        self, name: str, detector: Detects, wanted: Sequence[str], before: int, total: int,
+        self, name: str, detector: ObjectDetector, wanted: Sequence[str], before: int, total: int,
         gathered: Sequence[tuple[PlantPlace, bool]],
     ) -> Iterator[SearchProgress]:
         """Plant into one frame after the other and search it; those that show no plant are left out."""

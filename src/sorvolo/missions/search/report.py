@@ -9,7 +9,7 @@ from sorvolo.detection.tiling import TASK
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M
 from sorvolo.geometry.summary import median_of_known
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.measure import MeasuredClass, MeasuredFlight, SearchFrame
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
@@ -105,7 +105,7 @@ def is_coarse(searched: Searched, settings: SearchSettings, info: ModelInfo) -> 
 
 
 def build_search_report(
-    searched: Searched, settings: SearchSettings, detector: Detects, refly: "Refly | None"
+    searched: Searched, settings: SearchSettings, detector: ObjectDetector, refly: "Refly | None"
 ) -> dict[str, Any]:
     """search.json (docs/formats.md)."""
     rows = {label: _class_row(searched, label, settings, detector.info) for label in searched.labels}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.missions.simulate.ahead import in_order
-from sorvolo.missions.simulate.folder import PICTURES_MARK, simulation_description, simulation_folder
+from sorvolo.missions.simulate.simulation_folder import PICTURES_MARK, simulation_description, simulation_folder
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.pictures import PictureSettings, SimulatedPicture, simulate_picture
 from sorvolo.simulation.truth import coco_categories

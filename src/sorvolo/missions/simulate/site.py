@@ -9,11 +9,11 @@ from typing import Any
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.missions.simulate.ahead import in_order
-from sorvolo.missions.simulate.folder import MARK, simulation_description, simulation_folder
-from sorvolo.simulation.events import event_features
+from sorvolo.missions.simulate.simulation_folder import MARK, simulation_description, simulation_folder
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.settings import GEOID_HEIGHT_M, SimulationSettings
+from sorvolo.simulation.true_changes import event_features
 from sorvolo.simulation.truth import (
     change_mask,
     coco_boxes,

@@ -32,11 +32,11 @@ from sorvolo.training.checkpoint import (
     weights_bytes,
 )
 from sorvolo.training.drawing import batches_from
-from sorvolo.training.export import ExportCheck, check_export, export_onnx
 from sorvolo.training.exported import ExportedModel
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.four_steps import STEP_NAMES, FourStepTraining
 from sorvolo.training.joint import Progress
+from sorvolo.training.onnx_export import ExportCheck, check_export, export_onnx
 from sorvolo.training.progress import Check, History, Learner, seconds_left
 from sorvolo.training.samples import Augmentation, Sample
 from sorvolo.training.seeing import padded_to

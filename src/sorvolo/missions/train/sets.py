@@ -9,8 +9,8 @@ from typing import Any
 from sorvolo.capture.photos import read_picture
 from sorvolo.detection.light import is_thermal
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.simulate.folder import PICTURES_MARK
 from sorvolo.missions.simulate.pictures import simulate_pictures
+from sorvolo.missions.simulate.simulation_folder import PICTURES_MARK
 from sorvolo.missions.train.holding_out import hold_out
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset, read_datasets

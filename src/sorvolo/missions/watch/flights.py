@@ -11,13 +11,13 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, open_sources
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.live_journal import SourceNotes
-from sorvolo.missions.flight.reading import read_ahead
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
-from sorvolo.missions.watch.ground import over_heights
+from sorvolo.missions.watch.ground_height import over_heights
 from sorvolo.missions.watch.journal import StoppedWatch, WatchJournal, WatchOrder
 from sorvolo.missions.watch.places import Places, places_of
 from sorvolo.missions.watch.run import WatchRun, WatchUpdate
@@ -33,7 +33,7 @@ _STOPPED = "stopped on demand"
 
 def watch(
     source: Path | str, settings: WatchSettings = WatchSettings(), outputs: WatchOutputs = WatchOutputs(), *,  # noqa: B008 (frozen)
-    telemetry: Path | str | None = None, camera: Path | str | None = None, detector: Detects | None = None,
+    telemetry: Path | str | None = None, camera: Path | str | None = None, detector: ObjectDetector | None = None,
     live: LiveSettings = LiveSettings(), until: threading.Event | None = None,  # noqa: B008 (frozen)
 ) -> Generator[WatchUpdate]:
     """Search a flight, yielding an update for each frame searched.
@@ -85,7 +85,9 @@ def _free_folder(folder: Path) -> Path:
     return next(each for each in names if not each.exists())
 
 
-def _checked_detector(detector: Detects | None, settings: WatchSettings, outputs: WatchOutputs) -> Detects:
+def _checked_detector(
+    detector: ObjectDetector | None, settings: WatchSettings, outputs: WatchOutputs
+) -> ObjectDetector:
     """The detector of a watch. Raises InputError or SettingsError where it, or where its finds go, cannot be used."""
     if outputs.cot:
         check_host(cot_place(outputs.cot))
@@ -95,7 +97,7 @@ def _checked_detector(detector: Detects | None, settings: WatchSettings, outputs
     return finder
 
 
-def _demand_known_classes(detector: Detects, settings: WatchSettings, outputs: WatchOutputs) -> None:
+def _demand_known_classes(detector: ObjectDetector, settings: WatchSettings, outputs: WatchOutputs) -> None:
     if unknown := sorted(set(settings.classes) - set(detector.classes)):
         raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
     if unknown := sorted(set(outputs.cot_types) - {*detector.classes, *COT_TYPES}):

@@ -9,10 +9,10 @@ from typing import Any
 import sorvolo
 from sorvolo.capture.source import LiveSource
 from sorvolo.errors import SorvoloError, SorvoloWarning
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.live_journal import BEGUN, SAMPLES, SourceNotes, go_on
-from sorvolo.missions.flight.replay import Replay
 from sorvolo.missions.flight.request import live_request, request_of
+from sorvolo.missions.flight.resumed_frames import ResumedFrames
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.exports.detection_files import JOURNAL
@@ -58,7 +58,7 @@ class WatchJournal:
         self.file = journal
         self._notes = notes
         self.sent = frozenset(each for each in self._read() if isinstance(each, Sent))
-        self._replay = Replay(self.frames())
+        self._replay = ResumedFrames(self.frames())
 
     @property
     def is_live(self) -> bool:
@@ -115,7 +115,7 @@ class WatchOrder:
 
     settings: WatchSettings
     outputs: WatchOutputs
-    detector: Detects
+    detector: ObjectDetector
 
     def journal(self, setup: FlightSetup, folder: Path) -> RunJournal:
         """The journal of a watch in its folder, with what a killed watch of the same work left.

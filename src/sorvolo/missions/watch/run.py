@@ -12,7 +12,7 @@ from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.scene import SceneMagnifier
 from sorvolo.detection.tiling import whole_m_per_px
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.flight.detects import Detects
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
@@ -89,8 +89,8 @@ class WatchRun:
     """
 
     def __init__(
-        self, setup: FlightSetup, places: Places, detector: Detects, settings: WatchSettings, outputs: WatchOutputs,
-        folder: Path, journal: WatchJournal,
+        self, setup: FlightSetup, places: Places, detector: ObjectDetector, settings: WatchSettings,
+        outputs: WatchOutputs, folder: Path, journal: WatchJournal,
     ) -> None:
         self._journal = journal
         self._setup, self._places, self._detector = setup, places, detector

@@ -17,8 +17,8 @@ from typing import Any, BinaryIO, Self
 from sorvolo.errors import SorvoloWarning, StoreError
 from sorvolo.store.atomic import writing
 from sorvolo.store.copies.folder import refuse_loss, refuse_other
-from sorvolo.store.copies.objects import ConflictError, Objects
-from sorvolo.store.copies.state import (
+from sorvolo.store.copies.object_store import ConflictError, Objects
+from sorvolo.store.copies.site_state import (
     CatalogueState,
     SiteFile,
     SiteState,

@@ -21,7 +21,7 @@ from sorvolo.store.atomic import (
     sync_file,
     writing,
 )
-from sorvolo.store.copies.state import (
+from sorvolo.store.copies.site_state import (
     CatalogueState,
     SiteFile,
     SiteState,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from sorvolo.errors import StoreError
 from sorvolo.store.copies.bucket import MANIFEST, SHOWN, BucketEnd, Manifest, catalogue_key, key_of
-from sorvolo.store.copies.objects import ConflictError, Objects
-from sorvolo.store.copies.state import SiteFile
+from sorvolo.store.copies.object_store import ConflictError, Objects
+from sorvolo.store.copies.site_state import SiteFile
 
 _FOLDERS = ("tiles/", "files/", "catalogues/")
 _AT_ONCE = 1000  # keys in a request

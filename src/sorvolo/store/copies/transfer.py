@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import BinaryIO, Protocol
 
 from sorvolo.errors import StoreError
-from sorvolo.store.copies.state import DamagedError, SiteFile, SiteState, chunks_of
+from sorvolo.store.copies.site_state import DamagedError, SiteFile, SiteState, chunks_of
 
 
 class SiteEnd(Protocol):

@@ -14,8 +14,8 @@ from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.copies.bucket import SHOWN, BucketEnd, Manifest, key_of
 from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.objects import Objects, open_objects
-from sorvolo.store.copies.state import CatalogueState, DamagedError, SiteFile, SiteState, tile_of
+from sorvolo.store.copies.object_store import Objects, open_objects
+from sorvolo.store.copies.site_state import CatalogueState, DamagedError, SiteFile, SiteState, tile_of
 from sorvolo.store.copies.transfer import CopyUpdate, copy
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.files import lock_folder

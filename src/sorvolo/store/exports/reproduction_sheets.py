@@ -40,7 +40,7 @@ class Sheet:
 
 
 def reproduction_sheets(tables: Mapping[str, Any]) -> list[Sheet]:
-    """The sheets of what `missions.reproduce.tables.tables_of` gives, in the order of the thesis's chapter."""
+    """The sheets of what `missions.reproduce.thesis_tables.tables_of` gives, in the order of the thesis's chapter."""
     return [
         _distortions(tables["figure_3_12"]), *_times(tables["table_4_1"]), _deviations(tables["section_4_1_1"]),
         _counted(tables["tables_4_3_and_4_4"], "tables_4_3_and_4_4", "Tables 4.3 and 4.4: frames"),

@@ -9,7 +9,7 @@ from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections
 
 
-class Detects(Protocol):
+class ObjectDetector(Protocol):
     """Something that finds objects in pictures; `detection.detector.Detector` is one."""
 
     @property

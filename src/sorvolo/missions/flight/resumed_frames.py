@@ -15,7 +15,7 @@ class Indexed(Protocol):
 _Frame = TypeVar("_Frame", bound=Indexed)
 
 
-class Replay(Generic[_Frame]):
+class ResumedFrames(Generic[_Frame]):
     """Frames in the order in which they were worked on; each is handed out once."""
 
     def __init__(self, frames: Iterator[_Frame]) -> None:

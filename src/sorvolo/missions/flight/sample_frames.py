@@ -9,36 +9,36 @@ from sorvolo.errors import InputError
 from sorvolo.mosaic.selection import SelectionSettings, evenly, every, has_texture
 from sorvolo.survey.flight import Frame
 
-_GLIMPSES = 5
+_SAMPLES = 5
 _LIVE_STEP_S = 0.5  # between the frames of a live flight
 
 
-def glimpses_of(source: Source) -> list[Frame]:
+def sample_frames(source: Source) -> list[Frame]:
     """A few frames spread over the flight; of a live one the next few, half a second apart, which ends it."""
     if isinstance(source, VideoSource):
-        return source.glimpses(_GLIMPSES)
+        return source.sample_frames(_SAMPLES)
     if isinstance(source, LiveSource):
-        coming = islice(source.frames(every(_LIVE_STEP_S if source.kind == "video" else 0.0)), _GLIMPSES)
+        coming = islice(source.frames(every(_LIVE_STEP_S if source.kind == "video" else 0.0)), _SAMPLES)
         return [frame for frame in coming if isinstance(frame, Frame)]
     return list(_spread_photos(source))
 
 
 def _spread_photos(source: Source) -> Iterator[Frame]:
-    chosen = set(evenly(source.frame_count, _GLIMPSES))
+    chosen = set(evenly(source.frame_count, _SAMPLES))
     return (frame for frame in source.frames(lambda index, _: index in chosen) if isinstance(frame, Frame))
 
 
 def _spread_frames(source: Source) -> Iterator[Frame]:
     """Frames of a recorded flight, one at first: that is nearly always enough."""
     if isinstance(source, VideoSource):
-        yield from source.glimpses(1)
-        yield from source.glimpses(_GLIMPSES)
+        yield from source.sample_frames(1)
+        yield from source.sample_frames(_SAMPLES)
     else:
         yield from _spread_photos(source)
 
 
 def refuse_without_texture(source: Source) -> None:
-    """Raise InputError for a recorded flight none of whose glimpses shows anything but one gray, or noise alone."""
+    """Raise InputError for a recorded flight whose sample frames all show one gray, or noise alone."""
     if isinstance(source, LiveSource):
         return
     settings = SelectionSettings()
