@@ -3,7 +3,7 @@
 import hashlib
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -194,7 +194,7 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
     single: list[Path] = []
     for path in dict.fromkeys(inputs):
         if path.is_dir():
-            films, album = _inside(path)
+            films, album = _flights_in(path)
             videos += films
             albums += album
         else:
@@ -205,7 +205,7 @@ def _sort_inputs(inputs: Sequence[Path]) -> tuple[list[Path], list[_AlbumInput]]
     return videos, albums
 
 
-def _inside(folder: Path) -> tuple[list[Path], list[_AlbumInput]]:
+def _flights_in(folder: Path) -> tuple[list[Path], list[_AlbumInput]]:
     """A folder's photos as one album, or, where it has none, its videos."""
     if mark := next((name for name in _SITE_MARKS if (folder / name).is_file()), None):
         raise InputError(
@@ -213,11 +213,15 @@ def _inside(folder: Path) -> tuple[list[Path], list[_AlbumInput]]:
             "compare take the site as --site)"
         )
     files = [each for each in sorted(folder.iterdir()) if each.is_file() and each.name[0] != "."]
-    if photos := [each for each in files if each.suffix.lower() in PHOTO_SUFFIXES]:
+    if photos := _of_kind(files, PHOTO_SUFFIXES):
         return [], [_AlbumInput(folder.resolve(), photos, len(files) - len(photos))]
-    if films := [each for each in files if each.suffix.lower() in VIDEO_SUFFIXES]:
+    if films := _of_kind(files, VIDEO_SUFFIXES):
         return films, []
     raise InputError(_nothing_in(folder, len(files)))
+
+
+def _of_kind(files: Iterable[Path], suffixes: Container[str]) -> list[Path]:
+    return [each for each in files if each.suffix.lower() in suffixes]
 
 
 def _nothing_at(text: str) -> str:

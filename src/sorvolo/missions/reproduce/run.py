@@ -3,7 +3,7 @@
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ def reproduce(
     started_s = time.monotonic()
     work = _Work(read_umcd_folder(place), out, settings)
     tasks = [
-        *work.absent(is_whole), *work.mosaic_tasks(), *work.npu_tasks(npu), *work.change_tasks(),
+        *(work.absent() if is_whole else ()), *work.mosaic_tasks(), *work.npu_tasks(npu), *work.change_tasks(),
         *work.detector_tasks(okutama),
     ]
     for number, task in enumerate(tasks, start=1):
@@ -92,12 +92,12 @@ class _Work:
             return Row(task.id, task.kind, missing=str(error)), False
         return self._rows.put(Row(task.id, task.kind, values, named), stamp), False
 
-    def absent(self, is_whole: bool) -> Iterator[_Task]:
-        """The videos of the thesis's tables that the folder lacks, as far as they are asked for."""
+    def absent(self) -> Iterator[_Task]:
+        """The videos of the thesis's tables that the folder lacks."""
         lists = (self._dataset.without_telemetry, self._dataset.mosaicking, self._dataset.change_detection)
         for (part, wanted), found in zip(VIDEOS.items(), lists):
             there = {_plain(each.key) for each in found}
-            for environment, names in wanted.items() if is_whole else ():
+            for environment, names in wanted.items():
                 for name in names[:self._settings.videos]:
                     if _plain(f"{environment}/{name}") not in there:
                         where = f"{part}/{environment}/{name}.mp4"
@@ -107,7 +107,7 @@ class _Work:
         """Section 4.1: Table 4.1 and its text, Figures 3.12 and 4.1 to 4.3."""
         first = None
         for each in self._chosen(self._dataset.mosaicking):
-            yield from self._tasks_of_map(each, has_telemetry=True)
+            yield from self._tasks_of_map(each)
             yield self._task("correlation", each.key, (each,), partial(self._correlate, each))
             first = first or each
         if first is not None:
@@ -117,13 +117,13 @@ class _Work:
                 )
             yield self._task("example", first.key, (first,), partial(self._example, first))
         for each in self._chosen(self._dataset.without_telemetry):
-            yield from self._tasks_of_map(each, has_telemetry=False)
+            yield from self._tasks_of_map(each)
 
     def npu_tasks(self, place: Path | None) -> Iterator[_Task]:
         """Table 4.1 on its own dataset, and the correlation with the mosaics of Bu et al."""
         sequences = {each.video.key: each for each in read_npu_folder(place)} if place is not None else {}
         for video in self._chosen([each.video for each in sequences.values()]):
-            yield from self._tasks_of_map(video, has_telemetry=bool(video.texts))
+            yield from self._tasks_of_map(video)
             mosaic = sequences[video.key].mosaic
             for method in MAP_METHODS:
                 row_id = f"{PUBLISHED}/{video.key}/{method}"
@@ -169,10 +169,10 @@ class _Work:
             chosen.setdefault(each.environment.lower(), []).append(each)
         return [each for group in chosen.values() for each in group[:self._settings.videos]]
 
-    def _tasks_of_map(self, each: UmcdVideo, *, has_telemetry: bool) -> Iterator[_Task]:
+    def _tasks_of_map(self, each: UmcdVideo) -> Iterator[_Task]:
         for method in MAP_METHODS:
-            row_id = f"{'with' if has_telemetry else 'without'}/{each.key}/{method}"
-            yield self._task("mosaic", row_id, (each,), partial(self._map, each, method, has_telemetry))
+            row_id = f"{'with' if each.has_telemetry else 'without'}/{each.key}/{method}"
+            yield self._task("mosaic", row_id, (each,), partial(self._map, each, method))
 
     def _task(self, kind: str, row_id: str, videos: Sequence[UmcdVideo], make: Callable[[], _Made]) -> _Task:
         files = tuple(path for each in videos for path in _files_of(each))
@@ -195,33 +195,36 @@ class _Work:
         place = self._dataset.place
         return str(path.relative_to(place) if path.is_relative_to(place) else path)
 
-    def _look_into(self, each: UmcdVideo, needs_telemetry: bool) -> VideoInput:
+    def _look_into(self, each: UmcdVideo) -> VideoInput:
         camera = None if each.environment == ENVIRONMENT else self._dataset.camera  # another drone flew those
-        return video_input(each, camera, needs_telemetry=needs_telemetry)
+        return video_input(each, camera)
 
     def _site(self, each: UmcdVideo, name: str) -> Path:
         return self._out / "sites" / each.key.replace("/", "-") / name
 
+    def _map_site(self, each: UmcdVideo, method: str) -> Path:
+        return self._site(each, method if each.has_telemetry else f"bare-{method}")
+
     def _mapped(self, each: UmcdVideo, method: str) -> Path:
         """The site of a flight's map, made where it is not there; a killed run's unfinished one is made anew."""
-        site = self._site(each, method)
+        site = self._map_site(each, method)
         if site in self._unmapped:
             raise InputError(f"the map of {each.key} could not be made: {self._unmapped[site]}")
         if not (site / "mosaic.tif").is_file():
             self._map_into(site, each, method)
         return site
 
-    def _map_into(self, site: Path, each: UmcdVideo, method: str, needs_telemetry: bool = True) -> Mapping[str, Any]:
+    def _map_into(self, site: Path, each: UmcdVideo, method: str) -> Mapping[str, Any]:
         try:
-            return mosaics.map_video(self._input(each, needs_telemetry), site, method)
+            return mosaics.map_video(self._input(each), site, method)
         except (InputError, GeometryError, StoreError) as error:
             self._unmapped[site] = str(error)
             raise
 
-    def _map(self, each: UmcdVideo, method: str, has_telemetry: bool) -> _Made:
-        site = self._site(each, method if has_telemetry else f"bare-{method}")
-        values = self._map_into(site, each, method, has_telemetry)
-        named = {"sequence": each.key, "environment": each.environment, "has_telemetry": has_telemetry}
+    def _map(self, each: UmcdVideo, method: str) -> _Made:
+        site = self._map_site(each, method)
+        values = self._map_into(site, each, method)
+        named = {"sequence": each.key, "environment": each.environment, "has_telemetry": each.has_telemetry}
         return {**named, "method": method, **values}, {"map": mosaics.map_jpeg(site)}
 
     def _correlate(self, each: UmcdVideo) -> _Made:
@@ -237,7 +240,7 @@ class _Work:
             site = self._mapped(each, "thesis")
         else:
             site = self._site(each, "homography")
-            mosaics.map_video(self._input(each, True), site, "thesis", transform)
+            mosaics.map_video(self._input(each), site, "thesis", transform)
         named = {"sequence": each.key, "transform": transform}
         return {**named, **mosaics.distortion_of(site)}, {"map": mosaics.map_jpeg(site)}
 
@@ -246,7 +249,7 @@ class _Work:
 
     def _compare(self, first: UmcdVideo, later: UmcdVideo, title: str) -> _Made:
         values, shown = comparisons.compare_video(
-            self._input(later, True), self._mapped(first, "planar"), self._out / "sites" / "compared", title, later,
+            self._input(later), self._mapped(first, "planar"), self._out / "sites" / "compared", title, later,
             self._settings.views_per_second,
         )
         pictures = {
@@ -255,7 +258,7 @@ class _Work:
         return {"sequence": later.key, "environment": later.environment, "method": title, **values}, pictures
 
     def _time(self, first: UmcdVideo, later: UmcdVideo) -> _Made:
-        before, after = self._input(first, False), self._input(later, False)
+        before, after = (self._input(replace(each, has_telemetry=False)) for each in (first, later))  # it needs none
         return {"sequence": later.key, **comparisons.time_comparison(before, after, self._settings.repeats)}, {}
 
     def _detect(self, videos: Sequence[UmcdVideo], model: str) -> _Made:

@@ -4,7 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from sorvolo.errors import SettingsError
@@ -31,15 +31,14 @@ def simulated_dataset(
     """
     _claim(place, size, settings)
     for name in chosen_presets(size, settings.videos):
-        environment, path, has_telemetry = _parts_of(name)
-        done = _last_file(place, environment, path, has_telemetry)
-        if done.exists():
+        path = _path_of(name)
+        if (place / path.last_file).exists():
             continue
         scratch = place / ".partial"
         for step in simulate_site(scratch, simulation_of(name, size, settings)):
             yield name, step
         with writing(place):
-            _arrange(scratch, place, environment, path, has_telemetry)
+            _arrange(scratch, place, path)
             shutil.rmtree(scratch)
 
 
@@ -81,36 +80,46 @@ def _claim(place: Path, size: SimulatedSize, settings: ReproductionSettings) -> 
     atomic_write_bytes(mark, json_bytes(wanted))
 
 
-def _parts_of(name: str) -> tuple[str, str, bool]:
-    """("Urban", "path1", True) of "umcd-telemetry-urban-path1"."""
-    has_telemetry = name.startswith(_WITH)
-    environment, _, path = name.removeprefix(_WITH if has_telemetry else _WITHOUT).partition("-")
-    return environment.capitalize(), path, has_telemetry
+@dataclass(frozen=True)
+class _Path:
+    """A path that was flown over: once for a map, and where it has telemetry again for the changes."""
+
+    environment: str
+    name: str
+    has_telemetry: bool
+
+    @property
+    def last_file(self) -> Path:
+        """What is moved to its place in the dataset last: where it is, the whole path is."""
+        if self.has_telemetry:
+            return Path(WITH, CHANGES, self.environment, f"{self.name}{MASKS_ENDING}")
+        return Path(WITHOUT, MOSAICKING, self.environment, f"{self.name}.mp4")
 
 
-def _last_file(place: Path, environment: str, path: str, has_telemetry: bool) -> Path:
-    """What is moved to its place last: where it is, the whole path is."""
-    if has_telemetry:
-        return place / WITH / CHANGES / environment / f"{path}{MASKS_ENDING}"
-    return place / WITHOUT / MOSAICKING / environment / f"{path}.mp4"
+def _path_of(preset_name: str) -> _Path:
+    """Urban, path1, with telemetry: of "umcd-telemetry-urban-path1"."""
+    has_telemetry = preset_name.startswith(_WITH)
+    environment, _, name = preset_name.removeprefix(_WITH if has_telemetry else _WITHOUT).partition("-")
+    return _Path(environment.capitalize(), name, has_telemetry)
 
 
-def _arrange(made: Path, place: Path, environment: str, path: str, has_telemetry: bool) -> None:
+def _arrange(made: Path, place: Path, path: _Path) -> None:
     """Move a simulation's files to their places in the dataset."""
+    environment = path.environment
     _move(made / "camera.xml", place / CALIBRATION / "camera.xml")
-    if not has_telemetry:
-        _move(made / "flight1" / "flight1.mp4", _last_file(place, environment, path, has_telemetry))
+    if not path.has_telemetry:
+        _move(made / "flight1" / "flight1.mp4", place / path.last_file)
         return
     for part, flight in ((MOSAICKING, "flight1"), (CHANGES, "flight2")):
         for file in sorted((made / flight).iterdir()):
             ending = _NMEA_ENDING.get(file.suffix, file.suffix)
             if file.is_file() and ending != ".xml":
-                _move(file, place / WITH / part / environment / f"{path}{ending}")
+                _move(file, place / WITH / part / environment / f"{path.name}{ending}")
     objects, boxes = _read(made / "truth" / "objects.geojson"), _read(made / "truth" / "flight2" / "boxes.json")
-    fps = preset(f"{_WITH}{environment.lower()}-{path}").imaging.fps
+    fps = preset(f"{_WITH}{environment.lower()}-{path.name}").imaging.fps
     text = umcd_metadata(fps, objects["features"], boxes, flight=2)
-    atomic_write_bytes(place / WITH / CHANGES / environment / f"{path}.txt", text.encode())
-    _move(made / "truth" / "flight2" / "changes", _last_file(place, environment, path, has_telemetry))
+    atomic_write_bytes(place / WITH / CHANGES / environment / f"{path.name}.txt", text.encode())
+    _move(made / "truth" / "flight2" / "changes", place / path.last_file)
 
 
 def _move(file: Path, to: Path) -> None:

@@ -27,14 +27,14 @@ class VideoInput:
         return {"telemetry": self.telemetry, "camera": self.camera}
 
 
-def video_input(each: UmcdVideo, camera: Path | None, *, needs_telemetry: bool) -> VideoInput:
-    """Look into a video and what lies beside it; raises InputError for one that cannot be used, saying what it lacks.
+def video_input(each: UmcdVideo, camera: Path | None) -> VideoInput:
+    """Look into a video and what lies beside it; raises InputError for one that cannot be used, naming what it lacks.
 
     A table of telemetry is not read here: the mission that reads it reports what is wrong with it.
     """
     info = read_video_info(each.video)
     telemetry = next((path for path in each.texts if is_telemetry(path)), None)
-    if needs_telemetry and telemetry is None:
+    if each.has_telemetry and telemetry is None:
         beside = ", ".join(path.name for path in each.texts) or "nothing"
         raise InputError(
             f"{each.video}: no telemetry beside it (found: {beside}); add the table or the NMEA log under its name"

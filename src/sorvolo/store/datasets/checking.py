@@ -11,7 +11,15 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.naming import Naming, nothing_maps, of_one_unnamed
-from sorvolo.store.datasets.parsed import SHARES, Finding, ParsedBox, ParsedPicture, ParsedSet, notices_of
+from sorvolo.store.datasets.parsed import (
+    SHARES,
+    Finding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    findings_in,
+    notices_of,
+)
 from sorvolo.store.datasets.picture_files import shown_size_px
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -29,7 +37,7 @@ def labelled_set(
     names, classes = _mapped(parsed, place, names, counts)
     made = [_labelled(picture, place, names, classes, pattern) for picture in parsed.pictures]
     pictures = tuple(picture for picture, _ in made if picture is not None)
-    found = notices_of([*parsed.findings, *(finding for _, findings in made for finding in findings)])
+    found = notices_of([*parsed.findings, *findings_in(made)])
     if not pictures:
         raise InputError(
             f"{place}: none of its {len(parsed.pictures)} pictures can be used: "

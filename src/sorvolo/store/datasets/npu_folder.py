@@ -38,9 +38,8 @@ def read_npu_folder(place: Path) -> tuple[NpuSequence, ...]:
         folder = each.video.parent
         is_alone = folder != place and in_folder[folder] == 1
         name = folder.name if is_alone else each.name
-        found.append(NpuSequence(
-            replace(each, environment=ENVIRONMENT, name=name), _mosaic(folder, "" if is_alone else each.name)
-        ))
+        video = replace(each, environment=ENVIRONMENT, name=name, has_telemetry=bool(each.texts))
+        found.append(NpuSequence(video, _mosaic(folder, "" if is_alone else each.name)))
     return tuple(found)
 
 

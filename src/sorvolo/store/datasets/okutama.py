@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import frames_by_video, no_frames, pictures_around
-from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet, findings_in
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import read_text
 
@@ -31,7 +31,7 @@ def read_okutama(place: Path) -> ParsedSet:
     files_of = {path.stem: path for path in reversed(files)}
     read = {video: _boxes(path) for video, path in sorted(files_of.items())}
     labelled = {video: by_frame for video, (by_frame, _) in read.items()}
-    findings = [each for _, wrong in read.values() for each in wrong]
+    findings = findings_in(read.values())
     if not any(labelled.values()):
         raise InputError(f"{place}: no line is an {FORM} label (track, four edges, frame, three flags, \"Person\")")
     frames = frames_by_video(pictures_around(place, FORM), labelled)

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 from sorvolo.survey.flight import Notice
 
@@ -60,6 +60,11 @@ FINDINGS: Mapping[str, str] = {
     "counted_from_zero": "files count pixels from 0, not from 1 as the VOC devkit does, and were read so",
     "no_boxes_for_frame": "frames show objects at unknown places; they are ignored as a whole",
 }
+
+
+def findings_in(read: Iterable[tuple[Any, Iterable[Finding]]]) -> list[Finding]:
+    """The findings of what was read piece by piece, each as what it gave and what was wrong there."""
+    return [each for _, findings in read for each in findings]
 
 
 def notices_of(findings: Iterable[Finding]) -> tuple[Notice, ...]:

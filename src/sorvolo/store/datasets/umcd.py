@@ -1,7 +1,7 @@
 """UMCD: a metadata text file for each video, a block for each object: what it is and when it is in view."""
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from math import inf, isfinite
 from pathlib import Path
@@ -60,9 +60,7 @@ def read_umcd(place: Path) -> ParsedSet:
             "learnt from them; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects, or label the frames anew"
         )
     names = dict.fromkeys(each.name for video in videos.values() for each in video.objects)
-    malformed = (each for video in videos.values() for each in video.malformed)
-    unplaced = (Finding("no_boxes_for_frame", each.path.name) for each in result if each.is_ignored)
-    return ParsedSet(FORM, tuple(result), tuple(names), (*malformed, *unplaced))
+    return ParsedSet(FORM, tuple(result), tuple(names), tuple(_findings(videos.values(), result)))
 
 
 @dataclass(frozen=True)
@@ -112,6 +110,15 @@ def _videos(place: Path) -> dict[Path, _Video]:
     if not videos:
         raise InputError(f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)")
     return videos
+
+
+def _findings(videos: Iterable[_Video], pictures: Iterable[ParsedPicture]) -> Iterator[Finding]:
+    """What was wrong in the metadata files, and the frames that show objects at unknown places."""
+    for video in videos:
+        yield from video.malformed
+    for each in pictures:
+        if each.is_ignored:
+            yield Finding("no_boxes_for_frame", each.path.name)
 
 
 def _labelled_frames(name: str, video: _Video, frames: Mapping[int, Path]) -> Iterator[ParsedPicture]:

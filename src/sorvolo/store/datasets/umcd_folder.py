@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.errors import InputError
@@ -25,7 +25,10 @@ _REST = re.compile(r"(?:[-_. ](?!\d).*)?")  # path4_1 is another video than path
 
 @dataclass(frozen=True)
 class UmcdVideo:
-    """One video. `texts` lie beside it under its name and are no metadata; `masks` is a folder of change masks."""
+    """One video. `texts` lie beside it under its name and are no metadata; `masks` is a folder of change masks.
+
+    `has_telemetry`: the dataset has its telemetry, so that one of the texts has to be that.
+    """
 
     environment: str  # its folder's name, as written there
     name: str
@@ -33,6 +36,7 @@ class UmcdVideo:
     texts: tuple[Path, ...] = ()
     metadata: Path | None = None
     masks: Path | None = None
+    has_telemetry: bool = True
 
     @property
     def key(self) -> str:
@@ -68,7 +72,8 @@ def read_umcd_folder(place: Path) -> UmcdFolder:
     parts = {name: _folder(place, name) for name in (WITHOUT, WITH, CALIBRATION)}
     mosaicking, changes = (_folder(parts[WITH], name) for name in (MOSAICKING, CHANGES))
     bare = _folder(parts[WITHOUT], MOSAICKING) or parts[WITHOUT]
-    videos, maps, later = (videos_in(part) for part in (bare, mosaicking, changes))
+    maps, later = videos_in(mosaicking), videos_in(changes)
+    videos = tuple(replace(each, has_telemetry=False) for each in videos_in(bare))
     if not (videos or maps or later):
         raise InputError(
             f"{place}: not the UMCD dataset: no videos in '{WITHOUT}', nor in '{MOSAICKING}' or '{CHANGES}' of "

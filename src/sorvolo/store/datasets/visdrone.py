@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets.pairing import frames_by_video, no_frames, paired, pictures_around
-from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet, findings_in
 from sorvolo.store.datasets.picture_files import files_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
 
@@ -33,7 +33,7 @@ def read_visdrone(place: Path) -> ParsedSet:
     """
     files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_label_file(path)]
     parsed = {path: _rows(path) for path in files}
-    malformed = [each for _, wrong in parsed.values() for each in wrong]
+    malformed = findings_in(parsed.values())
     rows = {path: found for path, (found, _) in parsed.items() if found or not read_text(path).strip()}
     length = _numbers_a_line(place, rows)
     pictures = pictures_around(place, FORM)

@@ -6,7 +6,7 @@ from math import isfinite
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.store.datasets.parsed import SHARES, Finding, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.store.datasets.parsed import SHARES, Finding, ParsedBox, ParsedPicture, ParsedSet, findings_in
 from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, files_below, pictures_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
 
@@ -29,11 +29,10 @@ def read_yolo(place: Path) -> ParsedSet:
     labels = {path: found for path in pictures if (found := _label_file(path)) is not None}
     _demand_both(folder, pictures, labels)
     read = {path: _boxes(labels[path], names) if path in labels else ([], []) for path in pictures}
-    malformed = [each for _, wrong in read.values() for each in wrong]
+    malformed = findings_in(read.values())
     _demand_shares(folder, [box for boxes, _ in read.values() for box in boxes], malformed)
     result = tuple(ParsedPicture(path, tuple(boxes), SHARES) for path, (boxes, _) in read.items())
-    without = (Finding("pictures_without_labels", path.name) for path in pictures if path not in labels)
-    return ParsedSet(FORM, result, tuple(names), (*_lonely(folder, labels), *malformed, *without))
+    return ParsedSet(FORM, result, tuple(names), (*_lonely(folder, pictures, labels), *malformed))
 
 
 def looks_like_yolo(line: str) -> bool:
@@ -134,12 +133,15 @@ def _demand_shares(folder: Path, boxes: Sequence[ParsedBox], malformed: Sequence
         )
 
 
-def _lonely(folder: Path, labels: dict[Path, Path]) -> Iterator[Finding]:
-    """Label files of no picture."""
+def _lonely(folder: Path, pictures: list[Path], labels: dict[Path, Path]) -> Iterator[Finding]:
+    """Label files of no picture, and pictures without a label file."""
     used = set(labels.values())
     for path in files_below(folder, ".txt"):
         if path not in used and is_label_file(path) and _is_label_place(path, folder):
             yield Finding("labels_without_picture", path.name)
+    for path in pictures:
+        if path not in labels:
+            yield Finding("pictures_without_labels", path.name)
 
 
 def _is_label_place(path: Path, folder: Path) -> bool:

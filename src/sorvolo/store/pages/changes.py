@@ -72,23 +72,32 @@ def changes_page(
         for each in changes
     ]
     is_reviewed = any(each.verdict is not None for each in changes)
-    unknown = number_at(report, "comparison", "unknown_share")
     page = render(
         "changes.html", title=f"{report.get('flight')} - changes", flight=known(report.get("flight")),
         site=known(report.get("site")), against=at(report, "comparison", "against_version"),
         headline=_headline(report, changes), summary=" ".join(_summary(report, changes)),
         warning_lines=_warnings(report), is_many=len(changes) > _MANY, legend=_legend(changes),
         before_words=before_words, after_words=after_words,
-        map=_map(*shown) if shown else None,
-        coverage=coverage_shapes(coverage, site, shown[1]) if shown and not site.is_local else (),
-        gap_rows=gap_rows(coverage), size_rows=() if site.is_local else size_rows(coverage),
-        changes=listed, is_reviewed=is_reviewed, has_metres=not site.is_local,
-        systems=() if site.is_local else tuple(SYSTEMS.items()),
+        **_compared_ground(report, coverage, site, shown), changes=listed, is_reviewed=is_reviewed,
+        has_metres=not site.is_local, systems=() if site.is_local else tuple(SYSTEMS.items()),
         columns=_columns(listed, is_reviewed), files=_files(site),
         view_rows=_view_rows(report), not_announced=_not_announced(report),
-        reasons=_reasons(report), unknown_share=None if unknown is None else f"{unknown:.1%}", how=_how(report),
+        reasons=_reasons(report), how=_how(report),
     )
     return str(page)
+
+
+def _compared_ground(
+    report: Mapping[str, Any], coverage: Sequence[Any], site: Site, shown: tuple[Picture, Picture] | None
+) -> dict[str, Any]:
+    """The map on both dates with the ground that was not compared, for the template; sizes only of sites in metres."""
+    unknown = number_at(report, "comparison", "unknown_share")
+    return {
+        "map": _map(*shown) if shown else None,
+        "coverage": coverage_shapes(coverage, site, shown[1]) if shown and not site.is_local else (),
+        "gap_rows": gap_rows(coverage), "size_rows": () if site.is_local else size_rows(coverage),
+        "unknown_share": None if unknown is None else f"{unknown:.1%}",
+    }
 
 
 def _reasons(report: Mapping[str, Any]) -> list[tuple[Any, Any]]:
