@@ -125,8 +125,8 @@ class Trial:
         command = [sys.executable, "-m", "sorvolo", mission, flight]
         if mission != "watch":
             return [*command, "--site", str(place), *shared]
-        told = f"{sys.executable} -c \"open('{self._alerts}', 'a').write('{{id}} ')\""
-        return [*command, "--out", str(place), *shared, "--save", "pictures", "--fps", "2", "--alert-command", told]
+        alert = f"{sys.executable} -c \"open('{self._alerts}', 'a').write('{{id}} ')\""
+        return [*command, "--out", str(place), *shared, "--save", "pictures", "--fps", "2", "--alert-command", alert]
 
 
 def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, object]]:

@@ -77,13 +77,13 @@ class PostgresServer:
     def _run(self, command: list[str | None]) -> None:
         # C and a home of its own: neither the tester's language nor files are to matter
         environment = {"PATH": os.environ["PATH"], "LC_ALL": "C", "HOME": str(self.folder)}
-        with open(self.folder / "said", "w+") as said:  # no pipe: the server would keep it open
+        with open(self.folder / "output", "w+") as output:  # no pipe: the server would keep it open
             done = subprocess.run(
-                [str(each) for each in command], user=self._user, cwd=self.folder, env=environment, stdout=said,
-                stderr=said, timeout=120,
+                [str(each) for each in command], user=self._user, cwd=self.folder, env=environment, stdout=output,
+                stderr=output, timeout=120,
             )
-            said.seek(0)
-            assert done.returncode == 0, said.read()
+            output.seek(0)
+            assert done.returncode == 0, output.read()
 
 
 def _is_known(user: str) -> bool:

@@ -10,7 +10,7 @@ SHAPE = (60, 80)
 ALL = np.ones(SHAPE, bool)
 
 
-def says(*things: tuple[int, float]) -> Difference:
+def differing(*things: tuple[int, float]) -> Difference:
     """A difference of 10 x 10 px at each (left, sureness)."""
     mask = np.zeros(SHAPE, np.uint8)
     for left, _ in things:
@@ -35,7 +35,7 @@ def says(*things: tuple[int, float]) -> Difference:
 )
 def test_one_must_be_sure_and_all_earlier_pictures_must_show_it(by_map, earlier, is_believed):
     def opinion(sureness):
-        return says() if sureness is None else says((30, sureness))
+        return differing() if sureness is None else differing((30, sureness))
 
     found = believed((opinion(by_map), ALL), [(opinion(each), ALL) for each in earlier])
     assert len(found.boxes) == len(found.scores) == int(is_believed)
@@ -45,12 +45,12 @@ def test_one_must_be_sure_and_all_earlier_pictures_must_show_it(by_map, earlier,
 def test_who_does_not_see_the_place_is_not_asked():
     blind = ALL.copy()
     blind[:, 25:45] = False
-    assert len(believed((says((30, 0.9)), ALL), [(says(), blind)]).boxes) == 1
-    assert len(believed((says((30, 0.9)), ALL), [(says(), ALL)]).boxes) == 0
+    assert len(believed((differing((30, 0.9)), ALL), [(differing(), blind)]).boxes) == 1
+    assert len(believed((differing((30, 0.9)), ALL), [(differing(), ALL)]).boxes) == 0
 
 
 def test_what_lies_a_few_pixels_beside_is_the_same_and_announced_once():
-    found = believed((says((30, 0.9)), ALL), [(says((34, 0.9)), ALL), (says((28, 0.8)), ALL)])
+    found = believed((differing((30, 0.9)), ALL), [(differing((34, 0.9)), ALL), (differing((28, 0.8)), ALL)])
     assert found.boxes.tolist() == [[30, 20, 10, 10]]
 
 
@@ -65,7 +65,8 @@ def test_neighbours_whose_boxes_overlap_are_both_reported():
 def test_nothing_is_found_where_the_map_knows_no_ground():
     known = ALL.copy()
     known[:, :60] = False
-    assert not believed((says((30, 0.9)), known), [(says((30, 0.9)), ALL), (says((30, 0.9)), ALL)]).mask.any()
+    twice = [(differing((30, 0.9)), ALL), (differing((30, 0.9)), ALL)]
+    assert not believed((differing((30, 0.9)), known), twice).mask.any()
 
 
 def test_a_seam_of_the_map_through_a_thing_is_no_change_where_a_whole_picture_shows_it(ground):

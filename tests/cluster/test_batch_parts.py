@@ -195,6 +195,6 @@ def test_a_batch_of_broken_flights_ends_with_code_1_and_names_them(
 ) -> None:
     _touch(tmp_path / "in" / "1.mp4")
     assert main(["batch", str(tmp_path / "in"), "--root", str(tmp_path / "maps"), "--json"]) == 1
-    said = json.loads(capsys.readouterr().out)
-    assert said["counts"] == {"failed": 1}
-    assert said["flights"][0]["words"].startswith("1.mp4 cannot be read as a video")
+    output = json.loads(capsys.readouterr().out)
+    assert output["counts"] == {"failed": 1}
+    assert output["flights"][0]["words"].startswith("1.mp4 cannot be read as a video")

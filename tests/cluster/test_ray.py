@@ -178,8 +178,8 @@ def test_a_cluster_that_is_not_there_is_an_error_within_seconds(
         monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{silent.getsockname()[1]}")
         address, started_s = name.format(port=silent.getsockname()[1]), time.monotonic()
         assert main(["batch", str(tmp_path / "in"), "--root", str(tmp_path / "maps"), "--executor", address]) == 1
-    said = capsys.readouterr().err
-    assert f"error: --executor {address}: " in said and words in said
+    output = capsys.readouterr().err
+    assert f"error: --executor {address}: " in output and words in output
     assert time.monotonic() - started_s < 30
 
 

@@ -71,7 +71,7 @@ def test_raw_thermal_frames_are_stretched(detector: Detector) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "reason"),
     [
         (np.zeros((4, 4)), "255 \\*"),
         (np.zeros((4, 4, 2), np.uint8), "\\(4, 4, 2\\)"),
@@ -83,8 +83,8 @@ def test_raw_thermal_frames_are_stretched(detector: Detector) -> None:
         (["a.jpg"], "str"),
     ],
 )
-def test_what_is_no_picture_is_said(detector: Detector, wrong: object, says: str) -> None:
-    with pytest.raises(InputError, match=says):
+def test_what_is_no_picture_is_refused(detector: Detector, wrong: object, reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
         detector.detect(wrong)  # type: ignore[arg-type]
 
 
@@ -165,7 +165,7 @@ def test_says_where_it_runs_and_what_it_is(detector: Detector) -> None:
 
 
 class TestThermalFramesAndDaylightModels:
-    """A model that knows daylight alone hands thermal frames to one that knows both, and says so."""
+    """A model that knows daylight alone hands thermal frames to one that knows both, and reports it."""
 
     @pytest.fixture(autouse=True)
     def _folder(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -130,8 +130,8 @@ def test_what_is_not_the_file_never_appears(folder: Path, model: Path, address: 
         ("http://127.0.0.1:9/x.onnx", _hash(model), "Without a network"),
         ("coast", _hash(model), "SORVOLO_MODELS_URL"),
     ]
-    for source, sha256, says in attempts:
-        with pytest.raises(InputError, match=says):
+    for source, sha256, reason in attempts:
+        with pytest.raises(InputError, match=reason):
             fetch_model(source, sha256)
     text = tmp_path / "page.onnx"
     text.write_text("<html>")

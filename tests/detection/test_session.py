@@ -72,15 +72,15 @@ def test_a_foreign_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("shape", "says"), [("4, 3, H, W", "1, 3, H, W"), ("1, 1, H, W", "1, 3, H, W"), ("1, 3, 64, W", "both free"),
+    ("shape", "reason"), [("4, 3, H, W", "1, 3, H, W"), ("1, 1, H, W", "1, 3, H, W"), ("1, 3, 64, W", "both free"),
                         ("1, 3, 50, 64", "stride is 32"), ("1, 3, H", "1, 3, H, W")],
 )  # fmt: skip
-def test_other_inputs(tmp_path: Path, shape: str, says: str) -> None:
+def test_other_inputs(tmp_path: Path, shape: str, reason: str) -> None:
     text = f"""m (uint8[{shape}] image) => (float[K, 4] boxes, float[K] scores, int64[K] labels) {{
       boxes = Constant <value = float[1, 4] {{0, 0, 1, 1}}> ()
       scores = Constant <value_floats = [0.5]> ()
       labels = Constant <value_ints = [0]> () }}"""
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=reason):
         read_info(_identity(tmp_path / "m.onnx", text))
 
 

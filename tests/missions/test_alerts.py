@@ -48,7 +48,7 @@ def server() -> Iterator[str]:
 
 
 def _script(folder: Path, body: str) -> str:
-    path = folder / "told me.py"
+    path = folder / "sent to me.py"
     path.write_text(body)
     return f"{sys.executable} '{path}'"
 

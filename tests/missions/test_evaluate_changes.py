@@ -129,13 +129,13 @@ def test_late_needs_to_know_when(site, simulated):
     assert measured.events.judged_late == 0
     third_ns = {pair.found.id: int(pair.true.clear_ns[2]) for pair in measured.match.pairs}
     for delay_s, late in ((0.9, 0), (1.1, len(third_ns)), (None, None)):
-        def say(events, delay_s=delay_s):
+        def announce(events, delay_s=delay_s):
             for each in events:
                 at_ns = third_ns.get(each["properties"]["id"])
                 given = None if at_ns is None or delay_s is None else utc_text(at_ns + round(delay_s * 1e9))
                 each["properties"]["announced"] = given
 
-        edit(site, say)
+        edit(site, announce)
         (given,) = evaluate_changes(site, simulated)
         assert given.events.judged_late == len(third_ns)
         assert given.events.late == late or (late is None and given.events.late > 0)  # only after the last frame
@@ -152,12 +152,12 @@ def test_a_clock_without_a_date_is_understood(site, simulated):
     write(path, rows)
     stated = {pair.found.id: int(pair.true.clear_ns[2]) - start_ns + 700_000_000 for pair in measured.match.pairs}
 
-    def say(events):
+    def announce(events):
         for each in events:
             at_ns = stated.get(each["properties"]["id"])
             each["properties"]["announced"] = None if at_ns is None else utc_text(at_ns)
 
-    edit(site, say)
+    edit(site, announce)
     (given,) = evaluate_changes(site, simulated)
     assert [pair.delay_s for pair in given.match.pairs] == pytest.approx([0.7] * len(stated), abs=1e-3)
 

@@ -257,7 +257,7 @@ def test_those_who_want_it_are_alerted(flown: Path, detector: TruthDetector, tmp
         "open(sys.argv[1], 'a').write(json.dumps([sys.argv[2:], reported]) + '\\n')\n"
         "sys.exit(0 if open(reported['crop'], 'rb').read(2) == b'\\xff\\xd8' else 1)\n"
     )
-    out = tmp_path / "told.jsonl"
+    out = tmp_path / "alerts.jsonl"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(0.2)

@@ -118,9 +118,9 @@ def test_a_stream_s_states_are_announced_in_their_order() -> None:
             return 0
 
     async def announce() -> None:
-        tell = announcing(Disk())  # type: ignore[arg-type]
+        announce = announcing(Disk())  # type: ignore[arg-type]
         for number in range(3):
-            tell("scout", {"n": number})
+            announce("scout", {"n": number})
         while len(written) < 3:
             await asyncio.sleep(0.02)
 

@@ -182,8 +182,8 @@ def test_a_full_disk_is_announced_before_the_download(
         assert main(["site", "copy", f"s3://{BUCKET}/nothing-here", str(tmp_path / "back")]) == 1
         assert "no site at s3://archive/nothing-here" in capsys.readouterr().err
         assert main(["--debug", "site", "copy", f"s3://no-{BUCKET}/x", str(tmp_path / "back")]) == 1
-        said = capsys.readouterr().err
-        assert "there is no such bucket" in said and SECRET not in said and KEY not in said
+        output = capsys.readouterr().err
+        assert "there is no such bucket" in output and SECRET not in output and KEY not in output
 
 
 @pytest.mark.parametrize("address", [

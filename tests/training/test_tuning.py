@@ -111,8 +111,8 @@ def test_models_that_do_not_fit_are_reported(
         model = onnx.load(learnt)
         (entry,) = [each for each in model.metadata_props if each.key == "sorvolo"]
         entry.value = json.dumps(json.loads(entry.value) | changes)
-        onnx.save(model, tmp_path / "told.onnx")
-        return str(tmp_path / "told.onnx")
+        onnx.save(model, tmp_path / "described.onnx")
+        return str(tmp_path / "described.onnx")
 
     assert "is of the preset fast, not accurate: train with --preset fast" in words(
         "--weights", str(learnt), "--preset", "accurate"

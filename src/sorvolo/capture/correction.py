@@ -55,7 +55,7 @@ def telemetry_faults(
     """How far telemetry's cameras, at the corrected clock, were off from the solved ones of the same frames.
 
     `poses` have the fixes' scale (`rescaled`), whose uncertainty is that of the heights. `knows_height`: telemetry's
-    heights count from something that is taken for the ground; else they say nothing of it.
+    heights count from something that is taken for the ground; else they do not show it.
     An error that all fixes share does not show in the pictures: `position_m` has the scatter alone.
     """
     turned = np.array([_turn(prior.rotation, pose) for prior, pose in zip(priors, poses)]).reshape(-1, 3)

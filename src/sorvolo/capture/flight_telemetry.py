@@ -74,7 +74,7 @@ class FlightTelemetry:
         self.track = _continued(self.track, shifted(found, self.offset_s))
 
     def covers(self, seconds: float) -> bool:
-        """Whether any fix lies within a video of so many seconds, or nearly."""
+        """Whether any fix lies within a video of this many seconds, or nearly."""
         track, known = self.track, self._known
         margin_s = 1.5 * track.interval_s + 0.5
         return bool(((track.sample_s[known] >= -margin_s) & (track.sample_s[known] <= seconds + margin_s)).any())

@@ -89,7 +89,7 @@ class Aligned:
 class NotAligned:
     """A frame that fits the map nowhere, why, and the residual of the best try (NaN without any).
 
-    `is_outside`: it lies beyond the known ground, as far as anyone can tell.
+    `is_outside`: it lies beyond the known ground, as far as is known.
     """
 
     reason: str
@@ -415,7 +415,7 @@ class Aligner:
     def _by_features(
         self, new: Keyframe, features: Features, site_from_image: Matrix3, prior: CameraPrior, *, is_free: bool
     ) -> Matrix3 | None:
-        """The guess corrected by the map's features around it; `is_free`: turned and shifted as they tell."""
+        """The guess corrected by the map's features around it; `is_free`: turned and shifted by them."""
         grid_from_image = self._on_grid(site_from_image, new.camera)
         if grid_from_image is None:
             return None
@@ -524,7 +524,7 @@ def _nearer(first: NotAligned, second: NotAligned) -> NotAligned:
 
 
 def _spread_of(points_px: PointsPx, known: Mask, across_down: tuple[int, int]) -> float:
-    """The share of the frame's cells on known ground, so many across and down, that hold points."""
+    """The share of the frame's cells on known ground, this many across and down, that hold points."""
     height, width = known.shape
     cells = np.array(across_down)
     on_map = cv2.resize(known.astype(np.float32), across_down, interpolation=cv2.INTER_AREA) > 0.5

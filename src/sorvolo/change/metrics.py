@@ -87,10 +87,10 @@ def frame_counts(found: Mask, truth: Mask, unknown: Mask | None = None, least_px
     there = int(np.count_nonzero(truth & known))
     if 0 < there < least_px or not known.any():
         return Counts(unknown=1)
-    says = int(np.count_nonzero(found & known)) >= least_px
+    is_reported = int(np.count_nonzero(found & known)) >= least_px
     if there:
-        return Counts(tp=1) if says else Counts(fn=1)
-    return Counts(fp=1) if says else Counts(tn=1)
+        return Counts(tp=1) if is_reported else Counts(fn=1)
+    return Counts(fp=1) if is_reported else Counts(tn=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +132,8 @@ class TrueEvent:
         object.__setattr__(self, "path_m", frozen(self.path_m).reshape(-1, 2))
 
     def is_shown(self, ground: "ComparedGround", views: int, moving_views: int) -> bool:
-        """Whether compared ground shows it well enough to have to be found: all of its outline in so many clear views,
-        or, if it moves, so many of the places of its path."""
+        """Whether compared ground shows it well enough to have to be found: all of its outline in `views` clear views,
+        or, if it moves, `moving_views` of the places of its path."""
         if self.kind is ChangeKind.MOVING:
             return int(np.count_nonzero(ground.holds(self.path_m))) >= moving_views
         return len(self.clear_ns) >= views and bool(ground.holds(self.outline_m).all())

@@ -91,10 +91,10 @@ Receivers = Annotated[
     typer.Option("--telemetry", help="A live source's receiver, as SITE=ADDRESS: udp://:10110, serial:/dev/ttyUSB0."),
 ]
 Tries = Annotated[int, typer.Option(help="Set a flight aside when it ended its process so many times.")]
-Stall = Annotated[float, typer.Option(help="End a process that neither answers nor computes for so many seconds.")]
+Stall = Annotated[float, typer.Option(help="End a process that neither answers nor computes for this many seconds.")]
 Blocks = Annotated[
     int,
-    typer.Option(help="Divide each flight of photos into so many blocks of ground, joined to one map."),
+    typer.Option(help="Divide each flight of photos into this many blocks of ground, joined to one map."),
 ]
 Shares = Annotated[
     bool | None,

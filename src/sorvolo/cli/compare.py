@@ -70,8 +70,8 @@ MethodOption = Annotated[
     ChangeMethod, typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline.")
 ]
 ViewsPerSecond = Annotated[float, typer.Option(help="Frames of a video compared per second of flight.")]
-Votes = Annotated[int, typer.Option(help="Announce a change that so many views show ...")]
-Voters = Annotated[int, typer.Option(help="... of the last so many views of that ground.")]
+Votes = Annotated[int, typer.Option(help="How many views must show a change before it is announced ...")]
+Voters = Annotated[int, typer.Option(help="... and of how many, the last ones of that ground.")]
 WritesMasks = Annotated[bool, typer.Option("--masks", help="Also write each frame's change mask and boxes.")]
 StepsFolder = Annotated[
     Path | None, typer.Option(help="Folder for pictures of method thesis's eight steps (4-8 MB a view).")

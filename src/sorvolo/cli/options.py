@@ -34,7 +34,7 @@ GroundElevation = Annotated[
 ]
 CotAuthority = Annotated[Path | None, typer.Option(help="For tls://: the authority of the server's certificate, PEM.")]
 CotCertificate = Annotated[Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")]
-GiveUp = Annotated[float, typer.Option(help="End a live source after so many seconds without a picture.")]
+GiveUp = Annotated[float, typer.Option(help="End a live source after this many seconds without a picture.")]
 
 
 class PlaceFormat(StrEnum):

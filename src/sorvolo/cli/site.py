@@ -59,7 +59,7 @@ def copy_command(
 @site_app.command("prune")
 def prune_command(
     place: Annotated[str, typer.Argument(help="The site in a store: s3://BUCKET/NAME.")],
-    keep_days: Annotated[float, typer.Option(min=0.0, help="Keep what was stored less than so many days ago.")] = 7.0,
+    keep_days: Annotated[float, typer.Option(min=0.0, help="Keep what was stored less than this many days ago.")] = 7.0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Remove nothing: count.")] = False,
     as_json: AsJson = False,
 ) -> None:

@@ -34,7 +34,7 @@ class RestartSettings:
     patience_s: float = 900.0  # a database or store that is restored from its backup; then the flight has failed
 
     def wait_s(self, starts: int) -> float:
-        """The wait after so many starts in a row that ended badly."""
+        """The wait after this many starts in a row that ended badly."""
         return min(self.longest_wait_s, 2.0 ** (starts - 1))
 
 

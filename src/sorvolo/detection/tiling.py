@@ -13,10 +13,10 @@ from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, Task, required_px_per_m
 from sorvolo.survey.objects import TYPICAL_SIZE_M
 
 Tiles = Literal["auto"] | int | None
-"""How a picture is cut: "auto", tiles of so many of its pixels a side, or not at all."""
+"""How a picture is cut: "auto", tiles of this many of its pixels a side, or not at all."""
 
 MOST_WHOLE_PX = 2_400_000
-"""Up to so many pixels "auto" shows a picture at once: 1920 x 1080 and a little more."""
+"""Up to this many pixels "auto" shows a picture at once: 1920 x 1080 and a little more."""
 
 MOST_AT_ONCE_PX = 8_400_000
 """A larger picture than a 4K frame is cut into tiles even if it was asked for whole: it would take gigabytes."""
@@ -105,7 +105,7 @@ def plan_tiles(
 
     `tiles` "auto": the scale comes from `m_per_px`; where that is unknown (NaN), it is 1, or 1.5 for a `thermal` frame
     that is small. A picture that is still small is one tile; else it is cut into tiles of at most that size, which show
-    the fewest pixels twice. A number: tiles of so many of the picture's pixels a side, not scaled. None: the picture as
+    the fewest pixels twice. A number: tiles of as many of the picture's pixels, not scaled. None: the picture as
     it is. Tiles overlap by the longest object that is wanted, as far as its size is known, at most by half. A model of
     one input size, `fixed_px`, gets tiles of that size from "auto". Raises SettingsError for a tile size or a sampling
     distance that cannot be.

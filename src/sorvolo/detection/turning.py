@@ -30,7 +30,7 @@ def is_from_above(site_from_camera: Matrix3, settings: LookSettings = LookSettin
 
 
 def turned(picture: ImageRGB, quarters: int) -> ImageRGB:
-    """A picture (H, W, 3) turned counter-clockwise by so many quarters."""
+    """A picture (H, W, 3) turned counter-clockwise by this many quarters."""
     return np.ascontiguousarray(np.rot90(picture, quarters))
 
 

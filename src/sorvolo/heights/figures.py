@@ -57,35 +57,35 @@ def surface_figures(surface: Surface, shows_ground: Mask) -> Mapping[str, Any]:
 
 def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettings()) -> list[str]:
     """What in the flight makes its heights weak."""
-    said = []
+    remarks = []
     if solved.lost:
-        said.append(
+        remarks.append(
             f"{len(solved.lost)} of {len(solved.lost) + len(solved.views)} photos share too few points with others "
             "and are not part of the heights"
         )
     places = np.array([view.site_from_camera.translation_m for view in solved.views])
     spread = np.linalg.svd(places[:, :2] - places[:, :2].mean(axis=0), compute_uv=False)
     if spread[1] < settings.one_strip * spread[0]:
-        said.append(
+        remarks.append(
             "the photos lie along one strip: the tilt of the ground across it is known from the drone's attitude "
             "alone (about 3 degrees); fly at least two strips, or one across, for heights"
         )
     tilt = np.degrees(np.arccos(np.clip([-view.site_from_camera.rotation[2, 2] for view in solved.views], -1, 1)))
     if np.median(tilt) > settings.oblique_deg:
-        said.append(
+        remarks.append(
             f"the photos look {np.median(tilt):.0f} degrees off the vertical: walls and what lies behind things have "
             "heights of their surroundings"
         )
     camera = solved.views[0].camera
     fit_px = solved.residual_px * min(1.0, settings.fit_side_px / max(camera.width_px, camera.height_px))
     if fit_px > settings.bad_fit_px:
-        said.append(
+        remarks.append(
             f"the photos fit each other in space to {solved.residual_px:.2f} px only: a rolling shutter, blur, things "
             "that move or a zoomed lens; the heights may be off by several times their stated error"
         )
     if not np.isfinite(solved.fix_rms_m).all():
-        said.append("no GPS position: the heights have the map's own scale")
-    return said
+        remarks.append("no GPS position: the heights have the map's own scale")
+    return remarks
 
 
 def surface_warnings(surface: Surface, settings: WarningSettings = WarningSettings()) -> list[str]:

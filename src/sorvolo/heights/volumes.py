@@ -153,10 +153,10 @@ def _added_up(
 
 
 def _step(off: Floats, east: Floats, north: Floats) -> Floats:
-    """(3,) the shift that explains the differences; along east and north only as far as slopes can tell."""
+    """(3,) the shift that explains the differences; along east and north only as far as slopes show it."""
     columns = np.column_stack([-east, -north, np.ones_like(off)])
     normal = columns.T @ columns
-    # flat ground tells nothing of a shift along it: a prior of 1 m against differences of 0.1 m
+    # flat ground does not show a shift along it: a prior of 1 m against differences of 0.1 m
     normal[[0, 1], [0, 1]] += 0.01
     return np.asarray(np.linalg.solve(normal, columns.T @ off), np.float64)
 

@@ -64,7 +64,7 @@ class ColourPairs:
         return len(self.colours_a)
 
     def thinned(self, most: int) -> "ColourPairs":
-        """At most so many of them, taken evenly."""
+        """At most this many of them, taken evenly."""
         if len(self) <= most:
             return self
         pick = np.linspace(0, len(self) - 1, most).astype(int)

@@ -111,7 +111,7 @@ class MapDeviation:
 
 
 def frames_to_compare(count: int, most: int) -> list[int]:
-    """At most so many of a flight's frames, by number, evenly chosen."""
+    """At most this many of a flight's frames, by number, evenly chosen."""
     return list(range(count)) if count <= most else np.linspace(0, count - 1, most).astype(int).tolist()
 
 

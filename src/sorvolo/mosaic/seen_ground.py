@@ -149,7 +149,7 @@ def _runs(cells: Mask) -> Iterator[tuple[int, int, int]]:
 
 
 def _regions(cells: Mask, least: float) -> Iterator[Mask]:
-    """Connected regions of so many cells at least, the largest first."""
+    """Connected regions of this many cells at least, the largest first."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats(cells.astype(np.uint8), connectivity=4)
     sizes = stats[:, cv2.CC_STAT_AREA]
     for number in np.argsort(-sizes, kind="stable").tolist():

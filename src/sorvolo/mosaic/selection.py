@@ -124,7 +124,7 @@ def every(step_s: float) -> Callable[[int, int], bool]:
 
 
 def evenly(count: int, most: int) -> list[int]:
-    """At most so many of the numbers from 0 to `count` - 1, evenly chosen, first and last among them."""
+    """At most this many of the numbers from 0 to `count` - 1, evenly chosen, first and last among them."""
     return [int(each) for each in np.unique(np.rint(np.linspace(0, count - 1, min(most, count))))]
 
 

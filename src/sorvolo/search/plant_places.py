@@ -33,7 +33,7 @@ def plant_places(
     cells: Cells, seen: Conditions, labels: Sequence[str], plants: int, *, keep_off_m: Sequence[Floats], free_m: float,
     rng: np.random.Generator, usable: Mask, settings: PlaceSettings = PlaceSettings(),
 ) -> list[list[PlantPlace]]:
-    """Rounds of places: so many of each class in all, those of a round so far apart that all stand at once.
+    """Rounds of places: this many of each class in all, those of a round so far apart that all stand at once.
 
     Places lie in `usable` cells (N,) and `free_m` away from all of `keep_off_m`. Cells with few views are taken as
     often as those with many, which most ground has. Fewer are given where the ground has no room for more in 40 rounds.

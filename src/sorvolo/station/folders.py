@@ -13,7 +13,7 @@ from sorvolo.store.site.catalogue_place import is_site
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder, so many levels below the root."""
+    """A folder, this many levels below the root."""
 
     path: Path
     depth: int

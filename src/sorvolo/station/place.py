@@ -55,7 +55,7 @@ def place_routes(
         site: str, lon: float = Query(ge=-360, le=360), lat: float = Query(ge=-90, le=90),
         most_per_flight: int = Query(12, ge=1, le=200),
     ) -> list[dict[str, Any]]:
-        """Every frame that shows the place, in order of time, at most so many a flight: those that see it best.
+        """Every frame that shows the place, in order of time, at most this many a flight: those that see it best.
 
         `crop_url` is a picture of the ground around it, north up; null where nothing was kept to cut it from.
         """
@@ -96,12 +96,12 @@ def _flight_row(site_id: str, found: FoundFlight, reviews: Reviews) -> dict[str,
 
 def _things(site_id: str, found: FoundFlight, reviews: Reviews) -> list[dict[str, Any]]:
     """What a flight found at the place, by the index, with the verdicts on it."""
-    said = {kind: reviews.current(site_id, kind) for kind in {each.type for each in found.things}}
+    verdicts = {kind: reviews.current(site_id, kind) for kind in {each.type for each in found.things}}
     return [
         {
             "type": each.type, "id": each.id, "class": each.label, "kind": each.kind or None, "score": each.score,
             "first_seen": utc_text(each.first_ns), "last_seen": utc_text(each.last_ns),
-            "review": _review(said[each.type].get(each.id)),
+            "review": _review(verdicts[each.type].get(each.id)),
         }
         for each in found.things
     ]
@@ -115,13 +115,13 @@ def _near(
     ring = place.buffer(reach_deg)
     result: dict[str, list[dict[str, Any]]] = {}
     for name, kind in (("changes", "change"), ("objects", "object")):
-        collection, said = collections.get(site_id, name), reviews.current(site_id, kind)
+        collection, verdicts = collections.get(site_id, name), reviews.current(site_id, kind)
         for each in _touching(collection, ring):
             values = each["properties"]
             result.setdefault(values["flight"], []).append({
                 "type": kind, "id": each["id"], "class": values["class"], "kind": values.get("kind"),
                 "score": values.get("score"), "first_seen": values["datetime"], "last_seen": values["end_datetime"],
-                "review": _review(said.get(str(each["id"]))),
+                "review": _review(verdicts.get(str(each["id"]))),
             })
     return result
 

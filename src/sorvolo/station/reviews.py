@@ -180,9 +180,9 @@ class Reviews:
 
     @staticmethod
     def _conflict(wish: ReviewWish, now: Review | None) -> Problem:
-        said = f"{now.who} gave the verdict {now.verdict}" if now is not None else "the verdict was withdrawn"
+        newer = f"{now.who} gave the verdict {now.verdict}" if now is not None else "the verdict was withdrawn"
         return Problem(
-            409, f"{said} meanwhile; look at it, and give your verdict upon revision {now.revision if now else 0}",
+            409, f"{newer} meanwhile; look at it, and give your verdict upon revision {now.revision if now else 0}",
             current=None if now is None else asdict(now),
         )
 

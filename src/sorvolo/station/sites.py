@@ -43,7 +43,7 @@ class SiteShelf:
         return self._folders(_LOOK_EVERY_S)
 
     def _folders(self, at_most_s: float) -> dict[str, Path]:
-        """The folders as they were found so many seconds ago at most."""
+        """The folders as they were found this many seconds ago at most."""
         with self._lock:
             if time.monotonic() - self._looked_s >= at_most_s:
                 self._found = _sites_below(self.root)

@@ -173,7 +173,7 @@ class Uploads:
             return upload_id
 
     def demand_room(self, more_bytes: int) -> None:
-        """Raise Problem (507) where so many bytes more would not leave the floor of free space."""
+        """Raise Problem (507) where this many bytes more would not leave the floor of free space."""
         free = shutil.disk_usage(self._settings.root).free
         if free - more_bytes < self._settings.free_floor_gb * 1e9:
             raise Problem(

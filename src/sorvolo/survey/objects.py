@@ -56,7 +56,7 @@ class Detections:
         return Detections(self.boxes_px[index], self.scores[index], self.labels[index], self.classes)
 
     def surest(self, most: int) -> "Detections":
-        """At most so many rows, those of the highest scores first."""
+        """At most this many rows, those of the highest scores first."""
         return self.only(np.argsort(-self.scores, kind="stable")[:most])
 
 

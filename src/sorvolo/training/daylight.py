@@ -20,7 +20,7 @@ class JudgeSettings:
 
     levels: tuple[int, ...] = (1, 2)  # strides 8 and 16
     grown: tuple[float, ...] = (1.3, 2.0)  # the box and its surroundings, in sides of the box
-    cells: tuple[int, ...] = (4, 3)  # pooled to so many cells a side
+    cells: tuple[int, ...] = (4, 3)  # pooled to this many cells a side
     width: int = 48
 
 

@@ -14,7 +14,7 @@ from sorvolo.training.tfjs_graph import TfjsGraph
 
 COCO_CLASSES = 80
 BINS = 11
-"""A box's side lies 0 to 10 strides from its cell's centre; a distribution over so many bins gives the place."""
+"""A box's side lies 0 to 10 strides from its cell's centre; a distribution over this many bins gives the place."""
 
 _MEAN_BGR, _STD_BGR = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
 _SLOPE = 0.1

@@ -151,7 +151,7 @@ def _holds(found: _Found, box: Floats, score: float, label: int) -> bool:
 
 
 def _reaching(model: FasterRCNN, regions: int) -> FasterRCNN:
-    """The same layers, looking at so many regions."""
+    """The same layers, looking at this many regions."""
     own = copy(model)
     own.reach = replace(model.reach, regions=regions)
     return own

@@ -107,7 +107,7 @@ class GrowingFolder:
         return False
 
     def samples(self, since: int) -> tuple[TimesNs, Floats]:
-        """Positions after the first so many, as `FlightSoFar` has them."""
+        """Positions after the first this many, as `FlightSoFar` has them."""
         return self._log.samples(since)
 
     def continue_from(self, so_far: FlightSoFar) -> None:

@@ -65,7 +65,7 @@ class TelemetryLog:
             self._changed.notify_all()
 
     def samples(self, since: int) -> tuple[TimesNs, Floats]:
-        """The times (N,) and samples (N, columns of `TELEMETRY_COLUMNS`) after the first so many."""
+        """The times (N,) and samples (N, columns of `TELEMETRY_COLUMNS`) after the first this many."""
         with self._changed:
             return self._times_ns[since : self._count].copy(), self._rows[since : self._count].copy()
 

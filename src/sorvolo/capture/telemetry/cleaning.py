@@ -216,7 +216,7 @@ def sigma_from_hdop_m(hdop: float) -> float:
 
 
 def rounding_sigma_m(decimals: int) -> float:
-    """Sigma in m, per axis, of a position rounded to so many decimals of a degree: its step / sqrt 12."""
+    """Sigma in m, per axis, of a position rounded to this many decimals of a degree: its step / sqrt 12."""
     return float(10.0**-decimals * M_PER_DEG_LATITUDE / np.sqrt(12))
 
 

@@ -125,7 +125,7 @@ def _share(rim: Mask, cells: Mask) -> float:
 
 
 def _rim(cells: Mask, reach: int) -> Mask:
-    """The cells around, up to so many away."""
+    """The cells around, up to this many away."""
     return np.asarray((cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0) & ~cells)
 
 

@@ -36,7 +36,7 @@ class PlantingSettings:
     contrasts: tuple[float, ...] = (1.0, 0.35)  # plain and faint: of the thing's own colour, the rest is the ground's
     apart_px: int = 100  # a grid of this side, so that each thing stands on ground of its own
     first_step: int = 4  # every fourth view at first ...
-    steps_alike: int = 6  # ... and after so many a half of them: planting costs a third of a comparison
+    steps_alike: int = 6  # ... and after this many a half of them: planting costs a third of a comparison
     shown: float = 0.25  # of a thing's pixels marked as changed: found
     wanted: float = 0.8  # of the things of a size found: that size is found
     drawn: DrawnThing = field(default_factory=DrawnThing)

@@ -59,7 +59,7 @@ class CellWindow:
         )
 
     def grown(self, cells: int) -> "CellWindow":
-        """The window with so many cells more on each side."""
+        """The window with this many cells more on each side."""
         return CellWindow(self.x0 - cells, self.y0 - cells, self.x1 + cells, self.y1 + cells)
 
     def part(self, part: tuple[slice, slice]) -> "CellWindow":

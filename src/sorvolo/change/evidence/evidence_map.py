@@ -50,7 +50,7 @@ class PassingSettings:
     """Which cells are no part of a change: what leaned over its place for a few views (0015)."""
 
     share: float = 0.5  # flagged in a share of views so many times as large as the surest cells' ...
-    views: int = 8  # ... of at least so many views
+    views: int = 8  # ... of at least this many views
     surest_percent: float = 97  # percentile of its cells' shares that is that of the surest
 
 

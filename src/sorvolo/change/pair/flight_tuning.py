@@ -7,7 +7,7 @@ from statistics import median
 from sorvolo.change.pair.robust import RobustResult, RobustSettings
 from sorvolo.geometry.arrays import Floats
 
-MEMORY_FRAMES = 50  # light and wind change within minutes: older frames tell nothing about now
+MEMORY_FRAMES = 50  # light and wind change within minutes: older frames do not show how it is now
 LEAST_KNOWN = 0.05  # share of a frame that must be known for its measures to count
 
 

@@ -27,8 +27,8 @@ class LearnedSettings:
     reach: int = 1  # cells of a layer that a feature is looked for around: alignment is good to less than a cell
     least_middle: tuple[float, float] = (0.8, 0.55)  # of distance, in features' standard deviations, and of 1 - cosine:
     least_spread: tuple[float, float] = (0.25, 0.17)  # two dates have these at least; no pair is taken as calmer
-    least_known: int = 64  # cells of a layer; fewer tell nothing about unchanged ground
-    most: float = 8.0  # spreads; beyond, more says no more
+    least_known: int = 64  # cells of a layer; too few to know unchanged ground by
+    most: float = 8.0  # spreads; beyond, more means no more
     direction: float = 2.0  # weight of the angle between features, beside 1 of their distance
 
 
@@ -89,7 +89,7 @@ def _padded(image: NDArray[np.uint8], stride: int) -> NDArray[np.uint8]:
 
 
 def _in_spreads(measure: Floats32, held: Mask, least_middle: float, least_spread: float, most: float) -> Floats32:
-    """A measure (rows, columns) less its median where `held`, in spreads, at most so many."""
+    """A measure (rows, columns) less its median where `held`, in spreads, at most this many."""
     median = float(np.median(measure[held]))
     spread = max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(measure[held] - median))), least_spread)
     away = (measure - np.float32(max(median, least_middle))) / np.float32(spread)

@@ -50,7 +50,7 @@ class RobustSettings:
 class RobustResult:
     """What changed: `mask` (h, w) uint8 0 or 255, `boxes` (N, 4) x, y, width, height and `scores` (N,) from 0 to 1.
 
-    `light`, `settling` and `noise` tell what the pair set itself: the light, the misalignment, and the 95 % quantile
+    `light`, `settling` and `noise` are what the pair set itself: the light, the misalignment, and the 95 % quantile
     of differences where nothing changed; lengths of `settling` are in half size pixels. `known` is the share compared.
     """
 

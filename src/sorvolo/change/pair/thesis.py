@@ -207,7 +207,7 @@ def _compare(
         before = prepare_reference(before, valid, settings, threads)
     if before.averaging_px != settings.averaging_px:
         raise SettingsError(
-            f"the reference was prepared with averaging_px {before.averaging_px}, the settings say "
+            f"the reference was prepared with averaging_px {before.averaging_px}, the settings have "
             f"{settings.averaging_px}; prepare it with these settings"
         )
     if before.picture.shape != query.shape or (valid is not None and valid.shape != query.shape[:2]):

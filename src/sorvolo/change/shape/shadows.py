@@ -31,7 +31,8 @@ class ThingSettings:
 
 
 def without_shadow(change: Change, settings: ThingSettings = ThingSettings()) -> Change:
-    """The change with its outline, area and length drawn around the thing alone; the same change where nothing tells.
+    """The change with its outline, area and length drawn around the thing alone, where its picture shows which part
+    that is.
 
     The outline is what the convex hull of the pixels that are no shadow holds of the change, so that a dark thing with
     a few bright parts stays whole. The patch keeps the shadow: it belongs into the map.

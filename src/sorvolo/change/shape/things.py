@@ -20,7 +20,7 @@ class Parts:
         self._views = 0
 
     def is_due(self, views: int) -> bool:
-        """Whether, with so many views, it is time to look again for things to part."""
+        """Whether, with this many views, it is time to look again for things to part."""
         return views >= _MORE_VIEWS * self._views
 
     def join(self, announced: Sequence[Change]) -> None:
@@ -31,7 +31,7 @@ class Parts:
     def take(
         self, things: Sequence[Change], views: int, now_ns: int, next_id: Callable[[], str]
     ) -> list[Change]:
-        """The things as they are seen after so many views, the largest first; those announced for the first time, now.
+        """The things as they are seen after `views` views, the largest first; those announced for the first time, now.
 
         All come under the id of the whole. Each keeps the id of what was announced there; the largest of the
         others keeps that of the whole. Any more are new and get ids from `next_id`, if they were there already when

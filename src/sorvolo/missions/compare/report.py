@@ -115,7 +115,7 @@ def comparison_headline(changes: int, coverage: Mapping[str, Any], *, is_local: 
     """The first line of a comparison: its `quality`, "compared" or "doubtful", and its `text`.
 
     It is doubtful when most of the ground under the views that the map shows could not be compared: then the number of
-    changes says nothing about the site. `coverage` is that of the report.
+    changes proves nothing about the site. `coverage` is that of the report.
     """
     compared, missing = (area_text(coverage[name], is_local=is_local) for name in ("compared_m2", "not_compared_m2"))
     found = f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"

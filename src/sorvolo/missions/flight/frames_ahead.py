@@ -9,7 +9,7 @@ from sorvolo.survey.flight import Frame, LostFrame
 
 
 def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Frame | LostFrame]:
-    """The frames, read in a thread of their own, at most so many before they are asked for.
+    """The frames, read in a thread of their own, at most this many before they are asked for.
 
     What the reading raises is raised here.
     """

@@ -178,7 +178,7 @@ class ObjectFinder:
         return {name: max(each.get(name, 0.0) for each in of_frames) for name in self._detector.classes}
 
     def _take(self, left: float) -> None:
-        """Collect what was seen until so many frames still wait."""
+        """Collect what was seen until this many frames still wait."""
         while self._waiting and (len(self._waiting) > left or self._waiting[0].done()):
             seen = self._waiting.popleft().result()
             self._seen[seen.index] = seen

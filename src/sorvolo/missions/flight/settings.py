@@ -68,7 +68,7 @@ class CompareSettings:
     method: Literal["robust", "thesis"] = "robust"
     views_per_second: float = 5.0  # of flight: neighbouring frames of a video show the same again
     votes: int = 3  # k: views of a piece of ground that must show a change ...
-    voters: int = 5  # n: ... among the last so many that saw it
+    voters: int = 5  # n: ... among the last this many that saw it
     offset_s: float | None = None  # telemetry time = video time + this
     ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
     side_px: int | None = None  # longest side at which frames are compared; None: photos larger than a video's frames

@@ -163,7 +163,7 @@ class _Work:
                 yield _Task(f"detector/Okutama/{model}", "detector", (okutama,), make)
 
     def _chosen(self, videos: Sequence[UmcdVideo]) -> list[UmcdVideo]:
-        """At most so many of each environment."""
+        """At most this many of each environment."""
         chosen: dict[str, list[UmcdVideo]] = {}
         for each in videos:
             chosen.setdefault(each.environment.lower(), []).append(each)

@@ -54,7 +54,7 @@ class SimulatedSize:
 class ReproductionSettings:
     """How much of chapter 4 is done, and how. The dataset's own size is `videos` None."""
 
-    videos: int | None = None  # at most so many of each environment, in each part of the dataset
+    videos: int | None = None  # at most this many of each environment, in each part of the dataset
     views_per_second: float = 5.0  # that are compared; the thesis compared every frame
     repeats: int = 5  # of the timed comparison of section 4.2.2
     seed: int = 1  # of what is simulated, held out, and learnt

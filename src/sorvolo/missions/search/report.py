@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sorvolo.missions.search.refly import Refly
 
 _FEW_PLANTS = 25  # fewer outcomes of a class leave its probability a guess
-_MOST_HOLES = 0.01  # of the area: more is said in the headline and the exit code
+_MOST_HOLES = 0.01  # of the area: more is reported in the headline and the exit code
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,7 +43,7 @@ class WatchSettings:
 
     def _check_frames(self) -> None:
         if self.every is not None and self.frames_per_second is not None:
-            raise SettingsError("give every N-th frame (--every) or so many frames a second (--fps), not both")
+            raise SettingsError("give every N-th frame (--every) or this many frames a second (--fps), not both")
         if self.every is not None and self.every < 1:
             raise SettingsError(f"every N-th frame: N must be 1 or more, got {self.every}")
         if self.frames_per_second is not None and not 0.001 <= self.frames_per_second <= 1000:

@@ -34,10 +34,10 @@ export async function send(path, init) {
     throw new Problem(0, "The station does not answer", UNREACHABLE);
   }
   if (answer.ok) return answer;
-  const said = await answer.json().catch(() => ({}));
+  const problem = await answer.json().catch(() => ({}));
   if (answer.status === 401) session.dispatchEvent(new Event("needed"));
-  throw new Problem(answer.status, said.title || `The station answered ${answer.status}`,
-    said.detail || "Try again; if it stays so, look at the station's own messages.", said);
+  throw new Problem(answer.status, problem.title || `The station answered ${answer.status}`,
+    problem.detail || "Try again; if it stays so, look at the station's own messages.", problem);
 }
 
 export const get = (path, options) => ask("GET", path, undefined, options);

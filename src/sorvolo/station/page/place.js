@@ -11,7 +11,7 @@ export function placePanel(screen, body) {
   let shown = null;
   let drawn = ""; // what of the page's state the list was last drawn with
   let last = screen.lastPlace ?? null;
-  const hint = el("p", { class: "hint" }, "Tap the ground on the map: every flight that saw it, in order, what changed there and who said so.");
+  const hint = el("p", { class: "hint" }, "Tap the ground on the map: every flight that saw it, in order, what changed there, and people's verdicts.");
 
   async function look(place) {
     turn += 1;
@@ -38,13 +38,13 @@ export function placePanel(screen, body) {
     const flights = new Map();
     for (const each of views) flights.set(each.flight, [...(flights.get(each.flight) ?? []), each]);
     const found = unique(views.flatMap((each) => [...each.changes, ...each.objects]));
-    const said = unique(views.flatMap((each) => each.reviews), (each) => `${each.id} ${each.at}`);
+    const reviews = unique(views.flatMap((each) => each.reviews), (each) => `${each.id} ${each.at}`);
     fill(body,
       el("div", { class: "row" }, el("p", { class: "place-name" }, words.place(place, { local: screen.data.detail.is_local })), copyButton(place)),
       views.length ? el("p", { class: "soft" }, `${words.counted(views.length, "view")} in ${words.counted(flights.size, "flight")}, first ${words.time(views[0].time)}`)
         : el("p", { class: "hint" }, "No flight saw this place."),
       found.length ? el("section", {}, el("h3", {}, "What was found here"), el("ul", { class: "plain" }, found.map((each) => change(screen, each)))) : null,
-      said.length ? el("section", {}, el("h3", {}, "Reviews"), el("ul", { class: "plain" }, said.map(review))) : null,
+      reviews.length ? el("section", {}, el("h3", {}, "Reviews"), el("ul", { class: "plain" }, reviews.map(review))) : null,
       [...flights].map(([flight, list]) => el("section", { class: "dates" },
         el("h3", {}, words.day(list[0].time), el("small", {}, ` ${flight}`)),
         el("ol", { class: "film", tabindex: 0, "aria-label": `Views of ${flight}` }, list.map((each) => view(screen, each))))));

@@ -91,7 +91,7 @@ class VideoPane {
     this.canvas.hidden = this.fmp4;
     this.player.hidden = !this.fmp4;
     this.poll = setInterval(() => this.ask(), STATE_MS);
-    socket.addEventListener("message", ({ data }) => (typeof data === "string" ? this.said(JSON.parse(data)) : this.packet(data)));
+    socket.addEventListener("message", ({ data }) => (typeof data === "string" ? this.report(JSON.parse(data)) : this.packet(data)));
     socket.addEventListener("close", () => {
       if (socket !== this.socket) return;
       fill(this.delay, "no signal");
@@ -107,7 +107,7 @@ class VideoPane {
     } catch { /* the connection's own sign shows it */ }
   }
 
-  said(words) {
+  report(words) {
     if (words.type === "format") {
       this.format = words;
       if (words.epoch_us !== undefined) this.epoch_us = words.epoch_us;

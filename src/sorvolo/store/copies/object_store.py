@@ -46,7 +46,7 @@ _WORDS = {
 }  # S3's codes of errors
 
 _BY_STATUS = {"403": _WORDS["AccessDenied"], "401": _KEYS, "301": _REGION}
-_WITHOUT_ANSWER = (  # by what the library says, the first that is in it
+_WITHOUT_ANSWER = (  # by the library's message, the first that is in it
     ("169.254.", _NO_KEYS), ("credential", _NO_KEYS),
     ("certificate", "the store's certificate is not trusted: set AWS_CA_BUNDLE to its authority's PEM file"),
     ("timed out", _SLOW), ("timedout", _SLOW),

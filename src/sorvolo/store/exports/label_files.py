@@ -62,7 +62,7 @@ def write_coco(path: Path, labelled: LabelledSet, scores: Sequence[Floats] | Non
 
 def write_yolo(folder: Path, labelled: LabelledSet) -> int:
     """Write `labels/*.txt`, `classes.txt` and `data.yaml` to `folder`; the number of ignored regions, which YOLO
-    cannot say and which are left out.
+    cannot express and which are left out.
 
     Pictures are expected in `folder/images`, where those that lie there already keep their sub-folders; others are
     to be copied there under their own names. A picture without boxes gets an empty file. Raises InputError when two

@@ -34,7 +34,7 @@ def open_raster(
 ) -> Iterator[rasterio.DatasetReader]:
     """Open a user's GeoTIFF, with these drivers alone: a VRT renamed .tif could name any file or address.
 
-    Raises InputError, saying that `what` was needed, for anything but a file on the disk, so that none of GDAL's
+    Raises InputError, naming `what` as needed, for anything but a file on the disk, so that none of GDAL's
     virtual paths (/vsicurl/, /vsizip/) and none of rasterio's (https:, zip:) is followed.
     """
     try:

@@ -156,7 +156,7 @@ def load_reviews(connection: Connection) -> list[StoredReview]:
 
 
 def put_reviews(connection: Connection, changes: Sequence[StoredChange], verdict: Verdict, note: str) -> None:
-    """Say the same of each of these changes; an earlier word on one is replaced."""
+    """Give each of these changes the same verdict; an earlier one is replaced."""
     now = utc_now()
     for each in changes:
         connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))

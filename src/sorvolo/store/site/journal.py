@@ -39,7 +39,7 @@ class Entry:
 class RunJournal:
     """The journal of one run at `path`. `append` adds an entry, from any thread; `entries` are the complete ones.
 
-    `key` says of what run it is, `after` over which version of the map (0: none), `program` by which version of
+    `key` names the run that it is of, `after` over which version of the map (0: none), `program` by which version of
     Sorvolo. A file with others, or a damaged one,
     counts as empty. Nothing is written before the first `append`, which cuts off what comes after the last entry that
     was taken. An entry is whole after a kill or is not there; after a power cut those that the disk had not got are
