@@ -78,7 +78,7 @@ class Ear:
             self.epochs.append((arrived_ns, epoch))
             self._came.notify_all()
 
-    def wait(self, count: int, timeout_s: float = 10.0) -> bool:
+    def wait(self, count: int, timeout_s: float = 60.0) -> bool:
         with self._came:
             return self._came.wait_for(lambda: len(self.epochs) >= count, timeout_s)
 

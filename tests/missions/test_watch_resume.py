@@ -17,6 +17,7 @@ from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.simulation.settings import OutputSettings
+from waiting import wait_for
 
 _EFFORT = ("seconds", "latency_s", "frames_per_second", "peak_memory_mb")
 _KILLED_AT = 12  # frames
@@ -56,6 +57,11 @@ def watched(
     return updates
 
 
+def noted(folder: Path) -> int:
+    """How many messages that were sent the journal of a watch has noted."""
+    return (folder / "run.journal").read_bytes().count(b'"receiver"')
+
+
 def content(folder: Path) -> dict[str, bytes]:
     """All files but pages, without what a watch took."""
     found = {}
@@ -69,11 +75,13 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def ids(alerts: Path, count: int) -> list[int]:
-    """Those sent so far, once there are so many."""
-    end_s = time.monotonic() + 20
-    while len(words := alerts.read_text().split() if alerts.exists() else []) < count and time.monotonic() < end_s:
-        time.sleep(0.05)
-    return [int(each) for each in words]
+    """Those sent so far, once there are at least `count`."""
+
+    def sent() -> list[int]:
+        return [int(each) for each in alerts.read_text().split()] if alerts.is_file() else []
+
+    wait_for(lambda: len(sent()) >= count)
+    return sent()
 
 
 def test_it_goes_on_and_tells_nobody_twice(video: Path, detector: TruthDetector, tmp_path: Path) -> None:
@@ -83,7 +91,7 @@ def test_it_goes_on_and_tells_nobody_twice(video: Path, detector: TruthDetector,
     def killed(updates: list[WatchUpdate]) -> None:
         if len(updates) == _KILLED_AT:
             reported.extend(ids(alerts, sum(len(each.new) for each in updates)))
-            time.sleep(0.5)  # what was sent is noted after it
+            wait_for(lambda: noted(whole) == len(reported))
             shutil.copytree(whole, amid)
 
     updates = watched(video, whole, detector, alerts, killed)

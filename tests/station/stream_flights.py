@@ -1,12 +1,50 @@
 """Small flights for the tests of streaming: a few seconds of moving pictures with telemetry beside them."""
 
+import threading
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 
+from sorvolo.station.footage import Footage, Format, Piece
+from sorvolo.station.messages import Kind
+
 RATE = 10
+
+
+class HeldFootage:
+    """A recording that stops before one of its pictures until it is let go on: a drone that is certainly in the air."""
+
+    is_live = False
+
+    def __init__(self, footage: Footage, before: int) -> None:
+        self._footage, self._before = footage, before
+        self.goes_on = threading.Event()
+
+    @property
+    def name(self) -> str:
+        """See `Footage`."""
+        return self._footage.name
+
+    @property
+    def format(self) -> Format:
+        """See `Footage`."""
+        return self._footage.format
+
+    def pieces(self, begin_us: int, stop: threading.Event) -> Iterator[Piece]:
+        """See `Footage`."""
+        pictures = 0
+        for each in self._footage.pieces(begin_us, stop):
+            pictures += each.kind is Kind.VIDEO
+            while pictures > self._before and not (self.goes_on.wait(0.02) or stop.is_set()):
+                pass
+            yield each
+
+    def notices(self) -> Sequence[str]:
+        """See `Footage`."""
+        return self._footage.notices()
 
 
 def write_video(

@@ -8,7 +8,7 @@ import socket
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from sorvolo.station.outward import OutwardSettings
 from sorvolo.station.relays import Relay
 from sorvolo.station.state import StationState
 from sorvolo.station.webhooks import SIGNATURE, webhook, webhook_name
+from waiting import wait_for
 
 FOUND = NewEvent("object.found", {"feature": {"type": "Feature", "properties": {"class": "person"}}}, "field", "r1")
 
@@ -34,13 +35,6 @@ def events(tmp_path: Path) -> Iterator[EventLog]:
     state = StationState.open(tmp_path / "station")
     yield EventLog(state)
     state.close()
-
-
-def wait_for(there: Callable[[], bool], limit_s: float = 5.0) -> None:
-    until_s = time.monotonic() + limit_s
-    while not there():
-        assert time.monotonic() < until_s
-        time.sleep(0.02)
 
 
 class Receiver:
@@ -208,7 +202,7 @@ def listening(port: int, got: list[tuple[str, bytes]]) -> Client:
     client.on_subscribe = lambda *_: ready.set()
     client.connect("127.0.0.1", port)
     client.loop_start()
-    assert ready.wait(5)
+    assert ready.wait(60)
     return client
 
 
@@ -230,7 +224,7 @@ def test_a_real_broker_gets_events_also_those_of_while_it_was_away(
     time.sleep(0.3)
     broker.start()
     listener = listening(broker.port, got)
-    wait_for(lambda: any(topic == "team/a_b/change.announced" for topic, _ in got), 15)
+    wait_for(lambda: any(topic == "team/a_b/change.announced" for topic, _ in got))
     wait_for(lambda: relay.figures().waiting == 0)
     relay.close()
     sender.close()

@@ -5,22 +5,24 @@ import ssl
 import subprocess
 import threading
 import time
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 
 import av
 import pytest
-from stream_flights import RATE, write_track, write_video
+from stream_flights import RATE, HeldFootage, write_track, write_video
 from stream_server import TOKEN, StreamServer
 
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import open_sources
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.station.client import StreamClient, StreamReport, StreamSettings, stream_url
-from sorvolo.station.footage import open_footage
+from sorvolo.station.footage import Footage, open_footage
 from sorvolo.station.ingest import IngestLimits
 from sorvolo.station.messages import Kind
 from sorvolo.station.spool import Spool
+from waiting import wait_for
 
 ALL = StreamSettings(speed=0, latency_s=float("inf"))
 
@@ -35,11 +37,32 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def client(
     video: Path, server: StreamServer, spool: Path, *, token: str = TOKEN, stream: str = "drone",
     settings: StreamSettings = ALL, stop: threading.Event | None = None,
+    held: Callable[[Footage], Footage] = lambda footage: footage,
 ) -> StreamClient:
     stop = stop or threading.Event()
-    footage = open_footage(str(video), None, None, LiveSettings(first_s=3, give_up_s=1), stop)
+    footage = held(open_footage(str(video), None, None, LiveSettings(first_s=3, give_up_s=1), stop))
     url = stream_url(server.url, stream)
     return StreamClient(footage, Spool(spool, settings.spool_bytes), url, token, settings, stop)
+
+
+class InTheAir:
+    """A client whose flight stands still before its 16th picture of 30, with what comes before at the station."""
+
+    def __init__(
+        self, flight: Path, server: StreamServer, spool: Path, stop: threading.Event | None = None,
+        settings: StreamSettings = ALL,
+    ) -> None:
+        self.client = client(flight, server, spool, stop=stop, settings=settings, held=self._held)
+        self.thread = threading.Thread(target=self.client.run)
+        self.thread.start()
+        wait_for(lambda: self.client.report.frames >= 10)
+
+    def _held(self, footage: Footage) -> Footage:
+        self._footage = HeldFootage(footage, before=15)
+        return self._footage
+
+    def goes_on(self) -> None:
+        self._footage.goes_on.set()
 
 
 def kept(server: StreamServer, stream: str = "drone") -> Path:
@@ -72,29 +95,32 @@ def test_a_flight_arrives_whole_with_its_telemetry(flight: Path, tmp_path: Path)
 
 def test_a_server_killed_in_mid_flight_loses_and_doubles_nothing(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams") as server:
-        sending = client(flight, server, tmp_path / "spool", settings=StreamSettings(speed=1.5))
-        thread = threading.Thread(target=sending.run)
-        thread.start()
-        time.sleep(0.8)
+        drone = InTheAir(flight, server, tmp_path / "spool")
         server.kill()
         with kept(server).open("ab") as file:  # a message of which only a part was written
             file.write(b"\x47" + bytes(500))
-        time.sleep(0.6)
+        wait_for(lambda: not drone.client.report.is_linked)
+        time.sleep(0.5)  # the outage's length
         server.start()
-        thread.join(10)
-        assert not thread.is_alive()
+        drone.goes_on()
+        drone.thread.join(60)
+        report = drone.client.report
+        assert not drone.thread.is_alive()
         assert times(kept(server)) == list(range(30))
-        assert sending.report.outages == 1 and sending.report.outage_s > 0.4
-        assert sending.report.frames == 30 and sending.report.late == 0
+        assert report.outages == 1 and report.outage_s > 0.4
+        assert report.frames == 30 and report.late == 0
 
 
 def test_a_client_that_restarts_goes_on_with_its_flight(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams") as server:
         stop = threading.Event()
-        first = client(flight, server, tmp_path / "spool", settings=StreamSettings(speed=2, flush_s=0.2), stop=stop)
-        threading.Timer(0.7, stop.set).start()
-        threading.Timer(0.5, server.kill).start()
-        first.run()
+        drone = InTheAir(flight, server, tmp_path / "spool", stop, StreamSettings(speed=0, flush_s=0.2))
+        first = drone.client
+        server.kill()
+        drone.goes_on()
+        wait_for(lambda: first._spool.counts().waiting > 0)
+        stop.set()
+        drone.thread.join(60)
         assert not first.is_complete and first.report.spooled > 0
         server.start()
         with pytest.raises(InputError, match="another sorvolo stream uses this spool"):
@@ -175,26 +201,29 @@ def test_a_stream_that_is_not_what_it_says_is_refused(flight: Path, tmp_path: Pa
 
 def test_two_drones_of_one_name(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams") as server:
-        first = client(flight, server, tmp_path / "spool1", settings=StreamSettings(speed=1.5))
-        thread = threading.Thread(target=first.run)
-        thread.start()
-        time.sleep(0.5)
+        drone = InTheAir(flight, server, tmp_path / "spool1")
         second = client(flight, server, tmp_path / "spool2")
-        words: list[str] = []
-        second.run(lambda report: words.append(report.words))
-        thread.join(10)
-        assert "another drone sends as drone; give --stream another name" in words
+        also = threading.Thread(target=second.run)
+        also.start()
+        wait_for(lambda: second.report.words == "another drone sends as drone; give --stream another name")
+        drone.goes_on()
+        for each in (drone.thread, also):
+            each.join(60)
+            assert not each.is_alive()
         files = sorted((tmp_path / "streams" / "drone").glob("*.ts"))
         assert [times(each) for each in files] == [list(range(30))] * 2  # one after the other, never mixed
 
 
 def test_a_full_disk_is_waited_for(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams", limits=IngestLimits(free_bytes=10**18)) as server:
-        reports: list[StreamReport] = []
         stop = threading.Event()
         sending = client(flight, server, tmp_path / "spool", settings=StreamSettings(speed=0, flush_s=0.1), stop=stop)
-        threading.Timer(1.0, stop.set).start()
-        sending.run(reports.append)
+
+        def show(report: StreamReport) -> None:
+            if "disk is full" in report.words and report.spooled == 30:
+                stop.set()
+
+        sending.run(show)
         assert "disk is full" in sending.report.words and sending.report.spooled == 30
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import uvicorn
+from stream_flights import HeldFootage
 from test_runs import FLIGHT
 from websockets.asyncio.client import connect
 
@@ -21,6 +22,7 @@ from sorvolo.station.client import StreamClient, StreamSettings, stream_url
 from sorvolo.station.footage import open_footage
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.spool import Spool
+from waiting import wait_for
 
 
 class Station:
@@ -79,33 +81,40 @@ def station(tmp_path: Path) -> Iterator[Station]:
     made.stop()
 
 
-def sending(flown: Path, station: Station, spool: Path, speed: float) -> StreamClient:
-    stop = threading.Event()
-    footage = open_footage(str(flown), None, str(flown.parent.parent / "camera.xml"), LiveSettings(), stop)
-    settings = StreamSettings(speed=speed)
-    return StreamClient(footage, Spool(spool, 50_000_000), stream_url(station.url, "scout"), "", settings, stop)
+class InTheAir:
+    """A drone that sends its flight in real time, all but its last pictures, until it may go on."""
 
+    def __init__(self, flown: Path, station: Station, spool: Path) -> None:
+        stop = threading.Event()
+        footage = open_footage(str(flown), None, str(flown.parent.parent / "camera.xml"), LiveSettings(), stop)
+        self._held, url = HeldFootage(footage, before=6), stream_url(station.url, "scout")
+        self.client = StreamClient(self._held, Spool(spool, 50_000_000), url, "", StreamSettings(), stop)
+        self._thread = threading.Thread(target=self.client.run)
 
-def begun(station: Station) -> None:
-    """Wait until a stream is there to be read."""
-    while not any(each["flights"] for each in station.ask("/api/streams")):
-        time.sleep(0.05)
+    def start(self) -> None:
+        self._thread.start()
+
+    def end(self) -> None:
+        """The rest of the flight."""
+        self._held.goes_on.set()
+        self._thread.join(60)
+        assert not self._thread.is_alive()
 
 
 def test_a_map_of_a_stream_outlives_a_restarted_station(station: Station, flown: Path, tmp_path: Path) -> None:
-    drone = sending(flown, station, tmp_path / "spool", speed=0.8)
-    flying = threading.Thread(target=drone.run)
-    flying.start()
-    begun(station)
+    drone = InTheAir(flown, station, tmp_path / "spool")
+    drone.start()
+    wait_for(lambda: any(each["flights"] for each in station.ask("/api/streams")))
     run = station.ask("/api/runs", {
         "mission": "map", "site": "new", "input": {"stream": "scout"}, "options": {"model": "none"},
     })
-    time.sleep(0.7)
+    wait_for(lambda: list((tmp_path / "root" / "new").glob("flights/*/run.journal")))
     station.stop()
-    time.sleep(0.3)
+    wait_for(lambda: not drone.client.report.is_linked)
     station.start()
-    flying.join(30)
-    assert drone.is_complete and drone.report.outages == 1 and drone.report.late == drone.report.overflowed == 0
+    drone.end()
+    report = drone.client.report
+    assert drone.client.is_complete and report.outages == 1 and report.late == report.overflowed == 0
     done = station.ended(run["id"])
     assert done["state"] == "finished", done
     (flight,) = station.ask("/api/sites/new")["flights"]
@@ -116,10 +125,9 @@ def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, f
     async def watch() -> tuple[list[int], list[dict[str, Any]]]:
         pictures, boxes = [], []
         async with connect(f"{station.url.replace('http', 'ws')}/api/streams/scout/video") as socket:
-            flying.start()
-            until_s = time.monotonic() + 30
-            while time.monotonic() < until_s and not boxes:
-                item = await asyncio.wait_for(socket.recv(), 30)
+            drone.start()
+            while not boxes:
+                item = await asyncio.wait_for(socket.recv(), 60)
                 if isinstance(item, str):
                     boxes += [words for words in [json.loads(item)] if words["type"] == "boxes"]
                     continue
@@ -130,8 +138,8 @@ def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, f
                     })
         return pictures, boxes
 
-    flying = threading.Thread(target=sending(flown, station, tmp_path / "spool", speed=0.3).run)
+    drone = InTheAir(flown, station, tmp_path / "spool")
     pictures, boxes = asyncio.run(watch())
-    flying.join(30)
+    drone.end()
     assert boxes and min(abs(boxes[0]["pts_us"] - each) for each in pictures) < 1000
     assert boxes[0]["frame_size_px"] == [320, 180]

@@ -22,6 +22,7 @@ from sorvolo.station.settings import STATE_FOLDER, StationSettings
 from sorvolo.station.state import StationState
 from sorvolo.station.stream_routes import announcing
 from sorvolo.station.tokens import make_token
+from waiting import wait_for
 
 WS = "ws://127.0.0.1:8750"
 HELLO = Message(Kind.HELLO, 0, 0, Hello("a" * 16, "h264", 160, 120, 10.0).to_json().encode()).to_bytes()
@@ -77,10 +78,7 @@ def test_a_refused_link_leaves_its_name_free(client: TestClient) -> None:
             return dict(drone.receive_json())
 
     def wait_until_gone() -> None:
-        until_s = time.monotonic() + 5
-        while client.get("/api/streams/scout").json()["is_connected"]:
-            assert time.monotonic() < until_s, "the link counts for ever"
-            time.sleep(0.02)
+        wait_for(lambda: not client.get("/api/streams/scout").json()["is_connected"])
 
     assert answer("a", "h264")["type"] == "welcome"
     wait_until_gone()
@@ -117,14 +115,14 @@ def test_a_stream_s_states_are_announced_in_their_order() -> None:
             written.append(event.data["n"])
             return 0
 
-    async def announce() -> None:
+    async def run() -> None:
         announce = announcing(Disk())  # type: ignore[arg-type]
         for number in range(3):
             announce("scout", {"n": number})
         while len(written) < 3:
             await asyncio.sleep(0.02)
 
-    asyncio.run(asyncio.wait_for(announce(), 5))
+    asyncio.run(asyncio.wait_for(run(), 60))
     assert written == [0, 1, 2]
 
 
