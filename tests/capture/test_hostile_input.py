@@ -23,6 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from mutations import mutated
 from sorvolo.capture import decoding
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.calibration import read_camera
@@ -302,23 +303,6 @@ def test_why_a_cut_jpeg_cannot_be_decoded_is_plain(checks: Image.Image) -> None:
     checks.save(buffer, "JPEG")
     with pytest.raises(InputError, match=r"the file ends before the picture does\); copy it again"):
         decode_photo(buffer.getvalue()[:-2000], "a.jpg")
-
-
-def mutated(data: st.DataObject, valid: bytes, most: int = 12) -> bytes:
-    """The bytes with some changed, cut out or doubled."""
-    changed = bytearray(valid)
-    for _ in range(data.draw(st.integers(1, most))):
-        if not changed:
-            break
-        place = data.draw(st.integers(0, len(changed) - 1))
-        action = data.draw(st.integers(0, 2))
-        if action == 0:
-            changed[place] = data.draw(st.integers(0, 255))
-        elif action == 1:
-            del changed[place:place + data.draw(st.integers(1, 40))]
-        else:
-            changed[place:place] = changed[place:place + data.draw(st.integers(1, 40))]
-    return bytes(changed)
 
 
 KML = (

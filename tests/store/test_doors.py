@@ -14,13 +14,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rasterio
 from fake_flights import SITE, image, map_flight, tile
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from mutations import mutated
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.flight_files import read_orthophoto
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image, rgba_from_png
 from sorvolo.store.nofollow import read_below
+from sorvolo.store.rasters.base_map import BaseMap
 from sorvolo.store.rasters.geotiff import parse_crs, read_raster
 from sorvolo.store.rasters.height_model import read_height_model
 from sorvolo.store.site.archive import Archive
@@ -264,6 +269,42 @@ def test_a_users_raster_fetches_and_opens_nothing_else(tmp_path: Path, web: tupl
             with pytest.raises(InputError, match="no such file"):
                 reader(Path(path))
     assert not asked
+
+
+def raster_of(path: Path, side_px: int, bands: int, dtype: str, *, written: bool = True) -> Path:
+    with rasterio.open(
+        path, "w", driver="GTiff", width=side_px, height=side_px, count=bands, dtype=dtype, crs="EPSG:32632",
+        transform=rasterio.Affine(0.5, 0, 500_000, 0, -0.5, 5_100_000), tiled=True, compress="deflate",
+        SPARSE_OK=not written, bigtiff="YES" if side_px > 10_000 else "NO",
+    ) as sink:
+        if written:
+            sink.write(np.arange(bands * side_px**2).reshape(bands, side_px, side_px).astype(dtype))
+    return path
+
+
+def test_a_small_raster_of_many_pixels_is_no_ground_to_simulate_over(tmp_path: Path) -> None:
+    sparse = raster_of(tmp_path / "sparse.tif", 40_000, 3, "uint8", written=False)
+    assert sparse.stat().st_size < 1_000_000
+    with pytest.raises(InputError, match="40000 x 40000 pixels; at most 500 million"):
+        read_orthophoto(sparse)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_any_raster_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    colours, heights = raster_of(folder / "a.tif", 64, 3, "uint8"), raster_of(folder / "b.tif", 64, 1, "float32")
+    reader, valid = data.draw(st.sampled_from([
+        (lambda path: read_raster(path, 100), colours), (read_orthophoto, colours),
+        (lambda path: BaseMap.open(path).bounds_deg, colours),
+        (lambda path: read_height_model(path, (8.9, 46.0, 9.1, 46.1)), heights),
+    ]))
+    path = folder / "any.tif"
+    path.write_bytes(mutated(data, valid.read_bytes(), 4))
+    try:
+        reader(path)
+    except InputError:
+        pass
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "9e999", "'wide'", "x'00'"])

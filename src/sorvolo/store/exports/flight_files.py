@@ -93,6 +93,7 @@ UMCD_COLUMNS = (
 _UMCD_IDLE_INSTRUMENTS = ("0.0", "0.0", "-9.81", *["0.0"] * 3, *["0"] * 4)  # acceleration, rotation, magnetometer
 _UMCD_IDLE_ERRORS = (*["0.0"] * 4, "9.81", "0.0")  # errors, size of the acceleration and of the rotation
 _UMCD_MOTORS = (*["5200"] * 4, *["38"] * 4)  # speed and load of the four motors
+_MOST_GROUND_PX = 500_000_000  # of an orthophoto to simulate over: its colours take 1.5 GB then
 _GPX = "http://www.topografix.com/GPX/1/1"
 _DJI = "http://www.dji.com/drone-dji/1.0/"
 _SENSOR_WIDTH_MM = 6.3  # what a small drone's 1/2.3 inch sensor measures
@@ -217,7 +218,7 @@ def write_mask(path: Path, mask: ImageGray) -> None:
 def read_orthophoto(path: Path, m_per_px: float | None = None) -> tuple[ImageRGB, float]:
     """An orthophoto's colours and its metres per pixel: its own where it has a metric CRS, else `m_per_px`.
 
-    Raises InputError for a file that is no picture of three 8-bit bands or whose pixel size is not known.
+    Raises InputError for no picture of three 8-bit bands, one too large, and one whose pixel size is not known.
     """
     try:
         with open_raster(path, "an orthophoto", ("GTiff", "PNG", "JPEG")) as source:
@@ -231,6 +232,11 @@ def read_orthophoto(path: Path, m_per_px: float | None = None) -> tuple[ImageRGB
             if not size_m:
                 raise InputError(
                     f"{path}: has no metric coordinate system; give its pixel size with --ground-gsd"
+                )
+            if source.width * source.height > _MOST_GROUND_PX:
+                raise InputError(
+                    f"{path}: {source.width} x {source.height} pixels; at most {_MOST_GROUND_PX / 1e6:.0f} million are "
+                    "simulated over: cut out the part to fly over (gdal_translate -srcwin)"
                 )
             return np.ascontiguousarray(np.moveaxis(source.read([1, 2, 3]), 0, -1)), float(size_m)
     except rasterio.errors.RasterioIOError as error:
