@@ -1,6 +1,5 @@
 """The station answers: sites, versions, tiles that may be kept for ever, problems in words."""
 
-import time
 import tracemalloc
 from pathlib import Path
 from typing import ClassVar
@@ -18,6 +17,7 @@ from sorvolo.station.settings import StationSettings
 from sorvolo.station.sites import bounds_lonlat
 from sorvolo.station.tiles import render
 from sorvolo.store.site.archive import Archive
+from waiting import wait_for
 
 FIELD = "/api/sites/field"
 
@@ -134,7 +134,7 @@ def test_a_site_deleted_while_it_is_looked_at(client: TestClient, root: Path) ->
     with Archive.open(root / "field", write=True) as archive:
         archive.create_site(SITE)
         map_flight(archive, "new", 10, count=1)
-    time.sleep(0.15)
+    wait_for(lambda: client.get(FIELD).status_code == 200)
     assert [each["id"] for each in client.get(FIELD).json()["flights"]] == ["new"]
 
 

@@ -10,6 +10,7 @@ from fake_flights import SITE
 from starlette.testclient import TestClient
 
 from sorvolo.store.site.archive import Archive
+from waiting import wait_for
 
 URL = "/api/sites/field/drawings"
 
@@ -53,10 +54,12 @@ def test_a_new_site_has_none_of_a_deleted_one_of_its_name(client: TestClient, ro
     time.sleep(0.01)
     with Archive.open(root / "field", write=True) as archive:
         archive.create_site(SITE)
+    wait_for(lambda: client.get(URL).status_code == 200)  # it may have been looked for while it was gone
     assert client.get(URL).json() == {"type": "FeatureCollection", "revision": 0, "features": []}
     assert client.put(URL, json={"revision": 0, "features": [zone("new")]}).json()["revision"] == 1
     shutil.rmtree(root / "field")
     shutil.copytree(made_site, root / "field")  # the first site is back, and what was drawn since is not of it
+    wait_for(lambda: client.get(URL).status_code == 200)
     assert client.get(URL).json()["features"] == []
 
 

@@ -53,7 +53,7 @@ class InTheAir:
         settings: StreamSettings = ALL,
     ) -> None:
         self.client = client(flight, server, spool, stop=stop, settings=settings, held=self._held)
-        self.thread = threading.Thread(target=self.client.run)
+        self.thread = threading.Thread(target=self.client.run, daemon=True)
         self.thread.start()
         wait_for(lambda: self.client.report.frames >= 10)
 
@@ -203,7 +203,7 @@ def test_two_drones_of_one_name(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams") as server:
         drone = InTheAir(flight, server, tmp_path / "spool1")
         second = client(flight, server, tmp_path / "spool2")
-        also = threading.Thread(target=second.run)
+        also = threading.Thread(target=second.run, daemon=True)
         also.start()
         wait_for(lambda: second.report.words == "another drone sends as drone; give --stream another name")
         drone.goes_on()

@@ -19,7 +19,7 @@ from small_flights import simulate_into
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.station.app import station_app
 from sorvolo.station.client import StreamClient, StreamSettings, stream_url
-from sorvolo.station.footage import open_footage
+from sorvolo.station.footage import Footage, open_footage
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.spool import Spool
 from waiting import wait_for
@@ -81,40 +81,32 @@ def station(tmp_path: Path) -> Iterator[Station]:
     made.stop()
 
 
-class InTheAir:
-    """A drone that sends its flight in real time, all but its last pictures, until it may go on."""
+def sending(footage: Footage, station: Station, spool: Path, speed: float = 1.0) -> StreamClient:
+    settings = StreamSettings(speed=speed)
+    url = stream_url(station.url, "scout")
+    return StreamClient(footage, Spool(spool, 50_000_000), url, "", settings, threading.Event())
 
-    def __init__(self, flown: Path, station: Station, spool: Path) -> None:
-        stop = threading.Event()
-        footage = open_footage(str(flown), None, str(flown.parent.parent / "camera.xml"), LiveSettings(), stop)
-        self._held, url = HeldFootage(footage, before=6), stream_url(station.url, "scout")
-        self.client = StreamClient(self._held, Spool(spool, 50_000_000), url, "", StreamSettings(), stop)
-        self._thread = threading.Thread(target=self.client.run)
 
-    def start(self) -> None:
-        self._thread.start()
-
-    def end(self) -> None:
-        """The rest of the flight."""
-        self._held.goes_on.set()
-        self._thread.join(60)
-        assert not self._thread.is_alive()
+def footage_of(flown: Path) -> Footage:
+    camera = str(flown.parent.parent / "camera.xml")
+    return open_footage(str(flown), None, camera, LiveSettings(), threading.Event())
 
 
 def test_a_map_of_a_stream_outlives_a_restarted_station(station: Station, flown: Path, tmp_path: Path) -> None:
-    drone = InTheAir(flown, station, tmp_path / "spool")
-    drone.start()
+    held = HeldFootage(footage_of(flown), before=6)
+    drone = sending(held, station, tmp_path / "spool")
+    flying = threading.Thread(target=drone.run, daemon=True)
+    flying.start()
     wait_for(lambda: any(each["flights"] for each in station.ask("/api/streams")))
     run = station.ask("/api/runs", {
         "mission": "map", "site": "new", "input": {"stream": "scout"}, "options": {"model": "none"},
     })
-    wait_for(lambda: list((tmp_path / "root" / "new").glob("flights/*/run.journal")))
     station.stop()
-    wait_for(lambda: not drone.client.report.is_linked)
+    wait_for(lambda: not drone.report.is_linked)
     station.start()
-    drone.end()
-    report = drone.client.report
-    assert drone.client.is_complete and report.outages == 1 and report.late == report.overflowed == 0
+    held.goes_on.set()
+    flying.join(60)
+    assert drone.is_complete and drone.report.outages == 1 and drone.report.late == drone.report.overflowed == 0
     done = station.ended(run["id"])
     assert done["state"] == "finished", done
     (flight,) = station.ask("/api/sites/new")["flights"]
@@ -125,7 +117,7 @@ def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, f
     async def watch() -> tuple[list[int], list[dict[str, Any]]]:
         pictures, boxes = [], []
         async with connect(f"{station.url.replace('http', 'ws')}/api/streams/scout/video") as socket:
-            drone.start()
+            flying.start()
             while not boxes:
                 item = await asyncio.wait_for(socket.recv(), 60)
                 if isinstance(item, str):
@@ -138,8 +130,9 @@ def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, f
                     })
         return pictures, boxes
 
-    drone = InTheAir(flown, station, tmp_path / "spool")
+    drone = sending(footage_of(flown), station, tmp_path / "spool", speed=0.3)
+    flying = threading.Thread(target=drone.run, daemon=True)
     pictures, boxes = asyncio.run(watch())
-    drone.end()
+    flying.join(60)
     assert boxes and min(abs(boxes[0]["pts_us"] - each) for each in pictures) < 1000
     assert boxes[0]["frame_size_px"] == [320, 180]
