@@ -73,7 +73,7 @@ def test_a_new_site_has_no_verdicts_of_a_deleted_one_of_its_name(
         archive.create_site(SITE)
         map_flight(archive, "a", 40)
         map_flight(archive, "b", 90, compared=True)
-    wait_for(lambda: client.get(REVIEWS).status_code == 200)  # it may have been looked for while it was gone
+    wait_for(lambda: client.get("/api/sites/field").status_code == 200)  # it may have been looked for while it was gone
     assert properties(client, "b-1")["review"] is None and client.get(REVIEWS).json() == []
     assert all(each.verdict is None for each in list_changes(root / "field"))
     assert verdict(client, "b-1", "confirmed", 0).status_code == 201
