@@ -39,11 +39,11 @@ class ParsedPicture:
 
 
 class Finding(NamedTuple):
-    """Something wrong that reading goes on without: a code of `FINDINGS`, where it is, and how often there."""
+    """Something wrong that reading goes on without: a code of `FINDINGS`, where it is, and how many `times` there."""
 
     code: str
     place: str
-    count: int = 1
+    times: int = 1
 
 
 FINDINGS: Mapping[str, str] = {
@@ -71,9 +71,9 @@ def notices_of(findings: Iterable[Finding]) -> tuple[Notice, ...]:
     """One notice a code, in words: how many in all, and where the first is."""
     counts: Counter[str] = Counter()
     first: dict[str, str] = {}
-    for code, place, count in findings:
-        if count:
-            counts[code] += count
+    for code, place, times in findings:
+        if times:
+            counts[code] += times
             first.setdefault(code, place)
     return tuple(
         Notice(code, count, f"{count} {FINDINGS[code]}, the first: {first[code]}") for code, count in counts.items()
