@@ -9,7 +9,7 @@ from toy_models import draw, onnx, rectangle_model, square_model
 
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.quantise import quantise
+from sorvolo.detection.quantise import pool_before_rounding, quantise
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.model_files import quantise_model
 from sorvolo.store.images import jpeg_from_image
@@ -174,3 +174,33 @@ def _weights(model: bytes, part: str) -> list[onnx.TensorProto]:
             name = node.input[1]
             found.append(values[makers[name].input[0] if name in makers else name])
     return found
+
+
+@pytest.mark.parametrize("is_in_float", [True, False])
+def test_a_pool_behind_a_layer_in_float_comes_before_the_rounding(is_in_float: bool) -> None:
+    seen = "image" if is_in_float else "seen"
+    made = onnx.parser.parse_model(f"""
+        <ir_version: 9, opset_import: ["" : 19]>
+        squares (float[1, 1, 8, 8] image, float[2, 1, 3, 3] weight, float step, uint8 zero)
+            => (float[1, 2, 3, 3] pooled) {{
+            rounded = QuantizeLinear(image, step, zero)
+            seen = DequantizeLinear(rounded, step, zero)
+            felt = Conv({seen}, weight)
+            leaky = LeakyRelu<alpha = 0.1>(felt)
+            whole = QuantizeLinear(leaky, step, zero)
+            back = DequantizeLinear(whole, step, zero)
+            largest = MaxPool<kernel_shape = [2, 2], strides = [2, 2]>(back)
+            again = QuantizeLinear(largest, step, zero)
+            pooled = DequantizeLinear(again, step, zero)
+        }}""")
+    rng = np.random.default_rng(3)
+    given = {
+        "image": rng.normal(size=(1, 1, 8, 8)).astype(np.float32), "step": np.float32(0.05), "zero": np.uint8(99),
+        "weight": rng.normal(size=(2, 1, 3, 3)).astype(np.float32),
+    }
+    before = onnx.reference.ReferenceEvaluator(made).run(None, given)[0]
+    pool_before_rounding(made.graph)
+    pool = next(each for each in made.graph.node if each.op_type == "MaxPool")
+    assert pool.input[0] == ("leaky" if is_in_float else "back")
+    assert len(made.graph.node) == (7 if is_in_float else 9)
+    np.testing.assert_array_equal(onnx.reference.ReferenceEvaluator(made).run(None, given)[0], before)

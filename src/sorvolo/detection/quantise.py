@@ -3,7 +3,8 @@
 import json
 import logging
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ _CARRIERS = frozenset({
 # carry features on, but one interpolates at places that eight bits cannot name, the other means away their rounding
 _FLOAT = frozenset({"RoiAlign", "ReduceMean"})
 _HALF = 10  # ONNX's number for float16, in which a model may store weights
+_ACTIVATIONS = frozenset({"Relu", "LeakyRelu", "Clip"})
 _READERS = frozenset({"Conv", "Gemm"})
 _PARTS = ("backbone", "head", "neck", "proposals")  # of a network
 
@@ -80,6 +82,7 @@ def quantise(
             op_types_to_quantize=sorted(_CARRIERS - _FLOAT),
         )
         quantised = onnx.load_model(out)
+    pool_before_rounding(quantised.graph)
     if samples.count < LEAST_PICTURES:
         raise InputError(
             f"{samples.count} pictures are too few to measure how large a model's numbers become; needed are "
@@ -115,6 +118,39 @@ def _lies_in_any(node: str, parts: Sequence[str]) -> bool:
 def _lies_in(node: str, part: str) -> bool:
     """Whether a node of the graph, named by its path, belongs to a part of the network."""
     return f"{node}/".startswith(f"/{part}/")
+
+
+def pool_before_rounding(graph: Any) -> None:
+    """Let a pool behind a layer in float take the largest number before it is rounded: the same, and much quicker.
+
+    ONNX Runtime has no quick pool of eight bits, and there is a quarter of the numbers left to round.
+    """
+    makers = {name: node for node in graph.node for name in node.output}
+    readers = Counter(name for node in graph.node for name in node.input)
+    for pool in [node for node in graph.node if node.op_type == "MaxPool"]:
+        back, rounding = _rounding_of(pool.input[0], makers) or (None, None)
+        if back is None or rounding is None or not _is_float(rounding.input[0], makers):
+            continue
+        if readers[back.output[0]] == readers[rounding.output[0]] == 1:  # nobody else wants them
+            pool.input[0] = rounding.input[0]
+            graph.node.remove(back)
+            graph.node.remove(rounding)
+
+
+def _rounding_of(name: str, makers: Mapping[str, Any]) -> tuple[Any, Any] | None:
+    """The nodes that round a tensor and make it float again, the last first; None where it is not rounded."""
+    back = makers.get(name)
+    if back is None or back.op_type != "DequantizeLinear":
+        return None
+    rounding = makers.get(back.input[0])
+    return None if rounding is None or rounding.op_type != "QuantizeLinear" else (back, rounding)
+
+
+def _is_float(name: str, makers: Mapping[str, Any]) -> bool:
+    """Whether a tensor comes out of a layer in float."""
+    while name in makers and makers[name].op_type in _ACTIVATIONS:
+        name = makers[name].input[0]
+    return name in makers and _rounding_of(makers[name].input[0], makers) is None
 
 
 @contextmanager
