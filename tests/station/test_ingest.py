@@ -93,6 +93,21 @@ def test_a_stream_that_falls_silent_after_its_hello_is_free_for_the_drone_s_next
     assert state["frames"] == 1 and [each["is_over"] for each in state["flights"]] == [False]
 
 
+def test_a_stream_of_many_flights_states_its_newest(tmp_path: Path) -> None:
+    """Thousands of its states are kept as events: each with all flights ever, a station would grow with each flight."""
+    folder = tmp_path / "drone"
+    folder.mkdir()
+    for number in range(25):
+        (folder / f"20260101T0000{number:02d}Z_{number:016x}.ts").write_bytes(b"12345")
+    ingest = Ingest(tmp_path, IngestLimits(free_bytes=0))
+    state = ingest.state("drone")
+    assert state["flight_count"] == 25 and len(state["flights"]) == 10
+    assert state["flights"][-1] == {"flight": f"20260101T000024Z_{24:016x}", "bytes": 5, "is_over": False}
+    newest = ingest.newest("drone")
+    assert newest is not None and newest.stem == state["flights"][-1]["flight"]
+    assert ingest.kept_bytes("drone") == 125
+
+
 @pytest.mark.parametrize(("seconds", "is_known"), [(0, True), (-50, True), (-3600, False), (3600, False)])
 def test_the_delay_of_pictures_is_stated_where_the_clocks_agree(tmp_path: Path, seconds: int, is_known: bool) -> None:
     """Clocks apart, or a recorded flight: no page is given the flight's zero to count from."""

@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from sorvolo.station.map_overview import MapOverview
-from sorvolo.station.pyramid import BytesCache, Pyramid
+from sorvolo.station.pyramid import BytesCache, Pyramid, halved
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.tiles import TileView
 
 
 def pyramid(archive: Archive, version: int = 2) -> Pyramid:
@@ -27,6 +29,41 @@ def test_halved_tiles_average_the_ground_and_keep_its_edge(made_site: Path) -> N
         assert state.picture(1, (7, 7)) is None
         edge = pyramid(archive, 1).picture(2, (0, 0))
         assert edge is not None and int(edge[..., 0][edge[..., 3] > 0].min()) >= 42  # the darkest red of any tile
+
+
+@pytest.mark.parametrize("alphas", [(255,), (0, 255), (0, 40, 255), (0,)])
+def test_a_picture_at_half_its_size_is_the_mean_by_alpha(alphas: tuple[int, ...]) -> None:
+    """Of each four pixels, to the gray level; in double precision beside it."""
+    random = np.random.default_rng(len(alphas))
+    rgba = random.integers(0, 256, (32, 48, 4), dtype=np.uint8)
+    rgba[..., 3] = random.choice(alphas, (32, 48))
+    small = halved(rgba)
+    fours = rgba.astype(np.float64).reshape(16, 2, 24, 2, 4)
+    share = fours[..., 3:]
+    total = share.sum(axis=(1, 3))
+    expected = (fours[..., :3] * share).sum(axis=(1, 3)) / np.maximum(total, 1e-9)
+    is_seen = total[..., 0] > 0
+    assert small.shape == (16, 24, 4) and np.abs(small[..., 3] - total[..., 0] / 4).max() <= 0.51
+    assert np.abs(small[..., :3] - expected)[is_seen].max(initial=0.0) <= 0.51
+
+
+def test_a_tile_of_the_web_reads_only_the_tiles_under_it(made_site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While a map grows each of them was painted anew."""
+    with Archive.open(made_site, write=False) as archive:
+        state, read = pyramid(archive), set[tuple[int, int]]()
+        of_site = type(state._tiles).__getitem__
+
+        def noted(view: TileView, index: tuple[int, int]) -> np.ndarray:
+            read.add(index)
+            return of_site(view, index)
+
+        monkeypatch.setattr(type(state._tiles), "__getitem__", noted)
+        side_px, pieces = state.pieces(1)
+        assert side_px == 256 and len(pieces) == 4 > len(state.keys[1])
+        piece = state.piece(1, (0, 0))
+        assert piece is not None and read == {(0, 0)}
+        whole = state.picture(1, (0, 0))
+        assert whole is not None and np.array_equal(whole[:256, :256], piece)
 
 
 def test_the_geotiffs_overviews_are_the_same_tiles(made_site: Path) -> None:

@@ -35,6 +35,7 @@ REFUSED_CODE, BUSY_CODE = 4400, 4503
 _HELLO_S = 10.0
 _SPACE_EVERY_S = 1.0
 _LIVE_NS = 60_000_000_000  # telemetry that is so old was recorded
+_MOST_FLIGHTS_SHOWN = 10  # of a stream, with each of its states: thousands of states are kept
 _MOST_REASON_BYTES = 120  # a close frame holds 123
 
 
@@ -126,10 +127,13 @@ class Ingest:
         return [self.state(name) for name in sorted(names) if is_stream(name)]
 
     def state(self, stream: str) -> dict[str, Any]:
-        """A stream at a glance: its flights, newest last, and what the one that is being sent does."""
+        """A stream at a glance: its newest flights, in order, and what the one that is being sent does."""
         check_stream(stream)
-        flight = self._flights.get(stream)
-        found = {"stream": stream, "is_connected": stream in self._links, "flights": self._kept(stream)}
+        flight, files = self._flights.get(stream), self._files(stream)
+        found = {
+            "stream": stream, "is_connected": stream in self._links, "flight_count": len(files),
+            "flights": [_kept(each) for each in files[-_MOST_FLIGHTS_SHOWN:]],
+        }
         return found | (flight.figures() if flight is not None else {})
 
     def samples(self) -> dict[str, Sample]:
@@ -139,8 +143,12 @@ class Ingest:
 
     def newest(self, stream: str) -> Path | None:
         """The file of the stream's newest flight, which a mission follows; None where there is none."""
-        kept = self._kept(stream)
-        return self._folder / stream / f"{kept[-1]['flight']}.ts" if kept else None
+        files = self._files(stream)
+        return files[-1] if files else None
+
+    def kept_bytes(self, stream: str) -> int:
+        """How much of a stream's flights lies on the disk."""
+        return sum(each.stat().st_size for each in self._files(stream))
 
     def show_boxes(self, found: Mapping[str, Any]) -> None:
         """Give a mission's detections in one frame to whoever watches the stream; from any thread.
@@ -178,12 +186,10 @@ class Ingest:
                 del self._links[stream]
                 self._announce(stream, self.state(stream))
 
-    def _kept(self, stream: str) -> list[dict[str, Any]]:
+    def _files(self, stream: str) -> list[Path]:
+        """The files of a stream's flights, oldest first."""
         folder = self._folder / stream
-        files = sorted(folder.glob("*.ts")) if folder.is_dir() else []
-        return [
-            {"flight": each.stem, "bytes": each.stat().st_size, "is_over": _ended(each).exists()} for each in files
-        ]
+        return sorted(folder.glob("*.ts")) if folder.is_dir() else []
 
     async def _greeted(self, stream: str, link: Link) -> "Flight":
         """The flight that a drone comes with, open for writing. Raises Refusal, InputError or StoreError."""
@@ -387,6 +393,11 @@ def open_flight(folder: Path, hello: Hello) -> Flight:
 def _is_now(sample: Sample) -> bool:
     """Whether telemetry is of a flight that goes on, whose delay can be stated, and not of a recorded one."""
     return abs(time.time_ns() - sample.time_ns) < _LIVE_NS
+
+
+def _kept(path: Path) -> dict[str, Any]:
+    """A flight on the disk as it is listed."""
+    return {"flight": path.stem, "bytes": path.stat().st_size, "is_over": _ended(path).exists()}
 
 
 def _ended(path: Path) -> Path:

@@ -80,7 +80,7 @@ class _StationCollector(Collector):
             connected.add_metric(label, float(state["is_connected"]))
             frames.add_metric(label, state.get("frames", 0))
             rate.add_metric(label, (state.get("frames_per_s") or 0.0) if state["is_connected"] else 0.0)
-            size.add_metric(label, sum(each["bytes"] for each in state["flights"]))
+            size.add_metric(label, self._ingest.kept_bytes(state["stream"]))
             viewers.add_metric(label, self._ingest.viewers(state["stream"]))
         yield from (connected, frames, rate, size, viewers)
 

@@ -60,12 +60,13 @@ class Pyramid:
     """The tiles of one state of a map at halved resolutions. Level 0 is the map's own.
 
     Pictures are known by the hashes of what they are made of: where the map did not change, one made for an earlier
-    state is used again from `cache`. `coarse` may give tiles of levels above 0 without reading what they are made of.
+    state is used again from `cache`. `coarse`, where given, may have tiles of levels above 0 without reading what they
+    are made of.
     """
 
     def __init__(
         self, tiles: TileView, tile_px: int, cache: BytesCache[str, ImageRGBA],
-        coarse: Callable[[int, TileIndex], ImageRGBA | None] = lambda _, __: None,
+        coarse: Callable[[int, TileIndex], ImageRGBA | None] | None = None,
     ) -> None:
         self._tiles, self._cache, self._coarse, self.tile_px = tiles, cache, coarse, tile_px
 
@@ -117,30 +118,69 @@ class Pyramid:
             return self._tiles[index]  # kept by the site's own cache
         return self._cache.get(key, lambda: self._halved(level, index))
 
+    def pieces(self, level: int) -> tuple[int, Mapping[TileIndex, str]]:
+        """How large the pieces of a level are that `piece` gives, px, and what names each.
+
+        Above level 0 a piece is a quarter of a tile: what one tile of the level below becomes. Where a map grows under
+        a view, only the tiles under that view have to be read.
+        """
+        return (self.tile_px, self.keys[0]) if level == 0 else (self.tile_px // 2, self.keys[level - 1])
+
+    def piece(self, level: int, index: TileIndex) -> ImageRGBA | None:
+        """A piece of a level; None where there is none. Raises as `picture` does."""
+        if level == 0:
+            return self.picture(0, index)
+        if self._coarse is None:
+            return self._half_of(level - 1, index)
+        whole, half = self.picture(level, (index[0] // 2, index[1] // 2)), self.tile_px // 2
+        if whole is None:
+            return None
+        left, top = half * (index[0] % 2), half * (index[1] % 2)
+        return whole[top:top + half, left:left + half]
+
+    def _half_of(self, level: int, index: TileIndex) -> ImageRGBA | None:
+        """A tile made smaller, (tile_px / 2, tile_px / 2, 4); None where there is none."""
+        key = self.keys[level].get(index)
+        if key is None:
+            return None
+
+        def made() -> ImageRGBA:
+            part = self.picture(level, index)
+            assert part is not None  # its key is there
+            return halved(part)
+
+        return self._cache.get(f"half {key}", made)
+
     def _halved(self, level: int, index: TileIndex) -> ImageRGBA:
-        given = self._coarse(level, index)
+        given = None if self._coarse is None else self._coarse(level, index)
         if given is not None:
             return given
         half = self.tile_px // 2
         result = np.zeros((self.tile_px, self.tile_px, 4), np.uint8)
         for right in (0, 1):
             for down in (0, 1):
-                part = self.picture(level - 1, (2 * index[0] + right, 2 * index[1] + down))
+                part = self._half_of(level - 1, (2 * index[0] + right, 2 * index[1] + down))
                 if part is not None:
-                    result[down * half:(down + 1) * half, right * half:(right + 1) * half] = _half(part)
+                    result[down * half:(down + 1) * half, right * half:(right + 1) * half] = part
         result.setflags(write=False)
         return result
 
 
-def _half(rgba: ImageRGBA) -> ImageRGBA:
-    """Half the size; colours are averaged where the map is, so that its edges do not darken."""
-    alpha = rgba[..., 3]
-    small_alpha = cv2.resize(alpha, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    if alpha.min() == 255:
-        colours = cv2.resize(rgba[..., :3], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    else:
-        weighted = rgba[..., :3] * (alpha[..., None] / np.float32(255))
-        sums = cv2.resize(weighted, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-        colours = sums / np.maximum(small_alpha[..., None] / np.float32(255), 1e-3)
-        colours = np.clip(np.round(colours), 0, 255).astype(np.uint8)
-    return np.dstack([colours, small_alpha])
+def halved(rgba: ImageRGBA) -> ImageRGBA:
+    """A picture of even sides at half its size, not to be written to.
+
+    Colours are averaged by their alpha, so that the map's edges do not darken. That takes time and is only needed where
+    the alphas of four pixels differ.
+    """
+    small = np.asarray(cv2.resize(rgba, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+    fours = [rgba[down::2, right::2] for down in (0, 1) for right in (0, 1)]
+    alphas = [each[..., 3] for each in fours]
+    lowest, highest = np.minimum.reduce(alphas), np.maximum.reduce(alphas)
+    at = np.nonzero(lowest != highest)
+    if len(at[0]):
+        mixed = np.stack([each[at] for each in fours]).astype(np.float32)
+        share = mixed[..., 3:]
+        colours = (mixed[..., :3] * share).sum(axis=0) / share.sum(axis=0)  # one alpha at least is above 0
+        small[at] = np.round(np.column_stack([colours, share.mean(axis=0)])).astype(np.uint8)
+    small.setflags(write=False)
+    return small

@@ -155,10 +155,10 @@ def holder_in(connection: HTTPConnection) -> Holder:
     return holder
 
 
-def needs(role: Role) -> Callable[[HTTPConnection], Holder]:
+def needs(role: Role) -> Callable[[HTTPConnection], Awaitable[Holder]]:
     """A route's demand: who asks has at least this role. Raises Problem (403)."""
 
-    def demanded(connection: HTTPConnection) -> Holder:
+    async def demanded(connection: HTTPConnection) -> Holder:  # waits for nothing: a plain function costs a thread
         holder = holder_in(connection)
         if holder.role < role:
             raise Problem(403, f"the role {role.word} is needed, this token has {holder.role.word}; ask for another")

@@ -63,11 +63,14 @@ def stream_routes(ingest: Ingest) -> APIRouter:
 
 
 def announcing(events: EventLog) -> Announce:
-    """Stream states as live events; written beside the event loop, as the disk is waited for, and in order."""
+    """Stream states as live events; written beside the event loop, as the disk is waited for, and in order.
+
+    An event names the newest flight alone: thousands of events are kept in memory.
+    """
     writing = ThreadPoolExecutor(1, thread_name_prefix="stream states")  # two threads could swap coming and going
 
     def announce(stream: str, state: Mapping[str, Any]) -> None:
-        event = NewEvent("stream.state", {**state, "stream": stream})
+        event = NewEvent("stream.state", {**state, "stream": stream, "flights": list(state["flights"])[-1:]})
         writing.submit(events.append, event)
 
     return announce
