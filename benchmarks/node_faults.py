@@ -79,7 +79,8 @@ class NodeFaults:
         name, fault = KINDS[kind]
         if not name:
             self._cluster.remove_node(self._draw.choice(sorted(self._cluster.worker_nodes, key=id)), False)
-            self._cluster.add_node(num_cpus=1)
+            with mock.patch.object(signal, "signal"):  # which Ray would set, and cannot from a thread
+                self._cluster.add_node(num_cpus=1)
             return True
         found = sorted(self._processes(name))
         if not found:
