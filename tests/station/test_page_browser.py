@@ -33,6 +33,11 @@ from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
 
 AXE = (Path(__file__).parent / "vendor" / "axe.min.js").read_text(encoding="utf-8")
+BEYOND = """() => {
+  const panel = document.querySelector('.panel'), edge = panel.getBoundingClientRect().right;
+  return [...panel.querySelectorAll('button, select, input')].filter(each => !each.closest('.film, .timeline'))
+    .filter(each => each.getBoundingClientRect().right > edge + 1).map(each => each.outerHTML.slice(0, 90));
+}"""
 MOST_BYTES = 2_500_000  # of the page, cold
 PANELS = ("map", "review", "compare", "place", "draw", "missions", "export")
 
@@ -554,6 +559,29 @@ def test_everybody_can_use_it(browser: Any, served: Served) -> None:
     watched.page.locator("#settings-button").click()
     found["settings"] = serious(watched.page)
     assert {name: each for name, each in found.items() if each} == {}
+    context.close()
+
+
+def test_a_tablet_shows_every_panel_whole(browser: Any, served: Served) -> None:
+    """Upright: no button beyond its panel's edge, facts in lines and not in letters, nothing serious for axe-core."""
+    context = browser.new_context(viewport={"width": 820, "height": 1180}, reduced_motion="reduce")
+    watched = Watched(context, served.url)
+    page = watched.page
+    show(watched, served)
+    page.evaluate(AXE)
+    found, cut = {}, {}
+    for panel in PANELS:
+        if panel != "map":  # which is open; touched again it folds
+            page.locator(f"[data-panel={panel}]").first.click()
+        page.locator(".panel h2").first.wait_for()
+        found[panel] = serious(page)
+        cut[panel] = page.evaluate(BEYOND)
+        if panel == "review":
+            page.locator(".gallery .facts dd").first.wait_for()
+            assert page.locator(".gallery .facts dd").first.evaluate("each => each.offsetWidth") > 200
+    assert {name: each for name, each in found.items() if each} == {}
+    assert {name: each for name, each in cut.items() if each} == {}
+    assert watched.faults == []
     context.close()
 
 
