@@ -203,7 +203,7 @@ def test_contains_does_not_depend_on_where_on_earth(latitude, longitude, corners
     ("# nothing\n", "no coordinates"),
     ("45.0 12.0\n45.01 12.01\n45.0 12.01\n45.01 12.0\n45.0 12.0", "crosses itself"),
 ])
-def test_files_that_are_no_area_say_why(read, text, message):
+def test_files_that_are_no_area_name_the_reason(read, text, message):
     with pytest.raises(InputError, match=message):
         read(text, "bad.txt")
 

@@ -200,7 +200,7 @@ def test_a_file_without_size_is_judged_by_its_optical_centre(read):
     (xml(extra="<distortion_order>k1 k2 k3 k4 k5</distortion_order>"), "does not name"),
     ('<!DOCTYPE a [<!ENTITY b "c">]><a><camera_matrix>&b;</camera_matrix></a>', "broken XML"),
 ])
-def test_broken_files_say_what_is_wrong(read, text, message):
+def test_broken_files_state_what_is_wrong(read, text, message):
     with pytest.raises(InputError, match=message):
         read(text)
 
@@ -218,7 +218,7 @@ def test_files_that_are_none(tmp_path):
         read_camera(tmp_path / "huge.yml", 640, 480)
 
 
-def test_fisheye_zero_is_opencvs_way_to_say_no(read):
+def test_fisheye_zero_is_opencvs_way_of_none(read):
     assert_same(read(xml(extra="<fisheye_model>0</fisheye_model>")).camera, CAMERA)
 
 
@@ -329,7 +329,7 @@ def test_35_mm_equivalents_minding_the_wide_cut():
     assert wide.fx_px == pytest.approx(photo.fx_px)
 
 
-def test_nothing_known_is_a_guess_that_says_what_to_do():
+def test_nothing_known_is_a_guess_that_states_what_to_do():
     found = guess_camera(640, 360)
     assert found.camera.angle_of_view_deg[0] == pytest.approx(70)
     assert found.focal_sigma == 0.2

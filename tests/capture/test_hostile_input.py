@@ -213,7 +213,7 @@ def test_heic_pictures_are_photos(tmp_path: Path, checks: Image.Image) -> None:
         open_sources([tmp_path / "a.mp4"])
 
 
-def test_heic_without_its_extra_says_what_to_install(
+def test_heic_without_its_extra_states_what_to_install(
     tmp_path: Path, checks: Image.Image, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.heic"
@@ -278,7 +278,7 @@ def test_dng_pictures_are_photos(tmp_path: Path) -> None:
         pass
 
 
-def test_dng_without_its_extra_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dng_without_its_extra_states_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "a.dng"
     path.write_bytes(dng_of(np.zeros((64, 64, 3), np.uint8)))
     monkeypatch.setitem(__import__("sys").modules, "rawpy", None)

@@ -255,7 +255,7 @@ def test_streams_that_are_pushed(here: str, there: str, container: str) -> None:
     assert all((b - a) % 38 == 1 for a, b in pairwise(numbers))
 
 
-def test_nothing_there_is_an_error_that_says_so() -> None:
+def test_nothing_there_is_an_error_with_a_reason() -> None:
     port = free_port()
     short = LiveSettings(first_s=0.5)
     with pytest.raises(InputError, match=rf"udp://:{port}: no picture within 0 s .*is the drone sending"):

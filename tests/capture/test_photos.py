@@ -345,7 +345,7 @@ def test_sensefly_angles_count_from_the_nadir(tmp_path: Path, angles: tuple[floa
     assert columns["horizontal_sigma_m"] == 1.5 and columns["vertical_sigma_m"] == 2.5
 
 
-def test_times_are_utc_where_something_says_so(tmp_path: Path) -> None:
+def test_times_are_utc_where_something_states_it(tmp_path: Path) -> None:
     ten_ns = 1_622_541_600 * 1_000_000_000
     gps = read_photo_metadata(write_photo(
         tmp_path / "a.jpg", utc="2021:06:01 10:00:00.5", local="2021:06:01 03:00:00"

@@ -138,7 +138,7 @@ def test_the_camera_fits_the_frames_as_delivered(tmp_path: Path) -> None:
     assert given.camera.angle_of_view_deg[0] == pytest.approx(60)
 
 
-def test_what_is_missing_is_said(tmp_path: Path) -> None:
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no input"):
         open_sources([])
     with pytest.raises(InputError, match=r"no such file or folder: .*nowhere; a video, a folder of photos.*rtsp://"):

@@ -48,7 +48,7 @@ def test_every_reader_is_listed_by_its_own_name():
     (b"offsetTime,Longitude,Latitude\n0,0,0\n", "0/0"),
     (NMEA.replace(b"545", b"546"), "bad checksum"),
 ])
-def test_unusable_files_say_what_was_found(tmp_path, data, words):
+def test_unusable_files_state_what_was_found(tmp_path, data, words):
     path = write(tmp_path / "flight.csv", data)
     with pytest.raises(InputError, match=words) as caught:
         read_telemetry(path)

@@ -150,7 +150,7 @@ def test_a_void_date_does_not_move_the_flight():
     assert codes(telemetry)["no_fix"] == 1
 
 
-def test_no_fix_says_nothing():
+def test_no_fix_shows_nothing():
     text = flight(2) + gga("120002", 48.1, 11.5, quality=0) + gga("120003", 48.1, 11.5)
     telemetry = nmea.read(text.encode(), "a.log")
     assert np.isnan(telemetry["latitude_deg"][2])

@@ -291,7 +291,7 @@ def test_a_date_without_its_zone_is_reported():
     assert codes(flight_table.read(text.encode(), "a.csv"))["time_zone_unknown"] == 3
 
 
-def test_the_barometer_stands_in_for_the_relative_height_and_says_so():
+def test_the_barometer_stands_in_for_the_relative_height_and_reports_it():
     columns = tuple(name for name in COLUMNS if name != "relativeHeight")
     telemetry = flight_table.read(table(columns, 3).encode(), "a.csv")
     assert list(telemetry["height_above_takeoff_m"]) == [0.0, 1.0, 2.0]

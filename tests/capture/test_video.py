@@ -175,7 +175,7 @@ def test_a_raw_stream_without_stamps_is_timed_by_its_rate(tmp_path: Path) -> Non
     ("name", "container_options"), [("a.ts", {}), ("a.mkv", {}), ("a.mp4", FRAGMENTED)],
     ids=["ts", "mkv", "fragmented"],
 )
-def test_a_cut_file_delivers_what_is_there_and_says_so(
+def test_a_cut_file_delivers_what_is_there_and_reports_it(
     tmp_path: Path, name: str, container_options: dict[str, str]
 ) -> None:
     path = write_video(tmp_path / name, 60, container_options=container_options)
@@ -192,7 +192,7 @@ def test_a_whole_file_is_not_called_cut(tmp_path: Path) -> None:
         assert not read_video_info(write_video(tmp_path / name, 5, container_options=options)).is_cut
 
 
-def test_a_cut_mp4_says_that_its_index_is_missing(tmp_path: Path) -> None:
+def test_a_cut_mp4_states_that_its_index_is_missing(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.mp4")
     data = path.read_bytes()
     assert "moov" in top_boxes(path)

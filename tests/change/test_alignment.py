@@ -1,5 +1,7 @@
 """Frames laid over a map: from telemetry that errs, from the frames before, from nothing at all."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ NO_SEARCH = SearchSettings(least_pairs=10**6, weak_pairs=10**6)
 DOWN = np.diag([1.0, -1.0, -1.0])
 
 
+@cache
 def textured(side: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     total = np.zeros((side, side, 3), np.float32)
@@ -34,7 +37,7 @@ GROUND = textured(8 * TILE_PX, 5)  # 102 m square around the site's origin
 SITE_GRID = SiteGrid.at(Geodetic(0.0, 0.0), M_PER_PX, "", TILE_PX)
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def tiles() -> dict:
     """The ground as a map; its north-east tile is a hole."""
     found = {}
@@ -44,6 +47,12 @@ def tiles() -> dict:
             found[column - 4, row - 4] = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
     del found[3, -4]
     return found
+
+
+@pytest.fixture(scope="module")
+def reference(tiles) -> ReferenceMap:
+    """The map, whose features are found once for all tests."""
+    return ReferenceMap(tiles, SITE_GRID.grid)
 
 
 def site_from_ground() -> np.ndarray:
@@ -80,15 +89,15 @@ def error_px(found: Aligned, pose: Pose) -> float:
     return float(np.linalg.norm(miss_m, axis=1).max() / (pose.translation_m[2] / CAMERA.fx_px))
 
 
-def aligner(tiles) -> Aligner:
-    return Aligner(ReferenceMap(tiles, SITE_GRID.grid), SITE_GRID)
+def aligner(reference) -> Aligner:
+    return Aligner(reference, SITE_GRID)
 
 
 @pytest.mark.parametrize("off_m", [(0, 0, 0), (6, -5, 2), (-9, 9, -3)])
 @pytest.mark.parametrize("yaw_deg", [0, 90, 200])
-def test_telemetry_may_be_metres_off(tiles, off_m, yaw_deg):
+def test_telemetry_may_be_metres_off(reference, off_m, yaw_deg):
     pose = Pose(turned(yaw_deg, 3.0), np.array([4.0, -7.0, 30.0]))
-    found = aligner(tiles).align(photographed(pose, gain=0.7), CAMERA, prior_at(pose, off_m, 4.0), 0)
+    found = aligner(reference).align(photographed(pose, gain=0.7), CAMERA, prior_at(pose, off_m, 4.0), 0)
     assert isinstance(found, Aligned)
     assert not found.followed
     assert error_px(found, pose) < 1.0
@@ -96,8 +105,8 @@ def test_telemetry_may_be_metres_off(tiles, off_m, yaw_deg):
     assert found.residual_px < 0.7
 
 
-def test_each_fit_foretells_the_next_although_fixes_jump(tiles):
-    along = aligner(tiles)
+def test_each_fit_foretells_the_next_although_fixes_jump(reference):
+    along = aligner(reference)
     rng = np.random.default_rng(1)
     followed = []
     for k in range(8):
@@ -109,33 +118,33 @@ def test_each_fit_foretells_the_next_although_fixes_jump(tiles):
     assert sum(followed) >= 6
 
 
-def test_another_height_and_flight_direction_fit(tiles):
+def test_another_height_and_flight_direction_fit(reference):
     pose = Pose(turned(300.0), np.array([0.0, 0.0, 55.0]))
-    found = aligner(tiles).align(photographed(pose), CAMERA, prior_at(pose, (2, 1, 0)), 0)
+    found = aligner(reference).align(photographed(pose), CAMERA, prior_at(pose, (2, 1, 0)), 0)
     assert isinstance(found, Aligned)
     assert error_px(found, pose) < 1.0
 
 
-def test_a_frame_without_telemetry_is_found_in_the_whole_map(tiles):
+def test_a_frame_without_telemetry_is_found_in_the_whole_map(reference):
     pose = Pose(turned(25.0), np.array([12.0, 9.0, 30.0]))
     unknown = CameraPrior(np.zeros(3), np.full(3, np.inf), DOWN, np.full(3, np.inf))
-    found = aligner(tiles).align(photographed(pose), CAMERA, unknown, 0)
+    found = aligner(reference).align(photographed(pose), CAMERA, unknown, 0)
     assert isinstance(found, Aligned)
     assert error_px(found, pose) < 1.0
 
 
-def test_other_ground_does_not_fit_and_says_so(tiles):
+def test_other_ground_does_not_fit_and_reports_it(reference):
     pose = Pose(turned(0.0), np.array([0.0, 0.0, 30.0]))
-    found = aligner(tiles).align(photographed(pose, textured(8 * TILE_PX, 77)), CAMERA, prior_at(pose), 0)
+    found = aligner(reference).align(photographed(pose, textured(8 * TILE_PX, 77)), CAMERA, prior_at(pose), 0)
     assert isinstance(found, NotAligned)
     assert not found.is_outside
     assert found.reason
 
 
-def test_a_fit_that_is_too_bad_keeps_the_residual_of_the_best_try(tiles):
+def test_a_fit_that_is_too_bad_keeps_the_residual_of_the_best_try(reference):
     pose = Pose(turned(0.0), np.array([0.0, 0.0, 30.0]))
     strict = AlignmentSettings(most_residual_px=0.01, doubtful_px=0.01, search=NO_SEARCH)
-    found = Aligner(ReferenceMap(tiles, SITE_GRID.grid), SITE_GRID, strict).align(
+    found = Aligner(reference, SITE_GRID, strict).align(
         photographed(pose, gain=0.7), CAMERA, prior_at(pose), 0
     )
     assert isinstance(found, NotAligned)
@@ -146,6 +155,7 @@ def test_a_fit_that_is_too_bad_keeps_the_residual_of_the_best_try(tiles):
     assert _nearer(_nearer(_nearer(unlike, worse), bad), unlike) is bad
 
 
+@cache
 def rebuilt(share: float) -> np.ndarray:
     """The ground with so much of it replaced, in blocks, in other light; the rest has moved by some 0.2 m."""
     rng = np.random.default_rng(8)
@@ -163,13 +173,12 @@ def rebuilt(share: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("yaw_off_deg,height_factor", [(0.0, 1.0), (90.0, 1.0), (0.0, 1.18)])
-def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(tiles, yaw_off_deg, height_factor):
+def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(reference, yaw_off_deg, height_factor):
     pose = Pose(turned(10.0, 1.0), np.array([3.0, -2.0, 30.0]))
     image = photographed(pose, rebuilt(0.6))
     prior = prior_at(Pose(turned(10.0 + yaw_off_deg), pose.translation_m * [1, 1, height_factor]), (1.0, -0.5, 0.0))
     if height_factor > 1:
         prior = CameraPrior(prior.position_m, np.array([2.0, 2.0, 6.0]), prior.rotation, prior.attitude_sigma_deg)
-    reference = ReferenceMap(tiles, SITE_GRID.grid)
     without = Aligner(reference, SITE_GRID, AlignmentSettings(search=NO_SEARCH)).align(image, CAMERA, prior, 0)
     assert isinstance(without, NotAligned)
     found = Aligner(reference, SITE_GRID).align(image, CAMERA, prior, 0)
@@ -178,8 +187,7 @@ def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(tiles, yaw_o
 
 
 @pytest.mark.long
-def test_neighbours_hold_a_frame_of_ground_that_hardly_stayed(tiles):
-    reference = ReferenceMap(tiles, SITE_GRID.grid)
+def test_neighbours_hold_a_frame_of_ground_that_hardly_stayed(reference):
     aligner, alone_px, beside_px = Aligner(reference, SITE_GRID), [], []
     ground = np.concatenate([rebuilt(0.3)[:, :1000], textured(8 * TILE_PX, 31)[:, 1000:]], axis=1)
     for number, east_m in enumerate((-12.0, -6.0, 0.0, 6.0)):
@@ -194,16 +202,15 @@ def test_neighbours_hold_a_frame_of_ground_that_hardly_stayed(tiles):
     assert max(beside_px[2:]) < 0.6 * max(alone_px[2:])
 
 
-def test_beyond_the_map_is_outside(tiles):
+def test_beyond_the_map_is_outside(reference):
     pose = Pose(turned(0.0), np.array([200.0, 0.0, 30.0]))
-    found = aligner(tiles).align(photographed(pose), CAMERA, prior_at(pose), 0)
+    found = aligner(reference).align(photographed(pose), CAMERA, prior_at(pose), 0)
     assert isinstance(found, NotAligned)
     assert found.is_outside
     assert found.reason == "less than 10% of it lies on the map"
 
 
-def test_the_map_is_seen_as_the_camera_saw_it_and_holes_are_unknown(tiles):
-    reference = ReferenceMap(tiles, SITE_GRID.grid)
+def test_the_map_is_seen_as_the_camera_saw_it_and_holes_are_unknown(reference):
     pose = Pose(turned(10.0), np.array([38.0, 38.0, 30.0]))
     grid_from_image = SITE_GRID.grid_from_site_affine(np.zeros(2), 50.0) @ site_from_image_homography(CAMERA, pose)
     seen, known = reference.seen_from(grid_from_image, CAMERA.width_px, CAMERA.height_px)
@@ -222,8 +229,7 @@ def test_a_coarse_view_reads_a_coarse_level(scale, level):
     assert level_for(np.diag([scale, scale, 1.0]), 640, 360) == level
 
 
-def test_levels_lie_over_each_other(tiles):
-    reference = ReferenceMap(tiles, SITE_GRID.grid)
+def test_levels_lie_over_each_other(reference):
     fine = np.array([[1.0, 0, -200], [0, 1, -152], [0, 0, 1]])
     coarse = np.array([[4.0, 0, -200 + 1.5], [0, 4, -152 + 1.5], [0, 0, 1]])
     large, _ = reference.seen_from(fine, 400, 320)
@@ -264,10 +270,10 @@ def test_a_small_view_beside_a_large_one_shows_the_same_and_reads_no_tile(tiles)
     assert apart[0] < 0.5 * min(apart[1:])
 
 
-def test_a_map_that_differs_locally_is_met_by_a_local_fit(tiles):
+def test_a_map_that_differs_locally_is_met_by_a_local_fit(reference):
     """Waves of 0.2 m over ground that changed: the camera's fit alone leaves them."""
     pose = Pose(turned(10.0, 1.0), np.array([3.0, -2.0, 30.0]))
-    found = aligner(tiles).align(photographed(pose, rebuilt(0.4)), CAMERA, prior_at(pose, (1.0, -0.5, 0.0)), 0)
+    found = aligner(reference).align(photographed(pose, rebuilt(0.4)), CAMERA, prior_at(pose, (1.0, -0.5, 0.0)), 0)
     assert isinstance(found, Aligned) and found.local is not None
     assert found.local_m > 0.03
     places = found.local.places_px(CAMERA.width_px, CAMERA.height_px)
@@ -287,8 +293,8 @@ def test_a_map_that_differs_locally_is_met_by_a_local_fit(tiles):
     assert missed(found.local.moved_px.reshape(-1, 2)) < 0.85 * missed(0.0)
 
 
-def test_a_frame_without_gps_is_placed_beside_one_that_was_on_rebuilt_ground(tiles):
-    along, ground = aligner(tiles), rebuilt(0.6)
+def test_a_frame_without_gps_is_placed_beside_one_that_was_on_rebuilt_ground(reference):
+    along, ground = aligner(reference), rebuilt(0.6)
     placed = []
     for number, east_m in enumerate((0.0, 3.0, 6.0)):
         pose = Pose(turned(10.0, 1.0), np.array([east_m, -2.0, 30.0]))
@@ -299,14 +305,14 @@ def test_a_frame_without_gps_is_placed_beside_one_that_was_on_rebuilt_ground(til
         assert isinstance(found, Aligned)
         placed.append(error_px(found, pose) * 30 / CAMERA.fx_px)
     assert max(placed) < 0.7  # m
-    alone = aligner(tiles).align(photographed(pose, ground), CAMERA, prior, 0)
+    alone = aligner(reference).align(photographed(pose, ground), CAMERA, prior, 0)
     assert isinstance(alone, NotAligned)
 
 
 @pytest.mark.long
-def test_one_strip_that_is_not_found_does_not_lose_the_flight(tiles):
+def test_one_strip_that_is_not_found_does_not_lose_the_flight(reference):
     """Photos of other ground between two strips: those before and after are placed as if it had not been."""
-    along, ground = aligner(tiles), rebuilt(0.3)
+    along, ground = aligner(reference), rebuilt(0.3)
     other = textured(8 * TILE_PX, 31)
     for number in range(14):
         pose = Pose(turned(0.0), np.array([-6.0 + number, 0.0, 30.0]))
@@ -318,9 +324,9 @@ def test_one_strip_that_is_not_found_does_not_lose_the_flight(tiles):
         assert lost or error_px(found, pose) * 30 / CAMERA.fx_px < 0.6
 
 
-def test_a_frame_tried_again_is_placed_beside_its_neighbours(tiles):
+def test_a_frame_tried_again_is_placed_beside_its_neighbours(reference):
     """Ground that stayed in its west third only: nothing there places the frame until those beside it have been."""
-    along = aligner(tiles)
+    along = aligner(reference)
     ground = np.concatenate([rebuilt(0.3)[:, :1000], textured(8 * TILE_PX, 31)[:, 1000:]], axis=1)
     poses = [Pose(turned(0.0), np.array([east_m, 0.0, 30.0])) for east_m in (10.0, -12.0, -6.0, 0.0, 5.0)]
 

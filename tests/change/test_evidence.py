@@ -215,7 +215,7 @@ def test_views_with_gaps_between_them_still_add_up():
     assert len(evidence.conclude()) == 1
 
 
-def test_unknown_ground_says_nothing():
+def test_unknown_ground_shows_nothing():
     # the map has a hole over half of the thing, then over all of it
     half = (0.0, -2.0, 3.0, 2.0)
     evidence, _ = collect(flight([Thing(0, 0)], hole_m=half))

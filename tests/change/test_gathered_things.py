@@ -52,7 +52,7 @@ def test_features_differ_where_a_thing_of_the_grounds_brightness_stands_and_not_
     assert np.percentile(apart[elsewhere], 99) < 0.6
 
 
-def test_where_hardly_anything_is_known_nothing_is_said(ground):
+def test_where_hardly_anything_is_known_nothing_is_reported(ground):
     known = np.zeros(ground.shape[:2], bool)
     known[:20, :20] = True
     assert not learned_difference(ground, with_car(ground), known).any()

@@ -107,7 +107,7 @@ def test_things_that_moved_are_not_followed(size: tuple[int, int]) -> None:
     assert np.linalg.norm(at_thing - by_px[place].reshape(-1, 2).mean(axis=0)) < 1.0  # px; it moved by 5
 
 
-def test_the_displacement_is_bounded_in_metres_and_holes_say_nothing() -> None:
+def test_the_displacement_is_bounded_in_metres_and_holes_show_nothing() -> None:
     before, known = texture(1), KNOWN.copy()
     known[:, 400:] = False
     by_px = np.full((HEIGHT, WIDTH, 2), [4.0, 0.0], np.float32)

@@ -96,7 +96,7 @@ def test_flat_pictures_are_equal(value: int) -> None:
     assert not compare_robust(flat, flat).mask.any()
 
 
-def test_bad_input_says_what_is_wrong(ground: np.ndarray) -> None:
+def test_bad_input_states_what_is_wrong(ground: np.ndarray) -> None:
     with pytest.raises(InputError, match="same pixels"):
         compare_robust(ground, ground[:-2])
     with pytest.raises(InputError, match="uint8"):
@@ -128,7 +128,7 @@ def test_trees_know_their_features() -> None:
     assert how_sure(np.zeros((0, len(FEATURES))), FEATURES).shape == (0,)
 
 
-def test_a_flight_tunes_itself_and_says_how(ground: np.ndarray) -> None:
+def test_a_flight_tunes_itself_and_shows_how(ground: np.ndarray) -> None:
     tuning = FlightTuning()
     assert tuning.settings() == RobustSettings() and "nothing" in str(tuning.chosen()["settings"])
     loud = np.random.default_rng(5).normal(0, 14, ground.shape)

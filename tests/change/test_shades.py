@@ -57,7 +57,7 @@ def test_a_dark_thing_hides_the_grounds_structure_and_is_no_shadow() -> None:
     assert np.count_nonzero(compare_robust(before, after).mask[150:220, 200:300]) > 0.8 * 70 * 100
 
 
-def test_nothing_is_said_of_unknown_ground() -> None:
+def test_nothing_is_reported_of_unknown_ground() -> None:
     logarithms = [
         np.rint((np.log2(shaded(ground(), place) + 8.0) - 3) * 2 * STEPS).astype(np.uint8)
         for place in ((200, 180), (250, 190))

@@ -100,7 +100,7 @@ def by_the_text(before: Any, after: Any, parameters: ThesisSettings) -> tuple[An
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 24), st.integers(1, 30)), st.booleans())
-def test_every_pixel_is_as_the_text_says(seed: int, size: tuple[int, int], printed: bool) -> None:
+def test_every_pixel_is_as_the_text_has_it(seed: int, size: tuple[int, int], printed: bool) -> None:
     before, after = pair(seed, size)
     parameters = replace(SMALL, isolation_as_printed=printed)
     mask, boxes = by_the_text(before, after, parameters)

@@ -203,7 +203,7 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
         (RuntimeError("Invalid authentication token"), "the cluster needs another token"),
     ],
 )
-def test_what_ray_says_of_a_cluster_that_takes_no_batch_is_put_in_words(error: Exception, words: str) -> None:
+def test_what_ray_reports_of_a_cluster_that_takes_no_batch_is_put_in_words(error: Exception, words: str) -> None:
     assert words in why_not("ray://10.0.0.1:10001", error)
 
 

@@ -35,7 +35,7 @@ class Disturbed(LocalExecutor):
             os.kill(self._running[key][0].pid, signal.SIGKILL)
 
 
-def test_streams_are_started_again_and_finished_when_told(flown: Path, tmp_path: Path) -> None:
+def test_streams_are_started_again_and_finished_on_request(flown: Path, tmp_path: Path) -> None:
     for name in ("killed", "poisoned"):
         another(flown, tmp_path / "in" / name)
     root, until = tmp_path / "maps", threading.Event()

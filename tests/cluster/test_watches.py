@@ -144,7 +144,7 @@ def test_whose_watch_a_folder_holds(tmp_path: Path) -> None:
     assert [each.path.name for each in find_flights([tmp_path], tmp_path / "maps")] == ["in"]  # crops are no flight
 
 
-def test_what_nobody_was_told_stands_in_the_headline() -> None:
+def test_what_nobody_got_stands_in_the_headline() -> None:
     notices = [
         {"code": "alert_url_failed", "text": "the alert to http://x failed 2 times, last: refused"},
         {"code": "lost_frames", "text": "1 frame could not be used"},

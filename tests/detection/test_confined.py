@@ -63,7 +63,7 @@ def test_it_answers_as_it_would_here(tmp_path: Path) -> None:
     assert described_confined(path.read_bytes(), "toy").info == describe(path.read_bytes(), "toy").info
 
 
-def test_what_is_wrong_with_a_model_is_said_as_it_would_be_here(tmp_path: Path) -> None:
+def test_what_is_wrong_with_a_model_is_reported_as_it_would_be_here(tmp_path: Path) -> None:
     (tmp_path / "junk.onnx").write_bytes(b"junk")
     for opens in (Session, read_info):
         with pytest.raises(InputError, match=r"junk\.onnx"):

@@ -158,7 +158,7 @@ def test_a_model_of_one_size_sees_any_picture(tmp_path: Path) -> None:
     np.testing.assert_allclose(fixed.detect(large, tiles="auto").boxes_px, [(64, 128, 128, 192)], atol=1e-3)
 
 
-def test_says_where_it_runs_and_what_it_is(detector: Detector) -> None:
+def test_states_where_it_runs_and_what_it_is(detector: Detector) -> None:
     assert detector.provider == "ONNX Runtime on the CPU, 1 thread"
     assert detector.classes == CLASSES
     assert (detector.info.name, detector.info.stride, detector.info.best_px["car"]) == ("toy", 32, (16.0, 200.0))
@@ -195,7 +195,7 @@ class TestThermalFramesAndDaylightModels:
         assert len(self.day.detect(grey)) == 0, "0.51 lies below them, above the daylight model's of people"
         assert len(self.day.detect(grey, least_score=0.4)) == 3
 
-    def test_without_one_it_is_said(self, picture: np.ndarray, tmp_path: Path) -> None:
+    def test_without_one_it_is_reported(self, picture: np.ndarray, tmp_path: Path) -> None:
         classes = ["boat", "buoy", "raft"]  # none that the packaged model knows
         stated = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": {each: [4, 300] for each in classes}}
         model = rectangle_model(tmp_path / "sea.onnx", name="sea", thermal=False, classes=classes, **stated)
@@ -221,7 +221,7 @@ class TestThermalFramesAndDaylightModels:
         (notice,) = detector.notices
         assert (notice.code, notice.count) == ("thermal_model", 2) and "'night', which was trained" in notice.text
 
-    def test_a_thermal_model_says_that_colour_is_not_known(self, picture: np.ndarray) -> None:
+    def test_a_thermal_model_states_that_colour_is_not_known(self, picture: np.ndarray) -> None:
         night = rectangle_model(self.folder / "night.onnx", name="night", daylight=False)
         detector = Detector.load(night, provider="cpu", threads=1)
         detector.detect(picture[:, :, 0])

@@ -268,7 +268,7 @@ def test_help_of_every_command_has_an_example(capsys: pytest.CaptureFixture[str]
         assert f"sorvolo models {command}" in " ".join(example.replace("│", " ").split())
 
 
-def test_packaged_models_are_what_their_cards_say() -> None:
+def test_packaged_models_are_what_their_cards_state() -> None:
     packaged = [each for each in installed_models() if each.is_packaged]
     if not packaged:
         pytest.skip("no model comes with this copy of the package")

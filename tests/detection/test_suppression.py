@@ -29,7 +29,7 @@ def test_a_cut_piece_gives_way_to_the_whole() -> None:
     assert found.scores.tolist() == [0.9], "the best of both"
 
 
-def test_of_two_whole_ones_the_more_central_says_where() -> None:
+def test_of_two_whole_ones_the_more_central_states_where() -> None:
     found = merge_tiles([_tile(_LEFT, (82, 40, 92, 50, 0.9, 0)), _tile(_RIGHT, (83, 40, 93, 50, 0.5, 0))], _SIZE)
     np.testing.assert_allclose(found.boxes_px, [[82, 40, 92, 50]])
     mirrored = merge_tiles([_tile(_LEFT, (88, 40, 96, 50, 0.9, 0)), _tile(_RIGHT, (89, 40, 97, 50, 0.5, 0))], _SIZE)

@@ -296,7 +296,7 @@ def test_yaw_that_is_half_a_turn_wrong(photos: Path, photographed: Path, tmp_pat
     assert report["frames"]["vision"] == 12 and report["gps_residual_m"]["rms"] < 0.5
 
 
-def test_photos_that_all_say_0_0_are_mapped_without_a_place(photos: Path, tmp_path: Path) -> None:
+def test_photos_that_all_state_0_0_are_mapped_without_a_place(photos: Path, tmp_path: Path) -> None:
     for path in photos.iterdir():
         with Image.open(path) as image:
             exif = image.getexif()

@@ -144,7 +144,7 @@ def test_views_in_one_corner_are_refused(looked):
         calibrate_camera(small, BOARD)
 
 
-def test_no_board_says_how_to_count(looked):
+def test_no_board_shows_how_to_count(looked):
     with pytest.raises(InputError, match="8x5 inner corners in any of 2 pictures; count"):
         calibrate_camera(looked[-1:] * 2, BOARD)
 

@@ -396,7 +396,7 @@ def test_settings_are_checked(make: Callable[[], object]):
         make()
 
 
-def test_a_site_without_a_map_says_how_to_make_one(flown, tmp_path):
+def test_a_site_without_a_map_shows_how_to_make_one(flown, tmp_path):
     with pytest.raises(StoreError, match="sorvolo map"):
         list(compare_flights([flown / "flight2"], tmp_path / "none", _COMPARE, camera=flown / "camera.xml"))
     assert not (tmp_path / "none").exists()

@@ -100,7 +100,7 @@ def test_it_goes_on_where_it_was(whole: tuple[Path, Path], flown: Path, tmp_path
     assert not list(site.rglob("run.journal"))
 
 
-def test_other_settings_begin_anew_and_say_so(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
+def test_other_settings_begin_anew_and_report_it(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
     site = copy(whole[1], tmp_path)
     with pytest.warns(SorvoloWarning, match="flight2: a run that was stopped cannot continue: .* other settings"):
         updates = compare_flights(
@@ -111,7 +111,7 @@ def test_other_settings_begin_anew_and_say_so(whole: tuple[Path, Path], flown: P
     assert not (site / "flights" / "flight2").exists()
 
 
-def test_another_flight_tells_whose_run_it_ends(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
+def test_another_flight_names_whose_run_it_ends(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
     site = copy(whole[1], tmp_path)
     with pytest.warns(SorvoloWarning, match="a run of flight2 was stopped before it was complete, and cannot continue"):
         updates = map_flights(
@@ -121,7 +121,7 @@ def test_another_flight_tells_whose_run_it_ends(whole: tuple[Path, Path], flown:
         updates.close()
 
 
-def test_method_thesis_begins_anew_and_says_so(flown: Path, tmp_path: Path) -> None:
+def test_method_thesis_begins_anew_and_reports_it(flown: Path, tmp_path: Path) -> None:
     settings = MapSettings(method="thesis", model="none")
     updates = map_flights([flown / "flight1"], tmp_path / "site", settings, camera=flown / "camera.xml")
     next(updates)

@@ -271,7 +271,7 @@ def test_broken_positions_are_refused(site, tmp_path, text):
         evaluate_mosaic(site, positions=path)
 
 
-def test_positions_without_a_column_say_which_there_are(site, tmp_path):
+def test_positions_without_a_column_state_which_there_are(site, tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("name,longitude_deg,latitude_deg\n1,9.2,45.5\n")
     with pytest.raises(InputError, match="no column frame, but name, longitude_deg, latitude_deg; needed are"):

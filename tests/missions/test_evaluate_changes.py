@@ -230,7 +230,7 @@ def test_mask_folders_of_any_form(tmp_path):
     assert (strict.masks.frames.unknown, strict.masks.frames.tn) == (2, 1)
 
 
-def test_what_cannot_be_measured_says_why(site, simulated, tmp_path):
+def test_what_cannot_be_measured_names_the_reason(site, simulated, tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     small = mask_folder(tmp_path / "small", {"0.png": np.zeros((5, 5), np.uint8)})

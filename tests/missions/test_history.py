@@ -126,7 +126,7 @@ def test_the_map_is_written_as_it_was(site: Path, tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"site", "map.tif", "map.png", "map.KMZ"}
 
 
-def test_what_cannot_be_written_is_said(site: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_refused(site: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"\.tif, \.png or \.kmz"):
         export_version(site, None, tmp_path / "map.jpg")
     with pytest.raises(InputError, match="no folder"):

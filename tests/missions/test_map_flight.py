@@ -231,7 +231,7 @@ def test_telemetry_that_ends_before_the_video(filmed: Path, tmp_path: Path) -> N
     assert corner_errors_m(site, "flight1", filmed / "truth")[1] < 2 * _SHAPE_M
 
 
-def test_photos_and_what_frames_geojson_says_of_them(photographed: Path, tmp_path: Path) -> None:
+def test_photos_and_what_frames_geojson_states_of_them(photographed: Path, tmp_path: Path) -> None:
     site, photos = tmp_path / "site", photographed / "flight1" / "photos"
     run_map(site, photos, "--camera", photographed / "camera.xml")
     absolute_m, shape_m = corner_errors_m(site, "photos", photographed / "truth")

@@ -57,7 +57,7 @@ def test_verdicts_are_kept_and_changed(site: Path) -> None:
     (["b-1", "x-9"], None, "x-9"), (["1"], None, "no change 1"), (["3"], "b", "no change 3"),
     ([], None, "no change was"), (["1"], "z", "no flight z"),
 ])
-def test_an_unknown_change_is_named_and_nothing_is_said(
+def test_an_unknown_change_is_named_and_nothing_is_changed(
     site: Path, ids: list[str], flight: str | None, words: str
 ) -> None:
     with pytest.raises(InputError, match=words):
@@ -103,7 +103,7 @@ def test_a_folder_that_is_no_site_is_not_made_one(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
-def test_the_command_lists_and_says(
+def test_the_command_lists_and_gives_verdicts(
     site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "160")
@@ -124,7 +124,7 @@ def test_the_command_lists_and_says(
     (["--reject"], "which changes"), (["nope", "--reject"], "no change nope"),
     (["1", "--reject"], "give --flight as well"),
 ])
-def test_the_command_says_what_is_wrong(
+def test_the_command_states_what_is_wrong(
     site: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
 ) -> None:
     assert main(["review", str(site), *arguments]) == 1

@@ -99,7 +99,7 @@ def test_a_detector_that_sees_all_gives_high_chances_and_the_files_agree(site: P
     assert report["headline"]["text"].startswith("probability of detection of a car")
 
 
-def test_a_blind_detector_finds_nothing_and_the_headline_says_so(site: Path, tmp_path: Path) -> None:
+def test_a_blind_detector_finds_nothing_and_the_headline_reports_it(site: Path, tmp_path: Path) -> None:
     settings = SearchSettings(plants=12, classes=("car",), sun_deg=(215, 48))
     report = _report(site, tmp_path / "out", Comparing(site, sees=False), settings)
     assert report["flights"][0]["classes"]["car"]["found"] == 0

@@ -200,7 +200,7 @@ class _InTheMiddle:
         return Detections(np.array([box]), np.array([0.9]), np.array([CLASSES.index("person")]), CLASSES)
 
 
-def test_heights_without_a_ground_are_said_and_can_be_helped(
+def test_heights_without_a_ground_are_reported_and_can_be_helped(
     flown: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:
     log = flown / "flight1" / "other" / "flight1.nmea"

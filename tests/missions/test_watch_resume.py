@@ -84,7 +84,7 @@ def ids(alerts: Path, count: int) -> list[int]:
     return sent()
 
 
-def test_it_goes_on_and_tells_nobody_twice(video: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_it_goes_on_and_notifies_nobody_twice(video: Path, detector: TruthDetector, tmp_path: Path) -> None:
     whole, amid, alerts = tmp_path / "whole", tmp_path / "amid", tmp_path / "sent"
     reported: list[int] = []
 
@@ -127,7 +127,7 @@ def test_an_alert_that_was_not_sent_is_sent(flown: Path, detector: TruthDetector
     assert ids(tmp_path / "none", len(found)) == found
 
 
-def test_other_settings_begin_anew_and_say_so(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_other_settings_begin_anew_and_report_it(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
     video, folder = flown / "flight1" / "flight1.mp4", tmp_path / "watch"
     updates = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70", detector=detector)
     next(updates)

@@ -71,7 +71,7 @@ def test_a_long_chain_does_not_drift():
     assert max(np.abs(np.log(gain)).max() for gain in found.gains.values()) <= np.log(2) + 1e-9
 
 
-def test_no_links_and_empty_links_say_nothing():
+def test_no_links_and_empty_links_show_nothing():
     assert solve_exposure({}).gains == {}
     empty = ColourPairs(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     found = solve_exposure({(3, 7): empty})

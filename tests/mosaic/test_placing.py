@@ -41,7 +41,7 @@ def test_a_picture_that_sees_the_horizon_is_not_laid():
     assert laid(-15)[1] is None
 
 
-def test_the_record_of_a_rejected_frame_says_why_and_has_no_place():
+def test_the_record_of_a_rejected_frame_names_the_reason_and_has_no_place():
     record = PlacedFrame.rejected(3, "IMG_3.jpg", 17, "blurred", CAMERA)
     assert (record.status, record.reason, record.name, record.time_ns) == (Status.REJECTED, "blurred", "IMG_3.jpg", 17)
     assert record.site_from_camera is None

@@ -72,7 +72,7 @@ def test_each_scoring_of_a_held_out_set_counts(provenance: ModuleType, tmp_path:
 
 
 @pytest.mark.parametrize("name", ["change_events", "change_methods", "watch_counts"])
-def test_published_scores_say_how_often_their_set_was_scored(name: str) -> None:
+def test_published_scores_state_how_often_their_set_was_scored(name: str) -> None:
     result = json.loads((BENCHMARKS / "results" / f"{name}.json").read_text())
     ledger = json.loads((BENCHMARKS / "results" / "scored.json").read_text())
     assert 1 <= result["times_scored"] <= ledger[result["held_out"]]

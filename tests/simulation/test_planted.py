@@ -81,7 +81,7 @@ def test_motion_blur_is_longer_along_the_motion() -> None:
     assert blur_px2[0, 0] > 2.5 * blur_px2[1, 1]
 
 
-def test_dark_noisy_and_thermal_frames_are_told_apart() -> None:
+def test_dark_noisy_and_thermal_frames_are_distinguished() -> None:
     rng = np.random.default_rng(2)
     noisy = np.clip(_ground() + rng.normal(0, 6, (480, 640, 3)), 0, 255).astype(np.uint8)
     assert frame_light(noisy).noise == pytest.approx(6, rel=0.3)

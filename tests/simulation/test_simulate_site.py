@@ -131,7 +131,7 @@ def test_the_video_holds_every_frame_at_its_time(site):
     assert np.allclose(times, np.array(expected) / 5, atol=1e-9)
 
 
-def test_every_format_says_the_same_place(site):
+def test_every_format_gives_the_same_place(site):
     flight = next(simulate_flights(SMALL))
     for name in ("flight1.csv", "other/flight1.srt", "other/flight1_old_dialect.srt", "other/flight1.nmea",
                  "other/flight1.gpx"):

@@ -150,7 +150,7 @@ def test_a_killed_mission_is_named_and_the_next_one_may_start(open_station: Call
     assert [each["state"] for each in client.get("/api/runs").json()] == ["stopped", "failed"]
 
 
-def test_a_mission_that_cannot_do_its_work_says_why(open_station: Callable[[], TestClient]) -> None:
+def test_a_mission_that_cannot_do_its_work_names_the_reason(open_station: Callable[[], TestClient]) -> None:
     """The same words as on the command line."""
     client = open_station()
     order = wish(client)

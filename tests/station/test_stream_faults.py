@@ -191,7 +191,7 @@ def test_pictures_that_no_browser_plays_are_refused_at_once(tmp_path: Path) -> N
         open_footage(str(video), None, None, LiveSettings(), threading.Event())
 
 
-def test_a_stream_that_is_not_what_it_says_is_refused(flight: Path, tmp_path: Path) -> None:
+def test_a_stream_that_is_not_what_it_states_is_refused(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams") as server:
         sending = client(flight, server, tmp_path / "spool")
         object.__setattr__(sending._footage.format, "codec", "hevc")

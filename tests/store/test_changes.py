@@ -92,7 +92,7 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
     assert "version 1: flight a, flown 2023-11-14" in page and "version 2: flight b" in page
 
 
-def test_the_geojson_says_what_is_promised_in_wgs84(folder: Path) -> None:
+def test_the_geojson_states_what_is_promised_in_wgs84(folder: Path) -> None:
     with Archive.open(folder, write=True) as archive:
         compare(archive, "b", [fake_change(3, score=0.875)])
         site = archive.site()
@@ -116,7 +116,7 @@ def test_the_geojson_says_what_is_promised_in_wgs84(folder: Path) -> None:
     assert np.allclose(feature["outline_m"], fake_change(3).outline_m, atol=1e-4)
 
 
-def test_a_local_site_writes_no_places_on_earth_and_says_why(tmp_path: Path) -> None:
+def test_a_local_site_writes_no_places_on_earth_and_names_the_reason(tmp_path: Path) -> None:
     with Archive.open(tmp_path / "site", write=True) as archive:
         archive.create_site(LOCAL_SITE)
         map_flight(archive, "a", 20, count=1)
@@ -168,7 +168,7 @@ def test_any_change_makes_plain_json(places: list[tuple[float, float, float]]) -
     assert json.loads(json.dumps(collection, allow_nan=False)) == collection
 
 
-def test_a_comparison_without_changes_says_so_and_a_mapping_says_nothing(folder: Path) -> None:
+def test_a_comparison_without_changes_reports_that_and_a_mapping_nothing(folder: Path) -> None:
     with Archive.open(folder, write=True) as archive:
         compare(archive, "b", [])
         assert list(archive.comparisons()) == [2]
@@ -274,7 +274,7 @@ def test_a_verdict_reaches_the_files_and_outlives_the_run(folder: Path) -> None:
 
 
 @pytest.mark.usefixtures("kind")
-def test_an_unknown_id_is_named_and_nothing_is_said(folder: Path) -> None:
+def test_an_unknown_id_is_named_and_nothing_is_changed(folder: Path) -> None:
     with Archive.open(folder, write=True) as archive:
         compare(archive, "b", [fake_change(1)])
         with pytest.raises(InputError, match="b-9"):
@@ -284,7 +284,7 @@ def test_an_unknown_id_is_named_and_nothing_is_said(folder: Path) -> None:
         archive.review("b-1", Verdict.REJECTED)
 
 
-def test_masks_say_changed_unchanged_and_unknown(folder: Path) -> None:
+def test_masks_state_changed_unchanged_and_unknown(folder: Path) -> None:
     changed = np.zeros((6, 8), np.uint8)
     changed[2:4, 3:6] = 255
     valid = np.ones((6, 8), bool)

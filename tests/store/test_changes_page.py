@@ -122,7 +122,7 @@ def test_the_headline_counts_and_does_not_count_what_moves() -> None:
     ({"reasons": {"too few points fit": 9}}, "too few points fit"),
     ({"candidates": {"withdrawn": {"a passing shadow": 2}}}, "a passing shadow"),
 ])
-def test_what_was_not_compared_is_said(changed: dict[str, Any], words: str) -> None:
+def test_what_was_not_compared_is_reported(changed: dict[str, Any], words: str) -> None:
     report = fake_report(5) | {"warnings": [], "comparison": fake_comparison(**changed)}
     assert words in "".join(checked(page_of([], report)).text)
 
@@ -184,7 +184,7 @@ def test_times_without_a_date_are_times_into_the_flight() -> None:
     assert "2:05 into the flight" in page and "1970" not in page and "2023-11-14 22:13:23" in page
 
 
-def test_pictures_that_are_gone_are_said_to_be() -> None:
+def test_pictures_that_are_gone_are_reported_to_be() -> None:
     changes = [fake_change(1)]
     page = changes_page({}, stored_changes("b", changes), None, None, LOCAL_SITE, {})
     assert page.count("the picture is missing") == 2

@@ -30,7 +30,7 @@ def _track(**changes: Any) -> Track:
     return replace(track, **changes)
 
 
-def test_an_event_says_where_what_and_how_long() -> None:
+def test_an_event_states_where_what_and_how_long() -> None:
     event = fromstring(cot_event(_track(), _SITE, uid="sorvolo.f.7", now_ns=_NOW_NS, stale_s=120))
     assert event.tag == "event" and event.get("version") == "2.0"
     assert (event.get("uid"), event.get("type"), event.get("how")) == ("sorvolo.f.7", "a-u-G", "m-g")

@@ -310,7 +310,7 @@ def test_okutama_is_scaled_from_the_original_and_lost_people_are_left_out(tmp_pa
     assert notices(labelled) == {"labels_without_picture": 1, "scaled_labels": 3}
 
 
-def test_okutama_without_frames_says_how_to_lay_them(tmp_path):
+def test_okutama_without_frames_shows_how_to_lay_them(tmp_path):
     put.put_text(tmp_path / "1.1.1.txt", '0 1200 600 1260 720 0 0 0 0 "Person"\n')
     put.put_picture(tmp_path / "other" / "0.jpg")
     with pytest.raises(InputError, match=r"1\.1\.1/000123\.jpg"):
@@ -434,7 +434,7 @@ def test_a_turned_box_is_where_the_turned_picture_shows_it(orientation):
     assert box.tolist() == [x.min(), y.min(), x.max() + 1, y.max() + 1]
 
 
-def test_what_is_no_set_of_labelled_pictures_says_so(tmp_path):
+def test_what_is_no_set_of_labelled_pictures_is_refused(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         read_dataset(tmp_path / "nowhere")
     with pytest.raises(InputError, match="holds no pictures"):

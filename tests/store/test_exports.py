@@ -54,7 +54,7 @@ def test_a_frame_is_the_ground_polygon_of_its_corners_in_order() -> None:
     assert max(len(str(number).split(".")[1]) for number in ring[0]) >= 9
 
 
-def test_a_frames_properties_say_where_its_camera_was() -> None:
+def test_a_frames_properties_state_where_its_camera_was() -> None:
     properties = feature(frames_geojson([frame(2)], SITE))["properties"]
     camera_m = SITE.frame.site_from_wgs84(
         np.array([properties["camera_latitude_deg"]]), np.array([properties["camera_longitude_deg"]]),
@@ -122,7 +122,7 @@ def test_a_feature_is_a_line_whatever_its_values_are() -> None:
         assert [json.loads(line.rstrip(",")) for line in lines[1:-1]] == [{"a": written}, {"b": 1}]
 
 
-def test_plain_json_says_what_json_can() -> None:
+def test_plain_json_holds_what_json_can() -> None:
     @dataclass(frozen=True)
     class Settings:
         gsd_m: float
@@ -290,7 +290,7 @@ def test_the_same_map_gives_the_same_kmz(tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "one.kmz").read_bytes() == (tmp_path / "two.kmz").read_bytes()
 
 
-def test_a_site_says_what_its_height_is_counted_from() -> None:
+def test_a_site_states_what_its_height_is_counted_from() -> None:
     above_takeoff = replace(SITE, origin=Geodetic(46.5, 13.25, 0.0), height_reference="above take-off")
     properties = feature(frames_geojson([frame(0)], above_takeoff))["properties"]
     assert (properties["camera_height_m"], properties["height_reference"]) == (20, "above take-off")

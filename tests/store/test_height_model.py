@@ -51,7 +51,7 @@ def test_between_pixels_a_slope_is_met_exactly(tmp_path: Path) -> None:
     assert np.isnan(model.at(np.array([12.7, np.nan]), np.array([41.895, 41.895]))).all()
 
 
-def test_a_large_model_is_read_coarser_and_says_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_model_is_read_coarser_and_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(height_model, "_MOST_PX", 40)
     model = read_height_model(slope(tmp_path / "fine.tif"), _BOUNDS_DEG)
     assert max(model.heights_m.shape) <= 40

@@ -98,7 +98,7 @@ def _refused(words: str) -> None:
     (507, "XMinioStorageFull", "the store is full"),
     (418, "Teapot", "the store answered 418 Teapot"),
 ])
-def test_each_refusal_says_what_to_do(server: _Server, status: int, code: str, words: str) -> None:
+def test_each_refusal_states_what_to_do(server: _Server, status: int, code: str, words: str) -> None:
     server.answer = lambda request: request.refuse(status, code)
     _refused(words)
     assert server.asked <= 4  # 503 is asked again, within limits

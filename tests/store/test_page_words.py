@@ -10,5 +10,5 @@ from sorvolo.store.pages.words import count_words
     ({"person": 4, "car": 3}, "4 people, 3 cars"),
     ({"car": 0}, "nothing"),
 ])
-def test_counts_are_said_in_english(counts: dict[str, int], words: str) -> None:
+def test_counts_are_given_in_english(counts: dict[str, int], words: str) -> None:
     assert count_words(counts) == words

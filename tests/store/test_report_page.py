@@ -144,7 +144,7 @@ def test_local_map_promises_no_metres() -> None:
     assert "units" not in words and "GPS fix" not in words and "position accuracy" not in words.lower()
 
 
-def test_scale_bar_is_as_long_as_it_says() -> None:
+def test_scale_bar_is_as_long_as_it_states() -> None:
     report, picture = fake_report(), fake_picture(400, 200)
     report["area_m2"] = np.count_nonzero(picture[..., 3]) * 0.25**2  # 0.25 m a pixel: 100 m wide
     share, length = re.search(
@@ -153,7 +153,7 @@ def test_scale_bar_is_as_long_as_it_says() -> None:
     assert float(length) / (float(share) / 100) == pytest.approx(100.0, rel=1e-3)
 
 
-def test_unknown_numbers_are_said_or_left_out() -> None:
+def test_unknown_numbers_are_stated_or_left_out() -> None:
     report = _without_numbers(plain_json(fake_report()))
     words = _words(report_page(report, fake_picture(60, 40)))
     assert "None" not in words and "nan" not in words.lower().split()

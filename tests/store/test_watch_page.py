@@ -31,7 +31,7 @@ def _track(number: int, **changes: Any) -> dict[str, Any]:
     return track | changes
 
 
-def test_a_page_says_what_where_and_how_sure() -> None:
+def test_a_page_states_what_where_and_how_sure() -> None:
     tracks = [_track(1), _track(2, **{"class": "car", "velocity_m_s": [3.0, 4.0]})]
     way_m = np.column_stack([np.linspace(0, 50, 9), np.zeros(9)])
     page = checked(watch_page(_REPORT, tracks, {1: b"\xff\xd8picture"}, way_m))
@@ -54,7 +54,7 @@ def test_neighbours_on_the_map_have_names_that_can_be_read() -> None:
     assert (apart | np.eye(5, dtype=bool)).all()
 
 
-def test_a_day_is_said_once_in_a_row() -> None:
+def test_a_day_is_given_once_in_a_row() -> None:
     days = {"first_seen": "2026-05-01T23:59:58Z", "last_seen": "2026-05-02T00:00:01Z"}
     page = watch_page(_REPORT, [_track(1), _track(2, **days)], {}, np.zeros((0, 2)))
     assert ">2026-05-01 10:00:00<" in page and ">10:00:09<" in page and ">2026-05-02 00:00:01<" in page

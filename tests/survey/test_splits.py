@@ -60,7 +60,7 @@ def test_the_seed_decides_and_the_order_does_not():
     assert len({held_out(whole, seed) for seed in range(6)}) >= 4
 
 
-def test_too_few_videos_and_impossible_shares_are_said():
+def test_too_few_videos_and_impossible_shares_are_reported():
     with pytest.raises(InputError, match=r"2 videos cannot make 3 parts.*blocks"):
         split_by_group(videos(5, 5), SHARES)
     for shares in ({}, {"train": 0.5}, {"train": 1.2, "test": -0.2}):

@@ -91,7 +91,7 @@ def test_a_wrong_compass_shows_in_the_way_that_the_ground_takes(off_deg: float) 
     assert compass.clockwise_deg * off_deg >= 0
 
 
-def test_hovering_says_nothing_of_the_compass() -> None:
+def test_hovering_shows_nothing_of_the_compass() -> None:
     compass, random = CompassError(), np.random.default_rng(5)
     for frame in range(200):
         compass.add(0.2 * frame, random.normal(0, 0.3, 2), random.normal(0, 1.0, 2))

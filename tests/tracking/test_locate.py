@@ -167,7 +167,7 @@ def test_a_height_model_is_met_where_the_ray_meets_it():
     ({"rotation": site_from_gimbal_rotation(0.0, -2.0, 0.0)}, "no better than"),
     ({"position_m": np.array([0.0, 0.0, -3.0])}, "not above the ground"),
 ])
-def test_what_has_no_place_says_why(change, words):
+def test_what_has_no_place_names_the_reason(change, words):
     sighting, unlocated = place(one([CAMERA.cx_px, CAMERA.cy_px]), replace(PRIOR, **change))
     assert sighting is None
     ((reason, count),) = unlocated.items()
@@ -186,7 +186,7 @@ def test_nothing_found_is_nothing_placed():
     assert locate(no_detections(CLASSES), 0, "0", 0, CAMERA, PRIOR)[0] == []
 
 
-def test_places_from_sixty_metres_are_as_good_as_they_say():
+def test_places_from_sixty_metres_are_as_good_as_they_state():
     """Boxes of a simulated flight, GPS of 1.5 m, gimbal of 0.5 degrees: at most 2 m rms, 90 to 99 % in 2 sigma."""
     settings = SimulationSettings(
         seed=21, flights=1, scene=SceneSettings("dirt", people=12, cars=6, small_objects=6, has_scenery=False),

@@ -56,7 +56,7 @@ def test_an_aslant_view_shows_far_cars_smaller() -> None:
     assert scene.impossible(seen, SIZE_PX).tolist() == [False, False, True]
 
 
-def test_too_few_cars_or_sizes_of_all_kinds_tell_nothing() -> None:
+def test_too_few_cars_or_sizes_of_all_kinds_show_nothing() -> None:
     few, mixed = SceneScale(), SceneScale()
     few.see(street(10.0, count=5), SIZE_PX)
     mixed.see(found([("car", 300, 200, 2.0 ** k, 2.0 ** k) for k in range(1, 8)] * 2), SIZE_PX)

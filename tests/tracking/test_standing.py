@@ -127,7 +127,7 @@ def test_what_one_strip_only_cuts_is_no_second_object(yaw_deg: float) -> None:
     assert all(abs(each.size_m[0] - 4.4) < 0.8 for each in fused.objects)
 
 
-def test_what_every_frame_cuts_has_no_size_and_a_place_that_says_so() -> None:
+def test_what_every_frame_cuts_has_no_size_and_a_place_with_its_error() -> None:
     """A car beyond the rim of what was flown: reported once, its place within the stated sigma, its length unknown."""
     frames = survey()
     fused = fuse(sightings(frames, [("car", 16.0, -18.0, 90.0, (0.0, 0.0))], misses=0.0, least_shown=0.2), frames)

@@ -126,7 +126,7 @@ def test_a_head_for_people_finds_them_and_nanodet_supports_it() -> None:
 
 
 @pytest.mark.parametrize("has_people", [False, True])
-def test_its_onnx_file_says_what_torch_says_and_can_be_learnt_on_from(tmp_path: Path, has_people: bool) -> None:
+def test_its_onnx_file_gives_what_torch_gives_and_can_be_learnt_on_from(tmp_path: Path, has_people: bool) -> None:
     torch.manual_seed(2)
     aerial = fast(CLASSES).eval()
     torch.nn.init.normal_(aerial.head.scores.weight, std=0.3)

@@ -158,7 +158,7 @@ def test_bins_and_cells_are_boxes_around_the_cells_centre() -> None:
     np.testing.assert_allclose(boxes[4], [12 - 8, 12 - 16, 12 + 24, 12 + 32], atol=1e-4)
 
 
-def test_the_onnx_file_says_what_torch_says_at_any_size(tmp_path: Path) -> None:
+def test_the_onnx_file_gives_what_torch_gives_at_any_size(tmp_path: Path) -> None:
     torch.manual_seed(4)
     head = NanoDetHead(6)
     for layer in head.outputs:

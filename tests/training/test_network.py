@@ -122,7 +122,7 @@ def test_a_small_network_learns_what_it_has_not_seen(trained):
     assert _found_share(tiny(), unseen) < 0.1
 
 
-def test_the_exported_graph_says_what_torch_says(trained):
+def test_the_exported_graph_gives_what_torch_gives(trained):
     model = trained[0].average
     exported = export_onnx(model, {"classes": ["square", "disc"], "name": "tiny"})
     rng = np.random.default_rng(3)
@@ -204,7 +204,7 @@ def test_a_residual_stack_adds_nothing_at_first():
         assert torch.allclose(stack(features), stack.standard(features), atol=1e-6)
 
 
-def test_every_stem_says_how_wide_it_is():
+def test_every_stem_shows_how_wide_it_is():
     for kind in ("standard", "extended", "extended-residual"):
         for light in (True, False):
             stem = proposal_stem(kind, 16, 16, light=light).eval()
