@@ -89,3 +89,19 @@ def test_files_of_tests_have_names_of_their_own() -> None:
     """Pytest imports them by their bare names: of two alike it collects one."""
     names = [path.name for path in (ROOT / "tests").rglob("*.py") if path.name != "conftest.py"]
     assert sorted(names) == sorted(set(names))
+
+
+def test_pages_help_and_docs_are_in_plain_english() -> None:
+    """The glossary of CONTRIBUTING.md: report, announce, state, name, estimate in place of telling and saying."""
+    words = re.compile(r"\b(told|tells|says|said|saying)\b|(?<![a-z])(as_told|teller)(?![a-z])", re.IGNORECASE)
+    texts = [
+        path for folder, endings in (("src", (".py", ".html", ".js")), ("docs", (".md",)))
+        for path in (ROOT / folder).rglob("*") if path.suffix in endings
+    ]
+    found = [
+        f"{path.relative_to(ROOT)}, line {number}: {line.strip()[:100]}"
+        for path in [*texts, ROOT / "README.md"]
+        if not {"vendor", "decisions"} & set(path.parts)  # libraries of others; how it came about
+        for number, line in enumerate(path.read_text().splitlines(), start=1) if words.search(line)
+    ]
+    assert not found, "\n".join(found)

@@ -41,3 +41,12 @@ def client(root: Path) -> Iterator[TestClient]:
     """A browser on the station's own machine."""
     with TestClient(station_app(StationSettings(root)), base_url=HOST, client=("127.0.0.1", 5000)) as client:
         yield client
+
+
+@pytest.fixture(scope="module")
+def reader(made_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+    """A browser at a station that all tests of a module share: for requests that change nothing there."""
+    root = tmp_path_factory.mktemp("shared") / "maps"
+    shutil.copytree(made_site, root / "field")
+    with TestClient(station_app(StationSettings(root)), base_url=HOST, client=("127.0.0.1", 5000)) as client:
+        yield client

@@ -109,18 +109,18 @@ def test_the_growing_map_is_shown_while_a_flight_is_mapped(client: TestClient, r
 @pytest.mark.parametrize("path", [
     "tiles/2/20/0/0.webp", "tiles/2/3/4/2.webp", "tiles/live/20/5/5.png",
 ])
-def test_where_the_map_is_not_there_is_no_tile(client: TestClient, path: str) -> None:
+def test_where_the_map_is_not_there_is_no_tile(reader: TestClient, path: str) -> None:
     """The other side of the Earth, and far out, have no picture; that is no error."""
-    assert client.get(f"{FIELD}/{path}").status_code == 204
+    assert reader.get(f"{FIELD}/{path}").status_code == 204
 
 
 @pytest.mark.parametrize("path", [
     "/api/sites/nowhere", f"{FIELD}/tiles/9/20/1/1.webp", f"{FIELD}/tiles/2/40/1/1.webp", f"{FIELD}/tiles/x/2/1/1.webp",
     "/api/nothing",
 ])
-def test_problems_are_documents(client: TestClient, path: str) -> None:
+def test_problems_are_documents(reader: TestClient, path: str) -> None:
     """RFC 9457: title, status, detail."""
-    answer = client.get(path)
+    answer = reader.get(path)
     assert answer.status_code == 404
     assert answer.headers["content-type"] == "application/problem+json"
     assert answer.json()["status"] == 404 and answer.json()["title"] and answer.json()["detail"]

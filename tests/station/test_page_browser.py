@@ -130,7 +130,7 @@ def test_changes_are_judged_with_the_keyboard_and_others_see_it(
     page.keyboard.press("n")
     page.keyboard.type("seen on foot")
     page.keyboard.press("Enter")
-    page.locator(".gallery .said", has_text="seen on foot").wait_for()
+    page.locator(".gallery .remark", has_text="seen on foot").wait_for()
     page.keyboard.press("c")
     other.page.locator(f".strip button.confirmed[data-id='{first}']").wait_for()
     page.locator(f".strip [aria-current]:not([data-id='{first}'])").wait_for()  # the next one is up

@@ -39,15 +39,15 @@ def test_every_flight_that_saw_a_place_is_remembered_in_order(client: TestClient
 
 
 @pytest.mark.parametrize("query", ["lon=0&lat=0", "lon=-170&lat=80"])
-def test_nobody_saw_other_places(client: TestClient, query: str) -> None:
+def test_nobody_saw_other_places(reader: TestClient, query: str) -> None:
     """An empty list."""
-    assert client.get(f"/api/sites/field/place?{query}").json() == []
+    assert reader.get(f"/api/sites/field/place?{query}").json() == []
 
 
 @pytest.mark.parametrize("query", ["lon=0", "lat=91&lon=0", "lat=a&lon=0", "lat=nan&lon=0"])
-def test_what_is_no_place(client: TestClient, query: str) -> None:
+def test_what_is_no_place(reader: TestClient, query: str) -> None:
     """422 in words."""
-    assert client.get(f"/api/sites/field/place?{query}").status_code == 422
+    assert reader.get(f"/api/sites/field/place?{query}").status_code == 422
 
 
 def test_the_frame_of_a_number_is_that_frame(tmp_path: Path) -> None:

@@ -41,9 +41,9 @@ def test_the_map_as_ogc_tiles(client: TestClient) -> None:
     ("tiles/WebMercatorQuad/{}?expression=1%2B1", 200), ("statistics", 404), ("preview", 404), ("map.html", 404),
     ("tiles/WebMercatorQuad/{}?algorithm=contours", 422), ("tiles/WebMercatorQuad/{}?rescale=x", 422),
 ])
-def test_what_would_cost_too_much_is_not_there(client: TestClient, path: str, status: int) -> None:
+def test_what_would_cost_too_much_is_not_there(reader: TestClient, path: str, status: int) -> None:
     """No sizes without bound, no expressions, nothing that reads the whole raster."""
-    assert client.get(f"{COG}/{path.format(corner_tile(client) + '.png')}").status_code == status
+    assert reader.get(f"{COG}/{path.format(corner_tile(reader) + '.png')}").status_code == status
 
 
 def test_files_come_by_id_and_are_geotiffs(client: TestClient, root: Path, tmp_path: Path) -> None:

@@ -60,16 +60,16 @@ def refused(client: TestClient, address: str, **headers: str) -> int:
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8750", "", "[::2]"])
-def test_a_forged_host_is_refused(client: TestClient, host: str) -> None:
+def test_a_forged_host_is_refused(reader: TestClient, host: str) -> None:
     """A page whose name was pointed to this machine (DNS rebinding) sends its own name."""
-    assert client.get("/api/status", headers={"host": host}).status_code == 421
-    assert refused(client, SOCKET, host=host) in (421, 4421)
+    assert reader.get("/api/status", headers={"host": host}).status_code == 421
+    assert refused(reader, SOCKET, host=host) in (421, 4421)
 
 
 @pytest.mark.parametrize("host", ["localhost:8750", "127.0.0.1", "[::1]:8750", "LOCALHOST"])
-def test_this_machines_names_are_right(client: TestClient, host: str) -> None:
+def test_this_machines_names_are_right(reader: TestClient, host: str) -> None:
     """However they are written."""
-    assert client.get("/api/status", headers={"host": host}).status_code == 200
+    assert reader.get("/api/status", headers={"host": host}).status_code == 200
 
 
 def test_names_are_known_on_other_addresses_too(root: Path) -> None:
@@ -354,9 +354,9 @@ def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
     "/api/sites/field/tiles/..%2f1/18/1/1.webp", "/api/sites/station/tiles/1/18/1/1.webp", "/station/station.db",
     "/api/streams/..%2f..",
 ])
-def test_no_path_leads_outside(client: TestClient, path: str) -> None:
+def test_no_path_leads_outside(reader: TestClient, path: str) -> None:
     """Names are looked up, never followed."""
-    answer = client.get(path)
+    answer = reader.get(path)
     assert answer.status_code in (400, 404, 405), path
     assert b"root:" not in answer.content and b"SQLite" not in answer.content and b"import" not in answer.content
 

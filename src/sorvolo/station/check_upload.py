@@ -51,7 +51,7 @@ def _video(part: Path, container: str) -> dict[str, Any]:
     with part.open("rb") as file:
         head = file.read(16)
     if not _has_signature(head, container):
-        raise Refusal(f"its content is no {container} video, whatever its name says")
+        raise Refusal(f"its content is no {container} video, whatever its name is")
     try:
         # the demuxer is given: a playlist or a list of files in disguise would make FFmpeg open other things
         with av.open(str(part), format=container, options={"protocol_whitelist": "file"}) as video:
@@ -171,13 +171,13 @@ def _check_picture(path: Path) -> None:
         head = file.read(12)
     if path.suffix.lower() in _SIGNATURES:  # their decoders are the mission's; their size is bounded there
         if not any(head[at:at + len(sign)] == sign for at, sign in _SIGNATURES[path.suffix.lower()]):
-            raise Refusal(f"{path.name} is no {path.suffix[1:].upper()} picture, whatever its name says")
+            raise Refusal(f"{path.name} is no {path.suffix[1:].upper()} picture, whatever its name is")
         return
     try:
         with Image.open(path, formats=_PICTURE_FORMATS) as picture:
             width_px, height_px = picture.size
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise Refusal(f"{path.name} is no picture that can be read, whatever its name says") from error
+        raise Refusal(f"{path.name} is no picture that can be read, whatever its name is") from error
     if not 0 < width_px * height_px <= _MOST_PIXELS:
         raise Refusal(f"{path.name} has {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken")
 

@@ -35,7 +35,7 @@ export function verdictLine(feature) {
   const { review, reviewer, reviewed_at: at, note } = feature.properties;
   if (!review && !note) return el("p", { class: "verdict none" }, "Not reviewed yet");
   return el("p", { class: `verdict ${review || "none"}` }, el("b", {}, wordsOf(review)),
-    reviewer ? ` by ${reviewer}` : "", at ? `, ${words.time(at)}` : "", note ? el("span", { class: "said" }, ` “${note}”`) : "");
+    reviewer ? ` by ${reviewer}` : "", at ? `, ${words.time(at)}` : "", note ? el("span", { class: "remark" }, ` “${note}”`) : "");
 }
 
 /** Buttons and a note for a feature. */
