@@ -1,6 +1,6 @@
 """The true orthophoto: each piece of ground seen by a photo that nothing hides it from, on its own height."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -30,6 +30,7 @@ class OrthophotoSettings:
     hidden_cells: float = 3.0  # a height this much above the line of sight, in cells, hides what is behind
     hidden_merit: float = 0.02  # of a photo that does not see the ground, against one that does
     block_tiles: int = 2  # painted together, to a side: what is painted around them is a smaller share
+    strip_blocks: int = 2  # high, painted to and fro: blocks that follow each other show the same few photos
 
 
 def paint_orthophoto(
@@ -45,10 +46,7 @@ def paint_orthophoto(
     painter = _Painter(surface.lattice, ground, choose_photos(surface.lattice, ground, views, settings), site_grid,
                        views, pictures)
     count, side = settings.block_tiles, site_grid.grid.tile_px
-    blocks = sorted(
-        {(row // count, column // count) for column, row in painter.tiles()},
-        key=lambda block: (block[0] // 3, block[1] // 3, block),  # those near each other show the same few photos
-    )
+    blocks = _to_and_fro({(row // count, column // count) for column, row in painter.tiles()}, settings.strip_blocks)
     for number, (down, across) in enumerate(blocks, start=1):
         first = across * count, down * count
         rgba = painter.block(first, count)
@@ -58,6 +56,15 @@ def paint_orthophoto(
             tile = np.ascontiguousarray(rgba[y * side:(y + 1) * side, x * side:(x + 1) * side])
             if tile[..., 3].any():
                 yield (first[0] + x, first[1] + y), tile, number / len(blocks)
+
+
+def _to_and_fro(blocks: Collection[tuple[int, int]], rows: int) -> list[tuple[int, int]]:
+    """Blocks (row, column) strip by strip of so many rows, every other strip backwards."""
+    def place(block: tuple[int, int]) -> tuple[int, int, int]:
+        strip = block[0] // rows
+        return strip, -block[1] if strip % 2 else block[1], block[0]
+
+    return sorted(blocks, key=place)
 
 
 def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View], settings: OrthophotoSettings) -> Winners:

@@ -35,6 +35,10 @@ class SurfaceSettings:
     match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
     relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
 
+    def sizes_m(self, cell_m: float) -> tuple[float, float]:
+        """What a pixel covers of the ground in the pictures that the two sweeps take, for cells of `cell_m`."""
+        return self.coarser * cell_m, cell_m
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:

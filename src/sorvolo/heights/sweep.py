@@ -5,8 +5,9 @@ and one that cannot see a place does not decide about it.
 """
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -19,6 +20,9 @@ from sorvolo.heights.views import View, inside
 _MORE = 3  # views beyond the wanted ones
 _ANGLES = 16  # directions in a picture that are distinguished, over half a turn
 _ANGLE_RAD = np.pi / _ANGLES
+
+Seen: TypeAlias = Mask | bool
+"""Where a photo sees the cells of a window: (H, W), or everywhere, or nowhere."""
 
 
 @dataclass(frozen=True)
@@ -77,13 +81,12 @@ def sweep(
     spreads = _spreads(lattice, [views[k] for k in chosen], bounds.usual_m)
     finest_m = settings.level_px * lattice.cell_m / max(float(spreads.max()), 0.05)
     level_m = max(finest_m, (high_m - low_m) / (settings.most_levels - 1))
-    levels = low_m + level_m * np.arange(int(np.ceil((high_m - low_m) / level_m)) + 1)
+    levels: Floats = low_m + level_m * np.arange(int(np.ceil((high_m - low_m) / level_m)) + 1.0)
     eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
     laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
-    agreement = np.empty((shape[0], len(levels), shape[1]), np.float32)
-    for number, up_m in enumerate(levels):
-        agreement[:, number] = _agreement(laid, float(up_m), settings)
-    seen = [np.broadcast_to(each.whole(bounds.usual_m, min(settings.window_cells)), shape) for each in laid]
+    agreement = _agreements(laid, levels, settings)
+    least, usual_m = min(settings.window_cells), np.array([bounds.usual_m])
+    seen = [np.broadcast_to(next(each.wholes(usual_m, least)), shape) for each in laid]
     seen_by = np.sum(seen, axis=0).astype(np.float32)
     total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
     up_m, score = _best(total, agreement, levels)
@@ -150,7 +153,7 @@ class _Laid:
         self, view: View, picture: ImageGray, lattice: Lattice, bounds: Bounds, others_m: PointsM,
         settings: SweepSettings,
     ) -> None:
-        self._shape = lattice.shape
+        self.shape = lattice.shape
         camera = view.camera.resized(picture.shape[1], picture.shape[0])
         turn = view.site_from_camera.rotation.T
         project = camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
@@ -166,10 +169,6 @@ class _Laid:
         self.channel = which.tolist()
         self._px_per_cell = lattice.cell_m * camera.fx_px / max(
             float(view.site_from_camera.translation_m[2]) - bounds.usual_m, 1e-3)
-        self._always = frozenset(  # the lines move evenly with the height: what is inside at both ends is so between
-            side for side in settings.window_cells
-            if all(self._lines(each, side)[1].all() for each in (bounds.low_m, bounds.high_m))
-        )
 
     def at(self, up_m: float) -> list[Floats32]:
         """The photo on the plane at a height, (H, W) float32, for each of the others; 0 outside of it."""
@@ -177,42 +176,46 @@ class _Laid:
         laid = [
             channel for first in range(0, len(self.channels), 4)
             for channel in cv2.split(cv2.warpPerspective(
-                self._contrast[..., first:first + 4], there, self._shape[::-1],
+                self._contrast[..., first:first + 4], there, self.shape[::-1],
                 flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             ))
         ]
         return [laid[each] for each in self.channel]
 
-    def whole(self, up_m: float, side: int) -> Mask:
-        """Where a patch lies in the photo as a whole when the ground is at a height: (H, W), or (1, 1) if it is alike.
+    def wholes(self, levels_m: Floats, side: int) -> Iterator[Seen]:
+        """Where a patch lies in the photo as a whole when the ground is at each of some heights, (L,).
 
         Beyond its border it would see the border, not the ground.
         """
-        if side in self._always:
-            return np.ones((1, 1), bool)
-        lines, inside = self._lines(up_m, side)
-        if inside.all():
-            return np.ones((1, 1), bool)
-        if not inside.any(axis=1).all():
-            return np.zeros((1, 1), bool)
-        known = np.ones(self._shape, bool)
-        columns, rows = np.arange(self._shape[1]), np.arange(self._shape[0])[:, None]
-        for line in lines[~inside.all(axis=1)]:
+        lines = self._lines(levels_m, side)
+        inside = lines @ self._corners >= 0
+        everywhere, nowhere = inside.all(axis=(1, 2)), ~inside.any(axis=2).all(axis=1)
+        for number in range(len(levels_m)):
+            if everywhere[number] or nowhere[number]:
+                yield bool(everywhere[number])
+                continue
+            known = self._within(lines[number][~inside[number].all(axis=1)])
+            yield known if known.any() else False
+
+    def _within(self, lines: Floats) -> Mask:
+        """(H, W) the cells on the inner side of lines, (K, 3)."""
+        columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
+        known = np.ones(self.shape, bool)
+        for line in lines:
             known &= line[0] * columns + (line[1] * rows + line[2]) >= 0
         return known
 
-    def _lines(self, up_m: float, side: int) -> tuple[Floats, Mask]:
-        """(4, 3) a photo's sides on a level plane, and (4, 4) to the inner side of which the window's corners lie."""
+    def _lines(self, levels_m: Floats, side: int) -> Floats:
+        """(L, 4, 3) a photo's sides on level planes: positive on the inner side, where the picture's depth is."""
         inset = 0.5 * (side * self._px_per_cell + self._apron)
-        (w, h), (x, y, z) = self._size, self._picture_from_cells(up_m)
-        # inside is to one side of four lines, for where the picture's depth is positive
-        lines = np.array([x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y])
-        return lines, lines @ self._corners >= 0
+        (w, h), planes = self._size, self._level + levels_m[:, None, None] * self._up
+        x, y, z = planes[:, 0], planes[:, 1], planes[:, 2]
+        return np.stack([x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y], axis=1)
 
     def shows(self, up_m: Floats32, side: int) -> Mask:
         """(H, W) where a patch lies in the photo as a whole at each cell's own height, (H, W); nowhere for NaN."""
         inset = 0.5 * (side * self._px_per_cell + self._apron)
-        columns, rows = np.arange(self._shape[1]), np.arange(self._shape[0])[:, None]
+        columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
         (w, h), (x, y, z) = self._size, (
             level[0] * columns + (level[1] * rows + level[2]) + up[2] * up_m for level, up in zip(self._level, self._up)
         )
@@ -267,55 +270,104 @@ def _contrast(picture: Floats32, angle_rad: float, settings: SweepSettings) -> F
     return np.asarray(away / np.sqrt(spread + np.float32(settings.noise_levels**2)), np.float32)
 
 
-def _agreement(laid: Sequence[_Laid], up_m: float, settings: SweepSettings) -> Floats32:
+def _agreements(laid: Sequence[_Laid], levels_m: Floats, settings: SweepSettings) -> Floats32:
+    """(H, L, W) how well the photos agree at each of L heights."""
+    wholes = [[each.wholes(levels_m, side) for each in laid] for side in settings.window_cells]
+    result = np.empty((laid[0].shape[0], len(levels_m), laid[0].shape[1]), np.float32)
+    for number, up_m in enumerate(levels_m.tolist()):
+        known = [[next(each) for each in of_side] for of_side in wholes]
+        result[:, number] = _agreement(laid, up_m, known, settings)
+    return result
+
+
+def _agreement(
+    laid: Sequence[_Laid], up_m: float, known: Sequence[Sequence[Seen]], settings: SweepSettings
+) -> Floats32:
     """(H, W) how well the photos agree at a height, 0 to 1; NaN where fewer than two see it.
 
-    The mean over the better half of the pairs that see a cell, for a photo from which something hides it agrees with
-    none (Kang, Szeliski and Chai 2001).
+    `known` is where each photo sees the patches of each size. The mean over the better half of the pairs that see a
+    cell, for a photo from which something hides it agrees with none (Kang, Szeliski and Chai 2001).
     """
-    pictures = [each.at(up_m) for each in laid]
-    known = [[each.whole(up_m, side) for each in laid] for side in settings.window_cells]
-    scores = []
-    for i, j in itertools.combinations(range(len(laid)), 2):
-        both = [seen[i] & seen[j] for seen in known]
-        if any(each.any() for each in both):
-            scores.append(_likeness(pictures[i][j] * pictures[j][i], both, settings))
-    if not scores:
-        return np.full(pictures[0][0].shape, np.nan, np.float32)
-    return _better_mean(scores, settings.pair_share)
+    pairs = list(_pairs(known))
+    if not pairs:
+        return np.full(laid[0].shape, np.nan, np.float32)
+    pictures = {k: laid[k].at(up_m) for k in {k for i, j, _ in pairs for k in (i, j)}}
+    scores = [_likeness(pictures[i][j] * pictures[j][i], both, settings) for i, j, both in pairs]
+    is_whole = all(any(each is True for each in both) for _, _, both in pairs)
+    return (_better_mean if is_whole else _better_mean_of_known)(scores, settings.pair_share)
 
 
-def _likeness(product: Floats32, both: Sequence[Mask], settings: SweepSettings) -> Floats32:
+def _pairs(known: Sequence[Sequence[Seen]]) -> Iterator[tuple[int, int, list[Seen]]]:
+    """The photos that see patches together, two by two, and where they do, for each size of a patch."""
+    for i, j in itertools.combinations(range(len(known[0])), 2):
+        both = [_both(seen[i], seen[j]) for seen in known]
+        if any(each is not False for each in both):
+            yield i, j, both
+
+
+def _both(first: Seen, second: Seen) -> Seen:
+    """Where two photos see a patch."""
+    if first is False or second is False:
+        return False
+    if first is True or second is True:
+        return second if first is True else first
+    both = first & second
+    return both if both.any() else False
+
+
+def _likeness(product: Floats32, both: Sequence[Seen], settings: SweepSettings) -> Floats32:
     """(H, W) how alike patches are in two photos, the mean over those of their sizes that both see; -1 for none."""
-    total, count = np.zeros_like(product), np.zeros((1, 1), np.float32)
+    total, whole, partly = None, 0, []
     for side, seen in zip(settings.window_cells, both):
+        if seen is False:
+            continue
         alike = np.asarray(cv2.boxFilter(product, -1, (side, side)), np.float32)
         np.maximum(alike, 0, out=alike)
-        if not seen.all():
+        if seen is True:
+            whole += 1
+        else:
             alike *= seen
-        total += alike
-        count = count + seen.astype(np.float32)
-    if (count == len(settings.window_cells)).all():
-        total /= len(settings.window_cells)
-        return total
+            partly.append(seen)
+        total = alike if total is None else np.add(total, alike, out=total)
+    assert total is not None
+    if not partly:
+        return np.divide(total, np.float32(whole), out=total)
+    count = np.sum(partly, axis=0, dtype=np.float32) + np.float32(whole)
     return np.where(count > 0, total / np.maximum(count, 1), np.float32(-1))
 
 
 def _better_mean(scores: list[Floats32], share: float) -> Floats32:
+    """(H, W) the mean over the best `share` of the scores."""
+    wanted = int(np.ceil(len(scores) * share))
+    total = np.zeros_like(scores[0])
+    for each in itertools.islice(_from_the_largest(scores), wanted):
+        total += each
+    total /= wanted
+    return total
+
+
+def _better_mean_of_known(scores: list[Floats32], share: float) -> Floats32:
     """(H, W) the mean over the best `share` of the scores that are known (not -1); NaN where none is."""
     counted = np.zeros(scores[0].shape, np.float32)
     for each in scores:
         counted += each >= 0
     wanted = np.ceil(counted * share)
-    total, lower = np.zeros_like(counted), np.empty_like(counted)
-    for rank in range(int(np.ceil(len(scores) * share))):
-        for k in range(len(scores) - 1 - rank):  # the largest of those left moves to their end
+    total = np.zeros_like(counted)
+    for rank, each in enumerate(itertools.islice(_from_the_largest(scores), int(np.ceil(len(scores) * share)))):
+        total += each * (rank < wanted)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(counted > 0, total / np.maximum(wanted, 1), np.float32(np.nan)), np.float32)
+
+
+def _from_the_largest(scores: list[Floats32]) -> Iterator[Floats32]:
+    """(H, W) of each cell its largest score, then its second, and so on; `scores` change."""
+    lower = np.empty_like(scores[0])
+    for left in range(len(scores) - 1, -1, -1):
+        for k in range(left):  # the largest of those left moves to their end
             np.minimum(scores[k], scores[k + 1], out=lower)
             np.maximum(scores[k], scores[k + 1], out=scores[k + 1])
             scores[k], lower = lower, scores[k]
-        total += scores[len(scores) - 1 - rank] * (rank < wanted)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(counted > 0, total / np.maximum(wanted, 1), np.float32(np.nan)), np.float32)
+        yield scores[left]
 
 
 def _cost(agreement: Floats32, settings: SmoothingSettings) -> Floats32:
@@ -335,7 +387,7 @@ def _cost(agreement: Floats32, settings: SmoothingSettings) -> Floats32:
     return np.where(unseen, chance[:, None], cost)
 
 
-def _best(total: Floats32, agreement: Floats32, levels: Floats32) -> tuple[Floats32, Floats32]:
+def _best(total: Floats32, agreement: Floats32, levels: Floats) -> tuple[Floats32, Floats32]:
     """(H, W) the height of least total cost, between levels by a parabola, and the agreement there."""
     best = total.argmin(axis=1)
     around = np.clip(best, 1, max(len(levels) - 2, 1))
@@ -352,7 +404,7 @@ def _best(total: Floats32, agreement: Floats32, levels: Floats32) -> tuple[Float
     return up_m.astype(np.float32), score
 
 
-def _deviation(total: Floats32, up_m: Floats32, levels: Floats32, settings: SweepSettings) -> Floats32:
+def _deviation(total: Floats32, up_m: Floats32, levels: Floats, settings: SweepSettings) -> Floats32:
     """(H, W) the root mean square distance of the other levels from a height, each by its probability."""
     chance = np.exp((total.min(axis=1, keepdims=True) - total) / (8 * settings.smoothing.temperature))
     away = levels[None, :, None].astype(np.float32) - up_m[:, None]

@@ -18,7 +18,7 @@ from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.heights.flight_views import flight_views, run_of
-from sorvolo.missions.heights.pictures import FlightPictures
+from sorvolo.missions.heights.pictures import FlightPictures, SmallPictures
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.images import png_from_rgba
@@ -74,8 +74,7 @@ def make_heights(
         views = flight_views(archive, flight_id, keyframes)
         _lattice(archive.site(), views, settings)  # too many cells end here, before minutes of work
         yield HeightsUpdate(flight_id, "cameras", 0.0)
-        plain = FlightPictures(archive, keyframes)
-        solved = solve_cameras(views, plain.gray, settings.cameras)
+        solved = solve_cameras(views, FlightPictures(archive, keyframes).gray, settings.cameras)
         kept = [each for each in keyframes if each.name not in set(solved.lost)]
         pictures = FlightPictures(archive, kept, solved.radial)
         cameras_s = time.monotonic() - started_s
@@ -116,14 +115,11 @@ def _sweep(
 ) -> Generator[HeightsUpdate, None, Surface]:
     lattice = _lattice(archive.site(), solved.views, settings)
 
-    def gray(number: int, size_m: float) -> Any:
-        return pictures.gray_of_size(solved.views[number], number, size_m)
-
+    small = SmallPictures(pictures, solved.views, settings.surface.sizes_m(lattice.cell_m))
     for each in sweep_surface(
-        lattice, solved.views, gray, solved.points_m, solved.height_sigma, settings.surface
+        lattice, solved.views, small.gray, solved.points_m, solved.height_sigma, settings.surface
     ):
         if isinstance(each, Surface):
-            pictures.forget_small()
             return each
         yield HeightsUpdate(flight_id, "heights", each)
     raise AssertionError("a sweep ends with a surface")
