@@ -4,16 +4,15 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from sorvolo.capture.sync import DATED_NS
 from sorvolo.change.areas.area_map import AreaMap, with_areas
 from sorvolo.change.areas.gathered_things import GatheredThings
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.evidence.shadow_doubt import SunAt
 from sorvolo.change.map_update import paint_changes
 from sorvolo.change.pair.thesis import thesis_steps
 from sorvolo.change.reference import ReferenceMap
@@ -22,9 +21,8 @@ from sorvolo.change.shape.outlines import KnownPlace
 from sorvolo.change.shape.reported import reported
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord, as_bgr
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Mask, Vector3
+from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
-from sorvolo.geometry.sun import sun_direction
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
@@ -38,6 +36,7 @@ from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
+from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.missions.map.journal import Taken
 from sorvolo.store.exports.change_files import write_pictures
@@ -50,7 +49,7 @@ from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
-from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame, Site
+from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 
@@ -252,7 +251,7 @@ class CompareRun:
                 self._evidence = EvidenceMap(
                     self._views.change_m_per_px(view),
                     EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._setup.source.name,
-                    self._views.earlier_pictures, _sun_at(self._archive.site()),
+                    self._views.earlier_pictures, partial(sun_over, self._archive.site()),
                 )
             announced: Sequence[Change] = self._reported(self._evidence.add(view))
             if self._settings.method != "thesis":
@@ -367,13 +366,3 @@ def _earlier_pictures(archive: Archive, superseded: str, sizes: ViewSizes = View
         ],
         images.get, relief,
     )
-
-
-def _sun_at(site: Site) -> SunAt:
-    """Where the sun stands over a site; not known where a clock has no date, or the site no place on earth."""
-    def sun_at(time_ns: int) -> Vector3 | None:
-        if site.is_local or time_ns < DATED_NS:
-            return None
-        return sun_direction(time_ns, site.origin.latitude_deg, site.origin.longitude_deg)
-
-    return sun_at

@@ -4,11 +4,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.turning import is_from_above
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Mask, Vector3
-from sorvolo.geometry.sun import direction_from_angles, sun_direction
+from sorvolo.geometry.sun import direction_from_angles
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import Conditions, FrameLook, gather, look_at
@@ -183,10 +183,7 @@ def _sun(frames: Sequence[SearchFrame], site: Site, settings: SearchSettings) ->
     """The direction to the sun; None where no clock knows the date."""
     if settings.sun_deg is not None:
         return direction_from_angles(*settings.sun_deg)
-    time_ns = frames[len(frames) // 2].placed.time_ns
-    if time_ns <= DATED_NS:
-        return None
-    return sun_direction(time_ns, site.origin.latitude_deg, site.origin.longitude_deg)
+    return sun_over(site, frames[len(frames) // 2].placed.time_ns)
 
 
 def _measured(
