@@ -35,6 +35,9 @@ WENT = [
 WALKED = [*WENT, *(
     Thing(each.east_m + 1.2, each.north_m - 1.4, each.size_m, colour=each.colour) for each in CAME
 )]
+PLANKS = [  # as bright beside the ground as the shadow beside it is dark
+    Thing(0.85, 0.5, (1.7, 0.4), colour=(245, 245, 245)), shadow(0, 0.5, "north", is_later=True), stays(0, 0.5),
+]
 LONGER = [shadow(0, 0.5, "east", is_later=False), shadow(0, 0.5, "north", is_later=True, length_m=3.5), stays(0, 0.5)]
 SUNS = {"earlier": WEST, "later": SOUTH}
 
@@ -48,6 +51,7 @@ SUNS = {"earlier": WEST, "later": SOUTH}
     (CAME, SUNS, True),
     (WENT, SUNS, True),
     (WALKED, SUNS, True),
+    (PLANKS, SUNS, True),
     (LONGER, SUNS, True),  # more than twice as long as the other one, the sun being as high
 ])
 def test_the_moved_shadow_of_what_stays_is_no_change(things, suns, is_reported):

@@ -5,7 +5,7 @@ stays and the sun does not, ground is brighter along the one date's direction an
 the same foot. What came or left has one of both shadows, and its own pixels differ.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.evidence.levelness import LaidPicture, LevelSettings, Sights
 from sorvolo.change.shape.outlines import mask_of
 from sorvolo.change.shape.patches import PatchWindow
-from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM, Vector3
+from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM, Vector3
 
 SunAt = Callable[[int], Vector3 | None]
 """The unit vector to the sun (east, north, up) at a UTC time; None where it is not known."""
@@ -61,7 +61,8 @@ class ShadowSettings:
 class ShadowMatch(NamedTuple):
     """How well the shadows of a thing that stays, `radius_m` wide to each side and `height_m` tall, explain a
     difference: the correlation, how much brighter (octaves) ground is that the earlier shadow left, how much darker
-    where the later one came, and the share of the difference that they cover."""
+    where the later one came, and the share of the difference that they cover. What is brighter than the ground around
+    it was not in a shadow, but something came."""
 
     likeness: float
     brighter: float
@@ -183,10 +184,12 @@ def _shadow(end_px: Floats, radius_px: float, half: int) -> Mask:
 
 
 class _Difference(NamedTuple):
-    """By how many octaves ground is brighter on the later date, (h, w), where that is known, 1 or 0; and where, 1 or 0,
-    it is `brighter` and `darker` in the outline that is asked about."""
+    """By how many octaves ground is brighter on the later date, (h, w), and how much of that shadows may do: what an
+    earlier one took of the ground's light (above 0), and what a later one takes (below 0). `known`, 1 or 0, is where
+    both dates show ground; `brighter` and `darker` where it differs in the outline that is asked about."""
 
     octaves: Floats32
+    shaded: Floats32
     known: Floats32
     brighter: Floats32
     darker: Floats32
@@ -197,20 +200,19 @@ class _Difference(NamedTuple):
     ) -> "_Difference":
         """Of two pictures of one window, `step` pixels of it taken together."""
         both = (earlier.gray > 0) & (later.gray > 0)
-        one, other = (each.gray.astype(np.float32) + settings.brighter.black for each in (earlier, later))
-        change = np.log2(other / one)
-        known = _shrunk(both.astype(np.float32), step)
-        octaves = _shrunk(np.where(both, change, 0).astype(np.float32), step) / np.maximum(known, 1e-3)
-        is_known = known > 0.5
-        octaves -= np.median(octaves[is_known]) if is_known.any() else 0.0
-        calm = (is_known & (np.abs(octaves) < settings.brighter.calm)).astype(np.float32)
-        side = 2 * round(settings.brighter.light_m / (later.window.m_per_px * step) / 2) + 1
-        light = cv2.blur(octaves * calm, (side, side)) / np.maximum(cv2.blur(calm, (side, side)), 0.05)
-        most = settings.brighter.most
-        octaves = np.where(is_known, np.clip(octaves - light, -most, most), 0).astype(np.float32)
+        share = _shrunk(both.astype(np.float32), step)
+        known = share > 0.5
+        cell_m = later.window.m_per_px * step
+        one, other = _beside_ground(
+            [_octaves(each.gray, both, step, settings.brighter) / np.maximum(share, 1e-3) for each in (earlier, later)],
+            known, cell_m, settings.brighter,
+        )
+        octaves = np.where(known, np.clip(other - one, -settings.brighter.most, settings.brighter.most), 0)
+        left = np.minimum(np.maximum(octaves, 0), np.maximum(-one, 0))
+        came = np.minimum(np.maximum(-octaves, 0), np.maximum(-other, 0))
         inside = _shrunk(mask_of(outline_m, later.window.site_from_patch, both.shape).astype(np.float32), step)
         brighter, darker = ((inside > 0.5) & (each > settings.least_depth) for each in (octaves, -octaves))
-        return cls(octaves, *(each.astype(np.float32) for each in (is_known, brighter, darker)))
+        return cls(*(np.asarray(each, np.float32) for each in (octaves, left - came, known, brighter, darker)))
 
     def match(self, pattern: _Pattern, enough: float) -> tuple[float, float, float, float] | None:
         """Likeness, how much brighter, how much darker, and the covered share, at the foot where the pattern fits best
@@ -218,18 +220,16 @@ class _Difference(NamedTuple):
         covered = self._covered(pattern)
         if covered is None:
             return None
-        left, left_px = _sums(self.octaves, pattern.left), _sums(self.known, pattern.left)
-        came, came_px = _sums(self.octaves, pattern.came), _sums(self.known, pattern.came)
-        power = _sums(self.octaves**2, pattern.around)
-        likeness = (left - came) / np.sqrt(np.maximum(power, 1e-6) * np.maximum(left_px + came_px, 1.0))
+        left_px, came_px = (_sums(self.known, each) for each in (pattern.left, pattern.came))
+        power = _sums(self.octaves**2, pattern.around) * np.maximum(left_px + came_px, 1.0)
+        likeness = _sums(self.octaves, pattern.left - pattern.came) / np.sqrt(np.maximum(power, 1e-6))
         shown = (left_px > 0.6 * pattern.left.sum()) & (came_px > 0.6 * pattern.came.sum())
         worth = np.where(shown, np.minimum(covered, enough) + likeness, -1.0)
         at = np.unravel_index(int(worth.argmax()), worth.shape)
         if not shown[at]:
             return None
-        return (
-            float(likeness[at]), float(left[at] / left_px[at]), float(-came[at] / came_px[at]), float(covered[at])
-        )
+        left, came = (_sums(self.shaded, each)[at] for each in (pattern.left, pattern.came))
+        return float(likeness[at]), float(left / left_px[at]), float(-came / came_px[at]), float(covered[at])
 
     def _covered(self, pattern: _Pattern) -> Floats32 | None:
         """(h, w) the share that a pattern there covers of what is brighter, or of what is darker, the lesser one; what
@@ -240,6 +240,22 @@ class _Difference(NamedTuple):
             _sums(asked, covers) / count for (asked, covers), count in zip(parts, cells) if count > 0.1 * sum(cells)
         ]
         return np.asarray(np.min(shares, axis=0), np.float32) if shares else None
+
+
+def _octaves(gray: ImageGray, known: Mask, step: int, settings: BrighterSettings) -> Floats32:
+    """The sums of logarithms of a picture, (h, w), where it is known, `step` pixels taken together."""
+    octaves = np.log2(gray.astype(np.float32) + np.float32(settings.black))
+    return _shrunk(np.where(known, octaves, 0).astype(np.float32), step)
+
+
+def _beside_ground(octaves: Sequence[Floats32], known: Mask, cell_m: float, settings: BrighterSettings) -> list[Floats]:
+    """By how many octaves cells, (h, w) of either date, are brighter than the unchanged ground around them."""
+    change = octaves[1] - octaves[0]
+    middle = np.median(change[known]) if known.any() else 0.0
+    calm = (known & (np.abs(change - middle) < settings.calm)).astype(np.float32)
+    side = 2 * round(settings.light_m / cell_m / 2) + 1
+    share = np.maximum(cv2.blur(calm, (side, side)), 0.05)
+    return [each - cv2.blur(each * calm, (side, side)) / share for each in octaves]
 
 
 def _sums(raster: Floats32, pattern: Floats32) -> Floats32:
