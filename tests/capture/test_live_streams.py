@@ -139,7 +139,7 @@ def test_a_sender_that_dies_and_comes_back_is_one_flight_with_an_outage(caplog: 
 
 def test_a_source_that_stays_silent_has_ended() -> None:
     port = free_port()
-    with sending(udp_url(port), count=100):
+    with sending(udp_url(port), count=40):
         source = open_live(f"udp://:{port}", LiveSettings(keeps_all=True, silent_s=0.5, give_up_s=1.0))
         began_s = time.monotonic()
         frames = list(source.frames(every_frame))

@@ -172,7 +172,9 @@ def rebuilt(share: float) -> np.ndarray:
     return (255 * (later / 255.0) ** 1.5).astype(np.uint8)
 
 
-@pytest.mark.parametrize("yaw_off_deg,height_factor", [(0.0, 1.0), (90.0, 1.0), (0.0, 1.18)])
+@pytest.mark.parametrize("yaw_off_deg,height_factor", [
+    (0.0, 1.0), pytest.param(90.0, 1.0, marks=pytest.mark.long), pytest.param(0.0, 1.18, marks=pytest.mark.long),
+])
 def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(reference, yaw_off_deg, height_factor):
     pose = Pose(turned(10.0, 1.0), np.array([3.0, -2.0, 30.0]))
     image = photographed(pose, rebuilt(0.6))
@@ -324,6 +326,7 @@ def test_one_strip_that_is_not_found_does_not_lose_the_flight(reference):
         assert lost or error_px(found, pose) * 30 / CAMERA.fx_px < 0.6
 
 
+@pytest.mark.long
 def test_a_frame_tried_again_is_placed_beside_its_neighbours(reference):
     """Ground that stayed in its west third only: nothing there places the frame until those beside it have been."""
     along = aligner(reference)

@@ -300,17 +300,17 @@ def test_a_live_view_is_reported_at_once_unless_the_next_one_waits_already(waiti
 
 
 def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, tmp_path):
-    compare(flown, site, CompareSettings(model="none", updates_map=False))
+    few = replace(_COMPARE, updates_map=False, views_per_second=1.25)
+    compare(flown, site, few)
     (rejected, *others) = features(site)
     with Archive.open(site, write=True) as archive:
         archive.review(rejected["id"], Verdict.REJECTED)
-    compare(flown, site, CompareSettings(model="none", updates_map=False))
+    compare(flown, site, few)
     assert [each["geometry"] for each in features(site)] == [each["geometry"] for each in (rejected, *others)]
     assert features(site)[0]["properties"]["review"] == "rejected"
     for suffix in (".mp4", ".csv"):
         shutil.copy(flown / "flight2" / f"flight2{suffix}", tmp_path / f"next{suffix}")
-    unchanged = CompareSettings(model="none", updates_map=False)
-    list(compare_flights([tmp_path / "next.mp4"], site, unchanged, camera=flown / "camera.xml"))
+    list(compare_flights([tmp_path / "next.mp4"], site, few, camera=flown / "camera.xml"))
     assert [each["geometry"] for each in features(site, "next")] == [each["geometry"] for each in others]
     assert report(site, "next")["comparison"]["suppressed"] == 1
 
@@ -557,7 +557,9 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
     assert not list(site.glob("flights/flight2/staged"))
 
 
-@pytest.mark.parametrize(("brightness", "printed"), [(0.4, "dark or of the ground's colour"), (0.06, "means little")])
+@pytest.mark.parametrize(("brightness", "printed"), [
+    pytest.param(0.4, "dark or of the ground's colour", marks=pytest.mark.long), (0.06, "means little"),
+])
 def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_ground(site, tmp_path, brightness, printed):
     weather = replace(_PAIR.later.weather, brightness=brightness)
     dark = replace(_PAIR, later=replace(_PAIR.later, weather=weather))
