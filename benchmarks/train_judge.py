@@ -309,13 +309,16 @@ def supported(looks: Sequence[Look]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows), np.concatenate(right).astype(float)
 
 
-def fitted(inputs: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Weights of the inputs (N, K), then the shift, of the logistic regression of what is right (Platt 1999)."""
+def fitted(inputs: np.ndarray, right: np.ndarray, counts: np.ndarray | float = 1.0) -> np.ndarray:
+    """Weights of the inputs (N, K), then the shift, of the logistic regression of what is right (Platt 1999).
+
+    `counts` (N,): how much each row counts.
+    """
     columns = np.column_stack([inputs, np.ones(len(inputs))])
 
     def loss(weights: np.ndarray) -> float:
         logits = columns @ weights
-        return float((np.logaddexp(0, logits) - right * logits).sum() + 0.1 * (weights**2).sum())
+        return float((counts * (np.logaddexp(0, logits) - right * logits)).sum() + 0.1 * (weights**2).sum())
 
     return np.asarray(minimize(loss, np.zeros(columns.shape[1])).x)
 

@@ -1,0 +1,139 @@
+"""What a model reports is looked at again: cut out with its surroundings and shown at other sizes (decision 0046).
+
+A trial, no part of the product. Only what was reported is looked at again, side by side on one sheet.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+import cv2
+import numpy as np
+
+from sorvolo.detection.session import Seen
+from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.box_overlap import iou_matrix
+
+Sees = Callable[[ImageRGB], Seen]
+"""What the model finds in a picture, (H, W, 3) RGB."""
+
+
+@dataclass(frozen=True)
+class SecondLook:
+    """How reports of a class are looked at again.
+
+    `looks_px`: in each look the report's longer side has so many pixels. A report's log-odds become `shift`, `own`
+    times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked at.
+    """
+
+    looks_px: tuple[float, ...]
+    own: float
+    again: float
+    shift: float
+    least: float
+
+
+@dataclass(frozen=True)
+class SheetSettings:
+    """How cut-outs are laid side by side on one picture. Weights hold for the values that they were fitted with."""
+
+    cell_px: int = 128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
+    columns: int = 8
+    most: int = 32  # cut-outs of one picture, best reports first; in a crowd the others keep their score
+    same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
+    unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
+    filling: int = 114  # beyond the picture's edge, as in training
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """A report cut out for one look: its row, its label, the picture (cell, cell, 3), its box (4,) px in there."""
+
+    row: int
+    label: int
+    picture: ImageRGB
+    box_px: Floats
+
+
+def looked_again(
+    seen: Seen, picture: ImageRGB, sees: Sees, hows: Mapping[int, SecondLook],
+    settings: SheetSettings = SheetSettings(),
+) -> Seen:
+    """What was `seen` in a picture (H, W, 3), with the scores that a second look leaves, best first.
+
+    `hows` names for labels how their reports are looked at again; others, and those below `least`, keep their score.
+    """
+    scores = seen.scores.copy()
+    for row, again in opinions(seen, picture, sees, hows, settings).items():
+        how = hows[int(seen.labels[row])]
+        odds = how.shift + how.own * float(_odds(scores[row])) + how.again * float(_odds(again).mean())
+        scores[row] = 1 / (1 + math.exp(-odds))
+    order = np.argsort(-scores, kind="stable")
+    return Seen(seen.boxes_px[order], scores[order], seen.labels[order])
+
+
+def opinions(
+    seen: Seen, picture: ImageRGB, sees: Sees, hows: Mapping[int, SecondLook],
+    settings: SheetSettings = SheetSettings(),
+) -> dict[int, Floats]:
+    """The scores (looks,) of each report's looks, by its row, for those that are looked at again."""
+    cuts = list(islice(_cuts(seen, picture, hows, settings), settings.most))
+    if not cuts:
+        return {}
+    scores, rows = _scores(cuts, sees, settings), np.array([each.row for each in cuts])
+    found = {row: scores[rows == row] for row in dict.fromkeys(rows.tolist())}
+    return {row: each for row, each in found.items() if len(each) == len(hows[int(seen.labels[row])].looks_px)}
+
+
+def _cuts(
+    seen: Seen, picture: ImageRGB, hows: Mapping[int, SecondLook], settings: SheetSettings
+) -> Iterator[_Cut]:
+    """The looks at every report that is looked at again, best reports first."""
+    for row in np.argsort(-seen.scores, kind="stable").tolist():
+        label = int(seen.labels[row])
+        how = hows.get(label)
+        if how is None or seen.scores[row] < how.least:
+            continue
+        for side_px in how.looks_px:
+            cut, box_px = cut_out(picture, seen.boxes_px[row].astype(float), side_px, settings)
+            yield _Cut(row, label, cut, box_px)
+
+
+def cut_out(
+    picture: ImageRGB, box_px: Floats, side_px: float, settings: SheetSettings = SheetSettings()
+) -> tuple[ImageRGB, Floats]:
+    """A box (4,) of a picture with its surroundings, (cell, cell, 3), its longer side `side_px`; its edges there."""
+    cell = settings.cell_px
+    reach = 0.5 * cell / side_px * float(max(box_px[2:] - box_px[:2]))
+    middle = (box_px[:2] + box_px[2:]) / 2
+    low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int)
+    size = int(max(high - low))
+    wide = np.full((size, size, 3), settings.filling, np.uint8)
+    start, end = np.maximum(low, 0), np.minimum(low + size, picture.shape[1::-1])
+    into, until = start - low, end - low
+    wide[into[1] : until[1], into[0] : until[0]] = picture[start[1] : end[1], start[0] : end[0]]
+    way = cv2.INTER_AREA if size > cell else cv2.INTER_LINEAR
+    shown = np.asarray(cv2.resize(wide, (cell, cell), interpolation=way), np.uint8)
+    return shown, (box_px - np.tile(low, 2)) * cell / size
+
+
+def _scores(cuts: Sequence[_Cut], sees: Sees, settings: SheetSettings) -> Floats:
+    """(looks,) what each look makes of its report; all on one sheet."""
+    cell, columns = settings.cell_px, min(settings.columns, len(cuts))
+    rows = math.ceil(len(cuts) / columns)
+    sheet = np.full((rows * cell, columns * cell, 3), settings.filling, np.uint8)
+    boxes = np.zeros((len(cuts), 4), np.float32)
+    for number, each in enumerate(cuts):
+        top, left = (cell * place for place in divmod(number, columns))
+        sheet[top : top + cell, left : left + cell] = each.picture
+        boxes[number] = each.box_px + np.array([left, top, left, top])
+    seen = sees(sheet)
+    same = iou_matrix(boxes, seen.boxes_px) >= settings.same_iou
+    same &= np.array([each.label for each in cuts])[:, None] == seen.labels[None]
+    return np.where(same, seen.scores[None], 0.0).max(axis=1, initial=settings.unseen)
+
+
+def _odds(scores: Floats | float) -> Floats:
+    inside = np.clip(scores, 1e-3, 1 - 1e-3)
+    return np.asarray(np.log(inside / (1 - inside)))
