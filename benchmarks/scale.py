@@ -91,7 +91,7 @@ def unit_rows(costs: Mapping[str, Any]) -> Iterable[Sequence[str]]:
     """The measured costs of a frame or a photo."""
     for name, row in costs.items():
         yield (
-            name, f"{row['cpu_s']:.2f}", f"{row['start_cpu_s']:.0f}", f"{row['peak_mb']:,.0f}",
+            name, f"{row['cpu_s']:.2f}", f"{max(0.0, row['start_cpu_s']):.0f}", f"{row['peak_mb']:,.0f}",
             f"{row['bytes'] / 1000:,.0f}", f"{row['files']:.1f}",
         )
 
@@ -136,7 +136,7 @@ def archive_rows(costs: Mapping[str, Any], given: Mapping[str, float]) -> Iterab
     photos = given["archive_tb"] * 1e6 / given["photo_mb"]
     prefix = f"photo, {given['photo_megapixels']:g} MP"
     yield "photos", f"{photos / 1e6:,.0f} million, {photos / given['photos_per_flight'] / 1e6:.2g} million flights"
-    for mission in ("map", "map with objects", "heights", "compare"):
+    for mission in ("map", "map with objects", "heights", "compare", "watch"):
         row = costs.get(f"{prefix}: {mission}")
         if row is not None:
             hours = photos * row["cpu_s"] / 3600
