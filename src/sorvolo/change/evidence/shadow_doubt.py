@@ -200,12 +200,11 @@ class _Difference(NamedTuple):
     ) -> "_Difference":
         """Of two pictures of one window, `step` pixels of it taken together."""
         both = (earlier.gray > 0) & (later.gray > 0)
-        share = _shrunk(both.astype(np.float32), step)
-        known = share > 0.5
+        known = _shrunk(both.astype(np.float32), step) > 0.5
         cell_m = later.window.m_per_px * step
         one, other = _beside_ground(
-            [_octaves(each.gray, both, step, settings.brighter) / np.maximum(share, 1e-3) for each in (earlier, later)],
-            known, cell_m, settings.brighter,
+            [_octaves(each.gray, both, step, settings.brighter) for each in (earlier, later)], known, cell_m,
+            settings.brighter,
         )
         octaves = np.where(known, np.clip(other - one, -settings.brighter.most, settings.brighter.most), 0)
         left = np.minimum(np.maximum(octaves, 0), np.maximum(-one, 0))
@@ -243,9 +242,10 @@ class _Difference(NamedTuple):
 
 
 def _octaves(gray: ImageGray, known: Mask, step: int, settings: BrighterSettings) -> Floats32:
-    """The sums of logarithms of a picture, (h, w), where it is known, `step` pixels taken together."""
-    octaves = np.log2(gray.astype(np.float32) + np.float32(settings.black))
-    return _shrunk(np.where(known, octaves, 0).astype(np.float32), step)
+    """The mean logarithms of a picture, (h, w), where it is known, `step` pixels taken together."""
+    octaves = np.where(known, np.log2(gray.astype(np.float32) + np.float32(settings.black)), 0).astype(np.float32)
+    share = np.maximum(_shrunk(known.astype(np.float32), step), np.float32(1e-3))
+    return np.asarray(_shrunk(octaves, step) / share, np.float32)
 
 
 def _beside_ground(octaves: Sequence[Floats32], known: Mask, cell_m: float, settings: BrighterSettings) -> list[Floats]:
