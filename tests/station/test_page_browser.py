@@ -107,6 +107,21 @@ def test_a_cold_page_is_small_and_lists_the_sites(browser: Any, served: Served) 
     context.close()
 
 
+def test_a_site_that_is_deleted_while_it_is_watched(browser: Any, made_site: Path, tmp_path: Path) -> None:
+    """The page goes back to the list, and states why."""
+    shutil.copytree(made_site, tmp_path / "field")
+    shutil.copytree(made_site, tmp_path / "other")
+    with Served(tmp_path) as station:
+        watched = Watched(browser.new_context(), station.url)
+        show(watched, station)
+        shutil.rmtree(tmp_path / "field")
+        watched.page.locator(".message.error", has_text="This site is gone").wait_for()
+        expect(watched.page.locator(".card a")).to_have_count(1)
+        assert "other" in watched.page.locator(".card a").get_attribute("href")
+        assert [each for each in watched.faults if not re.search("40[04]|410", each)] == []
+        watched.page.context.close()
+
+
 def test_an_empty_station_leads_to_a_first_flight(browser: Any, tmp_path: Path) -> None:
     with Served(tmp_path) as empty:
         watched = Watched(browser.new_context(), empty.url)
@@ -141,6 +156,44 @@ def test_changes_are_judged_with_the_keyboard_and_others_see_it(
     assert (kept["review"], kept["note"], kept["revision"]) == ("none", "seen on foot", 3)
     assert other.faults == []
     other.page.context.close()
+
+
+def test_a_change_and_an_object_are_tapped_on_the_map(browser: Any, served: Served) -> None:
+    """Each at its place: the card with its facts opens, and the verdict given there is kept."""
+    context = browser.new_context(viewport={"width": 1280, "height": 720}, reduced_motion="reduce")
+    watched = Watched(context, served.url)
+    page, card = watched.page, watched.page.locator(".card-over")
+    show(watched, served, "review")
+    change = changes(served)[2]
+    page.locator(f".strip button[data-id='{change['id']}']").click()
+    page.keyboard.press("m")  # to its place, in the middle of the map, beside the card
+    card.get_by_role("button", name="Close").click()
+    tap_middle_until(page, card)
+    tapped = card.locator("dt", has_text=re.compile("^Id$")).locator("+ dd").inner_text()
+    card.get_by_role("button", name="Confirm").click()
+    card.locator(".verdict.confirmed").wait_for()
+    kept = next(each["properties"] for each in changes(served) if each["id"] == tapped)  # others lie there, too
+    assert kept["review"] == "confirmed"
+    card.get_by_role("button", name="Close").click()
+    ring = np.array(change["geometry"]["coordinates"][0])
+    announce(served, "object.found", {"feature": {
+        "type": "Feature", "id": "o7", "properties": {"id": "o7", "class": "boat", "score": 0.9},
+        "geometry": {"type": "Point", "coordinates": ((ring.min(axis=0) + ring.max(axis=0)) / 2).tolist()},
+    }})
+    tap_middle_until(page, card.locator("h3", has_text=re.compile("boat", re.IGNORECASE)))
+    assert watched.faults == []
+    context.close()
+
+
+def tap_middle_until(page: Any, shown: Any) -> None:
+    """Tap the middle of the map again and again, until what lies there is shown: the map has drawn it by then."""
+    box = page.locator(".map-canvas").bounding_box()
+    for _ in range(200):
+        page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+        page.wait_for_timeout(100)
+        if shown.count():
+            return
+    raise AssertionError("nothing was shown")
 
 
 def test_a_verdict_that_came_first_is_shown_and_not_overwritten(browser: Any, served: Served) -> None:

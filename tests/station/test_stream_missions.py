@@ -2,20 +2,28 @@
 
 import asyncio
 import json
+import re
+import socket
+import subprocess
+import sys
 import threading
 import time
 import urllib.request
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import uvicorn
+from browsers import Watched, chromium
+from PIL import Image
 from stream_flights import HeldFootage
 from test_runs import FLIGHT
 from websockets.asyncio.client import connect
 
-from small_flights import simulate_into
+from small_flights import simulate_into, small_flight
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.station.app import station_app
 from sorvolo.station.client import StreamClient, StreamSettings, stream_url
@@ -23,6 +31,9 @@ from sorvolo.station.footage import Footage, open_footage
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.spool import Spool
 from waiting import wait_for
+
+IS_AWAY = re.compile(r"ERR_CONNECTION_REFUSED|ERR_CONNECTION_RESET|WebSocket connection to .* failed|Failed to fetch")
+"""What a browser's console states while its station is gone."""
 
 
 class Station:
@@ -64,6 +75,31 @@ class Station:
             assert time.monotonic() < until_s, state
             time.sleep(0.1)
         return dict(state)
+
+
+class StationProcess(Station):
+    """The same in a process of its own, which `stop` kills."""
+
+    def start(self) -> None:
+        if not self._port:
+            with socket.socket() as free:
+                free.bind(("127.0.0.1", 0))
+                self._port = free.getsockname()[1]
+        self._process = subprocess.Popen([
+            sys.executable, "-m", "sorvolo", "serve", str(self._root), "--port", str(self._port), "--free-floor", "0",
+        ])
+        wait_for(self._answers)
+
+    def stop(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def _answers(self) -> bool:
+        assert self._process.poll() is None
+        try:
+            return bool(self.ask("/api/status"))
+        except OSError:
+            return False
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +147,59 @@ def test_a_map_of_a_stream_outlives_a_restarted_station(station: Station, flown:
     assert done["state"] == "finished", done
     (flight,) = station.ask("/api/sites/new")["flights"]
     assert flight["matched"] == flight["frames"] >= 3 and flight["rejected"] == 0
+
+
+@pytest.fixture
+def killable(tmp_path: Path) -> Iterator[StationProcess]:
+    (tmp_path / "root").mkdir()
+    made = StationProcess(tmp_path / "root")
+    yield made
+    made.stop()
+
+
+def test_a_page_sees_a_flight_grow_though_its_station_is_killed(
+    killable: StationProcess, tmp_path: Path
+) -> None:
+    """A first flight over new ground: its map, the station gone and back, the rest of the map, the end; in Chromium."""
+    station = killable
+    simulate_into(tmp_path / "flight", small_flight(5, length_m=60, fps=4, cars=1))
+    held = HeldFootage(footage_of(tmp_path / "flight" / "flight1" / "flight1.mp4"), before=32)
+    drone = sending(held, station, tmp_path / "spool", speed=4.0)
+    flying = threading.Thread(target=drone.run, daemon=True)
+    with chromium() as browser:
+        context = browser.new_context(viewport={"width": 900, "height": 600}, reduced_motion="reduce")
+        watched = Watched(context, station.url)
+        page = watched.page
+        page.goto(f"{station.url}/#/site/new/missions")
+        page.get_by_text("Start a mission").wait_for()
+        flying.start()
+        wait_for(lambda: any(each["flights"] for each in station.ask("/api/streams")))
+        wish = {"mission": "map", "site": "new", "input": {"stream": "scout"}, "options": {"model": "none"}}
+        run = station.ask("/api/runs", wish)
+        page.get_by_role("button", name="Close the video").click()  # which lies over the map
+        wait_for(lambda: length_of_ground(page) > 1)
+        first_length = length_of_ground(page)
+        assert watched.faults == []
+        station.stop()
+        page.locator("#link-state:not(.live)").wait_for()
+        station.start()
+        page.locator("#link-state.live").wait_for()
+        held.goes_on.set()
+        flying.join(60)
+        done = station.ended(run["id"])
+        assert done["state"] == "finished", done
+        page.locator(".run.finished", has_text=done["headline"]).wait_for()
+        wait_for(lambda: length_of_ground(page) > 1.1 * first_length)
+        assert [each for each in watched.faults if not IS_AWAY.search(each)] == []
+        context.close()
+
+
+def length_of_ground(page: Any) -> float:
+    """How much wider the ground on the map is than high, at whatever zoom; 0 where there is none on the gray yet."""
+    page.evaluate("document.getElementById('messages').replaceChildren()")  # they lie over the map
+    shot = np.asarray(Image.open(BytesIO(page.locator(".map-canvas").screenshot())).convert("RGB")).astype(int)
+    rows, columns = np.nonzero(np.ptp(shot, axis=2) > 25)
+    return float(np.ptp(columns) / max(1, np.ptp(rows))) if len(rows) > 1000 else 0.0
 
 
 def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, flown: Path, tmp_path: Path) -> None:
