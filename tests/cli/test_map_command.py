@@ -14,7 +14,7 @@ import pytest
 
 from small_flights import simulate_into
 from sorvolo.cli import main as cli
-from sorvolo.cli.demo import _is_simulated
+from sorvolo.cli.demo import _is_simulated, _next_steps
 from sorvolo.cli.progress import words_of
 from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
@@ -85,6 +85,11 @@ def test_demo_takes_its_own_flights_again_and_no_others(simulated: Path, tmp_pat
     assert not _is_simulated(tmp_path, _settings())
     (tmp_path / "simulation.json").write_text('{"settings": []')
     assert not _is_simulated(tmp_path, _settings())
+
+
+def test_demo_ends_with_the_address_of_a_station() -> None:
+    *_, where, command = _next_steps(Path("demo-site"), Path("demo-site/site"))
+    assert "http://127.0.0.1:8750/" in where and command.split() == ["sorvolo", "serve", "demo-site", "--open"]
 
 
 def test_demo_leaves_other_peoples_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,14 +68,22 @@ def demo(
                 f"Checked against the truth: {events.found} of {events.must_find} changes found, "
                 f"{counted(events.false, 'false change')} reported."
             )
-    console.print("Next, see both flights in a browser, review the changes, or map a flight of your own:")
-    for command in (
-        f"sorvolo serve {folder} --open",
-        f"sorvolo review {site}",
-        f"sorvolo history {site}",
-        "sorvolo map MY_VIDEO.MP4 --site my-site",
-    ):
-        console.print(f"  {command}", soft_wrap=True, highlight=False, markup=False)
+    for line in _next_steps(folder, site):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
+def _next_steps(folder: Path, site: Path) -> list[str]:
+    """What to do with the demo's site; the last lines state where a browser shows it."""
+    from sorvolo.station.settings import StationSettings
+
+    return [
+        "Next, review the changes, or map a flight of your own:",
+        f"  sorvolo review {site}",
+        f"  sorvolo history {site}",
+        "  sorvolo map MY_VIDEO.MP4 --site my-site",
+        f"Or see both flights in a browser, at {StationSettings(folder).address}:",
+        f"  sorvolo serve {folder} --open",
+    ]
 
 
 def _simulate(folder: Path, settings: "SimulationSettings") -> None:
