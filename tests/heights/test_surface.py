@@ -11,6 +11,7 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.heights.figures import surface_figures, surface_warnings
+from sorvolo.heights.free_space import seen_through
 from sorvolo.heights.islands import IslandSettings
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
@@ -18,6 +19,7 @@ from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
+from sorvolo.heights.sweep import SweepSettings
 from sorvolo.heights.terrain import TerrainSettings, filled, terrain
 from sorvolo.registration.features import gray_from_rgb
 
@@ -113,6 +115,25 @@ def test_a_wall_hides_the_ground_behind_it() -> None:
     assert not seen[behind].any()
     assert seen[(x > reach + 0.8) & (np.abs(y) < 2)].all()
     assert seen[x < 4.5].all()
+
+
+def test_a_piece_that_photos_see_through_is_found_and_the_house_is_not(survey) -> None:
+    views, pictures, _ = survey
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    true = true_heights(lattice).astype(np.float32)
+    x, y = np.moveaxis(lattice.points_m(), 2, 0)
+    beside = (np.abs(x + 1) < 3) & (y > 1.2) & (y < 2.6)  # a match by chance, higher than the house
+    wrong = np.where(beside, np.float32(8), true)
+
+    def found_in(up_m: np.ndarray) -> np.ndarray:
+        def gray(number: int) -> np.ndarray:
+            return gray_from_rgb(pictures[number])
+
+        return seen_through(lattice, up_m, views, gray, 60, SweepSettings(window_cells=(3, 7)))
+
+    assert not found_in(true).any()
+    found = found_in(wrong)
+    assert found[beside].all() and not found[~beside].any()
 
 
 def test_photos_are_chosen_from_above(survey) -> None:

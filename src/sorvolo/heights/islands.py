@@ -40,7 +40,13 @@ def _windows(shape: tuple[int, ...], side: int) -> Iterator[tuple[int, int, int,
 
 
 def _alone(up_m: Floats32, step_m: float, most_cells: int) -> Mask:
-    """(H, W) the cells of pieces, within which neighbours differ by less than a step, of few cells."""
+    """(H, W) the cells of pieces of few cells."""
+    piece = pieces(up_m, step_m)
+    return np.asarray((np.bincount(piece.ravel())[piece] <= most_cells) & np.isfinite(up_m))
+
+
+def pieces(up_m: Floats32, step_m: float) -> Rows:
+    """(H, W) the number of the piece that each cell is of: within one, neighbours differ by less than a step."""
     number = np.arange(up_m.size).reshape(up_m.shape)
     joined: list[tuple[Rows, Rows]] = []
     for here, there in ((np.s_[:, 1:], np.s_[:, :-1]), (np.s_[1:], np.s_[:-1])):
@@ -50,4 +56,4 @@ def _alone(up_m: Floats32, step_m: float, most_cells: int) -> Mask:
     rows, columns = (np.concatenate(each) for each in zip(*joined, strict=True))
     ties = coo_matrix((np.ones(len(rows), np.int8), (rows, columns)), shape=(up_m.size, up_m.size))
     _, piece = connected_components(ties, directed=False)
-    return np.asarray((np.bincount(piece)[piece] <= most_cells).reshape(up_m.shape) & np.isfinite(up_m))
+    return np.asarray(piece.reshape(up_m.shape), np.int64)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
+from sorvolo.heights.free_space import FreeSpaceSettings, seen_through
 from sorvolo.heights.islands import IslandSettings, islands
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.semiglobal import SmoothingSettings
@@ -32,6 +33,7 @@ class SurfaceSettings:
     margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
     unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which one pair decides nothing
     islands: IslandSettings = field(default_factory=IslandSettings)
+    free_space: FreeSpaceSettings = field(default_factory=FreeSpaceSettings)
     match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
     relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
 
@@ -88,9 +90,24 @@ def sweep_surface(
             covered[y0:y1, x0:x1] = (swept.seen_by[inner] >= 2) | np.isfinite(found[inner])
             shown_by[y0:y1, x0:x1] = swept.shown_by[inner]
         yield (number + 1) / len(tiles)
-    alone = islands(up_m, shown_by, lattice.cell_m, settings.islands)
-    up_m[alone], sigma_m[alone] = np.nan, np.nan
+    up_m[islands(up_m, shown_by, lattice.cell_m, settings.islands)] = np.nan
+    up_m[_seen_through(lattice, up_m, views, pictures, settings)] = np.nan
+    sigma_m[np.isnan(up_m)] = np.nan
     yield Surface(lattice, up_m, sigma_m, covered)
+
+
+def _seen_through(
+    lattice: Lattice, up_m: Floats32, views: Sequence[View], pictures: Callable[[int, float], ImageGray],
+    settings: SurfaceSettings,
+) -> Mask:
+    """(H, W) the cells that photos see through, found on cells of the first sweep."""
+    times = settings.coarser
+    coarse = lattice.coarser(times)
+    found = seen_through(
+        coarse, np.ascontiguousarray(up_m[::times, ::times]), views, lambda i: pictures(i, coarse.cell_m),
+        _tile_cells(coarse.cell_m, views, settings), settings.coarse, settings.free_space,
+    )
+    return np.repeat(np.repeat(found, times, axis=0), times, axis=1)[:lattice.height, :lattice.width]
 
 
 def _bounds(points_m: PointsM, camera_m: float) -> Bounds:

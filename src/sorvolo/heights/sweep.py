@@ -96,6 +96,26 @@ def sweep(
     return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation, shown_by)
 
 
+def likeness_on(
+    lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], up_m: Floats32,
+    chosen: Sequence[int], settings: SweepSettings,
+) -> Iterator[tuple[int, int, Floats32]]:
+    """Two of the chosen views each, by number, and how alike (0 to 1) they are on heights without holes, (H, W).
+
+    It is 0 where a photo does not show the smaller patch as a whole.
+    """
+    bounds = Bounds(float(up_m.min()), float(up_m.max()), float(np.median(up_m)))
+    eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
+    laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
+    shown = [each.shows(up_m, min(settings.window_cells)) for each in laid]
+    on = [each.on(up_m) for each in laid]
+    for i, j in itertools.combinations(range(len(laid)), 2):
+        both = shown[i] & shown[j]
+        if both.any():
+            alike = _likeness(on[i][j] * on[j][i], [both] * len(settings.window_cells), settings)
+            yield chosen[i], chosen[j], np.maximum(alike, 0)
+
+
 def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: int) -> list[int]:
     """The rows of the views to compare over a lattice: those that see much of it, from angles that differ well."""
     across = np.linspace(0, 1, 5)
@@ -180,6 +200,16 @@ class _Laid:
                 flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             ))
         ]
+        return [laid[each] for each in self.channel]
+
+    def on(self, up_m: Floats32) -> list[Floats32]:
+        """The photo on heights, (H, W), for each of the others; 0 outside of it."""
+        columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
+        level, up = self._from_picture @ self._level, self._from_picture @ self._up
+        x, y, z = (each[0] * columns + (each[1] * rows + each[2]) + rise[2] * up_m for each, rise in zip(level, up))
+        z = np.where(z > 1e-6, z, np.nan)
+        u, v = (np.nan_to_num(each / z, nan=-1e6).astype(np.float32) for each in (x, y))
+        laid = [np.asarray(cv2.remap(each, u, v, cv2.INTER_LINEAR), np.float32) for each in cv2.split(self._contrast)]
         return [laid[each] for each in self.channel]
 
     def wholes(self, levels_m: Floats, side: int) -> Iterator[Seen]:
