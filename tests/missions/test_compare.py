@@ -538,6 +538,7 @@ def test_the_command_prints_the_changes_as_json(flown, site, capsys):
     assert not set(printed["withdrawn"]) & {each["properties"]["id"] for each in printed["changes"]["features"]}
 
 
+@pytest.mark.long  # kills at each step, and going on after one, have tests of their own
 def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(compared, flown, site):
     command = [
         sys.executable, "-m", "sorvolo", "compare", str(flown / "flight2"), "--site", str(site),

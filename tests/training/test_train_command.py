@@ -71,6 +71,7 @@ def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: P
     assert len(detector.detect(picture, least_score=0.02))
 
 
+@pytest.mark.long  # the same of a checkpoint alone is tested beside it
 def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: Path) -> None:
     settings = _settings(rpn="standard")
     whole = [each for each in _train(data, tmp_path / "whole", settings) if each.losses is not None]
@@ -88,11 +89,6 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: P
             row.pop("seconds")
     assert reports[0]["losses"] == reports[1]["losses"] and len(reports[0]["losses"]) == 6
     assert reports[0]["held_out"] == reports[1]["held_out"]
-
-    with pytest.raises(SettingsError, match="already holds a run; --resume continues it"):
-        next(_train(data, tmp_path / "stopped", settings))
-    with pytest.raises(SettingsError, match=r"cannot continue with other settings: .*seed was 1, is 2"):
-        list(_train(data, tmp_path / "stopped", _settings(rpn="standard", seed=2), resume=True))
 
 
 def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
@@ -132,6 +128,11 @@ def test_checkpoints_come_between_checks_too(
     content = (tmp_path / "out" / "checkpoint.pt").read_bytes()
     assert read_checkpoint(content, "checkpoint").state["step"] == 2
     run.close()  # type: ignore[attr-defined]
+    with pytest.raises(SettingsError, match="already holds a run; --resume continues it"):
+        next(_train(data, tmp_path / "out", settings))
+    other = _settings(schedule=schedule, rpn="standard", steps=400, seed=2)
+    with pytest.raises(SettingsError, match=r"cannot continue with other settings: .*seed was 1, is 2"):
+        list(_train(data, tmp_path / "out", other, resume=True))
 
 
 def test_other_labels_are_other_data(tmp_path: Path) -> None:
