@@ -146,7 +146,7 @@ def test_views_never_exceed_the_frames_searched(flown: Path, tmp_path: Path, has
     if not has_telemetry:
         video = tmp_path / "bare.mp4"
         video.write_bytes(_video(flown).read_bytes())
-    settings = WatchSettings(least_score=0.3, every=5, tiles=None)
+    settings = WatchSettings(least_score=0.3, every=3, tiles=None)
     folder = tmp_path / "watch"
     found = Detector.load("default", provider="cpu", threads=1)
     deque(watch(video, settings, WatchOutputs(folder=folder), camera=flown / "camera.xml", detector=found), 0)
