@@ -32,6 +32,19 @@ def test_the_report_names_ground_that_is_not_level(relief_m: float, tmp_path: Pa
     assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
 
 
+@pytest.mark.parametrize("seed", [6, 8], ids=["a house", "trees"])
+def test_what_stands_on_level_ground_makes_no_hill_of_it(seed: int, tmp_path: Path) -> None:
+    scene = replace(_LEVEL.scene, ground="urban", has_scenery=True)
+    simulate_into(tmp_path / "made", replace(_LEVEL, seed=seed, scene=scene))
+    camera = str(tmp_path / "made" / "camera.xml")
+    main(["map", str(tmp_path / "made" / "flight1" / "photos"), "--site", str(tmp_path / "site"), "--model", "none",
+          "--camera", camera])
+    report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
+    assert not any("the ground is not level" in each for each in report["warnings"]), report["warnings"]
+    off_m = _off_m(tmp_path)
+    assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
+
+
 def _off_m(folder: Path) -> np.ndarray:
     """(N,) how far each picture's corners lie from where they are, m, the mean."""
     truth = json.loads((folder / "made" / "truth" / "frames.geojson").read_text())
