@@ -163,6 +163,23 @@ def test_a_point_that_contradicts_the_others_is_named_and_left_out(
     assert control["control_rms_m"] < 0.05 and "G3" in capsys.readouterr().out
 
 
+def test_two_points_whose_places_are_exchanged_are_named_and_left_out(
+    surveyed: Surveyed, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place_m = {each.label: each.place_m for each in surveyed.marks}
+    other = {"G0": "G6", "G6": "G0"}
+
+    def swapped(mark: Mark) -> Mark:
+        return Mark(mark.label, place_m[other.get(mark.label, mark.label)], mark.x_px, mark.y_px, mark.photo)
+
+    gcp = surveyed.write(tmp_path / "gcp_list.txt", change=swapped)
+    assert run(tmp_path / "site", surveyed.photos, surveyed, gcp) == 0
+    control = control_of(tmp_path / "site")
+    assert sorted(control["excluded"]) == ["G0", "G6"]
+    assert control["control_rms_m"] < 0.05 and absolute_m(tmp_path / "site", surveyed) < 0.2
+    assert "G0" in capsys.readouterr().out
+
+
 def exchanged(text: str, first: int, second: int) -> str:
     """The lines with two columns exchanged."""
     head, *rows = text.splitlines()
