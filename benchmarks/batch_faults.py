@@ -157,9 +157,7 @@ def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
                 [flight], wanted, MapSettings(model=options.model), camera=folder / "flown-0" / "camera.xml"
             ):
                 pass
-        found, expected = content(site), content(wanted)
-        found.pop(POINTER, None)
-        wrong = sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
+        wrong = other_files(site, wanted)
         same += not wrong
         if wrong:
             differing.append({"flight": flight.name, "files": wrong[:5]})
@@ -171,6 +169,13 @@ def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
         shutil.rmtree(wanted)
     copies = {"faulty_copies": faulty_copies} if options.outages else {}
     return {"same_bytes": same, "differing": differing, "doubled": doubled, **copies}
+
+
+def other_files(site: Path, wanted: Path) -> list[str]:
+    """The files in which two sites differ, but for where their catalogues lie."""
+    found, expected = content(site), content(wanted)
+    found.pop(POINTER, None)
+    return sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
 
 
 def measured(folder: Path, options: argparse.Namespace) -> dict[str, object]:

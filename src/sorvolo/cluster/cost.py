@@ -1,6 +1,6 @@
 """What a try at a flight asks of a machine, by what flights took so far."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import ceil
 from statistics import median
@@ -41,13 +41,15 @@ def cost_of(row: Row, rows: Iterable[Row], settings: CostSettings = CostSettings
         if each.mission == row.mission and each.state in (State.DONE, State.DOUBTFUL) and each.peak_memory_mb > 0
     ]
     memory_mb = settings.reserve * max((each.peak_memory_mb for each in ended), default=0.0) or settings.unknown_mb
+    return Cost(_cpus(row, ended, settings), memory_mb * 2**row.crashes)
+
+
+def _cpus(row: Row, ended: Sequence[Row], settings: CostSettings) -> float:
+    """The cores of a flight, by those of its kind, recorded or live, that have ended; one before the first has."""
     is_live = is_live_address(row.source)
     shares = [
         each.cpu_s / each.seconds for each in ended if each.seconds > 0 and is_live_address(each.source) == is_live
     ]
-    cpus = median(shares or [1.0])
-    if is_live and shares:
-        asked = max(settings.least_live_cpus, ceil(20 * settings.reserve * cpus) / 20)  # in twentieths of a core
-    else:
-        asked = max(1.0, round(cpus))
-    return Cost(asked, memory_mb * 2**row.crashes)
+    if not is_live or not shares:
+        return max(1.0, round(median(shares or [1.0])))
+    return max(settings.least_live_cpus, ceil(20 * settings.reserve * median(shares)) / 20)  # in twentieths of a core
