@@ -79,6 +79,7 @@ def test_a_new_site_has_no_verdicts_of_a_deleted_one_of_its_name(
     assert verdict(client, "b-1", "confirmed", 0).status_code == 201
     shutil.rmtree(root / "field")
     shutil.copytree(made_site, root / "field")  # the first one is back, such as from a backup
+    wait_for(lambda: client.get("/api/sites/field/collections/changes/items/b-1").status_code == 200)
     assert properties(client, "b-1")["note"] == "a shadow"
 
 
