@@ -309,6 +309,14 @@ def test_yaw_turns_across_north_the_short_way():
         assert abs((found - expected + 180) % 360 - 180) < 1e-6
 
 
+def test_roll_turns_across_180_degrees_the_short_way():
+    """As a gimbal near straight down states it: yaw and roll are wild, and their sum is calm."""
+    yaw, roll = np.array([228.0, 282.0]), np.array([-139.0, 167.0])
+    track, _ = track_of(straight([0.0, 1], camera_yaw_deg=yaw, camera_pitch_deg=-89.5, camera_roll_deg=roll))
+    turned = track.prior(0.0).rotation.T @ track.prior(0.5).rotation
+    assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) < 3.0
+
+
 def test_a_gimbal_is_asked_before_the_body():
     angles = {"body_yaw_deg": 10.0, "body_pitch_deg": 5.0, "body_roll_deg": 0.0}
     body, _ = track_of(straight(ONE_HZ, **angles))

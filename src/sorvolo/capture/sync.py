@@ -129,7 +129,7 @@ class Track:
     vertical_sigma_m: float
     altitude_offset_sigma_m: float
     height_words: str
-    yaw_deg: Floats  # unwrapped, of the camera if known, else the body
+    yaw_deg: Floats  # unwrapped, as the roll is; of the camera if known, else the body
     pitch_deg: Floats
     roll_deg: Floats
     attitude: str  # "gimbal" | "body" | "none"
@@ -429,10 +429,11 @@ def _angles(telemetry: Telemetry) -> tuple[str, tuple[Floats, Floats, Floats]]:
         if len(telemetry) and known.mean() > 0.5:
             columns[2] = np.where(np.isfinite(columns[2]), columns[2], 0.0)
             index, where = np.arange(len(telemetry)), np.flatnonzero(known)
-            yaw = np.degrees(np.unwrap(np.radians(columns[0][known])))
+            # a gimbal that looks straight down states a roll as wild as its yaw: both go the short way round
+            yaw, roll = (np.unwrap(columns[each][known], period=360.0) for each in (0, 2))
             return kind, (
                 np.interp(index, where, yaw), np.interp(index, where, columns[1][known]),
-                np.interp(index, where, columns[2][known]),
+                np.interp(index, where, roll),
             )
     zeros = np.zeros(len(telemetry))
     return "none", (zeros, zeros, zeros)

@@ -13,7 +13,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import sorvolo
@@ -326,8 +326,12 @@ class _LiveTry:
         return run_order(self._worker, stall_s, self._found.put)
 
     def take_found(self) -> list[str]:
-        """What its watch found since this was last asked."""
-        return [self._found.get() for _ in range(self._found.qsize())]
+        """What its watch found since this was last asked, of two that ask at once by one."""
+        found = []
+        with suppress(Empty):
+            while True:
+                found.append(self._found.get_nowait())
+        return found
 
     def finish(self) -> None:
         """Have the flight end."""
