@@ -48,6 +48,7 @@ def run(
             return report
 
 
+@pytest.mark.long
 def test_a_database_that_comes_late_and_dies_on_the_way(
     flown: Path, tmp_path: Path, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -89,6 +90,7 @@ def test_a_database_that_comes_late_and_dies_on_the_way(
     assert found.pop(POINTER) and found == content(wanted)
 
 
+@pytest.mark.long
 def test_an_object_store_that_comes_late_has_every_map(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -95,7 +95,9 @@ def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: An
         assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order
 
 
-@pytest.mark.parametrize("look_s", [pytest.param(0.05, id="asked often"), pytest.param(300.0, id="asked at its end")])
+@pytest.mark.parametrize("look_s", [
+    pytest.param(0.05, id="asked often"), pytest.param(300.0, id="asked at its end", marks=pytest.mark.long),
+])
 def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
     cluster: Any, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look_s: float
 ) -> None:
@@ -134,6 +136,7 @@ def test_a_stream_whose_actor_dies_goes_on_in_the_same_folder(cluster: Any, flow
     assert [path.name for path in (tmp_path / "out" / "north-watch").iterdir()] == ["one"]
 
 
+@pytest.mark.long
 def test_a_machine_that_dies_loses_nothing(cluster: Any, flown: Path, tmp_path: Path) -> None:
     for name in ("one", "two"):
         another(flown, tmp_path / "in" / name)

@@ -157,6 +157,7 @@ def killable(tmp_path: Path) -> Iterator[StationProcess]:
     made.stop()
 
 
+@pytest.mark.long
 def test_a_page_sees_a_flight_grow_though_its_station_is_killed(
     killable: StationProcess, tmp_path: Path
 ) -> None:

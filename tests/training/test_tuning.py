@@ -55,6 +55,7 @@ def _held_out_ap50(folder: Path) -> float:
     return float(json.loads((folder / "training.json").read_text())["held_out"]["ap50"])
 
 
+@pytest.mark.long
 def test_a_tuned_model_knows_at_once_what_its_beginning_knew(
     learnt: Path, tuned: Path, data: Path, tmp_path: Path
 ) -> None:
