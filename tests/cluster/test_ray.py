@@ -95,9 +95,8 @@ def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: An
         assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order
 
 
-@pytest.mark.parametrize("look_s", [
-    pytest.param(0.05, id="asked often"), pytest.param(300.0, id="asked at its end", marks=pytest.mark.long),
-])
+@pytest.mark.long
+@pytest.mark.parametrize("look_s", [pytest.param(0.05, id="asked often"), pytest.param(300.0, id="asked at its end")])
 def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
     cluster: Any, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look_s: float
 ) -> None:
