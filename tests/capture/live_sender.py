@@ -68,12 +68,13 @@ class Sender(threading.Thread):
         self, url: str, *, count: int = 10_000, size: tuple[int, int] = (160, 96), klv: bool = False, first: int = 0,
         container: str = "mpegts", options: Mapping[str, str] | None = None, speed: float = 1.0,
         image: Callable[[int], Any] | None = None, klv_of: Callable[[int], bytes] = packet_of, rate: int = RATE,
+        codec: str = "libx264",
     ) -> None:
         super().__init__(daemon=True)
         self._url, self._count, self._size, self._klv, self._first = url, count, size, klv, first
         self._container, self._options, self._speed = container, dict(options or {}), speed
         self._image = image or (lambda index: picture(index, size))
-        self._klv_of, self._rate = klv_of, rate
+        self._klv_of, self._rate, self._codec = klv_of, rate, codec
         self._stopped = threading.Event()
         self.sent_s: dict[int, float] = {}
         self.error: Exception | None = None
@@ -86,9 +87,10 @@ class Sender(threading.Thread):
 
     def _send(self) -> None:
         with av.open(self._url, "w", format=self._container, options=self._options) as output:
-            stream = output.add_stream("libx264", rate=self._rate)
+            stream = output.add_stream(self._codec, rate=self._rate)
             stream.width, stream.height, stream.pix_fmt = *self._size, "yuv420p"
-            stream.options = {"preset": "ultrafast", "tune": "zerolatency", "g": "10", "crf": "12"}
+            if self._codec == "libx264":
+                stream.options = {"preset": "ultrafast", "tune": "zerolatency", "g": "10", "crf": "12"}
             data = output.add_data_stream("klv") if self._klv else None
             began_s = time.monotonic()
             for step in range(self._count):

@@ -2,7 +2,7 @@
 
 import socket
 import threading
-from contextlib import closing
+from contextlib import closing, suppress
 
 from live_sender import free_port, sending_apart
 
@@ -34,7 +34,8 @@ class RtspServer(threading.Thread):
         """Break all connections, as a drone out of reach does."""
         while self._connections:
             connection = self._connections.pop()
-            connection.shutdown(socket.SHUT_RDWR)
+            with suppress(OSError):  # the other side was first
+                connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         self._listener.close()

@@ -17,6 +17,7 @@ pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 import numpy as np
 from browsers import Served, Watched, chromium
+from live_sender import free_port, sending, udp_url
 from PIL import Image
 from playwright.sync_api import expect
 from pyproj import Geod
@@ -431,6 +432,25 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
         page.locator("aside.video footer", has_text="1 in the picture").wait_for()
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
     page.locator(".delay", has_text="ended").wait_for()
+
+
+def test_a_camera_s_address_shows_its_video(served: Served, opened: Watched) -> None:
+    """A watch that is started on the page, on a camera that sends MPEG-TS: its pictures, and then its boxes."""
+    page, port = opened.page, free_port()
+    show(opened, served, "missions")
+    with sending(udp_url(port)):
+        page.get_by_role("combobox", name="Mission").select_option("watch")
+        page.get_by_role("combobox", name="From").select_option("stream")
+        page.get_by_label("Stream's address").fill(f"udp://:{port}")
+        page.get_by_role("button", name="Start").click()
+        expect(page.locator("aside.video header b")).to_have_text(re.compile("^udp-"), timeout=60_000)
+        expect(page.locator(".delay")).to_have_text(re.compile("behind"))
+        brightest = page.locator("aside.video canvas").first.evaluate(
+            "each => Math.max(...each.getContext('2d').getImageData(0, 40, 160, 1).data.filter((_, n) => n % 4 < 3))"
+        )
+        assert brightest > 150  # the column in the middle of gray that moves: a picture, no empty canvas
+        page.locator(".run.running").get_by_role("button", name="Stop").click()
+        page.locator(".run.finished").wait_for(timeout=60_000)
 
 
 def test_without_webcodecs_the_video_plays_as_fragments(browser: Any, served: Served, tmp_path: Path) -> None:

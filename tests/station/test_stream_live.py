@@ -15,7 +15,7 @@ from test_stream_messages import units
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.errors import InputError
 from sorvolo.station.client import StreamClient, StreamSettings, remains_of, stream_url
-from sorvolo.station.footage import Piece, Timeline, open_footage
+from sorvolo.station.footage import ArrivalClock, Piece, Timeline, open_footage
 from sorvolo.station.messages import Hello, Kind
 from sorvolo.station.spool import Spool
 from sorvolo.station.transport_stream import FlightFile
@@ -101,6 +101,18 @@ def test_a_timeline_never_jumps_back() -> None:
     for dts_us, now_us in ((900, 0), (40_900, 40_000), (7, 2_040_000), (40_007, 2_080_000), (99_000_000, 2_120_000)):
         shown.append(dts_us + timeline.shift(dts_us, now_us))
     assert shown == [5_000_000, 5_040_000, 7_040_000, 7_080_000, 7_120_000] and timeline.restarts == 2
+
+
+def test_late_pictures_do_not_move_the_time_of_a_camera_without_telemetry() -> None:
+    """The one that came soonest counts; a clock that is slow by 30 ms a minute is followed."""
+    clock, began_ns, second_ns = ArrivalClock(), 1_760_000_000 * 10**9, 10**9
+    late_ms = [900, 40, 8, 90, 30, 8, 200, 8]
+    found = [clock.utc_ns(1_000_000 * step, began_ns + step * second_ns + late * 10**6) - step * second_ns - began_ns
+             for step, late in enumerate(late_ms)]
+    assert found[0] == 900 * 10**6 and all(7_900_000 < each < 12_000_000 for each in found[2:])
+    slow = [clock.utc_ns(1_000_000 * step, began_ns + round(step * second_ns * 1.0005)) for step in range(60, 600)]
+    assert abs(slow[-1] - began_ns - round(599 * second_ns * 1.0005)) < 10_000_000
+    assert clock.utc_ns(600_000_000, began_ns + 660 * second_ns) == began_ns + 660 * second_ns
 
 
 def test_what_an_earlier_flight_left_is_sent_as_that_flight(stream: bytes, tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from fastapi.responses import FileResponse, JSONResponse
 from starlette.staticfiles import StaticFiles
 
 from sorvolo import __version__
+from sorvolo.station.camera_door import CameraDoor, door_path
 from sorvolo.station.cogs import answer_raster_errors, cog_routes
 from sorvolo.station.collections import SiteCollections
 from sorvolo.station.crops import crop_routes
@@ -109,15 +110,18 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     """
     station = Station.open(settings)
     outward = Outward(receivers, station.events, station.ingest, settings.state_folder)
+    door = CameraDoor(door_path(settings), station.ingest)
     metrics = StationMetrics(settings.root, station.ingest, station.events, outward.figures)
 
     @asynccontextmanager
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
+        await door.open()
         station.runs.start_watching()
         station.map_watch.start()
         outward.start()
         yield
         await asyncio.to_thread(outward.close)
+        await door.close()
         await station.ingest.close()
         station.close()
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit, urlunsplit
 
-from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.client import ClientConnection, connect, unix_connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
 
 from sorvolo import __version__
@@ -45,6 +45,7 @@ class StreamSettings:
     ping_s: float = 5.0  # a link that answers no ping for so long is opened anew
     give_up_s: float = float("inf")  # without a link, once everything was taken
     authority: Path | None = None  # of the station's certificate, PEM
+    door: str = ""  # the socket of a station on this machine, which is called instead of the address
 
     def __post_init__(self) -> None:
         if not (self.speed == 0 or 0.01 <= self.speed <= 1000):
@@ -180,18 +181,14 @@ class StreamClient:
 
     async def _send_all(self, show: Callable[[StreamReport], None]) -> None:
         backoff = Backoff()
-        context, ping_s = self._context(), self._settings.ping_s
+        context = self._context()
         showing = asyncio.create_task(self._show(show))
         lost_s: float | None = time.monotonic()
         stopped_s: float | None = None
         try:
             while True:
                 try:
-                    async with connect(
-                        self._url, ssl=context, additional_headers=self._headers(), compression=None, proxy=None,
-                        open_timeout=_CONNECT_S, ping_interval=ping_s, ping_timeout=ping_s, close_timeout=2.0,
-                        max_size=1_000_000,
-                    ) as link:
+                    async with self._called(context) as link:
                         await self._greet(link)
                         backoff.reset()
                         if lost_s is not None:
@@ -211,6 +208,17 @@ class StreamClient:
         finally:
             showing.cancel()
             show(self._count())
+
+    def _called(self, context: ssl.SSLContext | None) -> connect:
+        """A new connection to the station, to be entered."""
+        ping_s, headers = self._settings.ping_s, self._headers()
+        ways: dict[str, Any] = {
+            "compression": None, "open_timeout": _CONNECT_S, "ping_interval": ping_s, "ping_timeout": ping_s,
+            "close_timeout": 2.0, "max_size": 1_000_000,
+        }
+        if self._settings.door:
+            return unix_connect(self._settings.door, self._url, **ways)
+        return connect(self._url, ssl=context, additional_headers=headers, proxy=None, **ways)
 
     def _is_hopeless(self, lost_s: float, stopped_s: float | None) -> bool:
         """Whether to leave what is not sent in the spool."""

@@ -16,6 +16,7 @@ from sorvolo.capture.live.addresses import FollowedPath, StreamAddress, is_live_
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import columns_of, klv_streams
 from sorvolo.capture.live.links import LINK_FORMS, NmeaLink, is_link
+from sorvolo.capture.live.reader import REFUSALS
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
 from sorvolo.capture.source import Source, open_sources, safe_name
 from sorvolo.capture.sync import tie_clocks
@@ -30,6 +31,8 @@ _JUMP_US = 10_000_000  # a clock that leaps so far was set anew
 _TIME_EVERY_US = 1_000_000  # where there is no telemetry, the time alone is stated so often
 _KNOWN_LENS = 0.04  # a focal length that is known so well is worth stating
 _OPEN_S = 6.0
+_DRIFT = 5e-4  # of a camera's clock: 30 ms a minute
+_LATE_NS = 5_000_000_000
 _STEP_US = 33_333  # between pictures where a clock began anew
 
 
@@ -56,6 +59,10 @@ class Piece:
     def shifted(self, shift_us: int) -> "Piece":
         """The same at another time."""
         return replace(self, pts_us=self.pts_us + shift_us, dts_us=self.dts_us + shift_us)
+
+
+class UnsendableInput(InputError):
+    """A video whose pictures a stream does not carry as they are."""
 
 
 class Footage(Protocol):
@@ -85,7 +92,7 @@ def open_footage(
 ) -> Footage:
     """The recording or the live source that an input names, as `sorvolo watch` takes them.
 
-    Raises InputError for what cannot be read, or whose pictures are neither H.264 nor H.265.
+    Raises InputError for what cannot be read, UnsendableInput where its pictures are neither H.264 nor H.265.
     """
     if is_live_address(text):
         address = live_address(text)
@@ -198,6 +205,7 @@ class LiveFootage:
         self._units = _Units()
         self._counts: Counter[str] = Counter()
         self._timeline = Timeline(0)
+        self._clock = ArrivalClock()
         self._why = ""  # the last connection broke
         self._fixes: deque[tuple[int, Epoch]] = deque(maxlen=1000)
         self._link = None if link is None else NmeaLink(
@@ -249,7 +257,7 @@ class LiveFootage:
             self._why = getattr(error, "strerror", None) or str(error)
 
     def _first(self) -> Any:
-        """The first connection. Raises InputError when none comes in `first_s`."""
+        """The first connection. Raises InputError when none comes in `first_s`, or the other side will not have us."""
         until_s = time.monotonic() + self._settings.first_s
         why, backoff = "nothing came", Backoff()
         while (left_s := until_s - time.monotonic()) > 0 and not self._stop.is_set():
@@ -257,6 +265,10 @@ class LiveFootage:
                 return self._open(left_s)
             except (av.FFmpegError, OSError, ValueError, IndexError) as error:
                 why = getattr(error, "strerror", None) or str(error)
+                if isinstance(error, REFUSALS):
+                    raise InputError(
+                        f"{self._address.shown}: {why}; check the address, the name and the password"
+                    ) from error
                 self._stop.wait(min(left_s, backoff.next_s()))
         raise InputError(
             f"{self._address.shown}: no picture within {self._settings.first_s:.0f} s ({why}); is the camera sending, "
@@ -291,7 +303,7 @@ class LiveFootage:
             yield from self._fixed(placed.pts_us)
             if not has_metadata and placed.dts_us >= due_us:
                 due_us = placed.dts_us + _TIME_EVERY_US
-                yield _piece(placed.pts_us, Sample(time.time_ns()))
+                yield _piece(placed.pts_us, Sample(self._clock.utc_ns(placed.pts_us, time.time_ns())))
             yield placed
 
     def _stated(self, data: "_Data", shift_us: int) -> list[Piece]:
@@ -334,6 +346,26 @@ class Timeline:
     def restart(self) -> None:
         """The source was opened anew: what it states next is on a new clock."""
         self._is_restarted = self._shift_us is not None
+
+
+class ArrivalClock:
+    """The UTC of pictures whose source states none: what came with the least delay counts. Only `utc_ns` changes it."""
+
+    def __init__(self) -> None:
+        self._zero_ns: int | None = None
+        self._at_ns = 0
+
+    def utc_ns(self, pts_us: int, now_ns: int) -> int:
+        """The UTC of a picture on the flight's clock that came now.
+
+        The delays of single pictures do not move it; it follows a camera's clock that runs slow by up to `_DRIFT`, and
+        begins anew where a picture is late by more than a connection holds back.
+        """
+        zero_ns = now_ns - pts_us * 1000
+        grown_ns = zero_ns if self._zero_ns is None else self._zero_ns + round(_DRIFT * max(0, now_ns - self._at_ns))
+        self._zero_ns = zero_ns if zero_ns - grown_ns > _LATE_NS else min(zero_ns, grown_ns)
+        self._at_ns = now_ns
+        return self._zero_ns + pts_us * 1000
 
 
 # ---- inside ---------------------------------------------------------------------------------------------------
@@ -400,7 +432,7 @@ def _format_of(video: Any, name: str) -> Format:
     context = video.codec_context
     codec = "unknown" if context is None else context.name
     if codec not in CODECS:
-        raise InputError(
+        raise UnsendableInput(
             f"{name}: its pictures are {codec}; a station takes {' or '.join(CODECS)} as they are, so set the camera "
             "to one of them, or convert a recording: ffmpeg -i INPUT -c:v libx264 OUTPUT.mp4"
         )

@@ -95,7 +95,8 @@ class Order:
     """What a mission's process is to do: everything resolved to paths and addresses; read by it alone.
 
     `source` is a path or an address with its password, which the order's file leaves out; `stream` is the name of the
-    drone's stream behind it, if any. `folder` is where a watch or a search puts its results.
+    stream behind it, if any: a drone's, or the one as which the station keeps a camera's in `streams`, taken at the
+    socket `door`. `folder` is where a watch or a search puts its results.
     """
 
     run: str
@@ -108,6 +109,8 @@ class Order:
     folder: str
     stream: str
     options: Mapping[str, Any]
+    door: str = ""
+    streams: str = ""
 
     def write(self, folder: Path) -> None:
         """Put it into a run's folder, without a stream's password. Raises StoreError on a full disk."""

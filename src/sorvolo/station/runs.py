@@ -5,6 +5,7 @@ import fcntl
 import itertools
 import json
 import os
+import re
 import secrets
 import shutil
 import signal
@@ -17,7 +18,9 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
+from sorvolo.station.camera_door import door_path
 from sorvolo.station.collections import SEARCH_FOLDER
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.inputs import Inputs
@@ -33,7 +36,7 @@ from sorvolo.station.orders import (
     RunWish,
 )
 from sorvolo.station.problems import Problem
-from sorvolo.station.settings import RUNS_FOLDER, StationSettings
+from sorvolo.station.settings import RUNS_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState, compact_json, utc_after, utc_now
 from sorvolo.store.atomic import writing
@@ -312,10 +315,13 @@ class Runs:
             ("source", wish.input), ("telemetry", options.telemetry), ("camera", options.camera_file),
         )}
         results = site / SEARCH_FOLDER if wish.mission == "search" else folder / "results"
+        stream, door = (wish.input.stream if wish.input else None) or "", door_path(self._settings)
+        is_camera = wish.input is not None and wish.input.stream_url is not None and door.is_socket()
         return Order(
             run_id, wish.mission, wish.site, str(site.resolve()), given["source"], given["telemetry"],
             given["camera"] or options.camera or "", str(results.resolve()),
-            (wish.input.stream if wish.input else None) or "", options.model_dump(mode="json"),
+            _stream_of_camera(given["source"], run_id) if is_camera else stream, options.model_dump(mode="json"),
+            str(door.resolve()) if is_camera else "", str((self._settings.root / STREAMS_FOLDER).resolve()),
         )
 
 
@@ -340,6 +346,13 @@ def _taken(run: Run, line: Mapping[str, Any]) -> tuple[Run, NewEvent]:
         )
         return run, _event(kind, run, run_row(run))
     return run, _event(kind, run, data)
+
+
+def _stream_of_camera(source: str, run_id: str) -> str:
+    """The name of a camera's stream: how and where it is reached, by which run; no path, which may be a key."""
+    parts = urlsplit(source)
+    place = re.sub(r"[^A-Za-z0-9.]+", "-", f"{parts.hostname or ''}-{parts.port or ''}").strip("-.")
+    return f"{parts.scheme}-{place[:40]}-{run_id[:6]}"
 
 
 def _is_live(run: Run) -> bool:

@@ -22,6 +22,7 @@ from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
+from sorvolo.station.camera import camera_opened
 from sorvolo.station.collections import on_earth
 from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, Order
 from sorvolo.store.exports.change_files import changes_geojson
@@ -89,7 +90,8 @@ def main(folder: Path) -> int:
     order, journal = Order.read(folder), Journal(folder / JOURNAL_FILE)
     stop = _Stop(is_live_address(order.source))
     try:
-        headline = _MISSIONS[order.mission](order, journal, stop.until)
+        with camera_opened(order, folder, stop.until) as opened:
+            headline = _MISSIONS[order.mission](opened, journal, stop.until)
     except KeyboardInterrupt:
         journal.add(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
         return _STOPPED_CODE

@@ -22,10 +22,12 @@ from sorvolo.survey.flight import Notice
 _OPEN_S = 6.0  # to be dialled and looked at
 _LISTEN_S = 3.0  # a listener that nobody speaks to is opened anew so often, so that it can be stopped
 _STAMP_JUMP_NS = 10 * SECOND_NS
-_REFUSED = (
+REFUSALS = (
     av.error.ProtocolNotFoundError, av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError,
     av.error.HTTPNotFoundError, av.error.PermissionError,
 )
+"""FFmpeg's errors for an other side that will not have us, however often it is asked."""
+
 _WALLCLOCK_BYTES = 8  # that a producer reference time begins with, us since 1970
 
 
@@ -157,7 +159,7 @@ class StreamReader:
         except (av.FFmpegError, OSError, ValueError, IndexError, MemoryError) as error:
             self._lost(self._why(error))
             self._counts["packet"] += self._file is not None and self._has_spoken
-            if isinstance(error, _REFUSED) and not self._has_spoken:
+            if isinstance(error, REFUSALS) and not self._has_spoken:
                 self.refused = self.failure
         return came
 

@@ -51,7 +51,7 @@ class Missions {
     const show = () => {
       from.hidden = input.hidden = this.mission === "search";
       fill(input, { upload: field("Files of the flight", files, "The video, and its telemetry (SRT, CSV, GPX …) if it is not inside; or all photos."),
-        stream: field("Stream's address", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows. The page shows no video of it: for that, send it with “sorvolo stream ADDRESS --to STATION” and choose it under what the station has."), ready }[this.from]);
+        stream: field("Stream's address", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows. The station opens the camera once; its video appears over the map."), ready }[this.from]);
     };
     const start = el("button", { class: "main" }, "Start");
     const form = el("form", { class: "stack start", on: { submit: async (event) => {
