@@ -48,6 +48,20 @@ def test_every_file_stands_in_the_tree_and_every_line_of_the_tree_is_a_file() ->
     assert set(drawn) == _files()
 
 
+def test_what_answers_the_questions_of_architecture_is_there() -> None:
+    """Each file that section 1 names exists, and defines the name in brackets behind it."""
+    text = (ROOT / "ARCHITECTURE.md").read_text()
+    answers = text[text.index("## 1. "):text.index("## 2. ")]
+    named = re.findall(r"`(\w[\w/]*/\w+\.(?:py|js))`(?: \(`([\w.]+)`)?", answers)
+    named = [each for each in named if each[0] != "cli/COMMAND.py"]
+    missing = [path for path, _ in named if not (PACKAGE / path).is_file()]
+    missing += [
+        f"{path}: {part}" for path, name in named for part in name.split(".")
+        if part and not re.search(rf"(def|class) {part}\b", (PACKAGE / path).read_text())
+    ]
+    assert len(named) > 40 and not missing
+
+
 @cache
 def _parsed(path: Path) -> ast.Module:
     gc.disable()  # else it walks all trees so far again and again
