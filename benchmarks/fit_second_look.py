@@ -20,6 +20,7 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -47,8 +48,7 @@ MOST_CUTS = 160
 ALOFT = "IMG_9364.jpg"
 
 
-@dataclass(frozen=True, eq=False)
-class Report:
+class Report(NamedTuple):
     """A report of a development picture: its set, picture and class, its score and the looks', and if it is right."""
 
     place: str

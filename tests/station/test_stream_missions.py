@@ -12,7 +12,7 @@ import urllib.request
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -102,6 +102,9 @@ class StationProcess(Station):
             return False
 
 
+AnyStation = TypeVar("AnyStation", bound=Station)
+
+
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flown")
@@ -109,12 +112,16 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "flight1" / "flight1.mp4"
 
 
-@pytest.fixture
-def station(tmp_path: Path) -> Iterator[Station]:
-    (tmp_path / "root").mkdir()
-    made = Station(tmp_path / "root")
+def running(kind: type[AnyStation], folder: Path) -> Iterator[AnyStation]:
+    (folder / "root").mkdir()
+    made = kind(folder / "root")
     yield made
     made.stop()
+
+
+@pytest.fixture
+def station(tmp_path: Path) -> Iterator[Station]:
+    yield from running(Station, tmp_path)
 
 
 def sending(footage: Footage, station: Station, spool: Path, speed: float = 1.0) -> StreamClient:
@@ -151,10 +158,7 @@ def test_a_map_of_a_stream_outlives_a_restarted_station(station: Station, flown:
 
 @pytest.fixture
 def killable(tmp_path: Path) -> Iterator[StationProcess]:
-    (tmp_path / "root").mkdir()
-    made = StationProcess(tmp_path / "root")
-    yield made
-    made.stop()
+    yield from running(StationProcess, tmp_path)
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,24 +12,28 @@ from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting
 
-_BESIDE_M = 0.4  # by which an object's place may lie outside of the change's outline, beside a part of its own length
-_LONGEST_S = 5.0  # before or after the time at which a moving change was where its outline is
-_TURN = 0.4  # of the way it goes meanwhile: people turn
-_LEAST_SIDE_PX = 160  # of a picture that a detector is shown
-_LEAST_SHARE = 0.5  # of the box or of the change, whichever is smaller, that both have in common
-_LIKE_LENGTHS = 1.6  # times the other's, at most
-LENIENT = 0.6
-"""Times each class's score: that something is there is known already."""
+
+@dataclass(frozen=True)
+class ClassSettings:
+    """When an object, a sighting or a detection names what a change is."""
+
+    beside_m: float = 0.4  # an object's place may lie so far outside of the outline, beside a part of its own length
+    longest_s: float = 5.0  # before or after the time at which a moving change was where its outline is
+    turn: float = 0.4  # of the way it goes meanwhile: people turn
+    least_side_px: int = 160  # of a picture that a detector is shown
+    least_share: float = 0.5  # of the box or of the change, whichever is smaller, that both have in common
+    like_lengths: float = 1.6  # times the other's, at most
+    lenient: float = 0.6  # times each class's score: that something is there is known already
 
 
-def stands_in(change: Change, thing: MapObject) -> bool:
+def stands_in(change: Change, thing: MapObject, settings: ClassSettings = ClassSettings()) -> bool:
     """Whether an object that does not move stands in a change's outline and is about as long."""
     if thing.moving or _outside_m(change.outline_m, thing.position_m) > 0:
         return False
-    return change.length_m / _LIKE_LENGTHS <= thing.length_m <= change.length_m * _LIKE_LENGTHS
+    return change.length_m / settings.like_lengths <= thing.length_m <= change.length_m * settings.like_lengths
 
 
-def object_at(change: Change, objects: Sequence[MapObject]) -> str:
+def object_at(change: Change, objects: Sequence[MapObject], settings: ClassSettings = ClassSettings()) -> str:
     """The class of the object that stands in a change's outline, or nearly, and is nearest to it in place and size.
 
     "" where there is none; what moves is left out.
@@ -39,7 +44,7 @@ def object_at(change: Change, objects: Sequence[MapObject]) -> str:
         if each.moving:
             continue
         length_m = each.length_m if np.isfinite(each.length_m) else change.length_m
-        reach_m = _BESIDE_M + length_m / 4
+        reach_m = settings.beside_m + length_m / 4
         outside_m = _outside_m(change.outline_m, each.position_m)
         if outside_m > reach_m:
             continue
@@ -50,7 +55,7 @@ def object_at(change: Change, objects: Sequence[MapObject]) -> str:
     return best
 
 
-def seen_at(change: Change, sightings: Sequence[Sighting]) -> str:
+def seen_at(change: Change, sightings: Sequence[Sighting], settings: ClassSettings = ClassSettings()) -> str:
     """The class of a flight's sightings in a change's outline, by their summed scores; "" where there is none.
 
     What moves is looked for where it was at each sighting's time.
@@ -59,10 +64,10 @@ def seen_at(change: Change, sightings: Sequence[Sighting]) -> str:
     speed_m_s = float(np.hypot(*change.velocity_m_s))
     for each in sightings:
         after_s = (each.time_ns - change.last_seen_ns) / 1e9
-        if change.kind is ChangeKind.MOVING and abs(after_s) > _LONGEST_S:
+        if change.kind is ChangeKind.MOVING and abs(after_s) > settings.longest_s:
             continue
         meanwhile_m: Floats = change.velocity_m_s * after_s if speed_m_s else np.zeros(2)
-        reach_m = _BESIDE_M + each.size_m[0] / 4 + _TURN * float(np.hypot(*meanwhile_m))
+        reach_m = settings.beside_m + each.size_m[0] / 4 + settings.turn * float(np.hypot(*meanwhile_m))
         outside_m = _outside_m(change.outline_m, each.position_m - meanwhile_m)
         if outside_m <= reach_m:
             sums[each.label] += each.score / (1.0 + max(outside_m, 0.0))
@@ -74,7 +79,7 @@ def can_show(patch: Patch, rgba: ImageRGBA) -> bool:
     return bool(patch.changed.any()) and bool((rgba[..., 3] > 0).any())
 
 
-def enlarged(rgba: ImageRGBA) -> tuple[ImageRGB, tuple[int, int]]:
+def enlarged(rgba: ImageRGBA, settings: ClassSettings = ClassSettings()) -> tuple[ImageRGB, tuple[int, int]]:
     """The picture without alpha, wide enough for a detector; how far it begins to the right of and below its corner.
 
     What is unknown gets the mean colour of what is known, what lies around is mirrored.
@@ -83,13 +88,14 @@ def enlarged(rgba: ImageRGBA) -> tuple[ImageRGB, tuple[int, int]]:
     rgb = rgba[..., :3].copy()
     rgb[~known] = rgb[known].mean(axis=0).astype(np.uint8)
     height, width = known.shape
-    top, left = (max(0, _LEAST_SIDE_PX - side + 1) // 2 for side in (height, width))
+    top, left = (max(0, settings.least_side_px - side + 1) // 2 for side in (height, width))
     padded = cv2.copyMakeBorder(rgb, top, top, left, left, cv2.BORDER_REFLECT)
     return np.asarray(padded, np.uint8), (left, top)
 
 
 def class_of_change(
-    patch: Patch, seen: Detections, thresholds: Mapping[str, float], offset_px: tuple[int, int]
+    patch: Patch, seen: Detections, thresholds: Mapping[str, float], offset_px: tuple[int, int],
+    settings: ClassSettings = ClassSettings(),
 ) -> str:
     """The class of the surest detection that covers the patch's change, in a picture that begins `offset_px` right of
     and below the patch's corner; "" where none does."""
@@ -100,7 +106,9 @@ def class_of_change(
     best, best_score = "", 0.0
     for box_px, name, score in zip(seen.boxes_px, seen.names, seen.scores):
         share = _common_share(np.asarray(box_px, np.float64), changed_px)
-        if score >= LENIENT * thresholds[name] and share >= _LEAST_SHARE and share * score > best_score:
+        if score < settings.lenient * thresholds[name] or share < settings.least_share:
+            continue
+        if share * score > best_score:
             best, best_score = name, share * float(score)
     return best
 

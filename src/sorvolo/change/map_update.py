@@ -1,6 +1,7 @@
 """The map brought up to date: changes' later pictures painted into its tiles; by how much it grew."""
 
 from collections.abc import Iterable, Mapping, MutableMapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -10,10 +11,15 @@ from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
-_GROWN_PX = 6  # of the tile, beyond the outline: covers the thing's blurred rim
-_FEATHER_PX = 4
-_MOST_GAIN = 1.6
-_LEAST_RING_PX = 50
+
+@dataclass(frozen=True)
+class PaintSettings:
+    """How a change is mixed into the map. Lengths in px of the tile."""
+
+    grown_px: int = 6  # beyond the outline: covers the thing's blurred rim
+    feather_px: int = 4  # over which old and new mix: no seam
+    most_gain: float = 1.6  # times brighter or darker, each channel: more is another surface, not another light
+    least_ring_px: int = 50  # of unchanged ground around, in px of the patch: of fewer no gain is taken
 
 
 def is_painted(change: Change) -> bool:
@@ -52,7 +58,8 @@ def grown_m2(
 
 
 def patched(
-    tile_rgba: ImageRGBA, tile_window: tuple[int, int, int, int], grid_from_site: Matrix3, patch: Patch
+    tile_rgba: ImageRGBA, tile_window: tuple[int, int, int, int], grid_from_site: Matrix3, patch: Patch,
+    settings: PaintSettings = PaintSettings(),
 ) -> ImageRGBA:
     """The tile with the patch's changed region as the flight saw it; the very same tile if nothing of it changes.
 
@@ -65,8 +72,8 @@ def patched(
     tile_from_grid = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
     tile_from_patch = (tile_from_grid @ grid_from_site @ patch.site_from_patch)[:2]
     scale = float(np.sqrt(abs(np.linalg.det(tile_from_patch[:, :2]))))
-    grow = max(1, round(_GROWN_PX / scale))
-    weight = _weight(patch, grow, max(1, round(_FEATHER_PX / scale)))
+    grow = max(1, round(settings.grown_px / scale))
+    weight = _weight(patch, grow, max(1, round(settings.feather_px / scale)))
     size = (x1 - x0, y1 - y0)
     laid_weight = cv2.warpAffine(weight, tile_from_patch, size, flags=cv2.INTER_LINEAR)
     known = cv2.warpAffine(patch.after[..., 3], tile_from_patch, size, flags=cv2.INTER_LINEAR) >= 250
@@ -76,7 +83,7 @@ def patched(
     laid = cv2.warpAffine(
         patch.after[..., :3], tile_from_patch, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     ).astype(np.float32)
-    laid *= _gains(patch, grow)
+    laid *= _gains(patch, grow, settings)
     share = laid_weight[..., None].copy()
     share[tile_rgba[..., 3] == 0] = 1.0  # nothing there to mix with
     mixed = tile_rgba[..., :3] * (1 - share) + laid * share
@@ -102,13 +109,13 @@ def _weight(patch: Patch, grow: int, feather: int) -> np.ndarray[tuple[int, int]
     return weight
 
 
-def _gains(patch: Patch, grow: int) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+def _gains(patch: Patch, grow: int, settings: PaintSettings) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     """(3,) what the later picture's channels are multiplied with to look like the map's ground around the change."""
     size = 2 * grow + 1
     near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
     ring = ~near & (patch.before[..., 3] > 0) & (patch.after[..., 3] > 0)
-    if np.count_nonzero(ring) < _LEAST_RING_PX:
+    if np.count_nonzero(ring) < settings.least_ring_px:
         return np.ones(3, np.float32)
     before = np.median(patch.before[ring][:, :3], axis=0) + 1.0
     after = np.median(patch.after[ring][:, :3], axis=0) + 1.0
-    return np.clip(before / after, 1 / _MOST_GAIN, _MOST_GAIN).astype(np.float32)
+    return np.clip(before / after, 1 / settings.most_gain, settings.most_gain).astype(np.float32)

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.pair.illumination import BLACK_LEVEL
 from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.survey.findings import ComparedView
 
-_BLACK_LEVEL = 8.0  # grey levels added before logarithms: below it a camera shows noise, not light
-_OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(_BLACK_LEVEL))  # of each grey level
+_OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))  # of each grey level
 _SKY = np.array([0.7, -0.7], np.float32)  # blue and red over green, by which light from the sky differs from the sun's
 
 Signs = NDArray[np.float32]

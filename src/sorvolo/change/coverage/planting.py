@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.change.pair.illumination import BLACK_LEVEL
 from sorvolo.geometry.arrays import Floats, ImageRGB, Mask
 from sorvolo.survey.findings import ComparedView
 
-_BLACK_LEVEL = 8.0  # grey levels added before logarithms, as the pair's light does
 _COLOURS = np.array([  # of cars, clothes and tarpaulins: white, silver, black, red, blue, yellow, green
     [235, 235, 230], [180, 182, 184], [28, 28, 32], [190, 40, 35], [40, 75, 160], [220, 180, 40], [60, 110, 60],
 ], np.float32)
@@ -135,7 +135,7 @@ def texture(view: ComparedView) -> NDArray[np.float32]:
     """How rough the ground is that a view shows, (h / 8, w / 8): the mean distance of a pixel from its surroundings in
     octaves of light, never less than what the eight bits of a picture leave."""
     gray = cv2.resize(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    level = np.log2(gray.astype(np.float32) + np.float32(_BLACK_LEVEL))
+    level = np.log2(gray.astype(np.float32) + np.float32(BLACK_LEVEL))
     detail = cv2.absdiff(level, cv2.blur(level, (9, 9)))
     size = max(1, gray.shape[1] // 4), max(1, gray.shape[0] // 4)
     coarse = cv2.resize(cv2.blur(detail, (13, 13)), size, interpolation=cv2.INTER_AREA)

@@ -19,7 +19,7 @@ BLACK_LEVEL = 8.0  # grey levels added before logarithms: below it a camera show
 STEPS_PER_OCTAVE = 48.0  # of local gains in a byte
 GAIN_ONE, CURVE_ONE = 4096, 16  # fixed point of the kernel `relight`
 
-_LOG = (np.log2(np.arange(256) + BLACK_LEVEL) * 48).astype(np.float32)
+_LOG = (np.log2(np.arange(256) + BLACK_LEVEL) * STEPS_PER_OCTAVE).astype(np.float32)
 _OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))
 
 

@@ -1,19 +1,25 @@
 """The things that one piece of changed ground holds, each announced under an id of its own that stays."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from sorvolo.change.shape.outlines import overlap
 from sorvolo.survey.findings import Change
 
-_MORE_VIEWS = 1.2  # so many times as many views may show another thing beside the first
-_SAME = 0.4  # of the union of two outlines of one thing lies in both
+
+@dataclass(frozen=True)
+class PartSettings:
+    """When ground is parted anew, and what is the same thing as before."""
+
+    more_views: float = 1.2  # so many times as many views may show another thing beside the first
+    same: float = 0.4  # of the union of two outlines of one thing lies in both
 
 
 class Parts:
     """Neighbours that lie so near to each other that their ground is one. `take` and `join` change it."""
 
-    def __init__(self) -> None:
+    def __init__(self, settings: PartSettings = PartSettings()) -> None:
+        self._settings = settings
         self.things: tuple[Change, ...] = ()
         self._announced: dict[str, Change] = {}  # by id, also those that do not show any more
         self._seen: tuple[Change, ...] = ()  # when last parted, announced or not
@@ -21,7 +27,7 @@ class Parts:
 
     def is_due(self, views: int) -> bool:
         """Whether, with this many views, it is time to look again for things to part."""
-        return views >= _MORE_VIEWS * self._views
+        return views >= self._settings.more_views * self._views
 
     def join(self, announced: Sequence[Change]) -> None:
         """Remember what was announced of a change that has become one with this: its things keep their ids."""
@@ -55,7 +61,7 @@ class Parts:
         new one; nothing where it was not there when last looked at."""
         if all(each.id != thing.id for each in named.values()):
             return {row: thing}
-        if now_ns < 0 or any(_is_same(thing, each) for each in self._seen):
+        if now_ns < 0 or any(self._is_same(thing, each) for each in self._seen):
             return {row: replace(thing, id=next_id(), announced_ns=now_ns)}
         return {}
 
@@ -64,11 +70,10 @@ class Parts:
         found: dict[int, Change] = {}
         free = dict(self._announced)
         for row, thing in enumerate(things):
-            same = next((each for each in free.values() if _is_same(thing, each)), None)
+            same = next((each for each in free.values() if self._is_same(thing, each)), None)
             if same is not None:
                 found[row] = replace(thing, id=same.id, announced_ns=free.pop(same.id).announced_ns)
         return found
 
-
-def _is_same(a: Change, b: Change) -> bool:
-    return overlap(a.outline_m, b.outline_m)[0] > _SAME
+    def _is_same(self, a: Change, b: Change) -> bool:
+        return overlap(a.outline_m, b.outline_m)[0] > self._settings.same
