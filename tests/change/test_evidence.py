@@ -89,7 +89,7 @@ def candidate(number: int, shown: int, missed: int) -> Candidate:
     for each in range(shown + missed):
         flagged = one if each < shown else no
         laid = LaidView(cell.grown(2), np.pad(flagged, 2), np.ones((5, 5), bool), np.full((5, 5), 230, np.uint8),
-                        np.zeros((5, 5), bool))
+                        *(np.zeros((5, 5), bool),) * 2, np.zeros((5, 5), np.int32))
         view = KeptView(START_NS + each, laid, np.array([each, 0.0, CAMERA_HEIGHT_M]), np.eye(3),
                         np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), 0.1, True)
         assert result.see(view, one, 0.1) == flagged.any()

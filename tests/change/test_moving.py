@@ -1,5 +1,6 @@
 """People and cars that move while they are seen: reported once as moving, never as changes of the ground."""
 
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings
 from sorvolo.change.motion.blobs import Blob
-from sorvolo.change.motion.parallax import TrackPoint, motion
+from sorvolo.change.motion.parallax import ParallaxSettings, TrackPoint, motion, shown_alone
 from sorvolo.errors import SettingsError
 from sorvolo.survey.findings import ChangeKind
 
@@ -100,6 +101,37 @@ def test_a_walker_seen_now_with_the_shadow_and_now_without_is_one():
     views = [view_of(i, i / 5, (-4 + 0.5 * i / 5, 0, CAMERA_HEIGHT_M), [things[i % 2]]) for i in range(24)]
     announced, final = events(views)
     assert len(announced) == len(final) == 1 and final[0].kind == ChangeKind.MOVING
+
+
+def test_a_walker_in_a_long_shadow_is_one_event_though_the_shadow_seems_to_stay():
+    walks = [
+        Thing(2, 1, (0.5, 0.5), velocity_m_s=(0.6, 0)),
+        Thing(0.25, 1, (3, 0.4), colour=(50, 50, 55), velocity_m_s=(0.6, 0)),  # low sun, along the way
+    ]
+    announced, final = events(flight(walks, seconds=6, speed_m_s=1.5, start_m=(-3, 0)))
+    assert [each.kind for each in final] == [ChangeKind.MOVING]
+    assert len(announced) == 1 and final[0].id == announced[0].id and final[0].announced_ns == announced[0].announced_ns
+
+
+def test_one_view_of_a_walker_joined_with_another_thing_is_no_view_of_the_walker():
+    lengths_m = (0.5, 0.52, 1.4, 0.49, 0.5, 0.5)
+    points = [
+        replace(each, blob=replace(each.blob, length_m=length_m))
+        for length_m, each in zip(lengths_m, (point(0.2 * i, (i, 0), (0, 0)) for i in range(6)))
+    ]
+    assert shown_alone(points, ParallaxSettings()) == (*points[:2], *points[3:])
+    grows = [replace(each, blob=replace(each.blob, length_m=0.5 * 1.5**i)) for i, each in enumerate(points)]
+    assert shown_alone(grows, ParallaxSettings()) == tuple(grows)
+
+
+def test_a_mover_seen_again_for_one_view_stays_where_it_was_seen_to_move():
+    walks, last = Thing(-3, -2, (0.5, 0.5), velocity_m_s=(0.9, 0.3)), 20
+    shown = {*range(last), 45}
+    views = [
+        view_of(i, i / 5, (-4 + 0.5 * i / 5, 0, CAMERA_HEIGHT_M), [walks] if i in shown else []) for i in range(46)
+    ]
+    _, (change,) = events(views)
+    assert change.last_seen_ns == views[last - 1].time_ns
 
 
 def test_two_who_walk_side_by_side_are_two():

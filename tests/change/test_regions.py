@@ -89,7 +89,23 @@ def test_rasters_move_between_windows_without_loss():
 
 
 def laid_of(flags, seen, window):
-    return LaidView(window, flags & seen, seen, np.full(flags.shape, 200, np.uint8), np.zeros_like(flags))
+    nothing = np.zeros_like(flags)
+    score, legs = np.full(flags.shape, 200, np.uint8), np.zeros(flags.shape, np.int32)
+    return LaidView(window, flags & seen, seen, score, nothing, nothing, legs)
+
+
+def test_a_piece_that_only_its_shadow_leaves_is_whole():
+    seen = np.ones((20, 20), bool)
+    seen[:4] = False
+    flags = np.zeros_like(seen)
+    flags[4:12, 3:6] = flags[4:12, 9:12] = flags[8:12, 15:18] = True  # two of three reach the view's rim
+    shaded = np.zeros_like(seen)
+    shaded[:9, 3:6] = True
+    laid = laid_of(flags, seen, CellWindow(0, 0, 20, 20))
+    assert np.array_equal(np.flatnonzero(laid.cut_off.any(axis=0)), [3, 4, 5, 9, 10, 11])
+    assert np.array_equal(np.flatnonzero(replace(laid, shaded=shaded).cut_off.any(axis=0)), [9, 10, 11])
+    all_shade = replace(laid, shaded=np.ones_like(seen))  # a dark wall: no shadow of anything that is seen
+    assert np.array_equal(all_shade.cut_off, laid.cut_off)
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=20))
@@ -123,7 +139,7 @@ def test_ground_where_nothing_changes_costs_no_memory_and_the_oldest_goes_first(
 def test_an_oblique_view_sees_no_ground_behind_its_horizon():
     view = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [])
     tilted = np.array([[1, 0, -160], [0, -1, 0], [0, 0.02, -0.6]], float)  # the horizon is at row 30
-    laid = lay(replace(view, site_from_image=tilted), 0.15, np.zeros(0, bool), np.zeros(0, bool))
+    laid = lay(replace(view, site_from_image=tilted), 0.15, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, int))
     assert max(laid.window.shape) <= 2 * 5 * CAMERA_HEIGHT_M / 0.15 + 2
     rows = np.nonzero(laid.seen.any(axis=1))[0]
     assert len(rows)

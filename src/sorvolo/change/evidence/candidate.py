@@ -3,7 +3,7 @@
 Seeds are candidates that are not certain yet: they may never be seen often enough for k of n views.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,6 +28,7 @@ class CandidateSettings:
     all_seen: float = 0.99  # a view that sees more knows its place
     most_places: int = 64  # of views, for the spread of its place
     most_cameras: int = 256  # of views that show it; of more every second one is kept
+    most_legs: int = 64  # of followed blobs that showed it; the oldest are forgotten
     most_seeds: int = 256  # uncertain candidates that are kept in any case ...
     most_seeds_px: int = 8_000_000  # ... and while their pictures have no more pixels (110 MB); the oldest go first
 
@@ -65,6 +66,7 @@ class Candidate:
         self._tally = Tally(first_seen_ns, first_seen_ns)
         self._places: list[Floats] = []
         self._cameras: list[Floats] = []
+        self._shown_by: dict[int, Tally] = {}  # the views in which a followed blob showed it, by its leg
         self._kind: ChangeKind | None = None
         self._kind_outline: PointsM | None = None
 
@@ -77,6 +79,10 @@ class Candidate:
     def tally(self) -> Tally:
         """What the views reported so far."""
         return self._tally
+
+    def shown_by(self, which: Callable[[int], bool]) -> list[Tally]:
+        """The views in which blobs showed it that were followed, on `which` legs: one tally for each of these."""
+        return [each for leg, each in self._shown_by.items() if which(leg)]
 
     @property
     def cameras_m(self) -> PointsM:
@@ -95,7 +101,7 @@ class Candidate:
         if report.flagged < self._settings.shows * report.seen:
             self.miss()
             return
-        self._count(view, report, residual_m=0.0, knows_place=True)
+        self._count(view, report, cells, residual_m=0.0, knows_place=True)
         self.pictures.vote(view.site_from_image, view.changed, view.valid)
 
     def see(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
@@ -108,17 +114,21 @@ class Candidate:
         if report.flagged < self._settings.shows * report.seen:
             self.miss()
             return False
-        self._count(view, report, view.residual_m, knows_place=report.seen > self._settings.all_seen)
-        self._note_rim(view, cells)
+        leg = self._count(
+            view, report, cells, view.residual_m, knows_place=report.seen > self._settings.all_seen
+        )
+        self._note_rim(view, cells, leg)
         return True
 
     def ask(self, view: KeptView, cells: Mask, cell_m: float) -> bool:
         """Count this view as for a seed: whatever shows some of it shows it; and its mask. Whether it does."""
         report = view.laid.report(self._cells, cells, cell_m)
         if report.flagged >= max(self._settings.shows * report.seen, 1e-9):
-            self._count(view, report, view.residual_m, knows_place=report.seen > self._settings.all_seen)
+            leg = self._count(
+                view, report, cells, view.residual_m, knows_place=report.seen > self._settings.all_seen
+            )
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
-            self._note_rim(view, cells)
+            self._note_rim(view, cells, leg)
             return True
         if report.seen >= self._settings.seen:
             self.miss()
@@ -131,6 +141,7 @@ class Candidate:
     def recount(self, views: int, asked: int) -> None:
         """Count anew what views reported: `views` of `asked` flagged what is left of it."""
         self._tally = self._tally.recounted(views, asked)
+        self._shown_by.clear()
 
     def become(self, number: int, *, is_single: bool) -> None:
         """A seed grows up; `is_single` if only one view ever saw its ground."""
@@ -179,17 +190,31 @@ class Candidate:
         self.extend(other.cells)
         return self
 
-    def _count(self, view: KeptView, report: CellReport, residual_m: float, *, knows_place: bool) -> None:
-        self._tally = self._tally.with_view(view.time_ns, report.score, residual_m, view.camera_m)
+    def _count(
+        self, view: KeptView, report: CellReport, cells: Mask, residual_m: float, *, knows_place: bool
+    ) -> int:
+        """Count a view that shows it; the leg of the followed blob that shows it there, 0 for none."""
+        seen = view.time_ns, report.score, residual_m, view.camera_m
+        self._tally = self._tally.with_view(*seen)
+        leg = view.laid.leg_of(self._cells, cells)
+        if leg:
+            known = self._shown_by.get(leg, Tally(view.time_ns, view.time_ns))
+            self._shown_by[leg] = known.with_view(*seen)
+            if len(self._shown_by) > self._settings.most_legs:
+                del self._shown_by[next(iter(self._shown_by))]
         self._cameras.append(view.camera_m)
         if len(self._cameras) > self._settings.most_cameras:
             del self._cameras[1::2]
         if knows_place and len(self._places) < self._settings.most_places:
             self._places.append(report.place_m)
+        return leg
 
-    def _note_rim(self, view: KeptView, cells: Mask) -> None:
-        if not view.laid.part_of(view.laid.cut_off, self._cells, cells).any():
-            self._tally = replace(self._tally, whole=self._tally.whole + 1)
+    def _note_rim(self, view: KeptView, cells: Mask, leg: int) -> None:
+        if view.laid.part_of(view.laid.cut_off, self._cells, cells).any():
+            return
+        self._tally = replace(self._tally, whole=self._tally.whole + 1)
+        if leg in self._shown_by:
+            self._shown_by[leg] = replace(self._shown_by[leg], whole=self._shown_by[leg].whole + 1)
 
 
 class Seeds:

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, ImageGray, Mask, Matrix3, PointsM
+from sorvolo.geometry.arrays import Floats, ImageGray, Labels, Mask, Matrix3, PointsM
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.survey.findings import ComparedView
+from sorvolo.survey.findings import ComparedView, Shade
 
 _CHUNK = 64  # cells, along a side of a stored piece
 _VOTES: NDArray[np.uint8] = np.array([bin(bits).count("1") for bits in range(256)], np.uint8)
@@ -109,7 +109,9 @@ class CellReport(NamedTuple):
 class LaidView:
     """One view as cells of a window: `flagged` where it shows a change, `seen` where it knows the ground.
 
-    `score` is 255 times the sureness of the change there; `held` marks cells under things that may move.
+    `score` is 255 times the sureness of the change there; `held` marks cells under things that may move. `shaded` is
+    where one date is no brighter than the other, all colours alike: where a shadow may lie. `legs` has the leg of
+    the followed blob that shows the change there, 0 where none does.
     """
 
     window: CellWindow
@@ -117,15 +119,38 @@ class LaidView:
     seen: Mask
     score: ImageGray
     held: Mask
+    shaded: Mask
+    legs: NDArray[np.int32]
+
+    @cached_property
+    def at_rim(self) -> Mask:
+        """The flagged pieces that end at unknown ground or at the view's rim."""
+        return self._pieces_that(self._beside_unseen)
 
     @cached_property
     def cut_off(self) -> Mask:
-        """The flagged pieces that end at unknown ground or at the view's rim."""
+        """Those of them that are not whole: what only its shadow leaves is. Of what is all shade, all counts."""
+        is_lit = self._pieces_that(~self.shaded)
+        return self._pieces_that(self._beside_unseen & ~(self.shaded & is_lit))
+
+    @cached_property
+    def _labels(self) -> NDArray[np.int32]:
+        return np.asarray(cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)[1], np.int32)
+
+    @cached_property
+    def _beside_unseen(self) -> Mask:
         unseen = cv2.copyMakeBorder((~self.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
-        beside = cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
-        _, labels = cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)
-        cut = np.unique(labels[beside & self.flagged])
-        return np.isin(labels, cut) if len(cut) else np.zeros_like(self.flagged)
+        return np.asarray(cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0)
+
+    def _pieces_that(self, reach: Mask) -> Mask:
+        """The flagged pieces of which any cell lies in a raster."""
+        found = np.unique(self._labels[reach & self.flagged])
+        return np.isin(self._labels, found) if len(found) else np.zeros_like(self.flagged)
+
+    def leg_of(self, window: CellWindow, cells: Mask) -> int:
+        """The leg of the followed blob that shows most of what is flagged of some `cells` of a window; or 0."""
+        legs = self.legs[window.within(self.window)][self.part_of(self.flagged, window, cells)]
+        return int(np.bincount(legs).argmax()) if len(legs) else 0
 
     def report(self, window: CellWindow, cells: Mask, cell_m: float) -> "CellReport":
         """What the view reports of some `cells` of a window."""
@@ -148,12 +173,14 @@ class LaidView:
 
 
 def lay(
-    view: ComparedView, cell_m: float, ignored: Mask, held: Mask, settings: CellSettings = CellSettings(),
+    view: ComparedView, cell_m: float, ignored: Mask, held: Mask, legs: Labels,
+    settings: CellSettings = CellSettings(),
 ) -> LaidView:
     """The view as cells of the ground.
 
-    `ignored` and `held`, (number of boxes,), choose boxes: what lies in ignored ones is taken for unknown ground. A
-    cell is flagged where most of it is changed, and seen where the map and the frame know all of it.
+    `ignored` and `held`, (number of boxes,), choose boxes: what lies in ignored ones is taken for unknown ground.
+    `legs`, (number of boxes,), are those of the blobs followed in them, 0 for none. A cell is flagged where
+    most of it is changed, and seen where the map and the frame know all of it.
     """
     height, width = view.changed.shape
     m_per_px = view.m_per_px
@@ -168,11 +195,13 @@ def lay(
 
     changed = small(view.changed)
     valid = small(view.valid.view(np.uint8) * np.uint8(255))
-    score, in_held = np.zeros((rows, columns), np.uint8), np.zeros((rows, columns), np.uint8)
+    score, in_held, followed = (np.zeros((rows, columns), np.uint8) for _ in range(3))
+    numbers = np.unique(np.append(legs, 0))[:256]
     for index in np.argsort(view.scores, kind="stable"):
         x, y, w, h = view.boxes[index]
         part = np.s_[y // shrink : -(-(y + h) // shrink), x // shrink : -(-(x + w) // shrink)]
         score[part] = round(255 * float(np.clip(view.scores[index], 0, 1)))
+        followed[part] = np.searchsorted(numbers, legs[index]) % len(numbers)
         if ignored[index]:
             valid = valid if valid.flags.writeable else valid.copy()
             valid[part][changed[part] > 0] = 0
@@ -192,7 +221,11 @@ def lay(
     _clear_behind(seen, cell_from_small)
     flagged = (laid(changed, cv2.INTER_LINEAR) >= 128) & seen
     may_move = laid(in_held, cv2.INTER_NEAREST) > 0 if held.any() else np.zeros_like(seen)
-    return LaidView(window, flagged, seen, np.where(flagged, laid(score, cv2.INTER_NEAREST), 0), may_move)
+    in_shade = (view.shade[::shrink, ::shrink][:rows, :columns] & (Shade.LATER | Shade.EARLIER) > 0).view(np.uint8)
+    return LaidView(
+        window, flagged, seen, np.where(flagged, laid(score, cv2.INTER_NEAREST), 0), may_move,
+        laid(in_shade, cv2.INTER_NEAREST) > 0, numbers[laid(followed, cv2.INTER_NEAREST)].astype(np.int32),
+    )
 
 
 def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:

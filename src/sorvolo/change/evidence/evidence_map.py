@@ -19,6 +19,7 @@ from sorvolo.change.evidence.announcing import (
     AnnounceSettings,
     Look,
     Reason,
+    Tally,
     Verdict,
     judge,
     sureness,
@@ -154,7 +155,7 @@ class EvidenceMap:
         new = {each for each in begun if self._current(each) == each}
         shown, pictures = self._update(view, kept_view, evidence.owner, new, most_pictures - len(begun))
         announced = [change for each in shown for change in self._announce(each, view.time_ns)]
-        announced += self._movers.see(view, moving, self._next_number)
+        announced += self._movers.see(view, moving, self._named)
         self._seeds.keep(view, kept_view, evidence, most_pictures - len(begun) - pictures)
         return tuple(announced)
 
@@ -233,7 +234,8 @@ class EvidenceMap:
         ))
         nothing = np.zeros(len(view.boxes), bool)
         moving, held = (followed.is_moving, followed.may_move) if may_follow else (nothing, nothing)
-        laid = lay(view, self._cell_m, moving, held, self._gathering.cells)
+        legs = followed.legs if may_follow else np.zeros(len(view.boxes), np.int64)
+        laid = lay(view, self._cell_m, moving, held, legs, self._gathering.cells)
         residual_m = view.residual_px * view.m_per_px if np.isfinite(view.residual_px) else 0.0
         kept_view = KeptView(
             view.time_ns, laid, view.camera_m, view.site_from_image, view.changed, view.valid, residual_m,
@@ -294,8 +296,8 @@ class EvidenceMap:
         if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(kept_view, earlier, part, cells):
             return False
         # of what ends at a rim more will come into view soon
-        is_cut_off = (cells & laid.cut_off[part]).any()
-        return not is_cut_off or int(evidence.votes[part][cells].max()) >= self._settings.n
+        is_at_rim = (cells & laid.at_rim[part]).any()
+        return not is_at_rim or int(evidence.votes[part][cells].max()) >= self._settings.n
 
     def _stands(
         self, kept_view: KeptView, earlier: Sequence[KeptView], part: tuple[slice, slice], cells: Mask
@@ -424,14 +426,14 @@ class EvidenceMap:
     def _judged(self, candidate: Candidate, *, is_over: bool) -> tuple[Verdict, Change | None]:
         """Whether a candidate is a change, and its record if its views alone make it one."""
         rules = self._rules
-        is_worth_it = views_score(candidate.tally, rules) >= rules.least_score
+        is_worth_it = views_score(self._tally_of(candidate), rules) >= rules.least_score
         candidate.note_restlessness(self._restlessness(candidate) if is_worth_it else 0.0)
-        verdict = judge(candidate.tally, rules, is_over=is_over)
+        tally = self._tally_of(candidate)
+        verdict = judge(tally, rules, is_over=is_over)
         whole = self._record(candidate) if isinstance(verdict, Announce) else None
         if whole is None:
             return verdict, None
-        tally = replace(candidate.tally, look=self._look(candidate, whole))
-        return judge(tally, rules, is_over=is_over), whole
+        return judge(replace(tally, look=self._look(candidate, whole)), rules, is_over=is_over), whole
 
     def _look(self, candidate: Candidate, whole: Change) -> Look:
         may_be_relief = self._relief is not None and self._relief.explains(
@@ -473,7 +475,25 @@ class EvidenceMap:
         return candidate.record(self._prefix, outline_m, self._cell_m, self._score(candidate), announced_ns)
 
     def _score(self, candidate: Candidate) -> float:
-        return sureness(candidate.tally, self._rules)
+        return sureness(self._tally_of(candidate), self._rules)
+
+    def _tally_of(self, candidate: Candidate) -> Tally:
+        """What the views reported of a candidate, less those in which something shows it that moves: where that was
+        before it was seen to move, nothing stands."""
+        return candidate.tally.less(candidate.shown_by(self._movers.knows))
+
+    def _named(self, leg: int) -> tuple[int, int | None]:
+        """The number of the change that a blob becomes which was seen to move, and when that was announced: those of a
+        change that it was taken for while it was not known to move, else a new one and None."""
+        for number, announced_ns in self._announced_ns.items():
+            candidate, parts = self._found[number], self._parts.get(number)
+            shown = sum(each.views for each in candidate.shown_by(lambda each: each == leg))
+            if 2 * shown > candidate.tally.views and (parts is None or len(parts.things) < 2):
+                self._grid.own(candidate.cells, self._cells_of(candidate), 0)
+                del self._found[number], self._announced_ns[number]
+                self._parts.pop(number, None)
+                return number, announced_ns
+        return self._next_number(), None
 
     def _cells_of(self, candidate: Candidate) -> Mask:
         return self._grid.read(candidate.cells).owner == candidate.number

@@ -17,9 +17,10 @@ from sorvolo.change.motion.parallax import (
     is_rigid,
     may_move,
     motion,
+    shown_alone,
 )
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.arrays import Floats, Labels, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import ComparedView
 from sorvolo.survey.objects import Sighting
@@ -77,7 +78,8 @@ class MovingSettings:
 class BlobTrack:
     """One blob over time, by its number: its first point, the last few, how many, and the sum of their scores.
 
-    `older` are those before the last few.
+    `older` are those before the last few. `leg` numbers how often anything came into view: this track and others.
+    `moves` as soon as it was once seen to, `moves_now` on this leg.
     """
 
     number: int
@@ -85,7 +87,9 @@ class BlobTrack:
     points: tuple[TrackPoint, ...]
     count: int
     score_sum: float
+    leg: int = 0
     moves: bool = False
+    moves_now: bool = False
     older: tuple[TrackPoint, ...] = ()
 
     @property
@@ -104,7 +108,7 @@ class BlobTrack:
         points = (*known, point)[-settings.slow_points :]
         return replace(
             self, points=points[-settings.points :], older=points[: -settings.points], count=self.count + 1,
-            score_sum=self.score_sum + point.blob.score,
+            score_sum=self.score_sum + point.blob.score, moves_now=self.moves_now and bool(known),
         )
 
     def joined(self, gone: "BlobTrack") -> "BlobTrack":
@@ -112,19 +116,21 @@ class BlobTrack:
         first, last = sorted((self, gone), key=lambda each: each.last.time_ns)
         return BlobTrack(
             self.number, min(self.first, gone.first, key=lambda each: each.time_ns), last.points,
-            first.count + last.count, first.score_sum + last.score_sum, self.moves or gone.moves, last.older,
+            first.count + last.count, first.score_sum + last.score_sum, last.leg, self.moves or gone.moves,
+            last.moves_now, last.older,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class MovingBlobs:
     """What moves in one view. For each box of the view: whether it shows something that moves, and whether
-    it may (so that nobody should call it a change of the ground yet). `movers` are the tracks that moved in this view,
-    `merged` numbers that turned out to be an earlier track's, with that one's.
+    it may (so that nobody should call it a change of the ground yet), and the leg of its track, 0 for none. `movers`
+    are the tracks that moved in this view, `merged` numbers that turned out to be an earlier track's, with that one's.
     """
 
     is_moving: NDArray[np.bool_]
     may_move: NDArray[np.bool_]
+    legs: Labels
     movers: tuple[BlobTrack, ...]
     merged: Mapping[int, int]
 
@@ -136,6 +142,7 @@ class BlobTracker:
         self._settings = settings
         self._tracker = Tracker(settings.sightings.tracker)
         self._tracks: dict[int, BlobTrack] = {}
+        self._legs = 0
         self._times_ns: deque[int] = deque(maxlen=settings.forget_views + 1)  # of the last views
 
     def follow(self, view: ComparedView) -> MovingBlobs:
@@ -151,17 +158,19 @@ class BlobTracker:
         )
         self._join(update.merged)
         is_moving, held = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
+        legs = np.zeros(len(view.boxes), np.int64)
         shown: dict[int, BlobTrack] = {}
         for blob, number in zip(blobs, update.track_ids):
             if number not in shown:  # else it is a part of a surer blob
                 shown[number] = self._prolonged(number, TrackPoint(now_ns, blob, camera_m), oldest_ns)
             track = shown[number]
+            legs[blob.box] = track.leg
             held[blob.box] = may_move(track.points, settings.parallax)
             is_moving[blob.box] = track.moves and held[blob.box]
         self._tracks.update(shown)
         self._forget(oldest_ns)
-        movers = tuple(each for each in shown.values() if each.moves)
-        return MovingBlobs(is_moving, held, movers, update.merged)
+        movers = tuple(each for each in shown.values() if each.moves_now)
+        return MovingBlobs(is_moving, held, legs, movers, update.merged)
 
     def _join(self, merged: Mapping[int, int]) -> None:
         for gone, kept in merged.items():
@@ -174,9 +183,16 @@ class BlobTracker:
         """The track with one more point, judged anew."""
         known = self._tracks.get(number)
         if known is None:
-            return BlobTrack(number, point, (point,), 1, point.blob.score)
+            return BlobTrack(number, point, (point,), 1, point.blob.score, self._next_leg())
         track = known.with_point(point, oldest_ns, self._settings)
-        return replace(track, moves=track.moves or self._is_mover(track))
+        if len(track.points) == 1:
+            return replace(track, leg=self._next_leg())
+        moves_now = track.moves_now or self._is_mover(track)
+        return replace(track, moves=track.moves or moves_now, moves_now=moves_now)
+
+    def _next_leg(self) -> int:
+        self._legs += 1
+        return self._legs
 
     def _forget(self, oldest_ns: int) -> None:
         """Only movers are remembered for longer: what stands is judged anew when it comes back into view."""
@@ -186,20 +202,23 @@ class BlobTracker:
 
     def _is_mover(self, track: BlobTrack) -> bool:
         """Whether enough views show a plausible thing that moves steadily, by more than parallax explains."""
-        settings, are_photos = self._settings, self._are_photos(track)
-        if len(track.points) < (settings.least_photos if are_photos else settings.least_views):
-            return False
-        parallax = settings.parallax
-        move = motion(track.points, parallax)
-        length_m = float(np.median([each.blob.length_m for each in track.points]))
-        slow = (*track.older, *track.points)
-        if self._goes_its_length(track.points, move, length_m) or (
-            track.older and self._goes_its_length(slow, motion(slow, parallax), length_m)
-        ):
+        are_photos, alone = self._are_photos(track), shown_alone(track.points, self._settings.parallax)
+        if self._moves(track.points, are_photos) or (len(alone) < len(track.points) and self._moves(alone, are_photos)):
             return True
-        return _is_plausible(track.points, move, length_m, settings) and (
-            is_rigid(track.points, length_m, parallax)
-            or (are_photos and floats(track.points, move, length_m, parallax))
+        slow = (*track.older, *track.points)
+        length_m = float(np.median([each.blob.length_m for each in track.points]))
+        return bool(track.older) and self._goes_its_length(slow, motion(slow, self._settings.parallax), length_m)
+
+    def _moves(self, points: Sequence[TrackPoint], are_photos: bool) -> bool:
+        """Whether points show it: a motion of its own, or a size that keeps what leans could not keep."""
+        settings, parallax = self._settings, self._settings.parallax
+        if len(points) < (settings.least_photos if are_photos else settings.least_views):
+            return False
+        move, length_m = motion(points, parallax), float(np.median([each.blob.length_m for each in points]))
+        if self._goes_its_length(points, move, length_m):
+            return True
+        return _is_plausible(points, move, length_m, settings) and (
+            is_rigid(points, length_m, parallax) or (are_photos and floats(points, move, length_m, parallax))
         )
 
     def _goes_its_length(self, points: Sequence[TrackPoint], move: Motion, length_m: float) -> bool:

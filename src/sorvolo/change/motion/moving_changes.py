@@ -24,24 +24,37 @@ class Movers:
     def __init__(self, id_prefix: str, m_per_px: float, cell_m: float) -> None:
         self._prefix, self._m_per_px, self._cell_m = id_prefix, m_per_px, cell_m
         self._known: dict[int, Change] = {}  # by the tracker's number
+        self._legs: set[int] = set()
 
     @property
     def changes(self) -> tuple[Change, ...]:
         """All of them as they were seen last."""
         return tuple(self._known.values())
 
-    def see(self, view: ComparedView, moving: MovingBlobs, next_number: Callable[[], int]) -> list[Change]:
-        """Bring what moves in this view up to date; those announced first, whose ids `next_number` gives."""
+    def knows(self, leg: int) -> bool:
+        """Whether something was seen to move on a leg of its track."""
+        return leg in self._legs
+
+    def see(
+        self, view: ComparedView, moving: MovingBlobs, named: Callable[[int], tuple[int, int | None]]
+    ) -> list[Change]:
+        """Bring what moves in this view up to date; those announced first. `named` gives the number of the change that
+        a leg of a track becomes, and when that was announced already; None if it was not."""
         announced = []
         for gone, kept in moving.merged.items():
             twice = self._known.pop(gone, None)
             if twice is not None:
                 self._known.setdefault(kept, twice)
         for track in moving.movers:
+            self._legs.add(track.leg)
             known = self._known.get(track.number)
             if known is None:
-                change = self._change(view, track, f"{self._prefix}-{next_number()}")
-                announced.append(change)
+                number, announced_ns = named(track.leg)
+                change = self._change(view, track, f"{self._prefix}-{number}")
+                if announced_ns is None:
+                    announced.append(change)
+                else:
+                    change = replace(change, announced_ns=announced_ns)
             else:
                 change = self._change(view, track, known.id)
                 change = replace(

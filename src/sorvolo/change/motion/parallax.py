@@ -7,6 +7,7 @@ as long as some h below 0.6 H explains it; only the rest of its motion counts.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -127,6 +128,19 @@ def floats(points: Sequence[TrackPoint], move: Motion, length_m: float, settings
         return False  # where k is not above 0, no height explains it
     apart_m = [k / (1 + k) * float(np.hypot(*(each.blob.place_m - each.camera_m))) for each in points]
     return _way_m(points) > settings.rigid_lengths * length_m and float(np.median(apart_m)) > length_m
+
+
+def shown_alone(points: Sequence[TrackPoint], settings: ParallaxSettings) -> tuple[TrackPoint, ...]:
+    """The points less those of single views in which the blob has another length than just before and after, where it
+    has one length: its shadow or a neighbour was joined with it there, and its place is not the thing's."""
+    kept = list(points[:1])
+    for point, after in pairwise(points[1:]):
+        before_m, here_m, after_m = (each.blob.length_m for each in (kept[-1], point, after))
+        around = sorted((before_m, after_m))
+        is_other = not around[1] / settings.steady_length <= here_m <= around[0] * settings.steady_length
+        if not is_other or around[1] >= settings.steady_length * around[0]:
+            kept.append(point)
+    return (*kept, *points[1:][-1:])
 
 
 def _way_m(points: Sequence[TrackPoint]) -> float:
