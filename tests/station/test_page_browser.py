@@ -108,7 +108,6 @@ def test_a_cold_page_is_small_and_lists_the_sites(browser: Any, served: Served) 
     context.close()
 
 
-@pytest.mark.long
 def test_a_site_that_is_deleted_while_it_is_watched(browser: Any, made_site: Path, tmp_path: Path) -> None:
     """The page goes back to the list, and states why."""
     shutil.copytree(made_site, tmp_path / "field")

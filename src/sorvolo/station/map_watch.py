@@ -32,6 +32,7 @@ class MapWatch:
 
     def __init__(self, shelf: SiteShelf, tiles: WebTiles, reviews: Reviews, events: EventLog) -> None:
         self._shelf, self._tiles, self._reviews, self._events = shelf, tiles, reviews, events
+        self._listed: set[str] = set()  # also those that could not be opened: their end is announced as well
         self._seen: dict[str, _Seen] = {}
         self._covered: dict[str, int] = {}  # when the coverage of the flight in the air was written, by site
         self._settled_s = 0.0
@@ -51,9 +52,11 @@ class MapWatch:
     def look(self) -> None:
         """Compare every map with how it was, and announce what changed."""
         folders = self._shelf.folders()
-        for site_id in self._seen.keys() - folders.keys():
-            del self._seen[site_id]
+        for site_id in self._listed - folders.keys():
             self._events.append(NewEvent("site.gone", {}, site_id))
+            self._listed.discard(site_id)
+            self._seen.pop(site_id, None)
+        self._listed |= folders.keys()
         for site_id in folders:
             try:
                 self._look_at(site_id)

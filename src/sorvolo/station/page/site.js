@@ -77,6 +77,7 @@ class SiteScreen {
     this.hear(matchMedia("(prefers-color-scheme: dark)"), "change", () => this.view?.follow());
     for (const type of ["site.changed", "run.finished", "run.stopped", "run.failed"]) this.hear(this.station.events, type, (event) => this.reload(event.detail));
     this.hear(this.station.events, "site.gone", ({ detail }) => { if (detail.site === this.data.id) this.gone(); });
+    this.hear(this.station.events, "state", ({ detail }) => { if (detail === "live") this.check(); });
     this.hear(this.station.events, "review.changed", ({ detail }) => { if (detail.site === this.data.id) this.data.judge(detail.data); });
     this.open(view);
     this.load();
@@ -113,9 +114,22 @@ class SiteScreen {
         if (!this.opened?.versions) this.view.showVersion(`live-${this.data.detail.live_revision}`);
       }
     } catch (problem) {
-      if (problem.status === 410) this.gone();
-      else if (problem.status !== 404) throw problem;
+      if (!this.lost(problem)) throw problem;
     }
+  }
+
+  /** Is the site still there? A station that was away announces nothing of what went meanwhile. */
+  async check() {
+    try {
+      await get(siteUrl(this.data.id));
+    } catch (problem) { this.lost(problem); }
+  }
+
+  /** Whether an answer means that there is no such site, which ends the screen of one that was there. */
+  lost({ status }) {
+    if (status !== 404 && status !== 410) return false;
+    if (!this.closed && !this.data.detail.is_new) this.gone();
+    return true;
   }
 
   gone() {
