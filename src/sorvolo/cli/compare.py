@@ -230,9 +230,10 @@ def _announcement(folder: Path, form: PlaceFormat) -> "Callable[[Change], str]":
     def words(change: "Change") -> str:
         colour = _COLOURS[change.kind]
         what = _class_words(change.class_before, change.class_after)
+        middle_m = (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2
         return (
             f"[{colour}]{change.kind.value:>11}[/{colour}]  {escape(change.id)}: {what + ', ' if what else ''}"
-            f"{change.length_m:.1f} {unit} long, at {place(change.outline_m.mean(axis=0))} "
+            f"{change.length_m:.1f} {unit} long, at {place(middle_m)} "
             f"(accuracy {change.sigma_m:.2f} {unit})"
         )
 
@@ -322,7 +323,9 @@ def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, 
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     place_name = place_heading(is_local, form)
     for name in ("id", "kind", f"length {unit}", place_name, f"accuracy {unit}", "views", "score"):
-        table.add_column(name, no_wrap=name in ("id", "kind", place_name), overflow="fold")
+        table.add_column(
+            name, no_wrap=name in ("id", "kind", place_name), overflow="fold", min_width=max(map(len, name.split()))
+        )
     for feature in features[:_MOST_ROWS]:
         each = feature["properties"]
         x, y = _middle(feature["geometry"]["coordinates"][0])
@@ -339,5 +342,6 @@ def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, 
 
 
 def _middle(ring: Sequence[Sequence[float]]) -> tuple[float, float]:
-    points = ring[:-1]
-    return sum(each[0] for each in points) / len(points), sum(each[1] for each in points) / len(points)
+    """The middle of the box around an outline: the place that pages, exports and `review` print."""
+    xs, ys = zip(*(each[:2] for each in ring))
+    return (min(xs) + max(xs)) / 2, (min(ys) + max(ys)) / 2
