@@ -24,7 +24,7 @@ from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import FlightWish, Mission, Order, WatchWish
 from sorvolo.cluster.ray_cluster import demand_same, probe_of, why_not
-from sorvolo.cluster.ray_executor import _demand_fit, _with_detector, ray_executor
+from sorvolo.cluster.ray_executor import RayExecutor, _demand_fit, _LiveTry, _with_detector, ray_executor
 from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.streams import run_streams, streams_of
 from sorvolo.cluster.table import LOCK, State
@@ -114,6 +114,46 @@ def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
         State.DONE, 1, "1 car, 1 person found in 4 frames"
     )
     assert (tmp_path / "out" / "north-watch" / "one" / "report.html").is_file()
+
+
+class _SlowActor:
+    """Found three things; what it is asked arrives late."""
+
+    def __init__(self) -> None:
+        self._tried, self.found_after, self.asked = _LiveTry(), self, 0
+        self._tried._found += ["car 1", "person 2", "object 3"]
+
+    def remote(self, taken: int) -> list[str]:
+        """The answer, which `_SlowRay` hands on later."""
+        self.asked += 1
+        return self._tried.found_after(taken)
+
+
+class _SlowRay:
+    """Ray, with answers that are there when they were waited for three times."""
+
+    exceptions = ray.exceptions
+
+    def __init__(self) -> None:
+        self._waits = 0
+
+    def wait(self, tasks: list[list[str]], timeout: float) -> tuple[list[list[str]], list[list[str]]]:
+        """Nothing, nothing, all."""
+        self._waits += 1
+        return ([], tasks) if self._waits % 3 else (tasks, [])
+
+    def get(self, task: list[str]) -> list[str]:
+        """The answer."""
+        return task
+
+
+def test_what_a_watch_found_is_not_lost_when_its_answers_are_late(tmp_path: Path) -> None:
+    executor, actor, key = RayExecutor("ray://127.0.0.1:1", None, 9.0, tmp_path), _SlowActor(), ("watch", "north")
+    executor._ray, executor._actors[key], executor._taken[key] = _SlowRay(), actor, 0
+    assert [executor._taken_found() for _ in range(6)] == [
+        [], [], [(key, "car 1"), (key, "person 2"), (key, "object 3")], [], [], []
+    ]
+    assert actor.asked == 2
 
 
 @pytest.mark.long

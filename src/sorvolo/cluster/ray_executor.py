@@ -13,7 +13,6 @@ from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from queue import Empty, SimpleQueue
 from typing import Any, TypeVar
 
 import sorvolo
@@ -86,6 +85,7 @@ class RayExecutor:
         self._running: dict[Key, Any] = {}
         self._actors: dict[Key, Any] = {}  # of those that are live
         self._asked_found: dict[Key, Any] = {}  # answers of theirs that are on their way
+        self._taken: dict[Key, int] = {}  # how much of what they found was taken
         self._last_found: list[tuple[Key, str]] = []  # by those that have ended since `take_found`
         self._detectors = MachineDetectors(ray, sharing.gpus) if sharing.is_shared else None
         self._is_gone = False
@@ -136,10 +136,11 @@ class RayExecutor:
                 if not ended and timeout_s is not None:
                     return None
             key = next(each for each, task in self._running.items() if task == ended[0])
-        ending = self._asked(lambda: self._ending(ended[0]))
+        ending, found = self._asked(lambda: self._ending(ended[0]))
         del self._running[key]
         if (actor := self._actors.pop(key, None)) is not None:
-            self._last_found += self._asked(lambda: self._found_to_the_end(key, actor))
+            self._asked_found.pop(key, None)
+            self._last_found += [(key, words) for words in found[self._taken.pop(key):]]
             self._ray.kill(actor)
         return key, ending
 
@@ -170,7 +171,7 @@ class RayExecutor:
         given = (order, self._stall_s, self._root, sorvolo.__version__, shared)
         if is_live_address(order.source):
             actor = self._ray.remote(_LiveTry).options(max_concurrency=3, max_restarts=0, **asked).remote()
-            self._actors[key], self._running[key] = actor, actor.run.remote(*given)
+            self._actors[key], self._running[key], self._taken[key] = actor, actor.run.remote(*given), 0
             return
         name = f"sorvolo {Path(order.source).name}"
         self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
@@ -178,31 +179,29 @@ class RayExecutor:
     def _taken_found(self) -> list[tuple[Key, str]]:
         found: list[tuple[Key, str]] = []
         for key, actor in self._actors.items():
-            task = self._asked_found.setdefault(key, actor.take_found.remote())
+            if key not in self._asked_found:
+                self._asked_found[key] = actor.found_after.remote(self._taken[key])
+            task = self._asked_found[key]
             if self._ray.wait([task], timeout=0)[0]:
                 del self._asked_found[key]
                 with suppress(self._ray.exceptions.RayActorError):  # its end is another's to state
-                    found += [(key, words) for words in self._ray.get(task)]
+                    words = self._ray.get(task)
+                    self._taken[key] += len(words)
+                    found += [(key, each) for each in words]
         return found
 
-    def _found_to_the_end(self, key: Key, actor: Any) -> list[tuple[Key, str]]:
-        """What a watch that has ended found and nobody has taken yet; of one whose machine died, nothing."""
-        on_its_way = self._asked_found.pop(key, None)
-        tasks = [each for each in (on_its_way, actor.take_found.remote()) if each is not None]
-        with suppress(self._ray.exceptions.RayError):
-            return [(key, words) for each in self._ray.get(tasks, timeout=WAITS.cancel_s) for words in each]
-        return []
-
-    def _ending(self, task: Any) -> Ending:
+    def _ending(self, task: Any) -> tuple[Ending, list[str]]:
+        """How a try ended, and all that its watch found; of one whose machine died, nothing."""
         try:
-            ending = self._ray.get(task)
+            ending, found = self._ray.get(task)
         except (StoreError, InputError) as error:  # what every flight would meet on that machine
             raise getattr(error, "cause", error) from None  # Ray's own holds a whole traceback
         except self._ray.exceptions.RayError as error:
             words = str(error).strip().split("\n")[0]
-            return Ending(Outcome.CRASHED, f"its machine or Ray's worker was lost ({type(error).__name__}): {words}")
+            lost = f"its machine or Ray's worker was lost ({type(error).__name__}): {words}"
+            return Ending(Outcome.CRASHED, lost), []
         assert isinstance(ending, Ending)
-        return ending
+        return ending, found
 
     def _machines(self) -> list[dict[str, float]]:
         """What the machines have that are there; those without cores run nothing."""
@@ -317,21 +316,19 @@ class _LiveTry:
 
     def __init__(self) -> None:
         self._worker: WorkerProcess | None = None
-        self._found: SimpleQueue[str] = SimpleQueue()
+        self._found: list[str] = []  # grows only
 
-    def run(self, order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]) -> Ending:
-        """The try in a process of its own, which ends with this one."""
+    def run(
+        self, order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]
+    ) -> tuple[Ending, list[str]]:
+        """The try in a process of its own, which ends with this one: how it ended, and all that its watch found."""
         _demand_fit(root, version)
         self._worker = WorkerProcess(_with_detector(order, shared))
-        return run_order(self._worker, stall_s, self._found.put)
+        return run_order(self._worker, stall_s, self._found.append), self._found
 
-    def take_found(self) -> list[str]:
-        """What its watch found since this was last asked, of two that ask at once by one."""
-        found = []
-        with suppress(Empty):
-            while True:
-                found.append(self._found.get_nowait())
-        return found
+    def found_after(self, taken: int) -> list[str]:
+        """What its watch found after the first so many. An answer that gets lost loses nothing: ask again."""
+        return self._found[taken:]
 
     def finish(self) -> None:
         """Have the flight end."""
@@ -339,13 +336,15 @@ class _LiveTry:
             self._worker.finish()
 
 
-def _try(order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]) -> Ending:
-    """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker."""
+def _try(
+    order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]
+) -> tuple[Ending, list[str]]:
+    """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker, as of `_LiveTry`."""
     _demand_fit(root, version)
     if not Path(order.source).exists():
         host = socket.gethostname()
         raise StoreError(f"the machine {host} does not have {order.source}; flights need the same path on all machines")
-    return run_order(WorkerProcess(_with_detector(order, shared)), stall_s)
+    return run_order(WorkerProcess(_with_detector(order, shared)), stall_s), []
 
 
 def _demand_fit(root: str, version: str) -> None:
