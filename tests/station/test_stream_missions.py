@@ -45,6 +45,7 @@ class Station:
 
     def start(self) -> None:
         app = station_app(StationSettings(self._root, free_floor_gb=0.0))
+        self._lock = app.state.station.lock
         self._server = uvicorn.Server(uvicorn.Config(
             app, "127.0.0.1", self._port, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=0,
         ))
@@ -58,6 +59,7 @@ class Station:
     def stop(self) -> None:
         self._server.should_exit = self._server.force_exit = True
         self._thread.join(10)
+        self._lock.close()  # as the end of its process does: what the server closes at its end is left out
 
     @property
     def url(self) -> str:

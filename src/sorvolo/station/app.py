@@ -33,6 +33,7 @@ from sorvolo.station.place_index import PlaceIndex
 from sorvolo.station.problems import PROBLEM_ANSWERS, Problem, answer_problems
 from sorvolo.station.prometheus import StationMetrics, memory_bytes, metrics_routes
 from sorvolo.station.reviews import Reviews, review_routes
+from sorvolo.station.root_lock import RootLock
 from sorvolo.station.run_routes import run_routes
 from sorvolo.station.runs import Runs
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
@@ -73,10 +74,20 @@ class Station:
     videos: FlightVideos
     place_index: PlaceIndex
     findings: Findings
+    lock: RootLock
 
     @classmethod
     def open(cls, settings: StationSettings) -> "Station":
-        """Open the station's own files. Raises StoreError where they cannot be used."""
+        """Open the station's own files. Raises StoreError where they cannot be used, or another station uses them."""
+        lock = RootLock(settings.state_folder)
+        try:
+            return cls._opened(settings, lock)
+        except BaseException:
+            lock.close()
+            raise
+
+    @classmethod
+    def _opened(cls, settings: StationSettings, lock: RootLock) -> "Station":
         state, shelf = StationState.open(settings.state_folder), SiteShelf(settings.root)
         events, tiles = EventLog(state, settings.limits.most_events), WebTiles(shelf)
         uploads = Uploads(settings, events)
@@ -90,7 +101,7 @@ class Station:
         return cls(
             settings, state, shelf, tiles, events, SiteCollections(shelf, findings), reviews, ingest, uploads, inputs,
             Runs(settings, state, shelf, events, inputs, ingest.show_boxes), MapWatch(shelf, tiles, reviews, events),
-            FlightVideos(inputs), PlaceIndex(shelf), findings,
+            FlightVideos(inputs), PlaceIndex(shelf), findings, lock,
         )
 
     def close(self) -> None:
@@ -101,6 +112,7 @@ class Station:
         self.place_index.close()
         self.shelf.close()
         self.state.close()
+        self.lock.close()
 
 
 def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardSettings()) -> FastAPI:  # noqa: B008
