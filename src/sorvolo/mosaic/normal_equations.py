@@ -72,12 +72,18 @@ class NormalEquations:
         )
         each, end = _CAMERA * np.arange(count), np.full(count, _CAMERA * count)
         one, other, last = _CAMERA * one, _CAMERA * other, np.array([_CAMERA * count])
-        parts = [
-            _entries(each, each, self._cameras), _entries(one, other, blocks),
-            _entries(other, one, blocks.transpose(0, 2, 1)), _entries(each, end, self._with_shared),
-            _entries(end, each, self._with_shared.transpose(0, 2, 1)), _entries(last, last, self._shared[None]),
-        ]
-        rows, columns, values = (np.concatenate(some) for some in zip(*parts, strict=True))
+        parts = (
+            (each, each, self._cameras), (one, other, blocks), (other, one, blocks.transpose(0, 2, 1)),
+            (each, end, self._with_shared), (end, each, self._with_shared.transpose(0, 2, 1)),
+            (last, last, self._shared[None]),
+        )
+        numbers = sum(some.size for _, _, some in parts)
+        rows, columns, values = np.empty(numbers, np.int32), np.empty(numbers, np.int32), np.empty(numbers)
+        first = 0
+        for part in parts:  # each at its place: of a long flight they are a hundred megabytes, which none holds twice
+            here = slice(first, first + part[2].size)
+            rows[here], columns[here], values[here] = _entries(*part)
+            first = here.stop
         size = _CAMERA * count + shared
         return coo_matrix((values, (rows, columns)), shape=(size, size)).tocsc()
 
