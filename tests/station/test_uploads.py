@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 import zipfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -262,3 +262,33 @@ def test_playlists_named_as_videos(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "part").write_bytes(data)
     with pytest.raises(Refusal):
         look(tmp_path / "part", tmp_path / "flight.mp4", GIGA)
+
+
+LIMITED = """
+import sys
+from sorvolo.station import check_upload
+def look(part, *_):
+    {work}
+check_upload.look = look
+check_upload._MEMORY_BYTES, check_upload._CPU_S = 1 << 30, 1
+check_upload.main(*sys.argv[1:5])
+"""
+
+
+@pytest.mark.parametrize(("work", "within_s", "words"), [
+    ("bytearray(2 << 30)", 60.0, "more memory than a flight needs"),
+    ("while True: pass", 60.0, "more memory or time than a flight needs"),
+    ("import time; time.sleep(60)", 1.0, "took too long"),
+])
+def test_the_process_that_looks_has_limits(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: str, within_s: float, words: str
+) -> None:
+    """Of memory, of processor time and of time: whatever a decoder does with an upload, it is refused in words."""
+    monkeypatch.setattr(uploads, "_CHECK_WITHIN_S", within_s)
+    child = Child()
+
+    def run(command: Sequence[str], timeout_s: float) -> bytes:
+        return child.run([command[0], "-c", LIMITED.format(work=work), *command[3:]], timeout_s)
+
+    error, facts = uploads.checked_apart(tmp_path / "part", tmp_path / "a.mp4", GIGA, 0, run)
+    assert error is not None and words in error and facts is None
