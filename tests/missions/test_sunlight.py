@@ -7,13 +7,15 @@ import numpy as np
 import pytest
 
 from small_flights import simulate_into, small_flight
-from sorvolo.change.evidence.announcing import Reason
+from sorvolo.change.evidence import evidence_map
+from sorvolo.change.evidence.shadow_doubt import ShadowDoubt
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.simulation.settings import LaterSettings, WeatherSettings
+from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 
 ROME = Site("field", Geodetic(41.9, 12.5, 80.0), "EPSG:32633", 0.03)
@@ -31,8 +33,17 @@ def test_without_a_place_or_a_date_it_is_unknown(site, time_ns):
     assert sun_over(site, time_ns) is None
 
 
-def test_the_moved_shadows_of_people_who_stay_are_no_changes_between_two_dates(tmp_path):
-    """Without the suns that the missions give it, two of these shadows are reported."""
+def test_the_moved_shadows_of_people_who_stay_are_no_changes_between_two_dates(tmp_path, monkeypatch):
+    """The comparison judges shadows by the suns of the site. That they explain these shadows, tests of it show: which
+    of the few views here show one hangs on the last bits of the poses."""
+    suns = []
+
+    class Observed(ShadowDoubt):
+        def __init__(self, earlier, sun_at, *others):
+            suns.append(sun_at)
+            super().__init__(earlier, sun_at, *others)
+
+    monkeypatch.setattr(evidence_map, "ShadowDoubt", Observed)
     stay = small_flight(4, height_m=14, length_m=14, size_px=(480, 270), noise_m=0.1, fps=3, people=4, speed_m_s=3)
     nothing = LaterSettings(
         people=0, cars=0, small_objects=0, removed=0, moved=0, weather=WeatherSettings(has_clouds=False, wind_m=0)
@@ -45,4 +56,7 @@ def test_the_moved_shadows_of_people_who_stay_are_no_changes_between_two_dates(t
     list(compare_flights([flown / "flight2"], site, CompareSettings(model="none"), camera=camera))
     candidates = json.loads((site / "flights" / "flight2" / "report.json").read_text())["comparison"]["candidates"]
     assert candidates["announced"] == {"still": 0, "moving": 0}
-    assert candidates["never_announced"][Reason.SHADOW.value] >= 1
+    with Archive.open(site, write=False) as archive:
+        place = archive.site()
+    (sun_at,) = suns
+    assert np.allclose(sun_at(NOON_NS), sun_over(place, NOON_NS))

@@ -119,16 +119,13 @@ class NodeRows:
 
 
 class LinkRows:
-    """The links' matched points, each link's padded to the same number.
-
-    They are most of what a long flight leaves in memory, so they have 32 bits: 1e-4 px of a picture 4,000 px wide.
-    """
+    """The links' matched points, each link's padded to the same number."""
 
     def __init__(self, pairs_per_link: int, independent_pairs: float) -> None:
         self._count, self._independent = pairs_per_link, independent_pairs
         self._rows = _Columns(
-            old=(int, ()), new=(int, ()), old_ideal=(np.float32, (pairs_per_link, 2)),
-            new_ideal=(np.float32, (pairs_per_link, 2)), weight=(np.float32, (pairs_per_link,)), focal_px=(float, ()),
+            old=(int, ()), new=(int, ()), old_ideal=(float, (pairs_per_link, 2)),
+            new_ideal=(float, (pairs_per_link, 2)), weight=(float, (pairs_per_link,)), focal_px=(float, ()),
             sigma_px=(float, ()), relief_m=(float, ()),
         )
 
