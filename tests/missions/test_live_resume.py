@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+import threading
 from collections.abc import Callable, Generator
 from pathlib import Path
 from types import SimpleNamespace
@@ -66,10 +67,13 @@ def mapped(
 ) -> list[MosaicUpdate]:
     """Map a live source; after so many frames the site is copied as a kill leaves it, and the run is over.
 
-    `fly` is called when the first new frame is on the map.
+    `fly` is called when the first new frame is on the map, or after some seconds: where the newest key frame shows the
+    same ground, none is needed before the drone has moved.
     """
     updates: list[MosaicUpdate] = []
     mapping = map_flights([source], site, _MAP, live=live, **kwargs)
+    standing = threading.Timer(5.0, fly)
+    standing.start()
     for each in mapping:
         updates.append(each)
         if not each.is_resumed:
@@ -80,6 +84,7 @@ def mapped(
             shutil.rmtree(site)
             shutil.move(site.with_name("amid"), site)
             break
+    standing.cancel()
     return updates
 
 
