@@ -119,7 +119,8 @@ def test_a_site_that_is_deleted_while_it_is_watched(browser: Any, made_site: Pat
         watched.page.locator(".message.error", has_text="This site is gone").wait_for()
         expect(watched.page.locator(".card a")).to_have_count(1)
         assert "other" in watched.page.locator(".card a").get_attribute("href")
-        assert [each for each in watched.faults if not re.search("40[04]|410", each)] == []
+        half_deleted = "40[049]|410"  # a question that comes while the folder goes is refused
+        assert [each for each in watched.faults if not re.search(half_deleted, each)] == []
         watched.page.context.close()
 
 
