@@ -7,41 +7,25 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-from websockets.asyncio.server import serve
-from websockets.exceptions import ConnectionClosed
+from websockets.asyncio.server import ServerConnection, serve
 
-from sorvolo.station.ingest import Ingest, IngestLimits, LinkClosed
+from sorvolo.station.camera_door import SocketLink
+from sorvolo.station.ingest import Ingest, IngestLimits
 
 TOKEN = "a-secret"
 _LIMITS = IngestLimits(sync_s=0.02)
 
 
-class SocketLink:
-    """A `websockets` connection as an `ingest.Link`; `pause_s` lets each message take so long: a slow link."""
+class SlowLink(SocketLink):
+    """Each message takes `pause_s`."""
 
-    def __init__(self, socket: Any, pause_s: float) -> None:
-        self._socket, self._pause_s = socket, pause_s
+    def __init__(self, connection: ServerConnection, pause_s: float) -> None:
+        super().__init__(connection)
+        self._pause_s = pause_s
 
     async def receive(self) -> bytes:
         await asyncio.sleep(self._pause_s)
-        try:
-            return bytes(await self._socket.recv(decode=False))
-        except ConnectionClosed as error:
-            raise LinkClosed from error
-
-    async def send(self, text: str) -> None:
-        try:
-            await self._socket.send(text)
-        except ConnectionClosed as error:
-            raise LinkClosed from error
-
-    async def close(self, code: int, reason: str) -> None:
-        closing = asyncio.ensure_future(self._socket.close(code, reason))
-        try:
-            while True:  # the drone's answer stands behind what it sent before
-                await self._socket.recv(decode=False)
-        except ConnectionClosed:
-            await closing
+        return await super().receive()
 
 
 class StreamServer:
@@ -92,7 +76,7 @@ class StreamServer:
         async def talk(socket: Any) -> None:
             self._sockets.add(socket)
             stream = socket.request.path.rpartition("/")[2]
-            await self.ingest.serve(stream, SocketLink(socket, self._pause_s))
+            await self.ingest.serve(stream, SlowLink(socket, self._pause_s))
 
         def check(socket: Any, request: Any) -> Any:
             if request.headers.get("Authorization") != f"Bearer {TOKEN}":

@@ -50,11 +50,11 @@ class CameraDoor:
 
     async def _take(self, connection: ServerConnection) -> None:
         stream = connection.request.path.rpartition("/")[2] if connection.request is not None else ""
-        await self._ingest.serve(stream, _DoorLink(connection))
+        await self._ingest.serve(stream, SocketLink(connection))
 
 
-class _DoorLink:
-    """A connection at the door as `ingest.Link`."""
+class SocketLink:
+    """A `websockets` connection as `ingest.Link`."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self._connection = connection
