@@ -5,6 +5,8 @@ import numpy as np
 import pytest
 from sensor_noise import camera
 
+from sorvolo.change.pair.region_extent import with_weak_ground
+from sorvolo.change.pair.regions import Regions
 from sorvolo.change.pair.robust import RobustResult, compare_robust
 
 SIZE = (360, 480)
@@ -70,3 +72,24 @@ def test_a_soft_shadow_is_no_part_of_the_thing() -> None:
     changed = plain(150) * (1 - cv2.GaussianBlur(shade, (0, 0), 2)[..., None])
     changed[THING] = (60, 60, 220)
     assert overlap(compared(plain(150), changed).mask, THING) > 0.8
+
+
+def test_weak_ground_that_joins_two_regions_belongs_to_the_nearest_and_ends() -> None:
+    """A doubted region along a cloud's edge, weakly joined with a sure box, gave the box all of that edge before."""
+    labels, weak = np.zeros((180, 400), np.uint8), np.zeros((180, 400), np.uint8)
+    weak[80:100, 20:390] = 255
+    labels[84:96, 40:52] = 1
+    labels[84:96, 120:200] = 2
+    boxes = np.array([[40, 84, 12, 12], [120, 84, 80, 12]], np.int32)
+    regions = Regions(labels, boxes, np.zeros((2, 0)), weak // 16, weak, 6.0, None, np.ones(2))
+
+    def columns(region: int) -> tuple[int, int]:
+        piece = with_weak_ground(regions, region, 20)
+        assert not (piece.mask & (labels[piece.window] == 2 - region)).any()
+        x, _, wide, _ = piece.box
+        return x, x + wide
+
+    # its own end less a rim of blur, half of the way to the neighbour; as far as things are looked for
+    assert columns(0) == (22, 78)
+    first, last = columns(1)
+    assert abs(first - 86) <= 1 and last == 260

@@ -75,17 +75,6 @@ def test_the_same_target_is_written_over_and_returned() -> None:
     assert np.array_equal(out, kernels.differences(before, after, None, 2, 2))
 
 
-def test_labels_are_looked_up_and_strangers_refused() -> None:
-    labels = np.random.default_rng(3).integers(0, 5, (7, 9)).astype(np.int32)
-    table, plain = np.uint8([0, 255, 3, 0, 9]), np.empty((7, 9), np.uint8)
-    numpy_robust.looked_up(labels, table, plain)
-    assert np.array_equal(kernels.looked_up(labels, table), plain)
-    with pytest.raises(ValueError, match="out of 0"):
-        kernels.looked_up(labels, table[:3])
-    with pytest.raises(ValueError, match="out of 0"):
-        kernels.looked_up(labels - 9, table)
-
-
 def test_two_threads_do_not_share_their_working_arrays() -> None:
     pairs = [pictures(90, 120, seed) for seed in range(6)]
     alone = [compare_robust(*pair) for pair in pairs]

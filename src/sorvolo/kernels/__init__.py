@@ -124,23 +124,6 @@ def relight(
     return out
 
 
-def looked_up(
-    labels: NDArray[np.int32], table: NDArray[np.uint8], out: NDArray[np.uint8] | None = None
-) -> NDArray[np.uint8]:
-    """The values (h, w) of labels (h, w), all of 0 .. len(table) - 1, in a table: see numpy_robust.
-
-    `out` (h, w) is written over where it is given, and returned.
-    """
-    if labels.ndim != 2 or table.ndim != 1:
-        raise ValueError(f"looked_up: labels {labels.shape} and table {table.shape} do not fit")
-    labels = np.ascontiguousarray(labels, np.int32)
-    if labels.size and not (labels.min() >= 0 and labels.max() < len(table)):
-        raise ValueError(f"looked_up: labels out of 0 .. {len(table) - 1}")
-    out = _target(out, labels.shape)
-    _robust.looked_up(labels, np.ascontiguousarray(table, np.uint8), out)
-    return out
-
-
 def differences(
     before: NDArray[np.uint8], after: NDArray[np.uint8], known: NDArray[np.bool_] | None, reach: int, weight: int,
     out: NDArray[np.uint8] | None = None,

@@ -141,15 +141,6 @@ Integers64 rim_balance(const Bytes &labels, const Integers32 &boxes, const Bytes
     return balance;
 }
 
-void looked_up(const Integers32 &labels, const Bytes &table, Bytes &out) {
-    const std::int64_t pixels = labels.shape(0) * labels.shape(1);
-    const std::int32_t *label = labels.data();
-    const std::uint8_t *value = table.data();
-    std::uint8_t *to = out.mutable_data();
-    pybind11::gil_scoped_release released;
-    for (std::int64_t at = 0; at < pixels; ++at) to[at] = value[label[at]];
-}
-
 // Which values lie over their thresholds, 1 or 0.
 SORVOLO_CLONES
 void mark_over(const std::uint8_t *value, const std::uint8_t *threshold, std::uint8_t *to, std::ptrdiff_t pixels) {
@@ -480,7 +471,6 @@ void bind_robust(pybind11::module_ &module) {
     using pybind11::arg;
     module.def("relight", &relight, arg("image").noconvert(), arg("curves").noconvert(), arg("gains").noconvert(),
                arg("left"), arg("top"), arg("wide"), arg("high"), arg("out").noconvert());
-    module.def("looked_up", &looked_up, arg("labels").noconvert(), arg("table").noconvert(), arg("out").noconvert());
     module.def("tint", &tint, arg("reference").noconvert(), arg("query").noconvert(), arg("logs").noconvert(),
                arg("boxes").noconvert(), arg("margin"), arg("out").noconvert());
     module.def("rim_balance", &rim_balance, arg("labels").noconvert(), arg("boxes").noconvert(),

@@ -28,11 +28,6 @@ def relight(
     out[part] = np.clip(((lifted.astype(np.int64) * fine + (1 << 15)) >> 16) - 8, 0, 255)
 
 
-def looked_up(labels: NDArray[np.int32], table: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
-    """Fills `out` (h, w) with the values of `labels` (h, w) in `table` (N,)."""
-    out[:] = table[labels]
-
-
 def differences(
     reference: NDArray[np.uint8], query: NDArray[np.uint8], known: NDArray[np.uint8] | None, reach: int, weight: int,
     out: NDArray[np.uint8],

@@ -92,6 +92,19 @@ def grown(regions: Regions, region: int, came: bool, views: Views, settings: Ext
     return None
 
 
+def with_weak_ground(regions: Regions, region: int, reach_px: int) -> Piece:
+    """`region` (0 .. N - 1) with the ground around it that differs weakly, less a rim of blur.
+
+    Weak ground may join many regions, and run on along a cloud's edge. Each pixel of it belongs to the nearest
+    region, and to none that is farther away than things are looked for.
+    """
+    window = _window(regions, region, reach_px)
+    weak, core = regions.weak[window], np.uint8(255) * (regions.labels[window] == region + 1)
+    # two blurs of 3 px reach two pixels out
+    weak = np.asarray(cv2.erode(held_parts(weak | core, core), np.ones((5, 5), np.uint8)), np.uint8)
+    return Piece(window, ((weak > 0) & (regions.nearest[window] == region + 1)) | (core > 0))
+
+
 def _is_thing(mask: Image, strength: Image, limit: float, settings: ExtentSettings) -> bool:
     """Whether a piece is nearly convex, and a few pixels off it the difference is gone: light fades away slowly."""
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

@@ -1,6 +1,7 @@
 """Where two pictures in the same light differ: regions, and what is measured of each to tell changes from the rest."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -84,6 +85,17 @@ class Regions:
     noise: float
     known: Mask | None
     came: Floats
+
+    @cached_property
+    def nearest(self) -> NDArray[np.uint8]:
+        """(h, w) the label of the region that is nearest to each pixel, 0 where there is no region; made once."""
+        inside = self.labels > 0
+        _, places = cv2.distanceTransformWithLabels(
+            np.logical_not(inside).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5, labelType=cv2.DIST_LABEL_PIXEL
+        )
+        label_at = np.zeros(int(places.max()) + 1, np.uint8)
+        label_at[places[inside]] = self.labels[inside]
+        return np.asarray(label_at[places])
 
 
 def find_regions(

@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.pair.illumination import Light, LightSettings, fit_light, relit
-from sorvolo.change.pair.region_extent import ExtentSettings, Piece, Views, grown
+from sorvolo.change.pair.region_extent import ExtentSettings, Piece, Views, grown, with_weak_ground
 from sorvolo.change.pair.region_score import how_sure
 from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings, find_regions
 from sorvolo.change.pair.residual_alignment import Settling, SettlingSettings, settle
 from sorvolo.change.pair.scratch import Scratch, scratch_of_thread
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
-from sorvolo.kernels import looked_up
 
 
 @dataclass(frozen=True)
@@ -169,9 +168,7 @@ def _result(
     if not sure.any():
         nothing = np.zeros(size[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0)
         return RobustResult(*nothing, light, settling, regions.noise, known)
-    count, labelled = cv2.connectedComponents(regions.weak, connectivity=8)
-    parts = np.asarray(labelled, np.int32)
-    went = _went(regions, parts)
+    went = _went(regions)
     pieces: dict[int, Piece] = {}
     for region in np.flatnonzero(sure & (scores >= masks.least_grown)):
         piece = grown(regions, int(region), not went[region], views, settings.extent)
@@ -180,16 +177,16 @@ def _result(
     half = regions.labels.shape[::-1]
     boxes_px = np.array([_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64)
     if settling.moved_px < masks.same_place_px or not (sure & went).any():
-        half_mask = _filled(sure, regions, pieces, parts, count, scratch, masks)
+        half_mask = _filled(sure, regions, pieces, settings)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
-        gone = _filled(sure & went, regions, pieces, parts, count, scratch, masks)
+        gone = _filled(sure & went, regions, pieces, settings)
         gone = np.asarray(
             cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR), np.uint8
         )
         stays = sure & ~went
         half_mask = gone
         if stays.any():
-            here = _filled(stays, regions, pieces, parts, count, scratch, masks)
+            here = _filled(stays, regions, pieces, settings)
             half_mask = np.asarray(cv2.max(here, gone), np.uint8)
         middle = boxes_px[:, :2] + boxes_px[:, 2:] / 2
         moved = np.column_stack([middle, np.ones(len(middle))]) @ settling.reference_from_query.T
@@ -225,8 +222,9 @@ def _enlarged(half_mask: ImageGray, size: tuple[int, int]) -> ImageGray:
     return mask
 
 
-def _went(regions: Regions, parts: NDArray[np.int32]) -> Mask:
+def _went(regions: Regions) -> Mask:
     """Which regions (N,) are things that the reference shows; what touches is one thing."""
+    parts = cv2.connectedComponents(regions.weak, connectivity=8)[1]
     part = np.zeros(len(regions.boxes), np.int64)
     for region, (x, y, wide, high) in enumerate(regions.boxes):
         place = slice(y, y + high), slice(x, x + wide)
@@ -236,48 +234,29 @@ def _went(regions: Regions, parts: NDArray[np.int32]) -> Mask:
 
 
 def _filled(
-    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], parts: NDArray[np.int32], count: int,
-    scratch: Scratch, settings: MaskSettings,
+    chosen: Mask, regions: Regions, pieces: Mapping[int, Piece], settings: RobustSettings
 ) -> ImageGray:
-    """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with what weakly
-    differs around its core, less a rim of blur; without gaps.
+    """The things of the `chosen` (N,) regions: their `pieces`, and where there is none the region with the weakly
+    differing ground that is its own; without gaps.
 
-    `parts` (h, w) are the weakly differing pieces, 0 .. `count` - 1, 0 none. Where a thing has the ground's own colour
-    nothing differs: what is nearly convex is taken to be so. The outline runs, to a part of a pixel, where the result
-    passes 127.
+    Where a thing has the ground's own colour nothing differs: what is nearly convex is taken to be so. The outline
+    runs, to a part of a pixel, where the result passes 127.
     """
     size = regions.labels.shape[0], regions.labels.shape[1]
-    cores, around, whole = scratch.stack("filled", size, 3)
-    alone = np.array([bool(is_chosen) and each not in pieces for each, is_chosen in enumerate(chosen)], bool)
-    if alone.any():
-        shown = np.zeros(256, np.uint8)
-        shown[1 : len(alone) + 1] = alone * np.uint8(255)
-        cv2.LUT(regions.labels, shown, dst=cores)
-        held = np.zeros(count, bool)
-        for region in np.flatnonzero(alone):
-            x, y, wide, high = regions.boxes[region]
-            place = slice(y, y + high), slice(x, x + wide)
-            held[parts[place][regions.labels[place] == region + 1]] = True
-        held[0] = False
-        looked_up(parts, held.astype(np.uint8) * np.uint8(255), whole)
-        cv2.erode(whole, np.ones((5, 5), np.uint8), dst=around)  # two blurs of 3 px reach two pixels out
-        np.multiply(around, regions.labels == 0, out=around)
-        cv2.max(cores, around, dst=around)
-    else:
-        around[:] = 0
-    for region in np.flatnonzero(chosen & ~alone):
-        piece = pieces[int(region)]
+    masks, around = settings.masks, np.zeros(size, np.uint8)
+    for region in np.flatnonzero(chosen):
+        piece = pieces.get(int(region)) or with_weak_ground(regions, int(region), settings.extent.reach_px)
         around[piece.window][piece.mask] = 255
     outlines, _ = cv2.findContours(around, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         hull = cv2.convexHull(outline)
-        is_full = cv2.contourArea(outline) > settings.convexity * cv2.contourArea(hull)
+        is_full = cv2.contourArea(outline) > masks.convexity * cv2.contourArea(hull)
         cv2.drawContours(around, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
     x, y, wide, high = cv2.boundingRect(around)
-    things = np.s_[max(0, y - settings.rim_px) : y + high + settings.rim_px,
-                   max(0, x - settings.rim_px) : x + wide + settings.rim_px]
+    things = np.s_[max(0, y - masks.rim_px) : y + high + masks.rim_px,
+                   max(0, x - masks.rim_px) : x + wide + masks.rim_px]
     outlined = np.zeros(size, np.uint8)
-    outlined[things] = _outlined(around[things], regions.strength[things], settings)
+    outlined[things] = _outlined(around[things], regions.strength[things], masks)
     if regions.known is not None:
         outlined[~regions.known] = 0
     return outlined
