@@ -61,6 +61,11 @@ class Served:
         with urllib.request.urlopen(request) as answer:
             return json.load(answer)
 
+    def read(self, path: str) -> str:
+        """The text that the station answers. Raises HTTPError."""
+        with urllib.request.urlopen(self.url + path) as answer:
+            return str(answer.read().decode())
+
     def __exit__(self, *_: object) -> None:
         self.server.should_exit = True
         self._thread.join(10)

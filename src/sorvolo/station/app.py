@@ -123,7 +123,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     station = Station.open(settings)
     outward = Outward(receivers, station.events, station.ingest, settings.state_folder)
     door = CameraDoor(door_path(settings), station.ingest)
-    metrics = StationMetrics(settings.root, station.ingest, station.events, outward.figures)
+    metrics = StationMetrics(settings, station.ingest, station.events, station.runs.counts, outward.figures)
 
     @asynccontextmanager
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -39,8 +39,17 @@ class CameraJob:
     spool: str
 
 
+@dataclass(frozen=True)
+class OpenedCamera:
+    """An order whose camera is being read; `left` is asked for when that is over."""
+
+    order: Order
+    left: Callable[[], int] = lambda: 0
+    """How many pictures the camera sent that the station's disk has not."""
+
+
 @contextmanager
-def camera_opened(order: Order, folder: Path, until: threading.Event) -> Iterator[Order]:
+def camera_opened(order: Order, folder: Path, until: threading.Event) -> Iterator[OpenedCamera]:
     """The order with the flight that the station keeps of its camera as the source, while the camera is read.
 
     An order without a camera's door stays as it is; so does one whose camera sends what no browser plays, but for its
@@ -49,12 +58,13 @@ def camera_opened(order: Order, folder: Path, until: threading.Event) -> Iterato
     is stopped before the first picture.
     """
     if not order.door:
-        yield order
+        yield OpenedCamera(order)
         return
     camera = _Camera(order, folder)
     try:
         path = camera.flight(Path(order.streams) / order.stream, until)
-        yield replace(order, stream="") if path is None else replace(order, source=f"follow:{path}", telemetry="")
+        own = replace(order, stream="") if path is None else replace(order, source=f"follow:{path}", telemetry="")
+        yield OpenedCamera(own, lambda: camera.left)
     except KeyboardInterrupt:
         camera.end(_LEAVE_S)
         raise
@@ -77,6 +87,7 @@ class _Camera:
             self._process.stdin.write(json.dumps(asdict(job)).encode() + b"\n")
             self._process.stdin.flush()
         self._path: Path | None = None
+        self.left = 0
         self._answers: queue.Queue[Mapping[str, Any]] = queue.Queue()
         self._listening = threading.Thread(target=self._listen, name="camera", daemon=True)
         self._listening.start()
@@ -113,6 +124,7 @@ class _Camera:
         finally:
             self._process.kill()
             self._process.wait()
+            self._listening.join(_TURN_S * 10)  # for its last lines
             shutil.rmtree(self._spool, ignore_errors=True)
 
     def _answer(self) -> Mapping[str, Any]:
@@ -126,7 +138,9 @@ class _Camera:
         assert self._process.stdout is not None
         with suppress(ValueError):  # closed, or cut in the middle of a line
             for line in self._process.stdout:
-                self._answers.put(json.loads(line))
+                answer = json.loads(line)
+                self.left = int(answer.get("left", self.left))
+                self._answers.put(answer)
         self._answers.put({"failed": "the process that reads the camera ended without a word"})
         if self._path is not None:  # it ended: who follows its file must not wait for more
             with suppress(OSError):
@@ -179,6 +193,7 @@ def _send(job: CameraJob, stop: threading.Event) -> int:
     try:
         client.run(show)
     finally:
+        _state({"left": client.report.spooled + client.report.overflowed})
         if client.is_complete:
             waiting.remove()
         else:

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -14,6 +13,7 @@ from typing import Any, Protocol
 from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.errors import InputError, StoreError
 from sorvolo.station.access_units import begins_decoding, has_picture
+from sorvolo.station.disk_room import shortage
 from sorvolo.station.messages import (
     Hello,
     Kind,
@@ -265,12 +265,8 @@ class Ingest:
 
     def _check_space(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        free = shutil.disk_usage(self._folder).free
-        if free < self._limits.free_bytes:
-            raise Refusal(
-                f"the station's disk is full: {free / 1e9:.2f} GB are free, and {self._limits.free_bytes / 1e9:.2f} GB "
-                "must stay so", is_final=False,
-            )
+        if short := shortage(self._folder, self._limits.free_bytes / 1e9):
+            raise Refusal(f"the station's disk is full: {short}", is_final=False)
 
     async def _acknowledge(self, flight: "Flight", link: Link) -> None:
         """Acknowledge what the disk has, step by step."""

@@ -24,6 +24,9 @@ LOCK_VARIABLE = "SORVOLO_RUN_LOCK"
 SOURCE_VARIABLE = "SORVOLO_RUN_SOURCE"
 """Of the same: the input, whose password no file is to hold."""
 
+TO_CHECK = 3
+"""The exit code of a mission whose flight is incomplete, as of commands whose result has to be checked."""
+
 Mission = Literal["map", "compare", "watch", "search"]
 WRITES: frozenset[str] = frozenset({"map", "compare"})
 """The missions that write into their site: one at a time."""
@@ -96,7 +99,8 @@ class Order:
 
     `source` is a path or an address with its password, which the order's file leaves out; `stream` is the name of the
     stream behind it, if any: a drone's, or the one as which the station keeps a camera's in `streams`, taken at the
-    socket `door`. `folder` is where a watch or a search puts its results.
+    socket `door`. A disk with less than `floor_gb` free is full; a stream of which nothing comes for `away_s` is over.
+    `folder` is where a watch or a search puts its results.
     """
 
     run: str
@@ -111,6 +115,8 @@ class Order:
     options: Mapping[str, Any]
     door: str = ""
     streams: str = ""
+    floor_gb: float = 0.0
+    away_s: float = 900.0
 
     def write(self, folder: Path) -> None:
         """Put it into a run's folder, without a stream's password. Raises StoreError on a full disk."""

@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from fastapi import APIRouter, Depends, Response
@@ -15,9 +15,13 @@ from sorvolo.station.events import EventLog
 from sorvolo.station.ingest import Ingest
 from sorvolo.station.relays import RelayFigures
 from sorvolo.station.security import needs
+from sorvolo.station.settings import StationSettings
 from sorvolo.station.tokens import Role
 
 _SECONDS = (0.005, 0.01, 0.03, 0.06, 0.1, 0.3, 1.0, 3.0, 10.0)
+
+RunCounts = Callable[[], Mapping[str, int]]
+"""How many missions there are in each state."""
 
 Relays = Callable[[], Sequence[RelayFigures]]
 
@@ -25,7 +29,9 @@ Relays = Callable[[], Sequence[RelayFigures]]
 class StationMetrics:
     """The figures of one station, in a registry of its own. `count` adds a request."""
 
-    def __init__(self, root: Path, ingest: Ingest, events: EventLog, relays: Relays = lambda: ()) -> None:
+    def __init__(
+        self, settings: StationSettings, ingest: Ingest, events: EventLog, runs: RunCounts, relays: Relays = lambda: (),
+    ) -> None:
         self.registry = CollectorRegistry()
         self._requests = Counter(
             "sorvolo_http_requests", "Requests answered", ("route", "method", "status"), registry=self.registry
@@ -34,7 +40,7 @@ class StationMetrics:
             "sorvolo_http_request_seconds", "Time to answer a request", ("route",), registry=self.registry,
             buckets=_SECONDS,
         )
-        self.registry.register(_StationCollector(root, ingest, events, relays))
+        self.registry.register(_StationCollector(settings, ingest, events, runs, relays))
 
     def count(self, route: str, method: str, status: int, seconds: float) -> None:
         """A request was answered; `route` is the route's pattern, so that ids make no new series."""
@@ -57,12 +63,23 @@ def metrics_routes(metrics: StationMetrics) -> APIRouter:
 class _StationCollector(Collector):
     """Reads the figures when they are asked for."""
 
-    def __init__(self, root: Path, ingest: Ingest, events: EventLog, relays: Relays) -> None:
-        self._root, self._ingest, self._events, self._relays = root, ingest, events, relays
+    def __init__(
+        self, settings: StationSettings, ingest: Ingest, events: EventLog, runs: RunCounts, relays: Relays,
+    ) -> None:
+        self._settings, self._ingest, self._events, self._runs, self._relays = settings, ingest, events, runs, relays
 
     def collect(self) -> Iterator[Metric]:
         """See `prometheus_client.registry.Collector`."""
-        yield GaugeMetricFamily("sorvolo_disk_free_bytes", "Free disk space", shutil.disk_usage(self._root).free)
+        free = shutil.disk_usage(self._settings.root).free
+        yield GaugeMetricFamily("sorvolo_disk_free_bytes", "Free disk space", free)
+        yield GaugeMetricFamily(
+            "sorvolo_disk_floor_bytes", "Free disk space below which nothing is taken in",
+            self._settings.free_floor_gb * 1e9,
+        )
+        missions = GaugeMetricFamily("sorvolo_missions", "Missions by how they stand or ended", labels=["state"])
+        for state, count in sorted(self._runs().items()):
+            missions.add_metric([state], count)
+        yield missions
         if (memory := memory_bytes()) is not None:
             yield GaugeMetricFamily("sorvolo_memory_bytes", "Resident memory of the station's process", memory)
         yield CounterMetricFamily("sorvolo_events", "Events so far", self._events.last)

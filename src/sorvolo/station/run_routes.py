@@ -34,7 +34,7 @@ def run_routes(runs: Runs, inputs: Inputs) -> APIRouter:
 
     @router.get("/api/runs/{run_id}", dependencies=[Depends(needs(Role.VIEW))])
     def one(run_id: str) -> dict[str, Any]:
-        """A mission: its state (running, finished, failed, stopped, lost), how far it is, how it ended."""
+        """A mission: its state (running, finished, incomplete, failed, stopped, lost), how far it is, how it ended."""
         return run_row(runs.get(run_id))
 
     @router.post("/api/runs/{run_id}/stop", dependencies=[Depends(needs(Role.OPERATE))])

@@ -4,6 +4,7 @@ import contextlib
 import fcntl
 import itertools
 import json
+import logging
 import os
 import re
 import secrets
@@ -22,6 +23,7 @@ from urllib.parse import urlsplit
 
 from sorvolo.station.camera_door import door_path
 from sorvolo.station.collections import SEARCH_FOLDER
+from sorvolo.station.disk_room import Reserve, shortage
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.inputs import Inputs
 from sorvolo.station.orders import (
@@ -31,24 +33,30 @@ from sorvolo.station.orders import (
     LOCK_VARIABLE,
     LOG_FILE,
     SOURCE_VARIABLE,
+    TO_CHECK,
     WRITES,
     Order,
     RunWish,
 )
 from sorvolo.station.problems import Problem
-from sorvolo.station.settings import RUNS_FOLDER, STREAMS_FOLDER, StationSettings
+from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState, compact_json, utc_after, utc_now
 from sorvolo.store.atomic import writing
 
-RUNNING, FINISHED, FAILED, STOPPED, LOST = "running", "finished", "failed", "stopped", "lost"
-"""States of a run; lost: its process ended without a word, as when the machine was switched off."""
+RUNNING, FINISHED, INCOMPLETE, FAILED, STOPPED, LOST = "running", "finished", "incomplete", "failed", "stopped", "lost"
+"""States of a run. Incomplete: finished and kept, but pictures of its flight are missing, as where the disk was full.
+Lost: its process ended without a word, as when the machine was switched off."""
 
 _ENDS = {"run.finished": FINISHED, "run.failed": FAILED, "run.stopped": STOPPED}
+NOTHING_KEPT = "stopped; nothing was kept"
+"""The headline of a mission that was stopped before it had anything."""
+
 _NEVER = "9999"
 _MOST_LINE_BYTES = 4_000_000
 _MOST_LOG_BYTES = 4000
 _LOOK_EVERY_S = 0.1
+_LOG = logging.getLogger("sorvolo.station.disk")
 _DISK_EVERY = 50  # looks between two at the disk
 
 
@@ -69,6 +77,7 @@ class Run:
     headline: str | None = None
     exit_code: int | None = None
     error: str | None = None
+    notice: str | None = None  # what a person should know while it runs: that the disk is full
     pid: int | None = None
     stop_asked: bool = False
     kill_at: str | None = None  # when a stop that brought no end becomes a kill
@@ -88,6 +97,7 @@ class Runs:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._lingering_s: dict[str, float] = {}  # ended by their own journal, their processes not yet: since when
         self._is_low = False
+        self._reserve = Reserve(settings.state_folder / RESERVE_FILE)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="runs", daemon=True)
 
@@ -107,6 +117,12 @@ class Runs:
             "SELECT record FROM runs WHERE ? IN ('', site) ORDER BY made_at DESC, id LIMIT ?", (site, limit)
         )
         return [Run(**json.loads(row["record"])) for row in rows]
+
+    def counts(self) -> dict[str, int]:
+        """How many missions there are in each state."""
+        return {row["state"]: row["count"] for row in self._state.rows(
+            "SELECT state, count(*) AS count FROM runs GROUP BY state"
+        )}
 
     def get(self, run_id: str) -> Run:
         """A run. Raises Problem (404)."""
@@ -186,16 +202,32 @@ class Runs:
             yield
 
     def look_at_disk(self) -> None:
-        """Announce once that the free space fell below the floor, and once that it is above it again."""
-        free_gb = shutil.disk_usage(self._settings.root).free / 1e9
-        is_low = free_gb < self._settings.free_floor_gb
+        """Announce once that the free space fell below the floor, and once that it is above it again.
+
+        Missions that run carry a notice meanwhile.
+        """
+        free_gb, floor_gb = shutil.disk_usage(self._settings.root).free / 1e9, self._settings.free_floor_gb
+        is_low = free_gb < floor_gb
+        if not is_low:
+            self._reserve.hold()
+        self._note_shortage(shortage(self._settings.root, floor_gb) if is_low else "")
         if is_low != self._is_low:
             self._is_low = is_low
-            floor_gb = self._settings.free_floor_gb
+            _LOG.log(
+                logging.WARNING if is_low else logging.INFO, "disk %s: %.2f GB are free, %.2f GB must stay so",
+                "full" if is_low else "has room again", free_gb, floor_gb,
+            )
             data = {"is_low": is_low, "free_gb": round(free_gb, 2), "floor_gb": floor_gb}
             self._events.append(NewEvent("station.disk", data))
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _note_shortage(self, short: str) -> None:
+        """Let the missions that run state that the disk is full (`short`: in words), or no more."""
+        with self._lock:
+            for run, _ in self._running():
+                if bool(short) != bool(run.notice):
+                    self._keep(replace(run, notice=_notice(run, short) if short else None), [])
 
     def _begin(self, run: Run) -> None:
         with self._events.appending([_event("run.started", run, run_row(run))]) as connection:
@@ -218,6 +250,8 @@ class Runs:
                     self.look_at_disk()
                 self.look()
             except Exception as error:  # a full disk, a folder taken away: logged, tried again
+                if self._reserve.give():
+                    continue
                 sys.stderr.write(f"station: runs cannot be followed: {error}\n")
                 self._ending.wait(2.0)
 
@@ -271,14 +305,16 @@ class Runs:
         process = self._processes.get(run.id)
         code = process.poll() if process is not None else None
         if run.stop_asked:
-            run = replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, headline="stopped; nothing was kept")
+            run = replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, notice=None, headline=NOTHING_KEPT)
             return run, _event("run.stopped", run, run_row(run))
         last = _tail(folder / LOG_FILE)
         words = "its process ended without a word"
         if code is not None and code < 0:
             words = f"its process was killed (signal {-code}), perhaps because memory ran out"
+        if short := shortage(folder, self._settings.free_floor_gb):
+            words += f" while the disk was full ({short})"
         run = replace(
-            run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code,
+            run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code, notice=None,
             error=f"{words}; the site is as it was before{': ' + last if last else ''}",
         )
         return run, _event("run.failed", run, run_row(run))
@@ -302,12 +338,8 @@ class Runs:
                 )
 
     def _demand_room(self) -> None:
-        free_gb = shutil.disk_usage(self._settings.root).free / 1e9
-        if free_gb < self._settings.free_floor_gb:
-            raise Problem(
-                507, f"{free_gb:.1f} GB are free, {self._settings.free_floor_gb:.1f} GB have to stay free; delete "
-                     "uploads or flights that you no longer need"
-            )
+        if short := shortage(self._settings.root, self._settings.free_floor_gb):
+            raise Problem(507, f"{short}; delete uploads, recordings or flights that you no longer need")
 
     def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> Order:
         options = wish.options
@@ -322,6 +354,7 @@ class Runs:
             given["camera"] or options.camera or "", str(results.resolve()),
             _stream_of_camera(given["source"], run_id) if is_camera else stream, options.model_dump(mode="json"),
             str(door.resolve()) if is_camera else "", str((self._settings.root / STREAMS_FOLDER).resolve()),
+            self._settings.free_floor_gb, self._settings.limits.away_s,
         )
 
 
@@ -340,12 +373,26 @@ def _taken(run: Run, line: Mapping[str, Any]) -> tuple[Run, NewEvent]:
     if kind == "run.progress":
         run = replace(run, progress=data)
     elif kind in _ENDS:
+        is_short = kind == "run.finished" and data["exit_code"] == TO_CHECK
         run = replace(
-            run, state=_ENDS[kind], ended_at=utc_now(), headline=data["headline"], exit_code=data["exit_code"],
-            error=data["error"],
+            run, state=INCOMPLETE if is_short else _ENDS[kind], ended_at=utc_now(), headline=data["headline"],
+            exit_code=data["exit_code"], error=data["error"], notice=None,
         )
         return run, _event(kind, run, run_row(run))
     return run, _event(kind, run, data)
+
+
+def _notice(run: Run, short: str) -> str:
+    """What a full disk means for a run."""
+    if _is_live(run):
+        return (
+            f"the station's disk is full ({short}): it takes no pictures of this flight until there is room. Delete "
+            "uploads, recordings or flights, or stop the mission to finish what came"
+        )
+    return (
+        f"{short} on the station's disk. If it fills, this mission fails and leaves its site as it was. Delete "
+        "uploads, recordings or flights"
+    )
 
 
 def _stream_of_camera(source: str, run_id: str) -> str:

@@ -17,6 +17,10 @@ RUNS_FOLDER = "runs"
 """The folder below the station's own that holds what missions leave, a folder for each run."""
 
 
+RESERVE_FILE = "reserve"
+"""The file below the station's own folder that holds some room for what must be written on a full disk."""
+
+
 @dataclass(frozen=True)
 class StationLimits:
     """How much a station does at the same time, and how long it waits for missions that are to end."""
@@ -29,13 +33,14 @@ class StationLimits:
     most_events: int = 200_000  # that are kept: who asks for older ones loads the site anew
     stop_within_s: float = 30.0  # a mission that was stopped is killed then
     finish_within_s: float = 3600.0  # a live flight that was stopped is finished first
+    away_s: float = 900.0  # a mission waits so long for a drone or camera of which nothing comes
 
     def __post_init__(self) -> None:
         counts = (
             self.most_connections, self.most_live_per_address, self.most_missions, self.most_streams,
             self.most_uploads, self.most_events,
         )
-        if min(counts) < 1 or min(self.stop_within_s, self.finish_within_s) <= 0:
+        if min(counts) < 1 or min(self.stop_within_s, self.finish_within_s, self.away_s) <= 0:
             raise SettingsError("limits of a station are counts from 1 and seconds above 0")
 
 

@@ -177,8 +177,8 @@ class Uploads:
         free = shutil.disk_usage(self._settings.root).free
         if free - more_bytes < self._settings.free_floor_gb * 1e9:
             raise Problem(
-                507, f"{free / 1e9:.1f} GB are free, of which {self._settings.free_floor_gb:.1f} GB stay free; delete "
-                     "uploads or flights that you no longer need"
+                507, f"{free / 1e9:.1f} GB are free, and {self._settings.free_floor_gb:.1f} GB must stay so; delete "
+                     "uploads, recordings or flights that you no longer need"
             )
 
     def close(self) -> None:

@@ -24,7 +24,8 @@ from sorvolo.errors import SorvoloError
 from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.station.camera import camera_opened
 from sorvolo.station.collections import on_earth
-from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, Order
+from sorvolo.station.incomplete import cut_off, unsent
+from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, TO_CHECK, Order
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
 from sorvolo.store.exports.plain import plain_json, utc_text
@@ -44,7 +45,6 @@ FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
 
 _PROGRESS_EVERY_S = 0.25
 _LIVE_S = 0.5  # how often the growing map is shown: a browser waits for it
-_DRONE_AWAY_S = 900.0
 _NICE = 5  # the server answers first
 _WRONG, _STOPPED_CODE = 1, 130
 
@@ -86,12 +86,12 @@ class _Stop:
 
 
 def main(folder: Path) -> int:
-    """Do the order in a run's folder; the exit code: 0, 1 for an error that its journal states, 130 stopped."""
+    """Do the order in a run's folder; the exit code: 0, 1 for an error that its journal states, 3 where the flight
+    is incomplete, 130 stopped."""
     order, journal = Order.read(folder), Journal(folder / JOURNAL_FILE)
     stop = _Stop(is_live_address(order.source))
     try:
-        with camera_opened(order, folder, stop.until) as opened:
-            headline = _MISSIONS[order.mission](opened, journal, stop.until)
+        headline, why = _flown(order, folder, journal, stop.until)
     except KeyboardInterrupt:
         journal.add(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
         return _STOPPED_CODE
@@ -103,8 +103,27 @@ def main(folder: Path) -> int:
         journal.add(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
         sys.stderr.write(without_secret(traceback.format_exc(), order.source))  # the run's log
         return _WRONG
+    if why:
+        journal.add(FINISHED, {"exit_code": TO_CHECK, "error": None, "headline": f"incomplete: {why}. {headline}"})
+        return TO_CHECK
     journal.add(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
     return 0
+
+
+def _flown(order: Order, folder: Path, journal: Journal, until: threading.Event) -> tuple[str, str]:
+    """The headline of a mission that was done, and why its flight is incomplete ("": it is not).
+
+    Raises what the mission raises; its words name what the flight lacks.
+    """
+    with camera_opened(order, folder, until) as camera:
+        try:
+            headline = _MISSIONS[order.mission](camera.order, journal, until)
+        except SorvoloError as error:
+            if not (why := cut_off(camera.order, was_stopped=until.is_set())):
+                raise
+            raise type(error)(f"{error}; the flight is incomplete: {why}") from error
+        why = cut_off(camera.order, was_stopped=until.is_set())
+    return headline, "; ".join(filter(None, (why, unsent(camera.left()))))
 
 
 def _map(order: Order, journal: Journal, until: threading.Event) -> str:
@@ -211,7 +230,7 @@ _MISSIONS = {"map": _map, "compare": _compare, "watch": _watch, "search": _searc
 def _live(order: Order, *, keeps_all: bool = False) -> LiveSettings:
     """How a live source is read: a drone that sends to this station comes back, and states when its flight is over."""
     settings = LiveSettings(keeps_all=keeps_all)
-    return replace(settings, give_up_s=_DRONE_AWAY_S) if order.stream else settings
+    return replace(settings, give_up_s=order.away_s) if order.stream else settings
 
 
 def _placed(journal: Journal, view: FrameView | None, name: str, status: str) -> None:

@@ -142,6 +142,7 @@ class Live {
     this.screen.view?.put("drone", []);
     this.show();
     if (type === "run.failed") message("The mission failed", { kind: "error", todo: data.error || data.headline || "See “Missions” for why." });
+    else if (data.state === "incomplete") message("The mission ended before its flight", { kind: "warning", todo: data.headline });
     else message(data.headline || "The mission is done");
   }
 

@@ -53,6 +53,14 @@ function listen() {
   show();
   station.events.addEventListener("state", show);
   station.events.addEventListener("reload", () => route());
+  station.events.addEventListener("station.disk", ({ detail: { data } }) => disk(data));
+}
+
+/** The station's disk fell below its floor of free space, or has room again. */
+function disk({ is_low: isLow, free_gb: free, floor_gb: floor }) {
+  if (!isLow) return void message("The station's disk has room again", { todo: "Streams and uploads go on by themselves." });
+  return void message("The station's disk is full", { kind: "error",
+    todo: `${free} GB are free, and ${floor} GB must stay so. No upload, mission or stream is taken in until there is room: delete uploads, recordings or flights.` });
 }
 
 /** Show the screen that the address names. */

@@ -23,7 +23,7 @@ class Missions {
     this.list = el("div", { class: "runs" });
     this.may = screen.station.status.role === "operate";
     fill(body, this.may ? this.form() : el("p", { class: "note" }, "Your token may look and review, not start missions."), this.uploadList = el("div", {}), el("h3", {}, "Missions here"), this.list);
-    const types = ["run.started", "run.finished", "run.failed", "run.stopped"];
+    const types = ["run.started", "run.finished", "run.failed", "run.stopped", "station.disk"]; // of which a row states what it means
     const again = () => this.load();
     const progress = ({ detail }) => {
       const run = this.runs.find((each) => each.id === detail.run);
@@ -139,6 +139,7 @@ class Missions {
       run.input?.name || run.input?.stream || run.input?.stream_url ? el("p", { class: "soft" }, run.input.name ?? run.input.stream ?? run.input.stream_url) : null,
       running ? el("progress", { ...(expected ? { value: Math.min(frames, expected), max: expected } : {}), "aria-label": "Progress" }) : null,
       running && frames ? el("p", {}, expected ? `frame ${frames} of ${expected}` : `${frames} frames`) : null,
+      run.notice ? el("p", { class: "error", role: "status" }, run.notice) : null,
       run.headline ? el("p", {}, run.headline) : null,
       run.error ? el("p", { class: "error" }, run.error) : null,
       run.ended_at ? el("p", { class: "soft" }, `took ${duration((new Date(run.ended_at) - new Date(run.started_at)) / 1000)}`) : null,
