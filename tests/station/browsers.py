@@ -61,6 +61,10 @@ class Served:
         with urllib.request.urlopen(request) as answer:
             return json.load(answer)
 
+    def send(self, path: str, method: str) -> None:
+        """A request whose answer has no content. Raises HTTPError."""
+        urllib.request.urlopen(urllib.request.Request(self.url + path, method=method)).close()
+
     def read(self, path: str) -> str:
         """The text that the station answers. Raises HTTPError."""
         with urllib.request.urlopen(self.url + path) as answer:

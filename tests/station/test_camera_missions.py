@@ -8,6 +8,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 
 import pytest
 from browsers import Served
@@ -47,6 +48,15 @@ def is_seen(station: Served, run: str, frames: int = 1) -> bool:
     found = state(station, run)
     assert found["state"] == "running", found
     return ((found["progress"] or {}).get("searched") or 0) >= frames
+
+
+def refused(station: Served, path: str) -> int:
+    """With which status the station does not delete something; 0 where it does."""
+    try:
+        station.send(path, "DELETE")
+    except HTTPError as error:
+        return error.code
+    return 0
 
 
 def ended(station: Served, run: str) -> dict[str, Any]:
@@ -92,6 +102,8 @@ def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(camera:
         processes = own_processes(station, run)
         assert sum(b"sorvolo.station.camera" in line for _, line in processes) == 1
         assert not any(SECRET.encode() in line for _, line in processes)
+        assert refused(station, f"/api/runs/{run}") == 409
+        assert refused(station, f"/api/streams/{stream['stream']}") == 423  # the mission reads it
         camera.hang_up()
         wait_for(lambda: camera.methods.count("PLAY") == 2, 30)
         before = station.ask(f"/api/streams/{stream['stream']}")["frames"]
@@ -105,6 +117,12 @@ def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(camera:
     written = [each for each in tmp_path.rglob("*") if each.is_file()]
     assert not [each for each in written if SECRET.encode() in each.read_bytes()]
     assert not list(tmp_path.rglob("spool"))
+    with Served(tmp_path, free_floor_gb=0.0) as station:
+        assert station.ask("/api/streams")[0]["bytes"] == kept["bytes"]
+        assert refused(station, f"/api/streams/{stream['stream']}/flights/nothing") == 404
+        assert refused(station, f"/api/runs/{run}") == 0
+        assert station.ask("/api/streams") == station.ask("/api/runs") == []
+    assert not list((tmp_path / "streams").iterdir()) and not (tmp_path / "station" / "runs" / run).exists()
 
 
 def test_a_camera_outlives_a_restarted_station(tmp_path: Path) -> None:

@@ -4,7 +4,9 @@ import json
 import re
 import shutil
 import struct
+import time
 from collections.abc import Iterator
+from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from io import BytesIO
 from pathlib import Path
@@ -29,6 +31,7 @@ from websockets.sync.client import connect
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.station.events import NewEvent
 from sorvolo.station.messages import Hello, Kind, Message
+from sorvolo.station.runs import Run
 from sorvolo.station.tokens import make_token
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
@@ -312,6 +315,89 @@ def test_a_page_that_slept_asks_from_its_last_event_and_gets_each_once(browser: 
     assert sockets[1].url.endswith(f"after={last}")
     assert watched.faults == []
     context.close()
+
+
+def test_a_browser_that_slept_notices_its_dead_connection(browser: Any, served: Served) -> None:
+    """A closed lid: ten minutes in which no timer runs and nothing comes, on a socket that nobody closed."""
+    context = browser.new_context()
+    watched = Watched(context, served.url)
+    watched.page.clock.install()
+    sockets: list[Any] = []
+    is_dead = [False]
+
+    def passed_on(socket: Any) -> None:
+        sockets.append(socket)
+        server, is_first = socket.connect_to_server(), len(sockets) == 1
+        server.on_message(lambda message: None if is_first and is_dead[0] else socket.send(message))
+
+    watched.page.route_web_socket(re.compile("/api/events"), passed_on)
+    show(watched, served)
+    watched.page.locator("#link-state.live").wait_for()
+    announce(served, "run.failed", {"error": "the lens is wet"})
+    watched.page.locator(".message", has_text="the lens is wet").wait_for()
+    last = served.station.events.last
+    is_dead[0] = True
+    announce(served, "run.failed", {"error": "the battery is empty"})
+    watched.page.wait_for_timeout(300)
+    assert watched.page.locator(".message", has_text="the battery is empty").count() == 0 and len(sockets) == 1
+    watched.page.clock.fast_forward("10:00")
+    watched.page.locator(".message", has_text="the battery is empty").wait_for()
+    watched.page.locator("#link-state.live").wait_for()
+    assert watched.page.locator(".message", has_text="the battery is empty").count() == 1
+    assert len(sockets) == 2 and sockets[1].url.endswith(f"after={last}")
+    assert watched.faults == []
+    context.close()
+
+
+def test_a_frozen_tab_catches_up_when_it_is_looked_at_again(browser: Any, served: Served) -> None:
+    """As browsers freeze tabs in the background: what happened meanwhile comes once each, and in order."""
+    context = browser.new_context()
+    watched = Watched(context, served.url)
+    show(watched, served)
+    watched.page.locator("#link-state.live").wait_for()
+    watched.page.evaluate("""() => {
+      window.heard = [];
+      const note = (each) => each.addedNodes.forEach((node) => window.heard.push(node.textContent));
+      new MutationObserver((all) => all.forEach(note))
+        .observe(document.getElementById('messages'), { childList: true });
+    }""")
+    chrome = context.new_cdp_session(watched.page)
+    chrome.send("Page.setWebLifecycleState", {"state": "frozen"})
+    for number in range(3):
+        announce(served, "run.failed", {"error": f"fault {number}"})
+    time.sleep(1.0)  # the length of its sleep
+    chrome.send("Page.setWebLifecycleState", {"state": "active"})
+    watched.page.locator(".message", has_text="fault 2").wait_for()
+    heard = [each for each in watched.page.evaluate("window.heard") if "fault" in each]
+    assert [re.search(r"fault \d", each)[0] for each in heard] == ["fault 0", "fault 1", "fault 2"]  # type: ignore[index]
+    assert watched.faults == []
+    context.close()
+
+
+def test_recordings_are_listed_with_their_size_and_deleted(served: Served, opened: Watched, tmp_path: Path) -> None:
+    """Not without being asked again; a mission that is over, too."""
+    page = opened.page
+    folder = served.station.settings.root / "streams" / "old-flight"
+    folder.mkdir(parents=True)
+    (folder / "20260501T100000Z_aa.ts").write_bytes(bytes(2_500_000))
+    watch_run(served.station, "feed", "field")
+    record = Run("feed", "watch", "field", "finished", "ada", "2026-05-01T10:00:00Z", "2026-05-01T10:01:00Z")
+    with served.station.state.changing() as connection:
+        connection.execute("UPDATE runs SET record = ? WHERE id = 'feed'", (json.dumps(asdict(record)),))
+    show(opened, served, "missions")
+    row = page.locator(".files li", has_text="Stream old-flight")
+    expect(row).to_contain_text("1 flight, 2.5 MB")
+    row.get_by_role("button").click()
+    page.get_by_role("dialog").get_by_role("button", name="Close").click()
+    assert folder.exists()
+    row.get_by_role("button").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(row).to_have_count(0)
+    assert not folder.exists()
+    page.locator(".run.finished", has_text="ada").get_by_role("button", name="Delete").click()
+    page.get_by_role("dialog").get_by_role("button", name="Delete").click()
+    expect(page.locator(".run.finished", has_text="ada")).to_have_count(0)
+    assert not (served.station.settings.state_folder / "runs" / "feed").exists()
 
 
 def test_a_place_is_remembered(served: Served, opened: Watched) -> None:

@@ -148,8 +148,9 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     for router in (
         _about_routes(station), _site_routes(station), event_routes(station.events),
         feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
-        crop_routes(station.shelf, station.findings), stream_routes(station.ingest), metrics_routes(metrics),
-        upload_routes(station.uploads, station.runs), run_routes(station.runs, station.inputs),
+        crop_routes(station.shelf, station.findings), stream_routes(station.ingest, station.runs),
+        metrics_routes(metrics), upload_routes(station.uploads, station.runs),
+        run_routes(station.runs, station.inputs, station.ingest),
         place_routes(station.shelf, station.collections, station.reviews, station.videos, station.place_index),
         video_routes(station.shelf, station.collections, station.videos),
         drawing_routes(Drawings(settings, station.shelf, station.events)),

@@ -25,6 +25,7 @@ from sorvolo.station.messages import (
     message_from_bytes,
     sample_from_json,
 )
+from sorvolo.station.problems import Problem
 from sorvolo.station.transport_stream import FlightFile
 from sorvolo.station.video import VideoHub
 from sorvolo.store.atomic import atomic_write_bytes
@@ -149,6 +150,26 @@ class Ingest:
     def kept_bytes(self, stream: str) -> int:
         """How much of a stream's flights lies on the disk."""
         return sum(each.stat().st_size for each in self._files(stream))
+
+    def delete(self, stream: str, flight: str | None = None) -> None:
+        """Take a stream's recordings away, or one of them; called in the event loop, where none begins meanwhile.
+
+        Raises Problem: 404 where there is none, 423 where the drone sends it.
+        """
+        check_stream(stream)
+        files = [each for each in self._files(stream) if flight in (None, each.stem)]
+        if not files:
+            raise Problem(404, f"no such recording of the stream {stream}; /api/streams lists those there are")
+        now = self._flights.get(stream)
+        if stream in self._links and (now is None or now.path in files):
+            raise Problem(423, f"the stream {stream} is being sent; wait until its flight is over")
+        if now is not None and now.path in files:
+            del self._flights[stream]
+        for each in files:
+            for path in (each, each.with_suffix(".json"), _ended(each)):
+                path.unlink(missing_ok=True)
+        if not any((self._folder / stream).iterdir()):
+            (self._folder / stream).rmdir()
 
     def show_boxes(self, found: Mapping[str, Any]) -> None:
         """Give a mission's detections in one frame to whoever watches the stream; from any thread.

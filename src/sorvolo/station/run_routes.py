@@ -1,9 +1,10 @@
-"""The routes of missions: what they can be started on, started, looked at, stopped."""
+"""The routes of missions: what they can be started on, started, looked at, stopped, taken away."""
 
 from typing import Any
 
 from fastapi import APIRouter, Depends, Query
 
+from sorvolo.station.ingest import Ingest
 from sorvolo.station.inputs import Inputs, input_row
 from sorvolo.station.orders import RunWish
 from sorvolo.station.runs import Runs, run_row
@@ -11,7 +12,7 @@ from sorvolo.station.security import needs
 from sorvolo.station.tokens import Holder, Role
 
 
-def run_routes(runs: Runs, inputs: Inputs) -> APIRouter:
+def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
     """Missions by the API, as from the command line."""
     router = APIRouter(tags=["runs"])
 
@@ -41,5 +42,15 @@ def run_routes(runs: Runs, inputs: Inputs) -> APIRouter:
     def stop(run_id: str) -> dict[str, Any]:
         """Ask it to end: a live flight is finished and kept, a recorded one is left out."""
         return run_row(runs.stop(run_id))
+
+    @router.delete("/api/runs/{run_id}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))])
+    async def delete(run_id: str) -> None:
+        """Take a mission that is over away: its record, what a watch found, the recording of its camera. The map that
+        it made stays. 409 while it runs, 423 while another mission reads the recording."""
+        stream = runs.stream_of(run_id)
+        with runs.unused_stream(stream, but=run_id):
+            runs.delete(run_id)
+            if stream and ingest.newest(stream) is not None:
+                ingest.delete(stream)
 
     return router

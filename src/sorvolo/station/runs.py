@@ -32,6 +32,7 @@ from sorvolo.station.orders import (
     LOCK_FILE,
     LOCK_VARIABLE,
     LOG_FILE,
+    ORDER_FILE,
     SOURCE_VARIABLE,
     TO_CHECK,
     WRITES,
@@ -188,6 +189,37 @@ class Runs:
             count += self._look_at(run, offset).state == RUNNING
         self._reap()
         return count
+
+    def delete(self, run_id: str) -> Run:
+        """Take away what is kept of a mission that is over: its record, its folder with what a watch found.
+
+        The map that it made stays in its site. Raises Problem: 404, 409 for one that runs.
+        """
+        with self._lock:
+            run = self.get(run_id)
+            if run.state == RUNNING or not _has_ended(self._folder / run.id):
+                raise Problem(409, "this run is running; stop it first")
+            with self._events.appending([_event("run.deleted", run, {"id": run.id})]) as connection:
+                connection.execute("DELETE FROM runs WHERE id = ?", (run.id,))
+            shutil.rmtree(self._folder / run.id, ignore_errors=True)
+            return run
+
+    def stream_of(self, run_id: str) -> str:
+        """The stream whose recording belongs to a mission alone: that of its camera; "" where there is none."""
+        run = self.get(run_id)
+        return _order_stream(self._folder / run.id) if "stream_url" in (run.input or {}) else ""
+
+    @contextmanager
+    def unused_stream(self, stream: str, but: str = "") -> Iterator[None]:
+        """No mission begins meanwhile. Raises Problem (423) where one that runs, `but` this one, reads the stream."""
+        with self._lock:
+            for run, _ in self._running():
+                if stream and run.id != but and stream == _order_stream(self._folder / run.id):
+                    raise Problem(
+                        423, f"a {run.mission} that {run.who} started reads this stream; wait until it ends, or stop "
+                             "it", run=run.id,
+                    )
+            yield
 
     @contextmanager
     def unused(self, upload_id: str) -> Iterator[None]:
@@ -412,6 +444,14 @@ def _uploads_of(run: Run) -> set[str]:
     options = run.options or {}
     wishes = (run.input, options.get("telemetry"), options.get("camera_file"))
     return {str(each["upload"]) for each in wishes if each and each.get("upload")}
+
+
+def _order_stream(folder: Path) -> str:
+    """The stream that a run's order names; "" where it names none."""
+    try:
+        return str(json.loads((folder / ORDER_FILE).read_bytes()).get("stream") or "")
+    except (OSError, ValueError):
+        return ""
 
 
 def _kill(pid: int | None) -> None:

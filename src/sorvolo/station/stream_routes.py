@@ -11,24 +11,39 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 from sorvolo.errors import InputError
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.ingest import REFUSED_CODE, Announce, Ingest, LinkClosed
+from sorvolo.station.runs import Runs
 from sorvolo.station.security import needs
 from sorvolo.station.tokens import Role
 from sorvolo.station.video import Viewer
 
 
-def stream_routes(ingest: Ingest) -> APIRouter:
+def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     """`/api/streams`, `/api/ingest/{stream}` and `/api/streams/{stream}/video`."""
     router = APIRouter(tags=["streams"])
 
     @router.get("/api/streams", dependencies=[Depends(needs(Role.VIEW))])
     def streams() -> list[dict[str, Any]]:
-        """Every stream that was ever sent, and what those do that are being sent."""
-        return ingest.streams()
+        """Every stream of which flights are kept, how many bytes those are, and what those do that are being sent."""
+        return [each | {"bytes": ingest.kept_bytes(each["stream"])} for each in ingest.streams()]
 
     @router.get("/api/streams/{stream}", dependencies=[Depends(needs(Role.VIEW))])
     def one_stream(stream: str) -> dict[str, Any]:
         """One stream: its flights, and how the one goes that is being sent."""
-        return ingest.state(stream) | {"viewers": ingest.viewers(stream)}
+        return ingest.state(stream) | {"viewers": ingest.viewers(stream), "bytes": ingest.kept_bytes(stream)}
+
+    @router.delete("/api/streams/{stream}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))])
+    async def delete_all(stream: str) -> None:
+        """Take all recordings of a stream away. 423 while a drone sends it, or a mission reads it."""
+        with runs.unused_stream(stream):
+            ingest.delete(stream)
+
+    @router.delete(
+        "/api/streams/{stream}/flights/{flight}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))],
+    )
+    async def delete_one(stream: str, flight: str) -> None:
+        """Take one recording of a stream away. 423 while a drone sends it, or a mission reads the stream."""
+        with runs.unused_stream(stream):
+            ingest.delete(stream, flight)
 
     @router.websocket("/api/ingest/{stream}")
     async def take(websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.OPERATE))]) -> None:

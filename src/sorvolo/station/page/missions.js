@@ -1,9 +1,9 @@
 // Missions: started on an upload or a stream, watched, stopped; and what became of earlier ones.
 
-import { get, post, Problem } from "./api.js";
-import { button, choice, el, field, fill, message, report } from "./dom.js";
+import { get, post, Problem, remove } from "./api.js";
+import { button, choice, dialog, el, field, fill, message, report } from "./dom.js";
 import { Upload } from "./upload.js";
-import { bytes, duration, time } from "./words.js";
+import { bytes, counted, duration, time } from "./words.js";
 import { zipOfFiles } from "./zip.js";
 
 const KINDS = {
@@ -22,8 +22,8 @@ class Missions {
     Object.assign(this, { screen, runs: [], uploads: [] });
     this.list = el("div", { class: "runs" });
     this.may = screen.station.status.role === "operate";
-    fill(body, this.may ? this.form() : el("p", { class: "note" }, "Your token may look and review, not start missions."), this.uploadList = el("div", {}), el("h3", {}, "Missions here"), this.list);
-    const types = ["run.started", "run.finished", "run.failed", "run.stopped", "station.disk"]; // of which a row states what it means
+    fill(body, this.may ? this.form() : el("p", { class: "note" }, "Your token may look and review, not start missions."), this.uploadList = el("div", {}), el("h3", {}, "Missions here"), this.list, this.kept = el("div", {}));
+    const types = ["run.started", "run.finished", "run.failed", "run.stopped", "run.deleted", "station.disk"]; // the last: rows state what it means
     const again = () => this.load();
     const progress = ({ detail }) => {
       const run = this.runs.find((each) => each.id === detail.run);
@@ -122,6 +122,7 @@ class Missions {
     try {
       this.runs = await get(`/api/runs?site=${encodeURIComponent(this.screen.data.id)}`);
       this.show();
+      await this.showKept();
     } catch (problem) {
       fill(this.list, el("p", { class: "hint" }, problem.detail));
     }
@@ -129,6 +130,27 @@ class Missions {
 
   show() {
     fill(this.list, this.runs.length ? this.runs.map((run) => this.row(run)) : el("p", { class: "hint" }, "None yet."));
+  }
+
+  /** What the station keeps of streams and uploads, with its size; taken away by whoever may start missions. */
+  async showKept() {
+    const [streams, uploads] = await Promise.all([get("/api/streams"), this.may ? get("/api/uploads") : []]);
+    const rows = [
+      ...streams.filter((each) => each.flight_count).map((each) => [`Stream ${each.stream}`, `${counted(each.flight_count, "flight")}, ${bytes(each.bytes)}`, `/api/streams/${encodeURIComponent(each.stream)}`]),
+      ...uploads.map((each) => [each.name, `upload, ${bytes(each.offset)}`, `/api/uploads/${encodeURIComponent(each.id)}`]),
+    ];
+    fill(this.kept, rows.length ? [el("h3", {}, "Recordings and uploads of the station"), el("ul", { class: "files" }, rows.map(([name, size, path]) => el("li", {}, el("b", {}, name), " ", el("span", { class: "soft" }, size),
+      this.may ? button("Delete", () => this.remove(path, `${name} (${size})`), { class: "quiet", "aria-label": `Delete ${name}` }) : null)))] : null);
+  }
+
+  /** Take away for good what a person confirms. */
+  remove(path, words) {
+    const box = dialog("Delete for good?", el("p", {}, words), el("p", { class: "note" }, "Maps that were made of it stay."),
+      button("Delete", async () => {
+        box.close();
+        try { await remove(path); } catch (problem) { report(problem); }
+        await this.load();
+      }, { class: "main" }));
   }
 
   row(run) {
@@ -143,7 +165,8 @@ class Missions {
       run.headline ? el("p", {}, run.headline) : null,
       run.error ? el("p", { class: "error" }, run.error) : null,
       run.ended_at ? el("p", { class: "soft" }, `took ${duration((new Date(run.ended_at) - new Date(run.started_at)) / 1000)}`) : null,
-      running && this.may ? button(run.stop_asked ? "Stop at once" : "Stop", () => this.stop(run), { class: "quiet" }) : null);
+      running && this.may ? button(run.stop_asked ? "Stop at once" : "Stop", () => this.stop(run), { class: "quiet" }) : null,
+      !running && this.may ? button("Delete", () => this.remove(`/api/runs/${encodeURIComponent(run.id)}`, `The record of this ${run.mission}${run.mission === "watch" ? ", what it found" : ""}${run.input?.stream_url ? ", the recording of its camera" : ""}`), { class: "quiet" }) : null);
   }
 
   async stop(run) {

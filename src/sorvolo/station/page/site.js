@@ -75,7 +75,7 @@ class SiteScreen {
     this.hear(this.data, "chosen", () => this.drawChosen());
     this.hear(choices, "change", (event) => { this.view?.follow(); if (event.detail !== "layers") this.redraw(); });
     this.hear(matchMedia("(prefers-color-scheme: dark)"), "change", () => this.view?.follow());
-    for (const type of ["site.changed", "run.finished", "run.stopped", "run.failed"]) this.hear(this.station.events, type, (event) => this.reload(event.detail));
+    for (const type of ["site.changed", "run.finished", "run.stopped", "run.failed", "run.deleted"]) this.hear(this.station.events, type, (event) => this.reload(event.detail));
     this.hear(this.station.events, "site.gone", ({ detail }) => { if (detail.site === this.data.id) this.gone(); });
     this.hear(this.station.events, "state", ({ detail }) => { if (detail === "live") this.check(); });
     this.hear(this.station.events, "review.changed", ({ detail }) => { if (detail.site === this.data.id) this.data.judge(detail.data); });
