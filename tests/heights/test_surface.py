@@ -18,9 +18,11 @@ from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_
 from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.smooth_sigma import SmoothSigma
+from sorvolo.heights.standing import Standing
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
-from sorvolo.heights.sweep import SweepSettings
+from sorvolo.heights.sweep import SweepSettings, choose_views
 from sorvolo.heights.terrain import TerrainSettings, filled, terrain
+from sorvolo.heights.views import inside
 from sorvolo.registration.features import gray_from_rgb
 
 ORIGIN, CRS = Geodetic(46.0, -91.0, 100.0), "EPSG:32615"
@@ -79,6 +81,18 @@ def test_the_roof_has_its_height(surface: Surface) -> None:
     assert np.nanmedian(surface.up_m[roof]) == pytest.approx(floor + tall, abs=0.1)
 
 
+def test_the_ground_beside_walls_is_not_as_high_as_the_roof(surface: Surface) -> None:
+    points = surface.lattice.points_m()
+    x, y = points[..., 0], points[..., 1]
+    west, south, east, north, _ = HOUSE
+    near = (x > west - 2) & (x < east + 2) & (y > south - 2) & (y < north + 2)
+    beside = near & ~((x > west - 0.4) & (x < east + 0.4) & (y > south - 0.4) & (y < north + 0.4))
+    off = surface.up_m - true_heights(surface.lattice)
+    # 76 cells were up to 5 m too high and 76 without height, when photos had a say from which the house hides it
+    assert (np.abs(off[beside]) > 1).sum() < 20
+    assert np.isnan(off[beside]).sum() < 40
+
+
 def test_bare_ground_is_what_the_houses_stand_on(surface: Surface) -> None:
     ground, shows = terrain(surface.lattice, surface.up_m, TerrainSettings(widest_m=10.0))
     points = surface.lattice.points_m()
@@ -131,9 +145,78 @@ def test_a_piece_that_photos_see_through_is_found_and_the_house_is_not(survey) -
 
         return seen_through(lattice, up_m, views, gray, 60, SweepSettings(window_cells=(3, 7)))
 
-    assert not found_in(true).any()
+    assert found_in(true).mean() < 0.002
     found = found_in(wrong)
-    assert found[beside].all() and not found[~beside].any()
+    assert found[beside].all() and found[~beside].mean() < 0.001
+
+
+def test_single_cells_of_a_wide_roof_that_photos_see_through_are_found(survey) -> None:
+    views, pictures, _ = survey
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    true = true_heights(lattice).astype(np.float32)
+    x, y = np.moveaxis(lattice.points_m(), 2, 0)
+    west, south, east, north, tall = HOUSE
+    beside = (x > east) & (x < east + 1.5) & (y > south) & (y < north)  # the roof goes on: one piece with it
+    roof = (x > west) & (x < east) & (y > south) & (y < north)
+    floor = float(hills(np.array((west + east) / 2), np.array((south + north) / 2)))
+    wrong = np.where(beside, np.float32(floor + tall), true)
+    found = seen_through(
+        lattice, wrong, views, lambda number: gray_from_rgb(pictures[number]), 60, SweepSettings(window_cells=(3, 7))
+    )
+    assert found[beside].mean() > 0.5
+    assert found[roof].mean() < 0.02 and found[~beside & ~roof].mean() < 0.01
+
+
+def _wall(lattice: Lattice) -> np.ndarray:
+    """The heights of a wall of 6 m on level ground."""
+    x, y = np.moveaxis(lattice.points_m(), 2, 0)
+    return np.where((x > 5) & (x < 7) & (np.abs(y) < 3), np.float32(6), np.float32(0))
+
+
+def test_a_camera_does_not_see_the_ground_behind_what_stands() -> None:
+    view = survey_views(strips=1, photos=1)[0]
+    lattice = Lattice.over(np.array([[-12.0, -10], [14, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    eye_m = view.site_from_camera.translation_m
+    hidden_m = Standing(lattice, _wall(lattice)).hidden_below_m(lattice, eye_m)
+    assert hidden_m is not None
+    x, y = np.moveaxis(lattice.points_m(), 2, 0)
+    away = 7 + 1.0  # a metre behind the wall the line of sight over it is so high
+    line_m = 6 - (eye_m[2] - 6) * (away - 7) / (7 - eye_m[0])
+    at = (np.abs(x - away) < 0.2) & (np.abs(y) < 1)
+    assert hidden_m[at].mean() == pytest.approx(line_m - 0.3, abs=0.7)  # 0.3 m: the margin
+    assert np.isneginf(hidden_m[x < 4.5]).all() and np.isneginf(hidden_m[np.abs(y) > 6]).all()
+
+
+def test_what_hides_nothing_is_not_asked_about() -> None:
+    view = survey_views(strips=1, photos=1)[0]
+    lattice = Lattice.over(np.array([[-12.0, -10], [14, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    level = Standing(lattice, np.zeros(lattice.shape, np.float32))
+    assert level.hidden_below_m(lattice, view.site_from_camera.translation_m) is None
+
+
+def test_only_what_stands_everywhere_around_stands_surely() -> None:
+    lattice = Lattice.over(np.array([[-12.0, -10], [14, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    up_m = _wall(lattice)
+    holes = lattice.points_m()[..., 1] > 8
+    up_m[holes] = np.nan
+    sure = Standing.surely(lattice, up_m, 7)
+    assert np.isfinite(sure.up_m).all() and (sure.up_m == 0)[holes].all()
+    known = ~holes
+    assert (sure.up_m[known] <= up_m[known]).all()
+    assert 0 < (sure.up_m == 6).sum() < (up_m == 6).sum()
+    nothing = Standing.surely(lattice, np.full(lattice.shape, np.nan, np.float32), 7)
+    assert np.isfinite(nothing.up_m).all()
+
+
+def test_photos_that_see_the_ground_beside_a_house_are_chosen(survey) -> None:
+    views, _, _ = survey
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    standing = Standing(lattice, true_heights(lattice).astype(np.float32))
+    places, shown = standing.shown(lattice, views)
+    level = np.array([inside(view.pixels_from_site(places), view.camera) for view in views])
+    assert (shown <= level).all() and (level & ~shown).sum() > 20
+    chosen = choose_views(lattice, views, 0.0, 4, standing)
+    assert (shown[chosen].sum(axis=0) < np.minimum(shown.sum(axis=0), 2)).mean() < 0.1
 
 
 def test_photos_are_chosen_from_above(survey) -> None:

@@ -1,16 +1,18 @@
-"""Heights that photos see through: pieces of a height model that would hide ground on which those photos agree.
+"""Heights that photos see through: a pixel of a photo shows one place, and often that is one that lies lower.
 
 What stands beside a wall is often a match by chance of two photos, for the wall hides the ground from the others. But
-a piece that is not there hides nothing: photos that it would keep from the roof or the ground behind agree on these
-(the free space of Merrell et al. 2007, "Real-time visibility-based fusion of depth maps").
+of all cells of a height model that fall on a pixel, the photo shows the one at which it agrees best with another photo.
+Where that lies lower than a cell, it sees through that cell (the free space of Merrell et al. 2007, "Real-time
+visibility-based fusion of depth maps").
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Rows
+from sorvolo.geometry.arrays import Floats32, ImageGray, Mask
 from sorvolo.heights.islands import pieces
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.sweep import SweepSettings, choose_views, likeness_on
@@ -20,14 +22,12 @@ from sorvolo.heights.views import View
 
 @dataclass(frozen=True)
 class FreeSpaceSettings:
-    """When photos see through a piece of a height model."""
+    """When photos see through a height model."""
 
     views: int = 6  # compared with each other at a place
     agrees: float = 0.3  # likeness of two photos, 0 to 1, by which they agree: by chance it is below 0.15
-    behind: float = 0.5  # share of the places that a cell hides on which a photo agrees: it sees through the cell
-    photos: float = 0.5  # share of the photos that see through a cell, of those that it hides something from
-    share: float = 0.5  # of a piece's cells that are seen through: the piece is not there
-    margin_cells: float = 1.5  # above the line of sight, below which a cell hides nothing
+    margin_cells: float = 1.5  # what a photo shows, less than that beside a cell's height, is the cell
+    share: float = 0.5  # of a piece: seen through so many times, of the times that it is seen
     step_cells: float = 2.0  # a height this much beside its neighbour's, in cells, is another piece
     window_cells: int = 1000  # whose pieces are worked on at a time
     apron_cells: int = 5  # beyond a tile: more than half a patch
@@ -37,46 +37,47 @@ def seen_through(
     lattice: Lattice, up_m: Floats32, views: Sequence[View], pictures: Callable[[int], ImageGray], tile_cells: int,
     sweep: SweepSettings, settings: FreeSpaceSettings = FreeSpaceSettings(),
 ) -> Mask:
-    """(H, W) the cells of pieces of a height model, NaN in holes, that photos see through.
+    """(H, W) the cells of a height model, NaN in holes, that as many photos see through as see them, and some pieces.
 
+    Of a piece fewer are enough, for it has many cells.
     `pictures(i)` is view i's gray picture of about the cells' detail, compared by `sweep` in tiles of so many cells.
     """
-    if not np.isfinite(up_m).any():
-        return np.zeros(up_m.shape, bool)
-    ground = filled(up_m, np.isfinite(up_m))
-    hides, through = np.zeros(up_m.shape, np.uint8), np.zeros(up_m.shape, np.uint8)
-    for number, places in _agreed(lattice, ground, np.isfinite(up_m), views, pictures, tile_cells, sweep, settings):
-        hidden, agreed = _behind(lattice, up_m, ground, views[number], places, settings)
-        hides += hidden > 0
-        through += (hidden > 0) & (agreed > settings.behind * hidden)
-    cells = (through > 0) & (through > settings.photos * hides)
-    found = np.zeros(up_m.shape, bool)
+    known = np.isfinite(up_m)
+    if not known.any():
+        return known
+    ground = filled(up_m, known)
+    through, shown = np.zeros(up_m.shape, np.uint8), np.zeros(up_m.shape, np.uint8)
+    for number, places in _compared(lattice, ground, known, views, pictures, tile_cells, sweep, settings):
+        lower, itself = _seen_at(lattice, ground, views[number], places, settings)
+        through.ravel()[places.cell[lower]] += 1
+        shown.ravel()[places.cell[itself]] += 1
+    found = known & (through > 0) & (through >= shown)
     for x0, y0, x1, y1 in lattice.windows(settings.window_cells):
         here = slice(y0, y1), slice(x0, x1)
-        piece = pieces(up_m[here], settings.step_cells * lattice.cell_m)
-        share = np.bincount(piece.ravel(), cells[here].ravel()) / np.maximum(np.bincount(piece.ravel()), 1)
-        found[here] = (share[piece] > settings.share) & np.isfinite(up_m[here])
+        rest = np.where(found[here], np.float32(np.nan), up_m[here])
+        for model in (up_m[here], rest):  # a plate beside a wall is apart from it once its own cells are gone
+            found[here] |= known[here] & _mostly(model, through[here], shown[here], lattice.cell_m, settings)
     return found
 
 
 @dataclass(frozen=True, eq=False)
 class _Places:
-    """Cells that a photo shows, (N,) rows and columns, and whether it agrees with another photo there."""
+    """Cells that a photo shows, (N,), by number, each once, and how well it agrees with another photo there."""
 
-    rows: Rows
-    columns: Rows
-    agrees: Mask
+    cell: NDArray[np.int32]
+    alike: NDArray[np.float16]
 
 
-def _agreed(
+def _compared(
     lattice: Lattice, ground: Floats32, known: Mask, views: Sequence[View], pictures: Callable[[int], ImageGray],
     tile_cells: int, sweep: SweepSettings, settings: FreeSpaceSettings,
-) -> list[tuple[int, _Places]]:
-    """Of each view, by number, the places at which it can be compared."""
+) -> Iterator[tuple[int, _Places]]:
+    """Of each view, by number, the places at which it can be compared with another one."""
     found: dict[int, list[_Places]] = {}
+    apron = settings.apron_cells
     for x0, y0, x1, y1 in lattice.windows(tile_cells):
-        left, top = max(0, x0 - settings.apron_cells), max(0, y0 - settings.apron_cells)
-        right, below = min(lattice.width, x1 + settings.apron_cells), min(lattice.height, y1 + settings.apron_cells)
+        left, top = max(0, x0 - apron), max(0, y0 - apron)
+        right, below = min(lattice.width, x1 + apron), min(lattice.height, y1 + apron)
         up_m = np.ascontiguousarray(ground[top:below, left:right])
         window = lattice.window(left, top, right, below)
         best: dict[int, Floats32] = {}
@@ -87,38 +88,36 @@ def _agreed(
         for number, alike in best.items():
             inner = alike[y0 - top:y1 - top, x0 - left:x1 - left]
             rows, columns = np.nonzero((inner > 0) & known[y0:y1, x0:x1])
-            agrees = inner[rows, columns] > settings.agrees
-            found.setdefault(number, []).append(_Places(rows + y0, columns + x0, agrees))
-    return [(number, _joined(parts)) for number, parts in found.items()]
+            cell = ((rows + y0) * lattice.width + columns + x0).astype(np.int32)
+            found.setdefault(number, []).append(_Places(cell, inner[rows, columns].astype(np.float16)))
+    for number, parts in found.items():
+        yield number, _Places(*(np.concatenate([getattr(each, name) for each in parts]) for name in ("cell", "alike")))
 
 
-def _joined(parts: Sequence[_Places]) -> _Places:
-    return _Places(*(np.concatenate([getattr(each, name) for each in parts]) for name in ("rows", "columns", "agrees")))
-
-
-def _behind(
-    lattice: Lattice, up_m: Floats32, ground: Floats32, view: View, places: _Places, settings: FreeSpaceSettings
-) -> tuple[Rows, Rows]:
-    """(H, W) how many places each cell of the model hides from a view, and on how many of these the view agrees."""
-    eye = view.site_from_camera.translation_m
-    at: Floats = lattice.cells_from_site(eye[None, :2])[0]
-    away = np.column_stack([at[0] - places.columns, at[1] - places.rows])
-    far = np.maximum(np.linalg.norm(away, axis=1), 1e-3)
-    away /= far[:, None]
-    here_m = ground[places.rows, places.columns]
-    climb = (eye[2] - here_m) / far  # metres a cell on the way to the camera
+def _seen_at(
+    lattice: Lattice, ground: Floats32, view: View, places: _Places, settings: FreeSpaceSettings
+) -> tuple[Mask, Mask]:
+    """(N,) at which places a view's pixel shows another one, which lies lower, and at which the place itself."""
+    rows, columns = np.divmod(places.cell, lattice.width)
+    up_m = ground.ravel()[places.cell]
+    cells = np.column_stack([columns, rows, np.ones(len(rows))])
+    pixels = view.pixels_from_site(np.column_stack([(cells @ lattice.site_from_cells.T)[:, :2], up_m]))
+    reach_m = max(float(view.site_from_camera.translation_m[2] - np.median(up_m)), 1e-3)
+    per_cell = max(lattice.cell_m * view.camera.fx_px / reach_m, 1.0)
+    width, height = (int(side / per_cell) + 2 for side in (view.camera.width_px, view.camera.height_px))
+    x, y = np.clip(np.rint(pixels / per_cell).astype(int), 0, [width - 1, height - 1]).T
+    at, order = y * width + x, np.argsort(places.alike, kind="stable")
+    alike, shows_m = np.zeros(width * height, np.float32), np.zeros(width * height, np.float32)
+    alike[at[order]], shows_m[at[order]] = places.alike[order], up_m[order]  # of several the last is the most alike
+    agrees, above_m = alike[at] > settings.agrees, up_m - shows_m[at]
     margin_m = settings.margin_cells * lattice.cell_m
-    hidden, agreed = np.zeros(up_m.size, np.int64), np.zeros(up_m.size, np.int64)
-    reach = min(float(np.ptp(ground)) / max(float(climb.min(initial=np.inf)), 1e-3), float(far.max(initial=0.0)))
-    step = 1.5
-    while step < reach:
-        columns = np.rint(places.columns + away[:, 0] * step).astype(int)
-        rows = np.rint(places.rows + away[:, 1] * step).astype(int)
-        on = (columns >= 0) & (rows >= 0) & (columns < lattice.width) & (rows < lattice.height) & (step < far)
-        cell = np.where(on, rows * lattice.width + columns, 0)
-        with np.errstate(invalid="ignore"):
-            hides = on & (up_m.ravel()[cell] > here_m + climb * step + margin_m)
-        np.add.at(hidden, cell[hides], 1)
-        np.add.at(agreed, cell[hides & places.agrees], 1)
-        step = max(step + 1.0, step * 1.06)
-    return hidden.reshape(up_m.shape), agreed.reshape(up_m.shape)
+    return agrees & (above_m > margin_m), agrees & (np.abs(above_m) <= margin_m)
+
+
+def _mostly(
+    up_m: Floats32, through: ImageGray, shown: ImageGray, cell_m: float, settings: FreeSpaceSettings
+) -> Mask:
+    """(H, W) the cells of pieces that are seen through often, of the times that they are seen."""
+    piece = pieces(up_m, settings.step_cells * cell_m)
+    often, seen = (np.bincount(piece.ravel(), each.ravel()) for each in (through, shown))
+    return np.asarray(((often > 0) & (often >= settings.share * seen))[piece])

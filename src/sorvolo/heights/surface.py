@@ -12,6 +12,7 @@ from sorvolo.heights.islands import IslandSettings, islands
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.semiglobal import SmoothingSettings
 from sorvolo.heights.smooth_sigma import SmoothSigma
+from sorvolo.heights.standing import Standing
 from sorvolo.heights.sweep import Bounds, SweepSettings, Swept, sweep
 from sorvolo.heights.views import View
 
@@ -71,7 +72,9 @@ def sweep_surface(
     heights_m = np.array([view.site_from_camera.translation_m[2] for view in views])
     everywhere = _bounds(points_m, float(np.median(heights_m)))
     side = _tile_cells(lattice.cell_m, views, settings)
-    coarse = _coarse(lattice.coarser(settings.coarser), views, pictures, everywhere, settings)
+    wide = lattice.coarser(settings.coarser)
+    coarse = _coarse(wide, views, pictures, everywhere, settings)
+    standing = Standing.surely(wide, coarse, max(settings.coarse.window_cells))
     up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
     covered, shown_by = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, np.uint8)
     tiles = list(lattice.windows(side))
@@ -80,7 +83,7 @@ def sweep_surface(
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
         bounds = _tile_bounds(coarse, settings, (x0, y0, x1, y1), lattice.cell_m)
         if bounds is not None:
-            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep)
+            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep, standing)
             found = _calmed(swept)
             unsure = swept.deviation_m > settings.unsure_cells * lattice.cell_m
             found[unsure & (swept.shown_by <= settings.islands.photos)] = np.nan

@@ -15,9 +15,11 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
+from sorvolo.heights.standing import Standing
 from sorvolo.heights.views import View, inside
 
-_MORE = 3  # views beyond the wanted ones
+_MORE = 3  # views beyond the wanted ones ...
+_LEFT_OUT = 0.04  # ... while two of those that are chosen leave out so much of the ground that two could show
 _ANGLES = 16  # directions in a picture that are distinguished, over half a turn
 _ANGLE_RAD = np.pi / _ANGLES
 
@@ -65,15 +67,15 @@ class Swept:
 
 def sweep(
     lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], bounds: Bounds,
-    settings: SweepSettings,
+    settings: SweepSettings, standing: Standing | None = None,
 ) -> Swept:
-    """The heights within bounds of a lattice's cells.
+    """The heights within bounds of a lattice's cells; a photo from which what is standing hides a height has no say.
 
     `pictures(i)` is view i's gray picture, uint8, of any size; it should have about a cell's detail. Which photos
     see a cell depends on its height: where fewer than two see the height that fits best, the cell is a hole.
     """
     low_m, high_m = bounds.low_m, bounds.high_m
-    chosen = choose_views(lattice, views, bounds.usual_m, settings.views)
+    chosen = choose_views(lattice, views, bounds.usual_m, settings.views, standing)
     shape = lattice.shape
     if len(chosen) < 2:
         nothing = np.full(shape, np.nan, np.float32)
@@ -84,9 +86,12 @@ def sweep(
     levels: Floats = low_m + level_m * np.arange(int(np.ceil((high_m - low_m) / level_m)) + 1.0)
     eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
     laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
-    agreement = _agreements(laid, levels, settings)
     least, usual_m = min(settings.window_cells), np.array([bounds.usual_m])
     seen = [np.broadcast_to(next(each.wholes(usual_m, least)), shape) for each in laid]
+    if standing is not None:
+        for each, eye_m in zip(laid, eyes_m):
+            each.hide(standing.hidden_below_m(lattice, eye_m))
+    agreement = _agreements(laid, levels, settings)
     seen_by = np.sum(seen, axis=0).astype(np.float32)
     total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
     up_m, score = _best(total, agreement, levels)
@@ -104,6 +109,8 @@ def likeness_on(
 
     It is 0 where a photo does not show the smaller patch as a whole.
     """
+    if len(chosen) < 2:
+        return
     bounds = Bounds(float(up_m.min()), float(up_m.max()), float(np.median(up_m)))
     eyes_m = np.array([views[k].site_from_camera.translation_m for k in chosen])
     laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
@@ -116,13 +123,14 @@ def likeness_on(
             yield chosen[i], chosen[j], np.maximum(alike, 0)
 
 
-def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: int) -> list[int]:
-    """The rows of the views to compare over a lattice: those that see much of it, from angles that differ well."""
-    across = np.linspace(0, 1, 5)
-    x, y = np.meshgrid(across * (lattice.width - 1), across * (lattice.height - 1))
-    cells = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
-    ground = np.column_stack([(cells @ lattice.site_from_cells.T)[:, :2], np.full(x.size, up_m)])
-    covers = np.array([inside(view.pixels_from_site(ground), view.camera) for view in views]).reshape(len(views), -1)
+def choose_views(
+    lattice: Lattice, views: Sequence[View], up_m: float, count: int, standing: Standing | None = None
+) -> list[int]:
+    """The rows of the views to compare over a lattice: those that see much of it, from angles that differ well.
+
+    What is standing says what they see; without it, the ground is level at a height.
+    """
+    ground, covers = _level_shown(lattice, views, up_m) if standing is None else standing.shown(lattice, views)
     middle = ground.mean(axis=0)
     rays = np.array([view.site_from_camera.translation_m for view in views]) - middle
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
@@ -130,7 +138,7 @@ def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: in
     least = np.ones(len(views))
     seen = np.zeros(len(ground))
     wanted = np.minimum(covers.sum(axis=0), 2)  # ground that only photos left out see would be a hole
-    while len(chosen) < count or (len(chosen) < count + _MORE and (seen < wanted).any()):
+    while len(chosen) < count or (len(chosen) < count + _MORE and (seen < wanted).mean() >= _LEFT_OUT):
         need = 1 / (1.0 + seen) ** 2
         worth = (covers * need).sum(axis=1) / need.sum() * (np.abs(rays[:, 2]) if not chosen else least)
         worth[chosen] = 0
@@ -142,6 +150,16 @@ def choose_views(lattice: Lattice, views: Sequence[View], up_m: float, count: in
         angle = np.arccos(np.clip(rays @ rays[best], -1, 1))
         least = np.minimum(least, _usefulness(angle))
     return chosen
+
+
+def _level_shown(lattice: Lattice, views: Sequence[View], up_m: float) -> tuple[PointsM, Mask]:
+    """Places all over a lattice at a height, (P, 3), and which of the views show each, (V, P)."""
+    across = np.linspace(0, 1, 5)
+    x, y = np.meshgrid(across * (lattice.width - 1), across * (lattice.height - 1))
+    cells = np.column_stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    ground = np.column_stack([(cells @ lattice.site_from_cells.T)[:, :2], np.full(x.size, up_m)])
+    shown = [inside(view.pixels_from_site(ground), view.camera) for view in views]
+    return ground, np.array(shown).reshape(len(views), -1)
 
 
 def _usefulness(angle: Floats) -> Floats:
@@ -174,6 +192,8 @@ class _Laid:
         settings: SweepSettings,
     ) -> None:
         self.shape = lattice.shape
+        self._hidden_below_m: Floats32 | None = None
+        self._clear_m = -np.inf  # nothing from here up is hidden
         camera = view.camera.resized(picture.shape[1], picture.shape[0])
         turn = view.site_from_camera.rotation.T
         project = camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
@@ -183,10 +203,13 @@ class _Laid:
         self._corners = np.array([[0, right, 0, right], [0, 0, bottom, bottom], [1.0, 1, 1, 1]])
         self._size = picture.shape[1], picture.shape[0]
         piece = self._crop_to(picture, bounds, settings)
-        angles = self._angles(others_m - view.site_from_camera.translation_m, lattice, bounds.usual_m)
-        self.channels, which = np.unique(angles, return_inverse=True)
-        self._contrast = np.dstack([_contrast(piece, each * _ANGLE_RAD, settings) for each in self.channels])
-        self.channel = which.tolist()
+        away_m = others_m - view.site_from_camera.translation_m
+        angles = self._angles(away_m, lattice, bounds.usual_m)
+        others = (away_m != 0).any(axis=1)
+        channels, which = np.unique(angles[others], return_inverse=True)
+        self._contrast = [_contrast(piece, each * _ANGLE_RAD, settings) for each in channels.tolist()]
+        self._channel = np.zeros(len(others), int)  # of each of the others; nobody asks for the photo's own
+        self._channel[others] = which
         self._px_per_cell = lattice.cell_m * camera.fx_px / max(
             float(view.site_from_camera.translation_m[2]) - bounds.usual_m, 1e-3)
 
@@ -194,13 +217,12 @@ class _Laid:
         """The photo on the plane at a height, (H, W) float32, for each of the others; 0 outside of it."""
         there = self._from_picture @ self._picture_from_cells(up_m)
         laid = [
-            channel for first in range(0, len(self.channels), 4)
-            for channel in cv2.split(cv2.warpPerspective(
-                self._contrast[..., first:first + 4], there, self.shape[::-1],
-                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            ))
+            np.asarray(cv2.warpPerspective(
+                each, there, self.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            ), np.float32)
+            for each in self._contrast
         ]
-        return [laid[each] for each in self.channel]
+        return [laid[each] for each in self._channel.tolist()]
 
     def on(self, up_m: Floats32) -> list[Floats32]:
         """The photo on heights, (H, W), for each of the others; 0 outside of it."""
@@ -209,8 +231,8 @@ class _Laid:
         x, y, z = (each[0] * columns + (each[1] * rows + each[2]) + rise[2] * up_m for each, rise in zip(level, up))
         z = np.where(z > 1e-6, z, np.nan)
         u, v = (np.nan_to_num(each / z, nan=-1e6).astype(np.float32) for each in (x, y))
-        laid = [np.asarray(cv2.remap(each, u, v, cv2.INTER_LINEAR), np.float32) for each in cv2.split(self._contrast)]
-        return [laid[each] for each in self.channel]
+        laid = [np.asarray(cv2.remap(each, u, v, cv2.INTER_LINEAR), np.float32) for each in self._contrast]
+        return [laid[each] for each in self._channel.tolist()]
 
     def wholes(self, levels_m: Floats, side: int) -> Iterator[Seen]:
         """Where a patch lies in the photo as a whole when the ground is at each of some heights, (L,).
@@ -220,12 +242,19 @@ class _Laid:
         lines = self._lines(levels_m, side)
         inside = lines @ self._corners >= 0
         everywhere, nowhere = inside.all(axis=(1, 2)), ~inside.any(axis=2).all(axis=1)
-        for number in range(len(levels_m)):
-            if everywhere[number] or nowhere[number]:
+        for number, up_m in enumerate(levels_m.tolist()):
+            if nowhere[number] or (everywhere[number] and up_m >= self._clear_m):
                 yield bool(everywhere[number])
                 continue
             known = self._within(lines[number][~inside[number].all(axis=1)])
+            if self._hidden_below_m is not None and up_m < self._clear_m:
+                known &= up_m >= self._hidden_below_m
             yield known if known.any() else False
+
+    def hide(self, below_m: Floats32 | None) -> None:
+        """From here on the photo does not show what lies lower than (H, W) heights."""
+        if below_m is not None:
+            self._hidden_below_m, self._clear_m = below_m, float(below_m.max())
 
     def _within(self, lines: Floats) -> Mask:
         """(H, W) the cells on the inner side of lines, (K, 3)."""
@@ -250,7 +279,8 @@ class _Laid:
             level[0] * columns + (level[1] * rows + level[2]) + up[2] * up_m for level, up in zip(self._level, self._up)
         )
         left, top = x - inset * z, y - inset * z
-        return (left >= 0) & (top >= 0) & (x <= (w - 1 - inset) * z) & (y <= (h - 1 - inset) * z)
+        shown: Mask = (left >= 0) & (top >= 0) & (x <= (w - 1 - inset) * z) & (y <= (h - 1 - inset) * z)
+        return shown if self._hidden_below_m is None else shown & (up_m >= self._hidden_below_m)
 
     def _picture_from_cells(self, up_m: float) -> Matrix3:
         return np.asarray(self._level + up_m * self._up)
