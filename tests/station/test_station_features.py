@@ -31,6 +31,8 @@ def features(client: TestClient, name: str, **query: Any) -> list[dict[str, Any]
 def test_a_client_finds_its_way_from_the_landing_page(client: TestClient) -> None:
     """QGIS follows links: landing page, conformance, collections, items."""
     links = {each["rel"]: each["href"] for each in client.get("/api/sites/field").json()["links"]}
+    assert all(each.startswith("http://127.0.0.1:8750/") for each in links.values())  # QGIS 3.22 reads no relative ones
+    assert client.get(links["service-desc"]).json()["openapi"]
     assert "http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/core" in client.get(
         links["conformance"]).json()["conformsTo"]
     found = client.get(links["data"]).json()["collections"]
@@ -41,6 +43,7 @@ def test_a_client_finds_its_way_from_the_landing_page(client: TestClient) -> Non
     assert west < 13.25 < east and south < 46.5 < north
     items = next(each["href"] for each in found[0]["links"] if each["rel"] == "items")
     assert client.get(items).json()["numberMatched"] == 8
+    assert all(each["href"].startswith(items) for each in client.get(f"{items}?limit=3").json()["links"])
     assert client.get(items.replace("/items", "")).json()["id"] == "frames"
 
 

@@ -218,11 +218,11 @@ def _site_routes(station: Station) -> APIRouter:
         return readable(station.shelf)
 
     @router.get("/{site}")
-    def one_site(site: str) -> dict[str, Any]:
+    def one_site(request: Request, site: str) -> dict[str, Any]:
         """A site with its versions and flights, and the revision of its live map."""
         detail = site_detail(site, station.shelf.open(site))
         revision = station.tiles.live(site).revision if detail["versions"] or detail["bounds_wgs84"] else None
-        return {**detail, "live_revision": revision, "links": landing_links(f"/api/sites/{site}")}
+        return {**detail, "live_revision": revision, "links": landing_links(request, site)}
 
     @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.webp", response_class=Response, responses=_picture("webp"))
     def tile_webp(site: str, version: str, z: int, x: int, y: int) -> Response:

@@ -30,11 +30,12 @@ class GeoJsonResponse(JSONResponse):
     media_type = _GEOJSON
 
 
-def landing_links(base: str) -> list[dict[str, str]]:
-    """The links of a site's landing page."""
+def landing_links(request: Request, site: str) -> list[dict[str, str]]:
+    """The links of a site's landing page; whole addresses, as in all answers here: QGIS reads no others."""
+    base, api = _base(request, site), f"{request.base_url}openapi.json"
     return [
         _link(base, "self", "application/json", "This site"),
-        _link("/openapi.json", "service-desc", "application/vnd.oai.openapi+json;version=3.0", "The API"),
+        _link(api, "service-desc", "application/vnd.oai.openapi+json;version=3.0", "The API"),
         _link(f"{base}/conformance", "conformance", "application/json", "What it conforms to"),
         _link(f"{base}/collections", "data", "application/json", "Collections of features"),
     ]
@@ -51,18 +52,18 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
         return {"conformsTo": _CONFORMS}
 
     @router.get("/collections")
-    def list_collections(site: str) -> dict[str, Any]:
+    def list_collections(request: Request, site: str) -> dict[str, Any]:
         """The collections of a site."""
-        base = f"/api/sites/{site}"
+        base = _base(request, site)
         return {
             "links": [_link(f"{base}/collections", "self", "application/json", "Collections")],
             "collections": [_about(name, collections.get(site, name), base) for name in TITLES],
         }
 
     @router.get("/collections/{name}")
-    def one_collection(site: str, name: str) -> dict[str, Any]:
+    def one_collection(request: Request, site: str, name: str) -> dict[str, Any]:
         """One collection: its extent and links."""
-        return _about(name, collections.get(site, name), f"/api/sites/{site}")
+        return _about(name, collections.get(site, name), _base(request, site))
 
     @router.get("/collections/{name}/items", response_class=GeoJsonResponse)
     def items(
@@ -92,6 +93,11 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
     return router
 
 
+def _base(request: Request, site: str) -> str:
+    """The whole address of a site, under the name and scheme by which the client asked."""
+    return f"{request.base_url}api/sites/{quote(site, safe=':')}"
+
+
 def _about(name: str, collection: Collection, base: str) -> dict[str, Any]:
     extent = {}
     if collection.shapes:
@@ -115,7 +121,7 @@ def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 
 def _page(request: Request, features: Sequence[Feature], limit: int, offset: int) -> dict[str, Any]:
     shown = features[offset:offset + limit]
-    path = request.url.path
+    path = f"{str(request.base_url).rstrip('/')}{quote(request.url.path, safe='/:')}"
     links = [_link(f"{path}?{request.url.query}" if request.url.query else path, "self", _GEOJSON, "This page")]
     if offset + limit < len(features):
         query = urlencode({**dict(request.query_params), "limit": limit, "offset": offset + limit})

@@ -12,7 +12,7 @@ _VERSION = "3.22.0"  # the form of the symbols, which later ones read, too
 @dataclass(frozen=True)
 class LayerStyle:
     """A layer's symbols: of what shape, by which attribute's values, in which colours (#rrggbb); "" is every other
-    value. `opacity` is that of filled ground; `is_hollow`: outlines alone."""
+    value. `opacity` is that of filled ground and of its rim; `is_hollow`: rims alone, thin where they are faint."""
 
     shape: str  # "marker", "line" or "fill"
     attribute: str
@@ -29,10 +29,10 @@ LAYER_STYLES: Mapping[str, LayerStyle] = MappingProxyType({
         "appeared": "#12b886", "disappeared": "#f03e3e", "replaced": "#9c6bff", "area": "#228be6", "moving": "#fd9e14",
         "": "#868e96",
     }, is_hollow=True),
-    "coverage": LayerStyle("fill", "status", {"compared": "#12b886", "": "#868e96"}, opacity=0.35),
+    "coverage": LayerStyle("fill", "status", {"compared": "#12b886", "": "#868e96"}, opacity=0.2),
     "frames": LayerStyle("fill", "status", {
         "vision": "#35b98a", "gps-only": "#f0a835", "": "#adb5bd",
-    }, is_hollow=True),
+    }, opacity=0.3, is_hollow=True),  # hundreds lie over each other, and the map is to be seen through them
     "track": LayerStyle("line", "", {"": "#343a40"}),
 })
 """The style of each layer, by its name; the colours are those of the station's page."""
@@ -69,7 +69,8 @@ def _symbol(symbols: Element, name: str, style: LayerStyle, colour: str) -> None
     else:
         kind, options = "SimpleFill", {
             "color": _rgba(colour, opacity), "style": "no" if style.is_hollow else "solid",
-            "outline_color": _rgba(colour), "outline_width": "0.5" if style.is_hollow else "0.1",
+            "outline_color": _rgba(colour, opacity),
+            "outline_width": "0.5" if style.is_hollow and style.opacity == 1 else "0.1",
             "outline_width_unit": "MM",
         }
     layer = SubElement(symbol, "layer", {"class": kind, "enabled": "1", "pass": "0", "locked": "0"})
