@@ -274,16 +274,29 @@ def test_photos_of_the_same_second_taken_elsewhere_count():
     assert collect(photos)[0].conclude()[0].views == 3
 
 
-def test_a_single_view_is_believed_only_if_very_sure_and_at_half_the_score():
-    thing = Thing(0, 0)
-    sure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.95)
-    unsure = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=0.7)
-    evidence, reported = collect([sure], AnnounceSettings(least_score=0.24), single_view_score=0.9)
-    assert reported == []
-    (change,) = evidence.conclude()
-    assert change.views == 1 and change.score < 0.4
-    assert collect([unsure], AnnounceSettings(least_score=0.24), single_view_score=0.9)[0].conclude() == ()
-    assert collect([sure])[0].conclude() == ()  # unless asked for, a single view is not believed at all
+def single(thing: Thing, score: float = 0.95) -> EvidenceMap:
+    """The evidence of one view alone."""
+    return collect([view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [thing], score=score)])[0]
+
+
+def test_what_one_view_alone_shows_must_be_very_sure_and_confirmed_by_other_evidence():
+    asked = []
+
+    def confirms(outline_m):
+        asked.append(outline_m)
+        return True
+
+    (change,) = single(Thing(0, 0)).conclude(confirms)
+    assert change.views == 1 and change.score < 0.67  # two views that agree have 0.7
+    assert np.hypot(*((asked[0].min(axis=0) + asked[0].max(axis=0)) / 2)) < 0.15
+    assert single(Thing(0, 0), score=0.7).conclude(confirms) == ()
+    assert single(Thing(0, 0)).conclude(lambda _: False) == ()
+    assert single(Thing(0, 0)).conclude() == ()  # where nothing else was measured, one view announces nothing
+
+
+def test_what_one_view_alone_shows_at_its_rim_is_not_announced():
+    half_m = (view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), []).changed.shape[1] / 2) * M_PER_PX
+    assert single(Thing(half_m, 0)).conclude(lambda _: True) == ()
 
 
 def test_low_scores_are_kept_but_not_announced():

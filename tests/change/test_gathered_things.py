@@ -7,7 +7,7 @@ import pytest
 from sorvolo.change.areas.gathered_things import GatheredThings
 from sorvolo.change.pair.learned_difference import learned_difference
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.survey.findings import Change, ChangeKind, ComparedView
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
 M_PER_PX = 0.1
 VIEW_PX = 352, 256
@@ -83,6 +83,16 @@ def test_a_thing_that_no_view_flags_is_reported_with_its_place_and_once(ground):
     assert 0.5 < change.area_m2 / ((east - west) * (north - south)) < 1.8
     assert change.patch.after[..., 3].any() and 0.3 < change.score <= 1
     assert things.conclude("b", 8, [change]) == []
+
+
+def test_what_one_view_alone_shows_is_confirmed_where_it_lies_apart_and_not_as_a_shadow_or_twice_seen(ground):
+    west, east, south, north = BOX_M
+    box_m = np.array([[west, south], [east, south], [east, north], [west, north]])
+    assert gathered(ground, with_car(ground), 1).shows_once(box_m)
+    assert not gathered(ground, with_car(ground), 1).shows_once(box_m - [0, 9])  # unchanged ground
+    assert not gathered(ground, with_car(ground), 1, shade=Shade.LATER_DARK).shows_once(box_m)
+    assert not gathered(ground, with_car(ground), 2).shows_once(box_m)
+    assert not gathered(ground, ground, 0).shows_once(box_m)
 
 
 def middle_of(change: Change) -> np.ndarray:

@@ -338,7 +338,11 @@ def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, 
     console.print(table)
     if len(features) > _MOST_ROWS:
         console.print(f"and {len(features) - _MOST_ROWS:,} more in changes.geojson")
-    console.print("accuracy: 1 sigma; views: how many show it; score: 0 to 1, how sure", style="dim", highlight=False)
+    single = sum(bool(each["properties"].get("single_view")) for each in features)
+    alone = f"; {counted(single, 'change')} by one view alone, where no other saw the ground" if single else ""
+    console.print(
+        f"accuracy: 1 sigma; views: how many show it{alone}; score: 0 to 1, how sure", style="dim", highlight=False
+    )
 
 
 def _middle(ring: Sequence[Sequence[float]]) -> tuple[float, float]:

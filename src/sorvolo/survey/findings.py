@@ -168,6 +168,11 @@ class ChangeFacts:
     length_m: float
     sigma_m: float
 
+    @property
+    def is_single_view(self) -> bool:
+        """Whether one view alone shows it: no other confirmed it."""
+        return self.views == 1
+
 
 @dataclass(frozen=True, eq=False)
 class Change(ChangeFacts):

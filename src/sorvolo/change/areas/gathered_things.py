@@ -12,7 +12,7 @@ from sorvolo.change.pair.learned_difference import LearnedSettings, learned_diff
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.change.shape.place_sigma import place_sigma_m
-from sorvolo.geometry.arrays import Mask
+from sorvolo.geometry.arrays import Mask, PointsM
 from sorvolo.survey.findings import Change, ComparedView, Shade
 
 _SUMS = ("seen", "apart", "agree", "dark")
@@ -61,6 +61,19 @@ class GatheredThings:
         }
         laid = self._ground.add(view, window, view.site_from_image, planes, view.valid.astype(np.float32))
         self._ground.show(view, window, laid["apart"] > settings.spreads)
+
+    def shows_once(self, outline_m: PointsM) -> bool:
+        """Whether one view alone saw most of an outline's ground, (N, 2), and lies as far apart there as a view must
+        to agree by itself, and not as in a shadow."""
+        settings, sums = self._settings, self._ground.sums
+        if self._ground.is_empty:
+            return False
+        site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
+        own = mask_of(outline_m, site_from_cell, self._ground.window.shape) & (sums["seen"] > 0)
+        if not own.any() or np.median(sums["seen"][own]) > 1:
+            return False
+        apart, dark = (float((sums[name][own] / sums["seen"][own]).mean()) for name in ("apart", "dark"))
+        return apart >= settings.own_spreads and dark <= settings.most_dark
 
     def conclude(self, id_prefix: str, first_number: int, others: Sequence[Change]) -> list[Change]:
         """After the last view: the things that `others` do not hold, numbered from `first_number` on."""

@@ -93,7 +93,6 @@ class Tally:
     whole: int = 0  # views that show all of it; in the others it ends at a rim
     camera_low_m: tuple[float, float, float] = (np.inf, np.inf, np.inf)
     camera_high_m: tuple[float, float, float] = (-np.inf, -np.inf, -np.inf)
-    is_single: bool = False  # one view saw its ground, and no other could
     restless: float = 0.0  # share of views that flag the ground around for nothing
     moved: int = 0  # views that were taken out, since what moves shows in them
     look: Look | None = None
@@ -174,8 +173,7 @@ def views_score(tally: Tally, settings: AnnounceSettings, calm: float = 1.0) -> 
     """
     if not tally.views:
         return 0.0
-    single = 0.5 if tally.is_single else 1.0
-    score = tally.score_sum / tally.views * (tally.views + 1) / (tally.asked + 2) * single * calm
+    score = tally.score_sum / tally.views * (tally.views + 1) / (tally.asked + 2) * calm
     wholeness = settings.cut_off + (1 - settings.cut_off) * min(2 * tally.whole / tally.views, 1.0)
     return float(np.clip(score * (0.5 if tally.is_from_one_place(settings) else 1.0) * wholeness, 0, 1))
 

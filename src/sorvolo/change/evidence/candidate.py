@@ -143,10 +143,9 @@ class Candidate:
         self._tally = self._tally.recounted(views, asked)
         self._shown_by.clear()
 
-    def become(self, number: int, *, is_single: bool) -> None:
-        """A seed grows up; `is_single` if only one view ever saw its ground."""
+    def become(self, number: int) -> None:
+        """A seed grows up."""
         self.number = number
-        self._tally = replace(self._tally, is_single=is_single)
 
     def note_restlessness(self, restless: float) -> None:
         """The share of the views of the ground around that flag it for nothing, as measured last."""

@@ -6,7 +6,7 @@ of them gathers k votes out of n in the same cell. Unknown ground counts neither
 """
 
 from collections import Counter, deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -39,10 +39,11 @@ from sorvolo.change.evidence.relief_doubt import ReliefDoubt
 from sorvolo.change.evidence.shadow_doubt import ShadowDoubt, SunAt
 from sorvolo.change.motion.blob_tracker import BlobTracker, MovingBlobs, MovingSettings
 from sorvolo.change.motion.moving_changes import Movers
+from sorvolo.change.shape.outlines import mask_of
 from sorvolo.change.shape.shadows import ThingSettings
 from sorvolo.change.shape.things import Parts
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.survey.findings import Change, ComparedView
 
 
@@ -88,7 +89,7 @@ class EvidenceSettings:
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and are no news
     least_area_m2: float = 0.02
     join_m: float = 0.3  # a smaller gap does not make two things of one
-    single_view_score: float = 2.0  # a single view's change this sure is announced at the end; above 1: never
+    single_view_score: float = 0.9  # what one view shows, and no other could, must be so sure, and confirmed: 0048
     gathering: GatherSettings = field(default_factory=GatherSettings)
     moving: MovingSettings = field(default_factory=MovingSettings)
     announcing: AnnounceSettings = field(default_factory=AnnounceSettings)
@@ -130,6 +131,7 @@ class EvidenceMap:
         self._announced_ns: dict[int, int] = {}  # by the number of the candidate
         self._parts: dict[int, Parts] = {}  # the things that an announced change holds, by its number
         self._stopped: dict[int, Verdict] = {}  # at the flight's end, by number
+        self._seen_once: set[int] = set()  # the numbers of those with ground that one view alone shows
         self._movers = Movers(id_prefix, m_per_px, self._cell_m)
         self._least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
         self._seeds = Seeds(
@@ -167,14 +169,15 @@ class EvidenceMap:
                 known += self._records(candidate)
         return tuple(sorted(known, key=_number_of))
 
-    def conclude(self) -> tuple[Change, ...]:
+    def conclude(self, confirms: Callable[[PointsM], bool] = lambda _: False) -> tuple[Change, ...]:
         """After the last view: all changes, with those that fewer than n views could see.
 
-        A change that the views of its ground did not confirm is withdrawn. One that a single view saw, and
-        no other could, is announced if that view was very sure, with half the score.
+        A change that the views of its ground did not confirm is withdrawn. One that a single view shows whole, and
+        no other could, is announced if that view was very sure and evidence of another kind `confirms` its outline,
+        (N, 2).
         """
-        for seed in self._seeds:
-            self._grow_late(seed)
+        for seed in sorted(self._seeds, key=self._score, reverse=True):  # one piece of ground may have several
+            self._grow_late(seed, confirms)
         for number, candidate in self._found.items():
             if number not in self._announced_ns:
                 self._announce(candidate, -1)
@@ -462,10 +465,21 @@ class EvidenceMap:
     def _records(self, candidate: Candidate) -> list[Change]:
         """An announced change as it is known now: its things, where it holds several."""
         parts = self._parts.get(candidate.number)
-        if parts is not None and len(parts.things) > 1:
-            return list(parts.things)
-        whole = self._record(candidate)
-        return [] if whole is None else [whole]
+        things = list(parts.things) if parts is not None and len(parts.things) > 1 else []
+        if not things:
+            whole = self._record(candidate)
+            things = [] if whole is None else [whole]
+        return [self._as_seen(candidate, each) for each in things] if candidate.number in self._seen_once else things
+
+    def _as_seen(self, candidate: Candidate, thing: Change) -> Change:
+        """A thing of a candidate that several views show, with one view and the score of one, where no other saw it."""
+        evidence = self._grid.read(candidate.cells)
+        own = mask_of(thing.outline_m, candidate.cells.site_from_cell(self._cell_m), candidate.cells.shape)
+        own &= evidence.owner == candidate.number
+        if own.any() and np.median(evidence.seen[own]) > 1:
+            return thing
+        once = replace(self._tally_of(candidate).recounted(1, 1), whole=1)
+        return replace(thing, views=1, score=sureness(once, self._rules))
 
     def _record(self, candidate: Candidate) -> Change | None:
         outline_m = candidate.outline_m(self._cells_of(candidate), self._cell_m, self._join_m)
@@ -504,14 +518,15 @@ class EvidenceMap:
 
     # ---- after the last view ----------------------------------------------------------------------------------
 
-    def _grow_late(self, seed: Candidate) -> None:
+    def _grow_late(self, seed: Candidate, confirms: Callable[[PointsM], bool]) -> None:
         """Make a candidate of what fewer than n views could see: the same share of them must show it as k of n."""
         evidence = self._grid.read(seed.cells)
         if seed.number:
             return
-        cells, is_single = self._late_cells(seed, evidence)
-        if is_single is None:
-            return
+        cells, single = self._late_cells(seed, evidence), self._single_cells(seed, evidence)
+        is_seen_once = np.count_nonzero(single) >= self._least_cells and self._is_confirmed(seed, single, confirms)
+        if is_seen_once:
+            cells |= single
         for piece, part in pieces(cells, self._gap):
             if self._joins_beside(seed.cells.part(part), piece & cells[part]):
                 cells[part] &= ~piece
@@ -520,21 +535,29 @@ class EvidenceMap:
         missed = int(evidence.seen[cells].max()) - seed.tally.asked
         if missed > 0:
             seed.miss(missed)
-        seed.become(self._next_number(), is_single=is_single)
+        seed.become(self._next_number())
+        if is_seen_once:
+            self._seen_once.add(seed.number)
         self._grid.own(seed.cells, cells, seed.number)
         self._found[seed.number] = seed
 
-    def _late_cells(self, seed: Candidate, evidence: CellEvidence) -> tuple[Mask, bool | None]:
-        """The cells of a seed that enough of the few views show, and whether that is a single one; None: too few."""
+    def _late_cells(self, seed: Candidate, evidence: CellEvidence) -> Mask:
+        """The cells of a seed that enough of the few views show."""
         settings, seen = self._settings, evidence.seen.astype(float)
         needed = np.maximum(settings.least_views, np.ceil(settings.k * np.minimum(seen, settings.n) / settings.n))
-        free = evidence.owner == 0
-        late = free & (((evidence.changed >= needed) & (seen < settings.n)) | (evidence.votes >= settings.k))
-        if np.count_nonzero(late) >= self._least_cells:
-            return late, False
-        single = free & (evidence.changed == 1) & (seen == 1)
-        is_sure = self._score(seed) * 1.5 >= settings.single_view_score
-        return single, True if np.count_nonzero(single) >= self._least_cells and is_sure else None
+        enough = ((evidence.changed >= needed) & (seen < settings.n)) | (evidence.votes >= settings.k)
+        return np.asarray(enough & (evidence.owner == 0))
+
+    def _single_cells(self, seed: Candidate, evidence: CellEvidence) -> Mask:
+        """The cells of a seed that one view shows, where no other saw them; none unless it is very sure and shows all
+        of it: at a rim walls lean in whole."""
+        tally = seed.tally
+        is_sure = tally.score_sum >= self._settings.single_view_score * tally.views and tally.whole > 0
+        return np.asarray((evidence.owner == 0) & (evidence.changed == 1) & (evidence.seen == 1) & is_sure)
+
+    def _is_confirmed(self, seed: Candidate, cells: Mask, confirms: Callable[[PointsM], bool]) -> bool:
+        outline_m = seed.outline_m(cells, self._cell_m, self._join_m)
+        return outline_m is not None and confirms(outline_m)
 
     def _joins_beside(self, window: CellWindow, cells: Mask) -> bool:
         """Give late `cells` of a window to the candidate beside them, if there is one."""

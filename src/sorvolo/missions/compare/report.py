@@ -99,6 +99,7 @@ def comparison_summary(
         "method": settings.method,
         **counts.summary(),
         "changes": {kind.value: kinds[kind] for kind in ChangeKind},
+        "single_view": sum(each.is_single_view for each in changes),
         "suppressed": suppressed,
         "compared_area_m2": coverage["compared_m2"],
         "headline": comparison_headline(len(changes), coverage, is_local=is_local),

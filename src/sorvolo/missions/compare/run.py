@@ -270,7 +270,8 @@ class CompareRun:
         views together show."""
         if self._evidence is None:
             return ()
-        things = self._evidence.conclude()
+        evidence, gathered = self._evidence, self._gathered
+        things = evidence.conclude() if gathered is None else evidence.conclude(gathered.shows_once)
         name, first = self._setup.source.name, self._evidence.next_number
         areas = self._areas.conclude(name, first)
         found = with_areas(things, areas)

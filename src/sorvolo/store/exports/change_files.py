@@ -104,6 +104,7 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
         "last_seen": utc_text(change.last_seen_ns),
         "announced": utc_text(change.announced_ns) if change.announced_ns >= 0 else None,
         "views": change.views,
+        "single_view": change.is_single_view,
         "area_m2": rounded(change.area_m2, 4),
         "length_m": rounded(change.length_m, 4),
         "sigma_m": rounded(change.sigma_m, 4),
@@ -129,8 +130,9 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
 
 def _description(change: StoredChange) -> str:
     """A change in words, a line each."""
+    views = "one view alone" if change.is_single_view else f"{change.views} views"
     lines = [
-        f"score {change.score:.2f} (0 to 1), {change.views} views, first seen {time_words(change.first_seen_ns)}",
+        f"score {change.score:.2f} (0 to 1), {views}, first seen {time_words(change.first_seen_ns)}",
         f"length {change.length_m:.2f} m, area {change.area_m2:.2f} m2",
         f"position accuracy {change.sigma_m:.2f} m (1 sigma)",
     ]

@@ -257,7 +257,8 @@ def _cells(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
         ("position accuracy", _length(change.sigma_m)),
     )
     return (
-        *measured, ("views", str(change.views)), ("first seen", time_words(change.first_seen_ns)),
+        *measured, ("views", "1 alone" if change.is_single_view else str(change.views)),
+        ("first seen", time_words(change.first_seen_ns)),
         ("score", f"{change.score:.2f}"),
     )
 
