@@ -207,6 +207,15 @@ def test_a_real_video() -> None:
     assert source.frame_count == 558 and counted == 6 and source.notices() == ()
 
 
+def test_a_table_beside_the_video_that_nobody_can_read_is_named(tmp_path: Path) -> None:
+    """A log whose columns are unknown was passed over without a word; one beside it that is read is used."""
+    write_video(tmp_path / "DJI_0001.mp4")
+    (tmp_path / "DJI_0001.csv").write_text("when,here,there\n1,2,3\n")
+    (source,) = open_sources([tmp_path / "DJI_0001.mp4"])
+    found = {notice.code: notice.text for notice in source.notices()}
+    assert "DJI_0001.csv" in found["unknown_telemetry"] and "no known telemetry format" in found["unknown_telemetry"]
+
+
 def test_an_empty_telemetry_file_beside_the_video_is_named(tmp_path: Path) -> None:
     write_video(tmp_path / "DJI_0001.mp4")
     (tmp_path / "DJI_0001.SRT").touch()

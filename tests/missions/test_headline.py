@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.missions.flight.headline import MapQuality, map_headline
-from sorvolo.missions.flight.warnings import _angle_warnings
+from sorvolo.missions.flight.warnings import _angle_warnings, unlevelled
 from sorvolo.mosaic.consistency import Consistency
 from sorvolo.mosaic.flight_figures import flight_figures
 from sorvolo.mosaic.graph_report import GraphReport
@@ -44,6 +45,17 @@ def test_frames_that_fit_each_other_are_a_map() -> None:
     assert quality_of(frames) is MapQuality.MAP
     headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True)
     assert headline.text == "8 of 8 frames matched"
+
+
+def test_a_map_that_nothing_levels_is_to_be_checked() -> None:
+    """A video that looks to the side without telemetry: 4 frames that fit are no view from above. GPS levels them."""
+    frames = [placed(10.0 * k) for k in range(4)]
+    graph = GraphReport(1.0, 0.1, 0.0, 0.0, 3, 0, 0.0, 0.3, angles_contradicted=1)
+    free, tied = SimpleNamespace(track=None), SimpleNamespace(track=object())
+    assert unlevelled(frames, graph, tied) == []  # type: ignore[arg-type]
+    (why,) = unlevelled(frames, graph, free)  # type: ignore[arg-type]
+    headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True, others=[why])
+    assert headline.quality is MapQuality.DOUBTFUL and "looked to the side" in headline.text
 
 
 @pytest.mark.parametrize("frames, why", [

@@ -29,7 +29,7 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photos import PhotoSource, read_album
-from sorvolo.capture.telemetry import empty_files_beside, find_telemetry_beside, is_telemetry, read_telemetry
+from sorvolo.capture.telemetry import find_telemetry_beside, is_telemetry, read_telemetry, unusable_files_beside
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.gpmf import read_gpmf_file
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
@@ -362,13 +362,7 @@ def _video_telemetry(
         return read_telemetry(telemetry), []
     if inside is not None and inside.telemetry.has_fixes:
         return inside.telemetry, []
-    notices = [
-        Notice(
-            "empty_telemetry", 1,
-            f"{each.name} beside the video is empty (0 bytes) and not used; copy it from the drone again",
-        )
-        for each in empty_files_beside(video)
-    ]
+    notices = [_not_used(each) for each in unusable_files_beside(video)]
     beside = find_telemetry_beside(video)
     if beside is None:
         return no_telemetry(), notices
@@ -377,6 +371,15 @@ def _video_telemetry(
     except InputError as error:
         text = f"the telemetry file beside the video cannot be used: {error}"
         return no_telemetry(), [*notices, Notice("unusable_telemetry", 1, text)]
+
+
+def _not_used(beside: Path) -> Notice:
+    """A file named as the video's telemetry that is none."""
+    if beside.stat().st_size == 0:
+        text = f"{beside.name} beside the video is empty (0 bytes) and not used; copy it from the drone again"
+        return Notice("empty_telemetry", 1, text)
+    text = f"{beside.name} beside the video is of no known telemetry format and not used"
+    return Notice("unknown_telemetry", 1, text)
 
 
 def _video_camera(info: VideoInfo) -> CameraModel:

@@ -40,6 +40,7 @@ _ADVICE = {
     "photo_without_gps": "nothing if most have one: these photos are placed by their overlap alone",
     "time_zone_unknown": "nothing, unless telemetry from another file must fit: then give --offset",
     "empty_telemetry": "or give other telemetry with --telemetry",
+    "unknown_telemetry": "see docs/formats-in.md for what is read, or give other telemetry with --telemetry",
     "unusable_telemetry": "give a readable file with --telemetry",
     "mixed_cameras": "map each camera's pictures as its own flight",
     "zoom": "map each focal length as its own flight",

@@ -102,16 +102,15 @@ def _only_one(known: Sequence[Path]) -> Path | None:
     return None
 
 
-def empty_files_beside(video: Path) -> list[Path]:
-    """Files named as the video's telemetry would be that hold nothing at all: cards that fail leave such ones."""
+def unusable_files_beside(video: Path) -> list[Path]:
+    """Files named as the video's telemetry would be that no reader recognises, empty ones of failed cards included."""
     if not video.parent.is_dir():
         return []
     stem = video.stem.lower()
     names = {stem, video.name.lower(), *(pattern.format(stem) for pattern in _BESIDE)}
     return sorted(
         each for each in video.parent.iterdir()
-        if each.suffix.lower() in _SUFFIXES and each.stem.lower() in names and each.is_file()
-        and each.stat().st_size == 0
+        if each.suffix.lower() in _SUFFIXES and each.stem.lower() in names and each.is_file() and not is_telemetry(each)
     )
 
 

@@ -31,15 +31,17 @@ class Headline:
 
 
 def map_headline(
-    placed: Sequence[PlacedFrame], figures: FlightFigures, *, is_video: bool, agreement: Consistency = NOTHING_KNOWN
+    placed: Sequence[PlacedFrame], figures: FlightFigures, *, is_video: bool, agreement: Consistency = NOTHING_KNOWN,
+    others: Sequence[str] = (),
 ) -> Headline:
-    """The headline of a flight that was mapped; photos were each meant, so that one photo is a map."""
+    """The headline of a flight that was mapped; photos were each meant, so that one photo is a map. `others` are
+    further doubts about the map, in words."""
     seen = sum(each.status is not Status.REJECTED for each in placed)
     if is_video and (seen == 1 or figures.reach_m < _HOVERING * figures.diagonal_m):
         return Headline(MapQuality.ONE_VIEW, f"no map: {_one_view(figures, seen)}")
     if agreement.faults:
         return Headline(MapQuality.CONTRADICTORY, f"a map that contradicts itself: {'; '.join(agreement.faults)}")
-    found = [*agreement.steps, *doubts(placed, figures)]
+    found = [*agreement.steps, *doubts(placed, figures), *others]
     if found:
         return Headline(MapQuality.DOUBTFUL, f"a map to check before use: {'; '.join(found)}")
     matched = sum(each.status is Status.VISION for each in placed)

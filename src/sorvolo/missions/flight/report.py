@@ -15,7 +15,7 @@ from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.flight.software import software
-from sorvolo.missions.flight.warnings import flight_warnings
+from sorvolo.missions.flight.warnings import flight_warnings, unlevelled
 from sorvolo.mosaic.base_ties import BaseReport
 from sorvolo.mosaic.consistency import Consistency, Stated, consistency
 from sorvolo.mosaic.flight_figures import (
@@ -70,7 +70,7 @@ def build_report(
         "inputs": list(source.inputs),
         "georeferenced": not site.is_local,
         "flown": utc_text(setup.flown_ns) if setup.flown_ns else None,
-        **_headline(result, figures, agreement, is_video=source.kind == "video"),
+        **_headline(result, figures, agreement, unlevelled(placed, graph, setup), is_video=source.kind == "video"),
         "frames": _frames(placed, source.frame_count),
         "reading": asdict(source.reading) if isinstance(source, VideoSource) else None,
         "camera": _camera(source.camera, result.camera, graph),
@@ -101,11 +101,11 @@ def build_report(
 
 
 def _headline(
-    result: FlightResult, figures: FlightFigures, agreement: Consistency, *, is_video: bool
+    result: FlightResult, figures: FlightFigures, agreement: Consistency, others: Sequence[str], *, is_video: bool
 ) -> dict[str, Any]:
     if not result.makes_map:
         return {}
-    headline = map_headline(result.placed, figures, is_video=is_video, agreement=agreement)
+    headline = map_headline(result.placed, figures, is_video=is_video, agreement=agreement, others=others)
     return {"headline": asdict(headline)}
 
 

@@ -54,6 +54,16 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
     return warnings
 
 
+def unlevelled(placed: Sequence[PlacedFrame], graph: GraphReport | None, setup: FlightSetup) -> list[str]:
+    """Why the map may be no view from above: pictures look aside, and neither angles nor positions level them."""
+    if setup.track is not None or graph is None or graph.angles_contradicted <= _MANY * len(placed):
+        return []
+    return [
+        "the camera looked to the side, and without telemetry nothing shows where level ground is: this is no view "
+        "from straight above"
+    ]
+
+
 def _relief_warnings(figures: FlightFigures, graph: GraphReport | None) -> list[str]:
     """Ground that is not level, where the pictures still fit each other; where they do not, `doubts` reports it."""
     residual_px = figures.residual_median_px
