@@ -128,7 +128,7 @@ def choose_views(
 ) -> list[int]:
     """The rows of the views to compare over a lattice: those that see much of it, from angles that differ well.
 
-    What is standing says what they see; without it, the ground is level at a height.
+    `standing` states what they see; without it, the ground is level at a height.
     """
     ground, covers = _level_shown(lattice, views, up_m) if standing is None else standing.shown(lattice, views)
     middle = ground.mean(axis=0)
