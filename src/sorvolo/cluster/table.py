@@ -4,7 +4,6 @@
 a batch begins. `docs/formats.md` has its fields.
 """
 
-import fcntl
 import json
 import os
 import signal
@@ -20,6 +19,7 @@ from typing import Any, BinaryIO, Self
 from sorvolo.cluster.orders import WORKER, Ending, Scouted
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.locks import take_lock
 from sorvolo.store.site.catalogue import utc_now
 from sorvolo.store.site.catalogue_place import is_site
 
@@ -164,20 +164,16 @@ def _locked(root: Path) -> int:
     with writing(path):
         lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
     began_s = time.monotonic()
-    while True:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            break
-        except BlockingIOError:
-            holder = _holder(lock)
-            waited_s = time.monotonic() - began_s
-            if _is_alive(holder) or waited_s > _ENDING_S:
-                os.close(lock)
-                who = holder or "its name is not known"
-                raise StoreError(f"another batch is running in {root}: {who}; wait until it ends, or stop it") from None
-            if waited_s > _PATIENCE_S:
-                _kill_orphans(path)
-            time.sleep(0.1)
+    while not take_lock(lock):
+        holder = _holder(lock)
+        waited_s = time.monotonic() - began_s
+        if _is_alive(holder) or waited_s > _ENDING_S:
+            os.close(lock)
+            who = holder or "its name is not known"
+            raise StoreError(f"another batch is running in {root}: {who}; wait until it ends, or stop it")
+        if waited_s > _PATIENCE_S:
+            _kill_orphans(path)
+        time.sleep(0.1)
     os.ftruncate(lock, 0)
     os.pwrite(lock, f"process {os.getpid()} on {socket.gethostname()}, since {utc_now()}".encode(), 0)
     return lock

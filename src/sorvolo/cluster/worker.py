@@ -4,7 +4,6 @@ It ends with whoever holds the other end of its input, so that no flight is mapp
 what its order needs alone: there is a process for each flight.
 """
 
-import fcntl
 import json
 import os
 import resource
@@ -273,6 +272,7 @@ def _is_flight(source: str, site: Path, flight: str) -> bool:
 
 def _wait_for_site(site: Path) -> None:
     """Wait for a site whose writer is about to end."""
+    from sorvolo.store.locks import take_lock
     from sorvolo.store.site.files import LOCK
 
     end_s = time.monotonic() + _SITE_BUSY_S
@@ -282,12 +282,11 @@ def _wait_for_site(site: Path) -> None:
         except OSError:  # no site yet, or none that may be opened: the mission states which
             return
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return
-        except BlockingIOError:
-            time.sleep(0.2)
+            if take_lock(lock):
+                return
         finally:
             os.close(lock)
+        time.sleep(0.2)
 
 
 def _begin() -> int:

@@ -1,11 +1,11 @@
 """One station for a root: the lock that it holds while it runs; the system lets go of it however the station ends."""
 
-import fcntl
 import os
 from pathlib import Path
 
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import writing
+from sorvolo.store.locks import take_lock
 
 _FILE = "station.lock"
 
@@ -18,15 +18,13 @@ class RootLock:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             self._file = os.open(folder / _FILE, os.O_RDWR | os.O_CREAT, 0o600)
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
+        if not take_lock(self._file):
             holder = os.pread(self._file, 20, 0).decode("ascii", "replace").strip()
             self.close()
             raise StoreError(
                 f"{folder.parent}: another station serves this folder already (process {holder or 'unknown'}); end "
                 "that one first, or serve another folder"
-            ) from error
+            )
         with writing(folder):
             os.ftruncate(self._file, 0)
             os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)

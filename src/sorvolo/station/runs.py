@@ -1,7 +1,6 @@
 """The station's missions: each in its own process, found again after a restart, its journal turned into events."""
 
 import contextlib
-import fcntl
 import itertools
 import json
 import logging
@@ -44,6 +43,7 @@ from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, 
 from sorvolo.station.sites import SiteShelf
 from sorvolo.station.state import StationState, compact_json, utc_after, utc_now
 from sorvolo.store.atomic import writing
+from sorvolo.store.locks import take_lock
 
 RUNNING, FINISHED, INCOMPLETE, FAILED, STOPPED, LOST = "running", "finished", "incomplete", "failed", "stopped", "lost"
 """States of a run. Incomplete: finished and kept, but pictures of its flight are missing, as where the disk was full.
@@ -469,7 +469,7 @@ def _spawned(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
     """
     lock = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o600)
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        take_lock(lock)
         with (folder / LOG_FILE).open("ab") as log:
             return subprocess.Popen(
                 [sys.executable, "-m", "sorvolo.station.worker", str(folder.resolve())], cwd=folder,
@@ -487,12 +487,9 @@ def _has_ended(folder: Path) -> bool:
     except OSError:
         return True
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+        return take_lock(lock)
     finally:
         os.close(lock)
-    return True
 
 
 def _new_lines(path: Path, offset: int) -> tuple[list[dict[str, Any]], int]:

@@ -1,6 +1,5 @@
 """The folder of a watch: a line for each detection as it is made, places and tracks as GeoJSON, crops of tracks."""
 
-import fcntl
 import json
 import os
 import shutil
@@ -28,6 +27,7 @@ from sorvolo.store.exports.plain import (
     utc_text,
 )
 from sorvolo.store.images import jpeg_from_image
+from sorvolo.store.locks import take_lock
 from sorvolo.survey.flight import Frame, Site
 from sorvolo.survey.objects import Sighting, Track
 
@@ -253,15 +253,13 @@ def _held(folder: Path) -> Iterator[None]:
     while True:
         with writing(path):
             lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if path.exists() and os.path.samestat(os.fstat(lock), path.stat()):
-                break  # else its former holder removed it meanwhile
-        except BlockingIOError as error:
+        if not take_lock(lock):
             os.close(lock)
             raise UnavailableError(
                 f"another process writes its watch into {folder}; wait until it has ended, or give another folder"
-            ) from error
+            )
+        if path.exists() and os.path.samestat(os.fstat(lock), path.stat()):
+            break  # else its former holder removed it meanwhile
         os.close(lock)
     try:
         yield

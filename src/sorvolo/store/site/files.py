@@ -1,6 +1,5 @@
 """SiteFiles: what a site consists of - its folder, its catalogue, its tiles; the only path layout (docs/formats.md)."""
 
-import fcntl
 import json
 import os
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ from sorvolo.store.atomic import TEMPORARY_PREFIX, writing
 from sorvolo.store.exports.coverage_files import COVERAGE
 from sorvolo.store.exports.plain import features_name
 from sorvolo.store.images import image_from_jpeg
+from sorvolo.store.locks import take_lock
 from sorvolo.store.nofollow import read_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue, VersionEntry
@@ -232,11 +232,9 @@ def lock_folder(folder: Path) -> int:
         refuse_links(folder)
     with writing(path):
         lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o644)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
+    if not take_lock(lock):
         os.close(lock)
-        raise BusyError(f"another process is mapping into {folder}; wait until it has finished") from error
+        raise BusyError(f"another process is mapping into {folder}; wait until it has finished")
     return lock
 
 
