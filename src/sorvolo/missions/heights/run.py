@@ -21,6 +21,7 @@ from sorvolo.missions.heights.flight_views import flight_views, run_of
 from sorvolo.missions.heights.pictures import FlightPictures, SmallPictures
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
 from sorvolo.store.exports.plain import json_bytes
+from sorvolo.store.freed_memory import give_back
 from sorvolo.store.images import png_from_rgba
 from sorvolo.store.rasters.geotiff import write_cog
 from sorvolo.store.rasters.heights import write_height_cog
@@ -78,11 +79,13 @@ def make_heights(
         kept = [each for each in keyframes if each.name not in set(solved.lost)]
         pictures = FlightPictures(archive, kept, solved.radial)
         cameras_s = time.monotonic() - started_s
+        give_back()
         surface = yield from _sweep(archive, solved, pictures, settings, flight_id)
         yield HeightsUpdate(flight_id, "ground", 0.0)
         ground, shows_ground = terrain(surface.lattice, surface.up_m, settings.terrain)
         _write_models(archive, flight_id, surface, ground)
         heights_s = time.monotonic() - started_s
+        give_back()
         if settings.has_orthophoto:
             yield from _paint(archive, surface, solved, pictures, settings, flight_id)
         report = {
