@@ -57,6 +57,7 @@ model: $(TRAINS)
 	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
 	  --aerial $(AERIAL)/default.onnx
 	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
+	$(BIN)/python benchmarks/pack_second_look.py benchmarks/results/second_look_fit.json
 
 # The libraries of the station's page, from npm, with their hashes and licences (needs npm; an install does not).
 page-vendor:

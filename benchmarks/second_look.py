@@ -1,11 +1,11 @@
-"""What a second look would change: benchmarks/second_look.py DATA WEIGHTS [--model default-int8] [--sets ...]
+"""What people's second look changes: benchmarks/second_look.py DATA [--model default-int8] [--sets ...]
 
-The trial of decision 0046. DATA holds `detection` and `flights`, WEIGHTS is what fit_second_look.py wrote. Every set is
-searched once; what the model reports is counted before and after the second look, at the model's thresholds. Flights
-that hardly show anyone (false_alarms.py: brighton_beach and caliterra, at full size) give reports a photo; how many
-are right was counted by eye on the crops that --out FOLDER gets (`kept`, `gone`, `new`), and is given with --right
-FLIGHT:CLASS=BEFORE,AFTER. Labelled sets (detection_data.py, held-out parts) give what is found and right at the
-thresholds, and AP50. Processor seconds of each look. Writes results/second_look.json.
+Decision 0049. DATA holds `detection` and `flights`. Every set is searched once; what the model reports is counted
+before and after the second look that its file states, at the model's thresholds. Flights that hardly show anyone
+(false_alarms.py: brighton_beach and caliterra, at full size) give reports a photo; how many are right was counted by
+eye on the crops that --out FOLDER gets (`kept`, `gone`, `new`), and is given with --right FLIGHT:CLASS=BEFORE,AFTER.
+Labelled sets (detection_data.py, held-out parts) give what is found and right at the thresholds, and AP50. Processor
+seconds of each look. Writes results/second_look_people.json; results/second_look.json is the trial of decision 0046.
 """
 
 import argparse
@@ -21,10 +21,10 @@ import numpy as np
 import detection_data
 from false_alarms import FIRST, M_PER_PX, SCALE, SHOWN, crop, possible, sheet
 from provenance import commit, machine, note_scoring
-from second_look_sheets import SecondLook, looked_again
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import score_set
+from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.store.exports.plain import plain_json
@@ -32,7 +32,7 @@ from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
 from train_default_model import reader
 
-RESULTS = Path(__file__).parent / "results" / "second_look.json"
+RESULTS = Path(__file__).parent / "results" / "second_look_people.json"
 SETS = (*FIRST, "semantic_drone", "sdd", "tinyperson", "tinyperson val", "mannequin", "aerial_cars", "cats")
 LEAST, EVERY = 0.02, {"mannequin": 4}
 BECAME = {(False, False): "", (True, True): "kept", (True, False): "gone", (False, True): "new"}
@@ -40,14 +40,13 @@ SCORES = (0.5, 0.6, 0.7, 0.78, 0.84, 0.9, 0.94, 0.96)
 
 
 class Looker:
-    """A model that looks once, and again by the weights of each class; counts what both take, processor seconds."""
+    """A model that looks once, and again as its file says; counts what both take, processor seconds."""
 
-    def __init__(self, model: str, weights: Path) -> None:
+    def __init__(self, model: str) -> None:
         self.session = Session(find_model(model), "cpu", 1)
-        fitted = json.loads(weights.read_text())
-        self.hows = {
-            self.session.info.classes.index(name): SecondLook(**each["weights"]) for name, each in fitted.items()
-        }
+        info = self.session.info
+        self.hows = {info.classes.index(name): how for name, how in info.second_look.items()}
+        self.session.info = replace(info, second_look={})
         self.detector = Detector(self.session)
         self.first_s = self.again_s = 0.0
 
@@ -83,7 +82,6 @@ def main() -> None:
     """Look, count, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
-    parser.add_argument("weights", type=Path)
     parser.add_argument("--model", default="default-int8")
     parser.add_argument("--sets", nargs="+", default=SETS)
     parser.add_argument("--right", nargs="*", default=[])
@@ -92,7 +90,7 @@ def main() -> None:
     wishes = parser.parse_args()
     known = json.loads(wishes.results.read_text())["sets"] if wishes.results.is_file() else {}
     for name in wishes.sets if not wishes.right else ():
-        looker = Looker(wishes.model, wishes.weights)
+        looker = Looker(wishes.model)
         row = flight(looker, wishes.data, name, wishes.out) if name in FIRST else labelled(looker, wishes.data, name)
         known[name] = row | note_scoring(f"second_look, {name}") | {
             "first_look_s": round(looker.first_s, 1), "second_look_s": round(looker.again_s, 1),
@@ -102,7 +100,9 @@ def main() -> None:
         judged(known, each)
     wishes.results.write_text(json.dumps(plain_json({
         "benchmark": "second_look", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-        "model": wishes.model, "weights": json.loads(wishes.weights.read_text()), "sets": known,
+        "model": wishes.model, "weights": json.loads(find_model(wishes.model).with_suffix(".json").read_text())[
+            "second_look"
+        ], "sets": known,
     }), indent=1) + "\n")
 
 

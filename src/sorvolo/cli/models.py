@@ -13,6 +13,7 @@ from rich.table import Table
 
 from sorvolo.cli.exit_codes import FAILED
 from sorvolo.errors import InputError
+from sorvolo.store.exports.plain import plain_json
 
 if TYPE_CHECKING:
     from sorvolo.detection.contract import ModelInfo
@@ -256,7 +257,7 @@ def _row(model: "InstalledModel") -> dict[str, Any]:
 
 
 def _facts(info: "ModelInfo") -> dict[str, Any]:
-    return {key: dict(value) if isinstance(value, Mapping) else value for key, value in vars(info).items()}
+    return {key: plain_json(value) for key, value in vars(info).items()}
 
 
 def _light(facts: Mapping[str, Any]) -> str:

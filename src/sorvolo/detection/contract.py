@@ -1,6 +1,7 @@
 """What a model file states about itself: the metadata that `sorvolo` writes into its ONNX files, checked."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -20,6 +21,29 @@ _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on
 
 
 @dataclass(frozen=True)
+class SecondLook:
+    """How reports of a class are looked at again (`second_look`).
+
+    `looks_px`: in each look the report's longer side has so many pixels. A look that would show it more than `enlarged`
+    times as large is left out, but for the smallest: blur has nothing to tell. A report's log-odds become `shift`,
+    `own` times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked
+    at.
+    """
+
+    looks_px: tuple[float, ...]
+    own: float
+    again: float
+    shift: float
+    least: float
+    enlarged: float
+
+    def sides_px(self, longer_px: float) -> tuple[float, ...]:
+        """The looks at a report whose longer side has so many pixels in its picture."""
+        own = tuple(side_px for side_px in self.looks_px if side_px <= self.enlarged * longer_px)
+        return own or (min(self.looks_px),)
+
+
+@dataclass(frozen=True)
 class ModelInfo:
     """One model, as its file describes it.
 
@@ -28,7 +52,7 @@ class ModelInfo:
     thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
     in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
     person asks for them. `turned`: pictures from straight above are looked at twice, once turned by a quarter, and each
-    class is reported from this mean score on; empty: once.
+    class is reported from this mean score on; empty: once. `second_look`: classes whose reports are looked at again.
     """
 
     name: str
@@ -47,6 +71,7 @@ class ModelInfo:
     created: str = ""
     on_request: tuple[str, ...] = ()
     turned: Mapping[str, float] = field(default_factory=dict)
+    second_look: Mapping[str, SecondLook] = field(default_factory=dict)
 
     @property
     def usual_classes(self) -> tuple[str, ...]:
@@ -74,7 +99,7 @@ def info_from_metadata(metadata: Mapping[str, str], where: str) -> ModelInfo:
                 f"{where} follows contract {fields['format']}, this version reads up to {FORMAT}: update sorvolo"
             )
         return _info(fields)
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{where}: its '{METADATA_KEY}' metadata cannot be used ({_reason(error)}); export the model again"
         ) from error
@@ -96,7 +121,7 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     return ModelInfo(
         str(fields["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
         bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request,
-        turned=MappingProxyType(turned), **texts,
+        turned=MappingProxyType(turned), second_look=MappingProxyType(_second_look(fields, classes)), **texts,
     )
 
 
@@ -119,6 +144,19 @@ def _best_px(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, tup
     if not all(0 < least < most for least, most in best_px.values()):
         raise ValueError(f"its best_px must be smallest and largest side, not {best_px}")
     return best_px
+
+
+def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, SecondLook]:
+    found = {}
+    for name, each in fields.get("second_look", {}).items():
+        weights = [float(each[key]) for key in ("own", "again", "shift", "least", "enlarged")]
+        looks_px = tuple(float(side_px) for side_px in each["looks_px"])
+        if name not in classes or not looks_px or not all(0 < side_px < math.inf for side_px in looks_px):
+            raise ValueError(f"its second_look must name classes and sizes of theirs, not {name} {list(looks_px)}")
+        if not all(map(math.isfinite, weights)) or not 0 <= weights[3] <= 1:
+            raise ValueError(f"its second_look must have finite weights and a least score, not {weights}")
+        found[name] = SecondLook(looks_px, *weights)
+    return found
 
 
 def _words(value: object) -> str:

@@ -12,6 +12,7 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import find_model, thermal_model
+from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles
@@ -171,6 +172,7 @@ class Detector:
             return looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
 
         seen = _seen_turned(rgb, whole) if from_above and session.info.turned else whole(rgb)
+        seen = _seen_again(session, rgb, seen, asked)
         least = _least_scores(session.info, _thresholds(session.info, from_above), asked, least_score)
         kept = seen.scores >= least[seen.labels]
         labels = seen.labels[kept]
@@ -225,6 +227,15 @@ def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:
         seen = whole(turned(rgb, quarters))
         looks.append(Seen(turned_back(seen.boxes_px, quarters, (rgb.shape[0], rgb.shape[1])), seen.scores, seen.labels))
     return agreed(looks, settings)
+
+
+def _seen_again(session: Session, rgb: ImageRGB, seen: Seen, asked: Sequence[str]) -> Seen:
+    """What was seen, scored again by a second look at the reports of `asked` classes for which the model has one."""
+    info = session.info
+    hows = {info.classes.index(name): how for name, how in info.second_look.items() if name in asked}
+    if not hows or session.fixed_px is not None:  # sheets have sizes of their own
+        return seen
+    return looked_again(seen, rgb, session.see, hows)
 
 
 def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:

@@ -1,16 +1,17 @@
-"""What a model reports is looked at again: cut out with its surroundings and shown at other sizes (decision 0046).
+"""Reports looked at again: cut out with their surroundings and shown to the same model at other sizes (decision 0049).
 
-A trial, no part of the product. Only what was reported is looked at again, side by side on one sheet.
+A boulder that looks like a person at one size seldom does at others. Only what was reported is looked at again, all of
+a picture side by side on one sheet, so that it costs little.
 """
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 
 import cv2
 import numpy as np
 
+from sorvolo.detection.contract import SecondLook
 from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.box_overlap import iou_matrix
@@ -20,27 +21,13 @@ Sees = Callable[[ImageRGB], Seen]
 
 
 @dataclass(frozen=True)
-class SecondLook:
-    """How reports of a class are looked at again.
-
-    `looks_px`: in each look the report's longer side has so many pixels. A report's log-odds become `shift`, `own`
-    times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked at.
-    """
-
-    looks_px: tuple[float, ...]
-    own: float
-    again: float
-    shift: float
-    least: float
-
-
-@dataclass(frozen=True)
 class SheetSettings:
     """How cut-outs are laid side by side on one picture. Weights hold for the values that they were fitted with."""
 
     cell_px: int = 128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
     columns: int = 8
-    most: int = 32  # cut-outs of one picture, best reports first; in a crowd the others keep their score
+    share: float = 0.25  # of the picture's pixels that the sheet has at most; in a crowd the others keep their score
+    cuts: tuple[int, int] = (8, 32)  # cut-outs of one picture, best reports first: at least so many may be, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
     filling: int = 114  # beyond the picture's edge, as in training
@@ -78,26 +65,34 @@ def opinions(
     settings: SheetSettings = SheetSettings(),
 ) -> dict[int, Floats]:
     """The scores (looks,) of each report's looks, by its row, for those that are looked at again."""
-    cuts = list(islice(_cuts(seen, picture, hows, settings), settings.most))
+    cuts: list[_Cut] = []
+    room = _most_cuts(picture, settings)
+    for looks in _cuts(seen, picture, hows, settings):
+        if len(cuts) + len(looks) > room:
+            break
+        cuts += looks
     if not cuts:
         return {}
     scores, rows = _scores(cuts, sees, settings), np.array([each.row for each in cuts])
-    found = {row: scores[rows == row] for row in dict.fromkeys(rows.tolist())}
-    return {row: each for row, each in found.items() if len(each) == len(hows[int(seen.labels[row])].looks_px)}
+    return {row: scores[rows == row] for row in dict.fromkeys(rows.tolist())}
+
+
+def _most_cuts(picture: ImageRGB, settings: SheetSettings) -> int:
+    fewest, most = settings.cuts
+    room = settings.share * picture.shape[0] * picture.shape[1] / settings.cell_px**2
+    return int(min(max(room, fewest), most))
 
 
 def _cuts(
     seen: Seen, picture: ImageRGB, hows: Mapping[int, SecondLook], settings: SheetSettings
-) -> Iterator[_Cut]:
-    """The looks at every report that is looked at again, best reports first."""
+) -> Iterator[list[_Cut]]:
+    """The looks at each report that is looked at again, best reports first."""
     for row in np.argsort(-seen.scores, kind="stable").tolist():
-        label = int(seen.labels[row])
+        label, box_px = int(seen.labels[row]), seen.boxes_px[row].astype(float)
         how = hows.get(label)
-        if how is None or seen.scores[row] < how.least:
-            continue
-        for side_px in how.looks_px:
-            cut, box_px = cut_out(picture, seen.boxes_px[row].astype(float), side_px, settings)
-            yield _Cut(row, label, cut, box_px)
+        if how is not None and seen.scores[row] >= how.least:
+            sides_px = how.sides_px(float(max(box_px[2:] - box_px[:2])))
+            yield [_Cut(row, label, *cut_out(picture, box_px, side_px, settings)) for side_px in sides_px]
 
 
 def cut_out(
@@ -109,12 +104,14 @@ def cut_out(
     middle = (box_px[:2] + box_px[2:]) / 2
     low, high = np.floor(middle - reach).astype(int), np.ceil(middle + reach).astype(int)
     size = int(max(high - low))
-    wide = np.full((size, size, 3), settings.filling, np.uint8)
     start, end = np.maximum(low, 0), np.minimum(low + size, picture.shape[1::-1])
-    into, until = start - low, end - low
-    wide[into[1] : until[1], into[0] : until[0]] = picture[start[1] : end[1], start[0] : end[0]]
+    part = picture[start[1] : end[1], start[0] : end[0]]
     way = cv2.INTER_AREA if size > cell else cv2.INTER_LINEAR
-    shown = np.asarray(cv2.resize(wide, (cell, cell), interpolation=way), np.uint8)
+    into, until = np.rint((np.stack([start, end]) - low) * cell / size).astype(int)
+    until = np.maximum(until, into + 1)
+    shown = np.full((cell, cell, 3), settings.filling, np.uint8)
+    width, height = (until - into).tolist()
+    shown[into[1] : until[1], into[0] : until[0]] = cv2.resize(part, (width, height), interpolation=way)
     return shown, (box_px - np.tile(low, 2)) * cell / size
 
 

@@ -1,0 +1,127 @@
+"""A second look at reports: what stands it, what falls, what it costs, and who gets it."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_sharing import sharing
+from toy_models import draw, rectangle_model
+
+from sorvolo.detection.contract import SecondLook
+from sorvolo.detection.detector import Detector
+from sorvolo.detection.second_look import SheetSettings, cut_out, looked_again, opinions
+from sorvolo.detection.session import Seen
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import ImageRGB
+
+HOW = {"looks_px": [34, 68], "own": 0.5, "again": 0.5, "shift": 0.0, "least": 0.5, "enlarged": 1.5}
+_PERSON, _BOULDER = (40, 60, 160, 200), (240, 40, 400, 220)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return rectangle_model(tmp_path_factory.mktemp("models") / "toy.onnx", second_look={"person": HOW})
+
+
+@pytest.fixture(scope="module")
+def detector(model: Path) -> Detector:
+    return Detector.load(model, provider="cpu", threads=1)
+
+
+def pictured(labels: tuple[int, int] = (0, 0), score: int = 230) -> ImageRGB:
+    """A filled rectangle, which is found at any size, and the outline of one, which is found as it is alone: shrunk,
+    its edge of one pixel is too dim."""
+    picture = draw((300, 480), [_PERSON, _BOULDER], labels=list(labels), scores=[score, score])
+    left, top, right, bottom = _BOULDER
+    picture[top + 1 : bottom - 1, left + 1 : right - 1] = 20
+    return picture
+
+
+def test_a_boulder_falls_and_a_person_stays(detector: Detector, tmp_path: Path) -> None:
+    plain = Detector.load(rectangle_model(tmp_path / "plain.onnx"), provider="cpu", threads=1)
+    assert len(plain.detect(pictured())) == 2, "at first both look like people"
+    found = detector.detect(pictured())
+    np.testing.assert_allclose(found.boxes_px, [_PERSON])
+    assert found.scores[0] > 0.8
+    own, unseen = math.log(230 / 25), math.log(0.02 / 0.98)
+    fallen = 1 / (1 + math.exp(-0.5 * (own + unseen)))
+    both = detector.detect(pictured(), least_score=0.0)
+    np.testing.assert_allclose(both.boxes_px, [_PERSON, _BOULDER], err_msg="best first")
+    assert both.scores[1] == pytest.approx(fallen, abs=0.01)
+
+
+def test_other_classes_and_weak_reports_keep_their_score(detector: Detector) -> None:
+    cars = detector.detect(pictured((1, 1)), least_score=0.0)
+    np.testing.assert_allclose(cars.scores, [230 / 255] * 2, atol=1e-6)
+    weak = detector.detect(pictured(score=125), least_score=0.0)
+    np.testing.assert_allclose(weak.scores, [125 / 255] * 2, atol=1e-6)
+
+
+def test_lists_tiles_and_a_shared_process_judge_alike(detector: Detector, model: Path, tmp_path: Path) -> None:
+    alone = detector.detect(pictured(), least_score=0.0)
+    with sharing(tmp_path) as (address, _):
+        shared = Detector.load(model, shared=address).detect(pictured(), least_score=0.0)
+    listed = detector.detect([pictured(), np.zeros((40, 40, 3), np.uint8)], least_score=0.0)[0]
+    tiled = detector.detect(pictured(), least_score=0.0, tiles=320)
+    for other in (shared, listed, tiled):
+        np.testing.assert_allclose(other.boxes_px, alone.boxes_px)
+        np.testing.assert_allclose(other.scores, alone.scores)
+
+
+def test_a_model_of_one_size_looks_once(tmp_path: Path) -> None:
+    path = rectangle_model(tmp_path / "fixed.onnx", fixed=(320, 480), second_look={"person": HOW})
+    assert len(Detector.load(path, provider="cpu", threads=1).detect(pictured())) == 2
+
+
+def test_a_crowd_costs_no_more_than_its_share() -> None:
+    shown = []
+
+    def sees(sheet: ImageRGB) -> Seen:
+        shown.append(sheet.shape)
+        return Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
+
+    how, settings = {0: SecondLook((34.0, 17.0), 0.5, 0.5, 0.0, 0.5, 9.0)}, SheetSettings()
+    boxes = np.array([[10 * n, 10, 10 * n + 8, 30] for n in range(60)], np.float32)
+    crowd = Seen(boxes, np.linspace(0.99, 0.6, 60), np.zeros(60, np.int64))
+    for size, cuts in {(640, 640): 8, (720, 1280): 14, (1500, 2000): 32}.items():
+        again = opinions(crowd, np.zeros((*size, 3), np.uint8), sees, how)
+        assert sorted(again) == list(range(cuts // 2)), "the best reports"
+        height, width, _ = shown.pop()
+        assert height * width <= max(settings.share * size[0] * size[1], 8 * 128**2) + 8 * 128**2
+    lone = looked_again(crowd, np.zeros((640, 640, 3), np.uint8), sees, how)
+    assert len(lone.scores) == 60 and (np.diff(lone.scores) <= 0).all()
+    none = Seen(boxes[:0], np.zeros(0), np.zeros(0, np.int64))
+    shown.clear()
+    assert opinions(none, np.zeros((640, 640, 3), np.uint8), sees, how) == {} and not shown, "nothing to look at"
+
+
+def test_looks_that_would_only_blur_are_left_out() -> None:
+    how = SecondLook((34.0, 68.0), 0.5, 0.5, 0.0, 0.5, enlarged=1.5)
+    assert how.sides_px(10) == (34.0,), "the smallest stays"
+    assert how.sides_px(40) == (34.0,) and how.sides_px(46) == (34.0, 68.0)
+
+
+@pytest.mark.parametrize("box", [(0, 0, 30, 20), (100, 70, 120, 80), (0, 0, 120, 80), (115, 75, 120, 80)])
+def test_cut_outs_at_the_edge_show_the_report_where_it_is_said_to_be(box: tuple[int, int, int, int]) -> None:
+    picture = draw((80, 120), [box])
+    for side_px in (34.0, 68.0):
+        shown, there = cut_out(picture, np.array(box, float), side_px)
+        assert shown.shape == (128, 128, 3)
+        assert max(there[2:] - there[:2]) == pytest.approx(side_px, rel=0.15)
+        rows, columns = np.nonzero((shown[..., 0] > 150) & (shown[..., 1] < 60))
+        seen = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        assert np.abs(seen - there).max() <= 0.04 * 128
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"dog": HOW}, {"person": HOW | {"looks_px": []}}, {"person": HOW | {"looks_px": [0]}},
+        {"person": HOW | {"least": 1.5}}, {"person": HOW | {"own": float("nan")}}, {"person": {}}, ["person"],
+    ],
+)
+def test_weights_that_cannot_be(tmp_path: Path, wrong: Any) -> None:
+    with pytest.raises(InputError, match="cannot be used"):
+        Detector.load(rectangle_model(tmp_path / "wrong.onnx", second_look=wrong), provider="cpu", threads=1)
