@@ -13,7 +13,6 @@ from rich.table import Table
 
 from sorvolo.cli.exit_codes import FAILED
 from sorvolo.errors import InputError
-from sorvolo.store.exports.plain import plain_json
 
 if TYPE_CHECKING:
     from sorvolo.detection.contract import ModelInfo
@@ -257,6 +256,8 @@ def _row(model: "InstalledModel") -> dict[str, Any]:
 
 
 def _facts(info: "ModelInfo") -> dict[str, Any]:
+    from sorvolo.store.exports.plain import plain_json
+
     return {key: plain_json(value) for key, value in vars(info).items()}
 
 
