@@ -35,6 +35,7 @@ from sorvolo.station.runs import Run
 from sorvolo.station.tokens import make_token
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
+from sorvolo.store.site.archive import Archive
 
 AXE = (Path(__file__).parent / "vendor" / "axe.min.js").read_text(encoding="utf-8")
 BEYOND = """() => {
@@ -125,6 +126,40 @@ def test_a_site_that_is_deleted_while_it_is_watched(browser: Any, made_site: Pat
         half_deleted = "40[049]|410"  # a question that comes while the folder goes is refused
         assert [each for each in watched.faults if not re.search(half_deleted, each)] == []
         watched.page.context.close()
+
+
+def test_a_site_is_deleted_once_its_name_is_typed(browser: Any, made_site: Path, tmp_path: Path) -> None:
+    """What would be lost is stated before; everybody who looks at it hears of it."""
+    shutil.copytree(made_site, tmp_path / "field")
+    shutil.copytree(made_site, tmp_path / "other")
+    with Served(tmp_path) as station:
+        looking, deleting = (Watched(browser.new_context(), station.url) for _ in range(2))
+        show(looking, station)
+        page = deleting.page
+        page.goto(station.url)
+        page.get_by_role("button", name="Delete field").click()
+        box = page.get_by_role("dialog")
+        expect(box).to_contain_text("2 flights, 2 versions of the map")
+        expect(box).to_contain_text(re.compile(r"\d+ files, \d+\.\d kB"))
+        name, button = box.get_by_label("Type field to confirm"), box.get_by_role("button", name="Delete")
+        name.fill("other")
+        expect(button).to_be_disabled()
+        box.get_by_role("button", name="Close").click()
+        assert (tmp_path / "field").exists()
+        page.get_by_role("button", name="Delete field").click()
+        name.fill("field")
+        button.click()
+        expect(page.locator(".card")).to_have_count(1)
+        looking.page.locator(".message.error", has_text="This site is gone").wait_for()
+        expect(looking.page.locator(".card")).to_have_count(1)
+        assert not (tmp_path / "field").exists() and (tmp_path / "other").exists()
+        assert deleting.faults == []
+        with Archive.open(tmp_path / "other", write=True):
+            page.get_by_role("button", name="Delete other").click()
+            page.locator(".message.error", has_text="another program writes the site").wait_for()
+        assert page.get_by_role("dialog").count() == 0
+        for each in (looking, deleting):
+            each.page.context.close()
 
 
 def test_an_empty_station_leads_to_a_first_flight(browser: Any, tmp_path: Path) -> None:

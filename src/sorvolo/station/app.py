@@ -37,7 +37,8 @@ from sorvolo.station.root_lock import RootLock
 from sorvolo.station.run_routes import run_routes
 from sorvolo.station.runs import Runs
 from sorvolo.station.security import COOKIE, Doorkeeper, holder_in, needs
-from sorvolo.station.settings import RUNS_FOLDER, STREAMS_FOLDER, StationSettings
+from sorvolo.station.settings import DELETED_FOLDER, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
+from sorvolo.station.site_deletion import SiteDeletion, site_deletion_routes
 from sorvolo.station.sites import SiteShelf, readable, site_detail
 from sorvolo.station.stac import stac_routes
 from sorvolo.station.state import StationState
@@ -123,10 +124,15 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     station = Station.open(settings)
     outward = Outward(receivers, station.events, station.ingest, settings.state_folder)
     door = CameraDoor(door_path(settings), station.ingest)
+    drawings = Drawings(settings, station.shelf, station.events)
+    deletion = SiteDeletion(
+        station.shelf, station.runs, station.reviews, drawings, settings.state_folder / DELETED_FOLDER
+    )
     metrics = StationMetrics(settings, station.ingest, station.events, station.runs.counts, outward.figures)
 
     @asynccontextmanager
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
+        await asyncio.to_thread(deletion.clear)
         await door.open()
         station.runs.start_watching()
         station.map_watch.start()
@@ -153,7 +159,7 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
         run_routes(station.runs, station.inputs, station.ingest),
         place_routes(station.shelf, station.collections, station.reviews, station.videos, station.place_index),
         video_routes(station.shelf, station.collections, station.videos),
-        drawing_routes(Drawings(settings, station.shelf, station.events)),
+        drawing_routes(drawings), site_deletion_routes(deletion),
         export_routes(station.shelf, station.collections),
         wmts_routes(station.shelf), stac_routes(station.shelf), *cog_routes(station.shelf),
     ):

@@ -64,7 +64,7 @@ class DrawingsWish(BaseModel):
 
 
 class Drawings:
-    """The drawings of all sites, a small file each. Only `put` changes them; threads may share it."""
+    """The drawings of all sites, a small file each. `put` and `forget` change them; threads may share it."""
 
     def __init__(self, settings: StationSettings, shelf: SiteShelf, events: EventLog) -> None:
         self._folder, self._shelf, self._events = settings.state_folder / _FOLDER, shelf, events
@@ -89,6 +89,11 @@ class Drawings:
             atomic_write_bytes(path, compact_json({**kept, "made_utc": made_utc}).encode())
         self._events.append(NewEvent("drawings.changed", {"revision": kept["revision"]}, site_id))
         return {"type": "FeatureCollection", **kept}
+
+    def forget(self, site_id: str) -> None:
+        """Drop the drawings of a site that was deleted."""
+        with self._lock:
+            self._path(site_id).unlink(missing_ok=True)
 
     def _kept(self, site_id: str, made_utc: str) -> dict[str, Any]:
         """What is kept for the site that was made then; nothing of a deleted one that had its name.

@@ -12,8 +12,8 @@ from sorvolo.errors import InputError, SettingsError, SorvoloError, StoreError
 
 _TITLES = {
     400: "Bad request", 401: "Token needed", 403: "Not allowed", 404: "Not found", 405: "Method not allowed",
-    408: "Nothing came", 409: "Conflict", 410: "Gone", 413: "Too large", 415: "Unknown kind",
-    421: "Misdirected request", 422: "Invalid request", 423: "In use", 429: "Too many attempts",
+    408: "Nothing came", 409: "Conflict", 410: "Gone", 412: "Changed meanwhile", 413: "Too large", 415: "Unknown kind",
+    421: "Misdirected request", 422: "Invalid request", 423: "In use", 428: "Look first", 429: "Too many attempts",
     500: "Error in the station", 507: "Disk full",
 }
 _KIND = "application/problem+json"

@@ -102,6 +102,12 @@ class Reviews:
             self.settle(site_id)
         return made
 
+    def forget(self, site_id: str) -> None:
+        """Drop all verdicts of a site that was deleted."""
+        with self._state.changing() as connection:
+            connection.execute("DELETE FROM reviews WHERE site = ?", (site_id,))
+        self._unsettled.discard(site_id)
+
     def settle(self, site_id: str) -> bool:
         """Write the verdicts on changes that the site does not have yet into it; whether all are in it now."""
         with self._settling:

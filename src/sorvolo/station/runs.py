@@ -221,6 +221,22 @@ class Runs:
                     )
             yield
 
+    def of_site(self, site_id: str) -> list[Run]:
+        """All runs of a site, of however long ago."""
+        return self.all(-1, site_id)
+
+    @contextmanager
+    def unused_site(self, site_id: str) -> Iterator[None]:
+        """No mission begins meanwhile. Raises Problem (409) where one runs on the site."""
+        with self._lock:
+            for run in self.of_site(site_id):
+                if run.state == RUNNING or not _has_ended(self._folder / run.id):
+                    raise Problem(
+                        409, f"a {run.mission} that {run.who} started runs on the site {site_id!r}; wait until it "
+                             "ends, or stop it", run=run.id,
+                    )
+            yield
+
     @contextmanager
     def unused(self, upload_id: str) -> Iterator[None]:
         """No mission begins meanwhile. Raises Problem (423) where one that runs reads the upload."""

@@ -17,6 +17,9 @@ RUNS_FOLDER = "runs"
 """The folder below the station's own that holds what missions leave, a folder for each run."""
 
 
+DELETED_FOLDER = "deleted"
+"""The folder below the station's own into which deleted sites are moved, to be removed there."""
+
 RESERVE_FILE = "reserve"
 """The file below the station's own folder that holds some room for what must be written on a full disk."""
 

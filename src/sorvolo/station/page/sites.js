@@ -1,7 +1,7 @@
 // The list of sites, and the first-run page where there is none.
 
-import { get } from "./api.js";
-import { el, fill } from "./dom.js";
+import { ask, get, siteUrl } from "./api.js";
+import { button, dialog, el, field, fill, report } from "./dom.js";
 import * as words from "./words.js";
 import { choices } from "./choices.js";
 
@@ -17,7 +17,7 @@ export async function showSites(main, title, station) {
   };
   await load();
   const again = () => load().catch(() => {});
-  const types = ["run.started", "run.finished", "run.failed"];
+  const types = ["run.started", "run.finished", "run.failed", "site.changed", "site.gone"];
   for (const type of types) station.events.addEventListener(type, again);
   choices.addEventListener("change", again);
   return {
@@ -31,13 +31,14 @@ export async function showSites(main, title, station) {
 function list(sites, station) {
   return el("div", { class: "sites" },
     el("h2", {}, "Sites"),
-    el("ul", { class: "cards" }, sites.map(card)),
+    el("ul", { class: "cards" }, sites.map((site) => card(site, station.status.role === "operate"))),
     station.status.role === "operate" ? newSite() : null);
 }
 
-function card(site) {
+function card(site, may) {
+  const remove = may ? button("Delete", () => showDeletion(site).catch(report), { class: "quiet", "aria-label": `Delete ${site.id}` }) : null;
   if (site.error) {
-    return el("li", { class: "card broken" }, el("h3", {}, site.name), el("p", {}, site.error));
+    return el("li", { class: "card broken" }, el("h3", {}, site.name), el("p", {}, site.error), remove);
   }
   const href = `#/site/${encodeURIComponent(site.id)}`;
   const where = site.is_local ? "no GPS" : site.center_wgs84 ? words.place(site.center_wgs84) : "nothing mapped yet";
@@ -46,7 +47,27 @@ function card(site) {
       site.versions && site.bounds_wgs84 ? preview(site) : el("div", { class: "preview none" }, "no map yet"),
       el("h3", {}, siteName(site))),
     el("p", {}, words.counted(site.flights, "flight"), " · ", words.counted(site.versions, "version")),
-    el("p", { class: "soft" }, where, site.updated_at ? ` · ${words.time(site.updated_at)}` : ""));
+    el("p", { class: "soft" }, where, site.updated_at ? ` · ${words.time(site.updated_at)}` : ""),
+    remove);
+}
+
+/** State what would be lost with a site, and delete it when its id is typed (two may have one name); or why it cannot be deleted now. */
+async function showDeletion(site) {
+  const loss = await get(siteUrl(site.id, "deletion"));
+  const name = el("input", { autocomplete: "off", spellcheck: "false" });
+  const remove = el("button", { class: "main", disabled: true }, "Delete");
+  name.addEventListener("input", () => { remove.disabled = name.value.trim() !== site.id; });
+  const form = el("form", { class: "stack", on: { submit: async (event) => {
+    event.preventDefault();
+    box.close();
+    try { await ask("DELETE", siteUrl(site.id), undefined, { headers: { "if-match": loss.etag } }); } catch (problem) { report(problem); }
+  } } },
+  el("p", {}, loss.versions === null ? "This site cannot be read." : `${words.counted(loss.flights, "flight")}, ${words.counted(loss.versions, "version")} of the map.`,
+    ` ${words.counted(loss.files, "file")}, ${words.bytes(loss.bytes)}.`),
+  el("p", { class: "note" }, `Verdicts and drawings go with it, and the records of its missions (${loss.missions}) with what watches found. Recordings and uploads stay.`),
+  field(`Type ${site.id} to confirm`, name), remove);
+  const box = dialog(`Delete the site ${site.id} for good?`, form);
+  name.focus();
 }
 
 /** A site as its list and title name it: its folder below the root. */

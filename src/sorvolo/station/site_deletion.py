@@ -1,0 +1,190 @@
+"""A site deleted for good: what would be lost with it, what stands against it, and its folder gone at once."""
+
+import errno
+import hashlib
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Response
+
+from sorvolo.errors import StoreError
+from sorvolo.station.drawings import Drawings
+from sorvolo.station.problems import Problem
+from sorvolo.station.reviews import Reviews
+from sorvolo.station.runs import Runs
+from sorvolo.station.security import needs
+from sorvolo.station.sites import SiteShelf
+from sorvolo.station.tokens import Role
+from sorvolo.store.atomic import writing
+from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file
+from sorvolo.store.site.files import COPYING, BusyError, lock_folder
+from sorvolo.store.site.origin import ORIGIN
+
+
+@dataclass(frozen=True)
+class SiteLoss:
+    """What goes with a site: its folder with all that lies in it, and what the station keeps of it.
+
+    `flights` and `versions` are None for a site that cannot be read. `missions` are records of missions that are over,
+    with what watches found.
+    """
+
+    site: str
+    flights: int | None
+    versions: int | None
+    files: int
+    bytes: int
+    missions: int
+
+
+@dataclass(frozen=True)
+class _Known:
+    """What a site's catalogue holds, None where it cannot be read; another mark after each flight."""
+
+    flights: int | None
+    versions: int | None
+    mark: str
+
+
+class SiteDeletion:
+    """Deletes sites. A folder that goes is moved into `bin_folder` first, so that nobody ever sees half a site."""
+
+    def __init__(
+        self, shelf: SiteShelf, runs: Runs, reviews: Reviews, drawings: Drawings, bin_folder: Path,
+    ) -> None:
+        self._shelf, self._runs, self._reviews, self._drawings = shelf, runs, reviews, drawings
+        self._bin = bin_folder
+
+    def loss(self, site_id: str) -> tuple[SiteLoss, str]:
+        """What would be lost, and the mark of what was counted, with which it can be deleted.
+
+        Raises Problem: 404, 409 where it cannot be deleted now, with the reason.
+        """
+        with self._free(site_id) as folder:
+            known = self._known(site_id, folder)
+        sizes = [each.lstat().st_size for each in _files_below(folder)]
+        missions = len(self._runs.of_site(site_id))
+        return SiteLoss(site_id, known.flights, known.versions, len(sizes), sum(sizes), missions), known.mark
+
+    def delete(self, site_id: str, mark: str) -> None:
+        """Delete the site as `loss` counted it.
+
+        Raises Problem: 404, 409 as `loss`, 412 where it was given flights since; StoreError where its folder cannot
+        be moved.
+        """
+        with self._free(site_id) as folder:
+            if mark != self._known(site_id, folder).mark:
+                raise Problem(412, f"the site {site_id!r} has changed since; look again at what would be lost")
+            gone = self._moved_away(folder)
+            try:
+                self._forget(site_id)
+            finally:
+                shutil.rmtree(gone, ignore_errors=True)
+
+    def clear(self) -> None:
+        """Remove what a killed station had moved away and not yet removed."""
+        if self._bin.is_dir() and not self._bin.is_symlink():
+            shutil.rmtree(self._bin, ignore_errors=True)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _free(self, site_id: str) -> Iterator[Path]:
+        """The site's folder, while no mission begins on it and no other program writes it."""
+        with self._runs.unused_site(site_id):
+            folder = self._shelf.folder(site_id)
+            self._demand_own(site_id, folder)
+            try:
+                lock = lock_folder(folder)
+            except BusyError as error:
+                raise Problem(409, f"another program writes the site {site_id!r}; wait until it is done") from error
+            try:
+                yield folder
+            finally:
+                os.close(lock)
+
+    def _demand_own(self, site_id: str, folder: Path) -> None:
+        """Raise Problem (409) for a site of which the folder is not the whole, or more."""
+        if folder == self._shelf.root:
+            raise Problem(409, f"the site {site_id!r} is the folder that the station serves; end it, and delete that")
+        file = catalogue_file(folder)
+        if file is None or file.name != CATALOGUE:
+            raise Problem(409, f"the catalogue of {site_id!r} lies in PostgreSQL; drop its schema, delete its folder")
+        if (folder / ORIGIN).exists():
+            raise Problem(409, f"{site_id!r} is a working copy of a site in a store, and would come back; delete that")
+        if (folder / COPYING).exists():
+            raise Problem(409, f"a copy is being made in {site_id!r}; finish it with the same `sorvolo site copy`")
+
+    def _known(self, site_id: str, folder: Path) -> "_Known":
+        """What the site's catalogue holds. Raises Problem (410) where the folder goes meanwhile."""
+        try:
+            about = (folder / CATALOGUE).stat()
+        except OSError as error:
+            raise Problem(410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others") from error
+        try:
+            complete = [each for each in self._shelf.open(site_id).versions() if each.complete]
+        except (StoreError, Problem):  # damaged, or a stranger's with links in it: all the more it may go
+            return _Known(None, None, _mark(about.st_dev, about.st_ino))
+        flights, newest = {each.flight_id for each in complete}, max((each.id for each in complete), default=0)
+        return _Known(len(flights), len(complete), _mark(about.st_dev, about.st_ino, len(flights), newest))
+
+    def _forget(self, site_id: str) -> None:
+        """Drop what the station keeps of a site whose folder is gone."""
+        self._shelf.forget(site_id)
+        for run in self._runs.of_site(site_id):
+            self._runs.delete(run.id)
+        self._reviews.forget(site_id)
+        self._drawings.forget(site_id)
+
+    def _moved_away(self, folder: Path) -> Path:
+        """Where the folder lies now, unseen. Raises StoreError where it cannot be moved: the site is as it was."""
+        gone = self._bin / secrets.token_hex(8)
+        with writing(self._bin):
+            self._bin.mkdir(mode=0o700, exist_ok=True)
+        try:
+            folder.rename(gone)
+        except OSError as error:
+            words = "it lies on another disk than the station's own" if error.errno == errno.EXDEV else error.strerror
+            raise StoreError(f"cannot delete {folder} ({words}); delete the folder itself") from error
+        return gone
+
+
+def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
+    """What a site's deletion would take, and the deletion itself."""
+    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.OPERATE))])
+
+    @router.get("/{site}/deletion")
+    def loss(site: str, response: Response) -> dict[str, Any]:
+        """What would be lost with the site; `etag`, the answer's ETag, is what its deletion needs. 409: why it cannot
+        be deleted now."""
+        found, mark = deletion.loss(site)
+        response.headers["etag"] = f'"{mark}"'
+        return {**asdict(found), "etag": f'"{mark}"'}
+
+    @router.delete("/{site}", status_code=204)
+    def delete(site: str, if_match: Annotated[str, Header(max_length=100)] = "") -> Response:
+        """Delete a site for good: its folder, verdicts, drawings, and the records of its missions with what watches
+        found. Recordings and uploads stay. If-Match is the ETag of `/deletion` (428 without, 412 where a flight came
+        since); 409 while a mission runs on it, or another program writes it."""
+        if not if_match:
+            raise Problem(428, "send the ETag of what would be lost (GET below it: /deletion) as If-Match")
+        deletion.delete(site, if_match.removeprefix("W/").strip('"'))
+        return Response(status_code=204)
+
+    return router
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    """Every file of a folder, links as they are and not followed."""
+    for place, _, names in os.walk(folder):
+        yield from (Path(place) / name for name in names)
+
+
+def _mark(*parts: int) -> str:
+    return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
