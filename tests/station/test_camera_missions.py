@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import shutil
 import signal
 import stat
 from collections.abc import Iterator
@@ -162,6 +163,20 @@ def test_a_killed_mission_takes_its_camera_with_it(camera: RtspServer, tmp_path:
         wait_for(lambda: not own_processes(station, run), 20)
         (stream,) = station.ask("/api/streams")
         assert not stream["is_connected"] and stream["flights"][0]["is_over"]
+
+
+def test_a_mission_whose_folder_is_taken_away_ends_with_its_camera(camera: RtspServer, tmp_path: Path) -> None:
+    """It wrote into nothing until the machine was switched off: no next station would have found it."""
+    with Served(tmp_path, free_floor_gb=0.0, stream_ranges=LOOPBACK) as station:
+        run = watched(station, camera.address)
+        wait_for(lambda: is_seen(station, run), 60)
+        folder = tmp_path / "station" / "runs" / run
+        log = (folder / "log.txt").open("rb")  # as whoever looks for the reason still has it
+        shutil.rmtree(folder)
+        wait_for(lambda: not own_processes(station, run), 40)
+        assert "its folder was taken away" in ended(station, run)["error"]
+        assert b"the folder of this run was taken away" in log.read()
+        log.close()
 
 
 @pytest.mark.long

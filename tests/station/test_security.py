@@ -444,7 +444,7 @@ def test_a_missions_error_holds_no_password(
         raise ValueError(f"Invalid data found when processing input: {source!r}")
 
     monkeypatch.setitem(worker._MISSIONS, "watch", fail)
-    monkeypatch.setattr(worker, "_Stop", lambda _: SimpleNamespace(until=None))
+    monkeypatch.setattr(worker, "_Stop", lambda _: SimpleNamespace(until=None, at_once=None, why=""))
     monkeypatch.setenv(SOURCE_VARIABLE, source)
     assert worker.main(tmp_path) == 1
     text = (tmp_path / "journal.jsonl").read_text() + capsys.readouterr().err

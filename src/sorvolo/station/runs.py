@@ -357,9 +357,11 @@ class Runs:
             return run, _event("run.stopped", run, run_row(run))
         last = _tail(folder / LOG_FILE)
         words = "its process ended without a word"
-        if code is not None and code < 0:
+        if not (folder / ORDER_FILE).exists():
+            words = "its folder was taken away, and its process ended"
+        elif code is not None and code < 0:
             words = f"its process was killed (signal {-code}), perhaps because memory ran out"
-        if short := shortage(folder, self._settings.free_floor_gb):
+        if short := shortage(self._settings.root, self._settings.free_floor_gb):
             words += f" while the disk was full ({short})"
         run = replace(
             run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code, notice=None,

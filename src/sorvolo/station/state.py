@@ -12,7 +12,9 @@ from typing import Any
 from sorvolo.errors import StoreError
 from sorvolo.store.atomic import writing
 
-_FILE = "station.db"
+STATE_FILE = "station.db"
+"""The file of the station's memory, in its own folder."""
+
 _FORMAT = 2
 _TABLES = """
 CREATE TABLE IF NOT EXISTS events (
@@ -58,7 +60,7 @@ class StationState:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
             folder.chmod(0o700)  # it holds hashes of tokens and the addresses of streams
-        path = folder / _FILE
+        path = folder / STATE_FILE
         try:
             state = cls(path)
             with state._lock:

@@ -26,6 +26,7 @@ from sorvolo.station.camera import camera_opened
 from sorvolo.station.collections import on_earth
 from sorvolo.station.incomplete import cut_off, unsent
 from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, TO_CHECK, Order
+from sorvolo.station.orphan_watch import ended_when_orphaned
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
 from sorvolo.store.exports.plain import plain_json, utc_text
@@ -74,9 +75,17 @@ class _Stop:
 
     def __init__(self, is_live: bool) -> None:
         self.until = threading.Event()
+        self.why = ""  # it is stopped although nobody asked for that
         self._is_live = is_live
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._take)
+
+    def at_once(self, why: str) -> None:
+        """Stop the mission for a reason of its own; from any thread."""
+        sys.stderr.write(f"{why}; stopped\n")  # the run's log
+        self.why = why
+        self.until.set()
+        os.kill(os.getpid(), signal.SIGTERM)
 
     def _take(self, _: int, __: FrameType | None) -> None:
         if self._is_live and not self.until.is_set():
@@ -91,8 +100,12 @@ def main(folder: Path) -> int:
     order, journal = Order.read(folder), Journal(folder / JOURNAL_FILE)
     stop = _Stop(is_live_address(order.source))
     try:
-        headline, why = _flown(order, folder, journal, stop.until)
+        with ended_when_orphaned(folder, order.run, stop.at_once):
+            headline, why = _flown(order, folder, journal, stop.until)
     except KeyboardInterrupt:
+        if stop.why:
+            journal.add(FAILED, {"exit_code": _WRONG, "error": f"{stop.why}; nothing was kept", "headline": None})
+            return _WRONG
         journal.add(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
         return _STOPPED_CODE
     except SorvoloError as error:
