@@ -28,6 +28,7 @@ from test_stream_messages import units
 from watch_runs import watch_run
 from websockets.sync.client import connect
 
+from faulty_link import FaultyLink
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.station.events import NewEvent
 from sorvolo.station.messages import Hello, Kind, Message
@@ -86,8 +87,9 @@ def opened(crew: Watched, served: Served) -> Iterator[Watched]:
     assert crew.faults == []
 
 
-def show(watched: Watched, served: Served, panel: str = "map") -> None:
-    watched.page.goto(f"{served.url}/#/site/field/{panel}")
+def show(watched: Watched, served: Served, panel: str = "map", url: str = "") -> None:
+    """The site's screen with a panel; `url`: at another address than the station's own."""
+    watched.page.goto(f"{url or served.url}/#/site/field/{panel}")
     watched.page.locator(".figure", has_text="matched").wait_for()
     watched.page.locator(".maplibregl-canvas").first.wait_for()
 
@@ -385,28 +387,65 @@ def test_a_browser_that_slept_notices_its_dead_connection(browser: Any, served: 
 
 
 def test_a_frozen_tab_catches_up_when_it_is_looked_at_again(browser: Any, served: Served) -> None:
-    """As browsers freeze tabs in the background: what happened meanwhile comes once each, and in order."""
+    """As browsers freeze tabs in the background: its connection is gone; what happened meanwhile comes once each, and
+    in order."""
     context = browser.new_context()
-    watched = Watched(context, served.url)
-    show(watched, served)
-    watched.page.locator("#link-state.live").wait_for()
-    watched.page.evaluate("""() => {
-      window.heard = [];
-      const note = (each) => each.addedNodes.forEach((node) => window.heard.push(node.textContent));
-      new MutationObserver((all) => all.forEach(note))
-        .observe(document.getElementById('messages'), { childList: true });
-    }""")
-    chrome = context.new_cdp_session(watched.page)
-    chrome.send("Page.setWebLifecycleState", {"state": "frozen"})
-    for number in range(3):
-        announce(served, "run.failed", {"error": f"fault {number}"})
-    time.sleep(1.0)  # the length of its sleep
-    chrome.send("Page.setWebLifecycleState", {"state": "active"})
-    watched.page.locator(".message", has_text="fault 2").wait_for()
-    heard = [each for each in watched.page.evaluate("window.heard") if "fault" in each]
-    assert [re.search(r"fault \d", each)[0] for each in heard] == ["fault 0", "fault 1", "fault 2"]  # type: ignore[index]
-    assert watched.faults == []
-    context.close()
+    with FaultyLink(served.port) as link:
+        url = f"http://127.0.0.1:{link.port}"
+        watched = Watched(context, url)
+        show(watched, served, url=url)
+        watched.page.locator("#link-state.live").wait_for()
+        watched.page.wait_for_load_state("networkidle")
+        watched.page.evaluate("""() => {
+          window.heard = [];
+          const note = (each) => each.addedNodes.forEach((node) => window.heard.push(node.textContent));
+          new MutationObserver((all) => all.forEach(note))
+            .observe(document.getElementById('messages'), { childList: true });
+        }""")
+        chrome = context.new_cdp_session(watched.page)
+        chrome.send("Page.setWebLifecycleState", {"state": "frozen"})
+        link.cut()
+        for number in range(3):
+            announce(served, "run.failed", {"error": f"fault {number}"})
+        time.sleep(1.0)  # the length of its sleep
+        link.mend()
+        chrome.send("Page.setWebLifecycleState", {"state": "active"})
+        watched.page.locator(".message", has_text="fault 2").wait_for()
+        watched.page.locator("#link-state.live").wait_for()
+        heard = [each for each in watched.page.evaluate("window.heard") if "fault" in each]
+        assert [re.search(r"fault \d", each)[0] for each in heard] == ["fault 0", "fault 1", "fault 2"]  # type: ignore[index]
+        tried = "ERR_CONNECTION_REFUSED"  # by the part of the browser that does not sleep
+        assert [each for each in watched.faults if tried not in each] == []
+        context.close()
+
+
+def test_a_page_that_lost_the_station_asks_at_once_when_it_is_looked_at(browser: Any, served: Served) -> None:
+    """It waits up to 15 s between two tries; nobody who comes back to it does."""
+    context = browser.new_context()
+    with FaultyLink(served.port) as link:
+        url = f"http://127.0.0.1:{link.port}"
+        watched = Watched(context, url)
+        watched.page.clock.install()
+        show(watched, served, url=url)
+        watched.page.locator("#link-state.live").wait_for()
+        watched.page.clock.pause_at(datetime.now(UTC) + timedelta(hours=1))
+        link.cut()
+        lost = watched.page.locator("#link-state.lost")
+        for _ in range(40):
+            watched.page.wait_for_timeout(100)  # of the test's own clock: for the answer to its last try
+            if lost.count():
+                break
+            watched.page.clock.run_for(5_000)
+        assert lost.count()
+        announce(served, "run.failed", {"error": "out of reach"})
+        link.mend()
+        watched.page.wait_for_timeout(500)
+        assert lost.count()  # its clock stands: it does not try by itself
+        watched.page.clock.set_fixed_time(datetime.now(UTC) + timedelta(hours=3))
+        watched.page.evaluate("dispatchEvent(new Event('focus'))")
+        watched.page.locator("#link-state.live").wait_for()
+        watched.page.locator(".message", has_text="out of reach").wait_for()
+        context.close()
 
 
 def test_recordings_are_listed_with_their_size_and_deleted(served: Served, opened: Watched, tmp_path: Path) -> None:
