@@ -8,7 +8,15 @@ from scenes import hills_with_houses, photo, survey_views, texture
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose, rotation_from_vector
-from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, height_deviations, triangulate
+from sorvolo.heights.adjustment import (
+    AdjustmentSettings,
+    Priors,
+    Scene,
+    adjust,
+    height_deviations,
+    matched_deviations,
+    triangulate,
+)
 from sorvolo.heights.cameras import Cameras3D, solve_cameras
 from sorvolo.heights.figures import camera_warnings
 from sorvolo.heights.smooth_sigma import SmoothSigma
@@ -93,6 +101,28 @@ def test_heights_err_more_away_from_the_middle_where_fixes_scatter() -> None:
     assert np.median(errors[0][away > 12]) == pytest.approx(tilted_m, rel=0.5)
     smooth = SmoothSigma.fitted(made.points_m[:, :2], errors[0])
     np.testing.assert_allclose(smooth.at(made.points_m[:, :2]), errors[0], atol=0.05)
+
+
+def test_a_few_wild_points_do_not_spoil_the_cameras_sigma() -> None:
+    """A point on almost parallel rays errs by tens of metres; of ten thousand points a few are such."""
+    rng = np.random.default_rng(6)
+    places = rng.uniform(-20, 20, (2000, 2))
+    sigma_m = np.sqrt(0.002 + 0.00003 * places[:, 0] ** 2 + 0.0001 * places[:, 1] ** 2)
+    wild = sigma_m.copy()
+    wild[rng.permutation(2000)[:20]] = rng.uniform(2, 20, 20)
+    np.testing.assert_allclose(SmoothSigma.fitted(places, wild).at(places), sigma_m, rtol=0.05)
+    np.testing.assert_allclose(SmoothSigma.fitted(places, sigma_m).at(places), sigma_m, rtol=0.01)
+
+
+def test_points_err_by_their_features_as_stated() -> None:
+    """Of 200 points seen by nine cameras that are known, with features off by 0.3 pixels."""
+    true = scene()
+    rng = np.random.default_rng(5)
+    priors = Priors(true.centres_m, np.full((9, 3), 0.05), true.rotations)
+    sigma_m = matched_deviations(true, priors, AdjustmentSettings(sigma_px=0.3))
+    off_m = triangulate(replace(true, seen=true.seen + rng.normal(0, 0.3 / 1000, true.seen.shape)))[:, 2]
+    times = (off_m - true.points_m[:, 2]) / sigma_m
+    assert np.sqrt((times**2).mean()) == pytest.approx(1.0, abs=0.2)
 
 
 def test_wrong_matches_do_not_bend_the_cameras() -> None:

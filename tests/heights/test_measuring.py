@@ -76,6 +76,7 @@ def test_heights_along_a_line() -> None:
     heights, sigmas = ramp.at(points)
     np.testing.assert_allclose(heights, 0.5 * points[:, 0], atol=0.1)
     np.testing.assert_allclose(sigmas, 0.05, atol=1e-6)
+    assert [len(each) for each in ramp.at(np.zeros((0, 2)))] == [0, 0]
     assert np.isnan(ramp.at(np.array([[100.0, 0]]))[0]).all()
 
 

@@ -15,6 +15,7 @@ from sorvolo.heights.free_space import seen_through
 from sorvolo.heights.islands import IslandSettings
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
+from sorvolo.heights.own_points import PointJudgement
 from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.smooth_sigma import SmoothSigma
@@ -288,7 +289,8 @@ def test_water_and_oblique_views_are_named(surface: Surface) -> None:
     half = Surface(surface.lattice, up_m, surface.sigma_m, np.ones(up_m.shape, bool))
     assert any("water" in each for each in surface_warnings(half))
     assert not surface_warnings(Surface(surface.lattice, surface.up_m, surface.sigma_m, np.isfinite(surface.up_m)))
-    figures = surface_figures(half, np.zeros(up_m.shape, bool))
+    figures = surface_figures(half, np.zeros(up_m.shape, bool), PointJudgement(7))
+    assert figures["own_points"]["points"] == 7 and figures["own_points"]["within_2_sigma"] is None
     assert 0.45 < figures["holes_share"] < 0.6
 
 

@@ -91,6 +91,8 @@ def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
         assert picture.res == flat.res and picture.crs == flat.crs
         assert (picture.read(4) == 255).mean() > 0.3
     assert report["surface"]["holes_share"] < 0.2
+    judged = report["surface"]["own_points"]
+    assert judged["points"] > 100 and judged["within_2_sigma"] > 0.9 and judged["factor"] >= 1
     assert (mapped / "mosaic.tif").read_bytes() == map_before
 
 

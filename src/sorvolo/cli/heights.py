@@ -77,6 +77,7 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
         ("holes", f"{surface['holes_share']:.1%} of the ground that two photos see"),
         ("height error", "" if surface["sigma_median_m"] is None else
          f"{surface['sigma_median_m']:.2f} m (1 sigma, median; without the error shared by all GPS fixes)"),
+        ("judged by", _judged(surface["own_points"])),
         ("bare ground", f"{surface['ground_share']:.0%} of the cells"),
         ("took", f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB"),
     ]
@@ -93,3 +94,14 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
     ):
         if (folder / file).is_file():
             show_path(name, folder / file, console)
+
+
+def _judged(found: Mapping[str, Any]) -> str:
+    """What the flight's own points state of the heights' error; "" without enough points."""
+    if found["median_m"] is None:
+        return ""
+    raised = f"; raised {found['factor']:.1f} times" if found["factor"] > 1 else ""
+    return (
+        f"{found['points']:,} points of the flight's own: {found['median_m']:.2f} m off (median), "
+        f"{found['within_2_sigma']:.0%} within 2 sigma of the match{raised}"
+    )

@@ -155,6 +155,14 @@ def height_deviations(scene: Scene, priors: Priors, settings: AdjustmentSettings
     return np.asarray(np.sqrt((half**2).sum(axis=0)))
 
 
+def matched_deviations(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> Floats:
+    """(P,) what the heights of the points err, one sigma in m, by the places of their features alone.
+
+    The cameras count as known: what they err, all heights near a point err alike.
+    """
+    return np.asarray(np.sqrt(np.linalg.inv(_linearise(scene, priors, settings).points + 1e-9 * np.eye(3))[:, 2, 2]))
+
+
 def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _Normal:
     residual, by_camera, by_shared, by_point = _derivatives(scene)
     white = residual / settings.sigma_px

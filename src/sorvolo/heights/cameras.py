@@ -6,11 +6,19 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM
+from sorvolo.geometry.arrays import Floats, ImageGray, Mask, PointsM, Rows
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
-from sorvolo.heights.adjustment import AdjustmentSettings, Priors, Scene, adjust, height_deviations, triangulate
+from sorvolo.heights.adjustment import (
+    AdjustmentSettings,
+    Priors,
+    Scene,
+    adjust,
+    height_deviations,
+    matched_deviations,
+    triangulate,
+)
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.tracks import Tracks, TrackSettings, find_tracks
 from sorvolo.heights.views import View
@@ -34,6 +42,7 @@ class Cameras3D:
     the focal length and the optical centre found.
     `lost` are the names of views that no track holds. `points_m` (P, 3), `residual_px` the rms of all observations at
     the views' size, `fix_rms_m` (3,) cameras minus fixes, NaN without; `height_sigma` what heights err by the cameras.
+    `point_sigma_m` (P,) is what the points' heights err by their features alone, `point_views` (P,) how many see each.
     """
 
     views: tuple[View, ...]
@@ -45,6 +54,8 @@ class Cameras3D:
     fix_rms_m: Floats
     observations: int
     height_sigma: SmoothSigma = field(default_factory=SmoothSigma)
+    point_sigma_m: Floats = field(default_factory=lambda: np.zeros(0))
+    point_views: Rows = field(default_factory=lambda: np.zeros(0, int))
 
 
 def solve_cameras(
@@ -140,12 +151,14 @@ def _solved(
     residual = scene.residuals_px()
     with np.errstate(invalid="ignore"):
         off = (scene.centres_m - priors.fixes_m)[held]
+    weighed = _as_it_fits(residual, settings.adjustment)
+    sigma = SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, weighed))
     return Cameras3D(
         moved, tuple(view.name for k, view in enumerate(views) if not held[k]), scene.points_m,
         float(np.sqrt(np.nanmean((residual**2).sum(axis=1)))), scale,
         (float(scene.shared[1]), float(scene.shared[2])),
-        np.sqrt(np.nanmean(off**2, axis=0)), len(scene.view),
-        _height_sigma(scene, priors, residual, settings.adjustment),
+        np.sqrt(np.nanmean(off**2, axis=0)), len(scene.view), sigma, matched_deviations(scene, priors, weighed),
+        np.bincount(scene.point, minlength=len(scene.points_m)),
     )
 
 
@@ -157,11 +170,7 @@ def _found(camera: Camera, scale: float, shift: Floats) -> Camera:
     )
 
 
-def _height_sigma(scene: Scene, priors: Priors, residual_px: Floats, settings: AdjustmentSettings) -> SmoothSigma:
-    """What heights err by the cameras: points' covariance through that of cameras and lens, the mean height left out.
-
-    The pictures weigh as they fit (their residuals' median), which is better than the settings assume.
-    """
+def _as_it_fits(residual_px: Floats, settings: AdjustmentSettings) -> AdjustmentSettings:
+    """The pictures weighed as they fit (their residuals' median), which is better than the settings assume."""
     fit_px = SIGMA_PER_MEDIAN_DEVIATION * float(np.nanmedian(np.abs(residual_px)))
-    fitting = replace(settings, sigma_px=max(fit_px, settings.least_sigma_px))
-    return SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, fitting))
+    return replace(settings, sigma_px=max(fit_px, settings.least_sigma_px))

@@ -1,5 +1,6 @@
 """A flight's heights in its report: figures, and what a user should know before using them."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Mask
 from sorvolo.heights.cameras import Cameras3D
+from sorvolo.heights.own_points import PointJudgement
 from sorvolo.heights.surface import Surface
 from sorvolo.heights.tracks import TrackSettings
 
@@ -39,8 +41,8 @@ def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
     }
 
 
-def surface_figures(surface: Surface, shows_ground: Mask) -> Mapping[str, Any]:
-    """The height model, as plain values; shares are of the ground that two photos see."""
+def surface_figures(surface: Surface, shows_ground: Mask, judgement: PointJudgement) -> Mapping[str, Any]:
+    """The height model and how its points judge it, as plain values; shares are of the ground that two photos see."""
     known = np.isfinite(surface.up_m)
     low, middle, high = np.nanpercentile(surface.up_m, [1, 50, 99]) if known.any() else (np.nan,) * 3
     covered = max(int(surface.covered.sum()), 1)
@@ -52,6 +54,9 @@ def surface_figures(surface: Surface, shows_ground: Mask) -> Mapping[str, Any]:
         "up_m": {"p01": float(low), "median": float(middle), "p99": float(high)},
         "sigma_median_m": float(np.nanmedian(surface.sigma_m)) if known.any() else None,
         "sigma_p95_m": float(np.nanpercentile(surface.sigma_m, 95)) if known.any() else None,
+        "own_points": {
+            name: value if np.isfinite(value) else None for name, value in dataclasses.asdict(judgement).items()
+        },
     }
 
 

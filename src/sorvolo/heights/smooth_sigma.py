@@ -5,9 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, PointsM
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.heights.lattice import Lattice
 
 _TERMS = 6
+_ROUNDS = 10  # of a robust fit
+_BENDS = 2.0  # robust deviations at which the Cauchy loss bends
 
 
 @dataclass(frozen=True)
@@ -25,12 +28,12 @@ class SmoothSigma:
 
     @classmethod
     def fitted(cls, places_m: PointsM, sigma_m: Floats) -> "SmoothSigma":
-        """Through sigmas (N,) at places (N, 2)."""
+        """Through sigmas (N,) at places (N, 2); a few may be wild, as of points that rays almost in parallel see."""
         if len(places_m) < _TERMS:
             return cls(least_m=float(np.median(sigma_m)) if len(sigma_m) else 0.0)
         low, high = places_m.min(axis=0), places_m.max(axis=0)
         middle, reach_m = (low + high) / 2, max(float((high - low).max()) / 2, 1e-6)
-        terms = np.linalg.lstsq(_powers((places_m - middle) / reach_m), sigma_m**2, rcond=None)[0]
+        terms = _robust_terms(_powers((places_m - middle) / reach_m), sigma_m**2)
         middle_m = (float(middle[0]), float(middle[1]))
         return cls(tuple(float(each) for each in terms), middle_m, reach_m, float(sigma_m.min()))
 
@@ -44,6 +47,17 @@ class SmoothSigma:
     def on(self, lattice: Lattice) -> Floats:
         """(H, W) the sigma of a lattice's cells, m."""
         return self.at(lattice.points_m().reshape(-1, 2)).reshape(lattice.shape)
+
+
+def _robust_terms(powers: Floats, square: Floats) -> Floats:
+    """(6,) the terms of squares (N,) by a Cauchy loss, begun at their median."""
+    off = square - np.median(square)
+    for _ in range(_ROUNDS):
+        spread = max(_BENDS * SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(off))), 1e-12)
+        root = 1 / np.sqrt(1 + (off / spread) ** 2)
+        terms = np.linalg.lstsq(powers * root[:, None], square * root, rcond=None)[0]
+        off = square - powers @ terms
+    return np.asarray(terms)
 
 
 def _powers(places: PointsM) -> Floats:

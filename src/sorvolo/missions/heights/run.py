@@ -13,6 +13,7 @@ from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
 from sorvolo.heights.figures import camera_figures, camera_warnings, surface_figures, surface_warnings
 from sorvolo.heights.lattice import CellSettings, Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
+from sorvolo.heights.own_points import OwnPointSettings, judged_by_points
 from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
@@ -41,6 +42,7 @@ class HeightSettings:
     has_orthophoto: bool = True
     cameras: CameraSettings = field(default_factory=CameraSettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
+    own_points: OwnPointSettings = field(default_factory=OwnPointSettings)
     terrain: TerrainSettings = field(default_factory=TerrainSettings)
     orthophoto: OrthophotoSettings = field(default_factory=OrthophotoSettings)
 
@@ -80,7 +82,8 @@ def make_heights(
         pictures = FlightPictures(archive, kept, solved.radial)
         cameras_s = time.monotonic() - started_s
         give_back()
-        surface = yield from _sweep(archive, solved, pictures, settings, flight_id)
+        swept = yield from _sweep(archive, solved, pictures, settings, flight_id)
+        surface, judgement = judged_by_points(swept, solved, settings.own_points)
         yield HeightsUpdate(flight_id, "ground", 0.0)
         ground, shows_ground = terrain(surface.lattice, surface.up_m, settings.terrain)
         _write_models(archive, flight_id, surface, ground)
@@ -91,7 +94,7 @@ def make_heights(
         report = {
             "flight": flight_id, "run": run_of(keyframes), "cell_m": surface.lattice.cell_m,
             "height_reference": archive.site().height_reference,
-            "cameras": camera_figures(solved), "surface": surface_figures(surface, shows_ground),
+            "cameras": camera_figures(solved), "surface": surface_figures(surface, shows_ground, judgement),
             "warnings": [*camera_warnings(solved), *surface_warnings(surface)],
             "seconds": {"cameras": cameras_s, "heights": heights_s, "total": time.monotonic() - started_s},
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
