@@ -104,7 +104,7 @@ def test_heights_err_more_away_from_the_middle_where_fixes_scatter() -> None:
 
 
 def test_a_few_wild_points_do_not_spoil_the_cameras_sigma() -> None:
-    """A point on almost parallel rays errs by tens of metres; of ten thousand points a few are such."""
+    """A point on almost parallel rays errs by tens of metres; one of 9,000 made all other sigmas far too small."""
     rng = np.random.default_rng(6)
     places = rng.uniform(-20, 20, (2000, 2))
     sigma_m = np.sqrt(0.002 + 0.00003 * places[:, 0] ** 2 + 0.0001 * places[:, 1] ** 2)
