@@ -89,7 +89,8 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
     names = "sigma_in_map_m", "height_change_m", "height_change_sigma_m"
     assert [reported[name] for name in names] == [0.03, -0.4, 0.1] and not any(other[name] for name in names)
     assert "2 changes" not in page and "1 change " in page and "1 moving object" in page
-    assert "version 1: flight a, flown 2023-11-14" in page and "version 2: flight b" in page
+    assert "version 1: flight a, <time>flown 2023-11-14</time>" in page and "version 2: flight b" in page
+    assert ".dates time{white-space:nowrap}" in page  # on a telephone, too, no line breaks a date
 
 
 def test_the_geojson_states_what_is_promised_in_wgs84(folder: Path) -> None:
@@ -342,7 +343,7 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
         with pytest.raises(InputError, match=r"had no map.*2023-11-14T22:13:20"):
             archive.version_at(flown - timedelta(seconds=2))
     page = (folder / "flights/b/changes.html").read_text()
-    assert "flight a, flown 2023-11-14" in page and "flight b, flown 2023-11-14" in page
+    assert all(f"flight {each}, <time>flown 2023-11-14</time>" in page for each in "ab")
     with sqlite3.connect(folder / "site.db") as connection:  # flights whose clocks have no date
         connection.execute("UPDATE flown SET first_ns = 7, last_ns = 8")
     connection.close()

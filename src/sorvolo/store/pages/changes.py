@@ -56,14 +56,14 @@ def changes_page(
     crops: Mapping[str, _Crops],
     *,
     coverage: Sequence[Any] = (),
-    before_words: str = "before",
-    after_words: str = "after",
+    before_words: tuple[str, str] = ("before", ""),
+    after_words: tuple[str, str] = ("after", ""),
 ) -> str:
     """changes.html of one flight: `report` as in report.json with its "comparison" (docs/formats.md).
 
-    `before` and `after` are the map's pictures on the same ground, None for a map without tiles; the words name their
-    dates. `crops` are the changes' pictures before and after by id, `coverage` the features of coverage.geojson. What
-    the report does not hold is left out. All text is escaped.
+    `before` and `after` are the map's pictures on the same ground, None for a map without tiles; the words name them,
+    and the day, which no line breaks. `crops` are the changes' pictures before and after by id, `coverage` the features
+    of coverage.geojson. What the report does not hold is left out. All text is escaped.
     """
     most_bytes = int(_CROPS_BYTES / max(2 * len(changes), 1))
     shown = (before, after) if before is not None and after is not None and after.rgba.size > 0 else None

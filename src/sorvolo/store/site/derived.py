@@ -173,12 +173,12 @@ def _before_and_after(
     return before, after
 
 
-def _words_of(version: VersionEntry | None) -> str:
-    """A version by its flight and when that was flown; where nothing of it is dated, when the version was made."""
+def _words_of(version: VersionEntry | None) -> tuple[str, str]:
+    """A version by its flight, and when that was flown; where nothing of it is dated, when the version was made."""
     if version is None:
-        return "no map yet"
+        return "no map yet", ""
     date = f"flown {version.flown_utc[:10]}" if version.flown_utc else f"mapped {version.created_utc[:10]}"
-    return f"version {version.id}: flight {version.flight_id}, {date}"
+    return f"version {version.id}: flight {version.flight_id},", date
 
 
 def _crops(files: SiteFiles, flight_id: str, change_id: str) -> tuple[ImageRGBA | None, ImageRGBA | None]:
