@@ -7,11 +7,13 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from live_sender import EPOCH_NS, RATE, free_port, number_of, sending, sending_apart, udp_url
 from rtsp_server import RtspServer
 
+from sorvolo.capture.live.addresses import StreamAddress, live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources, opened_sources
@@ -84,6 +86,21 @@ def test_the_first_frames_of_a_sender_that_begins_late_are_kept() -> None:
     assert number_of(frames[0][1].image) <= 2  # 30 where what came while it was opened is lost
     assert [frame.index for _, frame in frames] == list(range(0, 60, 2))
     assert late_s < 1.0 and not any(notice.code == "skipped_frame" for notice in source.notices())
+
+
+def test_a_stream_of_few_frames_a_second_is_opened_after_a_few() -> None:
+    """FFmpeg by itself waits for twenty pictures or its time limit, to know their rate: nine at four a second."""
+    port = free_port()
+    address = live_address(f"udp://:{port}")
+    assert isinstance(address, StreamAddress)
+    options, timeout_s = dict(address.options), (10, 5)
+    with (
+        sending(udp_url(port), rate=4) as sender,
+        av.open(address.url, format=address.container, options=options, timeout=timeout_s) as container,
+    ):
+        sent = len(sender.sent_s)
+        rate = container.streams.video[0].average_rate
+    assert rate == 4 and sent <= 6
 
 
 def test_without_metadata_frames_are_timed_by_when_they_came() -> None:

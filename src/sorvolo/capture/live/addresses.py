@@ -23,9 +23,11 @@ _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
     "rtsp": (554, {"rtsp_flags": "listen", "listen_timeout": "3"}),
 }
 # live: nothing is held back for a smoother picture, and a damaged packet does not end the stream; not `nobuffer`, which
-# throws away what came while the stream was looked at, and makes what comes later no sooner
+# throws away what came while the stream was looked at, and makes what comes later no sooner; twenty pictures for the
+# frame rate alone, FFmpeg's own choice, took 3 s at two a second: it is right from a few on
 _COMMON = {
     "fflags": "discardcorrupt", "flags": "low_delay", "analyzeduration": "1000000", "probesize": "5000000",
+    "fpsprobesize": "2",
 }
 _BY_SCHEME: Mapping[str, Mapping[str, str]] = {
     "rtsp": {"rtsp_transport": "tcp"},
