@@ -36,7 +36,7 @@ def test_a_page_states_what_where_and_how_sure() -> None:
     way_m = np.column_stack([np.linspace(0, 50, 9), np.zeros(9)])
     page = checked(watch_page(_REPORT, tracks, {1: b"\xff\xd8picture"}, way_m))
     text = " ".join(page.text)
-    assert "Objects found: 1 person, 1 car." in text and "person, car" in text
+    assert "Objects found: 1 car, 1 person." in text and "person, car" in text
     assert "41.900000, 12.600000" in text and "1.2 m" in text and "5.0 m/s" in text and "passes" in text
     assert "a <notice>" in text and "a <warning>" in text and "DJI<1>" in text and "Apache-2.0 & others" in text
     assert page.names.count("img") == 1 and page.names.count("circle") == 4 and "polyline" in page.names

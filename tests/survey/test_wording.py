@@ -2,7 +2,7 @@
 
 import pytest
 
-from sorvolo.survey.wording import counted, counted_list, plural
+from sorvolo.survey.wording import counted, counted_list, most_first, plural
 
 
 @pytest.mark.parametrize(("count", "noun", "words"), [
@@ -15,8 +15,15 @@ def test_a_count_has_its_plural(count: int, noun: str, words: str) -> None:
 
 
 def test_a_list_of_counts() -> None:
+    assert counted_list({"bus": 2, "person": 1, "car": 0}) == "2 buses, 1 person"
     assert counted_list({"person": 4, "car": 3, "small object": 0}) == "4 people, 3 cars"
     assert counted_list({"person": 0}) == "nothing" and counted_list({}, none="none found") == "none found"
+
+
+def test_the_most_frequent_stand_first_and_equals_by_name_whatever_order_they_came_in() -> None:
+    assert list(most_first(["person", "car", "boat", "boat"]).items()) == [("boat", 2), ("car", 1), ("person", 1)]
+    assert list(most_first(["car", "person"])) == list(most_first(["person", "car"])) == ["car", "person"]
+    assert most_first([]) == {}
 
 
 def test_verbs_agree() -> None:

@@ -1,6 +1,7 @@
 """Counts in plain English: "1 person", "4 people, 3 cars"."""
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
 
 _PLURALS = {"person": "people", "bus": "buses", "is": "are", "was": "were", "shows": "show"}
 
@@ -27,6 +28,11 @@ def counted(count: int, noun: str) -> str:
 def counted_list(counts: Mapping[str, int], *, none: str = "nothing") -> str:
     """How many of each thing, in the mapping's order; `none` where all counts are 0."""
     return ", ".join(counted(count, name) for name, count in counts.items() if count) or none
+
+
+def most_first(names: Iterable[str]) -> dict[str, int]:
+    """How often each name occurs, the most frequent first, equals by name."""
+    return dict(sorted(Counter(names).items(), key=lambda each: (-each[1], each[0])))
 
 
 def area_text(area_m2: float, *, is_local: bool = False) -> str:

@@ -20,7 +20,7 @@ from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import Notice, Site
 from sorvolo.survey.objects import Detections, Track
-from sorvolo.survey.wording import counted
+from sorvolo.survey.wording import counted, most_first
 
 # notices of sources about frames that cannot be used: left out where the reasons are reported
 _OF_LOST_FRAMES = ("unreadable_photo", "corrupt_photo", "duplicate_photo", "other_size", "other_shape")
@@ -77,8 +77,8 @@ def found_words(track: Track, site: Site, form: Coordinates = Coordinates.LATLON
 
 
 def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:
-    """How many confirmed tracks of each class, most first."""
-    return dict(Counter(each.label for each in tracks if each.confirmed).most_common())
+    """How many confirmed tracks of each class, most first, equals by name."""
+    return most_first(each.label for each in tracks if each.confirmed)
 
 
 def build_watch_report(

@@ -8,8 +8,9 @@ from markupsafe import Markup
 
 from sorvolo.store.exports.places import SYSTEMS, place_words
 from sorvolo.store.pages.render import render
-from sorvolo.store.pages.words import at, count_words, finite_or_none, jpeg_uri, known, number_at, plural, seconds_words
+from sorvolo.store.pages.words import at, finite_or_none, jpeg_uri, known, number_at, plural, seconds_words
 from sorvolo.survey.flight import Site
+from sorvolo.survey.wording import counted_list
 
 _MOST_CROP_BYTES = 250_000  # of all pictures together: the page stays one that can be mailed
 _MOST_ROWS = 200
@@ -40,7 +41,7 @@ def _words(search: Mapping[str, Any]) -> str:
     if not any(counts.values()):
         return f"No {' and no '.join(map(str, at(search, 'looked_for') or ['object']))} was found."
     moving = int(number_at(search, "moving") or 0)
-    return f"Objects found: {count_words(counts)}" + (f"; {moving} of them moved" if moving else "") + "."
+    return f"Objects found: {counted_list(counts)}" + (f"; {moving} of them moved" if moving else "") + "."
 
 
 def _how(search: Mapping[str, Any], is_local: bool) -> str:

@@ -3,7 +3,6 @@
 The page needs no other file, no network and no script.
 """
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +17,6 @@ from sorvolo.store.pages.plots import round_length
 from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import (
     at,
-    count_words,
     finite_or_none,
     join_words,
     jpeg_uri,
@@ -27,6 +25,7 @@ from sorvolo.store.pages.words import (
     seconds_words,
     with_unit,
 )
+from sorvolo.survey.wording import counted_list, most_first
 
 _WIDE_PX, _HIGH_PX, _RIM_PX = 940.0, 560.0, 36.0
 _LETTER_PX, _LINE_PX = 7.5, 12.0  # of the map's labels
@@ -47,14 +46,14 @@ def watch_page(
     `crops` are JPEG files by track, and `drone_m` (N, 2) the camera's places in site metres, none for a flight that
     nothing places. All text is escaped.
     """
-    counts = Counter(str(each["class"]) for each in tracks)
     shown = _crops(tracks, crops)
     is_local = not report.get("georeferenced")
     page = render(
         "watch.html", title=f"{report.get('flight')} - watch", flight=known(report.get("flight")),
         first=_when(report.get("first_frame")), last=_when(report.get("last_frame")),
-        counts=count_words(dict(counts.most_common())), frames=known(at(report, "frames", "detected")),
-        looked_for=_searched_for(report), warning_lines=report.get("warnings") or [],
+        counts=counted_list(most_first(str(each["class"]) for each in tracks)),
+        frames=known(at(report, "frames", "detected")), looked_for=_searched_for(report),
+        warning_lines=report.get("warnings") or [],
         maps=_maps(report, tracks, drone_m), rows=_rows(tracks, is_local=is_local),
         systems=() if is_local else tuple(SYSTEMS.items()),
         files=_LOCAL_FILES if is_local else _FILES,

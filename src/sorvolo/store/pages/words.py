@@ -44,11 +44,6 @@ def plural(count: float, name: str) -> str:
     return f"{count:.0f} {wording.plural(name, round(count))}"
 
 
-def count_words(counts: Mapping[str, int]) -> str:
-    """What was found: "4 people, 3 cars"; "nothing" for nothing."""
-    return ", ".join(plural(count, name) for name, count in counts.items() if count) or "nothing"
-
-
 def with_unit(pattern: str, value: Any) -> str | None:
     """The number in a pattern of str.format; None when it is none."""
     number = finite_or_none(value)
