@@ -89,7 +89,7 @@ def test_the_first_frames_of_a_sender_that_begins_late_are_kept() -> None:
 
 
 def test_a_stream_of_few_frames_a_second_is_opened_after_a_few() -> None:
-    """FFmpeg by itself waits for twenty pictures or its time limit, to know their rate: nine at four a second."""
+    """FFmpeg by itself waits for twenty pictures or its time limit, to know their rate."""
     port = free_port()
     address = live_address(f"udp://:{port}")
     assert isinstance(address, StreamAddress)
