@@ -20,6 +20,7 @@ from sorvolo.geometry.arrays import Floats, Floats16, Floats32, ImageRGB, Mask, 
 _SHRINK = 4
 _ITERATIONS = 8
 _LINKS_AT_ONCE = 512
+_FIELD_PX = 1 << 17  # of a picture, corrected at a time
 _SIGMA_FROM_MEDIAN = 1.126  # of the root mean square of three normal numbers
 
 
@@ -151,12 +152,18 @@ def corrected(
     diagonal2 = whole_width**2 + whole_height**2
     x = (2 * np.arange(x0, x0 + width) - (whole_width - 1)) ** 2 / diagonal2
     y = (2 * np.arange(y0, y0 + height) - (whole_height - 1)) ** 2 / diagonal2
-    radius2 = y.astype(np.float32)[:, None] + x.astype(np.float32)
-    field = cv2.exp(-(np.float32(vignette[0]) + np.float32(vignette[1]) * radius2) * radius2)
-    return cv2.merge([  # type: ignore[return-value]
-        cv2.multiply(channel, field, scale=float(gain), dtype=cv2.CV_8U)
-        for channel, gain in zip(cv2.split(image), gains)
-    ])
+    x, y = x.astype(np.float32), y.astype(np.float32)
+    result = np.empty((height, width, 3), np.uint8)
+    rows = max(1, _FIELD_PX // width)  # at a time: the field of a whole picture is five times as large as the picture
+    for first in range(0, height, rows):
+        some = slice(first, first + rows)
+        radius2 = y[some, None] + x
+        field = cv2.exp(-(np.float32(vignette[0]) + np.float32(vignette[1]) * radius2) * radius2)
+        cv2.merge([
+            cv2.multiply(channel, field, scale=float(gain), dtype=cv2.CV_8U)
+            for channel, gain in zip(cv2.split(image[some]), gains)
+        ], result[some])
+    return result
 
 
 @dataclass(frozen=True)
