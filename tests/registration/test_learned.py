@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.registration.learned import LEARNED, learned_features
+from sorvolo.registration.learned import LEARNED, learned_features, release_network
 
 
 @pytest.fixture(scope="module")
@@ -44,3 +44,10 @@ def test_most_keeps_the_surest_points(ground: np.ndarray) -> None:
 
 def test_a_picture_without_detail_has_hardly_any() -> None:
     assert len(learned_features(np.full((64, 64), 90, np.uint8))) < 10
+
+
+def test_a_released_network_finds_the_same_again(ground: np.ndarray) -> None:
+    before = learned_features(ground, most=100)
+    release_network()
+    after = learned_features(ground, most=100)
+    assert np.array_equal(after.points_px, before.points_px) and np.array_equal(after.descriptors, before.descriptors)

@@ -20,6 +20,7 @@ from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.overview import Overview, lay_out
 from sorvolo.mosaic.pose_graph import PoseGraph, pose_from_link
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
+from sorvolo.registration.learned import release_network
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Keyframe, Link, NoLink, Status
@@ -129,6 +130,7 @@ class PlanarMapper:
     def release(self) -> None:
         """Put what links need out of memory: no frame comes for a while."""
         self._keyframes.release()
+        release_network()
 
     def register(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Registered:
         """Tie an undistorted picture to the map as it is; `place` is what adds it."""

@@ -90,6 +90,11 @@ def _sampled(planes: Floats32, points_px: PointsPx) -> Floats32:
     ).T
 
 
+def release_network() -> None:
+    """Put the model out of memory; the next picture opens it again."""
+    _network.cache_clear()
+
+
 @lru_cache(maxsize=1)
 def _network() -> Any:
     """The packaged model, opened once; on as many cores as there are."""
