@@ -31,7 +31,7 @@ from sorvolo.training.joint import JointSettings, JointTraining
 from sorvolo.training.presets import fast
 from sorvolo.training.samples import Augmentation, Share
 from sorvolo.training.seeing import see
-from sorvolo.training.weights import load_lite0
+from sorvolo.training.weights import read_weights
 from train_default_model import reader
 
 ARMS = ("standard", "extended", "equal-cost", "extended-residual")
@@ -59,7 +59,7 @@ def main() -> None:
             started_s = time.process_time()
             torch.manual_seed(seed)
             model = arm_model(arm)
-            model.backbone.load_imagenet(load_lite0(wishes.weights))
+            model.backbone.load_imagenet(read_weights(wishes.weights).layers)
             training = JointTraining(model, JointSettings(steps=wishes.steps, batch=wishes.batch, averaging=0.99), seed)
             share = Share(parts["train"], 1.0, (0.7, 1.6), thermal=True)
             crops = Augmentation(side_px=wishes.side)

@@ -33,7 +33,7 @@ from sorvolo.training.exported import load_exported
 from sorvolo.training.joint import JointSettings, JointTraining, collate
 from sorvolo.training.presets import fast
 from sorvolo.training.samples import Augmentation, Sample, Share
-from sorvolo.training.weights import load_lite0
+from sorvolo.training.weights import read_weights
 
 SIMULATED_SEED, SIMULATED_PICTURES = 1, 1800
 SIMULATED = "boxes.json"
@@ -76,7 +76,7 @@ def main() -> None:
     model = fast(CLASSES, thaw_all=wishes.thermal)
     rate = JointSettings.rate
     if wishes.weights is not None:
-        model.backbone.load_imagenet(load_lite0(wishes.weights))
+        model.backbone.load_imagenet(read_weights(wishes.weights).layers)
     else:
         first = [each for batch in islice(stream(0, wishes.seed + 1), SETTLING) for each in batch]
         load_exported(model, find_model(wishes.start).read_bytes(), collate(first, "cpu")[0])

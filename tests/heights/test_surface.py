@@ -14,12 +14,12 @@ from sorvolo.heights.figures import surface_figures, surface_warnings
 from sorvolo.heights.free_space import seen_through
 from sorvolo.heights.islands import IslandSettings
 from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_orthophoto, visible
 from sorvolo.heights.own_points import PointJudgement
 from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
 from sorvolo.heights.smooth_sigma import SmoothSigma
-from sorvolo.heights.standing import Standing
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.sweep import SweepSettings, choose_views
 from sorvolo.heights.terrain import TerrainSettings, filled, terrain
@@ -178,7 +178,7 @@ def test_a_camera_does_not_see_the_ground_behind_what_stands() -> None:
     view = survey_views(strips=1, photos=1)[0]
     lattice = Lattice.over(np.array([[-12.0, -10], [14, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
     eye_m = view.site_from_camera.translation_m
-    hidden_m = Standing(lattice, _wall(lattice)).hidden_below_m(lattice, eye_m)
+    hidden_m = Obstacles(lattice, _wall(lattice)).hidden_below_m(lattice, eye_m)
     assert hidden_m is not None
     x, y = np.moveaxis(lattice.points_m(), 2, 0)
     away = 7 + 1.0  # a metre behind the wall the line of sight over it is so high
@@ -191,7 +191,7 @@ def test_a_camera_does_not_see_the_ground_behind_what_stands() -> None:
 def test_what_hides_nothing_is_not_asked_about() -> None:
     view = survey_views(strips=1, photos=1)[0]
     lattice = Lattice.over(np.array([[-12.0, -10], [14, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
-    level = Standing(lattice, np.zeros(lattice.shape, np.float32))
+    level = Obstacles(lattice, np.zeros(lattice.shape, np.float32))
     assert level.hidden_below_m(lattice, view.site_from_camera.translation_m) is None
 
 
@@ -200,23 +200,23 @@ def test_only_what_stands_everywhere_around_stands_surely() -> None:
     up_m = _wall(lattice)
     holes = lattice.points_m()[..., 1] > 8
     up_m[holes] = np.nan
-    sure = Standing.surely(lattice, up_m, 7)
+    sure = Obstacles.surely(lattice, up_m, 7)
     assert np.isfinite(sure.up_m).all() and (sure.up_m == 0)[holes].all()
     known = ~holes
     assert (sure.up_m[known] <= up_m[known]).all()
     assert 0 < (sure.up_m == 6).sum() < (up_m == 6).sum()
-    nothing = Standing.surely(lattice, np.full(lattice.shape, np.nan, np.float32), 7)
+    nothing = Obstacles.surely(lattice, np.full(lattice.shape, np.nan, np.float32), 7)
     assert np.isfinite(nothing.up_m).all()
 
 
 def test_photos_that_see_the_ground_beside_a_house_are_chosen(survey) -> None:
     views, _, _ = survey
     lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
-    standing = Standing(lattice, true_heights(lattice).astype(np.float32))
-    places, shown = standing.shown(lattice, views)
+    obstacles = Obstacles(lattice, true_heights(lattice).astype(np.float32))
+    places, shown = obstacles.shown(lattice, views)
     level = np.array([inside(view.pixels_from_site(places), view.camera) for view in views])
     assert (shown <= level).all() and (level & ~shown).sum() > 20
-    chosen = choose_views(lattice, views, 0.0, 4, standing)
+    chosen = choose_views(lattice, views, 0.0, 4, obstacles)
     assert (shown[chosen].sum(axis=0) < np.minimum(shown.sum(axis=0), 2)).mean() < 0.1
 
 

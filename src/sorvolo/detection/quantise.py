@@ -128,13 +128,15 @@ def pool_before_rounding(graph: Any) -> None:
     makers = {name: node for node in graph.node for name in node.output}
     readers = Counter(name for node in graph.node for name in node.input)
     for pool in [node for node in graph.node if node.op_type == "MaxPool"]:
-        back, rounding = _rounding_of(pool.input[0], makers) or (None, None)
-        if back is None or rounding is None or not _is_float(rounding.input[0], makers):
-            continue
-        if readers[back.output[0]] == readers[rounding.output[0]] == 1:  # nobody else wants them
-            pool.input[0] = rounding.input[0]
-            graph.node.remove(back)
-            graph.node.remove(rounding)
+        match _rounding_of(pool.input[0], makers):
+            case back, rounding if _is_float(rounding.input[0], makers) and _are_read_once(readers, back, rounding):
+                pool.input[0] = rounding.input[0]
+                graph.node.remove(back)
+                graph.node.remove(rounding)
+
+
+def _are_read_once(readers: Mapping[str, int], *nodes: Any) -> bool:
+    return all(readers[node.output[0]] == 1 for node in nodes)
 
 
 def _rounding_of(name: str, makers: Mapping[str, Any]) -> tuple[Any, Any] | None:

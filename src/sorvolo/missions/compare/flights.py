@@ -52,16 +52,11 @@ def compare_flights(
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being compared is left out, those before it are in.
     """
-    if steps is not None and settings.method != "thesis":
-        raise SettingsError("the steps are those of the thesis's method: give --method thesis as well")
-    if steps is not None and steps.resolve().is_relative_to(site.resolve()):
-        raise SettingsError(f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder")
+    if steps is not None:
+        _check_steps(steps, site, settings)
     wanted = None if area is None else read_area(area)
     with Archive.open(site, write=False) as archive:
-        if not archive.tiles():
-            raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
-        if not settings.trusts_map:
-            _refuse_contradictory(archive, site)
+        _check_map(archive, site, settings)
     is_live = any(is_live_address(str(each)) for each in inputs)
     looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
     check_classes(looks, settings.classes)
@@ -97,8 +92,20 @@ def _reviews(archive: Archive) -> list[tuple[str, str]]:
     return [(each.change_id, each.verdict.value) for each in archive.reviews()]
 
 
-def _refuse_contradictory(archive: Archive, site: Path) -> None:
-    """Raise StoreError for a map that contradicts itself: changes found on it would be its own faults."""
+def _check_steps(steps: Path, site: Path, settings: CompareSettings) -> None:
+    """Raise SettingsError where the intermediate pictures cannot be made, or not there."""
+    if settings.method != "thesis":
+        raise SettingsError("the steps are those of the thesis's method: give --method thesis as well")
+    if steps.resolve().is_relative_to(site.resolve()):
+        raise SettingsError(f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder")
+
+
+def _check_map(archive: Archive, site: Path, settings: CompareSettings) -> None:
+    """Raise StoreError where there is no map, or one that contradicts itself: changes on it would be its own faults."""
+    if not archive.tiles():
+        raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
+    if settings.trusts_map:
+        return
     for each in archive.flights():
         headline = archive.report(each.id).get("headline")
         if isinstance(headline, dict) and headline.get("quality") == MapQuality.CONTRADICTORY:

@@ -269,15 +269,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     before = run.start.thresholds if isinstance(run.start, ExportedModel) else {}
     thresholds = checked.thresholds(classes, before)
     scores = {name: each.score for name, each in thresholds.items()}
-    learnt = [share.labelled for share in run.sets.shares]
-    thermal, by_day = run.sets.lights
-    info = {
-        "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
-        "classes": list(classes), "thresholds": scores, "best_px": best_sizes_px(checked, scores, learnt, classes),
-        **_descent(run, ", ".join(each.name for each in learnt)),
-        "thermal": thermal, "daylight": by_day,
-        "created": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    info = _info(run, checked, scores)
     exported = export_onnx(model, info)
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
@@ -291,6 +283,20 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     atomic_write_bytes(run.out / REPORT, json_bytes(report))
     atomic_write_bytes(run.out / PAGE, training_page(plain_json(report)).encode())
     return check, notices
+
+
+def _info(run: _Run, checked: Checked, thresholds: dict[str, float]) -> dict[str, Any]:
+    """What the model file states of itself."""
+    learnt = [share.labelled for share in run.sets.shares]
+    classes, (thermal, by_day) = run.sets.classes, run.sets.lights
+    return {
+        "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
+        "classes": list(classes), "thresholds": thresholds,
+        "best_px": best_sizes_px(checked, thresholds, learnt, classes),
+        **_descent(run, ", ".join(each.name for each in learnt)),
+        "thermal": thermal, "daylight": by_day,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
 
 
 def _descent(run: _Run, learnt: str) -> dict[str, str]:

@@ -15,7 +15,7 @@ _SAMPLES = 16  # to a side of a window
 
 
 @dataclass(frozen=True)
-class StandingSettings:
+class ObstacleSettings:
     """When something is in the way."""
 
     margin_cells: float = 1.5  # below the line of sight, down to which a place is seen all the same
@@ -24,15 +24,15 @@ class StandingSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Standing:
+class Obstacles:
     """Heights `up_m` (H, W) float32 without holes over a lattice, of what surely stands there."""
 
     lattice: Lattice
     up_m: Floats32
-    settings: StandingSettings = StandingSettings()
+    settings: ObstacleSettings = ObstacleSettings()
 
     @classmethod
-    def surely(cls, lattice: Lattice, up_m: Floats32, patch_cells: int) -> "Standing":
+    def surely(cls, lattice: Lattice, up_m: Floats32, patch_cells: int) -> "Obstacles":
         """What surely stands by a height model, (H, W), NaN in holes, made with patches of so many cells.
 
         Beside an edge such a model is as high as the edge for up to half a patch: only that is sure which stands
