@@ -5,7 +5,6 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
-SEEDS ?=  # of the flights that `make bench` simulates; else drawn from the commit
 
 .PHONY: demo test test-long check bench model page-vendor wheel docs
 
@@ -23,8 +22,9 @@ check: $(TRAINS)
 	$(BIN)/mypy --num-workers 2
 	$(BIN)/lint-imports
 
+# The published tables that take minutes, at this commit: make bench [TABLES=NAME...] [DATA=FOLDER] [PEERS=ENVIRONMENT/bin]
 bench: $(READY)
-	$(BIN)/python benchmarks/mosaic_methods.py $(SEEDS)
+	$(BIN)/python benchmarks/quick_tables.py $(TABLES) $(if $(DATA),--data $(DATA)) $(if $(PEERS),--peer-bin $(PEERS))
 
 # dist/: an sdist, and a wheel made from it. The wheel holds the compiled kernels where there is a C++ compiler; an
 # install without one works on their NumPy twins, slower, and warns of it once.

@@ -47,7 +47,8 @@ def main() -> None:
     """Run the benchmark, or one method in the child process."""
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
-    parser.add_argument("seeds", type=int, nargs="*", help="else three drawn from the commit's hash")
+    parser.add_argument("seeds", type=int, nargs="*", help="else new ones, drawn from the commit's hash")
+    parser.add_argument("--count", type=int, default=3, help="how many seeds to draw")
     parser.add_argument("--preset", default="survey")
     parser.add_argument("--length", type=float, help="length of a strip, m, for a shorter flight")
     parser.add_argument("--repeats", type=int, default=1, help="runs of each method on each flight")
@@ -59,7 +60,7 @@ def main() -> None:
     if options.run:
         run_method(options.run[0], Path(options.run[1]), Path(options.run[2]))
         return
-    options.seeds = seeds_or_drawn("mosaic_methods", options.seeds, 3)
+    options.seeds = seeds_or_drawn("mosaic_methods", options.seeds, options.count)
     runs = []
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:
