@@ -17,12 +17,12 @@ where they are, what the map of the earlier date is off by as a whole taken out.
 **Changes** (2024-02-24/2024-03-01, and 2024-03-01/2024-03-12 and 2023-09-26/2023-10-14 under `others`): polygons in
 pixels of the earlier orthophoto, drawn by hand with the later one laid over the earlier beside it, 1.6 to 2 times as
 large, before anything was scored. On the second pair they are boxes mostly, and not all that changed was drawn. On the
-third all soil was driven over and most sunlight comes from another side: tracks, shadows and leaves were not drawn; what
-less than half of which a later photo shows was left out. A thing is found when an event
-overlaps it by at least a quarter of the smaller of the two areas and is at most ten times as large. An area (over 100
-m2) is found when one event covers at least 40 % of it; the share that all events together cover is given as well. An
-event is false when at least half of it lies on ground drawn as unchanged. Events that touch neither are counted as
-elsewhere: not all that changed is drawn.
+third all soil was driven over and most sunlight comes from another side: tracks, shadows and leaves were not drawn;
+what a later photo shows less than half of was left out. A thing is found when an event overlaps it by at least a
+quarter of the smaller of the two areas and is at most ten times as large. An area (over 100 m2) is found when one
+event covers at least 40 % of it; the share that all events together cover is given as well. An event is false when at
+least half of it lies on ground drawn as unchanged. Events that touch neither are counted as elsewhere: not all that
+changed is drawn.
 
 Each run is appended to results/real_dates.json: how often a pair was scored is how often it stands there.
 """
