@@ -94,7 +94,7 @@ Tries = Annotated[int, typer.Option(help="Set a flight aside when it ended its p
 Stall = Annotated[float, typer.Option(help="End a process that neither answers nor computes for this many seconds.")]
 Blocks = Annotated[
     int,
-    typer.Option(help="Divide each flight of photos into this many blocks of ground, joined to one map."),
+    typer.Option(help="Divide each flight into this many blocks of ground, joined to one map."),
 ]
 Shares = Annotated[
     bool | None,
@@ -237,7 +237,7 @@ def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None,
     if live and len(live) < len(places):
         raise SettingsError("give folders of flights or live sources, not both: they are two batches with two roots")
     if live and blocks > 1:
-        raise SettingsError("--blocks divides folders of photos; live sources are mapped whole")
+        raise SettingsError("--blocks divides recorded flights; live sources are mapped whole")
     if live and workers is not None and workers < len(live):
         raise SettingsError(f"--workers {workers}: {len(live)} live sources need a worker each")
 

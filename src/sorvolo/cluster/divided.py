@@ -37,7 +37,7 @@ class PartFailed(SorvoloError):
 def map_divided(
     key: Key, order: Order, count: int, executor: Executor, cost_of: Callable[[int], Cost], most_tries: int
 ) -> Generator[Progress, None, Ending]:
-    """Map a flight of photos in `count` blocks; yields how far it is.
+    """Map a flight in `count` blocks; yields how far it is.
 
     `order` is that of the whole flight, `cost_of` what a part asks for that crashed so often. Blocks that are whole
     stay until the map is made: the same call goes on with them. The joining is done in this process. Raises SetAside
@@ -70,6 +70,8 @@ def _mapped(order: Order, count: int, parts: "_Parts") -> Generator[Progress, No
     if isinstance(division, AlreadyDone):
         return division.flight, *reported_headline(site, division.flight)
     folder.mkdir(exist_ok=True)
+    if division.is_video and division.chosen() is None:
+        yield from parts.through("frames chosen", [Part(PartKind.FRAMES, 0, 1, str(folder), division.key)], 1)
     waiting = [
         Part(PartKind.BLOCK, number, division.count, str(folder), division.key)
         for number in range(division.count) if not division.is_done(number)
@@ -101,7 +103,7 @@ def _shown(joining: Generator[MosaicUpdate, None, str]) -> Generator[Progress, N
                 update = next(joining)
             except StopIteration as end:
                 return str(end.value)
-            yield "photos joined", update.keyframes, update.keyframes_expected
+            yield "pictures joined", update.keyframes, update.keyframes_expected
 
 
 class _Parts:

@@ -84,7 +84,8 @@ class FlightWish:
 class PartKind(StrEnum):
     """What a part of a flight in blocks is."""
 
-    BLOCK = "block"  # some of its photos, registered
+    FRAMES = "frames"  # those of a video that its map is made of, chosen
+    BLOCK = "block"  # some of its pictures, registered
     TILES = "tiles"  # some of its map's tiles, painted
 
 

@@ -94,14 +94,17 @@ def _done(order: Order, answers: Answers, until: threading.Event) -> tuple[str, 
 
 
 def _block(order: Order, part: Part, alive: Callable[..., None]) -> None:
-    """Register the photos of a block."""
+    """Register the pictures of a block, or choose the frames of a video before its blocks."""
     from sorvolo.missions.flight.settings import MapSettings
-    from sorvolo.missions.map.blocks import Division, map_block
+    from sorvolo.missions.map.blocks import Division, choose_of_video, map_block
 
     wish = order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
     division = Division(Path(part.folder), part.key, part.count)
-    map_block(Path(order.source), wish.camera or None, settings, division, part.number, alive)
+    if part.kind is PartKind.FRAMES:
+        choose_of_video(Path(order.source), wish.camera or None, settings, division, alive)
+    else:
+        map_block(Path(order.source), wish.camera or None, settings, division, part.number, alive)
 
 
 def _tiles(order: Order, part: Part, alive: Callable[..., None]) -> None:
@@ -215,7 +218,7 @@ def _search(order: Order, alive: Callable[..., None], until: threading.Event) ->
     return flight, str(head.get("text", "")), bool(head.get("complete"))
 
 
-_PARTS = {PartKind.BLOCK: _block, PartKind.TILES: _tiles}
+_PARTS = {PartKind.FRAMES: _block, PartKind.BLOCK: _block, PartKind.TILES: _tiles}
 _MISSIONS = {Mission.MAP: _map, Mission.COMPARE: _compare, Mission.SEARCH: _search}
 
 

@@ -1,8 +1,8 @@
-"""A block of a divided flight, mapped apart: its photos, registered with those around them, noted for the joining."""
+"""A block of a divided flight, mapped apart: its pictures, registered with those around them, noted for the joining."""
 
 import hashlib
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import closing
 from dataclasses import dataclass
 from heapq import merge
@@ -11,7 +11,8 @@ from pathlib import Path
 import sorvolo
 from sorvolo.capture.photos import PhotoSource
 from sorvolo.capture.source import Source, opened_sources
-from sorvolo.errors import SettingsError
+from sorvolo.capture.video import VideoSource
+from sorvolo.errors import SettingsError, StoreError
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
@@ -21,6 +22,7 @@ from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.missions.flight.sample_frames import refuse_without_texture
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
+from sorvolo.missions.map.chosen_frames import ChosenFrames, choose_frames, frames_again
 from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken
 from sorvolo.missions.map.planar_run import HORIZON
 from sorvolo.mosaic.division import Block, divide
@@ -36,17 +38,29 @@ from sorvolo.store.site.journal import RunJournal, content_sha256
 from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.flight import LostFrame, PosedFrame
 
-LEAST_PHOTOS = 8
+LEAST_PICTURES = 8
 """Of a block: with fewer its margin is larger than itself."""
 
 
 @dataclass(frozen=True)
 class Division:
-    """A flight divided into `count` blocks, whose files lie in `folder`; `key` is what is asked for of it."""
+    """A flight divided into `count` blocks, whose files lie in `folder`; `key` is what is asked for of it.
+
+    Of a video (`is_video`) the frames that its map is made of are chosen before.
+    """
 
     folder: Path
     key: str
     count: int
+    is_video: bool = False
+
+    def chosen(self) -> ChosenFrames | None:
+        """The chosen frames of a video; None before they are chosen."""
+        return ChosenFrames.at(*self._chosen)
+
+    def keep_chosen(self, frames: ChosenFrames) -> None:
+        """Note the chosen frames of a video."""
+        frames.write(*self._chosen)
 
     def is_done(self, number: int) -> bool:
         """Whether the block of this number is whole."""
@@ -60,12 +74,12 @@ class Division:
         atomic_write_bytes(self._done(number), self.key_of(number).encode())
 
     def journal(self, number: int) -> MapJournal:
-        """What a block notes of its photos, in the flight's order."""
+        """What a block notes of its pictures, in the flight's order."""
         path = self.folder / f"block-{number:04d}.journal"
         return MapJournal(RunJournal(path, self.key_of(number), 0, sorvolo.__version__))
 
     def picture(self, index: int) -> Path:
-        """The file of a photo as the map needs it: undistorted, JPEG."""
+        """The file of a picture as the map needs it: undistorted, JPEG."""
         return self.folder / "pictures" / f"{index:06d}.jpg"
 
     def earlier(self) -> Iterator[Step | FrameDetections]:
@@ -80,6 +94,11 @@ class Division:
         """The same for the same block only."""
         return content_sha256(self.key, self.count, number)
 
+    @property
+    def _chosen(self) -> tuple[Path, str]:
+        """The file of the chosen frames, and its key: the same for any number of blocks."""
+        return self.folder / "chosen.json", content_sha256(self.key)
+
     def _done(self, number: int) -> Path:
         return self.folder / f"block-{number:04d}.done"
 
@@ -88,23 +107,24 @@ def map_block(
     source: Path, camera: Path | str | None, settings: MapSettings, division: Division, number: int,
     alive: Callable[[], None] = lambda: None,
 ) -> int:
-    """Register the photos of one block, noted in the division's folder; how many they are.
+    """Register the pictures of one block, noted in the division's folder; how many they are.
 
     Nothing else is written: no site is needed. Raises InputError or SettingsError for a flight that cannot be divided,
-    StoreError when the disk is full.
+    StoreError when the disk is full or where the frames of a video are not chosen.
     """
     with opened_sources([source], None, camera) as sources:
         setup = prepare_divided(sources[0], settings)
-        if number == 0:
+        if number == 0 and not isinstance(sources[0], VideoSource):
             refuse_without_texture(sources[0])
-        block = divide(_outlines(setup), division.count)[number]
+        pictures = _Pictures.of(setup, division)
+        block = pictures.block(division.count, number)
         division.picture(0).parent.mkdir(parents=True, exist_ok=True)
         detector = open_detector(settings.model)
         finder = None if detector is None else ObjectFinder(detector, setup.source.camera.camera, settings.classes)
         spill = SpillFile(division.folder)
         run = _BlockRun(setup, settings, division, number, block, finder, spill)
         try:
-            for each in _selected(setup, settings, block):
+            for each in pictures.selected(settings, block):
                 run.take(each)
                 alive()
             run.end()
@@ -114,27 +134,37 @@ def map_block(
     return len(block.home)
 
 
+def choose_of_video(
+    source: Path, camera: Path | str | None, settings: MapSettings, division: Division,
+    alive: Callable[[], None] = lambda: None,
+) -> None:
+    """Choose the frames of a video that its map is made of, noted in the division's folder: what its blocks begin with.
+
+    Raises as `map_block` does.
+    """
+    with opened_sources([source], None, camera) as sources:
+        setup = prepare_divided(sources[0], settings)
+        refuse_without_texture(sources[0])
+        division.keep_chosen(choose_frames(setup, settings, alive))
+
+
 def prepare_divided(source: Source, settings: MapSettings) -> FlightSetup:
     """A flight that is to be divided, laid as the first of its site. Raises SettingsError where it cannot be."""
-    if not isinstance(source, PhotoSource):
-        raise SettingsError(
-            f"{source.name} is a video: which of its frames are mapped depends on those before, so it is not divided "
-            "into blocks; run the batch again without --blocks: what is mapped stays, the video is mapped whole"
-        )
     if not source.telemetry.has_fixes:
+        pictures = f"the photos of {source.name} have" if source.kind == "photos" else f"the video {source.name} has"
         raise SettingsError(
-            f"the photos of {source.name} have no GPS, by which they would be divided into blocks; leave --blocks out"
+            f"{pictures} no GPS, by which flights are divided into blocks; leave --blocks out"
         )
     return prepare(source, settings, None, telemetry_named=False)
 
 
-def most_blocks(source: Source) -> int:
+def most_blocks(setup: FlightSetup) -> int:
     """Into how many blocks a flight is divided at most."""
-    return max(1, source.frame_count // LEAST_PHOTOS)
+    return max(1, setup.plan.expected // LEAST_PICTURES)
 
 
 class _BlockRun:
-    """One block on its way through the photos."""
+    """One block on its way through its pictures."""
 
     def __init__(
         self, setup: FlightSetup, settings: MapSettings, division: Division, number: int, block: Block,
@@ -153,7 +183,7 @@ class _BlockRun:
         )
 
     def take(self, each: Selected | LostFrame) -> None:
-        """Register the next photo; one of the block itself is noted, with its picture."""
+        """Register the next picture; one of the block itself is noted, and stored."""
         frame = each if isinstance(each, LostFrame) else each.posed.frame
         is_home = frame.index in self._block.home
         taken, reason = None, each.reason
@@ -169,7 +199,7 @@ class _BlockRun:
         self._keep_detections(waits=False)
 
     def end(self) -> None:
-        """The last photo was taken: the block is whole."""
+        """The last picture was taken: the block is whole."""
         self._keep_detections(waits=True)
         self._journal.file.close()
         self._division.note_done(self._number)
@@ -200,19 +230,54 @@ class _BlockRun:
                 self._journal.keep_detections(seen)
 
 
-def _outlines(setup: FlightSetup) -> list[PointsM]:
-    """Where telemetry has each photo's outline on the ground, (4, 2) site metres; NaN beyond the horizon."""
-    source, track = setup.source, setup.track
-    assert isinstance(source, PhotoSource) and track is not None
-    priors = [
-        track.prior(setup.seconds(each.time_ns), smooth_s=setup.plan.smooth_s) for each in source.album.photos
-    ]
-    return [footprint(source.camera.camera, Pose(each.rotation, each.position_m)) for each in priors]
+@dataclass(frozen=True, eq=False)
+class _Pictures:
+    """The pictures of a flight that is divided, by their numbers and times; `chosen` are those of a video."""
+
+    setup: FlightSetup
+    numbers: Sequence[int]
+    times_ns: Sequence[int]
+    chosen: ChosenFrames | None
+
+    @classmethod
+    def of(cls, setup: FlightSetup, division: Division) -> "_Pictures":
+        """Those of a folder of photos, or those that were chosen of a video."""
+        source = setup.source
+        if isinstance(source, PhotoSource):
+            return cls(setup, range(source.frame_count), [each.time_ns for each in source.album.photos], None)
+        if (chosen := division.chosen()) is None:
+            raise StoreError(f"the frames of {source.name} are not chosen yet; give the same command again")
+        return cls(setup, [each.index for each in chosen.frames], [each.time_ns for each in chosen.frames], chosen)
+
+    def block(self, count: int, number: int) -> Block:
+        """One of `count` blocks of them; empty where so few pictures make fewer blocks."""
+        blocks = divide(self._outlines(), count)
+        if number >= len(blocks):
+            return Block(frozenset(), frozenset())
+        home, margin = (
+            frozenset(self.numbers[each] for each in part) for part in (blocks[number].home, blocks[number].margin)
+        )
+        return Block(home, margin)
+
+    def selected(self, settings: MapSettings, block: Block) -> Iterator[Selected | LostFrame]:
+        """The pictures of a block and around it, in the flight's order."""
+        wanted = block.home | block.margin
+        if self.chosen is None:
+            return _photos(self.setup, settings, wanted)
+        return frames_again(self.setup, [each for each in self.chosen.frames if each.index in wanted])
+
+    def _outlines(self) -> list[PointsM]:
+        """Where telemetry has each picture's outline on the ground, (4, 2) site metres; NaN beyond the horizon."""
+        setup = self.setup
+        assert setup.track is not None
+        priors = [
+            setup.track.prior(setup.seconds(each), smooth_s=setup.plan.smooth_s) for each in self.times_ns
+        ]
+        return [footprint(setup.source.camera.camera, Pose(each.rotation, each.position_m)) for each in priors]
 
 
-def _selected(setup: FlightSetup, settings: MapSettings, block: Block) -> Iterator[Selected | LostFrame]:
-    """The photos of a block and around it, in the flight's order."""
-    wanted = block.home | block.margin
+def _photos(setup: FlightSetup, settings: MapSettings, wanted: Set[int]) -> Iterator[Selected | LostFrame]:
+    """The photos of these numbers, in the flight's order."""
 
     def posed() -> Iterator[PosedFrame | LostFrame]:
         with closing(read_ahead(setup.source.frames(lambda index, _: index in wanted), 1)) as frames:

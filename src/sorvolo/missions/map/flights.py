@@ -3,8 +3,7 @@
 import threading
 import time
 import warnings
-from collections.abc import Generator, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Generator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,14 +11,11 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
-from sorvolo.capture.video import VideoSource
-from sorvolo.capture.video_spans import SparseReading
 from sorvolo.errors import SettingsError, SorvoloWarning
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import check_room
-from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
@@ -37,17 +33,16 @@ from sorvolo.missions.flight.setup import (
 from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.journal import Earlier, MapJournal, Step, begun_journal, go_on_live
 from sorvolo.missions.map.planar_run import PlanarRun
+from sorvolo.missions.map.reader import FrameReader
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
-from sorvolo.mosaic.selection import SelectionSettings, SmallCopies, every, select_keyframes, shows_all_between
+from sorvolo.mosaic.selection import SelectionSettings, select_keyframes
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.survey.area import Area
-from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
+from sorvolo.survey.flight import Frame, LostFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
-
-_AHEAD = 2  # decoded frames that wait to be placed
 
 
 def map_flights(
@@ -152,9 +147,9 @@ def _map_one(
             yield update(step, ended, step.index + 1)
         before.search(run.is_unsearched)
         selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
-        reader = _Reader(setup, before, selection if settings.method == "planar" else None)
+        reader = FrameReader(setup, before, selection if settings.method == "planar" else None)
         selected = select_keyframes(
-            reader.posed(run), selection,
+            reader.posed(run.look), selection,
             keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
             inside=setup.inside(area), memory=before.memory, small=reader.small,
         )
@@ -182,58 +177,3 @@ def _begun(
         return ThesisRun(setup, archive, settings, finder, MapJournal(file), request)
     journal = MapJournal(file, SourceNotes(file, source, samples) if isinstance(source, LiveSource) else None)
     return PlanarRun(setup, archive, settings, finder=finder, journal=journal, request=request, coverage=coverage)
-
-
-class _Reader:
-    """Reads a flight's frames after those of a killed run; of these only the ones that are needed again.
-
-    Of a recorded video it decodes the key frames of the stream, and what lies between them where that is needed by
-    `selection`; None: every frame.
-    """
-
-    def __init__(self, setup: FlightSetup, before: Earlier, selection: SelectionSettings | None) -> None:
-        self._setup, self._before, self._selection = setup, before, selection
-        self._is_candidate = every(setup.plan.step_s)
-        self.small = SmallCopies()
-        self.read = 0
-
-    def posed(self, run: FlightRun) -> Iterator[PosedFrame | LostFrame]:
-        """The frames to select from."""
-        for each in self._frames():
-            is_new = each.index > self._before.last
-            if is_new:
-                self.read = each.index + 1
-            if isinstance(each, LostFrame):
-                if is_new:
-                    yield each
-                continue
-            posed = PosedFrame(each, self._setup.prior(each, first=each.index == 0))
-            if is_new:
-                yield posed
-            else:
-                run.look(posed)
-
-    def _frames(self) -> Generator[Frame | LostFrame]:
-        """Those of a recorded flight are decoded while those before them are placed: photos by their source."""
-        source = self._setup.source
-        if isinstance(source, LiveSource) or source.kind == "photos":
-            yield from source.frames(self._is_wanted)
-            return
-        if isinstance(source, VideoSource) and self._selection is not None:
-            frames = source.frames(
-                self._is_wanted, SparseReading(self._setup.plan.step_s, self._is_needed, self._is_enough)
-            )
-        else:
-            frames = source.frames(self._is_wanted)
-        with closing(read_ahead(frames, _AHEAD)) as ahead:
-            yield from ahead
-
-    def _is_wanted(self, index: int, time_ns: int) -> bool:
-        return self._is_candidate(index, time_ns) and self._is_needed(index, time_ns)
-
-    def _is_needed(self, index: int, _time_ns: int) -> bool:
-        return index > self._before.last or index in self._before.needed
-
-    def _is_enough(self, before: Frame, after: Frame) -> bool:
-        assert self._selection is not None
-        return shows_all_between(self.small.of(before), self.small.of(after), self._selection)

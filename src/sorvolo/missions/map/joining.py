@@ -1,11 +1,12 @@
 """The blocks of a divided flight joined into one map: one graph of all links, solved as if one machine had done it."""
 
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
 
-from sorvolo.capture.source import opened_sources
+from sorvolo.capture.source import Source, opened_sources
+from sorvolo.capture.video import VideoSource
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, open_detector
@@ -13,11 +14,13 @@ from sorvolo.missions.flight.request import AlreadyDone, already_done, request_o
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, repeated
 from sorvolo.missions.map.blocks import Division, most_blocks, prepare_divided
+from sorvolo.missions.map.chosen_frames import ChosenFrames
 from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.journal import MapJournal, Step, begun_journal
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.tile_shares import PaintsElsewhere
 from sorvolo.store.site.archive import Archive
+from sorvolo.survey.flight import Notice
 from sorvolo.survey.mosaic import MosaicUpdate, Status
 
 
@@ -38,17 +41,17 @@ def plan_blocks(
             if (mapped := already_done(archive, setup, request)) is not None:
                 return mapped
             check_room(setup, archive.folder, settings.m_per_px)
-        return Division(folder, request, min(count, most_blocks(sources[0])))
+        return Division(folder, request, min(count, most_blocks(setup)), isinstance(sources[0], VideoSource))
 
 
 def join_blocks(
     source: Path, site: Path, settings: MapSettings, camera: Path | str | None, division: Division,
     elsewhere: PaintsElsewhere,
 ) -> Generator[MosaicUpdate, None, str]:
-    """Make one map of a flight's blocks, an update for each photo; the flight's name in the site.
+    """Make one map of a flight's blocks, an update for each picture; the flight's name in the site.
 
     All links go into one graph, which is solved as a whole; `elsewhere` paints the tiles. Raises InputError when no
-    photo has a place, StoreError where blocks are missing; the site then stays as it was.
+    picture has a place, StoreError where blocks are missing; the site then stays as it was.
     """
     started_s = time.monotonic()
     looks = open_detector(settings.model)
@@ -57,6 +60,8 @@ def join_blocks(
         setup = prepare_divided(sources[0], settings)
         setup = replace(setup, notices=(*setup.notices, *repeated(archive, setup.source.name, "mapped")))
         _demand_new(archive, setup)
+        chosen = division.chosen()
+        count = setup.source.frame_count if chosen is None else len(chosen.frames)
         finder = None if looks is None else ObjectFinder(looks, setup.source.camera.camera, settings.classes)
         journal = MapJournal(begun_journal(setup, archive, division.key, anew=True))
         coverage = FlightCoverage(setup, archive, None, (), settings.live_s)
@@ -72,16 +77,24 @@ def join_blocks(
                     continue
                 if each.memory is None:
                     lost.add(each.index)
-                yield _update(run, each, _joined(run, each, division), setup, started_s)
-            if run.selected != setup.source.frame_count:
+                yield _update(run, each, _joined(run, each, division), setup, count, started_s)
+            if run.selected != count:
                 raise StoreError(
-                    f"the blocks of {setup.source.name} hold {run.selected} of its {setup.source.frame_count} photos; "
-                    "give the same command again"
+                    f"the blocks of {setup.source.name} hold {run.selected} of its {count} pictures; give the same "
+                    "command again"
                 )
-            for _ in setup.source.frames(lambda index, _: index in lost):
-                pass  # the source counts the photos that it cannot read
-            run.finish(setup.source.notices(), started_s)
+            run.finish(_found_in(setup.source, lost, chosen), started_s)
         return setup.source.name
+
+
+def _found_in(source: Source, lost: Set[int], chosen: ChosenFrames | None) -> Sequence[Notice]:
+    """What was found in the flight's files; `lost` are the photos that could not be read."""
+    if isinstance(source, VideoSource) and chosen is not None:
+        source.reading = chosen.reading
+        return chosen.notices
+    for _ in source.frames(lambda index, _: index in lost):
+        pass  # the source counts them
+    return source.notices()
 
 
 def _demand_new(archive: Archive, setup: FlightSetup) -> None:
@@ -100,10 +113,9 @@ def _joined(run: PlanarRun, step: Step, division: Division) -> tuple[Status, str
 
 
 def _update(
-    run: PlanarRun, step: Step, ended: tuple[Status, str], setup: FlightSetup, started_s: float
+    run: PlanarRun, step: Step, ended: tuple[Status, str], setup: FlightSetup, count: int, started_s: float
 ) -> MosaicUpdate:
-    count = setup.source.frame_count
     return MosaicUpdate(
-        step.name, *ended, step.index + 1, count, run.selected, count, run.by_vision, 0, time.monotonic() - started_s,
-        run.view(step.index, step.time_ns),
+        step.name, *ended, step.index + 1, setup.source.frame_count, run.selected, count, run.by_vision, 0,
+        time.monotonic() - started_s, run.view(step.index, step.time_ns),
     )
