@@ -7,7 +7,7 @@ mission, with a watch, and with a map mission and many viewers. Times run from t
 picture (the camera's own delay is not in it) to
 
 - the tile at the frame's centre, fetched and whole, from the first announced map that has the frame in it;
-- the frame's boxes, received beside the video;
+- the frame's boxes, and how the picture moved to it, received beside the video;
 - the picture itself, received by a viewer.
 
 Then the flight is sent ten times (--soak), as fast as the link takes it: the station's memory and open files after
@@ -69,6 +69,7 @@ class Seen:
     zero_ns: int = 0  # UTC of the flight's zero
     pictures: list[tuple[float, float]] = field(default_factory=list)  # taken, delay
     boxes: list[tuple[float, float]] = field(default_factory=list)
+    motion: list[tuple[float, float]] = field(default_factory=list)
     map: list[tuple[float, float]] = field(default_factory=list)
     tiles_s: list[float] = field(default_factory=list)
     announced: dict[str, float] = field(default_factory=dict)  # when each revision of the map was heard of
@@ -164,6 +165,7 @@ def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: A
         "frame_to_map_tile": delays(seen.map), "frame_to_map_tile_running": delays(running(seen.map)),
         "tile_fetch": figures(seen.tiles_s),
         "frame_to_boxes": delays(seen.boxes), "frame_to_boxes_running": delays(running(seen.boxes)),
+        "frame_to_motion": delays(seen.motion), "frame_to_motion_running": delays(running(seen.motion)),
     }
 
 
@@ -210,14 +212,14 @@ async def followed(
 
 
 async def viewed(url: str, seen: Seen) -> None:
-    """A viewer: when each picture and each frame's boxes came."""
+    """A viewer: when each picture, each frame's boxes and its motion came."""
     with suppress(ConnectionClosed):
         async with connect(f"ws{url[4:]}/api/streams/{_STREAM}/video", max_size=20_000_000, compression=None) as link:
             async for item in link:
                 if isinstance(item, bytes):
                     note(seen.pictures, seen.taken_s.get(int.from_bytes(item[:8], "big", signed=True)))
-                elif (words := json.loads(item))["type"] == "boxes":
-                    note(seen.boxes, seen.taken_s.get(words["pts_us"]))
+                elif (words := json.loads(item))["type"] in ("boxes", "motion"):
+                    note(seen.boxes if words["type"] == "boxes" else seen.motion, seen.taken_s.get(words["pts_us"]))
 
 
 async def heard(url: str, seen: Seen) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.survey.objects import Detections
+from sorvolo.tracking.picture_steps import PictureStep
 
 _LIVE = LiveSettings(silent_s=1.0, give_up_s=1.5, first_s=15.0)
 _M_PER_PX = 2 * 60.0 * np.tan(np.radians(31.0)) / 160  # of the drone that live_sender flies
@@ -75,3 +77,26 @@ def test_the_newest_frames_are_searched_and_the_rest_is_counted(tmp_path: Path) 
 
     with sending(udp_url(port), image=_scene, count=RATE), pytest.raises(StoreError, match="which stays"):
         list(watch(address, outputs=outputs, detector=detector, live=_LIVE))
+
+
+def _textured(index: int) -> Any:
+    """Ground that moves two pixels down with every frame."""
+    noise = np.random.default_rng(5).integers(0, 130, (100, 40), np.uint8)
+    return np.dstack([np.roll(cv2.resize(noise, (160, 400)), 2 * index, axis=0)[:96]] * 3)
+
+
+def test_how_the_picture_moves_is_known_between_the_frames_that_are_searched(tmp_path: Path) -> None:
+    port = free_port()
+    steps: list[PictureStep] = []
+    address, outputs = f"udp://127.0.0.1:{port}", WatchOutputs(folder=tmp_path / "watch")
+    with sending(udp_url(port), klv=True, image=_textured, count=3 * RATE):
+        updates = list(watch(address, outputs=outputs, detector=_SlowDetector(), live=_LIVE, moved=steps.append))
+    assert len(steps) > 8
+    for step in steps:
+        frames = (step.to_ns - step.from_ns) * RATE / 1e9
+        assert frames == pytest.approx(2, abs=0.1)  # a tenth of a second, of twenty frames
+        assert step.to_from[:2, 2] == pytest.approx([0, 2 * frames], abs=0.6)
+        assert step.to_from[:2, :2] == pytest.approx(np.eye(2), abs=0.02)
+    assert all(later.from_ns == step.to_ns for step, later in pairwise(steps))
+    # on the clock of the updates, so that boxes can follow
+    assert steps[0].from_ns <= updates[-1].time_ns and updates[1].time_ns <= steps[-1].to_ns

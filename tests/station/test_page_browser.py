@@ -590,8 +590,85 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
             "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, 40, 20, 30]}],
         })
         page.locator("aside.video footer", has_text="1 in the picture").wait_for()
+        assert columns_drawn(page)[0] == pytest.approx(39, abs=2)
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
     page.locator(".delay", has_text="ended").wait_for()
+
+
+def columns_drawn(page: Any) -> tuple[int, int]:
+    """The first and last column of the overlay in which something is drawn, below the boxes' labels."""
+    first, last = page.locator("aside.video canvas.boxes").evaluate("""each => {
+      const copy = new OffscreenCanvas(each.width, each.height).getContext('2d', {willReadFrequently: true});
+      copy.drawImage(each, 0, 0);
+      const {data} = copy.getImageData(0, 50, each.width, 15);
+      const columns = [...Array(data.length / 4).keys()].filter(n => data[4 * n + 3] > 60).map(n => n % each.width);
+      return [Math.min(...columns), Math.max(...columns)];
+    }""")
+    return first, last
+
+
+def test_boxes_follow_the_picture_until_it_is_looked_at_again(
+    served: Served, opened: Watched, tmp_path: Path
+) -> None:
+    page = opened.page
+    messages = units(write_video(tmp_path / "v.mp4"), "h264")
+    hello = Message(Kind.HELLO, 0, 0, Hello("c" * 16, "h264", 160, 120, 10.0).to_json().encode())
+    with connect(f"{served.url.replace('http', 'ws')}/api/ingest/scout") as drone:
+        drone.send(hello.to_bytes())
+        drone.recv()
+        for each in messages:
+            drone.send(each.to_bytes())
+        page.locator("aside.video").wait_for()
+        expect(page.locator(".delay")).to_have_text(re.compile("behind"))
+        last_us = max(each.pts_us for each in messages if each.kind is Kind.VIDEO)
+        note, loop = served.station.ingest.hub("scout").note, served.station.ingest._loop
+        boxes = {
+            "type": "boxes", "pts_us": last_us - 1_000_000, "frame_size_px": [160, 120],
+            "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, 40, 20, 30]}],
+        }
+        loop.call_soon_threadsafe(note, boxes)
+        page.locator("aside.video footer", has_text="1 in the picture 1 s ago").wait_for()
+        assert columns_drawn(page) == pytest.approx((39, 61), abs=2)
+        for number in range(9):  # 5 px a step; the last 0.1 s are not known yet
+            from_us = last_us - 1_000_000 + 100_000 * number
+            loop.call_soon_threadsafe(note, {
+                "type": "motion", "from_us": from_us, "pts_us": from_us + 100_000,
+                "to_from": [1, 0, 5, 0, 1, 0, 0, 0, 1],
+            })
+        loop.call_soon_threadsafe(note, boxes)
+        page.locator("aside.video footer", has_text="1 in the picture, seen 1 s ago").wait_for()
+        assert columns_drawn(page) == pytest.approx((89, 111), abs=2)
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+
+
+def test_how_far_the_picture_moved_between_two_of_its_times(served: Served, opened: Watched) -> None:
+    ways = opened.page.evaluate("""async () => {
+      const {PictureMotion} = await import('/page/picture_motion.js');
+      const motion = new PictureMotion();
+      const step = (from_us, pts_us, x, scale = 1) => motion.take({
+        from_us, pts_us, to_from: [scale, 0, x, 0, scale, 0, 0, 0, 1],
+      });
+      const look = (pts_us, x) => ({
+        pts_us, frame_size_px: [100, 100], boxes: [{class: 'car', xywh_px: [x, 40, 10, 20]}],
+      });
+      const carried = (...asked) => motion.carried(...asked)?.map(({xywh_px}) => xywh_px) ?? null;
+      const unknown = carried(look(0, 10), 100000);
+      step(100000, 200000, 10); step(200000, 300000, 20); step(500000, 600000, 0, 1.5);
+      return {
+        unknown,
+        chain: carried(look(100000, 10), 300000), part: carried(look(150000, 10), 250000),
+        back: carried(look(300000, 40), 100000),
+        gap: carried(look(100000, 10), 600000), grown: carried(look(500000, 10), 600000),
+        gone: carried(look(200000, 90), 300000), far: carried(look(500000, 1), 1900000),
+        anew: (step(0, 100000, 7), carried(look(0, 10), 100000)), ahead: carried(look(100000, 10), 300000),
+      };
+    }""")
+    assert {name: way and [[round(each, 3) for each in box] for box in way] for name, way in ways.items()} == {
+        "unknown": None, "chain": [[40, 40, 10, 20]], "part": [[25, 40, 10, 20]], "back": [[10, 40, 10, 20]],
+        "gap": None, "grown": [[15, 60, 15, 30]], "gone": [], "far": None,
+        # the stream began anew: the old steps are gone, and its last one goes on for a while
+        "anew": [[17, 40, 10, 20]], "ahead": [[24, 40, 10, 20]],
+    }
 
 
 def test_a_camera_s_address_shows_its_video(served: Served, opened: Watched) -> None:

@@ -210,25 +210,30 @@ def length_of_ground(page: Any) -> float:
 
 
 def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, flown: Path, tmp_path: Path) -> None:
-    async def watch() -> tuple[list[int], list[dict[str, Any]]]:
-        pictures, boxes = [], []
+    async def watch() -> tuple[list[int], list[dict[str, Any]], list[dict[str, Any]]]:
+        pictures, boxes, motion = [], [], []
         async with connect(f"{station.url.replace('http', 'ws')}/api/streams/scout/video") as socket:
             flying.start()
-            while not boxes:
+            while not (boxes and motion):
                 item = await asyncio.wait_for(socket.recv(), 60)
                 if isinstance(item, str):
-                    boxes += [words for words in [json.loads(item)] if words["type"] == "boxes"]
+                    words = json.loads(item)
+                    boxes += [words] * (words["type"] == "boxes")
+                    motion += [words] * (words["type"] == "motion")
                     continue
                 pictures.append(int.from_bytes(item[:8], "big"))
                 if len(pictures) == 2:
                     await asyncio.to_thread(station.ask, "/api/runs", {
                         "mission": "watch", "site": "new", "input": {"stream": "scout"}, "options": {},
                     })
-        return pictures, boxes
+        return pictures, boxes, motion
 
     drone = sending(footage_of(flown), station, tmp_path / "spool", speed=0.3)
     flying = threading.Thread(target=drone.run, daemon=True)
-    pictures, boxes = asyncio.run(watch())
+    pictures, boxes, motion = asyncio.run(watch())
     flying.join(60)
     assert boxes and min(abs(boxes[0]["pts_us"] - each) for each in pictures) < 1000
+    for each in ("from_us", "pts_us"):  # how the picture moved, so that the boxes can follow it
+        assert min(abs(motion[0][each] - picture) for picture in pictures) < 1000
+    assert motion[0]["from_us"] < motion[0]["pts_us"] and len(motion[0]["to_from"]) == 9
     assert boxes[0]["frame_size_px"] == [320, 180]

@@ -101,7 +101,7 @@ class Station:
         inputs = Inputs(settings, uploads, ingest.newest)
         return cls(
             settings, state, shelf, tiles, events, SiteCollections(shelf, findings), reviews, ingest, uploads, inputs,
-            Runs(settings, state, shelf, events, inputs, ingest.show_boxes), MapWatch(shelf, tiles, reviews, events),
+            Runs(settings, state, shelf, events, inputs, ingest.show), MapWatch(shelf, tiles, reviews, events),
             FlightVideos(inputs), PlaceIndex(shelf), findings, lock,
         )
 

@@ -25,6 +25,7 @@ from sorvolo.station.messages import (
     message_from_bytes,
     sample_from_json,
 )
+from sorvolo.station.orders import BOXES, MOTION
 from sorvolo.station.problems import Problem
 from sorvolo.station.transport_stream import FlightFile
 from sorvolo.station.video import VideoHub
@@ -33,6 +34,7 @@ from sorvolo.store.atomic import atomic_write_bytes
 REFUSED_CODE, BUSY_CODE = 4400, 4503
 """WebSocket close codes: trying again is no use; try again later."""
 
+_SHOWN_AS = {BOXES: "boxes", MOTION: "motion"}  # the messages of a mission's lines, beside the video
 _LIVE_NS = 60_000_000_000  # telemetry that is so old was recorded
 _MOST_REASON_BYTES = 120  # a close frame holds 123
 
@@ -171,17 +173,18 @@ class Ingest:
         if not any((self._folder / stream).iterdir()):
             (self._folder / stream).rmdir()
 
-    def show_boxes(self, found: Mapping[str, Any]) -> None:
-        """Give a mission's detections in one frame to whoever watches the stream; from any thread.
+    def show(self, kind: str, found: Mapping[str, Any]) -> None:
+        """Give what a mission found in one frame, BOXES or MOTION, to whoever watches the stream; from any thread.
 
-        Their time is UTC; the pictures' own times count from the flight's zero, which telemetry ties to UTC.
+        Their times are UTC; the pictures' own times count from the flight's zero, which telemetry ties to UTC.
         """
         stream = str(found.get("stream") or "")
         flight, hub, loop = self._flights.get(stream), self._hubs.get(stream), self._loop
         if flight is None or hub is None or loop is None or flight.zero_us is None or not hub.viewers:
             return
-        pts_us = round(datetime.fromisoformat(str(found["time"])).timestamp() * 1e6) - flight.zero_us
-        words = {**found, "type": "boxes", "pts_us": pts_us}
+        words = {**found, "type": _SHOWN_AS[kind], "pts_us": _utc_us(found["time"]) - flight.zero_us}
+        if kind == MOTION:
+            words["from_us"] = _utc_us(found["from_time"]) - flight.zero_us
         try:
             loop.call_soon_threadsafe(hub.note, words)
         except RuntimeError:  # the loop was closed: nobody watches any more
@@ -405,6 +408,10 @@ def open_flight(folder: Path, hello: Hello) -> Flight:
         return Flight(found, hello)
     except OSError as error:
         raise StoreError(f"cannot use {folder} ({error.strerror or error}); check the disk") from error
+
+
+def _utc_us(text: Any) -> int:
+    return round(datetime.fromisoformat(str(text)).timestamp() * 1e6)
 
 
 def _is_now(sample: Sample) -> bool:

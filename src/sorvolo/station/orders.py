@@ -15,8 +15,9 @@ from sorvolo.store.atomic import atomic_write_bytes
 ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = "order.json", "journal.jsonl", "log.txt", "running.lock"
 """The files of a run's folder: what it is to do, what it did line by line, what it printed, who is at it."""
 
-BOXES = "frame.boxes"
-"""The type of a journal's line for what was detected in one frame."""
+BOXES, MOTION = "frame.boxes", "frame.motion"
+"""The types of a journal's lines for what was detected in one frame, and how the picture moved since another: both are
+shown with the video, and not kept as events."""
 
 LOCK_VARIABLE = "SORVOLO_RUN_LOCK"
 """Of the environment of a run's process: the number of its lock's descriptor, which its own children must not have."""

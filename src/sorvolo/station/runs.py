@@ -31,6 +31,7 @@ from sorvolo.station.orders import (
     LOCK_FILE,
     LOCK_VARIABLE,
     LOG_FILE,
+    MOTION,
     ORDER_FILE,
     SOURCE_VARIABLE,
     TO_CHECK,
@@ -89,9 +90,9 @@ class Runs:
 
     def __init__(
         self, settings: StationSettings, state: StationState, shelf: SiteShelf, events: EventLog, inputs: Inputs,
-        show_boxes: Callable[[Mapping[str, Any]], None] = lambda _: None,
+        show: Callable[[str, Mapping[str, Any]], None] = lambda *_: None,
     ) -> None:
-        self._show_boxes = show_boxes
+        self._show = show
         self._settings, self._state, self._shelf, self._events, self._inputs = settings, state, shelf, events, inputs
         self._folder = settings.state_folder / RUNS_FOLDER
         self._lock = threading.RLock()
@@ -325,8 +326,8 @@ class Runs:
         """The run after lines of its journal, and the events that they become."""
         events = []
         for line in lines:
-            if line["type"] == BOXES:  # ten a second: shown with the video, not kept
-                self._show_boxes(line["data"])
+            if line["type"] in (BOXES, MOTION):  # ten a second: shown with the video, not kept
+                self._show(line["type"], line["data"])
                 continue
             run, event = _taken(run, line)
             events.append(event)

@@ -10,8 +10,9 @@ import threading
 import time
 import traceback
 from collections.abc import Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.station.camera import camera_opened
 from sorvolo.station.collections import on_earth
 from sorvolo.station.incomplete import cut_off, unsent
-from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, TO_CHECK, Order
+from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, MOTION, TO_CHECK, Order
 from sorvolo.station.orphan_watch import ended_when_orphaned
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
@@ -40,6 +41,7 @@ from sorvolo.survey.wording import counted_list
 
 if TYPE_CHECKING:
     from sorvolo.missions.watch.run import WatchUpdate
+    from sorvolo.tracking.picture_steps import PictureStep
 
 FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
 """The types of a journal's last line."""
@@ -51,17 +53,19 @@ _WRONG, _STOPPED_CODE = 1, 130
 
 
 class Journal:
-    """The lines of a run: a JSON object each, whole once it can be read. Only `add` changes it."""
+    """The lines of a run: a JSON object each, whole once it can be read. Only `add` changes it; from any thread."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab")
+        self._adding = threading.Lock()
         self._progress_s = -1e9
 
     def add(self, kind: str, data: Mapping[str, Any]) -> None:
         """Append one line and hand it to the operating system."""
         line = json.dumps({"type": kind, "data": plain_json(data)}, ensure_ascii=False, allow_nan=False)
-        self._file.write(line.encode() + b"\n")
-        self._file.flush()
+        with self._adding:
+            self._file.write(line.encode() + b"\n")
+            self._file.flush()
 
     def progress(self, data: Mapping[str, Any], *, always: bool = False) -> None:
         """How far the run is, a few times a second at most."""
@@ -204,6 +208,7 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
     updates = watch(
         order.source, settings, WatchOutputs(Path(order.folder)), telemetry=order.telemetry or None,
         camera=order.camera or None, live=_live(order), until=until,
+        moved=partial(_moved, journal, order.stream) if order.stream else None,
     )
     with closing(updates):
         for update in updates:
@@ -292,6 +297,15 @@ def _seen(journal: Journal, update: "WatchUpdate", stream: str) -> None:
         return
     for feature in tracks_collection(list(update.new), update.site, {})["features"]:
         journal.add("object.found", {"feature": feature, "is_local": update.site.is_local})
+
+
+def _moved(journal: Journal, stream: str, step: "PictureStep") -> None:
+    """Write how the picture moved since a tenth of a second before; in the thread that reads the stream."""
+    with suppress(OSError):  # a disk that is full: the mission's own next line states it
+        journal.add(MOTION, {
+            "stream": stream, "from_time": utc_text(step.from_ns), "time": utc_text(step.to_ns),
+            "to_from": [float(f"{each:.9g}") for each in step.to_from.ravel()],
+        })
 
 
 def _map_progress(update: MosaicUpdate) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, PointsPx
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsPx
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import Detections, Sighting
 
@@ -182,20 +182,31 @@ def _followed(
     """Points found again, (M, 2), and their places; those that lead elsewhere on the way back are left out."""
     if len(last.points_px) < settings.least_inliers:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    start = last.points_px.astype(np.float32).reshape(-1, 1, 2)
+    end, good = followed_points(last.gray, gray, last.points_px, settings, step_px)
+    return end[good], last.places_px[good]
+
+
+def followed_points(
+    last: ImageGray, gray: ImageGray, points_px: PointsPx, settings: FlowSettings, step_px: Floats | None = None
+) -> tuple[PointsPx, Mask]:
+    """Where points (N, 2) of one small picture lie in another, and which (N,) lead back to where they came from.
+
+    `step_px` (2,) is how far the picture as a whole has moved, where that is known.
+    """
+    start = points_px.astype(np.float32).reshape(-1, 1, 2)
     step = np.zeros(2, np.float32) if step_px is None else step_px.astype(np.float32)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     end, there, _ = cv2.calcOpticalFlowPyrLK(
-        last.gray, gray, start, start + step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
+        last, gray, start, start + step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
         flags=flags,
     )
     back, again, _ = cv2.calcOpticalFlowPyrLK(
-        gray, last.gray, end, end - step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
+        gray, last, end, end - step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
         flags=flags,
     )
     miss = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
     good = (there.ravel() == 1) & (again.ravel() == 1) & (miss < settings.there_and_back_px)
-    return end.reshape(-1, 2)[good].astype(np.float64), last.places_px[good]
+    return end.reshape(-1, 2).astype(np.float64), good
 
 
 def _whole_step(last: ImageGray, gray: ImageGray) -> Floats:

@@ -31,7 +31,7 @@ from sorvolo.capture.sync import DATED_NS
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, TimesNs
+from sorvolo.geometry.arrays import Floats, ImageGray, TimesNs
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
 _HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is their delay known
@@ -42,6 +42,7 @@ _CLOCKS_AGREE_NS = 5_000_000_000
 _DELAYS_KEPT = 60
 _ZOOMED = 0.03
 _POLL_S = 0.25
+_TIMELY_NS = 5_000_000  # a frame so little before its turn is taken: the next one comes a whole frame later
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,27 @@ class _Held:
     decoded: av.VideoFrame
     stamp_ns: int
     arrived_s: float
+
+
+class _Glance:
+    """Gives a small copy of a frame every so often. Only `show` changes it, in the reading thread."""
+
+    def __init__(self, every_ns: int, width_px: int, take: Callable[[int, ImageGray], None]) -> None:
+        self._every_ns, self._width_px, self._take = every_ns, width_px, take
+        self._next_ns = 0
+
+    def show(self, time_ns: int, decoded: av.VideoFrame, size_px: tuple[int, int]) -> None:
+        """A decoded frame, as the flight's frames of this width and height show it."""
+        if self._next_ns - self._every_ns <= time_ns < self._next_ns:
+            return
+        self._next_ns = time_ns + self._every_ns - _TIMELY_NS
+        width_px = min(self._width_px, size_px[0])
+        height_px = max(1, round(width_px * size_px[1] / size_px[0]))
+        try:
+            gray = decoded.reformat(width_px, height_px, "gray", interpolation="AREA").to_ndarray()
+        except (av.FFmpegError, ValueError, MemoryError):
+            return  # a damaged frame, which is counted where it is asked for
+        self._take(time_ns, np.ascontiguousarray(gray, np.uint8))
 
 
 class LiveStream:
@@ -96,6 +118,7 @@ class LiveStream:
         self._wanted: Callable[[int, int], bool] | None = None
         self._is_asked = threading.Event()
         self._asking = threading.Lock()  # `wanted` is asked of one frame after the other
+        self._glance: _Glance | None = None
         self._count = self._resized = self._lost = self._zooms = 0
         self._arrived_s = time.monotonic()
         self._size_px = (0, 0)
@@ -272,6 +295,13 @@ class LiveStream:
         finally:
             self.close()
 
+    def glance(self, every_s: float, width_px: int, take: Callable[[int, ImageGray], None]) -> None:
+        """From now on give a small gray copy of a frame so often, with its time, in the thread that reads the stream.
+
+        Whether or not the frame itself is asked for: a mission knows how the picture moves while it looks at another.
+        """
+        self._glance = _Glance(round(every_s * 1e9), width_px, take)
+
     def close(self) -> None:
         """End the stream and let go of the link; harmless when done already."""
         self._closing.set()
@@ -407,6 +437,8 @@ class LiveStream:
         time_ns = self._clock.frame_utc_ns(held.stamp_ns)
         if self._is_file:
             self._is_asked.wait()
+        if self._glance is not None:
+            self._glance.show(time_ns + self._later_ns, held.decoded, self._size_px)
         with self._asking:
             is_passed_over = self._wanted is None and not self._settings.keeps_all
             if is_passed_over or self._closing.is_set():

@@ -8,9 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource, Source, open_sources
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageGray
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.live_journal import SourceNotes
@@ -20,12 +22,13 @@ from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.ground_height import over_heights
 from sorvolo.missions.watch.journal import StoppedWatch, WatchJournal, WatchOrder
 from sorvolo.missions.watch.places import Places, places_of
-from sorvolo.missions.watch.run import WatchRun, WatchUpdate
+from sorvolo.missions.watch.run import WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
 from sorvolo.store.exports.cursor_on_target import COT_TYPES
 from sorvolo.store.exports.detection_files import claimed_folder
 from sorvolo.survey.flight import Frame, LostFrame
+from sorvolo.tracking.picture_steps import SMALL_WIDTH_PX, STEP_S, PictureStep, PictureSteps
 
 _AHEAD = 4  # decoded frames that wait for the detector
 _STOPPED = "stopped on demand"
@@ -35,6 +38,7 @@ def watch(
     source: Path | str, settings: WatchSettings = WatchSettings(), outputs: WatchOutputs = WatchOutputs(), *,  # noqa: B008 (frozen)
     telemetry: Path | str | None = None, camera: Path | str | None = None, detector: ObjectDetector | None = None,
     live: LiveSettings = LiveSettings(), until: threading.Event | None = None,  # noqa: B008 (frozen)
+    moved: Callable[[PictureStep], None] | None = None,
 ) -> Generator[WatchUpdate]:
     """Search a flight, yielding an update for each frame searched.
 
@@ -43,6 +47,9 @@ def watch(
     wanted frame of a recorded flight is searched; of a live one, read with the settings `live`, the newest, so that
     latency stays bounded, and the others are counted. Objects are placed on the ground where telemetry allows it, else
     followed in the picture.
+
+    `moved` is given how the picture of a live video moved, ten times a second of flight, in the thread that reads it:
+    while a frame is searched, its last boxes can follow the picture (see `PictureSteps`). Times are those of updates.
 
     A watch that was killed goes on where it was when the same is asked for again, with a live stream within
     `live.same_flight_s`: what was found is not searched for again, and alerts that were sent are not sent again.
@@ -64,7 +71,7 @@ def watch(
             goes_on = order.go_on_live(each, live.same_flight_s) if isinstance(each, LiveSource) else None
             folder = _folder_of(each, outputs, is_only=len(sources) == 1) if goes_on is None else goes_on.folder
             yield from _watch_one(
-                each, WatchOrder(settings, replace(outputs, folder=folder), finder), folder, goes_on, until,
+                each, WatchOrder(settings, replace(outputs, folder=folder), finder), folder, goes_on, until, moved,
                 telemetry_named=telemetry is not None,
             )
 
@@ -105,8 +112,8 @@ def _demand_known_classes(detector: ObjectDetector, settings: WatchSettings, out
 
 
 def _watch_one(
-    source: Source, order: WatchOrder, folder: Path, goes_on: StoppedWatch | None, until: threading.Event, *,
-    telemetry_named: bool,
+    source: Source, order: WatchOrder, folder: Path, goes_on: StoppedWatch | None, until: threading.Event,
+    moved: Callable[[PictureStep], None] | None, *, telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
     settings, outputs, detector = order.settings, order.outputs, order.detector
     setup, places = _prepared(source, order, telemetry_named=telemetry_named)
@@ -116,6 +123,8 @@ def _watch_one(
     ):
         for searched in journal.frames() if goes_on is not None else ():
             yield run.recall(searched)
+        if moved is not None and isinstance(source, LiveStream):
+            _give_steps(source, setup, moved)
         ended = _STOPPED
         try:
             first = 0 if goes_on is None else goes_on.next_index
@@ -130,6 +139,18 @@ def _watch_one(
                 run.finish(ended=ended, skipped=source.skipped if isinstance(source, LiveSource) else 0)
         if ended != _STOPPED:
             _demand_searched(run, source)
+
+
+def _give_steps(source: LiveStream, setup: FlightSetup, moved: Callable[[PictureStep], None]) -> None:
+    """Have a live video compared with itself a tenth of a second before, while its frames are searched."""
+    steps = PictureSteps()
+
+    def compare(time_ns: int, gray: ImageGray) -> None:
+        step = steps.add(utc_ns(setup, time_ns), gray, source.size_px[0])
+        if step is not None:
+            moved(step)
+
+    source.glance(STEP_S, SMALL_WIDTH_PX, compare)
 
 
 def _demand_searched(run: WatchRun, source: Source) -> None:

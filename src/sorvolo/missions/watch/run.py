@@ -68,6 +68,12 @@ class WatchUpdate:
     is_resumed: bool
 
 
+def utc_ns(setup: FlightSetup, frame_ns: int) -> int:
+    """A frame's UTC by telemetry's clock; by its own where telemetry's was never set."""
+    time_ns = setup.utc_ns(frame_ns)
+    return time_ns if time_ns >= DATED_NS else frame_ns
+
+
 @dataclass(frozen=True, eq=False)
 class _Tracks:
     """The confirmed tracks after a frame, those that it shows, and those that it confirmed."""
@@ -153,7 +159,7 @@ class WatchRun:
     def add(self, frame: Frame, arrived_s: float) -> WatchUpdate:
         """Search one frame, whose turn came at `arrived_s` of the monotonic clock, and take in what it shows."""
         self.log.read = frame.index + 1
-        time_ns = self._utc_ns(frame)
+        time_ns = utc_ns(self._setup, frame.time_ns)
         searched, is_resumed = self._found(frame)
         with self.log.stage("track"):
             taken = self._places.take(frame, time_ns, searched.found)
@@ -248,11 +254,6 @@ class WatchRun:
         page = watch_page(report, rows, crops, self._places.path_m())
         atomic_write_bytes(self._folder / "report.html", page.encode())
         self._journal.file.remove()
-
-    def _utc_ns(self, frame: Frame) -> int:
-        """A frame's UTC by telemetry's clock; by its own where telemetry's was never set."""
-        time_ns = self._setup.utc_ns(frame.time_ns)
-        return time_ns if time_ns >= DATED_NS else frame.time_ns
 
     def _warnings(self, tracks: Sequence[Track]) -> list[str]:
         warnings = []

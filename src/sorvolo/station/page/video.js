@@ -4,12 +4,13 @@ import { get } from "./api.js";
 import { choices } from "./choices.js";
 import { button, el, fill, tick } from "./dom.js";
 import { CLASSES, OTHER_CLASS } from "./map_style.js";
+import { PictureMotion } from "./picture_motion.js";
 import { number, percent } from "./words.js";
 
-const BOXES_WITHIN_US = 250000; // boxes further from a picture than this are not its own
+const BOXES_WITHIN_US = 250000; // boxes further from a picture than this were not seen in it
 const KEPT_BOXES = 300;
 const CLOCKS_AGREE_S = 0.5;
-const OLD_BOXES_US = 4000000; // a slow detector's last boxes are shown, faintly, for so long
+const OLD_BOXES_US = 4000000; // a slow detector's last boxes are shown for so long
 const MOST_HELD_S = 4;
 const STAMP_BYTES = 8;
 const STATE_MS = 1000;
@@ -21,7 +22,7 @@ export function videoPane(screen) {
 
 class VideoPane {
   constructor(screen) {
-    Object.assign(this, { screen, boxes: [], stream: null, socket: null, late_s: 0 });
+    Object.assign(this, { screen, boxes: [], motion: new PictureMotion(), stream: null, socket: null, late_s: 0 });
     this.canvas = el("canvas", { width: 640, height: 360 });
     this.overlay = el("canvas", { class: "boxes", width: 640, height: 360, "aria-hidden": true });
     this.player = el("video", { ".muted": true, playsinline: true, hidden: true });
@@ -111,8 +112,10 @@ class VideoPane {
     if (words.type === "format") {
       this.format = words;
       if (words.epoch_us !== undefined) this.epoch_us = words.epoch_us;
+      Object.assign(this, { boxes: [], motion: new PictureMotion() }); // another flight's have other times
       this.show.begin(words);
     } else if (words.type === "boxes") this.take(words);
+    else if (words.type === "motion") this.motion.take(words);
   }
 
   packet(data) {
@@ -153,19 +156,20 @@ class VideoPane {
     for (const each of this.boxes) if (!best || Math.abs(each.pts_us - pts_us) < Math.abs(best.pts_us - pts_us)) best = each;
     const isOwn = best && Math.abs(best.pts_us - pts_us) < BOXES_WITHIN_US;
     const near = isOwn || (best && best.pts_us < pts_us && pts_us - best.pts_us < OLD_BOXES_US) ? best : null;
+    const carried = near && this.motion.carried(near, pts_us); // they follow the picture, where its motion is known
     const pen = this.overlay.getContext("2d");
     const [width, height] = near?.frame_size_px ?? [this.format?.width ?? 640, this.format?.height ?? 360];
     if (this.overlay.width !== width || this.overlay.height !== height) Object.assign(this.overlay, { width, height });
     pen.clearRect(0, 0, width, height);
-    const boxes = near?.boxes ?? [];
+    const boxes = carried ?? near?.boxes ?? [];
     const size = Math.max(12, width / 50);
     pen.font = `600 ${size}px system-ui, sans-serif`;
     pen.lineWidth = Math.max(2, width / 400);
-    pen.globalAlpha = isOwn ? 1 : 0.45;
+    pen.globalAlpha = isOwn || carried ? 1 : 0.45;
     pen.setLineDash(isOwn ? [] : [size / 2, size / 3]);
     for (const box of boxes) drawBox(pen, box, size);
     const ago_s = near ? (pts_us - near.pts_us) / 1e6 : 0;
-    fill(this.seen, boxes.length ? `${boxes.length} in the picture${isOwn ? "" : ` ${number(ago_s, 1)} s ago`}` : "");
+    fill(this.seen, boxes.length ? `${boxes.length} in the picture${isOwn ? "" : `${carried ? ", seen" : ""} ${number(ago_s, 1)} s ago`}` : "");
   }
 
   /** Play the recorded flight of a place's view. */
