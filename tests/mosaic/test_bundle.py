@@ -161,10 +161,11 @@ def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad, has_ground):
 
     def cost(at: int, step: np.ndarray) -> float:
         changed = moved(nodes, at, step[:6]) if at < 4 else nodes
-        return _normal_equations(problem, changed, shared + (step if at == 4 else 0.0), free)[0]
+        return _normal_equations(problem, changed, shared + (step if at == 4 else 0.0)).cost
 
-    problem = _Problem(pairs, ground, sigma, 3.0)
-    _, normal, gradient, position = _normal_equations(problem, nodes, shared, free)
+    problem = _Problem.of(pairs, ground, sigma, free, 3.0)
+    equations = _normal_equations(problem, nodes, shared)
+    gradient = equations.gradient()
     expected = []
     for at, length in ((1, 6), (2, 6), (3, 6), (4, 8)):
         for axis in range(length):
@@ -172,8 +173,8 @@ def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad, has_ground):
             step[axis] = 1e-6
             # the step solves normal * step = gradient for a cost of squares: the gradient is minus half its slope
             expected.append(-(cost(at, step) - cost(at, -step)) / 2e-6 / 2)
-    assert list(position) == [-1, 0, 1, 2]
-    assert normal.shape == (26, 26)
+    assert list(problem.position) == [-1, 0, 1, 2]
+    assert equations.size == 26
     # each kind of unknown against its own size: cameras, lens, offsets, boresight
     for kind in (slice(0, 18), slice(18, 20), slice(20, 23), slice(23, 26)):
         assert np.abs(gradient[kind] - expected[kind]).max() < 5e-3 * np.abs(expected[kind]).max()
@@ -201,7 +202,7 @@ def test_a_perfect_problem_is_solved_exactly(seed):
     nodes, pairs = staged(seed)
     solution = solve(disturbed(nodes, seed + 20), pairs, HELD, HELD, np.ones(6, bool), 40)
     assert np.abs(solution.nodes.centres_m - nodes.centres_m).max() < 1e-6
-    assert solution.cost < 1e-8
+    assert solution.equations.cost < 1e-8
     assert np.allclose(solution.nodes.rotations @ solution.nodes.rotations.transpose(0, 2, 1), np.eye(3), atol=1e-12)
 
 

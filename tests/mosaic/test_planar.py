@@ -9,7 +9,6 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity, site_f
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
-from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.planar import KnownKeyframe, PlanarMapper, PlanarSettings
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Status
@@ -125,7 +124,7 @@ def test_a_flight_with_next_to_no_memory_is_placed_as_with_plenty():
             return self[key]
 
     poses, shelf = flown(1, per_strip=4), Shelf()
-    plenty, little = PlanarMapper(PoseGraphSettings()), PlanarMapper(PoseGraphSettings(), keyframes=Keyframes(shelf, 1))
+    plenty, little = PlanarMapper(PoseGraphSettings()), PlanarMapper(PoseGraphSettings(), shelf=shelf, keyframe_bytes=1)
     for mapper in (plenty, little):
         rng = np.random.default_rng(1)
         for k, pose in enumerate(poses):

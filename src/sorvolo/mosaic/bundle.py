@@ -7,15 +7,15 @@ the whole map would gain by shrinking to a point.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import csc_matrix
 
 from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.geometry.pose import rotation_from_vector
-from sorvolo.mosaic.normal_equations import NormalEquations, factorised
+from sorvolo.mosaic.block_cholesky import Elimination
+from sorvolo.mosaic.normal_equations import NormalEquations
 
 SHARED = (
     "log_focal", "radial", "altitude_offset_m", "east_offset_m", "north_offset_m",
@@ -26,7 +26,7 @@ the calibration left over, the constant offsets of the altitude's zero and of GP
 turn of the camera, about its own axes, against the attitude that telemetry states (mounting, gimbal, compass)."""
 
 
-_LINKS_AT_ONCE = 256  # some megabytes of derivatives
+LINKS_AT_ONCE = 256  # some megabytes of derivatives
 _STEPS_AS_ONE = 4  # of the whole map at once, before its cameras move one by one
 
 
@@ -61,9 +61,24 @@ class Pairs:
         return Pairs(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
 
     def batches(self) -> "Iterator[Pairs]":
+        """See `Linked`."""
+        for first in range(0, len(self.old), LINKS_AT_ONCE):
+            yield self.of(slice(first, first + LINKS_AT_ONCE))
+
+
+class Linked(Protocol):
+    """The links of a solve, L of them, between nodes `old` and `new`, (L,) each."""
+
+    @property
+    def old(self) -> Rows:
+        """(L,) node index."""
+
+    @property
+    def new(self) -> Rows:
+        """(L,) node index."""
+
+    def batches(self) -> Iterator[Pairs]:
         """Some links after the others, so few at once that their derivatives stay small, however long the flight."""
-        for first in range(0, len(self.old), _LINKS_AT_ONCE):
-            yield self.of(slice(first, first + _LINKS_AT_ONCE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,17 +214,16 @@ def whiten(line: Linearised, pairs: Pairs) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Where a solve ended; `normal` and `position` let the caller ask for covariances."""
+    """Where a solve ended; `equations` and `position` let the caller ask for covariances."""
 
     nodes: Nodes
     shared: Floats
-    cost: float
-    normal: csc_matrix  # sparse (6 n + 8) square information matrix
+    equations: NormalEquations
     position: Rows  # (N,) place of each node in it, -1 for those held
 
 
 def solve(
-    nodes: Nodes, pairs: Pairs, shared: Floats, shared_sigma: Floats, free: NDArray[np.bool_], iterations: int,
+    nodes: Nodes, pairs: Linked, shared: Floats, shared_sigma: Floats, free: NDArray[np.bool_], iterations: int,
     robust_sigmas: float = 3.0, ground: Ground = NO_GROUND,
 ) -> Solution:
     """Levenberg-Marquardt with a Cauchy loss over the free nodes, (N,) bool, and the shared unknowns.
@@ -217,36 +231,51 @@ def solve(
     `shared_sigma` (8,) is each shared unknown's prior sigma about 0; 0 holds it at its present value.
     """
     damping = 1e-6
-    problem = _Problem(pairs, ground, shared_sigma, robust_sigmas)
+    problem = _Problem.of(pairs, ground, shared_sigma, free, robust_sigmas)
     if iterations and free.sum() > 2 and np.array_equal(free, nodes.own):
         nodes, shared = _moved_as_one(problem, nodes, shared)
-    cost, normal, gradient, position = _normal_equations(problem, nodes, shared, free)
+    equations = _normal_equations(problem, nodes, shared)
     for _ in range(iterations):
-        step = _damped_step(normal, gradient, damping)
-        moved, moved_shared = _advance(nodes, shared, step, position)
-        trial = _normal_equations(problem, moved, moved_shared, free)
-        if trial[0] > cost * (1 + 1e-9) or not np.isfinite(trial[0]):
+        step = equations.factorised(damping).solve(equations.gradient())
+        moved, moved_shared = _advance(nodes, shared, step, problem.position)
+        trial = _normal_equations(problem, moved, moved_shared)
+        if trial.cost > equations.cost * (1 + 1e-9) or not np.isfinite(trial.cost):
             damping = max(damping * 30, 1e-4)
             if damping > 1e3:
                 break
             continue
-        gain = cost - trial[0]
-        nodes, shared = moved, moved_shared
-        cost, normal, gradient, position = trial
+        gain = equations.cost - trial.cost
+        nodes, shared, equations = moved, moved_shared, trial
         damping = max(damping / 10, 1e-9)
-        if gain < 1e-5 * cost + 1e-9:
+        if gain < 1e-5 * equations.cost + 1e-9:
             break
-    return Solution(nodes, shared, cost, normal, position)
+    return Solution(nodes, shared, equations, problem.position)
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """What stays the same during a solve."""
 
-    pairs: Pairs
+    pairs: Linked
     ground: Ground
     shared_sigma: Floats  # (8,)
     robust_sigmas: float
+    position: Rows  # (N,) of each node among those that move, -1 for those held
+    elimination: Elimination
+
+    @classmethod
+    def of(
+        cls, pairs: Linked, ground: Ground, shared_sigma: Floats, free: NDArray[np.bool_], robust_sigmas: float
+    ) -> "_Problem":
+        """With the nodes that are `free`, (N,) bool."""
+        position = np.full(len(free), -1)
+        position[free] = np.arange(int(free.sum()))
+        one, other = position[pairs.old], position[pairs.new]
+        both = (one >= 0) & (other >= 0)
+        return cls(
+            pairs, ground, shared_sigma, robust_sigmas, position,
+            Elimination(int(free.sum()), one[both], other[both]),
+        )
 
 
 def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Nodes, Floats]:
@@ -255,17 +284,17 @@ def _moved_as_one(problem: _Problem, nodes: Nodes, shared: Floats) -> tuple[Node
     Links hardly notice such a motion, so telemetry alone decides it. Camera by camera it is a long way: straight steps
     along a turn stretch the map, and Levenberg-Marquardt allows only short ones. Here the turn is exact.
     """
-    state = _normal_equations(problem, nodes, shared, nodes.own)
+    equations = _normal_equations(problem, nodes, shared)
     for _ in range(_STEPS_AS_ONE):
-        cost, normal, gradient, _ = state
         middle_m = nodes.centres_m[nodes.own].mean(axis=0) * [1, 1, 0]
         basis = _common_motions(nodes.centres_m[nodes.own] - middle_m)
-        step = np.linalg.lstsq(basis.T @ (normal @ basis), basis.T @ gradient, rcond=None)[0]
+        among, pull = basis.T @ equations.times(basis), basis.T @ equations.gradient()
+        step = np.asarray(np.linalg.lstsq(among, pull, rcond=None)[0], np.float64)
         trial_nodes, trial_shared = _move_as_one(nodes, middle_m, step[:4]), shared + step[4:]
-        trial = _normal_equations(problem, trial_nodes, trial_shared, nodes.own)
-        if not trial[0] < cost * (1 - 1e-4):
+        trial = _normal_equations(problem, trial_nodes, trial_shared)
+        if not trial.cost < equations.cost * (1 - 1e-4):
             break
-        nodes, shared, state = trial_nodes, trial_shared, trial
+        nodes, shared, equations = trial_nodes, trial_shared, trial
     return nodes, shared
 
 
@@ -294,23 +323,19 @@ def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
     return replace(nodes, rotations=rotations, centres_m=centres_m)
 
 
-def _normal_equations(
-    problem: _Problem, nodes: Nodes, shared: Floats, free: NDArray[np.bool_]
-) -> tuple[float, csc_matrix, Floats, Rows]:
-    position = np.full(len(free), -1)
-    position[free] = np.arange(int(free.sum()))
-    into = NormalEquations(int(free.sum()), len(SHARED))
+def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> NormalEquations:
+    into = NormalEquations(problem.elimination, len(SHARED))
     if len(problem.pairs.old):
-        _add_links(into, nodes, problem.pairs, shared, position, problem.robust_sigmas)
+        _add_links(into, nodes, problem.pairs, shared, problem.position, problem.robust_sigmas)
     if len(problem.ground.node):
-        _add_ground(into, nodes, problem.ground, shared, position, problem.robust_sigmas)
-    _add_telemetry(into, nodes, shared, position, problem.robust_sigmas)
+        _add_ground(into, nodes, problem.ground, shared, problem.position, problem.robust_sigmas)
+    _add_telemetry(into, nodes, shared, problem.position, problem.robust_sigmas)
     _add_shared_priors(into, shared, problem.shared_sigma)
-    return into.cost, into.matrix(), into.gradient(), position
+    return into
 
 
 def _add_links(
-    into: NormalEquations, nodes: Nodes, pairs: Pairs, shared: Floats, position: Rows, robust: float
+    into: NormalEquations, nodes: Nodes, pairs: Linked, shared: Floats, position: Rows, robust: float
 ) -> None:
     for some in pairs.batches():
         line = linearise(nodes, some, shared)
@@ -377,19 +402,6 @@ def _add_telemetry(into: NormalEquations, nodes: Nodes, shared: Floats, position
     shared_pull[5:] = (information * error).sum(axis=0)
     into.add_cameras(blocks, coupling, np.concatenate([turn_pull, shift_pull], axis=1))
     into.add_shared(own, shared_pull)
-
-
-def _damped_step(normal: csc_matrix, gradient: Floats, damping: float) -> Floats:
-    diagonal = normal.diagonal()
-    damped = normal + csc_matrix(
-        (damping * diagonal + 1e-9, (np.arange(len(diagonal)), np.arange(len(diagonal)))), shape=normal.shape
-    )
-    if len(gradient) <= 120:
-        try:
-            return cho_solve(cho_factor(damped.toarray(), check_finite=False), gradient, check_finite=False)
-        except LinAlgError:
-            pass  # not positive definite by a hair: the sparse LU below copes
-    return factorised(damped).solve(gradient)
 
 
 def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tuple[Nodes, Floats]:

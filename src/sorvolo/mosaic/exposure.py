@@ -208,19 +208,19 @@ def _equations(
     pairs: Mapping[tuple[int, int], ColourPairs], unknowns: _Unknowns, settings: ExposureSettings
 ) -> _Equations:
     """The equations of all links, at least one of which has pairs."""
-    links = [each for each in sorted(pairs) if len(pairs[each])]
-    chosen = [pairs[each].thinned(settings.points_per_link) for each in links]
-    counts = np.array([len(each) for each in chosen])
-    slots = np.arange(counts.max())
-    exists = slots < counts[:, None]
-    rows = np.where(exists, slots, 0) + (np.cumsum(counts) - counts)[:, None]  # (L, P) of all pairs in a row
-    radius2_a, radius2_b, colours_a, colours_b = (
-        np.concatenate([getattr(each, name) for each in chosen]).astype(np.float32)
-        for name in ("radius2_a", "radius2_b", "colours_a", "colours_b")
-    )
-    difference = np.log(np.maximum(colours_a, 1.0)) - np.log(np.maximum(colours_b, 1.0))
+    links = sorted(pairs)
+    counts = np.array([min(len(pairs[each]), settings.points_per_link) for each in links])
+    links, counts = [each for each, count in zip(links, counts) if count], counts[counts > 0]
+    exists = np.arange(counts.max()) < counts[:, None]
+    radius2_a, radius2_b = np.zeros((2, *exists.shape), np.float32)
+    difference = np.zeros((*exists.shape, 3), np.float32)
+    for row, (link, count) in enumerate(zip(links, counts.tolist(), strict=True)):
+        chosen = pairs[link].thinned(settings.points_per_link)
+        radius2_a[row, :count], radius2_b[row, :count] = chosen.radius2_a, chosen.radius2_b
+        colours_a, colours_b = (each.astype(np.float32) for each in (chosen.colours_a, chosen.colours_b))
+        difference[row, :count] = np.log(np.maximum(colours_a, 1.0)) - np.log(np.maximum(colours_b, 1.0))
     columns = np.array([_columns_of(each, unknowns) for each in links])
-    return _Equations(columns, radius2_a[rows], radius2_b[rows], difference[rows], exists)
+    return _Equations(columns, radius2_a, radius2_b, difference, exists)
 
 
 def _columns_of(link: tuple[int, int], unknowns: _Unknowns) -> list[int]:

@@ -2,11 +2,11 @@
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import SuperLU
 
 from sorvolo.geometry.arrays import Floats
 from sorvolo.mosaic.bundle import SHARED
 from sorvolo.mosaic.graph_settings import OffsetSettings, PoseGraphSettings
+from sorvolo.mosaic.normal_equations import Factors
 
 _GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; judged together
 
@@ -21,27 +21,31 @@ def shared_sigma(settings: PoseGraphSettings, as_reported: NDArray[np.bool_]) ->
     return np.where(as_reported, np.minimum(sigma, _held_sigma(settings.offsets)), sigma)
 
 
-def unconfirmed(shared: Floats, sigma: Floats, factors: SuperLU, settings: OffsetSettings) -> list[int]:
+def unconfirmed(shared: Floats, sigma: Floats, factors: Factors, settings: OffsetSettings) -> list[int]:
     """The offsets, as indices of SHARED, that a flight does not show: telemetry is taken as it reports them.
 
     An offset that all frames share (altitude's zero, gimbal, compass) and that the rest of the flight sees at less than
     two of its own sigmas is noise: left free, it would only turn, tilt or scale the whole map. `shared` (8,) are the
     offsets found with the priors `sigma` (8,), `factors` the normal equations, whose last unknowns they are.
     """
-    size = factors.shape[0]
-    first = size - len(SHARED)
+    variances = shared_variances(factors)
     silent = set()
     for k in (k for group in _GROUPS for k in group):
         if not 0 < sigma[k] < settings.widest_sigma:
             continue
-        unit = np.zeros(size)
-        unit[first + k] = 1.0
-        variance = max(float(factors.solve(unit)[first + k]), 1e-30)
+        variance = max(float(variances[k]), 1e-30)
         information = 1 / variance - 1 / sigma[k] ** 2  # of the flight alone, without the prior
         estimate = shared[k] / variance / information if information > 0 else 0.0
         if estimate**2 * max(information, 0.0) <= settings.least_sigmas**2:
             silent.add(k)
     return [k for group in _GROUPS if silent.issuperset(group) for k in group]
+
+
+def shared_variances(factors: Factors) -> Floats:
+    """(8,) of the shared unknowns, the last of the normal equations."""
+    units = np.zeros((factors.size, len(SHARED)))
+    units[-len(SHARED):] = np.eye(len(SHARED))
+    return np.diag(factors.solve(units)[-len(SHARED):])
 
 
 def _held_sigma(settings: OffsetSettings) -> Floats:

@@ -3,9 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.linalg import SuperLU
 
-from sorvolo.geometry.arrays import Floats, Matrix3
+from sorvolo.geometry.arrays import Floats, Matrix3, Rows
+from sorvolo.mosaic.normal_equations import Factors
+
+_AT_ONCE = 16  # points on the ground: two right-hand sides each, as long as the flight
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +39,24 @@ def leans_m(rotations: Floats, stated: Floats, heights_m: Floats) -> Floats:
     return np.asarray(heights_m * np.linalg.norm(here - there, axis=1) / np.sqrt(2))
 
 
-def ground_sigma_m(rotation: Matrix3, height_m: float, start: int, factors: SuperLU) -> float:
-    """One sigma of the ground point at a camera's image centre, per axis; its unknowns begin at `start` of `factors`.
+def ground_sigmas_m(rotations: Floats, heights_m: Floats, starts: Rows, factors: Factors) -> list[float]:
+    """One sigma of the ground points at some cameras' image centres, per axis; their unknowns begin at `starts` (M,) of
+    `factors`.
 
-    `rotation` is site_from_camera, `height_m` the camera's height.
+    `rotations` (M, 3, 3) are site_from_camera, `heights_m` (M,) the cameras' heights.
     """
-    block = _ground_centre_jacobian(rotation, height_m)
-    right = np.zeros((factors.shape[0], 2))
-    right[start:start + 6] = block.T
-    return float(np.sqrt(max(0.0, np.trace(block @ factors.solve(right)[start:start + 6]) / 2)))
+    found: list[float] = []
+    for first in range(0, len(starts), _AT_ONCE):
+        some = slice(first, first + _AT_ONCE)
+        blocks = [_ground_centre_jacobian(*each) for each in zip(rotations[some], heights_m[some], strict=True)]
+        unknowns = starts[some, None] + np.arange(6)
+        right = np.zeros((factors.size, len(blocks), 2))
+        for k, block in enumerate(blocks):
+            right[unknowns[k], k] = block.T
+        solved = factors.solve(right.reshape(factors.size, -1)).reshape(right.shape)
+        for k, block in enumerate(blocks):
+            found.append(float(np.sqrt(max(0.0, np.trace(block @ solved[unknowns[k], k]) / 2))))
+    return found
 
 
 def _ground_centre_jacobian(rotation: Matrix3, height_m: float) -> Floats:

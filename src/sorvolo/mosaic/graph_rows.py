@@ -1,5 +1,6 @@
 """The pose graph's keyframes and links as arrays that stay stacked while they grow, as the solver wants them."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ from numpy.typing import NDArray
 from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.bundle import Nodes, Pairs
+from sorvolo.mosaic.bundle import LINKS_AT_ONCE, Nodes, Pairs
+from sorvolo.mosaic.shelf import Shelf, ShelvedRows
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
@@ -119,15 +121,15 @@ class NodeRows:
 
 
 class LinkRows:
-    """The links' matched points, each link's padded to the same number."""
+    """The links and their matched points; the points of older ones lie on the `shelf`, if there is one."""
 
-    def __init__(self, pairs_per_link: int, independent_pairs: float) -> None:
-        self._count, self._independent = pairs_per_link, independent_pairs
+    def __init__(self, pairs_per_link: int, independent_pairs: float, shelf: Shelf | None = None) -> None:
+        self._most, self._independent = pairs_per_link, independent_pairs
         self._rows = _Columns(
-            old=(int, ()), new=(int, ()), old_ideal=(float, (pairs_per_link, 2)),
-            new_ideal=(float, (pairs_per_link, 2)), weight=(float, (pairs_per_link,)), focal_px=(float, ()),
+            old=(int, ()), new=(int, ()), pairs=(int, ()), points=(int, ()), focal_px=(float, ()),
             sigma_px=(float, ()), relief_m=(float, ()),
         )
+        self._points = ShelvedRows("points", (2, pairs_per_link, 2), float, shelf)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -155,25 +157,36 @@ class LinkRows:
     def append(self, each: Link, old: tuple[int, Camera], new: tuple[int, Camera], sigma_px: float) -> None:
         """A link more, between two nodes and their registration cameras; its relief is that of the others."""
         pick = np.arange(len(each.new_px))
-        if len(pick) > self._count:
-            pick = np.linspace(0, len(pick) - 1, self._count).round().astype(int)
-        old_ideal, new_ideal, weight = np.zeros((self._count, 2)), np.zeros((self._count, 2)), np.zeros(self._count)
-        old_ideal[:len(pick)] = _ideal(old[1], each.old_px[pick])
-        new_ideal[:len(pick)] = _ideal(new[1], each.new_px[pick])
-        weight[:len(pick)] = min(1.0, self._independent / len(pick))
+        if len(pick) > self._most:
+            pick = np.linspace(0, len(pick) - 1, self._most).round().astype(int)
+        points = np.zeros((2, self._most, 2))
+        points[0, :len(pick)] = _ideal(old[1], each.old_px[pick])
+        points[1, :len(pick)] = _ideal(new[1], each.new_px[pick])
         self._rows.append(
-            old=old[0], new=new[0], old_ideal=old_ideal, new_ideal=new_ideal, weight=weight, focal_px=new[1].fx_px,
+            old=old[0], new=new[0], pairs=len(pick), points=len(self._points), focal_px=new[1].fx_px,
             sigma_px=sigma_px, relief_m=float(np.median(self.relief_m)) if len(self) else 0.1,
         )
+        self._points.append(points)
 
     def keep(self, chosen: NDArray[np.bool_]) -> None:
         """Drop the links where `chosen` (L,) is False."""
         self._rows.keep(chosen)
 
-    def pairs(self) -> Pairs:
-        """For the solver; views."""
-        names = ("old", "new", "old_ideal", "new_ideal", "weight", "focal_px", "sigma_px", "relief_m")
-        return Pairs(*(self._rows.column(name) for name in names))
+    def of(self, chosen: Rows) -> Pairs:
+        """The matched points of some links, each link's padded to the same number, for the solver."""
+        old, new, pairs, points, focal_px, sigma_px, relief_m = (
+            self._rows.column(name)[chosen]
+            for name in ("old", "new", "pairs", "points", "focal_px", "sigma_px", "relief_m")
+        )
+        exists = np.arange(self._most) < pairs[:, None]
+        weight = exists * np.minimum(1.0, self._independent / np.maximum(pairs, 1))[:, None]
+        found = self._points.read(points)
+        return Pairs(old, new, found[:, 0], found[:, 1], weight, focal_px, sigma_px, relief_m)
+
+    def batches(self) -> Iterator[Pairs]:
+        """See `Linked`."""
+        for first in range(0, len(self), LINKS_AT_ONCE):
+            yield self.of(np.arange(first, min(first + LINKS_AT_ONCE, len(self))))
 
 
 def _with_twice_the_room(column: NDArray[Any]) -> NDArray[Any]:

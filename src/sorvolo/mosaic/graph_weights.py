@@ -1,12 +1,13 @@
 """How far links and telemetry are believed, learnt from how they depart from the map that they make together."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Mask, Rows
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
-from sorvolo.mosaic.bundle import Nodes, Pairs, linearise, rotation_vector
+from sorvolo.mosaic.bundle import Linked, Nodes, Pairs, linearise, rotation_vector
 from sorvolo.mosaic.graph_rows import NodeRows
 
 _ENOUGH = 8  # frames from which telemetry's own errors are learnt
@@ -33,21 +34,19 @@ class LinkNoise:
         return self.across_px > max(6.0, 8 * typical_px)
 
 
-def link_noise(nodes: Nodes, pairs: Pairs, shared: Floats) -> LinkNoise:
+def link_noise(nodes: Nodes, pairs: Linked, shared: Floats) -> LinkNoise:
     """The noise of at least one link, by the cameras as they stand."""
     found = [_noise(nodes, some, shared) for some in pairs.batches()]
     return LinkNoise(np.concatenate([each.across_px for each in found]), np.concatenate([e.relief_m for e in found]))
 
 
-def miss_px(nodes: Nodes, pairs: Pairs, shared: Floats) -> Floats:
-    """(L, K) how far each pair is transferred amiss; NaN where there is none."""
-    if not len(pairs.old):
-        return np.zeros(pairs.weight.shape)
-    miss = np.concatenate([
-        np.linalg.norm(linearise(nodes, some, shared).residual_px, axis=-1) for some in pairs.batches()
-    ])
-    miss[pairs.weight <= 0] = np.nan
-    return miss
+def miss_px(nodes: Nodes, pairs: Linked, shared: Floats) -> Iterator[tuple[Rows, Rows, Floats]]:
+    """Of some links after the others their old and new nodes, (l,) each, and how far each pair is transferred amiss,
+    (l, K); NaN where there is none."""
+    for some in pairs.batches():
+        miss = np.linalg.norm(linearise(nodes, some, shared).residual_px, axis=-1)
+        miss[some.weight <= 0] = np.nan
+        yield some.old, some.new, miss
 
 
 def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:

@@ -7,24 +7,14 @@ needs only those around the one that is being placed.
 import io
 from collections import OrderedDict
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
+from sorvolo.mosaic.shelf import Shelf
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features, Keyframe
-
-
-class Shelf(Protocol):
-    """Where bytes are kept that memory has no room for, by key."""
-
-    def put(self, key: int, data: bytes) -> None:
-        """Keep these bytes."""
-
-    def get(self, key: int) -> bytes:
-        """The bytes kept under this key."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,46 +1,49 @@
-"""The normal equations of a solve: gathered camera by camera and link by link, then factorised."""
+"""The normal equations of a solve: gathered camera by camera and link by link, then solved."""
 
 import numpy as np
-from scipy.sparse import coo_matrix, csc_matrix
-from scipy.sparse.linalg import SuperLU, splu
 
 from sorvolo.geometry.arrays import Floats, Mask, Rows
-
-_CAMERA = 6  # unknowns
+from sorvolo.mosaic.block_cholesky import SIDE, Elimination
 
 
 class NormalEquations:
     """The information matrix and the gradient of some cameras' unknowns, six each, and of those that all share, last.
 
-    Terms of one camera are summed as they come, so that only what two cameras have in common grows with the links.
+    The cameras, and which of them links tie, are those of the `elimination`. Terms of one camera are summed as they
+    come, so that only what two cameras have in common grows with the links.
     """
 
-    def __init__(self, cameras: int, shared: int) -> None:
+    def __init__(self, elimination: Elimination, shared: int) -> None:
         self.cost = 0.0
-        self._cameras, self._shared = np.zeros((cameras, _CAMERA, _CAMERA)), np.zeros((shared, shared))
-        self._with_shared = np.zeros((cameras, _CAMERA, shared))
-        self._pull, self._shared_pull = np.zeros((cameras, _CAMERA)), np.zeros(shared)
-        self._between: list[tuple[Rows, Rows, Floats]] = []
+        self._elimination = elimination
+        cameras = elimination.count
+        self._cameras, self._shared = np.zeros((cameras, SIDE, SIDE)), np.zeros((shared, shared))
+        self._with_shared = np.zeros((cameras, SIDE, shared))
+        self._pull, self._shared_pull = np.zeros((cameras, SIDE)), np.zeros(shared)
+        self._between = np.zeros((elimination.ties, SIDE, SIDE))
+        self._ties = 0  # so many of them have come
 
     def add(self, jacobian: Floats, residual: Floats, cameras: tuple[Rows, ...]) -> None:
         """Whitened, weighted rows: `jacobian` (n, r, w), `residual` (n, r).
 
         Its first columns belong to the one or two `cameras`, (n,) each, negative where the camera is held; the last to
-        the first of the shared unknowns.
+        the first of the shared unknowns. Two cameras come in the order of the elimination's ties.
         """
         information = jacobian.transpose(0, 2, 1) @ jacobian
         pull = -np.einsum("nri,nr->ni", jacobian, residual)
-        rest = slice(_CAMERA * len(cameras), None)
-        few = jacobian.shape[2] - _CAMERA * len(cameras)
+        rest = slice(SIDE * len(cameras), None)
+        few = jacobian.shape[2] - SIDE * len(cameras)
         for k, at in enumerate(cameras):
-            here, free = slice(_CAMERA * k, _CAMERA * (k + 1)), at >= 0
+            here, free = slice(SIDE * k, SIDE * (k + 1)), at >= 0
             np.add.at(self._cameras, at[free], information[free, here, here])
             np.add.at(self._with_shared[:, :, :few], at[free], information[free, here, rest])
             np.add.at(self._pull, at[free], pull[free, here])
         if len(cameras) == 2:
             one, other = cameras
             both = (one >= 0) & (other >= 0)
-            self._between.append((one[both], other[both], information[both, :_CAMERA, _CAMERA:2 * _CAMERA]))
+            end = self._ties + int(both.sum())
+            self._between[self._ties:end] = information[both, :SIDE, SIDE:2 * SIDE]
+            self._ties = end
         self._shared[:few, :few] += information[:, rest, rest].sum(axis=0)
         self._shared_pull[:few] += pull[:, rest].sum(axis=0)
 
@@ -59,48 +62,52 @@ class NormalEquations:
         """Nothing pulls at these shared unknowns, (shared,)."""
         self._shared_pull[held] = 0.0
 
+    @property
+    def size(self) -> int:
+        """Unknowns: 6 n + shared."""
+        return self._pull.size + len(self._shared)
+
     def gradient(self) -> Floats:
         """(6 n + shared,)."""
         return np.concatenate([self._pull.ravel(), self._shared_pull])
 
-    def matrix(self) -> csc_matrix:
-        """(6 n + shared) square, symmetric, sparse."""
-        count, shared = self._with_shared.shape[0], len(self._shared)
-        one, other, blocks = (
-            (np.concatenate(each) for each in zip(*self._between, strict=True))
-            if self._between else (np.zeros(0, int), np.zeros(0, int), np.zeros((0, _CAMERA, _CAMERA)))
-        )
-        each, end = _CAMERA * np.arange(count), np.full(count, _CAMERA * count)
-        one, other, last = _CAMERA * one, _CAMERA * other, np.array([_CAMERA * count])
-        parts = (
-            (each, each, self._cameras), (one, other, blocks), (other, one, blocks.transpose(0, 2, 1)),
-            (each, end, self._with_shared), (end, each, self._with_shared.transpose(0, 2, 1)),
-            (last, last, self._shared[None]),
-        )
-        numbers = sum(some.size for _, _, some in parts)
-        rows, columns, values = np.empty(numbers, np.int32), np.empty(numbers, np.int32), np.empty(numbers)
-        first = 0
-        for part in parts:  # each at its place: of a long flight they are a hundred megabytes, which none holds twice
-            here = slice(first, first + part[2].size)
-            rows[here], columns[here], values[here] = _entries(*part)
-            first = here.stop
-        size = _CAMERA * count + shared
-        return coo_matrix((values, (rows, columns)), shape=(size, size)).tocsc()
+    def times(self, vectors: Floats) -> Floats:
+        """The information matrix times (6 n + shared, k) vectors."""
+        own = vectors[:-len(self._shared)].reshape(*self._pull.shape, -1)
+        shared = vectors[-len(self._shared):]
+        found = self._cameras @ own + self._with_shared @ shared
+        one, other = self._elimination.one, self._elimination.other
+        np.add.at(found, one, self._between @ own[other])
+        np.add.at(found, other, self._between.transpose(0, 2, 1) @ own[one])
+        along = np.einsum("nis,nik->sk", self._with_shared, own) + self._shared @ shared
+        return np.concatenate([found.reshape(self._pull.size, -1), along])
+
+    def factorised(self, damping: float = 0.0) -> "Factors":
+        """The equations, ready to be solved; each unknown held by `damping` times its own information, and a little."""
+        if not damping:
+            return Factors(self._elimination, self._cameras, self._between, self._with_shared, self._shared)
+        cameras, shared = self._cameras.copy(), self._shared.copy()
+        for blocks in (cameras, shared):
+            own = np.arange(blocks.shape[-1])
+            blocks[..., own, own] += damping * blocks[..., own, own] + 1e-9
+        return Factors(self._elimination, cameras, self._between, self._with_shared, shared)
 
 
-def factorised(normal: csc_matrix) -> SuperLU:
-    """Symmetric, positive definite equations, ready to be solved.
+class Factors:
+    """Normal equations in factors: those of the cameras, and what the shared unknowns have to do with them."""
 
-    The diagonal is taken as it comes: to seek larger pivots off it is not needed here, and would undo the ordering that
-    keeps the factors sparse.
-    """
-    return splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    def __init__(
+        self, elimination: Elimination, cameras: Floats, between: Floats, with_shared: Floats, shared: Floats
+    ) -> None:
+        self.size = cameras.shape[0] * SIDE + len(shared)
+        self._cameras = elimination.factorised(cameras, between)
+        self._with_shared = with_shared.reshape(-1, len(shared))
+        self._per_shared = self._cameras.solve(self._with_shared)
+        self._shared = shared - self._with_shared.T @ self._per_shared
 
-
-def _entries(rows: Rows, columns: Rows, blocks: Floats) -> tuple[Rows, Rows, Floats]:
-    """Row, column and value of each number of the blocks (n, h, w) that begin at these rows and columns, (n,) each."""
-    height, width = blocks.shape[1:]
-    r = rows.astype(np.int32)[:, None, None] + np.arange(height, dtype=np.int32)[None, :, None]
-    c = columns.astype(np.int32)[:, None, None] + np.arange(width, dtype=np.int32)[None, None, :]
-    r, c = np.broadcast_to(r, blocks.shape), np.broadcast_to(c, blocks.shape)
-    return r.ravel(), c.ravel(), blocks.ravel()
+    def solve(self, right: Floats) -> Floats:
+        """(6 n + shared,) or (6 n + shared, k) right-hand sides to as many solutions."""
+        split = len(self._with_shared)
+        cameras = self._cameras.solve(right[:split])
+        shared = np.linalg.solve(self._shared, right[split:] - self._with_shared.T @ cameras)
+        return np.concatenate([cameras - self._per_shared @ shared, shared])

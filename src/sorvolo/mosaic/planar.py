@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
 
 import cv2
 import numpy as np
@@ -12,13 +11,15 @@ from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.exposure import ColourPairs, Exposure, ExposureSettings, solve_exposure, tie_colours
+from sorvolo.mosaic.exposure import Exposure, ExposureSettings, solve_exposure, tie_colours
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.ground_ties import GroundTies
 from sorvolo.mosaic.keyframes import Keyframes
+from sorvolo.mosaic.linked_colours import LinkedColours
 from sorvolo.mosaic.overview import Overview, lay_out
 from sorvolo.mosaic.pose_graph import PoseGraph, pose_from_link
+from sorvolo.mosaic.shelf import Shelf
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
 from sorvolo.registration.learned import release_network
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
@@ -106,20 +107,23 @@ class _Tie:
 
 
 class PlanarMapper:
-    """Everything `--method planar` knows of one flight. `add` takes a keyframe; `retime` and `settle` end it."""
+    """Everything `--method planar` knows of one flight. `add` takes a keyframe; `retime` and `settle` end it.
+
+    What is not needed of an older keyframe goes to the `shelf`, where there is one.
+    """
 
     def __init__(
         self, graph: PoseGraphSettings, settings: PlanarSettings = PlanarSettings(),
-        known: Sequence[KnownKeyframe] = (), keyframes: Keyframes | None = None,
+        known: Sequence[KnownKeyframe] = (), shelf: Shelf | None = None, keyframe_bytes: int = 1 << 28,
     ) -> None:
         self._settings = settings
-        self._graph = PoseGraph(graph)
+        self._graph = PoseGraph(graph, shelf)
         self._cache = LinkCache(settings.links.features)
-        self._keyframes = Keyframes() if keyframes is None else keyframes
+        self._keyframes = Keyframes(shelf, keyframe_bytes)
         self._own: list[int] = []
         self._known = {each.id: each for each in known}
         self._known_centres_m = np.array([each.site_from_camera.translation_m for each in known]).reshape(-1, 3)
-        self._colours: dict[tuple[int, int], ColourPairs] = {}
+        self._colours = LinkedColours(settings.exposure.points_per_link, shelf)
         self._failures: dict[int, str] = {}
         self._met: list[int] = []  # of the known map, in the order in which they were loaded
 
@@ -301,7 +305,7 @@ class PlanarMapper:
     def recent_exposure(self) -> Exposure:
         """The same from the newest links alone: good enough for a map that still moves, at a price that does not grow
         with the flight."""
-        newest = dict(islice(reversed(self._colours.items()), self._settings.recent_links))
+        newest = self._colours.newest(self._settings.recent_links)
         return solve_exposure(newest, settings=self._settings.exposure)
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -479,7 +483,7 @@ class PlanarMapper:
         pairs = tie_colours(
             small_new, _scaled(each.new_px, new, small_new), small_old, _scaled(each.old_px, old, small_old)
         )
-        self._colours[each.new_id, each.old_id] = pairs.thinned(self._settings.exposure.points_per_link)
+        self._colours.keep((each.new_id, each.old_id), pairs)
 
 
 def _thumbnail(image: ImageRGB) -> ImageRGB:

@@ -15,13 +15,13 @@ from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.mosaic.bundle import NO_GROUND, SHARED, Ground, Nodes, Solution, linearise_ground, solve
 from sorvolo.mosaic.graph_alignment import change_to_fixes, change_to_ground, move_all
-from sorvolo.mosaic.graph_offsets import shared_sigma, unconfirmed
-from sorvolo.mosaic.graph_report import GraphReport, ground_sigma_m, leans_m
+from sorvolo.mosaic.graph_offsets import shared_sigma, shared_variances, unconfirmed
+from sorvolo.mosaic.graph_report import GraphReport, ground_sigmas_m, leans_m
 from sorvolo.mosaic.graph_rows import LinkRows, NodeRows
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.graph_weights import LinkNoise, Trust, link_noise, miss_px, telemetry_trust
 from sorvolo.mosaic.ground_ties import GroundTies
-from sorvolo.mosaic.normal_equations import factorised
+from sorvolo.mosaic.shelf import Shelf
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
@@ -40,13 +40,15 @@ class PoseGraph:
     last returned: those, and no others, have to be painted again.
     """
 
-    def __init__(self, settings: PoseGraphSettings = PoseGraphSettings()) -> None:  # noqa: B008 (frozen)
+    def __init__(
+        self, settings: PoseGraphSettings = PoseGraphSettings(), shelf: Shelf | None = None  # noqa: B008 (frozen)
+    ) -> None:
         self._settings = settings
         self._ids: dict[int, int] = {}
         self._names: list[int] = []
         self._nodes: list[_Node] = []
         self._rows = NodeRows()
-        self._links = LinkRows(settings.pairs_per_link, settings.independent_pairs)
+        self._links = LinkRows(settings.pairs_per_link, settings.independent_pairs, shelf)
         self._shared = np.zeros(len(SHARED))
         self._dropped = 0
         self._solved_at = self._region_solved_at = 0
@@ -197,19 +199,16 @@ class PoseGraph:
         self._as_reported[:] = False
         moved = self.settle()
         sigma = shared_sigma(self._settings, self._as_reported)
-        factors = factorised(self._solve(self._own(), shared=True, iterations=0).normal)
+        factors = self._solve(self._own(), shared=True, iterations=0).equations.factorised()
         self._as_reported[unconfirmed(self._shared, sigma, factors, self._settings.offsets)] = True
         return moved | self.settle()
 
     def report(self) -> GraphReport:
         """Focal length, offsets, links and residuals as they stand."""
-        solution = self._solve(self._own(), shared=True, iterations=0)
-        size = solution.normal.shape[0]
         sigma = 0.0
         if self._settings.focal_sigma > 0:
-            unit = np.zeros(size)
-            unit[size - len(SHARED)] = 1.0
-            sigma = float(np.sqrt(max(0.0, factorised(solution.normal).solve(unit)[size - len(SHARED)])))
+            factors = self._solve(self._own(), shared=True, iterations=0).equations.factorised()
+            sigma = float(np.sqrt(max(0.0, shared_variances(factors)[0])))
         rms = np.array([value for value in self.residuals_px().values() if np.isfinite(value)])
         leans = list(self.leans_m().values())
         tilts_rad, heights_m = self._rows.stated_sigma_rad[self._own(), 0], self._rows.centres_m[self._own(), 2]
@@ -237,14 +236,11 @@ class PoseGraph:
     def residuals_px(self) -> dict[int, float]:
         """Each keyframe's median transfer residual over its links, px at registration size; NaN without links."""
         result = dict.fromkeys(self._ids, float("nan"))
-        if not len(self._links):
-            return result
-        pairs = self._links.pairs()
-        miss = miss_px(self._state(), pairs, self._shared)
         gathered: dict[int, list[Floats]] = {}
-        for row, ends in enumerate(zip(pairs.old.tolist(), pairs.new.tolist(), strict=True)):
-            for at in ends:
-                gathered.setdefault(at, []).append(miss[row])
+        for old, new, miss in miss_px(self._state(), self._links, self._shared):
+            for row, ends in enumerate(zip(old.tolist(), new.tolist(), strict=True)):
+                for at in ends:
+                    gathered.setdefault(at, []).append(miss[row])
         for at, rows in gathered.items():
             result[self._names[at]] = float(np.nanmedian(np.concatenate(rows)))
         return result
@@ -255,12 +251,10 @@ class PoseGraph:
         solution = self._solve(own, shared=True, iterations=0)
         index = np.flatnonzero(own)
         sample = index if len(index) <= 250 else index[np.linspace(0, len(index) - 1, 250).round().astype(int)]
-        factors = factorised(solution.normal)
-        rotations, heights_m = self._rows.rotations, self._rows.centres_m[:, 2]
-        found = [
-            ground_sigma_m(rotations[at], heights_m[at], 6 * int(solution.position[at]), factors)
-            for at in sample.tolist()
-        ]
+        found = ground_sigmas_m(
+            self._rows.rotations[sample], self._rows.centres_m[sample, 2], 6 * solution.position[sample],
+            solution.equations.factorised(),
+        )
         every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
         return {self._names[at]: float(value) for at, value in zip(index, every, strict=True)}
 
@@ -321,9 +315,10 @@ class PoseGraph:
         return bool(own.any()) and self._relief_m() > self._settings.uneven * np.median(self._rows.centres_m[own, 2])
 
     def _solve(self, free: NDArray[np.bool_], *, shared: bool, iterations: int) -> Solution:
-        pairs = self._links.pairs()
         sigma = shared_sigma(self._settings, self._as_reported) if shared else np.zeros(len(SHARED))
-        solution = solve(self._state(), pairs, self._shared, sigma, free, iterations, ground=self._weighed_ground())
+        solution = solve(
+            self._state(), self._links, self._shared, sigma, free, iterations, ground=self._weighed_ground()
+        )
         if iterations:
             self._rows.rotations[:], self._rows.centres_m[:] = solution.nodes.rotations, solution.nodes.centres_m
             self._shared = solution.shared
@@ -335,7 +330,7 @@ class PoseGraph:
         It costs the same however long the flight is.
         """
         chosen = self._links_of(free)
-        pairs = self._links.pairs().of(chosen)
+        pairs = self._links.of(chosen)
         near = np.unique(np.concatenate([np.flatnonzero(free), pairs.old, pairs.new]))
         few = replace(pairs, old=np.searchsorted(near, pairs.old), new=np.searchsorted(near, pairs.new))
         solution = solve(
@@ -352,7 +347,7 @@ class PoseGraph:
         chosen = self._solve_around(free, iterations=3)
         if not len(chosen):
             return self._moved(np.flatnonzero(free))
-        noise = link_noise(self._state(), self._links.pairs().of(chosen), self._shared)
+        noise = link_noise(self._state(), self._links.of(chosen), self._shared)
         usual_px = float(np.median(self._links.sigma_px))
         false = noise.is_false(usual_px)  # perhaps: the whole map is solved before one is dropped
         believed_px = np.maximum(self._links.sigma_px[chosen], usual_px)
@@ -435,7 +430,7 @@ class PoseGraph:
         """Learn each link's noise across the parallax and the relief along it; drop links that cannot be true."""
         if not len(self._links):
             return
-        noise = link_noise(self._state(), self._links.pairs(), self._shared)
+        noise = link_noise(self._state(), self._links, self._shared)
         every = np.arange(len(self._links))
         self._weigh(every, noise, np.ones(len(every), bool))
         false = noise.is_false(float(np.median(noise.across_px)))

@@ -27,7 +27,6 @@ from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken
 from sorvolo.missions.map.planar_run import HORIZON
 from sorvolo.mosaic.division import Block, divide
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
-from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.mosaic.selection import Selected, SelectionSettings, select_keyframes
@@ -179,7 +178,7 @@ class _BlockRun:
         offset_sigma_m = None if setup.track is None else setup.track.altitude_offset_sigma_m
         self._mapper = PlanarMapper(
             PoseGraphSettings.of_flight(model.focal_sigma, offset_sigma_m, joins_map=False),
-            keyframes=Keyframes(spill, memory_budget_bytes(settings.memory_mb) // 4),
+            shelf=spill, keyframe_bytes=memory_budget_bytes(settings.memory_mb) // 4,
         )
 
     def take(self, each: Selected | LostFrame) -> None:

@@ -28,7 +28,6 @@ from sorvolo.missions.map.tile_shares import PaintsElsewhere
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
-from sorvolo.mosaic.keyframes import Keyframes
 from sorvolo.mosaic.placing import map_m_per_px, sees_horizon
 from sorvolo.mosaic.planar import PlanarMapper, Registered
 from sorvolo.mosaic.seen_ground import PictureOnGround
@@ -70,7 +69,7 @@ class PlanarRun(FlightRun):
                 model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.known_ground is not None
             ),
             known=self._known.for_graph(),
-            keyframes=Keyframes(self._spill, memory_budget_bytes(settings.memory_mb) // 8),
+            shelf=self._spill, keyframe_bytes=memory_budget_bytes(settings.memory_mb) // 8,
         )
         self._times_ns: dict[int, int] = {}  # of the flight's keyframes that have a place
         self._held: dict[int, ImageRGB | bytes | KeptPicture] = {}  # JPEG where all of the flight waits for its place

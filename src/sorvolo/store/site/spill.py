@@ -1,6 +1,7 @@
 """What a run cannot hold in memory, in files beside the site's that nobody else sees and no kill leaves behind."""
 
 import tempfile
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, BinaryIO, Self
@@ -20,10 +21,10 @@ class SpillFile:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._file: BinaryIO | None = None
-        self._places: dict[int, tuple[int, int]] = {}
+        self._places: dict[Hashable, tuple[int, int]] = {}
         self._end = 0
 
-    def put(self, key: int, data: bytes) -> None:
+    def put(self, key: Hashable, data: bytes) -> None:
         """Keep these bytes under a key that has none yet."""
         with writing(self._folder):
             if self._file is None:
@@ -34,7 +35,7 @@ class SpillFile:
         self._places[key] = self._end, len(data)
         self._end += len(data)
 
-    def get(self, key: int) -> bytes:
+    def get(self, key: Hashable) -> bytes:
         """The bytes kept under this key; raises KeyError where there are none."""
         at, length = self._places[key]
         assert self._file is not None
