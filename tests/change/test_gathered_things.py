@@ -7,6 +7,7 @@ import pytest
 from sorvolo.change.areas.gathered_things import GatheredThings
 from sorvolo.change.pair.learned_difference import learned_difference
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.sun import direction_from_angles, slide_of
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
 M_PER_PX = 0.1
@@ -58,7 +59,7 @@ def test_where_hardly_anything_is_known_nothing_is_reported(ground):
     assert not learned_difference(ground, with_car(ground), known).any()
 
 
-def gathered(before: ImageRGB, after: ImageRGB, views: int, shade: int = 0) -> GatheredThings:
+def gathered(before: ImageRGB, after: ImageRGB, views: int, shade: int | np.ndarray = 0) -> GatheredThings:
     things, rng = GatheredThings(), np.random.default_rng(3)
     for index in range(views):
         x, y = 32 * index, 24 * index
@@ -69,7 +70,7 @@ def gathered(before: ImageRGB, after: ImageRGB, views: int, shade: int = 0) -> G
         things.add(ComparedView(
             index, f"{index}", index * 10**9, site_from_image, np.array([x * M_PER_PX, -y * M_PER_PX, 40.0]), noisy,
             before[part].copy(), np.ones(VIEW_PX[::-1], bool), nothing, np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
-            nothing + np.uint8(shade),
+            nothing + np.broadcast_to(np.uint8(shade), before.shape[:2])[part],
         ))
     return things
 
@@ -107,3 +108,46 @@ def test_what_one_view_shows_or_may_be_a_shadow_is_not_reported(ground, views, s
 def test_unchanged_ground_in_another_light_and_no_flight_at_all_give_nothing(ground):
     assert gathered(ground, (0.7 * ground).astype(np.uint8), 4).conclude("b", 1, []) == []
     assert GatheredThings().conclude("b", 1, []) == []
+
+
+EARLIER, LATER = slide_of(direction_from_angles(237, 29)), slide_of(direction_from_angles(165, 39))
+
+
+def shadow_of_box(slide: np.ndarray) -> np.ndarray:
+    """The shadow of a box, 2 x 2 m and 2.5 m tall, without the box, in pixels of the ground."""
+    box = np.zeros((480, 640), bool)
+    box[150:170, 210:230] = True
+    shadow = np.zeros_like(box)
+    for up_m in np.arange(0.0, 2.5, 0.05):
+        east, north = np.rint(slide * up_m / M_PER_PX).astype(int)
+        shadow |= np.roll(box, (-north, east), (0, 1))
+    return shadow & ~box
+
+
+def outline_around(pixels: np.ndarray) -> np.ndarray:
+    rows, columns = np.nonzero(pixels)
+    corners = cv2.convexHull(np.column_stack([columns, rows]))[:, 0].astype(float)
+    return corners * M_PER_PX * [1, -1]
+
+
+def test_the_shadow_of_a_box_that_stays_has_moved_and_that_of_one_that_came_has_not(ground):
+    earlier, later = shadow_of_box(EARLIER), shadow_of_box(LATER)
+    came, left = later & ~earlier, earlier & ~later
+    both = gathered(ground, ground, 3, came * np.uint8(Shade.LATER_DARK) + left * np.uint8(Shade.EARLIER_DARK))
+    assert both.is_moved_shadow(outline_around(came), EARLIER, LATER)
+    back = gathered(ground, ground, 3, came * np.uint8(Shade.EARLIER_DARK) + left * np.uint8(Shade.LATER_DARK))
+    assert back.is_moved_shadow(outline_around(came), LATER, EARLIER)
+    assert not both.is_moved_shadow(outline_around(came), LATER, EARLIER)  # the sun went another way
+    assert not both.is_moved_shadow(outline_around(came), LATER, LATER)  # it did not move
+    assert not both.is_moved_shadow(outline_around(came) - [0, 9], EARLIER, LATER)  # no shade there
+
+    alone = gathered(ground, ground, 3, later * np.uint8(Shade.LATER_DARK))
+    assert not alone.is_moved_shadow(outline_around(later), EARLIER, LATER)
+    assert not gathered(ground, ground, 0).is_moved_shadow(outline_around(came), EARLIER, LATER)
+
+
+def test_outlines_beyond_the_ground_that_was_gathered_are_no_moved_shadow(ground):
+    things = gathered(ground, ground, 1)
+    for middle_m in ([-50, -50], [90, -9], [5, 60]):
+        outline_m = np.array([[0, 0], [1, 0], [1, 1.0]]) + middle_m
+        assert not things.is_moved_shadow(outline_m, EARLIER, LATER)

@@ -95,6 +95,10 @@ class EarlierPictures:
         nearest = [int(shown[each]) for each in order]
         return Vantage(self._cameras_m[nearest[0]], later_m, tuple(nearest))
 
+    def time_ns(self, outline_m: PointsM) -> int | None:
+        """When the newest picture that shows an outline, (N, 2), was taken, UTC; None where none shows it."""
+        return max((each.time_ns for each in self._pictures if _shows(each, outline_m)), default=None)
+
     def laid(self, vantage: Vantage, window: PatchWindow, settings: LevelSettings) -> list[LaidPicture]:
         """A few of the pictures that show a place, taken apart from each other, laid on a window of level ground."""
         found: list[LaidPicture] = []

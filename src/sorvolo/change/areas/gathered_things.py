@@ -8,14 +8,17 @@ import numpy as np
 
 from sorvolo.change.areas.ground_pictures import GroundPictureSettings
 from sorvolo.change.areas.ground_sums import GroundSums
+from sorvolo.change.areas.moved_shade import share_moved
 from sorvolo.change.pair.learned_difference import LearnedSettings, learned_difference
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.change.shape.place_sigma import place_sigma_m
-from sorvolo.geometry.arrays import Mask, PointsM
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ComparedView, Shade
 
-_SUMS = ("seen", "apart", "agree", "dark")
+_SUMS = ("seen", "apart", "agree", "came", "left")
+_SHADES = {"came": Shade.LATER_DARK, "left": Shade.EARLIER_DARK}  # shade of the later date alone, of the earlier alone
 _HIGHEST = 95.0  # percentile of what lies farthest apart
 
 
@@ -32,6 +35,8 @@ class GatherThingSettings:
     least_cells: int = 64  # smaller things are found by their outline
     most_of_cells: int = 2000  # larger ground is an area
     most_dark: float = 0.7  # share of it that is darker on one date as in a shadow: it may be one
+    is_moved: float = 0.6  # 0056: share of an outline that is shade, and of it that lies on the other date's, moved
+    tallest_m: float = 5.0  # 0056: what may throw a moved shadow; of higher things too many shades lie along the way
     sure_spreads: float = 3.0  # what lies so far apart is sure
     explained: float = 0.2  # share of it that other changes hold: it is reported with them
     learned: LearnedSettings = field(default_factory=LearnedSettings)
@@ -57,7 +62,7 @@ class GatheredThings:
             apart[leans] = np.minimum(apart[leans], 0)
         planes = {
             "apart": apart, "agree": (apart > settings.own_spreads).astype(np.float32),
-            "dark": ((view.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0).astype(np.float32),
+            **{name: ((view.shade & np.uint8(bit)) > 0).astype(np.float32) for name, bit in _SHADES.items()},
         }
         laid = self._ground.add(view, window, view.site_from_image, planes, view.valid.astype(np.float32))
         self._ground.show(view, window, laid["apart"] > settings.spreads)
@@ -72,8 +77,32 @@ class GatheredThings:
         own = mask_of(outline_m, site_from_cell, self._ground.window.shape) & (sums["seen"] > 0)
         if not own.any() or np.median(sums["seen"][own]) > 1:
             return False
-        apart, dark = (float((sums[name][own] / sums["seen"][own]).mean()) for name in ("apart", "dark"))
-        return apart >= settings.own_spreads and dark <= settings.most_dark
+        apart, came, left = (float((sums[name][own] / sums["seen"][own]).mean()) for name in ("apart", *_SHADES))
+        return apart >= settings.own_spreads and came + left <= settings.most_dark
+
+    def is_moved_shadow(self, outline_m: PointsM, earlier: Floats, later: Floats) -> bool:
+        """Whether an outline's ground, (N, 2), is shade of one date, and shade of the other lies where what stays
+        threw it; the shadow of a point 1 m up lies (2,) off, east and north: `earlier` and `later`."""
+        settings, sums = self._settings, self._ground.sums
+        if self._ground.is_empty:
+            return False
+        site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
+        step = np.linalg.inv(site_from_cell)[:2, :2] @ (earlier - later)
+        reach = np.abs(step).max() * settings.tallest_m + 1
+        at = apply_homography(np.linalg.inv(site_from_cell), outline_m)
+        (left, top), (right, low) = (at.min(axis=0) - reach).astype(int).clip(0), (at.max(axis=0) + reach).astype(int)
+        part = np.s_[top : max(low, top), left : max(right, left)]
+        seen = sums["seen"][part]
+        if not seen.any():
+            return False
+        site_from_part = site_from_cell @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]])
+        own = mask_of(outline_m, site_from_part, seen.shape) & (seen > 0)
+        shades = {name: sums[name][part] > 0.5 * np.maximum(seen, 1) for name in _SHADES}
+        for name, other, along in (("came", "left", step), ("left", "came", -step)):
+            shade = own & shades[name]
+            if np.count_nonzero(shade) > settings.is_moved * np.count_nonzero(own):
+                return share_moved(shade, shades[other], along, settings.tallest_m) > settings.is_moved
+        return False
 
     def conclude(self, id_prefix: str, first_number: int, others: Sequence[Change]) -> list[Change]:
         """After the last view: the things that `others` do not hold, numbered from `first_number` on."""
@@ -87,7 +116,7 @@ class GatheredThings:
         """Connected ground that lies apart, without an id."""
         settings, sums = self._settings, self._ground.sums
         seen = np.maximum(sums["seen"], 1)
-        mean = {name: sums[name] / seen for name in ("apart", "agree", "dark")}
+        mean = {name: sums[name] / seen for name in _SUMS[1:]}
         differs = (sums["seen"] >= settings.least_views) & (mean["apart"] > settings.spreads)
         opened = cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
         count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
@@ -101,9 +130,9 @@ class GatheredThings:
             own &= mean["apart"][part] > height
             if not settings.least_cells <= np.count_nonzero(own) <= settings.most_of_cells:
                 continue
-            apart, agree, dark = (float(mean[name][part][own].mean()) for name in ("apart", "agree", "dark"))
+            apart, agree, came, left = (float(mean[name][part][own].mean()) for name in _SUMS[1:])
             change = self._record(own, (x, y), agree * min(1.0, apart / settings.sure_spreads))
-            if change is not None and dark <= settings.most_dark:
+            if change is not None and came + left <= settings.most_dark:
                 yield change
 
     def _record(self, cells: Mask, corner: tuple[int, int], score: float) -> Change | None:

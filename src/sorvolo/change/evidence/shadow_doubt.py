@@ -19,6 +19,7 @@ from sorvolo.change.evidence.levelness import LaidPicture, LevelSettings, Sights
 from sorvolo.change.shape.outlines import mask_of
 from sorvolo.change.shape.patches import PatchWindow
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM, Vector3
+from sorvolo.geometry.sun import slide_of
 
 SunAt = Callable[[int], Vector3 | None]
 """The unit vector to the sun (east, north, up) at a UTC time; None where it is not known."""
@@ -113,7 +114,7 @@ def shadow_matches(
     settings: ShadowSettings = ShadowSettings(),
 ) -> Iterator[ShadowMatch]:
     """For each width and height the best match of two pictures of one window, of what differs in an outline, (N, 2)."""
-    one, other = (_slide(sun_at(each.time_ns)) for each in (earlier, later))
+    one, other = (slide_of(sun_at(each.time_ns)) for each in (earlier, later))
     if one is None or other is None:
         return
     step = max(1, int(settings.brighter.side_m / later.window.m_per_px))
@@ -122,11 +123,6 @@ def shadow_matches(
         match = difference.match(pattern, settings.covered)
         if match is not None:
             yield ShadowMatch(*match, radius_m, height_m)
-
-
-def _slide(sun: Vector3 | None) -> Floats | None:
-    """(2,) how far east and north the shadow of a point 1 m up lies from below it; None where there is none."""
-    return None if sun is None or sun[2] <= 0 else np.asarray(-sun[:2] / sun[2], np.float64)
 
 
 def _patterns(

@@ -23,6 +23,7 @@ from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecor
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
+from sorvolo.geometry.sun import slide_of
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
@@ -48,7 +49,7 @@ from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround
-from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
@@ -275,7 +276,23 @@ class CompareRun:
         name, first = self._setup.source.name, self._evidence.next_number
         areas = self._areas.conclude(name, first)
         found = with_areas(things, areas)
-        return found + ([] if self._gathered is None else self._gathered.conclude(name, first + len(areas), found))
+        if gathered is None:
+            return found
+        found += gathered.conclude(name, first + len(areas), found)
+        return [each for each in found if not self._is_moved_shadow(each, gathered)]
+
+    def _is_moved_shadow(self, change: Change, gathered: GatheredThings) -> bool:
+        """Whether a change is the shadow of what stays, by where the sun stood on both dates."""
+        earlier = self._views.earlier_pictures
+        before_ns = None if earlier is None else earlier.time_ns(change.outline_m)
+        if before_ns is None or change.kind is ChangeKind.MOVING:
+            return False
+        before, after = (
+            slide_of(sun_over(self._archive.site(), each)) for each in (before_ns, change.first_seen_ns)
+        )
+        if before is None or after is None:
+            return False
+        return gathered.is_moved_shadow(change.outline_m, before, after)
 
     def _reported(self, changes: Sequence[Change]) -> list[Change]:
         return reported(changes, self._map_sigma_m, self._rejected)
