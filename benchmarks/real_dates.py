@@ -124,9 +124,8 @@ def main() -> None:
 
 def append(output: Path, run: dict[str, Any]) -> None:
     """Add a run to the results, with its date, commit and machine."""
-    record = json.loads(output.read_text()) if output.is_file() else {
-        "benchmark": "real_dates", "held_out": HELD_OUT, "development": DEVELOPMENT, "right_m": RIGHT_M, "runs": [],
-    }
+    record = json.loads(output.read_text()) if output.is_file() else {"benchmark": "real_dates", "runs": []}
+    record = {**record, "held_out": HELD_OUT, "development": DEVELOPMENT, "right_m": RIGHT_M}
     stamp = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", "commit": commit(), "machine": machine()}
     record["runs"].append(stamp | run)
     output.write_text(json.dumps(record, indent=1) + "\n")
