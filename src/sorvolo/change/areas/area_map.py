@@ -5,7 +5,7 @@ season and cameras do on this flight. An area is connected ground of other struc
 much more than that, in the views on the whole and in most of them alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -137,21 +137,25 @@ def _differs(signs: AreaSigns, settings: AreaSettings, own_units: float) -> NDAr
 
 
 def with_areas(
-    changes: Sequence[Change], areas: Sequence[Change], settings: ApartSettings = ApartSettings()
+    changes: Sequence[Change], areas: Sequence[Change], settings: ApartSettings = ApartSettings(),
+    lies_apart: Callable[[PointsM], bool] = lambda _: False,
 ) -> list[Change]:
     """Changes and areas, each piece of ground reported once.
 
     A change that is a part of an area is left out, unless it is a thing that stands out from the ground around it on
-    either date; an area that things explain for the most part is left out itself.
+    either date, or whose outline, (N, 2), `lies_apart` by evidence of another kind. An area that things explain for the
+    most part is left out itself.
     """
-    kept = [
+    parts = [
         each for each in changes
-        if each.kind is ChangeKind.MOVING
-        or not any(_inside(each, area.outline_m) > settings.inside for area in areas)
-        or _is_thing(each.patch, settings.stands_out)
+        if each.kind is not ChangeKind.MOVING
+        and any(_inside(each, area.outline_m) > settings.inside for area in areas)
+        and not _is_thing(each.patch, settings.stands_out)
     ]
-    still = [each for each in kept if each.kind is not ChangeKind.MOVING]
-    return kept + [area for area in areas if _explained(area, still) < settings.explained]
+    things = [each for each in changes if each not in parts]
+    still = [each for each in things if each.kind is not ChangeKind.MOVING]
+    kept = [area for area in areas if _explained(area, still) < settings.explained]
+    return things + [each for each in parts if lies_apart(each.outline_m)] + kept
 
 
 def _explained(area: Change, things: Sequence[Change]) -> float:

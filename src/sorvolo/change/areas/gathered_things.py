@@ -80,29 +80,41 @@ class GatheredThings:
         apart, came, left = (float((sums[name][own] / sums["seen"][own]).mean()) for name in ("apart", *_SHADES))
         return apart >= settings.own_spreads and came + left <= settings.most_dark
 
+    def lies_apart(self, outline_m: PointsM) -> bool:
+        """Whether an outline's ground, (N, 2), differs on the mean as much as a thing that is found by that alone."""
+        part, own = self._around(outline_m)
+        seen, apart = (self._ground.sums[name][part][own] for name in ("seen", "apart"))
+        return bool(len(seen)) and float((apart / seen).mean()) > self._settings.spreads
+
     def is_moved_shadow(self, outline_m: PointsM, earlier: Floats, later: Floats) -> bool:
         """Whether an outline's ground, (N, 2), is shade of one date, and shade of the other lies where what stays
         threw it; the shadow of a point 1 m up lies (2,) off, east and north: `earlier` and `later`."""
-        settings, sums = self._settings, self._ground.sums
-        if self._ground.is_empty:
+        settings, slide = self._settings, earlier - later
+        part, own = self._around(outline_m, float(np.abs(slide).max()) * settings.tallest_m)
+        if not own.any():
             return False
-        site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
-        step = np.linalg.inv(site_from_cell)[:2, :2] @ (earlier - later)
-        reach = np.abs(step).max() * settings.tallest_m + 1
-        at = apply_homography(np.linalg.inv(site_from_cell), outline_m)
-        (left, top), (right, low) = (at.min(axis=0) - reach).astype(int).clip(0), (at.max(axis=0) + reach).astype(int)
-        part = np.s_[top : max(low, top), left : max(right, left)]
-        seen = sums["seen"][part]
-        if not seen.any():
-            return False
-        site_from_part = site_from_cell @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]])
-        own = mask_of(outline_m, site_from_part, seen.shape) & (seen > 0)
-        shades = {name: sums[name][part] > 0.5 * np.maximum(seen, 1) for name in _SHADES}
+        step = slide * [1, -1] / self._ground.cell_m
+        seen = np.maximum(self._ground.sums["seen"][part], 1)
+        shades = {name: self._ground.sums[name][part] > 0.5 * seen for name in _SHADES}
         for name, other, along in (("came", "left", step), ("left", "came", -step)):
             shade = own & shades[name]
             if np.count_nonzero(shade) > settings.is_moved * np.count_nonzero(own):
                 return share_moved(shade, shades[other], along, settings.tallest_m) > settings.is_moved
         return False
+
+    def _around(self, outline_m: PointsM, margin_m: float = 0.0) -> tuple[tuple[slice, slice], Mask]:
+        """The part of the raster around an outline, (N, 2), and which cells of it are the outline's and were seen."""
+        if self._ground.is_empty:
+            return np.s_[:0, :0], np.zeros((0, 0), bool)
+        site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
+        at, margin = apply_homography(np.linalg.inv(site_from_cell), outline_m), margin_m / self._ground.cell_m + 1
+        (left, top), (right, low) = (at.min(axis=0) - margin).astype(int).clip(0), (at.max(axis=0) + margin).astype(int)
+        part = np.s_[top : max(low, top), left : max(right, left)]
+        seen = self._ground.sums["seen"][part] > 0
+        if not seen.any():
+            return part, seen
+        own = mask_of(outline_m, site_from_cell @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]]), seen.shape)
+        return part, own & seen
 
     def conclude(self, id_prefix: str, first_number: int, others: Sequence[Change]) -> list[Change]:
         """After the last view: the things that `others` do not hold, numbered from `first_number` on."""

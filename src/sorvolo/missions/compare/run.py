@@ -275,9 +275,9 @@ class CompareRun:
         things = evidence.conclude() if gathered is None else evidence.conclude(gathered.shows_once)
         name, first = self._setup.source.name, self._evidence.next_number
         areas = self._areas.conclude(name, first)
-        found = with_areas(things, areas)
         if gathered is None:
-            return found
+            return with_areas(things, areas)
+        found = with_areas(things, areas, lies_apart=gathered.lies_apart)
         found += gathered.conclude(name, first + len(areas), found)
         return [each for each in found if not self._is_moved_shadow(each, gathered)]
 
