@@ -178,6 +178,10 @@ def test_what_is_part_of_an_area_is_not_reported_beside_it(grass):
     car = replace(part, id="b-2", patch=replace(plain, after=thing))
     beside = replace(part, id="b-3", outline_m=outline_m + np.array([20.0, 0.0]), patch=replace(plain, west_m=49.0))
     assert [each.id for each in with_areas([part, car, beside], [area])] == ["b-2", "b-3", "b-7"]
+    asked = []
+    found = with_areas([part, car, beside], [area], lies_apart=lambda each: asked.append(each) or True)
+    assert [each.id for each in found] == ["b-2", "b-3", "b-1", "b-7"] and len(asked) == 1
+    assert asked[0] is part.outline_m
     stack = replace(car, id="b-4", outline_m=area.outline_m)
     assert [each.id for each in with_areas([stack], [area])] == ["b-4"]
 

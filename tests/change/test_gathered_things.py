@@ -96,6 +96,15 @@ def test_what_one_view_alone_shows_is_confirmed_where_it_lies_apart_and_not_as_a
     assert not gathered(ground, ground, 0).shows_once(box_m)
 
 
+def test_a_thing_within_an_area_lies_apart_and_unchanged_ground_or_none_does_not(ground):
+    west, east, south, north = BOX_M
+    box_m = np.array([[west, south], [east, south], [east, north], [west, north]])
+    things = gathered(ground, with_car(ground), 3)
+    assert things.lies_apart(box_m)
+    assert not things.lies_apart(box_m - [0, 9]) and not things.lies_apart(box_m - [-90, 0])
+    assert not gathered(ground, ground, 0).lies_apart(box_m)
+
+
 def middle_of(change: Change) -> np.ndarray:
     return (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2
 
