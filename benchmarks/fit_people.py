@@ -2,9 +2,8 @@
 
 OUT holds people.pt. Its opinions and NanoDet's support become scores by a logistic regression on pictures that it did
 not learn from: TinyPerson's validation videos, and rendered people (DIR: scenes of another seed) on the ground of the
-flight `fixed_wing`. The reporting threshold is the least at which that ground, bare and with rendered things on it,
-alarms falsely in one of 40 looks at most (real ground has what no rendered thing is like: twice as strict as for cars).
-Writes OUT/people.json.
+flight `fixed_wing`, bare and with rendered things on it. Writes OUT/people.json. What is reported is decided after the
+second look (fit_second_look.py); FIRST_LOOK only sets beside which scores the aerial network's candidates stand.
 """
 
 import argparse
@@ -25,19 +24,18 @@ from sorvolo.training.daylight import Calibration, Daylight
 from sorvolo.training.nanodet import NanoDetHead
 from sorvolo.training.samples import Share
 from train_default_model import reader
-from train_judge import LEAST_SCORE, PERSON, Truth, fitted, least_threshold, odds, reliability, tiles, untrained
+from train_judge import LEAST_SCORE, PERSON, Truth, fitted, odds, reliability, tiles, untrained
 
 RENDERED, SIDE_PX, SEED = 60, 640, 5
-BARE_ALARMS = 0.025
+FIRST_LOOK = 0.75
 LOOKS = {"tinyperson": (1.5, 3.0), "fixed_wing": (0.7, 1.3)}
 
 
 @dataclass(frozen=True, eq=False)
 class Opinions:
-    """A look's people: `rows` (N, 3) of opinion, support, whether it is one; whether nobody is there."""
+    """A look's people: `rows` (N, 3) of opinion, support, whether it is one."""
 
     rows: np.ndarray
-    is_bare: bool
 
 
 def main() -> None:
@@ -72,7 +70,7 @@ def looks(data: Path, model: Daylight, scenes: list[Scene]) -> Iterator[Opinions
             whole = read(picture.path)
             for scale in LOOKS[labelled.name]:
                 for planes, truth in tiles(labelled, picture, whole, scale, rng):
-                    yield opinions(model, planes, truth, is_bare=labelled.name == "fixed_wing")
+                    yield opinions(model, planes, truth)
     things = [nobody(each) for each in scenes]
     for number in range(2 * RENDERED):
         source = Source(Share(bare, 1.0, (0.5, 2.0)), 1.0)
@@ -81,7 +79,7 @@ def looks(data: Path, model: Daylight, scenes: list[Scene]) -> Iterator[Opinions
         picture = LabelledPicture("", SIDE_PX, SIDE_PX, "rendered", made.boxes, none, made.ignored)
         labelled = LabelledSet("rendered", CLASSES, (picture,), frozenset())
         planes = torch.from_numpy(made.image.transpose(2, 0, 1).copy())[None]
-        yield opinions(model, planes, Truth(labelled, picture, made.boxes, made.ignored), is_bare=bool(number % 2))
+        yield opinions(model, planes, Truth(labelled, picture, made.boxes, made.ignored))
 
 
 def nobody(scene: Scene) -> Scene:
@@ -91,25 +89,22 @@ def nobody(scene: Scene) -> Scene:
 
 
 @torch.no_grad()
-def opinions(model: Daylight, planes: torch.Tensor, truth: Truth, *, is_bare: bool) -> Opinions:
+def opinions(model: Daylight, planes: torch.Tensor, truth: Truth) -> Opinions:
     """What the head finds in a picture (1, 3, H, W)."""
     levels = model.coco.backbone(planes)
     boxes, opinion, supporting = model.people_of(levels, model.coco.head(levels), (planes.shape[2], planes.shape[3]))
     right, known = truth.of(boxes.numpy())
     kept = known[:, PERSON] & (opinion.numpy() >= odds(np.array(LEAST_SCORE)))
-    return Opinions(np.stack([opinion.numpy(), supporting.numpy(), right[:, PERSON]], 1)[kept], is_bare)
+    return Opinions(np.stack([opinion.numpy(), supporting.numpy(), right[:, PERSON]], 1)[kept])
 
 
 def calibrated(found: list[Opinions]) -> dict[str, object]:
-    """The regression, the threshold, and how reliable scores are."""
+    """The regression, and how reliable scores are."""
     rows = np.concatenate([each.rows for each in found])
     fit = fitted(rows[:, :2], rows[:, 2])
-    bare = np.concatenate([each.rows for each in found if each.is_bare])
-    bare_looks = sum(each.is_bare for each in found)
     return {
         "person": asdict(Calibration(float(fit[0]), float(fit[2]), float(fit[1]))),
-        "threshold": least_threshold(bare[:, :2] @ fit[:2] + fit[2], bare_looks, BARE_ALARMS),
-        "looks": len(found), "bare_looks": bare_looks,
+        "threshold": FIRST_LOOK, "looks": len(found),
         "reliability": reliability(rows[:, :2] @ fit[:2] + fit[2], rows[:, 2]),
     }
 

@@ -8,6 +8,7 @@ files, go into the cards; the models' bytes stay the same.
 import argparse
 import hashlib
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,34 +18,38 @@ from pack_default_model import HOME
 from sorvolo.detection.contract import METADATA_KEY
 
 MODELS = ("default", "default-int8")
-KEYS = ("looks_px", "own", "again", "shift", "least", "enlarged")
-FIGURES = (
-    "before and after the second look (benchmarks/second_look.py, default-int8); `measured`, `against_float32` and "
-    "`false_alarms` are version 5's: the same networks, looking once"
-)
+KEYS = ("looks_px", "own", "again", "shift", "least", "enlarged", "by")
+FIGURES = "before and after the second look (benchmarks/second_look.py)"
 
 
 def main() -> None:
     """Rewrite both files and their cards."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights", type=Path)
-    parser.add_argument("--version", default="7", help="6 was withdrawn (decision 0032)")
+    parser.add_argument("--version", default="8")
     parser.add_argument("--measured", type=Path, help="results of second_look.py")
     parser.add_argument("--home", type=Path, default=HOME)
     wishes = parser.parse_args()
     fit = json.loads(wishes.weights.read_text())["person"]
-    fields = {"version": wishes.version, "second_look": {"person": {key: fit[key] for key in KEYS}}}
+    fields: dict[str, Any] = {
+        "version": wishes.version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
+        "second_look": {"person": {key: fit[key] for key in KEYS}},
+    }
     for name in MODELS:
         path = wishes.home / f"{name}.onnx"
+        card = json.loads(path.with_suffix(".json").read_text())
+        fields["thresholds"] = card["thresholds"] | {"person": fit["threshold"]}
         path.write_bytes(with_fields(path.read_bytes(), fields))
-        card = json.loads(path.with_suffix(".json").read_text()) | fields
+        card |= fields
         if name != "default":
             card["of"] = f"default, version {wishes.version}"
         card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
-        card["second_look_fit"] = {key: fit[key] for key in ("threshold", "reports", "crossed")}
+        card["second_look_fit"] = {key: fit[key] for key in ("threshold", "reports", "photos", "right_and_false")}
         if wishes.measured is not None:
             sets = json.loads(wishes.measured.read_text())["sets"]
-            card["second_look_measured"] = {"what": FIGURES} | {each: people_of(row) for each, row in sets.items()}
+            card["second_look_measured"] = {"what": FIGURES} | {
+                each: people_of(row) for each, row in sets.items() if "person" in row
+            }
         path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
 
 

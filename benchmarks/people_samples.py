@@ -1,34 +1,39 @@
 """Training pictures for people from the air: crops of real pictures with rendered people and things laid on them."""
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from detection_data import SMALL, aerial_cars, mannequin, tinyperson
+from detection_data import SMALL, aerial_cars, hituav, mannequin, tinyperson
 from drawn_meshes import Sprite
+from painted_grounds import painted_ground
 from rendered_people import Scene
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample
-from train_default_model import reader
 
 PERSON = 0
 _PLAIN = Augmentation(blur=0.0, haze=0.0, grey=0.0, noise=0.0)  # what is pasted gets the rest together with the ground
+_FEW_BARE = 0.15  # of thermal crops without people
 _LEAST_SEEN, _LEAST_PX = 0.45, 11.0  # of a pasted person; less teaches nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Pictures to cut from, and how rendered people come onto them: on this share of crops, 0 for never."""
+    """Pictures to cut from, and how rendered people come onto them: on this share of crops, 0 for never.
+
+    `seen`: what becomes of a picture before it is cut. `least_px`: real people whose longer side is shorter are
+    ignored; of crops without any, few are taken then.
+    """
 
     share: Share
     pasted: float
+    seen: Callable[[ImageRGB, np.random.Generator], ImageRGB] = lambda picture, _: picture
+    least_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,15 +47,43 @@ class Shown:
 
 def sources(data: Path, simulated: LabelledSet, ignored: Callable[[LabelledSet], LabelledSet]) -> list[Source]:
     """All that people are learnt from. Pictures with unlabelled people pass through `ignored` first."""
-    cars = ignored(aerial_cars(data)["train"])
-    dummy = mannequin(data)["train"]
+    cars, dummy = ignored(aerial_cars(data)["train"]), mannequin(data)["train"]
+    site, thermal = ground(data, "caliterra", "IMG_9354.jpg", "IMG_9399.jpg"), hituav(data)["train"]
+    thermal = thermal.only([each for each in thermal.pictures if (each.labels == PERSON).any()])
     return [
-        Source(Share(ground(data, "caliterra", "IMG_9354.jpg", "IMG_9399.jpg"), 4.0, (0.3, 2.2)), 0.8),
-        Source(Share(replace(cars, unlabelled=frozenset({SMALL})), 2.5, (0.4, 1.5)), 0.85),
-        Source(Share(simulated, 0.8, (0.6, 1.6)), 0.6),
+        Source(Share(site, 3.0, (0.3, 2.2)), 0.8),
+        Source(Share(replace(cars, unlabelled=frozenset({SMALL})), 2.2, (0.4, 1.5)), 0.85),
+        Source(Share(simulated, 0.6, (0.6, 1.6)), 0.6),
         Source(Share(tinyperson(data)["train"], 1.6, (1.0, 3.0), aslant=True), 0.35),
-        Source(Share(dummy, 0.8, (0.35, 1.2)), 0.6),
+        Source(Share(dummy, 0.7, (0.35, 1.2)), 0.6),
+        Source(Share(thermal, 1.6, (1.2, 3.0)), 0.25, by_day, 14.0),
+        Source(Share(replace(site, name="painted"), 1.6, (0.5, 2.0)), 0.7, Painted()),
     ]
+
+
+class Painted:
+    """Grounds painted over photos: the first few dozen that are asked for, again and again, for they take long."""
+
+    def __init__(self, count: int = 48) -> None:
+        self._count = count
+        self._made: dict[int, ImageRGB] = {}
+
+    def __call__(self, picture: ImageRGB, rng: np.random.Generator) -> ImageRGB:
+        """One of them."""
+        number = int(rng.integers(self._count))
+        if number not in self._made:
+            self._made[number] = np.ascontiguousarray(painted_ground(picture, np.random.default_rng((number, 99))))
+        return self._made[number]
+
+
+def by_day(frame: ImageRGB, rng: np.random.Generator) -> ImageRGB:
+    """A thermal frame as if by day: black hot or white hot, of any contrast, tinted."""
+    grey = frame[..., :1].astype(np.float32)
+    if rng.random() < 0.5:
+        grey = 255 - grey
+    grey = 255 * (grey / 255) ** np.exp(rng.normal(0, 0.3))
+    grey = (grey - 128) * rng.uniform(0.5, 1.2) + rng.uniform(80, 170)
+    return np.clip(grey * (1 + rng.normal(0, 0.07, 3)), 0, 255).astype(np.uint8)
 
 
 def ground(data: Path, flight: str, first: str = "", last: str = "~") -> LabelledSet:
@@ -58,40 +91,27 @@ def ground(data: Path, flight: str, first: str = "", last: str = "~") -> Labelle
     none = np.zeros((0, 4), np.float32)
     pictures = tuple(
         LabelledPicture(str(path), 1, 1, flight, none, np.zeros(0, np.int64), none)
-        for path in sorted((data.parent / "flights" / flight).glob("*.jpg")) if first <= path.name <= last
+        for path in sorted((data.parent / "flights" / flight).glob("*.[jJ][pP][gG]")) if first <= path.name <= last
     )
     return LabelledSet(flight, CLASSES, pictures, frozenset({SMALL}))
 
 
-def batches(
-    plan: Sequence[Source], scenes: Sequence[Scene], *, side_px: int, batch: int, seed: int, start: int = 0
-) -> Iterator[list[Shown]]:
-    """Endless batches from number `start` on; batch k is the same wherever one starts. The next is made meanwhile."""
-    read = cache(reader())
-    shares = np.array([each.share.weight for each in plan])
-
-    def made(number: int) -> list[Shown]:
-        rng = np.random.default_rng((seed, number))
-        chosen = rng.choice(len(plan), batch, p=shares / shares.sum())
-        return [shown(plan[int(each)], scenes, read, side_px, rng) for each in chosen]
-
-    with ThreadPoolExecutor(1) as executor:
-        waiting = executor.submit(made, start)
-        while True:
-            start += 1
-            ready, waiting = waiting, executor.submit(made, start)
-            yield ready.result()
-
-
 def shown(
-    source: Source, scenes: Sequence[Scene], read: Callable[[str], ImageRGB], side_px: int, rng: np.random.Generator
+    source: Source, scenes: Sequence[Scene], read: Callable[[str], ImageRGB], side_px: int, rng: np.random.Generator,
+    stones: Callable[["Shown", np.random.Generator], "Shown"] | None = None,
 ) -> Shown:
-    """One picture to learn from."""
-    pictures = source.share.labelled.pictures
-    picture = pictures[int(rng.integers(len(pictures)))]
-    plain = replace(_PLAIN, side_px=side_px)
-    cut = cut_sample(read(picture.path), picture, source.share, CLASSES, plain, rng)
-    own = people_of(cut)
+    """One picture to learn from; `stones` lays some on it."""
+    pictures, plain = source.share.labelled.pictures, replace(_PLAIN, side_px=side_px)
+    while True:
+        picture = pictures[int(rng.integers(len(pictures)))]
+        own = people_of(cut_sample(source.seen(read(picture.path), rng), picture, source.share, CLASSES, plain, rng))
+        if not source.least_px or len(own.boxes) or rng.random() < _FEW_BARE:
+            break
+    if source.least_px:
+        small = (own.boxes[:, 2:] - own.boxes[:, :2]).max(1, initial=0) < source.least_px
+        own = Shown(own.image, own.boxes[~small], np.vstack([own.ignored, own.boxes[small]]))
+    if stones is not None:
+        own = stones(own, rng)
     if rng.random() < source.pasted:
         own = pasted(own, scenes[int(rng.integers(len(scenes)))], rng)
     return replace(own, image=finished(own.image, rng))
@@ -117,7 +137,7 @@ def pasted(below: Shown, scene: Scene, rng: np.random.Generator) -> Shown:
         corner = np.round(centre - np.array(cut.shape[1::-1]) / 2).astype(int)
         if not _is_free(below.boxes, corner, cut.shape):
             continue
-        area = _laid(picture, owner, cut, corner, number, light, scene.sunlight)
+        area = laid(picture, owner, cut, corner, number, light, scene.sunlight)
         if scene.is_person[index]:
             areas[number] = area
     boxes, hidden = _boxes(owner, areas)
@@ -194,7 +214,7 @@ def _is_free(boxes: Floats, corner: np.ndarray, shape: Sequence[int]) -> bool:
     return not over.any()
 
 
-def _laid(
+def laid(
     picture: np.ndarray, owner: np.ndarray, cut: np.ndarray, corner: np.ndarray, number: int, light: Floats,
     sunlight: float,
 ) -> int:

@@ -1,11 +1,12 @@
-"""What people's second look changes: benchmarks/second_look.py DATA [--model default-int8] [--sets ...]
+"""What people's second look changes: benchmarks/second_look.py DATA [--model default] [--sets ...]
 
-Decision 0049. DATA holds `detection` and `flights`. Every set is searched once; what the model reports is counted
-before and after the second look that its file states, at the model's thresholds. Flights that hardly show anyone
-(false_alarms.py: brighton_beach and caliterra, at full size) give reports a photo; how many are right was counted by
-eye on the crops that --out FOLDER gets (`kept`, `gone`, `new`), and is given with --right FLIGHT:CLASS=BEFORE,AFTER.
-Labelled sets (detection_data.py, held-out parts) give what is found and right at the thresholds, and AP50. Processor
-seconds of each look. Writes results/second_look_people.json; results/second_look.json is the trial of decision 0046.
+Decisions 0049 and 0054. DATA holds `detection` and `flights`. Every set is searched once; what the model reports is
+counted before and after the second look that its file states, at the model's thresholds. Flights that hardly show
+anyone (false_alarms.py: brighton_beach and caliterra, at full size) give reports a photo; how many are right was
+counted by eye on the crops that --out FOLDER gets (`kept`, `gone`, `new`), and is given with --right
+FLIGHT:CLASS=BEFORE,AFTER. Labelled sets (detection_data.py, held-out parts) give what is found and right at the
+thresholds, and AP50. Processor seconds of each look. Writes results/second_look_people.json; results/second_look.json
+is the trial of decision 0046.
 """
 
 import argparse
@@ -24,7 +25,6 @@ from provenance import commit, machine, note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import score_set
-from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.store.exports.plain import plain_json
@@ -43,11 +43,10 @@ class Looker:
     """A model that looks once, and again as its file says; counts what both take, processor seconds."""
 
     def __init__(self, model: str) -> None:
-        self.session = Session(find_model(model), "cpu", 1)
-        info = self.session.info
-        self.hows = {info.classes.index(name): how for name, how in info.second_look.items()}
-        self.session.info = replace(info, second_look={})
-        self.detector = Detector(self.session)
+        self.whole = Detector.load(model, provider="cpu", threads=1)
+        session = Session(find_model(model), "cpu", 1)
+        session.info = replace(session.info, second_look={})
+        self.detector = Detector(session)
         self.first_s = self.again_s = 0.0
 
     def looks(
@@ -59,7 +58,7 @@ class Looker:
         found = self.detector.detect(picture, tiles=tiles, m_per_px=m_per_px, classes=classes, least_score=least)
         looked_s = time.process_time()
         seen = Seen(found.boxes_px, found.scores, found.labels)
-        seen = looked_again(seen, picture, self.session.see, self.hows)
+        seen = self.whole._seen_again(self.whole._session, picture, seen, classes)
         self.first_s += looked_s - began_s
         self.again_s += time.process_time() - looked_s
         return found, Detections(seen.boxes_px, seen.scores, seen.labels, found.classes)
@@ -82,7 +81,7 @@ def main() -> None:
     """Look, count, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--model", default="default-int8")
+    parser.add_argument("--model", default="default")
     parser.add_argument("--sets", nargs="+", default=SETS)
     parser.add_argument("--right", nargs="*", default=[])
     parser.add_argument("--out", type=Path)
@@ -118,13 +117,13 @@ def judged(known: dict, wish: str) -> None:
 
 def flight(looker: Looker, data: Path, name: str, out: Path | None) -> dict[str, object]:
     """Reports of a flight at full size, before and after."""
-    thresholds, crops = looker.session.info.thresholds, Crops()
+    thresholds, crops = looker.whole.info.thresholds, Crops()
     counts = {label: {"threshold": thresholds[label], "before": 0, "after": 0} for label in SHOWN}
     photos = [path for path in sorted((data / "flights" / name).glob("*.[jJ][pP][gG]")) if path.name >= FIRST[name]]
     for path in photos:
         shown = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
         picture, m_per_px = np.ascontiguousarray(shown[..., ::-1]), M_PER_PX[name] * SCALE
-        least = min(how.least for how in looker.hows.values())
+        least = min(how.least for how in looker.whole.info.second_look.values())
         first, after = (possible(each, shown, m_per_px) for each in looker.looks(picture, SHOWN, m_per_px, least))
         for label, box, was, score in followed(first, after):
             stages = was >= thresholds[label], score >= thresholds[label]
@@ -151,7 +150,7 @@ def labelled(looker: Looker, data: Path, name: str) -> dict[str, object]:
     pairs = [looker.looks(read(each.path), SHOWN) for each in chosen.pictures]
     rows: dict[str, object] = {"pictures": len(chosen)}
     for when, found in zip(("before", "after"), zip(*pairs)):
-        scores = score_set(chosen, list(found), chosen.classes, looker.session.info.thresholds, draws=20)
+        scores = score_set(chosen, list(found), chosen.classes, looker.whole.info.thresholds, draws=20)
         for row in scores.classes:
             if row.labels and row.label in SHOWN:
                 of_class = rows.setdefault(row.label, {"labels": row.labels})

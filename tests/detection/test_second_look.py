@@ -85,7 +85,7 @@ def test_a_crowd_costs_no_more_than_its_share() -> None:
     how, settings = {0: SecondLook((34.0, 17.0), 0.5, 0.5, 0.0, 0.5, 9.0)}, SheetSettings()
     boxes = np.array([[10 * n, 10, 10 * n + 8, 30] for n in range(60)], np.float32)
     crowd = Seen(boxes, np.linspace(0.99, 0.6, 60), np.zeros(60, np.int64))
-    for size, cuts in {(640, 640): 8, (720, 1280): 14, (1500, 2000): 32}.items():
+    for size, cuts in {(640, 640): 8, (720, 1280): 14, (1500, 2000): 45, (3000, 4000): 96}.items():
         again = opinions(crowd, np.zeros((*size, 3), np.uint8), sees, how)
         assert sorted(again) == list(range(cuts // 2)), "the best reports"
         height, width, _ = shown.pop()
@@ -125,3 +125,30 @@ def test_cut_outs_at_the_edge_show_the_report_where_it_is_said_to_be(box: tuple[
 def test_weights_that_cannot_be(tmp_path: Path, wrong: Any) -> None:
     with pytest.raises(InputError, match="cannot be used"):
         Detector.load(rectangle_model(tmp_path / "wrong.onnx", second_look=wrong), provider="cpu", threads=1)
+
+
+def test_another_model_may_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its labels are its own; what it does not see falls, and what it sees by another name does not count."""
+    monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path))
+    rectangle_model(tmp_path / "stranger.onnx", classes=("car", "person", "small object"))
+    how = HOW | {"by": "stranger"}
+    first = rectangle_model(tmp_path / "first.onnx", second_look={"person": how})
+    alone = rectangle_model(tmp_path / "alone.onnx", second_look={"person": HOW})
+    asked, self_asked = (Detector.load(each, provider="cpu", threads=1) for each in (first, alone))
+    assert asked.info.second_look["person"].by == "stranger" and self_asked.info.second_look["person"].by == ""
+    picture = pictured()
+    by_itself = self_asked.detect(picture, least_score=0.0)
+    by_another = asked.detect(picture, least_score=0.0)
+    assert by_itself.scores[0] > 0.8
+    # the stranger calls label 0 a car: it sees no person at all
+    fallen = 1 / (1 + math.exp(-0.5 * (math.log(230 / 25) + math.log(0.02 / 0.98))))
+    np.testing.assert_allclose(by_another.scores, [fallen] * 2, atol=0.01)
+    asked.rest()
+    np.testing.assert_allclose(asked.detect(picture, least_score=0.0).scores, by_another.scores)
+
+
+def test_a_second_model_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path))
+    path = rectangle_model(tmp_path / "first.onnx", second_look={"person": HOW | {"by": "nowhere"}})
+    with pytest.raises(InputError, match="there is no model 'nowhere'; installed are"):
+        Detector.load(path, provider="cpu", threads=1).detect(pictured())

@@ -27,7 +27,7 @@ class SecondLook:
     `looks_px`: in each look the report's longer side has so many pixels. A look that would show it more than `enlarged`
     times as large is left out, but for the smallest: blur has nothing to tell. A report's log-odds become `shift`,
     `own` times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked
-    at.
+    at. `by`: the installed model that looks, "" for the same one; another errs in other places.
     """
 
     looks_px: tuple[float, ...]
@@ -36,6 +36,7 @@ class SecondLook:
     shift: float
     least: float
     enlarged: float
+    by: str = ""
 
     def sides_px(self, longer_px: float) -> tuple[float, ...]:
         """The looks at a report whose longer side has so many pixels in its picture."""
@@ -155,7 +156,8 @@ def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str,
             raise ValueError(f"its second_look must name classes and sizes of theirs, not {name} {list(looks_px)}")
         if not all(map(math.isfinite, weights)) or not 0 <= weights[3] <= 1:
             raise ValueError(f"its second_look must have finite weights and a least score, not {weights}")
-        found[name] = SecondLook(looks_px, *weights)
+        own, again, shift, least, enlarged = weights
+        found[name] = SecondLook(looks_px, own, again, shift, least, enlarged, str(each.get("by", "")))
     return found
 
 

@@ -18,7 +18,7 @@ from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles
 from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.arrays import Floats, ImageRGB, Labels
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections
 
@@ -34,6 +34,7 @@ class Detector:
         self._any_may_stand_in = stand_in
         self._at_night: Session | None = None
         self._night_was_sought = False
+        self._opinions: dict[str, Session] = {}  # by name, those who look a second time
         self._seeking = threading.Lock()
         self._thermal_frames = self._daylight_frames = 0
 
@@ -134,7 +135,7 @@ class Detector:
 
     def rest(self) -> None:
         """Give back memory that is kept for the next picture: before work that needs it, and after the last picture."""
-        for each in (self._session, self._at_night):
+        for each in (self._session, self._at_night, *self._opinions.values()):
             if each is not None:
                 each.rest()
 
@@ -172,13 +173,12 @@ class Detector:
             return looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
 
         seen = _seen_turned(rgb, whole) if from_above and session.info.turned else whole(rgb)
-        seen = _seen_again(session, rgb, seen, asked)
+        seen = self._seen_again(session, rgb, seen, asked)
         least = _least_scores(session.info, _thresholds(session.info, from_above), asked, least_score)
         kept = seen.scores >= least[seen.labels]
         labels = seen.labels[kept]
         if session is not self._session:
-            own = [self.classes.index(name) if name in self.classes else -1 for name in session.info.classes]
-            labels = np.array(own, np.int64)[labels]
+            labels = _places_in(self.classes, session.info.classes)[labels]
         return Detections(seen.boxes_px[kept], seen.scores[kept], labels, self.classes)
 
     def _session_for(self, thermal: bool) -> Session:
@@ -202,6 +202,26 @@ class Detector:
                 self._at_night = None if found is None else self._opened(found)
                 self._night_was_sought = True
         return self._at_night or self._session
+
+    def _seen_again(self, session: Session, rgb: ImageRGB, seen: Seen, asked: Sequence[str]) -> Seen:
+        """What was seen, scored again by a second look at the reports of `asked` classes for which a model has one."""
+        info = session.info
+        hows = {info.classes.index(name): how for name, how in info.second_look.items() if name in asked}
+        for by in dict.fromkeys(how.by for how in hows.values()):
+            looking = self._second(session, by)
+            mine = {label: how for label, how in hows.items() if how.by == by}
+            if looking.fixed_px is None:  # sheets have sizes of their own
+                seen = looked_again(seen, rgb, _in_labels_of(looking, info.classes), mine)
+        return seen
+
+    def _second(self, session: Session, by: str) -> Session:
+        """Who looks a second time; threads that ask at once wait for it."""
+        if not by:
+            return session
+        with self._seeking:
+            if by not in self._opinions:
+                self._opinions[by] = self._opened(find_model(by))
+            return self._opinions[by]
 
     def _opened(self, path: Path) -> Session:
         return Session(path, self._wanted_provider, self._threads, self._shared)
@@ -229,13 +249,20 @@ def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:
     return agreed(looks, settings)
 
 
-def _seen_again(session: Session, rgb: ImageRGB, seen: Seen, asked: Sequence[str]) -> Seen:
-    """What was seen, scored again by a second look at the reports of `asked` classes for which the model has one."""
-    info = session.info
-    hows = {info.classes.index(name): how for name, how in info.second_look.items() if name in asked}
-    if not hows or session.fixed_px is not None:  # sheets have sizes of their own
-        return seen
-    return looked_again(seen, rgb, session.see, hows)
+def _in_labels_of(session: Session, classes: Sequence[str]) -> Callable[[ImageRGB], Seen]:
+    """How a model sees, its labels by the places of their names in `classes`; -1 for other names."""
+    own = _places_in(classes, session.info.classes)
+
+    def sees(picture: ImageRGB) -> Seen:
+        seen = session.see(picture)
+        return Seen(seen.boxes_px, seen.scores, own[seen.labels])
+
+    return sees
+
+
+def _places_in(classes: Sequence[str], names: Sequence[str]) -> Labels:
+    """(names,) where each name stands in `classes`; -1 where it does not."""
+    return np.array([classes.index(name) if name in classes else -1 for name in names], np.int64)
 
 
 def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:

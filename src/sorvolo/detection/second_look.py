@@ -1,6 +1,7 @@
-"""Reports looked at again: cut out with their surroundings and shown to the same model at other sizes (decision 0049).
+"""Reports looked at again: cut out with their surroundings and shown at other sizes, to the same model or another one.
 
-A boulder that looks like a person at one size seldom does at others. Only what was reported is looked at again, all of
+A boulder that looks like a person at one size seldom does at others (decision 0049), and one that fools one network
+seldom fools another that learnt from other pictures (decision 0054). Only what was reported is looked at again, all of
 a picture side by side on one sheet, so that it costs little.
 """
 
@@ -17,7 +18,7 @@ from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.box_overlap import iou_matrix
 
 Sees = Callable[[ImageRGB], Seen]
-"""What the model finds in a picture, (H, W, 3) RGB."""
+"""What a model finds in a picture, (H, W, 3) RGB, in the labels of the one that reported."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class SheetSettings:
     cell_px: int = 128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
     columns: int = 8
     share: float = 0.25  # of the picture's pixels that the sheet has at most; in a crowd the others keep their score
-    cuts: tuple[int, int] = (8, 32)  # cut-outs of one picture, best reports first: at least so many may be, and at most
+    cuts: tuple[int, int] = (8, 96)  # cut-outs of one picture, best reports first: at least so many may be, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
     filling: int = 114  # beyond the picture's edge, as in training
