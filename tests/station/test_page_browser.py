@@ -200,6 +200,62 @@ def test_changes_are_judged_with_the_keyboard_and_others_see_it(
     other.page.context.close()
 
 
+def test_keys_are_meant_for_what_is_shown_though_the_station_answers_late(browser: Any, served: Served) -> None:
+    """What is pressed and written after a verdict concerns the next change, also before the station has answered."""
+    watched = Watched(browser.new_context(), served.url)
+    page = watched.page
+
+    def late(route: Any) -> None:
+        page.wait_for_timeout(500)
+        route.continue_()
+
+    page.route("**/reviews", late)
+    show(watched, served, "review")
+    page.locator(".gallery h3").wait_for()
+    first, second, third, *_ = page.locator(".strip button").evaluate_all("all => all.map(each => each.dataset.id)")
+    before = {each["id"]: each["properties"].get("review") for each in changes(served)}
+    with page.expect_response("**/reviews"):
+        page.keyboard.press("c")
+        assert page.locator(".strip [aria-current]").get_attribute("data-id") == second
+        page.keyboard.press("n")
+        page.keyboard.type("rucksack", delay=100)  # its letters are keys that judge, withdraw, move on
+    page.keyboard.press("Enter")
+    page.locator(".gallery .remark", has_text="rucksack").wait_for()
+    page.keyboard.press("r")
+    page.keyboard.press("k")
+    with page.expect_response("**/reviews"), page.expect_response(lambda each: "none" in str(each.request.post_data)):
+        page.keyboard.press("u")  # before the station has taken what it withdraws
+    page.locator(f".strip button.open[data-id='{second}']").wait_for()
+    kept = {each["id"]: each["properties"] for each in changes(served)}
+    assert [kept[each].get("review") for each in (first, second)] == ["confirmed", "none"]
+    assert kept[second]["note"] == "rucksack" and kept[third].get("review") == before[third]
+    page.reload()
+    page.locator(f".strip button.open[data-id='{second}']").wait_for()  # withdrawn: it is to be reviewed again
+    assert watched.faults == []
+    page.context.close()
+
+
+def test_a_note_on_the_map_stays_under_the_hands(browser: Any, served: Served) -> None:
+    """While it is written other people judge and missions announce things."""
+    watched = Watched(browser.new_context(), served.url)
+    page = watched.page
+    show(watched, served, "review")
+    page.locator(".gallery h3").wait_for()
+    page.keyboard.press("m")
+    note = page.locator(".card-over input")
+    note.focus()
+    page.keyboard.type("a red")
+    announce(served, "object.found", {"feature": {
+        "type": "Feature", "id": "o9", "properties": {"id": "o9", "class": "boat", "score": 0.9},
+        "geometry": {"type": "Point", "coordinates": [0, 0]},
+    }})
+    page.get_by_text("boats (1)").or_(page.get_by_text("boat (1)")).first.wait_for()
+    page.keyboard.type(" car")
+    assert note.input_value().endswith("a red car")
+    assert watched.faults == []
+    page.context.close()
+
+
 def test_a_change_and_an_object_are_tapped_on_the_map(browser: Any, served: Served) -> None:
     """Each at its place: the card with its facts opens, and the verdict given there is kept."""
     context = browser.new_context(viewport={"width": 1280, "height": 720}, reduced_motion="reduce")
@@ -251,6 +307,7 @@ def test_a_verdict_that_came_first_is_shown_and_not_overwritten(browser: Any, se
     watched.page.keyboard.press("r")
     watched.page.locator(".message.warning", has_text="was quicker: confirmed, “my car”").wait_for()
     assert next(each["properties"]["review"] for each in changes(served) if each["id"] == chosen) == "confirmed"
+    watched.page.get_by_role("button", name="Show it").click()  # the gallery had gone on
     watched.page.keyboard.press("r")  # seen, and still meant
     watched.page.locator(f".strip button.rejected[data-id='{chosen}']").wait_for()
     assert [each for each in watched.faults if "409" not in each] == []

@@ -15,11 +15,17 @@ export function featureCard(screen) {
   screen.stage.append(box);
   return {
     show(feature) {
-      box.hidden = !feature || !SHOWN_IN.has(screen.shown);
-      if (!box.hidden) fill(box, cardOf(screen, feature));
+      const isHidden = !feature || !SHOWN_IN.has(screen.shown);
+      if (!isHidden && !box.hidden && isWritten(box) && box.dataset.id === String(feature.id)) return;
+      box.hidden = isHidden;
+      box.dataset.id = feature?.id ?? "";
+      if (!isHidden) fill(box, cardOf(screen, feature));
     },
   };
 }
+
+/** Whether a note is being written in it: that is not to vanish under the hands when something else changes. */
+export const isWritten = (node) => node.contains(document.activeElement) && document.activeElement.matches("input");
 
 function cardOf(screen, feature) {
   return [

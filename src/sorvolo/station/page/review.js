@@ -1,7 +1,7 @@
 // The gallery: changes and objects one after another, large pictures, judged with the keyboard.
 
 import { button, choice, el, fill, icon, tick } from "./dom.js";
-import { badge, facts, picture, pictures, titleOf } from "./feature_card.js";
+import { badge, facts, isWritten, picture, pictures, titleOf } from "./feature_card.js";
 import { counted } from "./words.js";
 import { cropsOf, isChange } from "./site_data.js";
 import { judge, verdictForm } from "./verdicts.js";
@@ -77,9 +77,7 @@ class Review {
     const at = list.findIndex((each) => each.id === this.at);
     this.big.hidden = at < 0;
     if (at < 0) return;
-    if (this.big.contains(document.activeElement) && document.activeElement.matches("input")) {
-      if (this.drawn === this.at) return; // a note is being written: it is not to vanish under the hands
-    }
+    if (isWritten(this.big) && this.drawn === this.at) return;
     this.drawn = this.at;
     const feature = list[at];
     this.pictures = pictures(feature);
@@ -88,7 +86,7 @@ class Review {
         button("Previous", () => this.step(-1), { class: "quiet", "aria-keyshortcuts": "K" }), button("Next", () => this.step(1), { class: "quiet", "aria-keyshortcuts": "J" })),
       this.pictures,
       el("div", { class: "gallery-foot" }, facts(feature, this.screen.data.detail.is_local),
-        el("div", {}, verdictForm(this.screen, feature, { keys: true }),
+        el("div", {}, verdictForm(this.screen, feature, { keys: true, given: (verdict, note) => this.give(verdict, note) }),
           el("div", { class: "row" }, button("Show on the map", () => this.map(), { icon: "target", "aria-keyshortcuts": "M" }),
             isChange(feature) ? button("Blink", () => this.blink(), { class: "quiet", "aria-keyshortcuts": "B" }) : null))));
     this.strip.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
@@ -117,12 +115,20 @@ class Review {
     if (next) this.choose(next.id);
   }
 
-  async give(verdict) {
+  /** Show a feature, whatever was shown. */
+  see(feature) {
+    this.what = isChange(feature) ? "changes" : "objects";
+    this.choose(feature.id);
+  }
+
+  /** Judge what is shown, and go on to the next at once: whatever is pressed from now on is meant for that. */
+  give(verdict, note = null) {
     const feature = this.screen.data.find(this.at);
     if (!feature || this.screen.station.status.role === "view") return;
     const list = this.list();
     const next = list[list.findIndex((each) => each.id === this.at) + 1]?.id;
-    if (await judge(this.screen, feature, verdict) && verdict !== "none" && next && this.at === feature.id) this.choose(next);
+    judge(this.screen, feature, verdict, note);
+    if (verdict !== "none" && next) this.choose(next);
   }
 
   key(event) {

@@ -22,6 +22,7 @@ export class SiteData extends EventTarget {
     await Promise.all(names.map(async (name) => {
       const kept = await features(this.id, name);
       if (name === "objects") kept.push(...await features(this.id, "findings"));
+      for (const { properties } of kept) if (properties.review === "none") properties.review = null; // withdrawn: open again
       const watched = this.all[name].filter((each) => each.properties.watched && !kept.some(({ id }) => id === each.id));
       this.all[name] = [...kept, ...watched]; // what a running watch has just found is not in its file yet
     }));
