@@ -77,19 +77,20 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     flights = {name: compared(options.data / name, options.peer_bin, options.three_d) for name in options.flights}
-    if not options.three_d and options.output.is_file():
-        keep_three_d(flights, json.loads(options.output.read_text()))
+    if options.output.is_file():
+        keep_earlier(flights, json.loads(options.output.read_text()))
     result = {"benchmark": "peers", "machine": machine(), "commit": commit(), "flights": flights}
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
 
 
-def keep_three_d(flights: dict[str, Any], before: dict[str, Any]) -> None:
-    """What pyOrthomosaic's 3D took in an earlier run is kept, with that run's commit."""
-    for name, runs in flights.items():
-        known = before["flights"].get(name, {}).get("pyorthomosaic_3d")
-        if known is not None:
-            runs["pyorthomosaic_3d"] = {"commit": before["commit"]} | known
+def keep_earlier(flights: dict[str, Any], before: dict[str, Any]) -> None:
+    """Flights and pyOrthomosaic's 3D that only an earlier run has are kept, with that run's commit."""
+    for name, known in before["flights"].items():
+        if name not in flights:
+            flights[name] = {"commit": before["commit"]} | known
+        elif "pyorthomosaic_3d" in known and "pyorthomosaic_3d" not in flights[name]:
+            flights[name]["pyorthomosaic_3d"] = {"commit": before["commit"]} | known["pyorthomosaic_3d"]
 
 
 def compared(folder: Path, peer_bin: Path | None, three_d: bool) -> dict[str, Any]:
