@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.headline import MapQuality
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.live_journal import SourceNotes
@@ -32,6 +34,7 @@ from sorvolo.survey.findings import CompareUpdate, ViewStatus
 from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 
 _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a thread for each
+_DECODED = 1  # frames of a video that wait to be compared
 
 
 def compare_flights(
@@ -172,7 +175,7 @@ def _ended(
     beside those that were (a video shows the same ground again anyway)."""
     again: set[int] = set()
     yield from run.recalled()
-    for each in _begun(source.frames(every(step_s)), setup, inside, run, ahead):
+    for each in _begun(_frames(source, step_s), setup, inside, run, ahead):
         if source.kind == "photos" and isinstance(each, Pending) and each.is_unplaced:
             again.add(each.posed.frame.index)
             run.put_off(each)
@@ -180,6 +183,16 @@ def _ended(
             yield each
     if again:
         yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead)
+
+
+def _frames(source: Source, step_s: float) -> Generator[Frame | LostFrame]:
+    """A frame each step. A recorded video is decoded in a thread of its own: photos and live sources have theirs."""
+    frames = source.frames(every(step_s))
+    if isinstance(source, LiveSource) or source.kind == "photos":
+        yield from frames
+        return
+    with closing(read_ahead(frames, _DECODED)) as ahead:
+        yield from ahead
 
 
 def _begun(
