@@ -10,7 +10,7 @@ import pytest
 from sorvolo.change.areas.area_map import AreaMap, AreaMapSettings, with_areas
 from sorvolo.change.areas.connected_areas import AreaSettings
 from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
-from sorvolo.change.areas.signs import leaning
+from sorvolo.change.areas.signs import leaning, level_of
 from sorvolo.change.shape.outlines import overlap
 from sorvolo.change.shape.patches import PatchWindow, cut
 from sorvolo.simulation.ground import GroundKind, paint_ground
@@ -194,8 +194,8 @@ def test_ground_that_leans_in_pictures_of_one_date_is_no_area(grass):
     shown[100:300, 200:400] = crown
     other[100:300, 200:400] = crown[::-1]
     everywhere = np.ones((480, 640), bool)
-    leans = leaning(shown, other, everywhere)
+    leans = leaning(level_of(shown), other, everywhere)
     assert leans[120:280, 220:380].mean() > 0.9 and leans[350:].mean() < 0.05
-    assert leaning(shown, np.roll(shown, 1, axis=0), everywhere).mean() < 0.05
+    assert leaning(level_of(shown), np.roll(shown, 1, axis=0), everywhere).mean() < 0.05
     smooth = np.full_like(shown, 120)
-    assert not leaning(smooth, np.full_like(shown, 90), everywhere).any()
+    assert not leaning(level_of(smooth), np.full_like(shown, 90), everywhere).any()

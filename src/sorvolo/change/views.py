@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.alignment import Aligned, Aligner, AlignStep
-from sorvolo.change.areas.signs import leaning
+from sorvolo.change.areas.signs import leaning, level_of
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
@@ -304,23 +304,28 @@ class ViewMaker:
         if self._pictures is None or compared.settings is None:
             return compared.found, None
         settings, (height, width) = self._settings, compared.valid.shape
-        leans = np.zeros((height, width), bool)
+        leans, level = np.zeros((height, width), bool), level_of(as_bgr(compared.reference))
         earlier: list[tuple[Difference, Mask]] = []
-        for number, (picture, sees) in enumerate(self._pictures.seen_from(
+        pictures = self._pictures.seen_from(
             compared.aligned.site_from_image, compared.aligned.camera_m, width, height,
             settings.witnesses + settings.further,
-        )):
+        )
+        for number in range(settings.witnesses + settings.further):
+            is_further = number >= settings.witnesses
+            seen = [each for _, each in earlier]
+            open_parts = unwitnessed(compared.found, seen, settings.corroboration) if is_further else []
+            if is_further and not open_parts:
+                break
+            picture, sees = next(pictures, (None, None))  # made only now: most views need no further ones
+            if picture is None or sees is None:
+                break
             sees &= self._lens_sees
-            if number >= settings.witnesses:
-                open_parts = unwitnessed(compared.found, [seen for _, seen in earlier], settings.corroboration)
-                if not open_parts:
-                    break
-                mask = compared.found.mask
-                if not any(is_whole(mask, part, sees, settings.corroboration) for part in open_parts):
-                    continue
+            mask = compared.found.mask
+            if is_further and not any(is_whole(mask, each, sees, settings.corroboration) for each in open_parts):
+                continue
             found = compare_robust(picture, compared.query, sees, compared.settings)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
-            leans |= leaning(as_bgr(compared.reference), picture, sees & compared.valid)
+            leans |= leaning(level, picture, sees & compared.valid)
         return believed((compared.found, compared.valid), earlier, settings.corroboration), leans
 
     def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:

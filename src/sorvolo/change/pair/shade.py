@@ -1,6 +1,7 @@
 """The shade mask of a view, made once: where one date shows ground no brighter than the other, all colours alike."""
 
 from dataclasses import dataclass
+from math import ceil
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ def shade_of_view(
 
     The map's picture is brought to the view's light first; 0 where not `valid` (h, w).
     """
-    before, after = (np.ascontiguousarray(each[..., ::-1]) for each in (reference, image))
+    before, after = (np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2BGR), np.uint8) for each in (reference, image))
     half = before.shape[1] // 2, before.shape[0] // 2
     known = None if valid.all() else cv2.resize(valid.view(np.uint8), half, interpolation=cv2.INTER_NEAREST) > 0
     small_before, small_after = (
@@ -48,10 +49,15 @@ def shade_between(before: ImageRGB, after: ImageRGB, settings: ShadeSettings = S
         (one, other, Shade.LATER, Shade.LATER_DARK), (other, one, Shade.EARLIER, Shade.EARLIER_DARK),
     ):
         most, spread = _parts(lighter, darker)
-        alike = spread < settings.alike * _ONE
-        shade |= (alike & (most < settings.no_brighter * _ONE)).view(np.uint8) * np.uint8(bit)
-        shade |= (alike & (most < settings.dark * _ONE)).view(np.uint8) * np.uint8(dark_bit)
+        alike = _below(spread, settings.alike * _ONE, 255)
+        for limit, marks in ((settings.no_brighter, bit), (settings.dark, dark_bit)):
+            cv2.bitwise_or(shade, cv2.bitwise_and(alike, _below(most, limit * _ONE, int(marks))), dst=shade)
     return shade
+
+
+def _below(values: MatLike, limit: float, marks: int) -> MatLike:
+    """(h, w) uint8 `marks` where whole values are less than a limit, else 0."""
+    return cv2.threshold(values, ceil(limit) - 1, marks, cv2.THRESH_BINARY_INV)[1]
 
 
 def _parts(lighter: MatLike, darker: MatLike) -> tuple[ImageGray, ImageGray]:

@@ -82,11 +82,12 @@ class Cut:
 
     def over(self, older: "Cut") -> "Cut":
         """This cut, and the older one where this one knows nothing."""
-        known = self.after[..., 3:] > 0
-        return Cut(
-            np.where(known, self.before, older.before), np.where(known, self.after, older.after),
-            np.where(known[..., 0], self.shade, older.shade),
+        known, own = self.after[..., 3], (self.before, self.after, self.shade)
+        before, after, shade = (
+            np.asarray(cv2.copyTo(each, known, other.copy()), np.uint8)
+            for each, other in zip(own, (older.before, older.after, older.shade))
         )
+        return Cut(before, after, shade)
 
     def moved(self, new: "PatchWindow", old: "PatchWindow") -> "Cut":
         """The cut of one window as another one has it."""
