@@ -255,6 +255,20 @@ def test_a_process_that_states_its_end_and_does_not_come_to_it_holds_up_nobody(t
         assert process.returncode == -signal.SIGKILL
 
 
+def test_a_line_of_a_mission_is_taken_in_when_it_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not when the station next looks at all missions: boxes wait for it."""
+    with TestClient(station_app(StationSettings(tmp_path)), base_url=HOST) as client:
+        runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
+        run = waiting(runs, Run("4" * 16, "map", "new", "running", "Ada", utc_now()), DEAF)
+        wait_for(lambda: run.id in runs._ends)
+        monkeypatch.setattr(runs_module, "_LOOK_EVERY_S", 3600.0)
+        time.sleep(0.3)  # the last wait of the usual length is over
+        with (runs._folder / run.id / "journal.jsonl").open("a") as journal:
+            journal.write(json.dumps({"type": "run.progress", "data": {"frames": 7}}) + "\n")
+        wait_for(lambda: (runs.get(run.id).progress or {}).get("frames") == 7)
+        runs._processes[run.id].kill()
+
+
 def test_the_missions_of_a_site_are_not_cut_off_by_those_of_others(tmp_path: Path) -> None:
     """The limit counts what was asked for."""
     with TestClient(station_app(StationSettings(tmp_path)), base_url=HOST) as client:

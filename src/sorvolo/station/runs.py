@@ -57,7 +57,8 @@ NOTHING_KEPT = "stopped; nothing was kept"
 _NEVER = "9999"
 _MOST_LINE_BYTES = 4_000_000
 _MOST_LOG_BYTES = 4000
-_LOOK_EVERY_S = 0.1
+_LOOK_EVERY_S = 0.1  # at all that runs
+_GLANCE_EVERY_S = 0.02  # whether a journal has grown: the boxes of a picture are in it
 _LOG = logging.getLogger("sorvolo.station.disk")
 _DISK_EVERY = 50  # looks between two at the disk
 
@@ -97,6 +98,7 @@ class Runs:
         self._folder = settings.state_folder / RUNS_FOLDER
         self._lock = threading.RLock()
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._ends: dict[str, int] = {}  # how far the journals of those that run were read
         self._lingering_s: dict[str, float] = {}  # ended by their own journal, their processes not yet: since when
         self._is_low = False
         self._reserve = Reserve(settings.state_folder / RESERVE_FILE)
@@ -292,7 +294,7 @@ class Runs:
 
     def _watch(self) -> None:
         for count in itertools.count():
-            if self._ending.wait(_LOOK_EVERY_S):
+            if self._is_ending():
                 return
             try:
                 if count % _DISK_EVERY == 0:
@@ -303,6 +305,15 @@ class Runs:
                     continue
                 sys.stderr.write(f"station: runs cannot be followed: {error}\n")
                 self._ending.wait(2.0)
+
+    def _is_ending(self) -> bool:
+        """Wait until a journal has grown, for `_LOOK_EVERY_S` at most; whether the station ends."""
+        until_s = time.monotonic() + _LOOK_EVERY_S
+        while not self._ending.wait(_GLANCE_EVERY_S):
+            grown = (_size_bytes(self._folder / run_id / JOURNAL_FILE) > end for run_id, end in list(self._ends.items()))
+            if time.monotonic() >= until_s or any(grown):
+                return False
+        return True
 
     def _look_at(self, run: Run, offset: int) -> Run:
         folder = self._folder / run.id
@@ -315,7 +326,9 @@ class Runs:
                 events.append(event)
             if events or end > offset:
                 self._keep(run, events, end)
+        self._ends[run.id] = end
         if run.state != RUNNING:
+            self._ends.pop(run.id, None)
             self._lingering_s.setdefault(run.id, time.monotonic())
             self._shelf.forget(run.site)
         elif not has_ended and (run.kill_at or _NEVER) < utc_now():
@@ -529,6 +542,14 @@ def _new_lines(path: Path, offset: int) -> tuple[list[dict[str, Any]], int]:
         except ValueError:  # a line that a power cut tore
             continue
     return lines, offset + end
+
+
+def _size_bytes(path: Path) -> int:
+    """How large a file is; 0 where it is not there."""
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
 
 
 def _tail(path: Path) -> str:

@@ -9,7 +9,7 @@ from sorvolo.capture.live.reconnect import LiveSettings, Outages
 ENDED_SUFFIX = ".ended"
 """A file of this name beside a growing one states that nothing more is added."""
 
-_POLL_S = 0.05
+_POLL_S = 0.01  # pictures wait for it
 _PACKET_BYTES = 188
 _NEWEST_BYTES = 16_000_000  # of a transport stream, some ten seconds: who wants the newest frames begins there
 
