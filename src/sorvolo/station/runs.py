@@ -310,7 +310,8 @@ class Runs:
         """Wait until a journal has grown, for `_LOOK_EVERY_S` at most; whether the station ends."""
         until_s = time.monotonic() + _LOOK_EVERY_S
         while not self._ending.wait(_GLANCE_EVERY_S):
-            grown = (_size_bytes(self._folder / run_id / JOURNAL_FILE) > end for run_id, end in list(self._ends.items()))
+            ends = list(self._ends.items())
+            grown = (_size_bytes(self._folder / run_id / JOURNAL_FILE) > end for run_id, end in ends)
             if time.monotonic() >= until_s or any(grown):
                 return False
         return True
