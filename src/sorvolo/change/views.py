@@ -19,7 +19,7 @@ from sorvolo.change.pair.shade import shade_of_view
 from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import ThesisOptions
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageGray, ImageRGB, Mask, Matrix3
+from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.registration.lens import Undistorter
@@ -80,13 +80,11 @@ class ViewOutcome:
 class ViewRecord:
     """A frame's comparison without its pictures, of which `ViewMaker.recall` makes the same outcome again.
 
-    `outcome` has no view; of the view, where there is one, `changed` and `shade` are its masks (h, w), with its boxes
-    and scores.
+    `outcome` has no view; of the view, where there is one, `changed` is its mask (h, w), with its boxes and scores.
     """
 
     outcome: ViewOutcome
     changed: Mask | None
-    shade: ImageGray | None
     boxes: Boxes | None
     scores: Floats | None
 
@@ -95,8 +93,8 @@ class ViewRecord:
         """That of an outcome."""
         view = outcome.view
         if view is None:
-            return cls(outcome, None, None, None, None)
-        return cls(replace(outcome, view=None), view.changed > 0, view.shade, view.boxes, view.scores)
+            return cls(outcome, None, None, None)
+        return cls(replace(outcome, view=None), view.changed > 0, view.boxes, view.scores)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,8 +197,7 @@ class ViewMaker:
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
         if changed > self._settings.all_changed:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
-        shade = shade_of_view(compared.reference, compared.image, valid) if len(found.boxes) else found.mask
-        view = self._view(frame, aligned, (compared.image, compared.reference, valid), found, shade)
+        view = self._view(frame, aligned, (compared.image, compared.reference, valid), found)
         doubted = _doubted(compared.found, found, self._settings.corroboration.sure)
         planted = self._plant(view, compared)
         return replace(outcome, view=view, doubted=doubted, leans=leans, planted=planted)
@@ -212,15 +209,15 @@ class ViewMaker:
         self._aligner.recall(image, self._lens.camera, posed.prior, posed.frame.time_ns, traces.step)
         if traces.measured is not None and self._tuning is not None:
             self._tuning.observe(traces.measured)
-        aligned, shade, boxes, scores = traces.aligned, record.shade, record.boxes, record.scores
-        if record.changed is None or aligned is None or shade is None or boxes is None or scores is None:
+        aligned, boxes, scores = traces.aligned, record.boxes, record.scores
+        if record.changed is None or aligned is None or boxes is None or scores is None:
             return outcome
         if self._tuning is not None:
             self._planting.pass_over()
         reference, known = self._map_under(aligned)
         image, valid = _laid(aligned, image, known)
         found = Difference(np.where(record.changed, np.uint8(255), np.uint8(0)), boxes, scores)
-        return replace(outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found, shade))
+        return replace(outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found))
 
     def undistorted(self, posed: PosedFrame) -> ImageRGB:
         """A frame's picture at the size at which it is compared, without the lens's distortion."""
@@ -289,10 +286,11 @@ class ViewMaker:
         return reference, known & self._lens_sees
 
     def _view(
-        self, frame: Frame, aligned: Aligned, pictures: tuple[ImageRGB, ImageRGB, Mask], found: Difference,
-        shade: ImageGray,
+        self, frame: Frame, aligned: Aligned, pictures: tuple[ImageRGB, ImageRGB, Mask], found: Difference
     ) -> ComparedView:
         """The compared view: `pictures` are the frame, the map and where both are valid."""
+        image, reference, valid = pictures
+        shade = shade_of_view(reference, image, valid) if len(found.boxes) else found.mask
         return ComparedView(
             frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
             *pictures, found.mask, found.boxes, found.scores, aligned.residual_px, shade,

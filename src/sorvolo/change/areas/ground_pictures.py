@@ -33,8 +33,7 @@ class GroundPictures:
     def show(self, view: ComparedView, places_m: PointsM) -> None:
         """Take the view's pictures of the squares that hold any of these places, (N, 2), where they are better."""
         side_m = self._side_m
-        for column, row in np.unique(np.floor(places_m / side_m).astype(int), axis=0):
-            key = int(column), int(row)
+        for key in _squares_at(places_m / side_m):
             if key not in self._squares and len(self._squares) >= self._settings.most_squares:
                 continue
             low_m = np.array(key) * side_m
@@ -81,3 +80,13 @@ class GroundPictures:
             key for key in sorted(self._squares)
             if first[0] <= key[0] <= last[0] and first[1] <= key[1] <= last[1]
         ]
+
+
+def _squares_at(places: PointsM) -> list[tuple[int, int]]:
+    """The squares, column and row, that hold any of these places, (N, 2) in sides of a square, column by column."""
+    squares = np.floor(places).astype(int)
+    first = squares.min(axis=0)
+    columns, rows = (squares - first).T
+    across = int(rows.max()) + 1
+    found = np.divmod(np.unique(columns * across + rows), across)  # in a fraction of the time that pairs would take
+    return [(int(column) + int(first[0]), int(row) + int(first[1])) for column, row in zip(*found)]

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sorvolo.change.shape.outlines import hull_of
 from sorvolo.change.shape.shadows import thing_of
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -63,7 +64,7 @@ def _blob(view: ComparedView, index: int, settings: BlobSettings) -> Blob | None
     x, y, w, h = left + int(xs.min()), top + int(ys.min()), int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1
     part = thing[ys.min():ys.max() + 1, xs.min():xs.max() + 1].view(np.uint8) * np.uint8(255)
     moments = cv2.moments(part, binaryImage=True)
-    hull = cv2.convexHull(cv2.findNonZero(part)).reshape(-1, 2) + np.array([x, y])
+    hull = hull_of(part) + np.array([x, y])
     hull_m = apply_homography(view.site_from_image, hull.astype(np.float64))
     middle = np.array([[x + moments["m10"] / moments["m00"], y + moments["m01"] / moments["m00"]]])
     place_m = apply_homography(view.site_from_image, middle)[0]

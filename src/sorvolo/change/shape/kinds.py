@@ -5,6 +5,7 @@ picture stands out it appeared, where only the earlier one does it disappeared, 
 place. How much each sign counts was fitted (logistic regression) to changes of simulated flights.
 """
 
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -27,7 +28,8 @@ _LEVELS = np.arange(256, dtype=np.float32)
 
 def kind_of(patch: Patch) -> ChangeKind:
     """What happened inside the patch's changed region; never `moving`."""
-    before, after = stands_out(patch.before, patch.changed), stands_out(patch.after, patch.changed)
+    region = _Region.of(patch.changed)
+    before, after = _signs(patch.before, region), _signs(patch.after, region)
     was_there, is_there = _chance(before, after), _chance(after, before)
     chances = {
         ChangeKind.APPEARED: is_there * (1 - was_there),
@@ -43,15 +45,40 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
     How far its pixels, their median, and the share of far pixels lie from the ground around, in the ground's own
     spread; the gradient along the outline and across it, and inside, against the ground's gradient.
     """
-    reach = _reach_px(changed)
-    if not changed.any():
+    return _signs(picture, _Region.of(changed))
+
+
+class _Region(NamedTuple):
+    """A changed region, which both dates have: the `part` of the pictures that holds it and the ground around it, and
+    masks of that, (h, w): `changed`, the ground `around`, the `rim` along the outline, and unit vectors outwards."""
+
+    part: tuple[slice, slice]
+    changed: Mask
+    around: Mask
+    rim: Mask
+    outwards: tuple[Floats32, Floats32]
+
+    @classmethod
+    def of(cls, changed: Mask) -> "_Region | None":
+        """The region of a mask (h, w); None of nothing."""
+        if not changed.any():
+            return None
+        reach = _reach_px(changed)
+        part = _near(changed, reach + 8)
+        changed = changed[part]
+        marked = changed.astype(np.uint8)
+        near = cv2.dilate(marked, np.ones((7, 7), np.uint8)) > 0
+        around = (cv2.dilate(marked, np.ones((2 * reach + 7, 2 * reach + 7), np.uint8)) > 0) & ~near
+        rim = near & (cv2.erode(marked, np.ones((5, 5), np.uint8)) == 0)
+        return cls(part, changed, around, rim, _outwards(marked))
+
+
+def _signs(picture: ImageRGBA, region: "_Region | None") -> Floats:
+    if region is None:
         return np.zeros(_SIGNS)
-    picture, changed = _near(picture, changed, reach + 8)
+    picture = picture[region.part]
     known = picture[..., 3] > 0
-    inside = changed & known
-    marked = changed.astype(np.uint8)
-    near = cv2.dilate(marked, np.ones((7, 7), np.uint8)) > 0
-    around = (cv2.dilate(marked, np.ones((2 * reach + 7, 2 * reach + 7), np.uint8)) > 0) & ~near & known
+    inside, around, rim = (each & known for each in (region.changed, region.around, region.rim))
     if not inside.any() or not around.any():
         return np.zeros(_SIGNS)
     lab8 = _lab(cv2.blur(_rgb(picture), (3, 3)))
@@ -59,11 +86,10 @@ def stands_out(picture: ImageRGBA, changed: Mask) -> Floats:
     lab = lab8.astype(np.float32)
     far = np.minimum(_length((lab[inside] - middle) / spread), 12.0)
     shift = float(np.linalg.norm((middle_and_deviation(lab8, inside)[0] - middle) / spread))
-    across_x, across_y = _outwards(marked)
     slope_x, slope_y = cv2.Sobel(lab, cv2.CV_32F, 1, 0, scale=0.25), cv2.Sobel(lab, cv2.CV_32F, 0, 1, scale=0.25)
     slope = _length(np.asarray(cv2.magnitude(slope_x, slope_y), np.float32))
-    rim = near & (cv2.erode(marked, np.ones((5, 5), np.uint8)) == 0) & known
-    outward = _length(slope_x[rim] * across_x[rim, None] + slope_y[rim] * across_y[rim, None])
+    across_x, across_y = (each[rim, None] for each in region.outwards)
+    outward = _length(slope_x[rim] * across_x + slope_y[rim] * across_y)
     rest = float(np.mean(slope[around])) + 1.0
     signs = [
         float(np.mean(far)), shift, float(np.mean(far > 3.0)) + 0.02,
@@ -91,13 +117,12 @@ def _reach_px(changed: Mask) -> int:
     return int(np.clip(0.35 * np.sqrt(np.count_nonzero(changed)), 4, 40))
 
 
-def _near(picture: ImageRGBA, changed: Mask, margin_px: int) -> tuple[ImageRGBA, Mask]:
-    """The part of both that lies at most `margin_px` around what changed, something."""
+def _near(changed: Mask, margin_px: int) -> tuple[slice, slice]:
+    """The part of a mask that lies at most `margin_px` around what changed, something."""
     x, y, wide, high = cv2.boundingRect(changed.view(np.uint8))
-    part = np.s_[
+    return np.s_[
         max(0, y - margin_px) : y + high + margin_px, max(0, x - margin_px) : x + wide + margin_px
     ]
-    return picture[part], changed[part]
 
 
 def _length(vectors: Floats32) -> Floats32:
@@ -110,12 +135,12 @@ def _chance(own: Floats, other: Floats) -> float:
     return float(1 / (1 + np.exp(-(own @ _OWN + other @ _OTHER + _BIAS))))
 
 
-def _outwards(marked: np.ndarray[tuple[int, int], np.dtype[np.uint8]]) -> tuple[Floats, Floats]:
+def _outwards(marked: np.ndarray[tuple[int, int], np.dtype[np.uint8]]) -> tuple[Floats32, Floats32]:
     """Unit vectors away from the region: the gradient of the distance to it, inside and outside."""
     distance = cv2.distanceTransform(1 - marked, cv2.DIST_L2, 3) - cv2.distanceTransform(marked, cv2.DIST_L2, 3)
     x, y = cv2.Sobel(distance, cv2.CV_32F, 1, 0), cv2.Sobel(distance, cv2.CV_32F, 0, 1)
     length = np.hypot(x, y) + 1e-6
-    return x / length, y / length
+    return np.asarray(x / length, np.float32), np.asarray(y / length, np.float32)
 
 
 def middle_and_deviation(picture: NDArray[np.uint8], where: Mask) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

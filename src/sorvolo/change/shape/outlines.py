@@ -67,6 +67,15 @@ def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px
     return outline_m
 
 
+def hull_of(mask: Mask | NDArray[np.uint8]) -> NDArray[np.int32]:
+    """(N, 2) the corners, x and y, of the convex hull of the pixels of a mask (h, w) that are not 0, one at least."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    part = mask[rows] != 0
+    left, right = part.argmax(axis=1), part.shape[1] - 1 - part[:, ::-1].argmax(axis=1)
+    ends = np.column_stack([np.concatenate([left, right]), np.concatenate([rows, rows])])  # no others can be corners
+    return np.asarray(cv2.convexHull(ends.astype(np.int32)).reshape(-1, 2), np.int32)
+
+
 def _ring_around(part: NDArray[np.uint8]) -> NDArray[np.int32]:
     """The contour of the one piece of a mask, or the hull of those that are not tiny beside the largest."""
     contours, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

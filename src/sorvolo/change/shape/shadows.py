@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sorvolo.change.shape.kinds import kind_of
-from sorvolo.change.shape.outlines import measures, outline_of
+from sorvolo.change.shape.outlines import hull_of, measures, outline_of
 from sorvolo.geometry.arrays import Floats32, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch, Shade
 
@@ -153,7 +153,7 @@ def _distance(mask: Mask) -> Floats32:
 
 def _hull(mask: Mask | NDArray[np.uint8]) -> Mask:
     hull = np.zeros(mask.shape, np.uint8)
-    cv2.fillConvexPoly(hull, cv2.convexHull(cv2.findNonZero(mask.view(np.uint8))), (1,))
+    cv2.fillConvexPoly(hull, hull_of(mask), (1,))
     return hull.view(bool)
 
 
@@ -166,7 +166,6 @@ def _joined(mask: Mask, m_per_px: float, apart_m: float) -> NDArray[np.int32]:
 
 
 def _may_be_a_car(changed: Mask, m_per_px: float, settings: ThingSettings) -> bool:
-    hull = cv2.convexHull(cv2.findNonZero(changed.view(np.uint8)))
-    short_m, long_m = sorted(float(each) * m_per_px for each in cv2.minAreaRect(hull)[1])
+    short_m, long_m = sorted(float(each) * m_per_px for each in cv2.minAreaRect(hull_of(changed))[1])
     narrowest_m, longest_m = settings.car_m
     return short_m >= narrowest_m and long_m <= longest_m
