@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 from batch_flights import another, content
 
 from ended_work import ended
+from small_flights import simulate_into, small_flight
 from sorvolo.cluster.batch import BatchReport, BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.local_executor import LocalExecutor
@@ -110,6 +112,20 @@ def test_again_nothing_is_done_twice(batched: tuple[Path, BatchReport], flown: P
     assert again.tries == 0
     assert [row.state for row in again.rows] == [row.state for row in first.rows]
     assert again.counts() == {"known": 1, "duplicate": 1, "skipped": 1, "failed": 1, "set aside": 1}
+
+
+def test_a_video_under_a_second_name_is_the_same_flight(tmp_path: Path) -> None:
+    made = simulate_into(tmp_path / "made", small_flight(5, length_m=12, fps=4))
+    shutil.copytree(made / "flight1", tmp_path / "in")
+    (tmp_path / "in" / "card2").mkdir()
+    for ending in (".mp4", ".csv"):
+        shutil.copy(tmp_path / "in" / f"flight1{ending}", tmp_path / "in" / "card2" / f"DJI_0042{ending}")
+    report = run([tmp_path / "in"], tmp_path / "maps", made / "camera.xml", {})
+    assert {Path(row.source).name: (row.state, row.words) for row in report.rows} == {
+        "DJI_0042.mp4": (State.DONE, "3 of 3 frames matched"),
+        "flight1.mp4": (State.DUPLICATE, f"the same flight as {tmp_path / 'in' / 'card2' / 'DJI_0042.mp4'}"),
+    }
+    assert [path.name for path in (tmp_path / "maps").iterdir() if path.is_dir()] == ["DJI_0042"]
 
 
 def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Path, tmp_path: Path) -> None:

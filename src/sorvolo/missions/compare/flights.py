@@ -135,7 +135,7 @@ def _compare_one(
     detector: ObjectDetector | None, base: int, request: str, *, anew: bool, samples: int,
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), setup.source
-    notices = (*setup.notices, *repeated(archive, source.name, "compared"), *_without_heights(archive, source.name))
+    notices = (*setup.notices, *repeated(archive, source, "compared"), *_without_heights(archive, source.name))
     setup = replace(setup, notices=notices)
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second

@@ -278,18 +278,28 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
     return Site(name, origin, crs, m_per_px, height_reference=reference)
 
 
-def repeated(archive: Archive, flight: str, done: str) -> tuple[Notice, ...]:
-    """The notice of a flight that the site has already: the version that it made is replaced, not painted over."""
+def repeated(archive: Archive, source: Source, done: str) -> tuple[Notice, ...]:
+    """The notices of a flight that the site has already: its version is replaced, not painted over; under another
+    name the same flight counts twice."""
     if not archive.has_site:
         return ()
-    made = [each.id for each in archive.versions() if each.complete and each.flight_id == flight]
-    if not made:
-        return ()
-    return (Notice(
-        "repeated", 1,
-        f"{flight} is in this site already (version {made[-1]}): it was {done} again, and the new version replaces "
-        "what it had made",
-    ),)
+    versions = {each.flight_id: each.id for each in archive.versions() if each.complete}
+    notices = [
+        Notice(
+            "same_flight", 1,
+            f"{source.name} begins with the same bytes as {each.id}, which is in this site already (version "
+            f"{versions[each.id]}): it is the same flight under another name, and counts twice",
+        )
+        for each in archive.flights()
+        if each.id in versions and each.id != source.name and each.fingerprint == source.fingerprint
+    ]
+    if (made := versions.get(source.name)) is not None:
+        notices.append(Notice(
+            "repeated", 1,
+            f"{source.name} is in this site already (version {made}): it was {done} again, and the new version "
+            "replaces what it had made",
+        ))
+    return tuple(notices)
 
 
 def founds_site(archive: Archive, flight: str) -> bool:

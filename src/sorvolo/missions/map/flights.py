@@ -126,7 +126,7 @@ def _map_one(
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
     check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
-    setup = replace(setup, notices=(*setup.notices, *repeated(archive, source.name, "mapped")))
+    setup = replace(setup, notices=(*setup.notices, *repeated(archive, source, "mapped")))
     live_folder = archive.folder if isinstance(source, LiveSource) else None
     finder = None if detector is None else ObjectFinder(
         detector, source.camera.camera, settings.classes, live_folder=live_folder

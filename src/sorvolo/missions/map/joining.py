@@ -58,7 +58,7 @@ def join_blocks(
     opened = opened_sources([source], None, camera, known_flights(site))
     with opened as sources, Archive.open(site, write=True) as archive:
         setup = prepare_divided(sources[0], settings)
-        setup = replace(setup, notices=(*setup.notices, *repeated(archive, setup.source.name, "mapped")))
+        setup = replace(setup, notices=(*setup.notices, *repeated(archive, setup.source, "mapped")))
         _demand_new(archive, setup)
         chosen = division.chosen()
         count = setup.source.frame_count if chosen is None else len(chosen.frames)
