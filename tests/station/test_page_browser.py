@@ -17,6 +17,7 @@ import pytest
 pytest.importorskip("fastapi", reason="the extra `station` is not installed")
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
+import av
 import numpy as np
 from browsers import Served, Watched, chromium
 from live_sender import free_port, sending, udp_url
@@ -623,6 +624,25 @@ def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
     assert states[wish["options"]["telemetry"]["upload"]] == ("f.csv", "ready")
     assert cuts
     opened.faults[:] = [each for each in opened.faults if "ERR_FAILED" not in each]  # the cut itself
+
+
+def test_a_cut_video_is_named_as_it_goes_up(opened: Watched, tmp_path: Path) -> None:
+    page, whole, head_first = opened.page, write_video(tmp_path / "whole.mp4", seconds=1), {"movflags": "faststart"}
+    with av.open(str(whole)) as read, av.open(str(tmp_path / "f.mp4"), "w", options=head_first) as written:
+        stream = written.add_stream_from_template(read.streams.video[0])
+        for packet in read.demux(video=0):
+            if packet.size:
+                packet.stream = stream
+                written.mux(packet)
+    data = (tmp_path / "f.mp4").read_bytes()
+    (tmp_path / "cut.mp4").write_bytes(data[:-2000])
+    page.route(re.compile(r"/api/runs"), lambda route: route.fulfill(
+        status=201, content_type="application/json", body='{"id": "r"}'
+    ) if route.request.method == "POST" else route.continue_())
+    page.keyboard.press("6")
+    page.get_by_label("Files of the flight").first.set_input_files([str(tmp_path / "cut.mp4")])
+    page.get_by_role("button", name="Start").click()
+    page.locator(".message.warning", has_text="cut.mp4 is cut: its last 2 kB are missing").wait_for()
 
 
 def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, tmp_path: Path) -> None:

@@ -160,6 +160,17 @@ def test_a_mission_that_cannot_do_its_work_names_the_reason(open_station: Callab
     assert done["state"] == "failed" and done["exit_code"] == 1 and "camera.xml" in done["error"]
 
 
+def test_a_station_over_a_relative_folder_flies_what_lies_there(
+    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `sorvolo serve maps` has it: missions run in folders of their own."""
+    shutil.copytree(flown, tmp_path / "maps" / "flown")
+    monkeypatch.chdir(tmp_path)
+    with TestClient(station_app(StationSettings(Path("maps"), free_floor_gb=0.0)), base_url=HOST) as client:
+        done = ended(client, client.post("/api/runs", json=wish(client)).json()["id"])
+    assert (done["state"], done["error"]) == ("finished", None)
+
+
 def test_a_mission_that_cannot_be_noted_does_not_run(
     open_station: Callable[[], TestClient], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -53,9 +53,9 @@ def checked(client: TestClient, address: str) -> dict[str, Any]:
     raise AssertionError(state)
 
 
-def video(path: Path, frames: int = 6) -> bytes:
+def video(path: Path, frames: int = 6, **options: str) -> bytes:
     """A small video."""
-    with av.open(str(path), "w", format="mp4") as file:
+    with av.open(str(path), "w", format="mp4", options=options) as file:
         stream = file.add_stream("mpeg4", rate=5)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         for number in range(frames):
@@ -125,6 +125,16 @@ def test_a_cut_off_video_is_refused_and_cannot_be_flown(client: TestClient, tmp_
     assert done["state"] == "refused" and "cut off" in done["why"]
     answer = client.post("/api/runs", json={"mission": "map", "site": "x", "input": {"upload": done["id"]}})
     assert answer.status_code == 409 and "cut off" in answer.json()["detail"]
+
+
+def test_of_a_video_that_was_cut_it_is_stated_how_much_is_missing(client: TestClient, tmp_path: Path) -> None:
+    """Its head comes first, so what is there can be used: of a drone that was lost there is no more."""
+    data = video(tmp_path / "v.mp4", movflags="faststart")
+    for cut in (0, 100):
+        address = begin(client, "cut.mp4", len(data) - cut).headers["location"]
+        send(client, address, 0, data[:len(data) - cut])
+        done = checked(client, address)
+        assert done["state"] == "ready" and done["facts"]["missing_bytes"] == cut
 
 
 def test_what_tus_can_do_and_what_is_not_taken(client: TestClient) -> None:

@@ -65,8 +65,10 @@ def _video(part: Path, container: str) -> dict[str, Any]:
                 raise Refusal(f"its pictures have {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken")
             next(video.decode(stream))
             seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else None
+            whole_bytes = max((each.pos + each.size for each in stream.index_entries), default=0)
             return {"kind": "video", "width_px": width_px, "height_px": height_px, "seconds": seconds,
-                    "codec": stream.codec_context.name}
+                    "codec": stream.codec_context.name,
+                    "missing_bytes": max(0, whole_bytes - part.stat().st_size)}  # a flight that was cut is still one
     except StopIteration:
         raise Refusal("no picture in it can be decoded; was it cut off?") from None
     except (av.FFmpegError, OSError) as error:

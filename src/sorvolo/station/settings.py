@@ -73,6 +73,7 @@ class StationSettings:
     limits: StationLimits = StationLimits()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "root", self.root.absolute())  # missions run in folders of their own
         if not 0 < self.port < 65536:
             raise SettingsError(f"--port {self.port}: a port from 1 to 65535 was needed")
         if not (self.free_floor_gb >= 0 and self.upload_most_gb > 0):

@@ -1,6 +1,8 @@
 // Uploads that go on where they were cut off: the tus protocol 1.0.0, creation and resumption, in pieces.
 
 import { Problem, send } from "./api.js";
+import { message } from "./dom.js";
+import { bytes } from "./words.js";
 
 const VERSION = { "tus-resumable": "1.0.0" };
 const PIECE_BYTES = 8 * 1024 * 1024;
@@ -47,8 +49,11 @@ export class Upload extends EventTarget {
   /** Wait until the station looked into the file; the upload's id. Throws Problem where it refuses it. */
   async checked(url) {
     for (;;) {
-      const { id, state, why } = await (await send(url, { signal: this.stopped.signal })).json();
+      const { id, state, why, facts } = await (await send(url, { signal: this.stopped.signal })).json();
       if (state === "refused") throw new Problem(415, `${this.file.name} cannot be used`, why);
+      if (state === "ready" && facts?.missing_bytes) {
+        message(`${this.file.name} is cut: its last ${bytes(facts.missing_bytes)} are missing`, { kind: "warning", todo: "What is there is used. Copy the video from the drone again to have all of it." });
+      }
       if (state === "ready") return id;
       await pause(300);
     }
