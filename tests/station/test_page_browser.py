@@ -38,6 +38,7 @@ from sorvolo.station.tokens import make_token
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
 from sorvolo.store.site.archive import Archive
+from waiting import wait_for
 
 AXE = (Path(__file__).parent / "vendor" / "axe.min.js").read_text(encoding="utf-8")
 BEYOND = """() => {
@@ -670,6 +671,44 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
         assert columns_drawn(page)[0] == pytest.approx(39, abs=2)
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
     page.locator(".delay", has_text="ended").wait_for()
+
+
+SLOW_DECODER = """window.VideoDecoder = class {  // five pictures a second, as a weak tablet has it
+  constructor({output}) { this.output = output; this.waiting = []; setInterval(() => this.next(), 200); }
+  get decodeQueueSize() { return this.waiting.length; }
+  configure() { this.state = 'configured'; }
+  decode({timestamp}) { this.waiting.push(timestamp); }
+  reset() { this.waiting = []; this.state = 'unconfigured'; }
+  close() { this.reset(); this.state = 'closed'; }
+  next() {
+    if (!this.waiting.length) return;
+    window.newestShown = this.waiting.shift();
+    const canvas = new OffscreenCanvas(160, 120);
+    canvas.getContext('2d');
+    this.output(new VideoFrame(canvas, {timestamp: window.newestShown}));
+  }
+};"""
+
+
+def test_a_slow_device_stays_near_live(browser: Any, served: Served, tmp_path: Path) -> None:
+    """It goes on at the next key frame; it fell further and further behind."""
+    watched = Watched(browser.new_context(), served.url)
+    watched.page.add_init_script(SLOW_DECODER)
+    messages = units(write_video(tmp_path / "v.mp4", seconds=12), "h264")
+    hello = Message(Kind.HELLO, 0, 0, Hello("b" * 16, "h264", 160, 120, 10.0).to_json().encode())
+    with connect(f"{served.url.replace('http', 'ws')}/api/ingest/weak") as drone:
+        drone.send(hello.to_bytes())
+        drone.recv()
+        drone.send(messages[0].to_bytes())
+        show(watched, served)
+        wait_for(lambda: watched.page.evaluate("window.newestShown") is not None)
+        for each in messages[1:]:
+            drone.send(each.to_bytes())
+        last_us = max(each.pts_us for each in messages if each.kind is Kind.VIDEO)
+        wait_for(lambda: watched.page.evaluate("window.newestShown") >= last_us, 12)  # all would take 24 s
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+    assert watched.faults == []
+    watched.page.context.close()
 
 
 def columns_drawn(page: Any) -> tuple[int, int]:

@@ -12,6 +12,7 @@ const KEPT_BOXES = 300;
 const CLOCKS_AGREE_S = 0.5;
 const OLD_BOXES_US = 4000000; // a slow detector's last boxes are shown for so long
 const MOST_HELD_S = 4;
+const MOST_UNDECODED = 15; // pictures, half a second: a decoder with more before it goes on at the next key frame
 const STAMP_BYTES = 8;
 const STATE_MS = 1000;
 
@@ -253,6 +254,10 @@ class FramePlayer {
       const { data, pts_us } = this.waiting.shift();
       const isKey = hasKey(data);
       if (!this.decoder || this.decoder.state !== "configured" || (this.needsKey && !isKey)) continue;
+      if (isKey && this.decoder.decodeQueueSize > MOST_UNDECODED) { // a device too slow for this video: near live, with gaps
+        this.decoder.reset();
+        this.decoder.configure(this.config);
+      }
       this.needsKey = false;
       this.decoder.decode(new EncodedVideoChunk({ type: isKey ? "key" : "delta", timestamp: pts_us, data }));
     }
