@@ -49,6 +49,21 @@ def test_one_of_another_run_is_empty_and_written_over(tmp_path: Path) -> None:
     assert kinds(tmp_path / "j", "other") == ["c"] and kinds(tmp_path / "j") == []
 
 
+def test_the_disk_has_entries_after_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a power cut may take; to wait for the disk each time would hold up every frame."""
+    now_s, synced = [100.0], []
+    monkeypatch.setattr("sorvolo.store.site.journal.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr(os, "fdatasync", lambda number: synced.append(os.fstat(number).st_size))
+    journal = RunJournal(tmp_path / "run.journal", "a", 0)
+    sizes = []
+    for step_s in (0.0, 0.4, 0.4, 0.4, 5.0):
+        now_s[0] += step_s
+        journal.append(Entry("frame", {}))
+        sizes.append((tmp_path / "run.journal").stat().st_size)
+    assert synced == [sizes[0], sizes[3], sizes[4]]
+    journal.remove()
+
+
 def test_a_torn_entry_is_dropped_and_the_next_takes_its_place(tmp_path: Path) -> None:
     written(tmp_path / "j", _ENTRIES[:2]).close()
     two = (tmp_path / "j").stat().st_size
