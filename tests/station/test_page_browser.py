@@ -665,10 +665,13 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
         ingest = served.station.ingest
         ingest._loop.call_soon_threadsafe(ingest.hub("scout").note, {
             "type": "boxes", "pts_us": last_us, "frame_size_px": [160, 120],
-            "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, 40, 20, 30]}],
+            "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, top, 20, 30]} for top in (40, 0)],
         })
-        page.locator("aside.video footer", has_text="1 in the picture").wait_for()
+        page.locator("aside.video footer", has_text="2 in the picture").wait_for()
         assert columns_drawn(page)[0] == pytest.approx(39, abs=2)
+        assert page.locator("aside.video canvas.boxes").evaluate(
+            "each => each.getContext('2d').getImageData(43, 5, 1, 1).data[3]"
+        )  # the label of a box at the upper edge is in the picture
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
     page.locator(".delay", has_text="ended").wait_for()
 

@@ -216,10 +216,11 @@ function drawBox(pen, { class: name, score, xywh_px: [x, y, w, h] }, size) {
   pen.strokeStyle = colour;
   pen.strokeRect(x, y, w, h);
   const text = `${name} ${percent(score)}`;
+  const top = Math.max(0, y - size * 1.25); // at the picture's upper edge in the box
   pen.fillStyle = colour;
-  pen.fillRect(x, y - size * 1.25, pen.measureText(text).width + size * 0.6, size * 1.25);
+  pen.fillRect(x, top, pen.measureText(text).width + size * 0.6, size * 1.25);
   pen.fillStyle = "#10201b";
-  pen.fillText(text, x + size * 0.3, y - size * 0.3);
+  pen.fillText(text, x + size * 0.3, top + size * 0.95);
 }
 
 /** Access units (Annex B) decoded by WebCodecs and drawn when due. */
