@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +43,9 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 
 
 def fill(disk: Path, left_bytes: int) -> Path:
-    """Leave so little of a disk; what fills it."""
+    """Leave so little of a disk, or less where others write meanwhile; what fills it."""
     path = disk / "filler"
-    with path.open("wb") as file:
+    with path.open("wb", buffering=0) as file, suppress(OSError):
         file.write(bytes(max(0, shutil.disk_usage(disk).free - left_bytes)))
     return path
 
