@@ -1,6 +1,7 @@
 """Upkeep of a site: missing derived files are written, files that nothing refers to are removed."""
 
 import shutil
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
@@ -29,16 +30,25 @@ def repair(files: SiteFiles) -> None:
         owed = records.owed_files(connection)
         shown = records.derived_version(connection)
     newest = _newest(files)
-    for each in owed:
-        _write_flight_files(files, each)
-    if owed or not site_objects_are_there(files):
-        write_site_objects(files)
+    with ThreadPoolExecutor(1, thread_name_prefix="map files") as other:
+        waiting: list[Future[None]] = []
+        if newest is not None and not _is_shown(files, newest, shown):
+            waiting.append(other.submit(write_map_files, files, newest))
+        for each in owed:
+            _write_flight_files(files, each)
+        if owed or not site_objects_are_there(files):
+            write_site_objects(files)
+        for written in waiting:
+            written.result()
     if newest is None:
         return
-    if not _looks_like(files, newest, shown) or (newest.tiles and not map_is_there(files)):
-        write_map_files(files, newest)
     with files.catalogue.changing() as connection:
         records.mark_written(connection, [each.run_id for each in owed], newest.id)
+
+
+def _is_shown(files: SiteFiles, newest: VersionEntry, shown: int) -> bool:
+    """Whether the map's files are those of the newest version, or would be the same."""
+    return _looks_like(files, newest, shown) and (not newest.tiles or map_is_there(files))
 
 
 def _newest(files: SiteFiles) -> VersionEntry | None:
