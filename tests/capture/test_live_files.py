@@ -219,15 +219,24 @@ def test_a_folder_into_which_nothing_comes(tmp_path: Path) -> None:
         open_sources([f"follow:{tmp_path}"], telemetry="udp://:10110")
 
 
-@pytest.mark.parametrize(("keeps_all", "packet"), [(True, 0), (False, 21_276)])
-def test_who_wants_the_newest_frames_begins_near_the_end(tmp_path: Path, keeps_all: bool, packet: int) -> None:
-    """20 MB of a transport stream: a map reads all of it, a watch its last 16 MB, from a packet's first byte."""
+@pytest.mark.parametrize(("keeps_all", "tables", "packet"), [
+    (True, (0, 50_000), 0), (False, (0, 9_000, 21_276, 50_000), 21_276), (False, (0, 9_000, 21_277), 9_000),
+    (False, (0,), 0),
+])
+def test_who_wants_the_newest_frames_begins_near_the_end(
+    tmp_path: Path, keeps_all: bool, tables: tuple[int, ...], packet: int
+) -> None:
+    """20 MB of a transport stream: a map reads all of it, a watch its last 16 MB, from where the stream is described."""
     path = tmp_path / "long.ts"
-    path.write_bytes(b"".join(b"\x47" + number.to_bytes(187, "big") for number in range(106_383)))
+    path.write_bytes(b"".join(
+        (b"\x47\x40\x00" if number in tables else b"\x47\x01\x00") + number.to_bytes(185, "big")
+        for number in range(106_383)
+    ))
     file = GrowingFile(path, LiveSettings(keeps_all=keeps_all), Outages("long.ts"), threading.Event())
     data = file.read(188)
     file.close()
-    assert data[0] == 0x47 and int.from_bytes(data[1:], "big") == packet
+    assert data[0] == 0x47 and int.from_bytes(data[3:], "big") == packet
+    assert file.is_whole == (packet == 0)
 
 
 def test_a_file_whose_end_is_stated_ends_at_once(tmp_path: Path) -> None:

@@ -158,6 +158,17 @@ def test_a_map_of_a_stream_outlives_a_restarted_station(station: Station, flown:
     assert flight["matched"] == flight["frames"] >= 3 and flight["rejected"] == 0
 
 
+def test_a_recorded_stream_is_searched_whole(station: Station, flown: Path, tmp_path: Path) -> None:
+    """A watch that is started after the flight's end leaves out no frame for newer ones: none come."""
+    drone = sending(footage_of(flown), station, tmp_path / "spool", speed=0)
+    drone.run()
+    assert drone.is_complete
+    run = station.ask("/api/runs", {"mission": "watch", "site": "new", "input": {"stream": "scout"}, "options": {}})
+    done = station.ended(run["id"])
+    assert done["state"] == "finished", done
+    assert done["progress"]["searched"] == done["progress"]["frames"] == drone.report.frames
+
+
 @pytest.fixture
 def killable(tmp_path: Path) -> Iterator[StationProcess]:
     yield from running(StationProcess, tmp_path)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.station.folders import Folder, folders_below
 from sorvolo.station.messages import check_stream
 from sorvolo.station.orders import InputWish, without_password
@@ -57,7 +58,10 @@ class Inputs:
         return [each.path for each in self.all() if each.kind == "video"] + self._uploads.videos()
 
     def source(self, wish: InputWish) -> str:
-        """The path or address that a mission opens. Raises Problem (400, 404)."""
+        """The path or address that a mission opens; of a stream, its newest flight, followed unless it has ended.
+
+        Raises Problem (400, 404).
+        """
         if wish.upload is not None:
             return str(self._uploads.finished_path(wish.upload))
         if wish.input is not None:
@@ -70,7 +74,8 @@ class Inputs:
             newest = self._newest_of_stream(wish.stream)
             if newest is None:
                 raise Problem(404, f"no drone sent a stream {wish.stream[:80]!r} yet; /api/streams lists them")
-            return f"follow:{newest.resolve()}"
+            path = newest.resolve()
+            return str(path) if path.with_name(path.name + ENDED_SUFFIX).exists() else f"follow:{path}"
         return checked_stream(wish.stream_url or "", self._settings.stream_ranges)
 
     def shown(self, wish: InputWish | None) -> dict[str, Any] | None:

@@ -53,12 +53,13 @@ _WRONG, _STOPPED_CODE = 1, 130
 
 
 class Journal:
-    """The lines of a run: a JSON object each, whole once it can be read. Only `add` changes it; from any thread."""
+    """The lines of a run: a JSON object each, whole once it can be read. Lines are added from any thread."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("ab")
         self._adding = threading.Lock()
         self._progress_s = -1e9
+        self._newest_progress: Mapping[str, Any] | None = None  # that was not written yet
 
     def add(self, kind: str, data: Mapping[str, Any]) -> None:
         """Append one line and hand it to the operating system."""
@@ -67,11 +68,22 @@ class Journal:
             self._file.write(line.encode() + b"\n")
             self._file.flush()
 
-    def progress(self, data: Mapping[str, Any], *, always: bool = False) -> None:
+    def progress(self, data: Mapping[str, Any]) -> None:
         """How far the run is, a few times a second at most."""
-        if always or time.monotonic() - self._progress_s >= _PROGRESS_EVERY_S:
-            self._progress_s = time.monotonic()
-            self.add("run.progress", data)
+        self._newest_progress = data
+        if time.monotonic() - self._progress_s >= _PROGRESS_EVERY_S:
+            self._write_progress()
+
+    def end(self, kind: str, data: Mapping[str, Any]) -> None:
+        """Append the last line, after how far the run came."""
+        self._write_progress()
+        self.add(kind, data)
+
+    def _write_progress(self) -> None:
+        self._progress_s = time.monotonic()
+        if self._newest_progress is not None:
+            self.add("run.progress", self._newest_progress)
+        self._newest_progress = None
 
 
 class _Stop:
@@ -108,22 +120,22 @@ def main(folder: Path) -> int:
             headline, why = _flown(order, folder, journal, stop.until)
     except KeyboardInterrupt:
         if stop.why:
-            journal.add(FAILED, {"exit_code": _WRONG, "error": f"{stop.why}; nothing was kept", "headline": None})
+            journal.end(FAILED, {"exit_code": _WRONG, "error": f"{stop.why}; nothing was kept", "headline": None})
             return _WRONG
-        journal.add(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
+        journal.end(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
         return _STOPPED_CODE
     except SorvoloError as error:
-        journal.add(FAILED, {"exit_code": _WRONG, "error": without_secret(str(error), order.source), "headline": None})
+        journal.end(FAILED, {"exit_code": _WRONG, "error": without_secret(str(error), order.source), "headline": None})
         return _WRONG
     except Exception as error:
         words = f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else f"{error.strerror or error}"
-        journal.add(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
+        journal.end(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
         sys.stderr.write(without_secret(traceback.format_exc(), order.source))  # the run's log
         return _WRONG
     if why:
-        journal.add(FINISHED, {"exit_code": TO_CHECK, "error": None, "headline": f"incomplete: {why}. {headline}"})
+        journal.end(FINISHED, {"exit_code": TO_CHECK, "error": None, "headline": f"incomplete: {why}. {headline}"})
         return TO_CHECK
-    journal.add(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
+    journal.end(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
     return 0
 
 

@@ -3,6 +3,7 @@
 import threading
 import time
 from pathlib import Path
+from typing import BinaryIO
 
 from sorvolo.capture.live.reconnect import LiveSettings, Outages
 
@@ -11,6 +12,8 @@ ENDED_SUFFIX = ".ended"
 
 _POLL_S = 0.01  # pictures wait for it
 _PACKET_BYTES = 188
+_TABLE = b"\x47\x00\x00"  # a packet of the program association table: its first bytes without their flags
+_SEARCHED_PACKETS = 10_000  # at a time
 _NEWEST_BYTES = 16_000_000  # of a transport stream, some ten seconds: who wants the newest frames begins there
 
 
@@ -19,7 +22,8 @@ class GrowingFile:
     a file beside it (`ENDED_SUFFIX`) states its end.
 
     There is no seeking, so the container must be one that is written front to back: MPEG-TS, fragmented MP4, MKV. Where
-    the newest frames are wanted rather than all, a long transport stream is begun near its end.
+    the newest frames are wanted rather than all, a long transport stream is begun near its end, where it is described:
+    between two of these places nothing in it can be decoded.
     """
 
     def __init__(self, path: Path, settings: LiveSettings, outages: Outages, stop: threading.Event) -> None:
@@ -30,8 +34,9 @@ class GrowingFile:
         self.is_whole = True
         """Whether it is read from its beginning."""
         if not settings.keeps_all and size > _NEWEST_BYTES and self._file.read(1) == b"\x47":
-            self.is_whole = False
-            self._file.seek((size - _NEWEST_BYTES) // _PACKET_BYTES * _PACKET_BYTES)
+            begin = _described_before(self._file, (size - _NEWEST_BYTES) // _PACKET_BYTES)
+            self.is_whole = begin == 0
+            self._file.seek(begin)
         else:
             self._file.seek(0)
 
@@ -55,3 +60,17 @@ class GrowingFile:
     def close(self) -> None:
         """Let go of the file."""
         self._file.close()
+
+
+def _described_before(file: BinaryIO, packet: int) -> int:
+    """Where a transport stream is described last, at this packet or before; its beginning where it is nowhere."""
+    end = packet + 1
+    while end > 0:
+        first = max(0, end - _SEARCHED_PACKETS)
+        file.seek(first * _PACKET_BYTES)
+        data = file.read((end - first) * _PACKET_BYTES)
+        for at in range(len(data) - _PACKET_BYTES, -1, -_PACKET_BYTES):
+            if bytes((data[at], data[at + 1] & 0x1F, data[at + 2])) == _TABLE:
+                return first * _PACKET_BYTES + at
+        end = first
+    return 0
