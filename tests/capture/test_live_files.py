@@ -226,7 +226,7 @@ def test_a_folder_into_which_nothing_comes(tmp_path: Path) -> None:
 def test_who_wants_the_newest_frames_begins_near_the_end(
     tmp_path: Path, keeps_all: bool, tables: tuple[int, ...], packet: int
 ) -> None:
-    """20 MB of a transport stream: a map reads all of it, a watch its last 16 MB, from where the stream is described."""
+    """20 MB of a transport stream: a map reads all of it, a watch its last 16 MB, from where it is described."""
     path = tmp_path / "long.ts"
     path.write_bytes(b"".join(
         (b"\x47\x40\x00" if number in tables else b"\x47\x01\x00") + number.to_bytes(185, "big")
