@@ -7,11 +7,15 @@ mission, with a watch, and with a map mission and many viewers. Times run from t
 picture (the camera's own delay is not in it) to
 
 - the tile at the frame's centre, fetched and whole, from the first announced map that has the frame in it;
-- the frame's boxes, and how the picture moved to it, received beside the video;
+- the frame's boxes, all of them and those of each class (cars may be known before people), and how the picture moved to
+  it, received beside the video;
 - the picture itself, received by a viewer.
 
 Then the flight is sent ten times (--soak), as fast as the link takes it: the station's memory and open files after
 each. 180 times the 40 s of --seconds 40 are two hours.
+
+The flight is encoded as drones send video: no picture waits for a later one, and a key frame comes every second. (The
+simulator's own video has pictures that do: up to a tenth of a second passes until such a one can be decoded.)
 
 A browser's decoding and drawing is not in them. The load of the machine is written beside the figures.
 """
@@ -36,6 +40,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed
@@ -54,6 +59,7 @@ from sorvolo.station.client import StreamClient, StreamSettings, stream_url
 from sorvolo.station.footage import open_footage
 from sorvolo.station.messages import Kind, sample_from_json
 from sorvolo.station.spool import Spool
+from sorvolo.survey.objects import CLASSES
 
 RESULTS = Path(__file__).parent / "results" / "station.json"
 _ZOOM = 21
@@ -69,6 +75,8 @@ class Seen:
     zero_ns: int = 0  # UTC of the flight's zero
     pictures: list[tuple[float, float]] = field(default_factory=list)  # taken, delay
     boxes: list[tuple[float, float]] = field(default_factory=list)
+    of_class: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {each: [] for each in CLASSES})
+    early: dict[int, list[str]] = field(default_factory=dict)  # classes of a picture that came first
     motion: list[tuple[float, float]] = field(default_factory=list)
     map: list[tuple[float, float]] = field(default_factory=list)
     tiles_s: list[float] = field(default_factory=list)
@@ -126,6 +134,7 @@ def main() -> None:
 
 def simulated(folder: Path, options: Any) -> Path:
     """The flight's folder, made unless it is there: one strip at 8 m/s, 40 m up, with things to find."""
+    sent = folder / "flight1" / "sent.mp4"
     if not (folder / "flight1" / "flight1.mp4").is_file():
         width, height = map(int, options.size.split("x"))
         settings = SimulationSettings(
@@ -136,7 +145,23 @@ def simulated(folder: Path, options: Any) -> Path:
         )
         for _ in simulate_site(folder, settings):
             pass
+    if not sent.is_file():
+        as_sent(folder / "flight1" / "flight1.mp4", sent)
     return folder
+
+
+def as_sent(video: Path, target: Path) -> None:
+    """The video as a drone's encoder sends it, with the same telemetry beside it."""
+    with av.open(str(video)) as source, av.open(str(target), "w") as output:
+        given = source.streams.video[0]
+        stream = output.add_stream("libx264", rate=given.average_rate)
+        stream.width, stream.height, stream.pix_fmt = given.width, given.height, "yuv420p"
+        stream.options = {"crf": "18", "preset": "veryfast", "bf": "0", "g": str(round(given.average_rate))}
+        for frame in source.decode(given):
+            frame.pict_type = av.video.frame.PictureType.NONE
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode())
+    shutil.copy(video.with_suffix(".csv"), target.with_suffix(".csv"))
 
 
 def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: Any) -> dict[str, Any]:
@@ -147,7 +172,7 @@ def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: A
     with station(root) as (url, pid):
         stop = threading.Event()
         footage = open_footage(
-            str(flight / "flight1" / "flight1.mp4"), None, str(flight / "camera.xml"), LiveSettings(), stop
+            str(flight / "flight1" / "sent.mp4"), None, str(flight / "camera.xml"), LiveSettings(), stop
         )
         client = StreamClient(
             footage, TimedSpool(scratch / "spool", seen), stream_url(url, _STREAM), "", StreamSettings(), stop
@@ -165,6 +190,7 @@ def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: A
         "frame_to_map_tile": delays(seen.map), "frame_to_map_tile_running": delays(running(seen.map)),
         "tile_fetch": figures(seen.tiles_s),
         "frame_to_boxes": delays(seen.boxes), "frame_to_boxes_running": delays(running(seen.boxes)),
+        "frame_to_boxes_of_running": {name: delays(running(each)) for name, each in seen.of_class.items()},
         "frame_to_motion": delays(seen.motion), "frame_to_motion_running": delays(running(seen.motion)),
     }
 
@@ -177,7 +203,7 @@ def repeated(flight: Path, scratch: Path, flights: int) -> dict[str, Any]:
     with station(scratch / "root") as (url, pid):
         for number in range(flights):
             stop = threading.Event()
-            footage = open_footage(str(flight / "flight1" / "flight1.mp4"), None, None, LiveSettings(), stop)
+            footage = open_footage(str(flight / "flight1" / "sent.mp4"), None, None, LiveSettings(), stop)
             spool = Spool(scratch / f"spool{number}", 2_000_000_000)
             settings = StreamSettings(speed=0, latency_s=math.inf)
             frames += StreamClient(footage, spool, stream_url(url, _STREAM), "", settings, stop).run().frames
@@ -218,8 +244,10 @@ async def viewed(url: str, seen: Seen) -> None:
             async for item in link:
                 if isinstance(item, bytes):
                     note(seen.pictures, seen.taken_s.get(int.from_bytes(item[:8], "big", signed=True)))
-                elif (words := json.loads(item))["type"] in ("boxes", "motion"):
-                    note(seen.boxes if words["type"] == "boxes" else seen.motion, seen.taken_s.get(words["pts_us"]))
+                elif (words := json.loads(item))["type"] == "motion":
+                    note(seen.motion, seen.taken_s.get(words["pts_us"]))
+                elif words["type"] == "boxes":
+                    note_boxes(seen, words["pts_us"], words.get("classes"))
 
 
 async def heard(url: str, seen: Seen) -> None:
@@ -260,6 +288,18 @@ async def shown(url: str, seen: Seen, event: dict[str, Any]) -> None:
         fetch_s = time.time() - began_s
         seen.tiles_s.append(fetch_s)
         seen.map.append((seen.taken_s[nearest], seen.announced[revision] + fetch_s - seen.taken_s[nearest]))
+
+
+def note_boxes(seen: Seen, pts_us: int, classes: list[str] | None) -> None:
+    """A picture's boxes: of some classes, or of all."""
+    taken_s = seen.taken_s.get(pts_us)
+    for name in CLASSES if classes is None else classes:
+        if classes is not None or name not in seen.early.get(pts_us, ()):
+            note(seen.of_class[name], taken_s)
+    if classes is None:
+        note(seen.boxes, taken_s)
+    else:
+        seen.early[pts_us] = classes
 
 
 def note(found: list[tuple[float, float]], taken_s: float | None) -> None:

@@ -110,11 +110,19 @@ def test_large_cars_are_seen_in_a_smaller_look_and_people_in_the_picture(
     look = detector_module._look
     monkeypatch.setattr(detector_module, "_look", noted)
     longest_px = detector.info.best_px["car"][1]
-    seen = detector.detect(picture, tiles="auto", m_per_px=4.4 / (1.5 * longest_px))
-    assert scales == pytest.approx([1.0, 1 / 1.5])
+    early = []
+    m_per_px = 4.4 / (1.5 * longest_px)
+    seen = detector.detect(
+        picture, tiles="auto", m_per_px=m_per_px, early=lambda *found: early.append((*scales, *found))
+    )
+    assert scales == pytest.approx([1 / 1.5, 1.0])
     assert seen.names == ["car", "person"], "each once, best first"
     np.testing.assert_allclose(seen.boxes_px, [(300, 300, 900, 600), (10, 20, 50, 80)], atol=2)
-    assert len(detector.detect(picture)) == 2 and scales[2:] == [1.0], "unknown ground is looked at once"
+    ((_, classes, cars),) = early  # after the first look, and never after the last
+    assert classes == ("car",) and cars.names == ["car"]
+    np.testing.assert_array_equal(cars.boxes_px, seen.boxes_px[:1])
+    found = detector.detect(picture, early=lambda *found: early.append(found))
+    assert len(found) == 2 and scales[2:] == [1.0] and len(early) == 1, "unknown ground is looked at once"
 
 
 def test_each_class_has_its_own_threshold(detector: Detector) -> None:

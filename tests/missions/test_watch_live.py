@@ -17,6 +17,7 @@ from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.run import EarlyFound, WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.survey.objects import Detections
 from sorvolo.tracking.picture_steps import PictureStep
@@ -100,3 +101,30 @@ def test_how_the_picture_moves_is_known_between_the_frames_that_are_searched(tmp
     assert all(later.from_ns == step.to_ns for step, later in pairwise(steps))
     # on the clock of the updates, so that boxes can follow
     assert steps[0].from_ns <= updates[-1].time_ns and updates[1].time_ns <= steps[-1].to_ns
+
+
+class _EarlyDetector(_SlowDetector):
+    """Cars are known before the picture is searched for people, of whom there are none."""
+
+    classes = ("car", "person")
+
+    def detect(self, image: ImageRGB, *, early: Any, **_: object) -> Detections:
+        found = super().detect(image)
+        early(("car",), found)
+        time.sleep(0.1)
+        return found
+
+
+def test_what_is_known_of_a_frame_early_comes_before_the_rest_of_it(tmp_path: Path) -> None:
+    port = free_port()
+    came: list[EarlyFound | WatchUpdate] = []
+    with sending(udp_url(port), klv=True, image=_scene, count=2 * RATE):
+        address, outputs = f"udp://127.0.0.1:{port}", WatchOutputs(folder=tmp_path / "watch")
+        for update in watch(address, outputs=outputs, detector=_EarlyDetector(), live=_LIVE, early=came.append):
+            came.append(update)
+    assert len(came) >= 4
+    for early, whole in zip(came[::2], came[1::2], strict=True):
+        assert isinstance(early, EarlyFound) and isinstance(whole, WatchUpdate)
+        assert early.classes == ("car",) and early.latency_s < whole.latency_s - 0.09
+        assert (early.time_ns, early.clip_ns, early.size_px) == (whole.time_ns, whole.clip_ns, whole.size_px)
+        assert np.array_equal(early.detections.boxes_px, whole.detections.boxes_px)

@@ -760,6 +760,40 @@ def test_boxes_follow_the_picture_until_it_is_looked_at_again(
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
 
 
+def test_boxes_of_cars_that_are_known_before_people_take_the_place_of_earlier_cars_alone(
+    served: Served, opened: Watched, tmp_path: Path
+) -> None:
+    page = opened.page
+    messages = units(write_video(tmp_path / "v.mp4"), "h264")
+    hello = Message(Kind.HELLO, 0, 0, Hello("e" * 16, "h264", 160, 120, 10.0).to_json().encode())
+    with connect(f"{served.url.replace('http', 'ws')}/api/ingest/scout") as drone:
+        drone.send(hello.to_bytes())
+        drone.recv()
+        for each in messages:
+            drone.send(each.to_bytes())
+        page.locator("aside.video").wait_for()
+        expect(page.locator(".delay")).to_have_text(re.compile("behind"))
+        last_us = max(each.pts_us for each in messages if each.kind is Kind.VIDEO)
+        note, loop = served.station.ingest.hub("scout").note, served.station.ingest._loop
+
+        def look(before_us: int, boxes: dict[str, int], **classes: list[str]) -> None:
+            loop.call_soon_threadsafe(note, {
+                "type": "boxes", "pts_us": last_us - before_us, "frame_size_px": [160, 120], **classes,
+                "boxes": [{"class": name, "score": 0.8, "xywh_px": [x, 40, 10, 30]} for name, x in boxes.items()],
+            })
+
+        look(1_000_000, {"person": 40, "car": 140})
+        page.locator("aside.video footer", has_text="2 in the picture 1 s ago").wait_for()
+        assert columns_drawn(page) == pytest.approx((39, 151), abs=2)
+        look(0, {"car": 120}, classes=["car"])  # not searched for people yet: the earlier one stays, with its age
+        wait_for(lambda: columns_drawn(page) == pytest.approx((39, 131), abs=2))
+        expect(page.locator("aside.video footer")).to_contain_text("2 in the picture 1 s ago")
+        look(0, {"person": 60, "car": 120})
+        wait_for(lambda: columns_drawn(page) == pytest.approx((59, 131), abs=2))
+        expect(page.locator("aside.video footer")).to_contain_text(re.compile("2 in the picture$"))
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+
+
 def test_how_far_the_picture_moved_between_two_of_its_times(served: Served, opened: Watched) -> None:
     ways = opened.page.evaluate("""async () => {
       const {PictureMotion} = await import('/page/picture_motion.js');

@@ -22,6 +22,9 @@ from sorvolo.geometry.arrays import Floats, ImageRGB, Labels
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections
 
+Early = Callable[[tuple[str, ...], Detections], None]
+"""Is given some of the classes that are searched for, and what was found of them: all that will be."""
+
 
 class Detector:
     """A model that is ready to look at pictures. `load` opens one; `detect` is called after, by any threads."""
@@ -98,6 +101,7 @@ class Detector:
     def detect(
         self, image: Picture, *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        early: Early | None = None,
     ) -> Detections: ...
 
     @overload
@@ -109,6 +113,7 @@ class Detector:
     def detect(
         self, image: Picture | Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        early: Early | None = None,
     ) -> Detections | list[Detections]:
         """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
 
@@ -117,6 +122,8 @@ class Detector:
         sampling distance; None or NaN: not known), a number of its pixels a side, or None for the picture as a whole;
         docs/detector.md gives the rule. `least_score` None means each class's own threshold; `classes` None means all.
         `from_above`: the camera looked about straight down; a model whose file asks for it (`turned`) then looks twice.
+        `early`, for one picture, is given the classes that have a look of their own (see `looks_for`), and what was
+        found of them, while the picture is searched for the others; in the end the same objects are among all.
         Raises InputError for anything that is no picture, SettingsError for a class, score or tile that cannot be.
         """
         wanted = self._wanted(classes)
@@ -124,7 +131,7 @@ class Detector:
             raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
         sampling = math.nan if m_per_px is None else float(m_per_px)
         if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
-            return self._seen(image, tiles, sampling, wanted, least_score, from_above)
+            return self._seen(image, tiles, sampling, wanted, least_score, from_above, early)
         return [self._seen(each, tiles, sampling, wanted, least_score, from_above) for each in image]
 
     def thresholds_for(self, picture: Picture, *, from_above: bool = False) -> Mapping[str, float]:
@@ -152,16 +159,31 @@ class Detector:
 
     def _seen(
         self, picture: Picture, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
-        least_score: float | None, from_above: bool,
+        least_score: float | None, from_above: bool, early: Early | None = None,
     ) -> Detections:
         thermal = is_thermal(picture)
         session = self._session_for(thermal)
         rgb = rgb_from_picture(picture)
         asked = [name for name in wanted if name in session.info.classes]
+        looks_twice = from_above and bool(session.info.turned)
+
+        def reported(seen: Seen, names: Sequence[str]) -> Detections:
+            least = _least_scores(session.info, _thresholds(session.info, from_above), names, least_score)
+            kept = seen.scores >= least[seen.labels]
+            labels = seen.labels[kept]
+            if session is not self._session:
+                labels = _places_in(self.classes, session.info.classes)[labels]
+            return Detections(seen.boxes_px[kept], seen.scores[kept], labels, self.classes)
 
         def whole(shown: ImageRGB) -> Seen:
             groups = looks_for(session.info, m_per_px, asked, thermal) if tiles == "auto" else (tuple(asked),)
-            return _together([look(shown, names) for names in groups], groups, session.info.classes)
+            looks: dict[tuple[str, ...], Seen] = {}
+            for names in reversed(groups):  # the smaller look first: it is known soon
+                looks[names] = look(shown, names)
+                is_last = names == groups[0]
+                if early is not None and not (is_last or looks_twice or session.info.second_look.keys() & set(names)):
+                    early(names, reported(looks[names], names))
+            return _together([looks[names] for names in groups], groups, session.info.classes)
 
         def look(shown: ImageRGB, names: Sequence[str]) -> Seen:
             size_px = shown.shape[0], shown.shape[1]
@@ -172,14 +194,8 @@ class Detector:
             looks = [SeenTile(place, _look(session, shown, place, plan.scale)) for place in plan.places_px]
             return looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
 
-        seen = _seen_turned(rgb, whole) if from_above and session.info.turned else whole(rgb)
-        seen = self._seen_again(session, rgb, seen, asked)
-        least = _least_scores(session.info, _thresholds(session.info, from_above), asked, least_score)
-        kept = seen.scores >= least[seen.labels]
-        labels = seen.labels[kept]
-        if session is not self._session:
-            labels = _places_in(self.classes, session.info.classes)[labels]
-        return Detections(seen.boxes_px[kept], seen.scores[kept], labels, self.classes)
+        seen = _seen_turned(rgb, whole) if looks_twice else whole(rgb)
+        return reported(self._seen_again(session, rgb, seen, asked), asked)
 
     def _session_for(self, thermal: bool) -> Session:
         """This model, or for a thermal frame an installed one: the one it names, or any where one may stand in."""

@@ -40,7 +40,7 @@ from sorvolo.survey.mosaic import FrameView, MosaicUpdate
 from sorvolo.survey.wording import counted_list
 
 if TYPE_CHECKING:
-    from sorvolo.missions.watch.run import WatchUpdate
+    from sorvolo.missions.watch.run import EarlyFound, WatchUpdate
     from sorvolo.tracking.picture_steps import PictureStep
 
 FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
@@ -221,6 +221,7 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
         order.source, settings, WatchOutputs(Path(order.folder)), telemetry=order.telemetry or None,
         camera=order.camera or None, live=_live(order), until=until,
         moved=partial(_moved, journal, order.stream) if order.stream else None,
+        early=partial(_seen_early, journal, order.stream) if order.stream else None,
     )
     with closing(updates):
         for update in updates:
@@ -293,22 +294,30 @@ def _seen(journal: Journal, update: "WatchUpdate", stream: str) -> None:
     """Write a frame's boxes, and each object that it confirmed; of a watch that was killed, it has written them."""
     if update.is_resumed:
         return
-    found = update.detections
-    boxes = [
-        {"class": name, "score": round(float(score), 3), "xywh_px": [
-            round(float(each), 1) for each in (x0, y0, x1 - x0, y1 - y0)
-        ]}
-        for name, score, (x0, y0, x1, y1) in zip(found.names, found.scores, found.boxes_px)
-    ]
-    journal.add(BOXES, {
-        "stream": stream or None, "frame": update.frame_name, "pts_us": update.clip_ns // 1000,
-        "time": utc_text(update.time_ns), "boxes": boxes, "frame_size_px": list(update.size_px),
-        "latency_s": round(update.latency_s, 3),
-    })
+    journal.add(BOXES, _boxes(update, stream))
     if not update.new:
         return
     for feature in tracks_collection(list(update.new), update.site, {})["features"]:
         journal.add("object.found", {"feature": feature, "is_local": update.site.is_local})
+
+
+def _seen_early(journal: Journal, stream: str, found: "EarlyFound") -> None:
+    """Write the boxes of some classes, before the frame is searched for the others."""
+    journal.add(BOXES, _boxes(found, stream) | {"classes": list(found.classes)})
+
+
+def _boxes(seen: "WatchUpdate | EarlyFound", stream: str) -> dict[str, Any]:
+    found = seen.detections
+    return {
+        "stream": stream or None, "frame": seen.frame_name, "pts_us": seen.clip_ns // 1000,
+        "time": utc_text(seen.time_ns), "frame_size_px": list(seen.size_px), "latency_s": round(seen.latency_s, 3),
+        "boxes": [
+            {"class": name, "score": round(float(score), 3), "xywh_px": [
+                round(float(each), 1) for each in (x0, y0, x1 - x0, y1 - y0)
+            ]}
+            for name, score, (x0, y0, x1, y1) in zip(found.names, found.scores, found.boxes_px)
+        ],
+    }
 
 
 def _moved(journal: Journal, stream: str, step: "PictureStep") -> None:

@@ -1,6 +1,6 @@
 """What missions ask of a detector, so that a test's own or a plug-in's can stand in for Sorvolo's."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Literal, Protocol
 
 from sorvolo.detection.contract import ModelInfo
@@ -37,10 +37,12 @@ class ObjectDetector(Protocol):
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        early: Callable[[tuple[str, ...], Detections], None] | None = None,
     ) -> Detections:
         """The objects in one picture, (H, W, 3), best first.
 
         `tiles` cuts a large picture: "auto" by `m_per_px` (the ground's sampling distance), a number of pixels a side,
         or None for the picture as a whole. None for `least_score` means each class's own; for `classes`, all.
-        `from_above`: the camera looked about straight down.
+        `from_above`: the camera looked about straight down. `early` may be given classes, and all that is found of
+        them, while the picture is still searched for others.
         """

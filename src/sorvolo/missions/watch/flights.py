@@ -4,7 +4,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sorvolo.capture.live.reconnect import LiveSettings
@@ -22,7 +22,7 @@ from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.ground_height import over_heights
 from sorvolo.missions.watch.journal import StoppedWatch, WatchJournal, WatchOrder
 from sorvolo.missions.watch.places import Places, places_of
-from sorvolo.missions.watch.run import WatchRun, WatchUpdate, utc_ns
+from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
 from sorvolo.store.exports.cursor_on_target import COT_TYPES
@@ -34,11 +34,19 @@ _AHEAD = 4  # decoded frames that wait for the detector
 _STOPPED = "stopped on demand"
 
 
+@dataclass(frozen=True)
+class _Heard:
+    """Who is given what is known of a live source before its frames' updates."""
+
+    moved: Callable[[PictureStep], None] | None = None
+    early: Callable[[EarlyFound], None] | None = None
+
+
 def watch(
     source: Path | str, settings: WatchSettings = WatchSettings(), outputs: WatchOutputs = WatchOutputs(), *,  # noqa: B008 (frozen)
     telemetry: Path | str | None = None, camera: Path | str | None = None, detector: ObjectDetector | None = None,
     live: LiveSettings = LiveSettings(), until: threading.Event | None = None,  # noqa: B008 (frozen)
-    moved: Callable[[PictureStep], None] | None = None,
+    moved: Callable[[PictureStep], None] | None = None, early: Callable[[EarlyFound], None] | None = None,
 ) -> Generator[WatchUpdate]:
     """Search a flight, yielding an update for each frame searched.
 
@@ -50,6 +58,8 @@ def watch(
 
     `moved` is given how the picture of a live video moved, ten times a second of flight, in the thread that reads it:
     while a frame is searched, its last boxes can follow the picture (see `PictureSteps`). Times are those of updates.
+    `early` is given what is found in a live frame of classes that take little time (cars, where they appear large),
+    before the frame's update, which has the same.
 
     A watch that was killed goes on where it was when the same is asked for again, with a live stream within
     `live.same_flight_s`: what was found is not searched for again, and alerts that were sent are not sent again.
@@ -70,8 +80,9 @@ def watch(
             order = WatchOrder(settings, outputs, finder)
             goes_on = order.go_on_live(each, live.same_flight_s) if isinstance(each, LiveSource) else None
             folder = _folder_of(each, outputs, is_only=len(sources) == 1) if goes_on is None else goes_on.folder
+            heard = _Heard(moved, early) if isinstance(each, LiveSource) else _Heard()
             yield from _watch_one(
-                each, WatchOrder(settings, replace(outputs, folder=folder), finder), folder, goes_on, until, moved,
+                each, WatchOrder(settings, replace(outputs, folder=folder), finder), folder, goes_on, until, heard,
                 telemetry_named=telemetry is not None,
             )
 
@@ -113,18 +124,18 @@ def _demand_known_classes(detector: ObjectDetector, settings: WatchSettings, out
 
 def _watch_one(
     source: Source, order: WatchOrder, folder: Path, goes_on: StoppedWatch | None, until: threading.Event,
-    moved: Callable[[PictureStep], None] | None, *, telemetry_named: bool,
+    heard: _Heard, *, telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
     settings, outputs, detector = order.settings, order.outputs, order.detector
     setup, places = _prepared(source, order, telemetry_named=telemetry_named)
     with (
         _begun(source, order, setup, folder, goes_on) as journal,
-        WatchRun(setup, places, detector, settings, outputs, folder, journal) as run,
+        WatchRun(setup, places, detector, settings, outputs, folder, journal, heard.early) as run,
     ):
         for searched in journal.frames() if goes_on is not None else ():
             yield run.recall(searched)
-        if moved is not None and isinstance(source, LiveStream):
-            _give_steps(source, setup, moved)
+        if heard.moved is not None and isinstance(source, LiveStream):
+            _give_steps(source, setup, heard.moved)
         ended = _STOPPED
         try:
             first = 0 if goes_on is None else goes_on.next_index

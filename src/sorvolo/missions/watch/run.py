@@ -1,7 +1,7 @@
 """One watch while it runs: each frame is searched, detections are placed and tracked, new objects reported."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +32,19 @@ from sorvolo.survey.wording import counted_list
 from sorvolo.tracking.following import Taken
 
 _LAST_ALERTS_S, _LAST_EVENTS_S = 35.0, 5.0  # how long the end waits for what is still on its way
+
+
+@dataclass(frozen=True, eq=False)
+class EarlyFound:
+    """All that a frame shows of some `classes`, while it is still searched for others. Fields as of WatchUpdate."""
+
+    frame_name: str
+    time_ns: int
+    classes: tuple[str, ...]
+    detections: Detections
+    latency_s: float
+    size_px: tuple[int, int]
+    clip_ns: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +104,15 @@ class _Tracks:
 class WatchRun:
     """One watch. A context manager; `finish` writes what is known at the end, however the watch ended.
 
-    `journal` notes what is detected and sent, and has what a killed watch noted.
+    `journal` notes what is detected and sent, and has what a killed watch noted. `early` is given what is found in a
+    frame before the frame's update.
     """
 
     def __init__(
         self, setup: FlightSetup, places: Places, detector: ObjectDetector, settings: WatchSettings,
-        outputs: WatchOutputs, folder: Path, journal: WatchJournal,
+        outputs: WatchOutputs, folder: Path, journal: WatchJournal, early: Callable[[EarlyFound], None] | None = None,
     ) -> None:
-        self._journal = journal
+        self._journal, self._early = journal, early
         self._setup, self._places, self._detector = setup, places, detector
         self._settings, self._outputs, self._folder = settings, outputs, folder
         self._classes = settings.classes or detector.info.usual_classes
@@ -117,13 +131,13 @@ class WatchRun:
     ) -> None:
         self._stack.close()
 
-    def _found(self, frame: Frame) -> tuple[SearchedFrame, bool]:
+    def _found(self, frame: Frame, arrived_s: float) -> tuple[SearchedFrame, bool]:
         """What is detected in a frame, and whether a watch that was killed had detected it."""
         earlier = self._journal.next_frame(frame.index)
         with self.log.stage("detect"):
-            return self._searched(frame, earlier), earlier is not None
+            return self._searched(frame, earlier, arrived_s), earlier is not None
 
-    def _searched(self, frame: Frame, earlier: SearchedFrame | None) -> SearchedFrame:
+    def _searched(self, frame: Frame, earlier: SearchedFrame | None, arrived_s: float) -> SearchedFrame:
         """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows.
 
         `earlier` is what it found in a watch that was killed, which is taken in its place.
@@ -138,13 +152,20 @@ class WatchRun:
             looks.append(self._detector.detect(part, classes=classes) if known is None else known)
             return looks[-1]
 
+        def known(names: tuple[str, ...], found: Detections) -> None:
+            if self._early is not None:
+                self._early(EarlyFound(
+                    frame.name, utc_ns(self._setup, frame.time_ns), names, found, time.monotonic() - arrived_s,
+                    frame.image.shape[1::-1], frame.time_ns - self._setup.source.start_ns,
+                ))
+
         if magnifier is not None:
             m_per_px = magnifier.m_per_px(frame.image, look)
         if m_per_px is not None and self._setup.source.kind != "photos":
             m_per_px = whole_m_per_px(self._detector.info, classes, m_per_px, frame.image.shape[:2])
         found = self._detector.detect(
             frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes,
-            from_above=self._places.is_from_above(frame),
+            from_above=self._places.is_from_above(frame), **({} if self._early is None else {"early": known}),
         ) if earlier is None else earlier.found
         if magnifier is not None:
             magnifier.see(found, frame.image)
@@ -160,7 +181,7 @@ class WatchRun:
         """Search one frame, whose turn came at `arrived_s` of the monotonic clock, and take in what it shows."""
         self.log.read = frame.index + 1
         time_ns = utc_ns(self._setup, frame.time_ns)
-        searched, is_resumed = self._found(frame)
+        searched, is_resumed = self._found(frame, arrived_s)
         with self.log.stage("track"):
             taken = self._places.take(frame, time_ns, searched.found)
         if not is_resumed:

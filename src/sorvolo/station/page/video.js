@@ -130,7 +130,9 @@ class VideoPane {
     return choices.get("holdForBoxes") ? Math.min(this.late_s, MOST_HELD_S) : 0;
   }
 
+  /** Boxes of a picture; with `classes`, those of some, known before the others. */
   take(data) {
+    if (!data.classes) this.boxes = this.boxes.filter((each) => each.pts_us !== data.pts_us);
     this.boxes.push(data);
     this.boxes.sort((one, other) => one.pts_us - other.pts_us);
     this.boxes.splice(0, this.boxes.length - KEPT_BOXES);
@@ -153,24 +155,40 @@ class VideoPane {
   }
 
   drawBoxes(pts_us) {
-    let best = null;
-    for (const each of this.boxes) if (!best || Math.abs(each.pts_us - pts_us) < Math.abs(best.pts_us - pts_us)) best = each;
-    const isOwn = best && Math.abs(best.pts_us - pts_us) < BOXES_WITHIN_US;
-    const near = isOwn || (best && best.pts_us < pts_us && pts_us - best.pts_us < OLD_BOXES_US) ? best : null;
-    const carried = near && this.motion.carried(near, pts_us); // they follow the picture, where its motion is known
+    const looks = this.looksFor(pts_us);
     const pen = this.overlay.getContext("2d");
-    const [width, height] = near?.frame_size_px ?? [this.format?.width ?? 640, this.format?.height ?? 360];
+    const [width, height] = looks.at(-1)?.frame_size_px ?? [this.format?.width ?? 640, this.format?.height ?? 360];
     if (this.overlay.width !== width || this.overlay.height !== height) Object.assign(this.overlay, { width, height });
     pen.clearRect(0, 0, width, height);
-    const boxes = carried ?? near?.boxes ?? [];
     const size = Math.max(12, width / 50);
     pen.font = `600 ${size}px system-ui, sans-serif`;
     pen.lineWidth = Math.max(2, width / 400);
-    pen.globalAlpha = isOwn || carried ? 1 : 0.45;
-    pen.setLineDash(isOwn ? [] : [size / 2, size / 3]);
-    for (const box of boxes) drawBox(pen, box, size);
-    const ago_s = near ? (pts_us - near.pts_us) / 1e6 : 0;
-    fill(this.seen, boxes.length ? `${boxes.length} in the picture${isOwn ? "" : `${carried ? ", seen" : ""} ${number(ago_s, 1)} s ago`}` : "");
+    let count = 0, oldest = null;
+    for (const look of looks) {
+      const isOwn = Math.abs(look.pts_us - pts_us) < BOXES_WITHIN_US;
+      const carried = this.motion.carried(look, pts_us); // they follow the picture, where its motion is known
+      const boxes = carried ?? look.boxes;
+      pen.globalAlpha = isOwn || carried ? 1 : 0.45;
+      pen.setLineDash(isOwn ? [] : [size / 2, size / 3]);
+      for (const box of boxes) drawBox(pen, box, size);
+      if (boxes.length && !oldest) oldest = { isOwn, carried, ago_s: (pts_us - look.pts_us) / 1e6 };
+      count += boxes.length;
+    }
+    fill(this.seen, count ? `${count} in the picture${oldest.isOwn ? "" : `${oldest.carried ? ", seen" : ""} ${number(oldest.ago_s, 1)} s ago`}` : "");
+  }
+
+  /** The looks that tell most of a picture, the older first: the nearest whole one, and where cars of a later one are known already, those. */
+  looksFor(pts_us) {
+    const nearest = (looks) => {
+      let best = null;
+      for (const each of looks) if (!best || Math.abs(each.pts_us - pts_us) < Math.abs(best.pts_us - pts_us)) best = each;
+      const isShown = best && (Math.abs(best.pts_us - pts_us) < BOXES_WITHIN_US || (best.pts_us < pts_us && pts_us - best.pts_us < OLD_BOXES_US));
+      return isShown ? best : null;
+    };
+    const best = nearest(this.boxes);
+    if (!best?.classes) return best ? [best] : [];
+    const whole = nearest(this.boxes.filter((each) => !each.classes));
+    return whole ? [{ ...whole, boxes: whole.boxes.filter((box) => !best.classes.includes(box.class)) }, best] : [best];
   }
 
   /** Play the recorded flight of a place's view. */
