@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_map_resume import Seeing, content
 
+from killed_copy import copy_as_killed
 from small_flights import simulate_into, small_flight
 from sorvolo.change.views import ViewMaker
 from sorvolo.errors import SorvoloWarning
@@ -61,7 +62,7 @@ def whole(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
         [flown / "flight1"], site, MapSettings(model="none"), camera=flown / "camera.xml", area=folder / "west.geojson"
     ):
         pass
-    compared(flown, site, then=lambda count: count != _KILLED_AT or shutil.copytree(site, amid))
+    compared(flown, site, then=lambda count: count != _KILLED_AT or copy_as_killed(site, amid))
     return site, amid
 
 
@@ -125,7 +126,7 @@ def test_method_thesis_begins_anew_and_reports_it(flown: Path, tmp_path: Path) -
     settings = MapSettings(method="thesis", model="none")
     updates = map_flights([flown / "flight1"], tmp_path / "site", settings, camera=flown / "camera.xml")
     next(updates)
-    shutil.copytree(tmp_path / "site", tmp_path / "amid")
+    copy_as_killed(tmp_path / "site", tmp_path / "amid")
     updates.close()
     with pytest.warns(SorvoloWarning, match="flight1: a stopped run begins again from the start: --method thesis"):
         again = map_flights([flown / "flight1"], tmp_path / "amid", settings, camera=flown / "camera.xml")

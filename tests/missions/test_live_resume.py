@@ -15,6 +15,7 @@ from live_sender import Sender
 from test_map_live import _LIVE, Drone, FilmedFlight
 from truth_detector import TruthDetector
 
+from killed_copy import copy_as_killed
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources
@@ -79,7 +80,7 @@ def mapped(
         if not each.is_resumed:
             fly()
         if len(updates) == killed_at:
-            shutil.copytree(site, site.with_name("amid"))
+            copy_as_killed(site, site.with_name("amid"))
             mapping.close()
             shutil.rmtree(site)
             shutil.move(site.with_name("amid"), site)
@@ -157,7 +158,7 @@ def test_a_comparison_of_a_stream_goes_on(
 
     comparing = compared()
     before = [each for _, each in zip(range(6), comparing)]
-    shutil.copytree(site, tmp_path / "amid")
+    copy_as_killed(site, tmp_path / "amid")
     comparing.close()
     shutil.rmtree(site)
     shutil.move(tmp_path / "amid", site)
@@ -202,7 +203,7 @@ def test_a_watch_of_a_growing_file_goes_on(
     before = [each for _, each in zip(range(12), watching)]
     sent = sum(len(each.new) for each in before)
     wait_for(lambda: (folder / "run.journal").read_bytes().count(b'"receiver"') == sent >= 1)  # noted once it is sent
-    shutil.copytree(folder, tmp_path / "amid")
+    copy_as_killed(folder, tmp_path / "amid")
     watching.close()
     shutil.rmtree(folder)
     shutil.move(tmp_path / "amid", folder)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from truth_detector import TruthDetector
 
+from killed_copy import copy_as_killed
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
@@ -72,7 +73,7 @@ def mapped(
 def copy_at(count: int, site: Path, amid: Path) -> None:
     """Copy the site in the middle of the flight."""
     if count == _KILLED_AT:
-        shutil.copytree(site, amid)
+        copy_as_killed(site, amid)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +84,7 @@ def whole(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     commit = FlightWriter.commit
 
     def copied(self: FlightWriter, *args: object, **kwargs: object) -> int:
-        shutil.copytree(site, late)
+        copy_as_killed(site, late)
         return commit(self, *args, **kwargs)  # type: ignore[arg-type]
 
     with pytest.MonkeyPatch.context() as patch:

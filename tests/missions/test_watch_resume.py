@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from truth_detector import TruthDetector
 
+from killed_copy import copy_as_killed
 from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
 from sorvolo.errors import SorvoloWarning
@@ -92,7 +93,7 @@ def test_it_goes_on_and_notifies_nobody_twice(video: Path, detector: TruthDetect
         if len(updates) == _KILLED_AT:
             reported.extend(ids(alerts, sum(len(each.new) for each in updates)))
             wait_for(lambda: noted(whole) == len(reported))
-            shutil.copytree(whole, amid)
+            copy_as_killed(whole, amid)
 
     updates = watched(video, whole, detector, alerts, killed)
     found = [track.id for each in updates for track in each.new]
@@ -116,7 +117,7 @@ def test_an_alert_that_was_not_sent_is_sent(flown: Path, detector: TruthDetector
     def killed(updates: list[WatchUpdate]) -> None:
         if len(updates) == _KILLED_AT:
             time.sleep(1.0)
-            shutil.copytree(folder, amid)
+            copy_as_killed(folder, amid)
 
     updates = watched(video, folder, detector, tmp_path / "none", killed)
     shutil.rmtree(folder)
@@ -131,7 +132,7 @@ def test_other_settings_begin_anew_and_report_it(flown: Path, detector: TruthDet
     video, folder = flown / "flight1" / "flight1.mp4", tmp_path / "watch"
     updates = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70", detector=detector)
     next(updates)
-    shutil.copytree(folder, tmp_path / "amid")
+    copy_as_killed(folder, tmp_path / "amid")
     updates.close()
     assert not (folder / "run.journal").exists()
     with pytest.warns(SorvoloWarning, match="a watch that was stopped cannot continue: it was of other settings"):
@@ -152,7 +153,7 @@ def test_what_was_printed_is_not_printed_again(
     monkeypatch.setattr("sorvolo.missions.watch.flights.Detector.load", lambda _: detector)
     closing = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70")
     new = [track.id for _, each in zip(range(_KILLED_AT), closing) for track in each.new]
-    shutil.copytree(folder, tmp_path / "amid")
+    copy_as_killed(folder, tmp_path / "amid")
     closing.close()
     shutil.rmtree(folder)
     shutil.move(tmp_path / "amid", folder)

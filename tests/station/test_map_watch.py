@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sorvolo.station import sites
+from sorvolo.station import map_watch, sites
 from sorvolo.station.app import Station
 from sorvolo.station.settings import StationSettings
 
@@ -45,5 +45,17 @@ def test_a_site_that_is_deleted_file_by_file_is_announced(station: Station, root
     station.map_watch.look()
     shutil.rmtree(root / "field")
     station.map_watch.look()
+    station.map_watch.look()
+    assert gone(station) == ["field"]
+
+
+def test_a_site_deleted_before_the_first_look_is_announced(
+    station: Station, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A page may have listed it by then."""
+    monkeypatch.setattr(map_watch, "_LOOK_EVERY_S", 60.0)  # the station's own thread does not look: the test does
+    station.map_watch.start()
+    shutil.rmtree(root / "field")
+    station.shelf.forget("field")
     station.map_watch.look()
     assert gone(station) == ["field"]

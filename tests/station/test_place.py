@@ -14,6 +14,7 @@ from starlette.testclient import TestClient
 
 from sorvolo.station.cut_video import frame_of
 from sorvolo.store.site.archive import Archive
+from waiting import wait_for
 
 
 def test_every_flight_that_saw_a_place_is_remembered_in_order(client: TestClient, root: Path) -> None:
@@ -65,9 +66,10 @@ def test_the_frame_of_a_number_is_that_frame(tmp_path: Path) -> None:
         frame_of(str(path), 400)
 
 
-def test_all_sites_are_asked_at_once(client: TestClient, root: Path) -> None:
+def test_all_sites_are_asked_at_once(client: TestClient, root: Path, made_site: Path) -> None:
     """By an index that the station makes and keeps: a flight that came since is found, a site that went is not."""
-    shutil.copytree(root / "field", root / "more" / "field")
+    shutil.copytree(made_site, root / "more" / "field")
+    wait_for(lambda: client.get("/api/sites/more:field").status_code == 200)
     place = {"lon": 0.0, "lat": 0.0}
     for each in client.get("/api/sites/field/collections/frames/items").json()["features"][:1]:
         place["lon"], place["lat"] = np.mean(each["geometry"]["coordinates"][0][:-1], axis=0)

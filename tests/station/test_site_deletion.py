@@ -47,9 +47,9 @@ def events(client: TestClient) -> list[tuple[str, str | None]]:
     return [(each["type"], each["site"]) for each in client.app.state.station.events.after(0)]  # type: ignore[attr-defined]
 
 
-def test_a_site_goes_with_all_that_the_station_keeps_of_it(client: TestClient, root: Path) -> None:
+def test_a_site_goes_with_all_that_the_station_keeps_of_it(client: TestClient, root: Path, made_site: Path) -> None:
     """Its size is stated before; every page hears of it; a new site of its name knows nothing of it."""
-    shutil.copytree(root / "field", root / "other")
+    shutil.copytree(made_site, root / "other")
     keep_run(client, "feed", "finished")
     body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
     assert client.post(f"{FIELD}/reviews", json=body).status_code == 201
@@ -147,9 +147,9 @@ def test_who_may_not_start_missions_deletes_nothing(root: Path, role: str) -> No
     "..", "%2e%2e", "..%2f..%2foutside", "%2e%2e:outside", "..:outside", "field%2f..%2f..%2foutside", "field%2f..",
     "station", "streams", ".", "%00", "field%00", "linked", "field%3alinked", "%2fetc",
 ])
-def test_no_name_leads_outside(client: TestClient, root: Path, tmp_path: Path, name: str) -> None:
+def test_no_name_leads_outside(client: TestClient, root: Path, made_site: Path, tmp_path: Path, name: str) -> None:
     """Not by a path, not by a link to a site that lies elsewhere."""
-    shutil.copytree(root / "field", tmp_path / "outside")
+    shutil.copytree(made_site, tmp_path / "outside")
     (root / "linked").symlink_to(tmp_path / "outside")
     (root / "streams").mkdir()
     before = sorted(tmp_path.rglob("*"))
@@ -173,11 +173,11 @@ def test_links_in_a_site_go_and_what_they_lead_to_stays(client: TestClient, root
 
 
 def test_a_folder_that_became_a_link_meanwhile_is_not_emptied(
-    client: TestClient, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    client: TestClient, root: Path, made_site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By somebody who may write below the root, between the last look and the deletion."""
     outside = tmp_path / "outside"
-    shutil.copytree(root / "field", outside)
+    shutil.copytree(made_site, outside)
     mark = mark_of(client)
     rename = Path.rename
 

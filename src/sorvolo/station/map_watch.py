@@ -40,7 +40,8 @@ class MapWatch:
         self._thread = threading.Thread(target=self._watch, name="maps", daemon=True)
 
     def start(self) -> None:
-        """Follow the maps from now on."""
+        """Follow the maps from now on; the sites of this moment are known when this returns."""
+        self._listed |= self._shelf.folders().keys()  # one deleted before the first look has to be announced as well
         self._thread.start()
 
     def close(self) -> None:
