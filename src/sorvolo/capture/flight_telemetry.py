@@ -20,8 +20,8 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
-_SLOWEST_M_S = 0.3
-_LOWEST_M = 2.0
+_SLOWEST_M_S = 0.3  # of a flight: the speed of one that hovers would ask for no second frame; by choice
+_LOWEST_M = 2.0  # above ground: a height of zero, as before take-off, would divide by nothing
 _PLACES_ASKED = 200  # of a flight
 _SEARCHED_SIGMAS, _SEARCHED_AGAIN_S = 4, 1.0  # how far a clock offset is searched, first and after one was found
 _LARGELY = 0.5  # share of samples that have a height: then it is the one that the flight counts in

@@ -1,6 +1,6 @@
 """Pictures of another size than the flight's: the same view in more or fewer pixels, or another view."""
 
-_SAME_ASPECT = 0.01
+_SAME_ASPECT = 0.01  # relative; by choice
 
 
 def is_same_shape(size_px: tuple[int, int], flight_px: tuple[int, int]) -> bool:

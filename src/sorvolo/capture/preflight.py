@@ -24,8 +24,8 @@ from sorvolo.survey.flight import Frame, Telemetry
 WANTED_OVERLAP = 0.7
 """Of consecutive frames, for a good map."""
 
-_MOVING_M_S = 0.5
-_FEWEST_SAMPLES = 3
+_MOVING_M_S = 0.5  # slower is hovering; by choice
+_FEWEST_SAMPLES = 3  # different places: two make no track
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from sorvolo.survey.flight import Notice
 PIXEL_LIMIT = 64_000_000
 """A video of larger frames is refused before it is decoded."""
 
-_GAP_S = 2.0
+_GAP_S = 2.0  # between two frames, or five usual steps: longer, pictures are missing; by choice
 _CLOCK_RETURNS_WITHIN = 25  # frames after a backward step in which the old clock may come back
-_DEMUX_RETRIES = 20
+_DEMUX_RETRIES = 20  # damaged places after which reading goes on; then the file has ended
 
 
 class VideoClock:

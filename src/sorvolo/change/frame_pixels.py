@@ -13,7 +13,7 @@ from sorvolo.survey.findings import ComparedView
 from sorvolo.survey.flight import PosedFrame
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
-_LEAST_SIDE_PX = 480
+_LEAST_SIDE_PX = 480  # longer side of a frame, however coarse the map; by choice
 _NO_PLACE_M: Vector3 = np.full(3, np.nan)
 
 

@@ -23,7 +23,7 @@ from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features
 
 _FEATURES = FeatureSettings()
-_QUARTERS_DEG = (0.0, 90.0, -90.0, 180.0)
+_QUARTERS_DEG = (0.0, 90.0, -90.0, 180.0)  # headings that are tried where none is known
 
 
 @dataclass(frozen=True)

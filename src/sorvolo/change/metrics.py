@@ -14,7 +14,7 @@ from sorvolo.geometry.arrays import Floats, Mask, PointsM, TimesNs, frozen
 from sorvolo.geometry.polygons import points_inside, signed_area
 from sorvolo.survey.findings import ChangeKind
 
-_FINEST_CELL_M = 0.1
+_FINEST_CELL_M = 0.1  # of compared ground: finer than any outline is known
 _MOST_CELLS = 4_000_000  # of compared ground, which bounds its memory
 
 

@@ -15,7 +15,7 @@ METADATA_KEY = "sorvolo"
 FORMAT = 1
 """The newest contract that this version reads; docs/detector.md lists its fields."""
 
-_FALLBACK_STRIDE = 32
+_FALLBACK_STRIDE = 32  # px: what a picture's sides are multiples of, in a model whose file does not state it
 _NEEDED = ("name", "classes", "thresholds", "best_px")
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 

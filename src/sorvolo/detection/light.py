@@ -12,10 +12,10 @@ Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) or (H, W, 1) grey, (H, W, 3) RGB, (H, W, 4) RGBA: any picture that a drone's camera makes."""
 
 _LEAST_SPAN = 64  # counts; a thermal frame of one temperature is not stretched until its noise fills the range
-_STRETCH_PERCENT = (0.5, 99.5)
+_STRETCH_PERCENT = (0.5, 99.5)  # percentiles that become black and white: single hot pixels take no range; by choice
 _COLOUR_LEVELS = 10  # grey through a video's coding strays by up to five; daylight pictures of ours reach 17 and more
 _COLOUR_SHARE = 0.01  # of a picture may have colour and the picture still be grey: a logo, a cross-hair
-_GLIMPSE_STEP = 4
+_GLIMPSE_STEP = 4  # px between the pixels that are asked whether there is colour
 
 
 def rgb_from_picture(picture: Picture) -> ImageRGB:

@@ -20,7 +20,7 @@ from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Labels, Numbers
 PACKAGED = Path(__file__).parent / "data"
 """The folder of the models that come with the package; all others run in a process of their own."""
 
-_FILLING = 114
+_FILLING = 114  # grey level beside a picture, as YOLO's and NanoDet's trainings fill it
 _RUN_CODE = frozenset({".pt", ".pth", ".pkl", ".pickle", ".ckpt", ".bin", ".joblib"})
 
 

@@ -15,7 +15,7 @@ SAME_IOU = 0.4
 
 _COVERED = 0.7  # so much of a cut piece within a box that another tile saw whole: the piece adds nothing
 _TOUCH_SHARE, _TOUCH_PX = 0.2, 2.0  # a box that ends so near its tile's border may go on beyond; boxes are imprecise
-_MORE = 1.1
+_MORE = 1.1  # times the piece's area: a box of its own size is no whole that it is part of; by choice
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ _THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal 
 _THERMAL_LARGER = 1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
 _MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a look of its own, which costs half or less
 _LEAST_OVERLAP_PX, _SPARE = 64, 1.15
-_LEAST_SIDE_PX = 64
+_LEAST_SIDE_PX = 64  # of a tile: less is a typing error
 
 
 @dataclass(frozen=True)

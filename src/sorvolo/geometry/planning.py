@@ -28,7 +28,7 @@ LEGAL_CEILING_M = 120.0
 TURN_S = 4.0
 """Time a multicopter loses by braking, turning and speeding up again at one waypoint."""
 
-_MOST_STRIPS = 5000
+_MOST_STRIPS = 5000  # over an area: beyond any flight, and bounds the time for a wrong area
 
 
 class Task(StrEnum):

@@ -8,7 +8,7 @@ from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.heights.lattice import Lattice
 
-_TERMS = 6
+_TERMS = 6  # of a surface of second degree in x and y
 _ROUNDS = 10  # of a robust fit
 _BENDS = 2.0  # robust deviations at which the Cauchy loss bends
 

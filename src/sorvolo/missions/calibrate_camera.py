@@ -11,8 +11,8 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.survey.flight import LostFrame
 
-_MOST_LOOKED_AT = 200
-_LOOKS_PER_S = 3.0
+_MOST_LOOKED_AT = 200  # frames of a video, which bounds the time
+_LOOKS_PER_S = 3.0  # of a board that a hand turns
 
 
 @dataclass(frozen=True)

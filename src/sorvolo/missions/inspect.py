@@ -25,7 +25,7 @@ from sorvolo.survey.flight import CameraModel, Notice
 
 _ZONE_NS = 900 * SECOND_NS  # time zones differ by quarters of an hour
 _BLURRED = 1.5  # registration.features.sharpness at 960 px falls below this when blurred by two pixels
-_BARE_LEVELS = 1.5
+_BARE_LEVELS = 1.5  # grey levels of `sharpness_and_texture`'s second figure
 _STILL_SHARE = 0.7  # of the first picture that all others show: the drone hovers, all flight long
 _STILL_M = 3.0  # flown in all, no more than a hovering drone's fixes wander
 

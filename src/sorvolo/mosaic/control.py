@@ -14,7 +14,7 @@ from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.survey.control import ControlMark, ControlReport, ControlResidual, ControlRole, GroundControl
 
-LEAST_CONTROL = 3
+LEAST_CONTROL = 3  # points: two fix a similarity, the third shows whether they are right
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from scipy.sparse.linalg import splu
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import Floats, Floats16, Floats32, ImageRGB, Mask, PointsPx, Rows, frozen
 
-_SHRINK = 4
-_ITERATIONS = 8
-_LINKS_AT_ONCE = 512
+_SHRINK = 4  # times smaller pictures: colours are means of so many pixels a side
+_ITERATIONS = 8  # rounds of the robust solve; by choice
+_LINKS_AT_ONCE = 512  # bounds the memory
 _FIELD_PX = 1 << 17  # of a picture, corrected at a time
 _SIGMA_FROM_MEDIAN = 1.126  # of the root mean square of three normal numbers
 

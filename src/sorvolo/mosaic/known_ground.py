@@ -12,9 +12,9 @@ from sorvolo.geometry.grid import Grid, TileIndex
 SETTLING_PX = 64
 """How far beyond a window its known ground must be seen for `settled` not to depend on where the window ends."""
 
-_SHRINK = 4
+_SHRINK = 4  # times smaller: light is smooth
 _RIM_PX = 3.0  # known pixels so deep within the rim show the step at it
-_REACH_PX = 48
+_REACH_PX = 48  # over which new ground comes back to its own light
 _LARGEST_STEP = 24  # gray levels: more is no light but another thing
 
 

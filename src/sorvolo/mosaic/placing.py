@@ -12,7 +12,7 @@ from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.survey.flight import CameraPrior
 
 _CLIMBING = 1.5  # times the usual height of the first frames: they show the climb
-_HORIZON_MARGIN_DEG = 5.0
+_HORIZON_MARGIN_DEG = 5.0  # below the horizon: ground there lies eleven heights away; by choice
 _KNOWN_ATTITUDE_DEG = 4.0  # one sigma of a gimbal's tilt
 
 

@@ -13,7 +13,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, sharpness
 from sorvolo.survey.flight import Frame, LostFrame, PosedFrame
 
-_SMALL_PX = 256
+_SMALL_PX = 256  # longer side of the pictures by which overlap is judged
 _COPIES_KEPT = 16  # more than wait between the decoder and the selection
 _COARSE_PX = 64  # at which a sensor's noise averages out and ground still shows itself
 

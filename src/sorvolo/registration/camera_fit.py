@@ -12,8 +12,8 @@ from sorvolo.geometry.homography import apply_homography, site_from_image_homogr
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 
 _STEP = 1e-4  # of numerical derivatives: metres, radians
-_ROUNDS = 24
-_FAR_PX = 1e4
+_ROUNDS = 24  # of the robust fit, at most
+_FAR_PX = 1e4  # for ground behind the camera: any robust loss ignores it
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from cv2.typing import MatLike
 from sorvolo.geometry.arrays import Descriptors, ImageGray, ImageRGB, Mask, PointsPx
 from sorvolo.survey.mosaic import Features
 
-_TEXTURE_SIDE_PX = 960
+_TEXTURE_SIDE_PX = 960  # longer side at which sharpness is measured, whatever the camera
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from sorvolo.registration.matching import match
 from sorvolo.registration.robust_fit import fit_homography
 
 _SIDE_PX = 640  # pictures are made so small: the answer needs no sub-pixel match
-_LEAST_INLIERS = 12
-_THRESHOLD_PX = 3.0
+_LEAST_INLIERS = 12  # pairs: four fix a homography; by choice
+_THRESHOLD_PX = 3.0  # between the two places of a pair that agrees, at that size; by choice
 _POINTS = 48  # cells a side of the grid that is counted
 
 

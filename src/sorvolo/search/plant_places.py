@@ -10,7 +10,7 @@ from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import Conditions
 
 _ROOM_M = {"person": 4.0, "car": 10.0, "small object": 3.0}  # around one that is planted, across
-_OTHER_ROOM_M = 5.0
+_OTHER_ROOM_M = 5.0  # of a class of a user's own model
 
 
 @dataclass(frozen=True)

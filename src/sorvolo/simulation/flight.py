@@ -27,7 +27,7 @@ from sorvolo.simulation.view import RaysF32, View, camera_view, ray_grid, remapp
 from sorvolo.simulation.world import Day, World, build_day, build_world
 from sorvolo.survey.flight import Frame, Telemetry, no_telemetry
 
-_CLOUD_CELL_M = 7.0
+_CLOUD_CELL_M = 7.0  # of ground for a cell of the clouds' shade
 _CLOUD_STEP_PX = 16  # clouds are soft: their shade is computed on a coarse grid of the picture
 
 

@@ -16,9 +16,9 @@ _SHARPEST = 25.0  # percentile of their blur: the softer edges are shadows and r
 _OF_SHARPEST = 1.1  # what that lacks, by pictures blurred on purpose
 _SECTORS = 4  # directions in which blur is measured
 _LEAST_BLUR_PX = 0.35  # of a pixel that gathers light over its own area
-_MOST_BLUR_PX = 6.0
+_MOST_BLUR_PX = 6.0  # beyond, no edge is left by which blur could be measured; by choice
 _WEAKEST = 2.0  # grey levels a pixel: below, there is no edge
-_BLOCK_PX = 16
+_BLOCK_PX = 16  # side of the blocks whose spread is the noise; the flattest count
 _MOST_NOISE = 12.0  # grey levels
 _GREY_LEVELS = 10  # within which the channels of a thermal picture agree
 

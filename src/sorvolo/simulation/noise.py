@@ -14,7 +14,7 @@ from sorvolo.geometry.arrays import Floats
 FieldF32 = NDArray[np.float32]
 """(height, width) float32."""
 
-_KNOTS_PER_CORRELATION = 2.0
+_KNOTS_PER_CORRELATION = 2.0  # of a wandering series: enough for a smooth curve
 
 
 def layer(rng: np.random.Generator, shape: tuple[int, int], scale_px: float) -> FieldF32:

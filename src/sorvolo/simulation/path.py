@@ -16,8 +16,8 @@ from sorvolo.simulation.settings import LaterSettings, MotionSettings, PathSetti
 LEAD_S = 5.0
 """The path is known this long before the video starts and after it ends: telemetry runs longer than video."""
 
-_STEP_M = 0.25
-_MOST_BANK_DEG = 35.0
+_STEP_M = 0.25  # between points of the path before it is rounded
+_MOST_BANK_DEG = 35.0  # of a fixed wing in a turn; by choice
 
 
 @dataclass(frozen=True, eq=False)

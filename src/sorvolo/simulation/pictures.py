@@ -28,9 +28,9 @@ SMALLEST_PX = 4
 LEAST_VISIBLE = 0.3
 
 _SIZES_PX = ((640, 640), (960, 540), (832, 624), (768, 768))
-_THERMAL_SIZE_PX = (640, 512)
+_THERMAL_SIZE_PX = (640, 512)  # of the common sensors
 _MARGIN_M = 5.0  # things and shadows just outside the picture reach into it
-_LARGEST_GROUND_PX = 4e6
+_LARGEST_GROUND_PX = 4e6  # pixels of painted ground, which bounds the memory
 _STEEPEST_DEG = 72.0  # no ray is nearer to the horizon: there is no ground painted
 
 

@@ -9,11 +9,11 @@ from sorvolo.geometry.arrays import Floats, Floats32, PointsM
 from sorvolo.simulation.ground_painting import Area
 from sorvolo.simulation.view import View
 
-_WAVES = 5
+_WAVES = 5  # that are summed to hills
 _SHORTEST, _LONGEST = 2.5, 5.0  # lengths of the waves, in heights of the flight: hills that a survey flies over
 _COARSE_PX = 4  # the hills are smooth: rays are followed on a coarse grid of the picture
-_MOST_STEPS = 200
-_NEAR_M = 1e-4
+_MOST_STEPS = 200  # of following a ray down
+_NEAR_M = 1e-4  # to the ground: the ray has arrived
 
 
 @dataclass(frozen=True, eq=False)

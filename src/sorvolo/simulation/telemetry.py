@@ -25,8 +25,8 @@ _COLUMNS = {  # what each format can carry
     "photos": (*_PLACE, "height_above_takeoff_m", *_CAMERA),
 }
 _RATES_HZ = {"csv": 10.0, "srt": 5.0, "nmea": 1.0, "gpx": 1.0}
-_BAROMETER_NOISE_M = 0.2
-_GAP_S = 3.0
+_BAROMETER_NOISE_M = 0.2  # one sigma; by choice
+_GAP_S = 3.0  # without samples, where a gap is asked for
 
 
 @dataclass(frozen=True, eq=False)

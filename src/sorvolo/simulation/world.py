@@ -18,7 +18,7 @@ from sorvolo.simulation.relief import LEVEL, Relief
 from sorvolo.simulation.settings import SceneSettings, SimulationSettings, WeatherSettings
 from sorvolo.simulation.view import Patch, View, blend, map_view, sample_patches
 
-_LARGEST_GROUND_PX = 26e6
+_LARGEST_GROUND_PX = 26e6  # pixels of painted ground, which bounds the memory
 _SHADOW_TINT = np.array([0.40, 0.44, 0.52], np.float32)  # what the blue sky alone still lights
 
 

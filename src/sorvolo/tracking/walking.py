@@ -9,7 +9,7 @@ from sorvolo.geometry.arrays import Floats, TimesNs
 from sorvolo.tracking.laying import LaidSighting
 
 _MOST_M_S = {"person": 4.0, "car": 20.0}  # a runner; a car in town; what is neither walks
-_OTHER_M_S = 4.0
+_OTHER_M_S = 4.0  # of a class of a user's own model, as a person's
 
 
 @dataclass(frozen=True)

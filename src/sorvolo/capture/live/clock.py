@@ -9,7 +9,7 @@ _WINDOW_NS = 15 * SECOND_NS
 _SLEW = 0.005  # seconds of correction a second of stream: a clock's drift is 1000 times slower
 _JUMP_NS = 2 * SECOND_NS  # a tie that is further off than this was set anew
 _YOUNG_NS = 2 * SECOND_NS  # the first frames come in a burst: until then the offset follows at once
-_STATED_KEPT = 9
+_STATED_KEPT = 9  # of a stream's newest statements of UTC: their median counts
 
 
 class Tie(IntEnum):

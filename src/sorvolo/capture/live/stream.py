@@ -37,10 +37,10 @@ from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemet
 _HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is their delay known
 _HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it states the frames' time and lens
 _FIRST_FIXES = 2  # enough for where a flight begins, and how fast
-_FIRST_FIXES_S = 10.0
-_CLOCKS_AGREE_NS = 5_000_000_000
-_DELAYS_KEPT = 60
-_ZOOMED = 0.03
+_FIRST_FIXES_S = 10.0  # waited for them; then the flight begins without
+_CLOCKS_AGREE_NS = 5_000_000_000  # further apart, one of the two clocks was set wrong; by choice
+_DELAYS_KEPT = 60  # of the newest fixes, whose least delay ties the clocks: a minute at one a second
+_ZOOMED = 0.03  # relative change of the field of view: more than its rounding in the metadata
 _POLL_S = 0.25
 _TIMELY_NS = 5_000_000  # a frame so little before its turn is taken: the next one comes a whole frame later
 

@@ -30,7 +30,7 @@ _Table: TypeAlias = dict[str, Floats]
 _JUMP_SLACK_M = 10.0  # receivers step this far when their set of satellites changes
 _HELD_FIX_S = 1.0  # a receiver that repeats its fix made it at most this long ago
 _COARSE_DECIMALS = 4  # at five decimals the rounding (1.1 m) is below the receiver's own noise
-_SEGMENTS_BACK = 200
+_SEGMENTS_BACK = 200  # of a track that jumps: bounds the time that a hostile file takes
 _TIME = re.compile(
     r"(\d{4})[-./](\d{1,2})[-./](\d{1,2})[ T]+(\d{1,2}):(\d{2}):(\d{2})"
     r"(?:[.,](\d{1,9})(?:,(\d{1,3}))?)?\s*(Z|UTC|[+-]\d{2}:?\d{2})?",

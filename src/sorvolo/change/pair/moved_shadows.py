@@ -11,7 +11,7 @@ from sorvolo.change.pair.regions import Image
 from sorvolo.geometry.arrays import Floats, Mask
 
 STEPS = 24  # to an octave, of differences of logarithms; these are 8 bit, 128 alike
-ALIKE = 128
+ALIKE = 128  # the grey level, 0 to 255, that stands for no difference of two pictures
 
 
 @dataclass(frozen=True)

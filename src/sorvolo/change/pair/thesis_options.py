@@ -10,7 +10,7 @@ from sorvolo.errors import SettingsError
 from sorvolo.survey.named_values import named_values, whole_number
 
 LIGHT = "light"
-_MOST_THREADS = 256
+_MOST_THREADS = 256  # a bound for typing errors, beyond any machine that this runs on
 
 
 @dataclass(frozen=True)

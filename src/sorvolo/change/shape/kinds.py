@@ -16,7 +16,7 @@ from sorvolo.geometry.arrays import Floats, Floats32, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.findings import ChangeKind, Patch
 
-_SIGNS = 6
+_SIGNS = 6  # that are measured of each date's picture, see `_signs`
 _REPLACED_PRIOR = 0.5  # seldom does one thing leave where another comes; else snow is a hundred things
 # seeds 241 and 242 of the presets compare, compare-urban and compare-dirt with 44 changes each: as they are, in another
 # light, with the thing's contrast shrunk to 45 %, and replaced by a thing of other colours

@@ -10,8 +10,8 @@ from sorvolo.change.shape.outlines import mask_of
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Matrix3, PointsM
 from sorvolo.survey.findings import ComparedView, Patch
 
-_LEAST_MARGIN_M = 0.5
-_MARGIN_SHARE = 0.5
+_LEAST_MARGIN_M = 0.5  # of ground around a change in its pictures, for a person to recognise the place
+_MARGIN_SHARE = 0.5  # of the change's longer side, where that is more
 _LEAST_PART = 1e-6  # of a pixel: less is a rounding error
 
 

@@ -20,7 +20,7 @@ NIGHT = 0.25
 black."""
 
 _NEW_GROUND = 0.05  # share of a frame beyond the map: with less it is not worth a place in it
-_OVERLAP = 0.7
+_OVERLAP = 0.7  # of consecutive frames, as a first flight's map is made with
 
 
 class MapExtension:

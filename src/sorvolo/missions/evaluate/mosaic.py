@@ -16,9 +16,9 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.frame_rows import FrameRow
 from sorvolo.survey.mosaic import Status
 
-_DEVIATION_FRAMES = 120
-_REFERENCE_PX = 2048
-_FARTHEST_M = 10_000.0
+_DEVIATION_FRAMES = 120  # at most, spread over the flight: it bounds the time
+_REFERENCE_PX = 2048  # longer side at which maps are compared
+_FARTHEST_M = 10_000.0  # from the map: a truth so far away is another flight's
 _POSITION_COLUMNS = ("frame", "longitude_deg", "latitude_deg")
 _POSITIONS_NEED = "needed are the columns frame,longitude_deg,latitude_deg[,height_m][,flight]"
 

@@ -28,8 +28,8 @@ from sorvolo.store.rasters.base_map import BaseMap
 from sorvolo.survey.flight import Notice
 
 _COARSEST = 8.0  # times the photos' own pixels
-_OVERVIEW_PX = 1400
-_GPS_SIGMA_M = 5.0
+_OVERVIEW_PX = 1400  # longer side of the flight's picture that is searched for on the base map
+_GPS_SIGMA_M = 5.0  # one sigma of a fix without corrections; by choice
 _LEAST_FRAMES, _LEAST_SHARE = 3, 0.2
 _ANOTHER_PLACE_M = 500.0  # beyond what oblique frames show and what GPS errs
 _MARGIN = 1.5  # heights around the cameras

@@ -13,7 +13,7 @@ from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.survey.control import ControlReport, GroundControl
 from sorvolo.survey.flight import Notice
 
-_ANOTHER_PLACE_M = 2_000.0
+_ANOTHER_PLACE_M = 2_000.0  # from the flight: farther than flights within sight go; by choice
 
 
 @dataclass(frozen=True, eq=False)

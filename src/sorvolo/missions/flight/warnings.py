@@ -12,7 +12,7 @@ from sorvolo.survey.wording import counted, plural
 
 OBLIQUE_DEG = 35.0  # pictures that look to opposite sides share too little to be linked
 _MANY = 0.1  # share of the frames
-_BAD_FIT_PX = 3.0
+_BAD_FIT_PX = 3.0  # median residual of a map's matches from which on it is warned of; by choice
 _TURNED_DEG = 6.0  # by which all stated angles may be off without a word
 _GUESSED = 0.1  # relative: a focal length that is hardly known
 

@@ -43,8 +43,8 @@ from sorvolo.survey.flight import Frame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 _WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
-_OFFSET_ROUNDS = 3
-_LOCAL_M_PER_PX = 1.0
+_OFFSET_ROUNDS = 3  # of finding the clock's offset, at most: what one leaves the next one finds
+_LOCAL_M_PER_PX = 1.0  # without GPS: a map's unit is a pixel of its first frame
 HORIZON = "the camera looks at the horizon"
 """Why a frame is rejected that shows more than the ground."""
 

@@ -28,7 +28,7 @@ from sorvolo.survey.corrected import Bias, CorrectedFrame, TelemetryFaults
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
-_KLV_STEP_S = 0.2
+_KLV_STEP_S = 0.2  # between samples, five a second; by choice
 
 
 @dataclass(frozen=True)

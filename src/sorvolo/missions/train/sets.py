@@ -23,7 +23,7 @@ _SMALL = CLASSES[2]
 _LOOKED_AT = 40  # pictures of a set that decide whether it is thermal
 _SUBSTANTIAL = 0.1  # share of the samples from which on a light is learnt
 _SYNTHETIC_PICTURES = (4, 1200)  # made at least and at most
-_SYNTHETIC_THERMAL = 0.2
+_SYNTHETIC_THERMAL = 0.2  # share of simulated pictures, by choice
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from sorvolo.tracking.following import GroundFollower, Located, PictureFollower,
 from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight
 from sorvolo.tracking.tracker import TrackerSettings
 
-_COMPASS_REPORTED_DEG = 2.0
+_COMPASS_REPORTED_DEG = 2.0  # by which a compass is off: less is not worth a notice; by choice
 _OF_MAPS = ("no_telemetry", "ground_unknown", "height_unknown")  # notices about what a mapping does about it
 
 
