@@ -1,7 +1,7 @@
 """Weights of people's second look: benchmarks/fit_second_look.py DATA OUT --model FILE --scenes DIR --things DIR
 
 The model searches development pictures, without a second look. What it reports is cut out and shown to another model
-(--by). A logistic regression of the report's own log-odds and the mean of the looks' says how likely the report is
+(--by). A logistic regression of the report's own log-odds and the mean of the looks' states how likely the report is
 right. Which looks (TRIED) was chosen by what lies above the threshold, each set judged by weights that did not see it.
 The threshold is the least of THRESHOLDS at which photos of each real ground without people have at most ALARMS false
 reports each.

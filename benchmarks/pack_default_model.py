@@ -60,7 +60,7 @@ FAILS = (
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is said of a model: `info` is what distinguishes its metadata, `sets` those of its card's figures, or all.
+    """A model's statements: `info` is what distinguishes its metadata, `sets` those of its card's figures, or all.
 
     `validation` makes the pictures by which thresholds are chosen, from the data's folder and one to write to.
     """

@@ -1,7 +1,7 @@
 """The packaged model in eight bits, and what that costs: python benchmarks/pack_int8_model.py DATA (after packing).
 
 Calibrated on pictures of the training sets, compared with the float32 model on pictures that neither learnt from; the
-card says by how much each class's AP differs. Where more than half a point is lost, nothing is written: what --parts
+card states by how much each class's AP differs. Where more than half a point is lost, nothing is written: what --parts
 names stays in float then, and it is tried again.
 """
 

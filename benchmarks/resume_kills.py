@@ -7,7 +7,7 @@ the second, two frames a second, with the model that is installed, and runs a pr
 the command in a process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from 0
 to 1, and runs the same command again to its end. A run that was through before its kill counts for nothing, and another
 moment is drawn. All files are compared with those of the undisturbed run, byte by
-byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report says of the time and the
+byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report states of the time and the
 memory that it took (docs/formats.md). Of a watch, each alert must have been sent once: one that was sent in the moment
 of the kill, before that was noted, may come twice, and is counted.
 """

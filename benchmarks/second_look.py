@@ -40,7 +40,7 @@ SCORES = (0.5, 0.6, 0.7, 0.78, 0.84, 0.9, 0.94, 0.96)
 
 
 class Looker:
-    """A model that looks once, and again as its file says; counts what both take, processor seconds."""
+    """A model that looks once, and again as its file states; counts what both take, processor seconds."""
 
     def __init__(self, model: str) -> None:
         self.whole = Detector.load(model, provider="cpu", threads=1)

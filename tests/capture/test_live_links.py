@@ -46,7 +46,7 @@ def sentences(utc_ns: int, seconds: float = 0.0) -> bytes:
 
 @contextmanager
 def speaking(send: Callable[[bytes], object], every_s: float = 0.1) -> Iterator[None]:
-    """A receiver that tells the time and its place until the end."""
+    """A receiver that sends the time and its place until the end."""
     is_over, began_ns = threading.Event(), time.time_ns()
 
     def speak() -> None:

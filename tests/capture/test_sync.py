@@ -213,7 +213,7 @@ def test_an_offset_is_seen_on_a_curved_path(offset_s, seed):
     samples = telemetry(sample_s, curved(sample_s) + rng.normal(0, 0.7, (120, 2)))
     track, _ = track_of(samples)
     frames_s = np.arange(5, 54, 0.8)
-    # what a frame at t shows is what telemetry says at t + offset
+    # what a frame at t shows is what telemetry has at t + offset
     found = estimate_offset(track, frames_s, seen_path(curved, frames_s + offset_s), reach_s=4.0)
     assert abs(found.offset_s - offset_s) < 3 * found.sigma_s
     assert 0.005 < found.sigma_s < 0.2

@@ -1,4 +1,4 @@
-"""The public comparison of two pictures: what it gives, and what it says of input that it cannot use."""
+"""The public comparison of two pictures: what it gives, and what it answers to input that it cannot use."""
 
 from typing import Any
 

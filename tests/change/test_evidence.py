@@ -323,7 +323,7 @@ def test_what_became_of_the_candidates_is_counted():
     }
 
 
-def test_something_seen_for_a_while_only_is_taken_back():
+def test_something_seen_for_a_while_only_is_withdrawn():
     thing = Thing(-4, 0)
     views = [view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < 6 else []) for i in range(30)]
     evidence, reported = collect(views)

@@ -49,7 +49,7 @@ def test_pictures_of_one_date_may_lie_a_little_off_each_other():
 @pytest.mark.parametrize("pictures", [
     [laid(CAMERAS[0], [])],
     [laid(CAMERAS[0], []), laid((-1.9, 0, 15.0), [])],  # hardly apart
-    [laid(each, [], gray=120) for each in CAMERAS],  # nothing to tell heights by
+    [laid(each, [], gray=120) for each in CAMERAS],  # nothing to see heights by
 ], ids=["one", "beside", "even"])
 def test_nothing_is_known_of_heights_from_one_place_or_without_texture(pictures):
     assert not is_level(pictures, OUTLINE, OTHER, SETTINGS)

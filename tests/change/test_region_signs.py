@@ -1,4 +1,4 @@
-"""What is measured of regions: signs that tell a thing from light, and outlines to a part of a pixel."""
+"""What is measured of regions: signs that distinguish a thing from light, and outlines to a part of a pixel."""
 
 import cv2
 import numpy as np

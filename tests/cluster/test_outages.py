@@ -122,7 +122,7 @@ def test_an_object_store_that_comes_late_has_every_map(
 def test_an_object_store_that_is_killed_in_the_middle_of_a_copy(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It dies after its third change, of which it tells nobody, and is there again with all three."""
+    """It dies after its third change, which it acknowledges to nobody, and is there again with all three."""
     another(flown, tmp_path / "in" / "one")
     place = f"s3://{BUCKET}/maps"
     with KilledBucket() as bucket:

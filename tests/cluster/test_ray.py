@@ -52,7 +52,7 @@ def cluster() -> Iterator[Any]:
         made = Cluster(initialize_head=True, head_node_args=head)
         made.client_address = f"ray://127.0.0.1:{port}"
         patch.setenv("RAY_ADDRESS", made.address)
-        for cards in (0, 1):  # Ray believes what it is told of graphics cards
+        for cards in (0, 1):  # Ray believes what it is given as graphics cards
             made.add_node(num_cpus=1, num_gpus=cards)
         yield made
         made.shutdown()

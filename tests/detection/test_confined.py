@@ -34,7 +34,7 @@ m (uint8[1, 3, H, W] image) => (float[K, 4] boxes, float[K] scores, int64[K] lab
 
 
 def _bomb(path: Path) -> Path:
-    """A kilobyte that makes two pictures of 10 GB each; what it says of itself is in order."""
+    """A kilobyte that makes two pictures of 10 GB each; what it states about itself is in order."""
     model = onnx.parser.parse_model(BOMB)
     onnx.helper.set_model_props(model, {each.key: each.value for each in onnx.load_model(
         rectangle_model(path.with_name("good.onnx"))).metadata_props})

@@ -1,4 +1,4 @@
-"""The measures of detections: values worked by hand, COCO's own, and intervals that mean what they say."""
+"""The measures of detections: values worked by hand, COCO's own, and intervals that hold what they state."""
 
 import importlib.util
 

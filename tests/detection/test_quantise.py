@@ -37,7 +37,7 @@ def test_finds_the_same(model: Path, tmp_path: Path, provider: str) -> None:
     if provider == "openvino":
         pytest.importorskip("openvino")
     made = quantise(model, _pictures(12), weight_bits=7)  # as this CPU may lack VNNI
-    assert (made.convolutions, made.of) == (2, 3), "the last convolution says where and stays in float"
+    assert (made.convolutions, made.of) == (2, 3), "the last convolution gives the place and stays in float"
     out = tmp_path / "int8.onnx"
     out.write_bytes(made.model)
     whole = Detector.load(model, provider="cpu", threads=1)
@@ -112,7 +112,7 @@ def test_convolutions_of_the_head_before_a_fully_connected_layer_are_whole_numbe
         own.graph.initializer.append(onnx.numpy_helper.from_array(values.astype(np.float32), name))
     onnx.save(own, tmp_path / "head.onnx")
     made = quantise(tmp_path / "head.onnx", _pictures(12), weight_bits=7)
-    assert (made.convolutions, made.of) == (3, 4), "only the one that says where stays in float"
+    assert (made.convolutions, made.of) == (3, 4), "only the one that gives the place stays in float"
     (tmp_path / "head-int8.onnx").write_bytes(made.model)
     whole, small = (Detector.load(tmp_path / f"{name}.onnx", provider="cpu") for name in ("head", "head-int8"))
     picture = _pictures(5)[0]

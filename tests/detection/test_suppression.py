@@ -52,7 +52,7 @@ def test_a_corner_that_looked_like_something_else_is_dropped() -> None:
     found = merge_tiles([_tile(_LEFT, car), _tile(_RIGHT, corner)], _SIZE)
     assert found.labels.tolist() == [1]
     seen_in_one_tile = merge_tiles([_tile(_LEFT, car, (85, 12, 99, 38, 0.7, 0)), _tile(_RIGHT)], _SIZE)
-    assert sorted(seen_in_one_tile.labels.tolist()) == [0, 1], "one tile that tells both apart is believed"
+    assert sorted(seen_in_one_tile.labels.tolist()) == [0, 1], "one tile that separates both is believed"
 
 
 def test_neighbours_in_the_shared_window_stay_two() -> None:

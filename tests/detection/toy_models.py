@@ -137,7 +137,7 @@ def draw(
 
 
 # Features of stride 4, their brightest places as squares of 16 px, suppressed; the score is the mean of the features
-# within. Three convolutions, of which the last one of its branch says where: a Faster R-CNN in small.
+# within. Three convolutions, of which the last one of its branch gives the place: a Faster R-CNN in small.
 _SQUARES = """
 <ir_version: 8, opset_import: ["" : 17]>
 squares (uint8[1, 3, H, W] image) => (float[K, 4] boxes, float[K] scores, int64[K] labels) {

@@ -38,7 +38,7 @@ def test_tiles_touched_are_those_that_brute_force_finds(points):
     x, y = np.meshgrid(np.linspace(-60, 60, 150), np.linspace(-60, 60, 150))
     samples = np.column_stack([x.ravel(), y.ravel()])
     samples = np.concatenate([border, samples[points_inside([outline], samples)]])
-    # a sample on a tile's rim falls to either side by rounding: only those clearly inside a tile tell
+    # a sample on a tile's rim falls to either side by rounding: only those clearly inside a tile count
     in_tile = (samples + 0.5) / 16 % 1
     clear = samples[np.all((in_tile > 1e-9) & (in_tile < 1 - 1e-9), axis=1)]
     tiles = {tuple(tile) for tile in np.floor((clear + 0.5) / 16).astype(int)}

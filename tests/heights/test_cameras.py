@@ -87,7 +87,7 @@ def test_adjustment_finds_cameras_points_and_lens() -> None:
 
 
 def test_heights_err_more_away_from_the_middle_where_fixes_scatter() -> None:
-    """What GPS leaves open of the tilt and the scale tells at the rim; better fixes lower it."""
+    """What GPS leaves open of the tilt and the scale shows at the rim; better fixes lower it."""
     made = scene()
     errors = [
         height_deviations(made, Priors(made.centres_m, np.full((9, 3), sigma_m), made.rotations), AdjustmentSettings(

@@ -89,7 +89,7 @@ def test_the_ground_beside_walls_is_not_as_high_as_the_roof(surface: Surface) ->
     near = (x > west - 2) & (x < east + 2) & (y > south - 2) & (y < north + 2)
     beside = near & ~((x > west - 0.4) & (x < east + 0.4) & (y > south - 0.4) & (y < north + 0.4))
     off = surface.up_m - true_heights(surface.lattice)
-    # 76 cells were up to 5 m too high and 76 without height, when photos had a say from which the house hides it
+    # 76 cells were up to 5 m too high and 76 without height, when photos counted from which the house hides it
     assert (np.abs(off[beside]) > 1).sum() < 20
     assert np.isnan(off[beside]).sum() < 40
 

@@ -171,7 +171,7 @@ def test_half_written_telemetry_with_lost_jumping_and_backward_fixes(
 
 
 def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tmp_path: Path) -> None:
-    """A map without a reference cannot tell place from place, but the motion does not fit, and the report states it."""
+    """Without a reference one place is like another, but the motion does not fit, and the report states it."""
     lines = (filmed / "flight1" / "other" / "flight1.nmea").read_text().splitlines()
     places = [line.split(",") for line in lines]
 

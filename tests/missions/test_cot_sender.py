@@ -55,7 +55,7 @@ def test_udp_arrives_and_a_dead_receiver_is_an_error_that_passes() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
         again.bind(("127.0.0.1", port))
         again.settimeout(5)
-        with pytest.raises(ConnectionRefusedError):  # tells of the datagram before
+        with pytest.raises(ConnectionRefusedError):  # of the datagram before
             sender.send(b"<event n='2'/>")
         assert again.recv(100) == b"<event n='2'/>"
     sender.close()

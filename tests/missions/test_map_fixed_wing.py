@@ -68,7 +68,7 @@ def test_wind_makes_a_wing_faster_downwind_and_turns_its_nose_and_turns_bank_it(
 
 def test_a_real_survey_is_one_map_within_what_its_receiver_errs(tmp_path: Path) -> None:
     photos = real_data("flights/fixed_wing")
-    coarse = ["--gsd", "0.4", "--model", "none"]  # how finely it is painted says nothing of where it lies
+    coarse = ["--gsd", "0.4", "--model", "none"]  # how finely it is painted has nothing to do with where it lies
     assert cli.main(["map", str(photos), "--site", str(tmp_path / "site"), *coarse]) == 0
     report = report_of(tmp_path / "site")
     assert report["frames"]["vision"] >= 0.95 * report["frames"]["selected"] and len(report["pieces"]) == 1

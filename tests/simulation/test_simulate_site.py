@@ -78,7 +78,7 @@ with video_writer(Path(sys.argv[1]), (320, 180), 10.0, 0, 20) as write:
 
 def test_a_video_does_not_depend_on_what_lay_in_memory_before(tmp_path):
     written = []
-    for filling in ("1", "85", "170"):  # glibc fills new memory with it; elsewhere it says nothing
+    for filling in ("1", "85", "170"):  # glibc fills new memory with it; elsewhere it does nothing
         path = tmp_path / f"{filling}.mp4"
         subprocess.run(
             [sys.executable, "-c", WRITE_A_VIDEO, str(path)], check=True, timeout=60,

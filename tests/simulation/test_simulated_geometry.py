@@ -1,4 +1,4 @@
-"""The pictures show the ground exactly where the true poses and the camera say."""
+"""The pictures show the ground exactly where the true poses and the camera have it."""
 
 from dataclasses import replace
 

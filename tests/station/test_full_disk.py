@@ -1,4 +1,4 @@
-"""A disk that fills during a flight, on a real small file system: said in words, waited for, ended as what it is."""
+"""A disk that fills during a flight, on a real small file system: stated in words, waited for, ended as what it is."""
 
 import shutil
 import subprocess
@@ -110,7 +110,7 @@ def test_a_flight_waits_for_a_full_disk_and_goes_on(flown: Path, disk: Path, tmp
 def test_a_flight_that_a_full_disk_cut_is_kept_and_called_incomplete(
     way: str, flown: Path, disk: Path, tmp_path: Path
 ) -> None:
-    """By a person who stops it, or after the longest wait: what came is a map, and nobody is told that it is all."""
+    """By a person who stops it, or after the longest wait: what came is a map, and it is not reported as all."""
     limits = StationLimits(away_s=900.0 if way == "stopped" else 6.0)
     with Served(disk, free_floor_gb=FLOOR_GB, limits=limits) as station:
         drone = Drone(flown, station, tmp_path / "spool")

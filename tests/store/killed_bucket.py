@@ -1,7 +1,7 @@
 """An S3 server that may be killed at any moment and comes back with all that it had answered for: moto's, with a log.
 
 moto keeps objects in memory. Here each change is written into a log before it is answered, and done again, from the
-log's beginning, before the server listens again: as a store on a disk, it forgets only what nobody was told.
+log's beginning, before the server listens again: as a store on a disk, it forgets only what was acknowledged to nobody.
 """
 
 import io

@@ -1,4 +1,4 @@
-"""The heading of a camera whose telemetry does not tell it, on ways that are known."""
+"""The heading of a camera whose telemetry does not have it, on ways that are known."""
 
 import numpy as np
 import pytest

@@ -66,7 +66,7 @@ def test_a_walker_moves_and_keeps_its_id():
 
 
 def test_a_frame_that_lies_aside_takes_no_object_for_its_neighbour():
-    """GPS jumps by the distance of two people: the pattern says who is who."""
+    """GPS jumps by the distance of two people: the pattern shows who is who."""
     row = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0], [6.0, 0.0], [0.0, 9.0], [7.0, -8.0]])
     tracker, aside_m = Tracker(), np.array([1.9, 0.3])
     updates = follow(tracker, [row] * 8 + [row + aside_m] * 8)
@@ -114,7 +114,7 @@ def test_two_cars_have_no_room_on_one_place(apart_m, count):
 
 
 def test_a_glimpse_at_the_edge_is_the_car_that_then_drives_on():
-    """Three sightings that hardly tell where it is, a second without it, and then it moves from there."""
+    """Three sightings that hardly show where it is, a second without it, and then it moves from there."""
     tracker = Tracker()
     for frame in [0, 1, 2, *range(8, 20)]:
         seen = [car(frame, [0.8 * frame if frame > 2 else 0.0, 0.0], own_m=1.5 if frame < 3 else 0.3)]

@@ -39,7 +39,7 @@ class _Aerial(torch.nn.Module):
 
 
 class _Coco(torch.nn.Module):
-    """Always finds one person; its score maps say `support` everywhere."""
+    """Always finds one person; its score maps are `support` everywhere."""
 
     def __init__(self, box: list[float], score: float, support: float = 0.0) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class _Coco(torch.nn.Module):
 
 
 def _silent_judge(answers: list[float]) -> Judge:
-    """Says the same of every candidate."""
+    """Judges every candidate alike."""
     judge = Judge(3)
     with torch.no_grad():
         for each in judge.decide.parameters():

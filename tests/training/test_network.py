@@ -333,7 +333,7 @@ def test_losses_of_a_batch_without_objects_are_finite():
 
 
 def test_crops_carry_their_boxes_along():
-    """A bright square on black is where its box says, however the crop lies."""
+    """A bright square on black is where its box lies, however the crop lies."""
     image = np.zeros((300, 400, 3), np.uint8)
     image[100:130, 200:250] = 255
     picture = LabelledPicture("p", 400, 300, "g", np.array([[200, 100, 250, 130]]), np.array([0]), np.zeros((0, 4)))

@@ -185,7 +185,7 @@ def test_what_was_remarked_is_reported_on_the_terminal_too(
 
 
 def _greyed(place: Path, count: int) -> Path:
-    """Every so manieth picture of the folder without its colours."""
+    """The folder, so many of its pictures, spread over it, without their colours."""
     paths = sorted((place / "images").glob("*.png"))
     for path in paths[:: len(paths) // count][:count]:
         cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))

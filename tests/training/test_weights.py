@@ -178,7 +178,7 @@ def test_a_cached_package_must_have_its_hash(tmp_path: Path, monkeypatch: pytest
     place = tmp_path / "weights" / source.name
     place.parent.mkdir()
     place.write_bytes(b"cut short")
-    # an address that nothing answers: the cut file must not be taken, and the words say what to do
+    # an address that nothing answers: the cut file must not be taken, and the words state what to do
     monkeypatch.setitem(module.SOURCES, "lite0", Source(f"http://127.0.0.1:9/{source.name}", source.sha256, ""))
     with pytest.raises(InputError, match=r"cannot be fetched.*--weights FILE"):
         fetch_weights("lite0")

@@ -25,7 +25,7 @@ class SecondLook:
     """How reports of a class are looked at again (`second_look`).
 
     `looks_px`: in each look the report's longer side has so many pixels. A look that would show it more than `enlarged`
-    times as large is left out, but for the smallest: blur has nothing to tell. A report's log-odds become `shift`,
+    times as large is left out, but for the smallest: blur shows nothing. A report's log-odds become `shift`,
     `own` times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked
     at. `by`: the installed model that looks, "" for the same one; another errs in other places.
     """

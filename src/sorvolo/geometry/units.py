@@ -7,7 +7,7 @@ SURVEY_FOOT_M = 1200 / 3937
 """The US survey foot, which maps of some states still count in."""
 
 M_PER_DEG_LATITUDE = 111_320.0
-"""A degree of latitude on the ground, right to 0.6 %: enough for search distances and for how coarse a fix is."""
+"""A degree of latitude on the ground, right to 0.6 %: enough for search distances and for the rounding of a fix."""
 
 KNOT_M_S = 1852 / 3600
 MILE_AN_HOUR_M_S = 0.44704

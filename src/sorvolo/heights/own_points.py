@@ -42,7 +42,7 @@ def judged_by_points(
     """The surface with its sigma raised to what the flight's own points in space show, and their judgement.
 
     A point and the cell there have the cameras in common: what these err is left out of the comparison, and stays in
-    the sigma as it is. The sigma is never lowered: points lie where the ground has texture, and say nothing for the
+    the sigma as it is. The sigma is never lowered: points lie where the ground has texture, and show nothing for the
     heights of ground that has none.
     """
     judges = solved.point_views >= settings.least_views

@@ -69,7 +69,7 @@ def sweep(
     lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], bounds: Bounds,
     settings: SweepSettings, obstacles: Obstacles | None = None,
 ) -> Swept:
-    """The heights within bounds of a lattice's cells; a photo from which an obstacle hides a height has no say.
+    """The heights within bounds of a lattice's cells; a photo from which an obstacle hides a height does not count.
 
     `pictures(i)` is view i's gray picture, uint8, of any size; it should have about a cell's detail. Which photos
     see a cell depends on its height: where fewer than two see the height that fits best, the cell is a hole.

@@ -1,4 +1,4 @@
-"""An exported model taken back into torch, to learn on: the way to tune the packaged model to one's own pictures."""
+"""An exported model read back into torch, to learn on: the way to tune the packaged model to one's own pictures."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -30,7 +30,7 @@ def compare_images(
 ) -> Comparison:
     """What changed from `reference` to `query`, two aligned BGR pictures (h, w, 3) uint8.
 
-    Where the bool mask `valid` (h, w) is False, say in a hole of a mosaic, the answer is unknown: never changed.
+    Where the bool mask `valid` (h, w) is False, as in a hole of a mosaic, the answer is unknown: never changed.
     `method` is "thesis" (section 3.2 of the thesis, with `ThesisSettings`; the reference may come from
     `prepare_reference`) or "robust" (`RobustSettings`, one thread). Raises InputError and SettingsError.
     """

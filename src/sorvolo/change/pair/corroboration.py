@@ -75,7 +75,7 @@ def unwitnessed(
 ) -> list[tuple[slice, slice]]:
     """The parts of the picture with sure differences from the map that no earlier picture shows whole.
 
-    The map is a mosaic: a seam through a thing tears it, and only a picture that is in one piece can tell that from a
+    The map is a mosaic: a seam through a thing tears it, and only a picture in one piece can distinguish that from a
     change. `seen` (h, w) is what each earlier picture shows.
     """
     parts = []

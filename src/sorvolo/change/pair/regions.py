@@ -1,4 +1,4 @@
-"""Where two pictures in the same light differ: regions, and what is measured of each to tell changes from the rest."""
+"""Where two pictures in the same light differ: regions, with measures that set changes apart from the rest."""
 
 from dataclasses import dataclass
 from functools import cached_property
