@@ -1,6 +1,7 @@
 """Processes of missions of which nobody knows any more end by themselves; others go on."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from sorvolo.station import worker
 from sorvolo.station.orders import MissionOptions, Order
 from sorvolo.station.orphan_watch import ended_when_orphaned, why_orphaned
 from sorvolo.station.state import StationState
@@ -81,3 +83,19 @@ def test_a_process_without_a_record_states_why_it_ended(folder: Path) -> None:
     assert process.returncode == 1
     assert "no record of this run" in (folder / "log.txt").read_text()
     assert "no record of this run" in (folder / "journal.jsonl").read_text()
+
+
+def test_a_mission_that_fails_because_its_folder_is_gone_states_that(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its own writing may fail before the missing folder is noticed: a traceback would hide the reason."""
+    monkeypatch.setattr(signal, "signal", lambda *_: None)  # those of the tests stay
+
+    def writing(*_: object) -> tuple[str, str]:
+        shutil.rmtree(folder)
+        (folder / "detections.jsonl").write_text("{}")
+        return "", ""
+
+    monkeypatch.setattr(worker, "_flown", writing)
+    assert worker.main(folder) == 1
+    assert capsys.readouterr().err == "the folder of this run was taken away; stopped\n"

@@ -26,8 +26,8 @@ from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.station.camera import camera_opened
 from sorvolo.station.collections import on_earth
 from sorvolo.station.incomplete import cut_off, unsent
-from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, MOTION, TO_CHECK, Order
-from sorvolo.station.orphan_watch import ended_when_orphaned
+from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, MOTION, ORDER_FILE, TO_CHECK, Order
+from sorvolo.station.orphan_watch import ended_when_orphaned, why_orphaned
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
 from sorvolo.store.exports.plain import plain_json, utc_text
@@ -124,19 +124,27 @@ def main(folder: Path) -> int:
             return _WRONG
         journal.end(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
         return _STOPPED_CODE
-    except SorvoloError as error:
-        journal.end(FAILED, {"exit_code": _WRONG, "error": without_secret(str(error), order.source), "headline": None})
-        return _WRONG
     except Exception as error:
-        words = f"{type(error).__name__}: {error}" if not isinstance(error, OSError) else f"{error.strerror or error}"
+        orphaned = "" if (folder / ORDER_FILE).exists() else why_orphaned(folder, order.run)
+        words = _words_of(error, orphaned, order.source)
         journal.end(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
-        sys.stderr.write(without_secret(traceback.format_exc(), order.source))  # the run's log
         return _WRONG
     if why:
         journal.end(FINISHED, {"exit_code": TO_CHECK, "error": None, "headline": f"incomplete: {why}. {headline}"})
         return TO_CHECK
     journal.end(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
     return 0
+
+
+def _words_of(error: Exception, orphaned: str, source: str) -> str:
+    """Why a mission failed; the details of a fault go into the run's log. Where its folder is gone, that is why."""
+    if orphaned:
+        sys.stderr.write(f"{orphaned}; stopped\n")
+        return f"{orphaned}; nothing was kept"
+    if isinstance(error, SorvoloError):
+        return str(error)
+    sys.stderr.write(without_secret(traceback.format_exc(), source))
+    return f"{error.strerror or error}" if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
 
 
 def _flown(order: Order, folder: Path, journal: Journal, until: threading.Event) -> tuple[str, str]:
