@@ -1,4 +1,4 @@
-# make demo: a map of a simulated flight. make test: what has to pass, in 15 minutes; make test-long: the few tests of
+# make demo: a map of a simulated flight. make test: what has to pass, in 12 minutes; make test-long: the few tests of
 # much work beside it. They make their own environment in .venv.
 PYTHON ?= python3
 VENV := .venv
@@ -11,8 +11,9 @@ TRAINS := $(VENV)/.trains
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
 
+# One worker more than two cores: a quarter of the tests' time is waiting for streams, processes and browsers.
 test: check $(TRAINS)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not long"
+	$(BIN)/python -m pytest -n 3 --dist worksteal -m "not long"
 
 test-long: $(TRAINS)
 	$(BIN)/python -m pytest -m long
@@ -77,15 +78,29 @@ $(WRITING)/.ready: requirements-docs.lock
 	$(WRITING)/bin/python -m pip install --quiet --disable-pip-version-check -r requirements-docs.lock
 	touch $@
 
-# The locks name all that is needed, so nothing is resolved; bytecode is made of what is used.
+# The locks name all that is needed, so nothing is resolved; bytecode is made of what is used. The kernels are compiled while
+# the locks' packages are unpacked, one lock after the other: both name some of the same.
 PIP := pip install --quiet --disable-pip-version-check --no-deps --no-compile
+MAKEFLAGS += --jobs=2
 
-$(READY): requirements.lock pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp)
+$(READY): $(VENV)/.locked $(VENV)/.built
+	touch $@
+
+$(TRAINS): $(READY) $(VENV)/.training
+	touch $@
+
+$(VENV)/.made:
 	$(PYTHON) -m venv $(VENV)
+	touch $@
+
+$(VENV)/.locked: requirements.lock | $(VENV)/.made
 	$(BIN)/python -m $(PIP) -r requirements.lock
+	touch $@
+
+$(VENV)/.built: pyproject.toml setup.py $(wildcard src/sorvolo/kernels/*.?pp) | $(VENV)/.made
 	$(BIN)/python -m $(PIP) -e .
 	touch $@
 
-$(TRAINS): $(READY) requirements-training.lock requirements-notebooks.lock
+$(VENV)/.training: requirements-training.lock requirements-notebooks.lock | $(VENV)/.locked
 	$(BIN)/python -m $(PIP) -r requirements-training.lock -r requirements-notebooks.lock
 	touch $@
