@@ -177,7 +177,7 @@ class VideoPane {
     fill(this.seen, count ? `${count} in the picture${oldest.isOwn ? "" : `${oldest.carried ? ", seen" : ""} ${number(oldest.ago_s, 1)} s ago`}` : "");
   }
 
-  /** The looks that tell most of a picture, the older first: the nearest whole one, and where cars of a later one are known already, those. */
+  /** The looks that show most of a picture, the older first: the nearest whole one, and where cars of a later one are known already, those. */
   looksFor(pts_us) {
     const nearest = (looks) => {
       let best = null;
