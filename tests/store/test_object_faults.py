@@ -5,6 +5,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,10 @@ from fake_flights import hashes, mapped_site
 from test_buckets import copied
 
 from sorvolo.cli.main import main
-from sorvolo.errors import SettingsError, StoreError
+from sorvolo.errors import SettingsError, StoreError, UnavailableError
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.object_store import Objects, ObjectSettings, open_objects
+from sorvolo.store.copies.object_store import Objects, ObjectSettings, _kind_of, _words_of, open_objects
 
 _QUICK = ObjectSettings(connect_s=1.0, request_s=1.0, retries=1, retry_s=2.0, tries=2, part_bytes=5 << 20)
 
@@ -102,6 +103,45 @@ def test_each_refusal_states_what_to_do(server: _Server, status: int, code: str,
     server.answer = lambda request: request.refuse(status, code)
     _refused(words)
     assert server.asked <= 4  # 503 is asked again, within limits
+
+
+@pytest.mark.parametrize(("region", "clock_s", "words"), [
+    ("eu-west-1", 0.0, "another region: set AWS_REGION"),
+    ("eu-central-1", 3600.0, "clock is off: set it (by NTP)"),
+    ("eu-central-1", 0.0, "no site at"),
+])
+def test_a_wrong_region_and_a_wrong_clock_are_named_by_what_was_signed(
+    server: _Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, region: str,
+    clock_s: float, words: str,
+) -> None:
+    """As Amazon does: the region and the time that the client signed with are held against the server's own."""
+    def checked(request: _Handler) -> None:
+        signed = datetime.strptime(request.headers["x-amz-date"], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        if "/eu-central-1/s3/aws4_request" not in request.headers["authorization"]:
+            request.refuse(400, "AuthorizationHeaderMalformed")
+        elif abs((datetime.now(UTC) + timedelta(seconds=clock_s) - signed).total_seconds()) > 900:
+            request.refuse(403, "RequestTimeTooSkewed")
+        else:
+            request.refuse(404, "NoSuchKey")
+
+    server.answer = checked
+    monkeypatch.setenv("AWS_REGION", region)
+    monkeypatch.setenv("SORVOLO_CACHE", str(tmp_path))
+    assert main(["history", f"s3://{BUCKET}/field"]) == 1
+    printed = capsys.readouterr().err
+    assert words in printed and SECRET not in printed and len(printed.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("fault", "words"), [
+    ("Error performing PUT http://169.254.169.254/latest/api/token: status code: 403 Forbidden", "no keys were found"),
+    ("Error performing PUT http://169.254.169.254/latest/api/token: operation timed out", "no keys were found"),
+    ("error sending request https://store/x: error: InvalidCertificate(UnknownIssuer)", "certificate is not trusted"),
+])
+def test_what_keeps_a_request_from_being_sent_is_not_waited_for(fault: str, words: str) -> None:
+    """A batch tries again what may pass; missing keys and untrusted certificates do not."""
+    assert words in _words_of(fault) and _kind_of(fault) is StoreError
+    away = "error sending request https://store/certificates/credentials: connection refused"
+    assert issubclass(_kind_of(away), UnavailableError) and "no connection" in _words_of(away)
 
 
 def test_a_store_that_cannot_be_reached_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

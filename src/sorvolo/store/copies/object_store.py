@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
 _PREFIX = re.compile(r"[A-Za-z0-9!_.*'()-]+(/[A-Za-z0-9!_.*'()-]+)*")  # names that no store or program writes otherwise
 _CODE = re.compile(r"<Code>([A-Za-z]{1,60})</Code>")
+_PATH = re.compile(r"(https?://[^/\s]*)\S*")  # which may hold any words
 _STATUS = re.compile(r"status code: (\d{3})")
 _CLOCK = "this machine's clock is off: set it (by NTP), then run the same command again"
 _FULL = "the store is full: free some space there"
@@ -46,9 +47,11 @@ _WORDS = {
 }  # S3's codes of errors
 
 _BY_STATUS = {"403": _WORDS["AccessDenied"], "401": _KEYS, "301": _REGION}
-_WITHOUT_ANSWER = (  # by the library's message, the first that is in it
-    ("169.254.", _NO_KEYS), ("credential", _NO_KEYS),
+_UNASKED = (  # by the library's message: what keeps it from asking the store at all, which no later try mends
+    ("http://169.254.", _NO_KEYS), ("credential", _NO_KEYS),  # where only Amazon's machines give keys
     ("certificate", "the store's certificate is not trusted: set AWS_CA_BUNDLE to its authority's PEM file"),
+)
+_WITHOUT_ANSWER = (  # likewise, the first that is in it
     ("timed out", _SLOW), ("timedout", _SLOW),
     ("", "no connection, or it was cut: check the network and AWS_ENDPOINT_URL, then run the same command again"),
 )
@@ -332,6 +335,8 @@ def _section(path: Path, *names: str) -> dict[str, str]:
 def _kind_of(text: str) -> type[StoreError]:
     """What a library's error is: no answer, one that may be another later (5xx), or a refusal."""
     status, code = _STATUS.search(text), _CODE.search(text)
+    if _unasked(text):
+        return StoreError
     if status is None and code is None:
         return _CutError
     is_busy = (status is not None and status[1].startswith("5")) or (code is not None and code[1] == "SlowDown")
@@ -343,6 +348,8 @@ def _words_of(text: str) -> str:
     code, status = _CODE.search(text), _STATUS.search(text)
     if code and code[1] in _WORDS:
         return f"{_WORDS[code[1]]} ({code[1]})"
+    if unasked := _unasked(text):
+        return unasked
     if "redirect" in text:
         return _REGION
     if status is None:
@@ -350,3 +357,11 @@ def _words_of(text: str) -> str:
     answered = f"the store answered {status[1]}{f' {code[1]}' if code else ''}"
     known = _BY_STATUS.get(status[1], "")
     return f"{known} ({answered})" if known else f"{answered}; run the same command again later"
+
+
+def _unasked(text: str) -> str:
+    """Advice where no store was asked; "" where one was. A store's answer has a code, and may quote such words."""
+    if _CODE.search(text):
+        return ""
+    own = _PATH.sub(r"\1", text.lower())
+    return next((words for hint, words in _UNASKED if hint in own), "")
