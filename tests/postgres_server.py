@@ -13,6 +13,7 @@ _SETTINGS = {  # nothing here outlives the tests
     "shared_buffers": "16MB", "max_connections": "60", "log_min_messages": "error",
 }
 _HBA = """host all guarded 127.0.0.1/32 scram-sha-256
+host all kept_out 127.0.0.1/32 reject
 host all all 127.0.0.1/32 trust
 """
 
@@ -25,7 +26,10 @@ def program(name: str) -> str | None:
 
 
 class PostgresServer:
-    """A server on a port of its own; may be stopped and started again. The user "guarded" needs a password."""
+    """A server on a port of its own; may be stopped and started again.
+
+    The user "guarded" needs a password, "kept_out" is let in nowhere.
+    """
 
     def __init__(self) -> None:
         with socket.socket() as free:

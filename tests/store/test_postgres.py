@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from sqlalchemy import Connection, create_engine, inspect
 
 from postgres_server import PostgresServer
 from sorvolo.cli.main import main
-from sorvolo.errors import SettingsError, StoreError
+from sorvolo.errors import SettingsError, StoreError, UnavailableError
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.transfer import copy
 from sorvolo.store.site import postgres_database, schema
@@ -285,7 +286,7 @@ def test_a_standby_is_read_and_named_when_it_is_to_be_written(site: Path, postgr
     try:
         with Archive.open(site, write=False) as reader:
             assert [each.id for each in reader.flights()] == ["a"]
-        words = r"cannot be written or read by sorvolo \(cannot execute .* in a read-only transaction\); ask for a role"
+        words = r"takes no changes \(cannot execute .* in a read-only transaction\): a standby, or set to read only"
         with pytest.raises(StoreError, match=words), Archive.open(site, write=True) as archive:
             map_flight(archive, "b", 60, count=1)
         with pytest.raises(StoreError, match=words):
@@ -296,6 +297,87 @@ def test_a_standby_is_read_and_named_when_it_is_to_be_written(site: Path, postgr
         postgres.start()
     with Archive.open(site, write=True) as archive:
         assert map_flight(archive, "b", 60, count=1) == 2
+
+
+def test_a_database_set_to_read_only_is_read_and_never_written(site: Path, postgres: PostgresServer) -> None:
+    """As hosts set a database whose disk is full: any session could undo it, and would fill the rest."""
+    postgres.sql("ALTER DATABASE postgres SET default_transaction_read_only = on")
+    before = content(site)
+    try:
+        with Archive.open(site, write=False) as reader:
+            assert [each.id for each in reader.flights()] == ["a"]
+        with pytest.raises(StoreError, match="as hosts do when a disk is full"), \
+                Archive.open(site, write=True) as archive:
+            map_flight(archive, "b", 60, count=1)
+        assert content(site) == before
+    finally:
+        postgres.sql("ALTER DATABASE postgres RESET ALL", database="template1")
+    with Archive.open(site, write=True) as archive:
+        assert map_flight(archive, "b", 60, count=1) == 2
+
+
+@pytest.fixture
+def small_database(postgres: PostgresServer) -> Iterator[tuple[str, Path]]:
+    """The address of a database on a file system of 24 MB, and that one's folder."""
+    place = postgres.folder / "small"
+    place.mkdir()
+    mounted = shutil.which("mount") and not subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(place)], capture_output=True
+    ).returncode
+    if not mounted:
+        place.rmdir()
+        pytest.skip("this user may not mount a small file system")
+    shutil.chown(place, postgres.folder.owner())
+    postgres.sql(f"CREATE TABLESPACE small LOCATION '{place}'", "CREATE DATABASE small TABLESPACE small")
+    yield postgres.url.replace("/postgres", "/small"), place
+    postgres.sql("DROP DATABASE small WITH (FORCE)", "DROP TABLESPACE small")
+    subprocess.run(["umount", "-l", str(place)], check=True)
+    place.rmdir()
+
+
+def test_a_disk_of_the_server_that_fills_costs_one_flight(
+    small_database: tuple[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url, disk = small_database
+    monkeypatch.setenv(VARIABLE, url)
+    filler = disk / "filler"
+    with Archive.open(tmp_path / "site", write=True) as archive:
+        archive.create_site(SITE)
+        map_flight(archive, "a", 20, count=2)
+        with open(filler, "wb", buffering=0) as file, suppress(OSError):
+            while file.write(bytes(4096)):
+                pass
+        with pytest.raises(StoreError, match=r"disk full: .*No space left on device.*on the server"):
+            for number in range(200):  # what the pages that are there still hold is written
+                map_flight(archive, f"b{number}", 60, count=1)
+        kept = [each.id for each in archive.flights()]
+        filler.unlink()
+        map_flight(archive, "c", 90, count=1)
+        assert [each.id for each in archive.flights()] == [*kept, "c"]
+
+
+@pytest.mark.parametrize(
+    ("user", "database", "more", "words"),
+    [
+        ("nobody_x", "postgres", "", r'refused nobody_x .*"nobody_x" does not exist\); name another user'),
+        ("plain", "closed", "", r'permission denied for database "closed" .*ask for a role that may connect'),
+        ("plain", "postgres", "sslmode=require", "does not support SSL.*correct sslmode"),
+        ("kept_out", "postgres", "", "pg_hba.conf.*have the server's administrator let this user and computer in"),
+        ("plain", "survey_x", "", r'"survey_x" does not exist.*make the database, or correct the address'),
+    ],
+)
+def test_who_is_not_let_in_is_an_error_and_not_waited_for(
+    user: str, database: str, more: str, words: str, tmp_path: Path, postgres: PostgresServer,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for role in ("plain", "kept_out"):
+        postgres.sql(f"DROP ROLE IF EXISTS {role}", f"CREATE ROLE {role} LOGIN")
+    postgres.sql("DROP DATABASE IF EXISTS closed", "CREATE DATABASE closed",
+                 "REVOKE CONNECT ON DATABASE closed FROM PUBLIC")
+    monkeypatch.setenv(VARIABLE, f"postgresql://{user}@127.0.0.1:{postgres.port}/{database}?{more}".rstrip("?"))
+    with pytest.raises(StoreError, match=words) as caught:
+        Archive.open(tmp_path / "site", write=True)
+    assert not isinstance(caught.value, UnavailableError)
 
 
 @pytest.fixture

@@ -26,9 +26,21 @@ _WAITS = {  # of libpq, unless the URL has others: a server that is not there is
     "tcp_user_timeout": "60000",
 }
 _LOST = ("08", "57P01", "57P02", "57P03", "57P05")
-_FULL = ("53100", "53200", "53400")
-_FORBIDDEN = ("42501", "25006")
+_FULL = ("53100", "53400")
+_FORBIDDEN = ("42501",)
+_ONLY_READS = ("25006",)
 _NOT_OURS = ("3F000", "42P01", "42703", "22P02")
+_PASSWORD = "give the password in ~/.pgpass or PGPASSWORD"
+_ENCRYPTION = "correct sslmode and sslrootcert in the address, or have the server's certificate mended"
+_REFUSALS = (  # by words of a server that lets nobody in, which gives no code; the first that fits
+    ("role \"", "name another user in the address"),
+    ("pg_hba", "have the server's administrator let this user and computer in (pg_hba.conf)"),
+    ("permission denied", "ask for a role that may connect to this database"),
+    ("password", _PASSWORD), ("authentication failed", _PASSWORD),
+    ("certificate", _ENCRYPTION), ("does not support SSL", _ENCRYPTION),
+    ("does not exist", "make the database, or correct the address (--catalogue or SORVOLO_CATALOGUE)"),
+)
+_FULL_WORDS = ("could not write init file", "No space left on device")  # where nobody can connect for that
 
 
 class PostgresDatabase:
@@ -188,31 +200,38 @@ class PostgresDatabase:
         lines = str(error.orig).strip().splitlines() or [type(error.orig).__name__]
         fault = lines[0]
         if state.startswith(_FULL):
-            return StoreError(
-                f"disk full: could not write {self.place} ({fault}); free some space on the server and run it again"
-            )
+            return self._full(fault)
         if state.startswith(_FORBIDDEN):
             return StoreError(
                 f"{self.place} cannot be written or read by {self._url.username or 'this user'} ({fault}); ask for a "
                 "role that may, or work with a copy of the site"
             )
+        if state.startswith(_ONLY_READS):
+            return StoreError(
+                f"{self.place} takes no changes ({fault}): a standby, or set to read only, as hosts do when a disk "
+                "is full; name the server that is written to, or ask its administrator"
+            )
         if state.startswith(_NOT_OURS):
             return damaged(self.place, fault)
         if not state or _is_lost(error):
             return self._unreachable(" ".join(lines))
-        return StoreError(f"cannot use {self.place}: {fault} ({state})")
+        return StoreError(f"cannot use {self.place}: {fault} ({state}); ask the server's administrator")
 
     def _unreachable(self, fault: str) -> StoreError:
-        if any(words in fault for words in ("password", "authentication failed", "pg_hba", "role \"")):
-            return StoreError(
-                f"{shown_url(self._url)} refused {self._url.username or 'this user'} ({fault}); give the password in "
-                "~/.pgpass or PGPASSWORD"
-            )
-        if "does not exist" in fault:
-            return StoreError(f"{shown_url(self._url)}: {fault}; make the database, or correct SORVOLO_CATALOGUE")
+        for words, advice in _REFUSALS:
+            if words in fault:
+                user = self._url.username or "this user"
+                return StoreError(f"{shown_url(self._url)} refused {user} ({fault}); {advice}")
+        if any(words in fault for words in _FULL_WORDS):
+            return self._full(fault)
         return ConnectionLostError(
             f"no connection to {self.place} ({fault}); what was stored is safe: run the same command again when the "
             "server is there, it continues where it was"
+        )
+
+    def _full(self, fault: str) -> StoreError:
+        return StoreError(
+            f"disk full: could not write {self.place} ({fault}); free some space on the server and run it again"
         )
 
 
@@ -225,18 +244,30 @@ def shown_url(url: URL) -> str:
 
 def _open_engine(url: URL, name: str, beside: str, *, write: bool) -> Engine:
     own: dict[str, Any] = {key: value for key, value in _WAITS.items() if key not in url.query}
-    mode = "off" if write else "on"
+    reads = "" if write else " -cdefault_transaction_read_only=on"  # a writer keeps what the server is set to
     path = f"{name},{beside}" if beside else name
     asked = url.query.get("options", "")
-    own["options"] = f"{asked} -csearch_path={path} -cdefault_transaction_read_only={mode}".strip()
+    own["options"] = f"{asked} -csearch_path={path}{reads}".strip()
     own.setdefault("application_name", "sorvolo")
     pool: dict[str, Any] = {"poolclass": NullPool} if write else {"poolclass": QueuePool, "pool_pre_ping": True}
+    if not write:
+        own["cursor_factory"] = _binary_cursor
     try:
         return create_engine(
             url.difference_update_query(["options"]), connect_args=own, isolation_level="REPEATABLE READ", **pool
         )
     except ModuleNotFoundError as error:
         raise StoreError("a catalogue in PostgreSQL needs psycopg: pip install 'sorvolo[postgres]'") from error
+
+
+def _binary_cursor(connection: Any, **options: Any) -> Any:
+    """A cursor whose rows arrive as PostgreSQL holds them: outlines and tiles' bytes would be twice as long in hex."""
+    from psycopg import Cursor
+    from psycopg.pq import Format
+
+    cursor: Any = Cursor(connection, **options)
+    cursor.format = Format.BINARY
+    return cursor
 
 
 def _writes(connection: Connection) -> int:
