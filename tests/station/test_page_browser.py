@@ -6,7 +6,7 @@ import shutil
 import struct
 import time
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from io import BytesIO
 from pathlib import Path
@@ -32,12 +32,13 @@ from websockets.sync.client import connect
 from faulty_link import FaultyLink
 from sorvolo.geometry.coordinates import Coordinates, place_text
 from sorvolo.station.events import NewEvent
-from sorvolo.station.messages import Hello, Kind, Message
+from sorvolo.station.messages import Hello, Kind, Message, Sample
 from sorvolo.station.runs import Run
 from sorvolo.station.tokens import make_token
 from sorvolo.store.exports.change_files import crop_names
 from sorvolo.store.images import jpeg_from_image, png_from_rgba
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.files import HeightFile
 from waiting import wait_for
 
 AXE = (Path(__file__).parent / "vendor" / "axe.min.js").read_text(encoding="utf-8")
@@ -386,6 +387,47 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     assert page.evaluate("window.pwned") is None
     announce(served, "run.finished", {"headline": "all done"})
     page.locator(".message", has_text="all done").wait_for()
+
+
+def test_tiles_of_a_site_whose_name_looks_like_a_growing_map(browser: Any, made_site: Path, tmp_path: Path) -> None:
+    shutil.copytree(made_site, tmp_path / "live-a1")
+    with Served(tmp_path) as station:
+        watched = Watched(browser.new_context(), station.url)
+        with watched.page.expect_response(re.compile("/api/sites/live-a1/tiles/live-")):
+            watched.page.goto(f"{station.url}/#/site/live-a1/map")
+        watched.page.locator(".figure", has_text="matched").wait_for()
+        with watched.page.expect_response(re.compile("/api/sites/live-a1/tiles/live-abc123/")):
+            station.station.events.append(NewEvent("map.tiles", {"revision": "abc123", "bounds": None}, "live-a1", "r"))
+        watched.page.wait_for_timeout(300)
+        assert watched.faults == []
+        watched.page.context.close()
+
+
+def test_a_delay_does_not_depend_on_the_browser_s_clock(browser: Any, served: Served, tmp_path: Path) -> None:
+    """It is an hour ahead; the drone's and the station's agree."""
+    watched = Watched(browser.new_context(), served.url)
+    watched.page.add_init_script("const now = Date.now; Date.now = () => now() + 3600000;")
+    show(watched, served)
+    messages = [each for each in units(write_video(tmp_path / "v.mp4"), "h264") if each.kind is Kind.VIDEO]
+    with connect(f"{served.url.replace('http', 'ws')}/api/ingest/punctual") as drone:
+        drone.send(Message(Kind.HELLO, 0, 0, Hello("f" * 16, "h264", 160, 120, 10.0).to_json().encode()).to_bytes())
+        drone.recv()
+        now = Sample(time.time_ns() - 5_000_000_000, {"latitude_deg": 45.0, "longitude_deg": 9.0})
+        drone.send(Message(Kind.TELEMETRY, 1, 0, now.to_json().encode()).to_bytes())
+        for number, each in enumerate(messages):  # three seconds of them, taken five to two seconds ago
+            drone.send(replace(each, seq=number + 2).to_bytes())
+        expect(watched.page.locator("aside.video header b")).to_have_text("punctual")
+        delay = watched.page.locator(".delay")
+        expect(delay).to_have_text(re.compile(r"^\d+(\.\d+)? s behind"))
+        watched.page.wait_for_timeout(1500)  # the station was asked for its clock
+        for number, each in enumerate(messages):
+            pts_us = each.pts_us + 3_000_000
+            drone.send(replace(each, seq=number + 100, pts_us=pts_us, dts_us=pts_us).to_bytes())
+        watched.page.wait_for_timeout(1500)
+        assert 0 < float(delay.inner_text().split()[0]) < 60
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+    assert watched.faults == []
+    watched.page.context.close()
 
 
 def test_a_page_that_slept_asks_from_its_last_event_and_gets_each_once(browser: Any, served: Served) -> None:
@@ -746,7 +788,7 @@ def test_boxes_follow_the_picture_until_it_is_looked_at_again(
             "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, 40, 20, 30]}],
         }
         loop.call_soon_threadsafe(note, boxes)
-        page.locator("aside.video footer", has_text="1 in the picture 1 s ago").wait_for()
+        page.locator("aside.video footer", has_text="1 in the picture, faint: seen 1 s ago").wait_for()
         assert columns_drawn(page) == pytest.approx((39, 61), abs=2)
         for number in range(9):  # 5 px a step; the last 0.1 s are not known yet
             from_us = last_us - 1_000_000 + 100_000 * number
@@ -755,7 +797,7 @@ def test_boxes_follow_the_picture_until_it_is_looked_at_again(
                 "to_from": [1, 0, 5, 0, 1, 0, 0, 0, 1],
             })
         loop.call_soon_threadsafe(note, boxes)
-        page.locator("aside.video footer", has_text="1 in the picture, seen 1 s ago").wait_for()
+        page.locator("aside.video footer", has_text="1 in the picture, dashed: seen 1 s ago").wait_for()
         assert columns_drawn(page) == pytest.approx((89, 111), abs=2)
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
 
@@ -783,11 +825,11 @@ def test_boxes_of_cars_that_are_known_before_people_take_the_place_of_earlier_ca
             })
 
         look(1_000_000, {"person": 40, "car": 140})
-        page.locator("aside.video footer", has_text="2 in the picture 1 s ago").wait_for()
+        page.locator("aside.video footer", has_text="2 in the picture, faint: seen 1 s ago").wait_for()
         assert columns_drawn(page) == pytest.approx((39, 151), abs=2)
         look(0, {"car": 120}, classes=["car"])  # not searched for people yet: the earlier one stays, with its age
         wait_for(lambda: columns_drawn(page) == pytest.approx((39, 131), abs=2))
-        expect(page.locator("aside.video footer")).to_contain_text("2 in the picture 1 s ago")
+        expect(page.locator("aside.video footer")).to_contain_text("2 in the picture, faint: seen 1 s ago")
         look(0, {"person": 60, "car": 120})
         wait_for(lambda: columns_drawn(page) == pytest.approx((59, 131), abs=2))
         expect(page.locator("aside.video footer")).to_contain_text(re.compile("2 in the picture$"))
@@ -885,18 +927,19 @@ def test_photos_go_up_as_one_file(opened: Watched, served: Served, tmp_path: Pat
     assert (upload["name"], upload["state"]) == ("DJI_0001-3-photos.zip", "ready")
 
 
-def test_heights_along_a_line_and_the_printed_sheet(opened: Watched) -> None:
+def test_heights_along_a_line_and_the_printed_sheet(opened: Watched, served: Served) -> None:
     page = opened.page
     heights = {"distance_m": [0, 10, 20, 30], "height_m": [101.5, None, 104, 103], "ground_m": [], "sigma_m": 0.2}
     page.route(re.compile("/profile"), lambda route: route.fulfill(json=heights))
     page.keyboard.press("5")
-    page.locator("[data-tool=profile]").click()
-    box = page.locator(".map-canvas").bounding_box()
-    for x in (0.4, 0.6):
-        page.mouse.click(box["x"] + x * box["width"], box["y"] + 0.5 * box["height"])
-        page.wait_for_timeout(350)
-    page.get_by_role("button", name="Done").click()
+    draw_profile(page)
+    page.locator(".hint", has_text="no heights yet").wait_for()
+    made = served.station.shelf.open("field").height_path("b", HeightFile.REPORT)
+    made.parent.mkdir(exist_ok=True)
+    made.write_text("{}")  # in a terminal meanwhile
+    draw_profile(page)
     page.locator(".profile figcaption", has_text="Difference 2.5 m, accuracy of a height 0.2 m").wait_for()
+    made.unlink()
     page.evaluate("""() => {
       window.print = () => { document.body.dataset.printed = document.querySelector('.sheet').textContent; };
     }""")
@@ -908,6 +951,43 @@ def test_heights_along_a_line_and_the_printed_sheet(opened: Watched) -> None:
     assert re.search(r"the picture is [\d.]+ (m|km) wide, north up, its middle at (46|33T)", printed)
     assert page.locator(".sheet img").evaluate("each => each.naturalWidth") > 500
     page.evaluate("dispatchEvent(new Event('afterprint'))")
+
+
+def draw_profile(page: Any) -> None:
+    page.locator("[data-tool=profile]").click()
+    box = page.locator(".map-canvas").bounding_box()
+    for x in (0.4, 0.6):
+        page.mouse.click(box["x"] + x * box["width"], box["y"] + 0.5 * box["height"])
+        page.wait_for_timeout(350)
+    page.get_by_role("button", name="Done").click()
+
+
+def test_a_site_that_is_not_there_yet_is_not_asked_for(browser: Any, tmp_path: Path) -> None:
+    """Its first mission fails, its station is away for a while: nothing is wrong on the page but that."""
+    with Served(tmp_path) as station:
+        watched = Watched(browser.new_context(), station.url)
+        page = watched.page
+        sockets: list[Any] = []
+
+        def passed_on(socket: Any) -> None:
+            sockets.append(socket)
+            socket.connect_to_server()
+
+        page.route_web_socket(re.compile("/api/events"), passed_on)
+        page.goto(f"{station.url}/#/site/new/missions")
+        page.get_by_text("Start a mission").wait_for()
+        station.station.events.append(NewEvent("run.failed", {"error": "no picture"}, "new", "run-1"))
+        page.locator(".message", has_text="no picture").wait_for()
+        sockets[0].close()
+        for _ in range(200):  # the page's, which Playwright passes on only while it waits
+            if len(sockets) == 2:
+                break
+            page.wait_for_timeout(100)
+        station.station.events.append(NewEvent("run.failed", {"error": "the lens is wet"}, "new", "run-2"))
+        page.locator(".message", has_text="the lens is wet").wait_for()
+        page.wait_for_timeout(300)
+        assert watched.faults == []
+        page.context.close()
 
 
 def test_a_base_map_comes_from_a_file(opened: Watched, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from sorvolo.station.settings import STATE_FOLDER, STREAMS_FOLDER
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import FlightEntry, VersionEntry
 from sorvolo.store.site.catalogue_place import CATALOGUE, catalogue_file, is_site
+from sorvolo.store.site.files import HeightFile
 from sorvolo.store.site.names import is_plain_name
 
 _DEEPEST = 2  # folders below the root: `sorvolo demo` puts its site one deeper than its folder
@@ -153,7 +154,7 @@ def site_summary(site_id: str, archive: Archive) -> dict[str, Any]:
 
 
 def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
-    """A site with its versions and flights."""
+    """A site with its versions and flights, and whether a flight of it has heights."""
     versions, comparisons = archive.versions(), archive.comparisons()
     compared = {each.flight_id for each in versions if each.id in comparisons}
     return {
@@ -162,6 +163,7 @@ def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
         "flights": [
             _flight_row(each, archive, versions, compared) for each in archive.flights() if each.status == "complete"
         ],
+        "has_heights": any(archive.height_path(each.flight_id, HeightFile.REPORT).exists() for each in versions),
     }
 
 

@@ -1,6 +1,7 @@
 """The routes of streams: a drone's own connection, what is known of each stream, and its pictures for browsers."""
 
 import asyncio
+import time
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any, Literal
@@ -29,7 +30,8 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
     @router.get("/api/streams/{stream}", dependencies=[Depends(needs(Role.VIEW))])
     def one_stream(stream: str) -> dict[str, Any]:
         """One stream: its flights, and how the one goes that is being sent."""
-        return ingest.state(stream) | {"viewers": ingest.viewers(stream), "bytes": ingest.kept_bytes(stream)}
+        kept = {"viewers": ingest.viewers(stream), "bytes": ingest.kept_bytes(stream)}
+        return ingest.state(stream) | kept | {"time_us": time.time_ns() // 1000}
 
     @router.delete("/api/streams/{stream}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))])
     async def delete_all(stream: str) -> None:

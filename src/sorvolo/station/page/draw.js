@@ -55,7 +55,7 @@ class Draw {
     this.buttons = Object.entries(TOOLS).map(([tool, [name]]) => el("button", { type: "button", data: { tool }, "aria-pressed": "false",
       disabled: !this.may && ["interest", "alert", "waypoint"].includes(tool), on: { click: () => this.take(tool) } }, name));
     fill(body, el("div", { class: "tools", role: "group", "aria-label": "Tools" }, this.buttons), this.live, this.list,
-      this.may ? el("details", {}, el("summary", {}, "Waypoints for holes"), el("p", { class: "note" }, "Where a search would have found little, or a comparison could not look."),
+      this.may ? el("details", {}, el("summary", {}, "Waypoints for holes"), el("p", { class: "note" }, "Where no picture was taken, a search would have found little, or a comparison could not look."),
         button("Plan waypoints", () => this.plan())) : null);
     this.hearer = ({ detail }) => { if (detail.site === screen.data.id) loadDrawings(screen).then(() => this.showList()); };
     screen.station.events.addEventListener("drawings.changed", this.hearer);
@@ -141,17 +141,22 @@ class Draw {
     this.screen.view?.put("sketch", [{ type: "Feature", properties: { purpose: "profile" }, geometry: { type: "LineString", coordinates: points } }]);
     const line = points.map((each) => each.map((value) => value.toFixed(8)).join(",")).join(";");
     try {
+      if (!this.screen.data.detail.is_new) await this.screen.data.loadDetail(); // heights made in a terminal are announced by nobody
+      if (!this.screen.data.detail.has_heights) {
+        fill(this.live, el("p", { class: "hint" }, "This site has no heights yet. Run “sorvolo heights” on it, then try again."));
+        return;
+      }
       const found = await get(`${siteUrl(this.screen.data.id, "profile")}?line=${line}`);
       fill(this.live, profilePlot(found), button("Clear", () => this.take(null), { class: "quiet" }));
     } catch (problem) {
-      fill(this.live, el("p", { class: "hint" }, problem.status === 404 ? "This site has no heights yet. Run “sorvolo heights” on it, then try again." : problem.detail));
+      fill(this.live, el("p", { class: "hint" }, problem.detail));
     }
   }
 
   async plan() {
     const made = waypointsFor(this.screen.data);
     if (!made.length) {
-      message("No hole to fly again", { todo: "Neither a measured search nor a comparison of this site left out ground that waypoints would help." });
+      message("No hole to fly again", { todo: "No flight, measured search or comparison of this site left out ground that waypoints would help." });
       return;
     }
     await saveDrawings(this.screen, (list) => [...list.filter((each) => !each.properties.planned), ...made]);

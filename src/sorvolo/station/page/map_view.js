@@ -121,12 +121,12 @@ export class MapView {
 
   /** A tile of the growing map by the revision that touched it last: the others stay in the browser's cache. */
   tileAddress(url) {
-    const found = /\/tiles\/live-[0-9a-f]+\/(\d+)\/(\d+)\/(\d+)\.webp$/.exec(url);
+    const found = /^(.*\/tiles\/live-)[0-9a-f]+(\/(\d+)\/(\d+)\/(\d+)\.webp)$/.exec(url); // a site's name may begin so, too
     if (!found) return url;
-    const [z, x, y] = found.slice(1).map(Number);
+    const [z, x, y] = found.slice(3).map(Number);
     const last = this.changes.findLast(({ bounds }) => !bounds || tileMeets(z, x, y, bounds));
     const revision = last?.revision ?? this.base;
-    return revision ? url.replace(/live-[0-9a-f]+/, `live-${revision}`) : url;
+    return revision ? `${found[1]}${revision}${found[2]}` : url;
   }
 
   /** The features below a point, the uppermost first. */

@@ -28,10 +28,12 @@ const PANELS = [
 
 /** Show a site; gives what closes it. */
 export async function showSite(main, title, numbers, station, id, view, at = null) {
-  const isNew = view === "missions" && !(await get("/api/sites")).some((each) => each.id === id);
+  const isNew = view === "missions" && !(await isMade(id));
   const detail = isNew ? notMadeYet(id) : await get(siteUrl(id));
   return new SiteScreen(main, title, numbers, station, new SiteData(detail), view, at);
 }
+
+const isMade = async (id) => (await get("/api/sites")).some((each) => each.id === id);
 
 function notMadeYet(id) {
   return { id, name: id, versions: [], flights: [], bounds_wgs84: null, center_wgs84: null, is_new: true };
@@ -105,6 +107,7 @@ class SiteScreen {
   async reload({ site }) {
     if (site !== this.data.id) return;
     try {
+      if (this.data.detail.is_new && !(await isMade(site))) return; // its first mission failed
       const wasNew = this.data.detail.is_new || !this.data.detail.bounds_wgs84;
       await this.data.loadDetail();
       await this.data.load();
@@ -120,6 +123,7 @@ class SiteScreen {
 
   /** Is the site still there? A station that was away announces nothing of what went meanwhile. */
   async check() {
+    if (this.data.detail.is_new) return;
     try {
       await get(siteUrl(this.data.id));
     } catch (problem) { this.lost(problem); }
@@ -128,7 +132,7 @@ class SiteScreen {
   /** Whether an answer means that there is no such site, which ends the screen of one that was there. */
   lost({ status }) {
     if (status !== 404 && status !== 410) return false;
-    if (!this.closed && !this.data.detail.is_new) this.gone();
+    if (!this.closed) this.gone();
     return true;
   }
 

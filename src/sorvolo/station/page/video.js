@@ -101,11 +101,14 @@ class VideoPane {
     });
   }
 
-  /** Where the drone is, by its own telemetry. */
+  /** Where the drone is, by its own telemetry; whether its flight is over. */
   async ask() {
     try {
+      const asked_us = Date.now() * 1000;
       const state = await get(`/api/streams/${encodeURIComponent(this.stream)}`);
+      this.ahead_us = (asked_us + Date.now() * 1000) / 2 - state.time_us;
       if (state.is_connected) this.screen.live.heard(state.telemetry);
+      else if (state.flights.at(-1)?.is_over) fill(this.delay, "ended");
     } catch { /* the connection's own sign shows it */ }
   }
 
@@ -148,7 +151,8 @@ class VideoPane {
     this.now_us = pts_us;
     this.drawBoxes(pts_us);
     const here_s = this.newest ? (this.newest.pts_us - pts_us) / 1e6 + (performance.now() - this.newest.at) / 1000 : null;
-    const whole_s = this.epoch_us !== undefined ? (Date.now() * 1000 - this.epoch_us - pts_us) / 1e6 : null;
+    // by the station's clock: this device's own may be wrong
+    const whole_s = this.epoch_us !== undefined && this.ahead_us !== undefined ? (Date.now() * 1000 - this.ahead_us - this.epoch_us - pts_us) / 1e6 : null;
     // a picture that left the drone after it came here: the two clocks disagree
     const behind_s = whole_s === null || whole_s < (here_s ?? 0) - CLOCKS_AGREE_S ? here_s : whole_s;
     if (behind_s !== null) fill(this.delay, `${number(Math.max(0, behind_s), 2)} s behind`);
@@ -174,7 +178,7 @@ class VideoPane {
       if (boxes.length && !oldest) oldest = { isOwn, carried, ago_s: (pts_us - look.pts_us) / 1e6 };
       count += boxes.length;
     }
-    fill(this.seen, count ? `${count} in the picture${oldest.isOwn ? "" : `${oldest.carried ? ", seen" : ""} ${number(oldest.ago_s, 1)} s ago`}` : "");
+    fill(this.seen, count ? `${count} in the picture${oldest.isOwn ? "" : `, ${oldest.carried ? "dashed" : "faint"}: seen ${number(oldest.ago_s, 1)} s ago`}` : "");
   }
 
   /** The looks that show most of a picture, the older first: the nearest whole one, and where cars of a later one are known already, those. */
