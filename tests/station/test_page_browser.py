@@ -430,6 +430,44 @@ def test_a_delay_does_not_depend_on_the_browser_s_clock(browser: Any, served: Se
     watched.page.context.close()
 
 
+def test_a_video_whose_connection_died_in_sleep_is_asked_for_anew(
+    browser: Any, served: Served, tmp_path: Path
+) -> None:
+    """The socket looks open, nothing comes: that is stated, and after some seconds another one is opened."""
+    watched = Watched(browser.new_context(), served.url)
+    page = watched.page
+    sockets: list[Any] = []
+
+    def passed_on(socket: Any) -> None:
+        sockets.append(socket)
+        server, is_first = socket.connect_to_server(), len(sockets) == 1
+        server.on_message(lambda data: None if is_first and died else socket.send(data))
+
+    page.route_web_socket(re.compile("/video"), passed_on)
+    show(watched, served)
+    died: list[bool] = []
+    messages = units(write_video(tmp_path / "v.mp4", seconds=4), "h264")
+    with connect(f"{served.url.replace('http', 'ws')}/api/ingest/asleep") as drone:
+        drone.send(Message(Kind.HELLO, 0, 0, Hello("a1" * 8, "h264", 160, 120, 10.0).to_json().encode()).to_bytes())
+        drone.recv()
+        for each in messages[:15]:
+            drone.send(each.to_bytes())
+        page.locator(".delay", has_text="behind").wait_for()
+        died.append(True)
+        page.locator(".delay", has_text="no picture for").wait_for()
+        for _ in range(300):
+            if len(sockets) > 1:
+                break
+            page.wait_for_timeout(100)
+        for each in messages[15:]:
+            drone.send(each.to_bytes())
+        page.locator(".delay", has_text="behind").wait_for()
+        drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
+        page.locator(".delay", has_text="ended").wait_for()
+    assert watched.faults == []
+    page.context.close()
+
+
 def test_a_page_that_slept_asks_from_its_last_event_and_gets_each_once(browser: Any, served: Served) -> None:
     context = browser.new_context()
     watched = Watched(context, served.url)

@@ -15,6 +15,8 @@ const MOST_HELD_S = 4;
 const MOST_UNDECODED = 15; // pictures, half a second: a decoder with more before it goes on at the next key frame
 const STAMP_BYTES = 8;
 const STATE_MS = 1000;
+const QUIET_S = 3; // without a picture of a drone that sends: stated
+const DEAD_S = 10; // the connection looks open and is dead, as after a sleep: made anew
 
 /** The pane over the map; it appears when a stream is on. `jump(view)` plays a recorded flight at a second. */
 export function videoPane(screen) {
@@ -56,7 +58,13 @@ class VideoPane {
 
   heard({ data }) {
     if (data.is_connected) this.offer(data.stream);
-    else if (data.stream === this.stream) fill(this.delay, data.flights?.at(-1)?.is_over ? "ended" : "no signal");
+    else if (data.stream === this.stream) this.off(data.flights?.at(-1)?.is_over ? "ended" : "no signal");
+  }
+
+  /** No pictures come, and why. */
+  off(why) {
+    this.isOff = true;
+    fill(this.delay, why);
   }
 
   offer(name) {
@@ -89,6 +97,7 @@ class VideoPane {
     const socket = new WebSocket(url);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
+    this.heard_at = performance.now();
     this.show = this.fmp4 ? new SegmentPlayer(this.player, (pts_us) => this.shown(pts_us), (pts_us) => { this.newest = { pts_us, at: performance.now() }; }) : new FramePlayer(this.canvas, (pts_us) => this.shown(pts_us), () => this.hold_s());
     this.canvas.hidden = this.fmp4;
     this.player.hidden = !this.fmp4;
@@ -96,19 +105,23 @@ class VideoPane {
     socket.addEventListener("message", ({ data }) => (typeof data === "string" ? this.report(JSON.parse(data)) : this.packet(data)));
     socket.addEventListener("close", () => {
       if (socket !== this.socket) return;
-      fill(this.delay, "no signal");
+      this.off("no signal");
       this.timer = setTimeout(() => this.connect(), 3000);
     });
   }
 
-  /** Where the drone is, by its own telemetry; whether its flight is over. */
+  /** Where the drone is, by its own telemetry; whether its flight is over, or the connection to it dead. */
   async ask() {
+    const quiet_s = (performance.now() - this.heard_at) / 1000;
+    if (quiet_s > QUIET_S && !this.isOff) fill(this.delay, `no picture for ${number(quiet_s, 0)} s`);
     try {
       const asked_us = Date.now() * 1000;
       const state = await get(`/api/streams/${encodeURIComponent(this.stream)}`);
       this.ahead_us = (asked_us + Date.now() * 1000) / 2 - state.time_us;
-      if (state.is_connected) this.screen.live.heard(state.telemetry);
-      else if (state.flights.at(-1)?.is_over) fill(this.delay, "ended");
+      if (state.is_connected) {
+        this.screen.live.heard(state.telemetry);
+        if (quiet_s > DEAD_S && this.socket) this.connect();
+      } else if (state.flights.at(-1)?.is_over) this.off("ended");
     } catch { /* the connection's own sign shows it */ }
   }
 
@@ -125,6 +138,8 @@ class VideoPane {
   packet(data) {
     const pts_us = this.fmp4 ? null : Number(new DataView(data).getBigInt64(0));
     if (pts_us !== null) this.newest = { pts_us, at: performance.now() };
+    this.isOff = false;
+    this.heard_at = performance.now();
     this.show.take(this.fmp4 ? new Uint8Array(data) : new Uint8Array(data, STAMP_BYTES), pts_us);
   }
 
