@@ -56,6 +56,17 @@ def test_large_pictures_are_made_to_fit() -> None:
     assert len(report_page(fake_report(), noise)) < 2_200_000
 
 
+def test_settings_are_words() -> None:
+    thesis = {"bands": 5, "side_px": None}
+    wishes = {"overlap": 0.7, "crs": None, "checks": [], "classes": ["person", "car"], "thesis": thesis}
+    words = _words(report_page(fake_report() | {"settings": wishes}, fake_picture()))
+    for shown in (
+        "overlap 0.7", "crs chosen from the flight", "checks none", "classes person, car",
+        "thesis bands 5, side_px chosen from the flight",
+    ):
+        assert shown in words
+
+
 def test_nothing_seen_is_no_picture() -> None:
     page = report_page(fake_report(), np.zeros((4, 4, 4), np.uint8))
     assert "img" not in checked(page).names

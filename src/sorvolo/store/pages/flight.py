@@ -1,7 +1,7 @@
 """The flight report as one page of HTML that needs no other file, no network and no script."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -71,11 +71,21 @@ def report_page(
         notices=[(known(each.get("count")), known(each.get("text")), known(each.get("code")))
                  for each in at(report, "notices") or []],
         stages=_stages(report), effort=_effort(report),
-        settings=[(name, "chosen from the flight" if value is None else value)
-                  for name, value in (at(report, "settings") or {}).items()],
+        settings=[(name, _setting_words(value)) for name, value in (at(report, "settings") or {}).items()],
         versions=list({"sorvolo": known(report.get("sorvolo")), **(at(report, "versions") or {})}.items()),
     )
     return str(page)
+
+
+def _setting_words(value: Any) -> str:
+    """What was wished for, as a person reads it."""
+    if value is None:
+        return "chosen from the flight"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_setting_words(each)}" for name, each in value.items())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        return ", ".join(map(_setting_words, value)) or "none"
+    return str(value)
 
 
 def _inputs(report: Mapping[str, Any]) -> str:
