@@ -28,6 +28,24 @@ def test_module_is_the_command() -> None:
     assert (run.returncode, run.stdout, run.stderr) == (0, f"sorvolo {sorvolo.__version__}\n", "")
 
 
+@pytest.mark.parametrize(("wished", "threads"), [(None, "1"), ("3", "3")])
+def test_linear_algebra_has_one_thread_unless_wished_otherwise(wished: str | None, threads: str) -> None:
+    """SciPy is asked what it runs with, as NumPy's own library has no word for it."""
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    asked = (
+        "import ctypes, pathlib\nfrom sorvolo.cli.main import main\nmain(['--version'])\nimport scipy, scipy.linalg\n"
+        "library = next((pathlib.Path(scipy.__file__).parent.parent / 'scipy.libs').glob('*openblas*'))\n"
+        "print(ctypes.CDLL(str(library)).scipy_openblas_get_num_threads())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", asked], env=environment | ({"OPENBLAS_NUM_THREADS": wished} if wished else {}),
+        capture_output=True, text=True, check=False,
+    )
+    if "StopIteration" in done.stderr or "undefined symbol" in done.stderr:
+        pytest.skip("SciPy runs on another library than OpenBLAS")
+    assert done.stdout.splitlines()[-1:] == [str(min(int(threads), os.cpu_count() or 1))], done.stderr
+
+
 def test_missing_kernels_are_one_line() -> None:
     """Without a compiler the NumPy kernels are used: a person reads one warning, once, without Python's own words."""
     program = (

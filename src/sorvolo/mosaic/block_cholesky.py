@@ -2,13 +2,16 @@
 
 SuperLU holds such factors twice, as L and as U, with an index beside each number. Here they are held once, in dense
 pieces (Duff and Reid 1983, the multifrontal method): cameras that are tied to the same others go out together.
+Triangles are solved by BLAS itself: SciPy's `solve_triangular` asks LAPACK, whose threads wait for each other over the
+smallest of them.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky, eigh, qr, solve_triangular
+from scipy.linalg import LinAlgError, cholesky, eigh, qr
+from scipy.linalg.blas import dtrsm
 from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
@@ -74,7 +77,7 @@ class Elimination:
             split = SIDE * len(front.out)
             corner, below = pieces[number]
             corner[:] = _corner(matrix[:split, :split])
-            below[:] = solve_triangular(corner, matrix[:split, split:], lower=True, check_finite=False).T
+            below[:] = dtrsm(1.0, corner.T, matrix[split:, :split], side=1)
             if front.into >= 0:
                 update = below @ below.T
                 np.subtract(matrix[split:, split:], update, out=update)
@@ -93,13 +96,13 @@ class BlockFactors:
         found = right.reshape(len(right), -1).copy()
         for front, (corner, below) in zip(self._fronts, self._pieces, strict=True):
             out = _unknowns(front.out)
-            found[out] = solve_triangular(corner, found[out], lower=True, check_finite=False)
+            found[out] = dtrsm(1.0, corner.T, found[out], trans_a=1)
             if len(front.rest):
                 found[_unknowns(front.rest)] -= below @ found[out]
         for front, (corner, below) in zip(reversed(self._fronts), reversed(self._pieces), strict=True):
             out = _unknowns(front.out)
             known = found[out] - below.T @ found[_unknowns(front.rest)] if len(front.rest) else found[out]
-            found[out] = solve_triangular(corner, known, lower=True, trans="T", check_finite=False)
+            found[out] = dtrsm(1.0, corner.T, known)
         return found.reshape(right.shape)
 
 
