@@ -52,11 +52,21 @@ def test_a_boulder_falls_and_a_person_stays(detector: Detector, tmp_path: Path) 
     assert both.scores[1] == pytest.approx(fallen, abs=0.01)
 
 
-def test_other_classes_and_weak_reports_keep_their_score(detector: Detector) -> None:
+def test_other_classes_keep_their_score(detector: Detector) -> None:
     cars = detector.detect(pictured((1, 1)), least_score=0.0)
     np.testing.assert_allclose(cars.scores, [230 / 255] * 2, atol=1e-6)
-    weak = detector.detect(pictured(score=125), least_score=0.0)
-    np.testing.assert_allclose(weak.scores, [125 / 255] * 2, atol=1e-6)
+
+
+def test_weak_reports_stay_behind_those_that_were_looked_at() -> None:
+    """Nothing sees any of them again: their order is that of their first scores, on both sides of `least`."""
+    count = 12
+    boxes = np.array([[20 * n, 10, 20 * n + 15, 40] for n in range(count)], np.float32)
+    seen = Seen(boxes, np.linspace(0.9, 0.1, count), np.zeros(count, np.int64))
+    none = Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
+    how = SecondLook((34.0,), own=1.2, again=0.7, shift=-0.1, least=0.5, enlarged=9.0)
+    after = looked_again(seen, np.zeros((800, 800, 3), np.uint8), lambda sheet: none, {0: how})
+    np.testing.assert_array_equal(after.boxes_px, boxes)
+    assert (np.diff(after.scores) < 0).all() and after.scores[0] < seen.scores[0]
 
 
 def test_lists_tiles_and_a_shared_process_judge_alike(detector: Detector, model: Path, tmp_path: Path) -> None:

@@ -50,10 +50,15 @@ def looked_again(
 ) -> Seen:
     """What was `seen` in a picture (H, W, 3), with the scores that a second look leaves, best first.
 
-    `hows` names for labels how their reports are looked at again; others, and those below `least`, keep their score.
+    `hows` names for labels how their reports are looked at again; others keep their score. Reports below `least` are
+    not looked at and count as not seen again, so that they stay behind those that were not.
     """
-    scores = seen.scores.copy()
-    for row, again in opinions(seen, picture, sees, hows, settings).items():
+    scores, unseen = seen.scores.copy(), np.array([settings.unseen])
+    weak = {
+        row: unseen for row, (score, label) in enumerate(zip(seen.scores.tolist(), seen.labels.tolist(), strict=True))
+        if label in hows and score < hows[label].least
+    }
+    for row, again in (weak | opinions(seen, picture, sees, hows, settings)).items():
         how = hows[int(seen.labels[row])]
         odds = how.shift + how.own * float(_odds(scores[row])) + how.again * float(_odds(again).mean())
         scores[row] = 1 / (1 + math.exp(-odds))
