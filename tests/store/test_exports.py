@@ -3,6 +3,7 @@
 import json
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -25,6 +26,7 @@ from sorvolo.store.exports.map_pictures import (
     write_preview,
     write_small_maps,
 )
+from sorvolo.store.exports.placemarks import Placemark, kml_bytes
 from sorvolo.store.exports.plain import geojson_bytes, plain_json, utc_text
 from sorvolo.store.images import shrink, unweighted, weighted
 from sorvolo.survey.flight import Site
@@ -314,3 +316,12 @@ def test_two_maps_are_shown_on_the_same_ground_and_common_tiles_are_read_once() 
     assert (0, 0) not in read and {(1, 0), (2, 1)} <= set(read)
     empty, same = pictures([{}, before], 512)
     assert not empty.rgba.any() and same.rgba.shape == empty.rgba.shape
+
+
+def test_documents_made_at_once_are_numbered_from_one_each() -> None:
+    """A map's KMZ is made beside its objects' KML, and the same map gives the same bytes."""
+    places = [Placemark(f"place {k}", "", 12.5, 41.9, 0, ((12.5, 41.9), (12.6, 41.9), (12.6, 42.0))) for k in range(60)]
+    alone = kml_bytes("alone", places)
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(lambda _: kml_bytes("alone", places), range(16)))
+    assert set(together) == {alone}

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import simplekml
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes
+from sorvolo.store.exports.placemarks import kml_from_one
 from sorvolo.store.exports.places import near_longitudes, wrapped_deg
 from sorvolo.store.exports.plain import name_safe
 from sorvolo.store.images import png_from_rgba, shrink, unweighted, weighted
@@ -194,23 +194,27 @@ def _write_kmz(small: Picture, site_grid: SiteGrid, name: str, path: Path) -> No
     counts = -(-size // _KMZ_PIECE_PX)
     longitudes = np.linspace(west, east, counts[0] + 1)
     latitudes = np.linspace(north, south, counts[1] + 1)
-    simplekml.Kml.resetidcounter()
-    kml = simplekml.Kml(name=name)
     images: dict[str, bytes] = {}
+    boxes: dict[str, tuple[str, tuple[float, float, float, float]]] = {}
     for row in range(counts[1]):
         for column in range(counts[0]):
             box = (longitudes[column], latitudes[row + 1], longitudes[column + 1], latitudes[row])
             rgba = _north_up(small, site_grid, box, *(int(side) for side in -(-size // counts)))
             if not rgba[..., 3].any():
                 continue
-            overlay = kml.newgroundoverlay(name=f"{name} {row}-{column}")
-            overlay.icon.href = f"files/{name_safe(name)}_{row}_{column}.png"
-            overlay.latlonbox.west, overlay.latlonbox.south = wrapped_deg(box[0]), box[1]
-            overlay.latlonbox.east, overlay.latlonbox.north = wrapped_deg(box[2]), box[3]
-            images[overlay.icon.href] = png_from_rgba(rgba)
+            file = f"files/{name_safe(name)}_{row}_{column}.png"
+            boxes[file] = f"{name} {row}-{column}", box
+            images[file] = png_from_rgba(rgba)
+    with kml_from_one(name) as kml:
+        for file, (title, (west, south, east, north)) in boxes.items():
+            overlay = kml.newgroundoverlay(name=title)
+            overlay.icon.href = file
+            overlay.latlonbox.west, overlay.latlonbox.south = wrapped_deg(west), south
+            overlay.latlonbox.east, overlay.latlonbox.north = wrapped_deg(east), north
+        text = kml.kml(format=False)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         # without the time at which it was made: the same map gives the same bytes
-        archive.writestr(zipfile.ZipInfo("doc.kml"), kml.kml(format=False), zipfile.ZIP_DEFLATED)
+        archive.writestr(zipfile.ZipInfo("doc.kml"), text, zipfile.ZIP_DEFLATED)
         for file, data in images.items():
             archive.writestr(zipfile.ZipInfo(file), data, zipfile.ZIP_STORED)
 

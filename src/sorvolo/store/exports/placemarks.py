@@ -1,6 +1,8 @@
 """Places to look at, for maps and receivers: KML for Google Earth and phones, GPX 1.1 for GPS receivers."""
 
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
@@ -8,6 +10,8 @@ import gpxpy.gpx
 import simplekml
 
 from sorvolo.geometry.units import DAY_NS
+
+_NUMBERING = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -23,21 +27,29 @@ class Placemark:
     outline_deg: tuple[tuple[float, float], ...] = ()
 
 
+@contextmanager
+def kml_from_one(title: str) -> Iterator[simplekml.Kml]:
+    """A document whose elements are numbered from 1, so that the same content gives the same bytes: simplekml counts
+    for the whole process, so no other thread may make one within the block."""
+    with _NUMBERING:
+        simplekml.Kml.resetidcounter()
+        yield simplekml.Kml(name=title)
+
+
 def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
     """The places as KML: a point each, and its outline where it has one."""
-    simplekml.Kml.resetidcounter()
-    document = simplekml.Kml(name=_printable(title))
-    for each in placemarks:
-        folder = document.newmultigeometry(name=_printable(each.name), description=_printable(each.description))
-        folder.newpoint(coords=[(each.longitude_deg, each.latitude_deg)])
-        if each.outline_deg:
-            folder.newpolygon(outerboundaryis=[*each.outline_deg, each.outline_deg[0]])
-        folder.style.polystyle.fill = 0
-        folder.style.linestyle.width = 3
-        folder.style.linestyle.color = simplekml.Color.red
-        if each.seen_ns >= DAY_NS:
-            folder.timestamp.when = _moment(each.seen_ns).strftime("%Y-%m-%dT%H:%M:%SZ")
-    return str(document.kml()).encode()
+    with kml_from_one(_printable(title)) as document:
+        for each in placemarks:
+            folder = document.newmultigeometry(name=_printable(each.name), description=_printable(each.description))
+            folder.newpoint(coords=[(each.longitude_deg, each.latitude_deg)])
+            if each.outline_deg:
+                folder.newpolygon(outerboundaryis=[*each.outline_deg, each.outline_deg[0]])
+            folder.style.polystyle.fill = 0
+            folder.style.linestyle.width = 3
+            folder.style.linestyle.color = simplekml.Color.red
+            if each.seen_ns >= DAY_NS:
+                folder.timestamp.when = _moment(each.seen_ns).strftime("%Y-%m-%dT%H:%M:%SZ")
+        return str(document.kml()).encode()
 
 
 def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:

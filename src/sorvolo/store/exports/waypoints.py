@@ -15,6 +15,7 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.planning import FlightPlan
 from sorvolo.store.atomic import atomic_write_bytes
+from sorvolo.store.exports.placemarks import kml_from_one
 from sorvolo.store.exports.wpml import wpml_kmz
 
 _TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _MOUNT_CONTROL, _TRIGGER_DISTANCE = 22, 16, 20, 178, 205, 206  # MAV_CMD
@@ -79,13 +80,13 @@ def _summary(plan: FlightPlan) -> _Item:
 
 
 def _kml(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
-    document = simplekml.Kml(name=name)
-    line = document.newlinestring(name=name, description=json.dumps(_summary(plan), indent=1))
-    line.coords = [(lon, lat, plan.height_m) for lon, lat in lonlat]
-    line.altitudemode = simplekml.AltitudeMode.relativetoground
-    line.style.linestyle.width = 3
-    line.style.linestyle.color = simplekml.Color.orange
-    return str(document.kml())
+    with kml_from_one(name) as document:
+        line = document.newlinestring(name=name, description=json.dumps(_summary(plan), indent=1))
+        line.coords = [(lon, lat, plan.height_m) for lon, lat in lonlat]
+        line.altitudemode = simplekml.AltitudeMode.relativetoground
+        line.style.linestyle.width = 3
+        line.style.linestyle.color = simplekml.Color.orange
+        return str(document.kml())
 
 
 def _qgroundcontrol(plan: FlightPlan, lonlat: _LonLat, _name: str) -> str:
