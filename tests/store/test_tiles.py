@@ -1,5 +1,6 @@
 """The growing map behaves like a dict of tiles, whatever is evicted, written, dropped or shared."""
 
+import errno
 import tempfile
 from pathlib import Path
 
@@ -62,6 +63,39 @@ def test_growing_tiles_are_a_dict(steps: list[tuple[str, TileIndex, int]], limit
             assert set(tiles) == set(truth) and len(tiles) == len(truth)
         assert {key: int(tile[0, 0, 0]) for key, tile in tiles.items()} == truth
         blobs.sync()
+
+
+def test_a_tile_that_could_not_be_written_is_still_to_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads write; what fails there is raised by who asks next, and nothing is lost by it."""
+    blobs = TileBlobs(tmp_path / "tiles")
+    tiles = GrowingTiles(blobs, {}, 16, 2 * 16 * 16 * 4)
+    painted = {(column, 0): np.full((16, 16, 4), 40 + column, np.uint8) for column in range(12)}
+    is_full, keep = True, TileBlobs.keep
+
+    def full_at_times(self: TileBlobs, data: bytes) -> str:
+        if is_full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return keep(self, data)
+
+    monkeypatch.setattr(TileBlobs, "keep", full_at_times)
+    failed = 0
+    for index, tile in painted.items():
+        try:
+            tiles[index] = tile
+        except OSError:
+            failed += 1
+    with pytest.raises(OSError, match="No space"):
+        tiles.save()
+    assert failed
+    is_full = False
+    for index, tile in painted.items():
+        if index not in tiles:  # it was being set when another one's failure was raised
+            tiles[index] = tile
+    assert set(tiles.save()) == set(painted)
+    for index, tile in painted.items():
+        np.testing.assert_array_equal(tiles[index], tile)
 
 
 def test_tiles_read_lately_are_kept_until_they_are_removed(tmp_path: Path) -> None:

@@ -74,8 +74,7 @@ class _Wishes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. The exit code: 0 success, 1 an error (one line on stderr), 2 wrong usage, 130 stopped."""
-    # before NumPy is loaded: BLAS's own threads wait for each other over our small matrices, beside threads of ours, and
-    # results would differ in their last bits with the number of cores
+    # before NumPy is loaded: BLAS's threads only wait for each other over our small matrices (decision 0033)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
     try:

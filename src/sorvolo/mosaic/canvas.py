@@ -7,6 +7,7 @@ images.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -88,6 +89,7 @@ class Canvas:
         self._painted_before: set[int] = set()
         self._within = within
         self._fillings: dict[int, ImageRGB] = {}
+        self._warping = ThreadPoolExecutor(1, thread_name_prefix="warping")
         self._bounded: set[TileIndex] = set()  # chunks where painted frames win what the map showed, no more
         for frame in painted:
             self._add(frame)
@@ -288,7 +290,7 @@ class Canvas:
             return left, top, share
 
         labels = winners_from_shares(((number, *share_of(each)) for number, each in enumerate(ids)), height, width)
-        picture = blend(labels, self._layers(ids, labels, x, y))
+        picture = blend(labels, self._one_ahead(self._layers(ids, labels, x, y)))
         if self._known is not None and apron > WINDOW_APRON_PX:
             lasting = self._known.lasting(x, y, x + width, y + height) & (labels >= 0)
             picture = settled(picture, self._stored(x, y, width, height), lasting)
@@ -296,6 +298,16 @@ class Canvas:
         alpha = (labels[inner, inner] >= 0).view(np.uint8) * np.uint8(255)
         rgba = cv2.merge([*cv2.split(picture[inner, inner]), alpha])
         return cv2.copyTo(rgba, alpha)  # type: ignore[return-value]
+
+    def _one_ahead(self, layers: Iterator[Layer]) -> Iterator[Layer]:
+        """The layers, each read and warped while the one before it is blended."""
+        coming = self._warping.submit(next, layers, None)
+        try:
+            while (layer := coming.result()) is not None:
+                coming = self._warping.submit(next, layers, None)
+                yield layer
+        finally:  # nobody else reads pictures meanwhile
+            wait([coming])
 
     def _layers(self, ids: list[int], labels: Winners, x: int, y: int) -> Iterator[Layer]:
         for number, each in enumerate(ids):

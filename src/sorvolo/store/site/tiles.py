@@ -4,6 +4,7 @@ import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,8 @@ from sorvolo.store.site.names import checked_sha256, is_sha256
 from sorvolo.store.site.origin import Origin
 
 _CACHE_BYTES = 96 << 20  # the tiles of a map of some hectares, which half a dozen exports read one after the other
+_WRITERS = 2  # threads that encode tiles
+_WRITTEN_AT_ONCE = 4  # tiles that wait for them beyond the memory's bound, or are with them
 
 
 class TileBlobs:
@@ -88,14 +91,15 @@ class TileBlobs:
 
     def sync(self) -> None:
         """Wait until every blob written so far is on the disk."""
-        for folder in {self._path(sha256).parent for sha256 in self._unsynced}:
+        written = self._unsynced.copy()  # threads may be adding to it
+        for folder in {self._path(sha256).parent for sha256 in written}:
             for path in folder.iterdir():
-                if path.stem in self._unsynced:
+                if path.stem in written:
                     sync_file(path)
             sync_file(folder)
-        if self._unsynced:
+        if written:
             sync_file(self._folder)
-        self._unsynced.clear()
+        self._unsynced -= written
 
     def remove(self, hashes: Collection[str]) -> None:
         """Delete blobs that no version refers to."""
@@ -181,7 +185,8 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
     """The tiles of the version that is being made: copy-on-write over an earlier version, bounded in memory.
 
     Tiles come out read-only; a changed one has to be set. Setting a fully transparent tile removes it. Blobs
-    are written when memory runs out and in `save`, so a tile repainted ten times a second is encoded once.
+    are written when memory runs out and in `save`, so a tile repainted ten times a second is encoded once; threads
+    encode them, and what fails there is tried again, and raised, by whoever asks next.
     """
 
     def __init__(
@@ -195,11 +200,17 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self._changed: set[TileIndex] = set()  # since the last `save`
         self._superseded: set[str] = set()
         self._bytes = 0
+        self._writers = ThreadPoolExecutor(_WRITERS, thread_name_prefix="tiles")
+        self._writing: dict[TileIndex, tuple[ImageRGBA, Future[str]]] = {}  # with the writers, the oldest first
 
     def __getitem__(self, index: TileIndex) -> ImageRGBA:
         if index in self._loaded:
             self._loaded.move_to_end(index)
             return self._loaded[index]
+        if index in self._writing:
+            tile, _ = self._writing[index]
+            self._keep(index, tile)
+            return tile
         sha256 = self._hashes[index]
         try:
             tile = self._blobs.load(sha256)
@@ -218,6 +229,7 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
             if index in self:
                 del self[index]
             return
+        self._settle(index)
         self._unsaved.add(index)
         self._changed.add(index)
         self._keep(index, frozen(rgba, np.uint8))
@@ -236,23 +248,25 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self._changed.add(index)
 
     def _let_go(self, index: TileIndex) -> None:
+        self._settle(index)
         dropped = self._loaded.pop(index, None)
         self._bytes -= 0 if dropped is None else dropped.nbytes
         self._unsaved.discard(index)
 
     def __iter__(self) -> Iterator[TileIndex]:
-        return iter(self._hashes.keys() | self._unsaved)
+        return iter(self._hashes.keys() | self._unsaved | self._writing.keys())
 
     def __len__(self) -> int:
-        return len(self._hashes.keys() | self._unsaved)
+        return len(self._hashes.keys() | self._unsaved | self._writing.keys())
 
     def __contains__(self, index: object) -> bool:
-        return index in self._hashes or index in self._unsaved
+        return index in self._hashes or index in self._unsaved or index in self._writing
 
     def save(self) -> dict[TileIndex, str | None]:
         """Write every unsaved tile; return the hashes of tiles changed since the last call, None: removed."""
         for index in sorted(self._unsaved):
             self._write(index)
+        self._settle_all()
         changed = {index: self._hashes.get(index) for index in self._changed}
         self._changed.clear()
         return changed
@@ -264,6 +278,7 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
 
     def take_back(self) -> None:
         """Undo every change: the tiles are the earlier version's again."""
+        self._settle_all()
         for index in self._unsaved | {each for each in self if self._hashes.get(each) != self._base.get(each)}:
             del self[index]
         for index in self._base.keys() - self._hashes.keys():
@@ -272,6 +287,7 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
 
     def take_superseded(self) -> set[str]:
         """Hashes that this version no longer uses; the caller knows whether another version does."""
+        self._settle_all()
         superseded = self._superseded - set(self._hashes.values())
         self._superseded = set()
         return superseded
@@ -287,8 +303,34 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
             self._bytes -= self._loaded.pop(oldest).nbytes
 
     def _write(self, index: TileIndex) -> None:
-        self._replace_hash(index, self._blobs.save(self._loaded[index]))
+        """Give a tile to the writers."""
+        tile = self._loaded[index]
+        self._writing[index] = tile, self._writers.submit(self._blobs.save, tile)
         self._unsaved.discard(index)
+        while len(self._writing) > _WRITTEN_AT_ONCE:
+            self._settle(next(iter(self._writing)))
+
+    def _settle(self, index: TileIndex) -> None:
+        """Wait until a tile that the writers have is written."""
+        if index not in self._writing:
+            return
+        tile, written = self._writing.pop(index)
+        try:
+            try:
+                sha256 = written.result()
+            except OSError:  # there may be room by now
+                sha256 = self._blobs.save(tile)
+            self._replace_hash(index, sha256)
+        except BaseException:  # a full disk, Ctrl-C: it is still to be written
+            if index not in self._loaded:
+                self._loaded[index] = tile
+                self._bytes += tile.nbytes
+            self._unsaved.add(index)
+            raise
+
+    def _settle_all(self) -> None:
+        for index in list(self._writing):
+            self._settle(index)
 
     def _replace_hash(self, index: TileIndex, sha256: str | None) -> None:
         former = self._hashes.pop(index, None)
