@@ -138,6 +138,10 @@ def test_a_site_is_deleted_once_its_name_is_typed(browser: Any, made_site: Path,
     shutil.copytree(made_site, tmp_path / "field")
     shutil.copytree(made_site, tmp_path / "other")
     with Served(tmp_path) as station:
+        watch_run(station.station, "fee1", "field")  # whose record goes with the site
+        record = Run("fee1", "watch", "field", "finished", "ada", "2026-05-01T10:00:00Z", "2026-05-01T10:01:00Z")
+        with station.station.state.changing() as connection:
+            connection.execute("UPDATE runs SET record = ?", (json.dumps(asdict(record)),))
         looking, deleting = (Watched(browser.new_context(), station.url) for _ in range(2))
         show(looking, station)
         page = deleting.page
@@ -158,7 +162,7 @@ def test_a_site_is_deleted_once_its_name_is_typed(browser: Any, made_site: Path,
         looking.page.locator(".message.error", has_text="This site is gone").wait_for()
         expect(looking.page.locator(".card")).to_have_count(1)
         assert not (tmp_path / "field").exists() and (tmp_path / "other").exists()
-        assert deleting.faults == []
+        assert looking.faults == deleting.faults == []
         with Archive.open(tmp_path / "other", write=True):
             page.get_by_role("button", name="Delete other").click()
             page.locator(".message.error", has_text="another program writes the site").wait_for()

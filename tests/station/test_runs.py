@@ -228,6 +228,18 @@ def waiting(runs: Runs, run: Run, program: str) -> Run:
     return run
 
 
+def test_a_watch_that_is_stopped_keeps_what_it_found_and_states_that_it_was(tmp_path: Path) -> None:
+    simulate_into(tmp_path / "flown", small_flight(5, length_m=60, fps=8))
+    with TestClient(station_app(StationSettings(tmp_path, free_floor_gb=0.0)), base_url=HOST) as client:
+        run = client.post("/api/runs", json=wish(client, "watch", model="default-int8")).json()
+        path = f"/api/runs/{run['id']}"
+        wait_for(lambda: client.get(path).json()["progress"])
+        client.post(f"{path}/stop")
+        done = ended(client, run["id"])
+    assert done["state"] == "finished" and done["headline"].startswith("stopped before the flight's end: ")
+    assert done["progress"]["frames"] < done["progress"]["frames_expected"]
+
+
 DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(60)"
 
 

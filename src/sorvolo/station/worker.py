@@ -92,6 +92,7 @@ class _Stop:
     def __init__(self, is_live: bool) -> None:
         self.until = threading.Event()
         self.why = ""  # it is stopped although nobody asked for that
+        self.cuts_short = False  # a recorded flight was not searched to its end
         self._is_live = is_live
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self._take)
@@ -107,6 +108,7 @@ class _Stop:
         if self._is_live and not self.until.is_set():
             self.until.set()
             return
+        self.cuts_short = True
         raise KeyboardInterrupt
 
 
@@ -129,6 +131,8 @@ def main(folder: Path) -> int:
         words = _words_of(error, orphaned, order.source)
         journal.end(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
         return _WRONG
+    if stop.cuts_short:  # a watch keeps what it found
+        headline = f"stopped before the flight's end: {headline}"
     if why:
         journal.end(FINISHED, {"exit_code": TO_CHECK, "error": None, "headline": f"incomplete: {why}. {headline}"})
         return TO_CHECK

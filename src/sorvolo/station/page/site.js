@@ -104,10 +104,11 @@ class SiteScreen {
     if (!this.closed) this.opened?.refresh?.();
   }
 
-  async reload({ site }) {
+  async reload({ site, type }) {
     if (site !== this.data.id) return;
     try {
-      if (this.data.detail.is_new && !(await isMade(site))) return; // its first mission failed
+      // its first mission failed, or the records of its missions go because it does
+      if ((this.data.detail.is_new || type === "run.deleted") && !(await isMade(site))) return;
       const wasNew = this.data.detail.is_new || !this.data.detail.bounds_wgs84;
       await this.data.loadDetail();
       await this.data.load();
