@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -173,6 +174,48 @@ def test_a_stream_whose_actor_dies_goes_on_in_the_same_folder(cluster: Any, flow
     assert (row.state, row.tries, report.crashes) == (State.DONE, 2, 1)
     assert row.words == "1 car found in 4 frames"
     assert [path.name for path in (tmp_path / "out" / "north-watch").iterdir()] == ["one"]
+
+
+def _hold_a_machine_at_work(cluster: Any, root: Path) -> tuple[Any, list[int]]:
+    """Wait for a flight with a journal, and hold all of its machine: no connection breaks, and nothing answers."""
+    while True:
+        time.sleep(0.02)
+        for node in list(cluster.worker_nodes):
+            raylet = node.all_processes["raylet"][0].process.pid
+            below = descendants({raylet})
+            if any(list(site.glob("flights/*/run.journal")) for pid in below for site in written_sites(pid, root)):
+                for pid in (held := [raylet, *below]):
+                    os.kill(pid, signal.SIGSTOP)
+                threading.Timer(200, _let_go, [held]).start()  # a batch that waits for it is to end, too
+                return node, held
+
+
+def _let_go(held: list[int]) -> None:
+    for pid in held:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+
+
+@pytest.mark.long  # it waits for Ray to count a machine as dead, which takes a minute
+def test_a_machine_that_is_cut_off_does_not_hold_up_the_batch(cluster: Any, flown: Path, tmp_path: Path) -> None:
+    """As behind a cut cable. What it may still write keeps the flight's next try waiting, until it is gone."""
+    for name in ("one", "two", "three"):
+        another(flown, tmp_path / "in" / name)
+    root, found = tmp_path / "maps", []
+    settings = BatchSettings(FlightWish(camera=str(flown / "camera.xml"), model="none"))
+    holder = ThreadPoolExecutor(1).submit(_hold_a_machine_at_work, cluster, root)
+    for update in run_batch(
+        [tmp_path / "in"], root, settings, lambda table: ray_executor("ray", None, 60.0, table.root)
+    ):
+        if update.row is not None:
+            found.append((update.row.state, update.row.words))
+        if update.row is not None and "does not answer" in update.row.words:
+            _let_go(holder.result()[1])  # it is reached again, and Ray ends it
+    assert (State.WAITING, "its machine does not answer any more") in found
+    assert sum(state is State.DONE for state, _ in found) == 3
+    cluster.remove_node(holder.result()[0], allow_graceful=False)
+    cluster.add_node(num_cpus=1)
+    assert not list(root.glob(".tmp-*"))
 
 
 @pytest.mark.long

@@ -83,7 +83,7 @@ def why_not(name: str, error: Exception) -> str:
     if name.startswith(SCHEME):
         return (
             f"what listens there accepts no Ray client ({words}): a cluster with a token (set RAY_AUTH_MODE=token and "
-            "RAY_AUTH_TOKEN_PATH), or no Ray"
+            "RAY_AUTH_TOKEN_PATH), one that is too busy or has just lost a machine (try again in a minute), or no Ray"
         )
     return f"no Ray cluster answers: {words}"
 

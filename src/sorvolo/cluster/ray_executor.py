@@ -6,6 +6,8 @@ off.
 
 import importlib.util
 import os
+import secrets
+import shutil
 import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -35,6 +37,7 @@ from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, sea
 from sorvolo.cluster.table import LOCK
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.memory import MemorySettings
+from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
 
 T = TypeVar("T")
 Key = tuple[str, str]
@@ -83,6 +86,9 @@ class RayExecutor:
         self._ray: Any = ray
         self._name, self._workers, self._stall_s, self._root = name, workers, stall_s, str(root.resolve())
         self._running: dict[Key, Any] = {}
+        self._begun = root.resolve() / f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-begun"  # on the shared disk
+        self._begun.mkdir()
+        self._notes: dict[Key, Path] = {}  # there: on which machine a try has begun
         self._actors: dict[Key, Any] = {}  # of those that are live
         self._asked_found: dict[Key, Any] = {}  # answers of theirs that are on their way
         self._taken: dict[Key, int] = {}  # how much of what they found was taken
@@ -133,11 +139,17 @@ class RayExecutor:
                 wait_s = timeout_s or WAITS.ending_s
                 demand_head(self._head)
                 ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=wait_s)
+                if not ended and (lost := self._asked(self._lost)) is not None:
+                    del self._running[lost]
+                    self._notes.pop(lost).unlink(missing_ok=True)
+                    return lost, Ending(Outcome.CRASHED, "its machine does not answer any more")
                 if not ended and timeout_s is not None:
                     return None
             key = next(each for each, task in self._running.items() if task == ended[0])
         ending, found = self._asked(lambda: self._ending(ended[0]))
         del self._running[key]
+        if (note := self._notes.pop(key, None)) is not None:
+            note.unlink(missing_ok=True)
         if (actor := self._actors.pop(key, None)) is not None:
             self._asked_found.pop(key, None)
             self._last_found += [(key, words) for words in found[self._taken.pop(key):]]
@@ -149,6 +161,7 @@ class RayExecutor:
 
         What a cluster ran that is gone ends with its machines' Ray, at the latest a minute after the head.
         """
+        shutil.rmtree(self._begun, ignore_errors=True)
         if self._is_gone:
             return
         with suppress(Exception):  # of a cluster that is gone, nothing runs
@@ -173,8 +186,21 @@ class RayExecutor:
             actor = self._ray.remote(_LiveTry).options(max_concurrency=3, max_restarts=0, **asked).remote()
             self._actors[key], self._running[key], self._taken[key] = actor, actor.run.remote(*given), 0
             return
-        name = f"sorvolo {Path(order.source).name}"
-        self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
+        name, note = f"sorvolo {Path(order.source).name}", self._begun / secrets.token_hex(6)
+        task = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given, str(note))
+        self._running[key], self._notes[key] = task, note
+
+    def _lost(self) -> Key | None:
+        """A try on a machine that Ray counts as dead.
+
+        Ray ends it by itself only when the connection to it breaks: where a cable was cut, not for minutes.
+        """
+        there = {each["NodeID"] for each in working_machines(self._ray)}
+        for key, note in self._notes.items():
+            with suppress(FileNotFoundError):  # it has not begun
+                if note.read_text() not in there:
+                    return key
+        return None
 
     def _taken_found(self) -> list[tuple[Key, str]]:
         found: list[tuple[Key, str]] = []
@@ -337,10 +363,17 @@ class _LiveTry:
 
 
 def _try(
-    order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]
+    order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str], note: str
 ) -> tuple[Ending, list[str]]:
-    """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker, as of `_LiveTry`."""
+    """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker, as of `_LiveTry`.
+
+    The file `note` then names the machine.
+    """
+    import ray
+
     _demand_fit(root, version)
+    with suppress(StoreError):  # of a batch that has ended
+        atomic_write_bytes(Path(note), ray.get_runtime_context().get_node_id().encode(), durable=False)
     if not Path(order.source).exists():
         host = socket.gethostname()
         raise StoreError(f"the machine {host} does not have {order.source}; flights need the same path on all machines")
