@@ -258,8 +258,11 @@ class BucketEnd:
                 lacking.append(file)
         return lacking
 
-    def put(self, file: SiteFile, stream: BinaryIO) -> None:
-        """Store a file under its content's name. Raises DamagedError for bytes of another SHA-256 than the file's."""
+    def put(self, file: SiteFile, stream: BinaryIO) -> bool:
+        """Store a file under its content's name; False where it is stored.
+
+        Raises DamagedError for bytes of another SHA-256 than the file's.
+        """
         digest, size = hashlib.sha256(), 0
         with _beside(stream) as (here, kept):
             for chunk in chunks_of(stream):
@@ -268,9 +271,11 @@ class BucketEnd:
                 kept(chunk)
             refuse_damaged(file, digest.hexdigest())
             named = SiteFile(file.path, size, digest.hexdigest())
-            if self._round.stored.get(key_of(named)) != size and self._round.claim(key_of(named)):
+            is_new = self._round.stored.get(key_of(named)) != size
+            if is_new and self._round.claim(key_of(named)):
                 self._objects.write(key_of(named), here)
             self._round.files[file.path] = named
+        return is_new
 
     def conclude(self, state: SiteState) -> None:
         """Make everything that was put the site. Raises StoreError where another writer was faster."""

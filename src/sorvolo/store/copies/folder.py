@@ -158,8 +158,8 @@ class FolderEnd:
         """The files that have yet to be put: not here, or of another size or time."""
         return [each for each in state.files.values() if not self._has(each)]
 
-    def put(self, file: SiteFile, stream: BinaryIO) -> None:
-        """Write a file whole or not at all. Raises DamagedError for bytes with another SHA-256 than the file's."""
+    def put(self, file: SiteFile, stream: BinaryIO) -> bool:
+        """Write a file whole or not at all; True. Raises DamagedError for bytes of another SHA-256."""
         path = self.folder / file.path
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -173,6 +173,7 @@ class FolderEnd:
             refuse_damaged(file, digest.hexdigest())
             if file.stamp:
                 os.utime(temporary, ns=(file.stamp, file.stamp))
+        return True
 
     def conclude(self, state: SiteState) -> None:
         """Make the folder this state of the site: the catalogue last; then remove files that are not in the state."""

@@ -50,8 +50,8 @@ class SiteEnd(Protocol):
         """The files that have yet to be put."""
         ...
 
-    def put(self, file: SiteFile, stream: BinaryIO) -> None:
-        """Write a file; raises DamagedError for bytes of another SHA-256 than the file's."""
+    def put(self, file: SiteFile, stream: BinaryIO) -> bool:
+        """Write a file, unless its bytes are there: False. Raises DamagedError for those of another SHA-256."""
         ...
 
     def conclude(self, state: SiteState) -> None:
@@ -88,6 +88,9 @@ class CopyOutcome:
     newest: int
     faults: Mapping[str, str]
     left_out: tuple[str, ...] = ()
+
+
+_THERE = "there"  # of a file: found only by its bytes, where an interrupted copy left them
 
 
 @dataclass
@@ -142,19 +145,18 @@ def _move(
     def move(file: SiteFile) -> str:
         try:
             with source.opened(file) as stream:
-                target.put(file, stream)
+                return "" if target.put(file, stream) else _THERE
         except FileNotFoundError:
             return "gone"
         except DamagedError:
             return "damaged"
-        return ""
 
     for file, fault in in_parallel(move, files, threads):
         if fault == "gone":
             gone.add(file.path)
-        elif fault:
+        elif fault not in ("", _THERE):
             counts.faults[file.path] = fault
-        else:
+        elif not fault:
             counts.copied += 1
             counts.copied_bytes += file.size
         done, done_bytes = done + 1, done_bytes + file.size
