@@ -331,7 +331,8 @@ def _started(executor: str, flown: Path, folder: Path) -> "subprocess.Popen[str]
     )
     table, end_s = folder / "maps" / "batch.jsonl", time.monotonic() + 90
     while not (table.exists() and '"running"' in table.read_text()):
-        assert process.poll() is None and time.monotonic() < end_s
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < end_s
         time.sleep(0.02)
     return process
 
