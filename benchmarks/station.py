@@ -245,7 +245,7 @@ async def viewed(url: str, seen: Seen) -> None:
                 if isinstance(item, bytes):
                     note(seen.pictures, seen.taken_s.get(int.from_bytes(item[:8], "big", signed=True)))
                 elif (words := json.loads(item))["type"] == "motion":
-                    note(seen.motion, seen.taken_s.get(words["pts_us"]))
+                    note(seen.motion, taken_s_of(seen, words["pts_us"]))
                 elif words["type"] == "boxes":
                     note_boxes(seen, words["pts_us"], words.get("classes"))
 
@@ -292,7 +292,7 @@ async def shown(url: str, seen: Seen, event: dict[str, Any]) -> None:
 
 def note_boxes(seen: Seen, pts_us: int, classes: list[str] | None) -> None:
     """A picture's boxes: of some classes, or of all."""
-    taken_s = seen.taken_s.get(pts_us)
+    taken_s = taken_s_of(seen, pts_us)
     for name in CLASSES if classes is None else classes:
         if classes is not None or name not in seen.early.get(pts_us, ()):
             note(seen.of_class[name], taken_s)
@@ -300,6 +300,12 @@ def note_boxes(seen: Seen, pts_us: int, classes: list[str] | None) -> None:
         note(seen.boxes, taken_s)
     else:
         seen.early[pts_us] = classes
+
+
+def taken_s_of(seen: Seen, pts_us: int) -> float | None:
+    """When the picture of a message was taken, whose time went through UTC and telemetry's zero: to 2 ms."""
+    nearest = min(seen.taken_s, key=lambda each: abs(each - pts_us), default=None)
+    return None if nearest is None or abs(nearest - pts_us) > 2000 else seen.taken_s[nearest]
 
 
 def note(found: list[tuple[float, float]], taken_s: float | None) -> None:
