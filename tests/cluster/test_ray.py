@@ -285,6 +285,7 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
             "another version of Ray or Python than this machine (Ray 2.60",
         ),
         (ConnectionError("ray client connection timeout"), "a cluster with a token (set RAY_AUTH_MODE=token"),
+        (ConnectionError("Initialization failure from server:\nTraceback"), "one that is too busy or has just lost"),
         (RuntimeError("Invalid authentication token"), "the cluster needs another token"),
     ],
 )

@@ -32,6 +32,7 @@ from sorvolo.store.site.catalogue_place import (
 from sorvolo.store.site.database import ConnectionLostError
 from sorvolo.store.site.journal import Entry
 from sorvolo.store.site.migrations.upgrade import upgrade
+from sorvolo.store.site.postgres_database import PostgresDatabase
 
 PASSWORD = "c0rrect-horse"
 
@@ -354,6 +355,13 @@ def test_a_disk_of_the_server_that_fills_costs_one_flight(
         filler.unlink()
         map_flight(archive, "c", 90, count=1)
         assert [each.id for each in archive.flights()] == [*kept, "c"]
+
+
+def test_a_server_so_full_that_nobody_can_connect_is_named_as_full() -> None:
+    url = parsed_url("postgresql://sorvolo@127.0.0.1/small")
+    assert url is not None
+    error = PostgresDatabase(url, "sorvolo_x", write=True)._unreachable("FATAL:  could not write init file")
+    assert str(error).startswith("disk full: could not write postgresql://127.0.0.1/small")
 
 
 @pytest.mark.parametrize(
