@@ -3,6 +3,7 @@
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from sorvolo.capture.live.addresses import FollowedPath, StreamAddress, is_live_address, live_address
+from sorvolo.capture.live.backlog import Backlog
 from sorvolo.capture.live.clock import StreamClock, Tie
 from sorvolo.capture.live.frame_queue import Arrived, FrameQueue
 from sorvolo.capture.live.links import SentenceBuffer, is_link
@@ -215,3 +217,35 @@ def test_bad_sentences_are_counted_and_noise_is_not_kept() -> None:
         buffer.take(b"\xff\x00" * 500, UTC)
     assert +counts == {"bad_checksum": 1, "unreadable_line": 2}
     assert [is_link(text) for text in ("serial:/dev/x", "udp://:1", "log.nmea", "a/tcp")] == [True, True, False, False]
+
+
+def decoded_of(step_s: float, jumps: Callable[[float], float] = lambda sent_s: 0.0) -> list[tuple[float, float, bool]]:
+    """Of 60 s of 30 packets a second, a key frame each second, when each was sent, its delay, and if it was decoded,
+    which takes `step_s`; `jumps` is what the way takes longer by when it is sent."""
+    backlog, now_s, found = Backlog(), 0.0, []
+    for index in range(1800):
+        sent_s = index / 30
+        now_s = max(now_s, sent_s + 0.2 + jumps(sent_s))  # what waits is read at once
+        is_decoded = backlog.decodes(round(sent_s * S), is_key=index % 30 == 0, now_s=now_s)
+        found.append((sent_s, now_s - sent_s, is_decoded))
+        now_s += step_s if is_decoded else 1e-4
+    return found
+
+
+def test_a_computer_too_slow_for_a_stream_shows_what_is_new() -> None:
+    found = decoded_of(step_s=0.05)
+    decoded = [each for each in found if each[2]]
+    assert max(delay_s for _, delay_s, _ in decoded) < 2.0, "24 s without leaving anything out"
+    assert len(decoded) > 0.4 * len(found)
+    taken_up = [sent_s for (sent_s, _, now), (_, _, before) in zip(found[1:], found[:-1], strict=True) if now > before]
+    assert taken_up and all(sent_s % 1 == 0 for sent_s in taken_up), "with key frames"
+
+
+def test_a_computer_that_is_fast_enough_decodes_everything() -> None:
+    assert all(is_decoded for _, _, is_decoded in decoded_of(step_s=0.02))
+    # the link stands still for 8 s, then all that waited comes at once
+    after_outage = decoded_of(step_s=0.02, jumps=lambda sent_s: max(0.0, 28.0 - sent_s) if sent_s >= 20 else 0.0)
+    assert all(is_decoded for sent_s, _, is_decoded in after_outage if sent_s < 20 or sent_s > 31)
+    # a way that takes 3 s longer from now on is no backlog
+    longer = decoded_of(step_s=0.02, jumps=lambda sent_s: 3.0 if sent_s >= 20 else 0.0)
+    assert all(is_decoded for sent_s, _, is_decoded in longer if sent_s < 20 or sent_s > 22)

@@ -14,6 +14,7 @@ from live_sender import EPOCH_NS, RATE, free_port, number_of, sending, sending_a
 from rtsp_server import RtspServer
 
 from sorvolo.capture.live.addresses import StreamAddress, live_address
+from sorvolo.capture.live.reader import StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import open_sources, opened_sources
@@ -180,6 +181,30 @@ def test_the_newest_frame_wins_where_the_flight_is_watched() -> None:
     assert source.skipped >= frame.index + 1 - len(late_s)  # every frame that was not given on is counted
     assert np.median(late_s) < 0.3  # however slow the detector: it is given what came last, not what waited meanwhile
     assert "skipped_frame" in [notice.code for notice in source.notices()]
+
+
+def test_a_stream_that_is_decoded_too_slowly_is_shown_as_it_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half the rate can be decoded: after ten seconds what is seen would be five seconds old, and ever older."""
+    take, port = StreamReader._take, free_port()
+
+    def slow_take(self: StreamReader, packet: Any) -> bool:
+        time.sleep(0.0 if packet.stream.type == "data" else 2.0 / RATE)
+        return take(self, packet)
+
+    monkeypatch.setattr(StreamReader, "_take", slow_take)
+    late_s: dict[int, float] = {}
+    with sending(udp_url(port), klv=True) as sender:
+        source = open_live(f"udp://:{port}", LiveSettings(silent_s=2.0))
+        began_s = time.monotonic()
+        for _, frame in source.arrivals(every_frame):
+            index = round((frame.time_ns - EPOCH_NS) / S * RATE)
+            late_s[index] = time.monotonic() - sender.sent_s[index]
+            if time.monotonic() - began_s > 10.0:
+                break
+        source.close()
+    assert max(late_s.values()) < 3.5, late_s
+    (left_out,) = [notice for notice in source.notices() if notice.code == "behind"]
+    assert left_out.count > 10 and len(late_s) > 20
 
 
 def test_frames_of_another_size_are_fitted_and_of_another_shape_lost() -> None:

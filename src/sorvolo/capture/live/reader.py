@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import av
 
 from sorvolo.capture.live.addresses import StreamAddress
+from sorvolo.capture.live.backlog import Backlog
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import klv_streams
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
@@ -69,7 +70,8 @@ class StreamReader:
     A connection that gives no packet for `silent_s` is closed and opened anew, with growing pauses where it has to be
     dialled. The stream has ended when nothing came for `give_up_s`. `refused` is then the reason, where the other side
     will not have us (a wrong name or password) and trying again is no use. `file` opens what is read instead of the
-    address: a file that grows.
+    address: a file that grows. Where the newest frames are wanted rather than all, and they come faster than they can
+    be decoded, some are left out up to a key frame.
     """
 
     def __init__(
@@ -106,6 +108,10 @@ class StreamReader:
             *self.outages.notices(),
             *notice("decode_error", counts["packet"], "damaged places in the stream, skipped: {}"),
             *notice("damaged_frame", counts["frame"], "frames damaged in part: {}"),
+            *notice(
+                "behind", counts["behind"],
+                "frames that came faster than this computer decodes them, left out up to the next key frame: {}",
+            ),
             *notice("missing_pts", counts["missing"], "frames without a time stamp, set by the usual step: {}"),
         ]
 
@@ -148,13 +154,15 @@ class StreamReader:
                 self._step_ns = round(SECOND_NS / float(video.average_rate or video.guessed_rate or 25))
                 # frames in threads would hold several back; a stripe each does not
                 video.thread_type = "SLICE"
+                backlog = Backlog()
                 for packet in container.demux([video, *metadata]):
                     if self._stop.is_set():
                         return came
                     if not packet.size:
                         continue
                     self._note_heard(is_first=not came)
-                    came |= self._take(packet)
+                    if self._is_wanted(packet, backlog):
+                        came |= self._take(packet)
             self._lost("the sender ended the stream")
         except (av.FFmpegError, OSError, ValueError, IndexError, MemoryError) as error:
             self._lost(self._why(error))
@@ -190,6 +198,15 @@ class StreamReader:
         if is_first or now_s - self._heard_s < self._settings.silent_s or self._file is not None:
             self._heard_s = now_s
             self.outages.back()
+
+    def _is_wanted(self, packet: Any, backlog: Backlog) -> bool:
+        """Whether a packet is looked at; video that is not is counted."""
+        if packet.stream.type == "data" or self._settings.keeps_all:
+            return True
+        stamp_ns = _stamp_of(packet, packet.time_base, by_order=True)
+        decodes = backlog.decodes(stamp_ns, is_key=packet.is_keyframe, now_s=time.monotonic())
+        self._counts["behind"] += not decodes
+        return decodes
 
     def _take(self, packet: Any) -> bool:
         """Give on what is in a packet; whether a frame was."""
@@ -245,6 +262,8 @@ def _facts_of(container: Any, video: Any, metadata: list[Any]) -> StreamFacts:
     return StreamFacts(video.codec_context.name, name, float(rate) if rate else 25.0, bool(metadata))
 
 
-def _stamp_of(timed: Any, time_base: Any) -> int | None:
-    stamp = timed.pts if timed.pts is not None else timed.dts
+def _stamp_of(timed: Any, time_base: Any, *, by_order: bool = False) -> int | None:
+    """When a picture is shown or, `by_order`, decoded."""
+    first, second = (timed.dts, timed.pts) if by_order else (timed.pts, timed.dts)
+    stamp = second if first is None else first
     return None if stamp is None or not time_base else round(stamp * time_base * SECOND_NS)
