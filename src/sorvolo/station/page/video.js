@@ -98,6 +98,7 @@ class VideoPane {
     socket.binaryType = "arraybuffer";
     this.socket = socket;
     this.heard_at = performance.now();
+    this.cameAlive = false; // pictures came by this connection
     this.show = this.fmp4 ? new SegmentPlayer(this.player, (pts_us) => this.shown(pts_us), (pts_us) => { this.newest = { pts_us, at: performance.now() }; }) : new FramePlayer(this.canvas, (pts_us) => this.shown(pts_us), () => this.hold_s());
     this.canvas.hidden = this.fmp4;
     this.player.hidden = !this.fmp4;
@@ -120,7 +121,7 @@ class VideoPane {
       this.ahead_us = (asked_us + Date.now() * 1000) / 2 - state.time_us;
       if (state.is_connected) {
         this.screen.live.heard(state.telemetry);
-        if (quiet_s > DEAD_S && this.socket) this.connect();
+        if (quiet_s > DEAD_S && this.cameAlive) this.connect();
       } else if (state.flights.at(-1)?.is_over) this.off("ended");
     } catch { /* the connection's own sign shows it */ }
   }
@@ -139,6 +140,7 @@ class VideoPane {
     const pts_us = this.fmp4 ? null : Number(new DataView(data).getBigInt64(0));
     if (pts_us !== null) this.newest = { pts_us, at: performance.now() };
     this.isOff = false;
+    this.cameAlive = true;
     this.heard_at = performance.now();
     this.show.take(this.fmp4 ? new Uint8Array(data) : new Uint8Array(data, STAMP_BYTES), pts_us);
   }
