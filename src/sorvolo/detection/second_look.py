@@ -53,15 +53,15 @@ def looked_again(
     `hows` names for labels how their reports are looked at again; others keep their score. Reports below `least` are
     not looked at and count as not seen again, so that they stay behind those that were not.
     """
-    scores, unseen = seen.scores.copy(), np.array([settings.unseen])
-    weak = {
-        row: unseen for row, (score, label) in enumerate(zip(seen.scores.tolist(), seen.labels.tolist(), strict=True))
-        if label in hows and score < hows[label].least
-    }
-    for row, again in (weak | opinions(seen, picture, sees, hows, settings)).items():
-        how = hows[int(seen.labels[row])]
-        odds = how.shift + how.own * float(_odds(scores[row])) + how.again * float(_odds(again).mean())
-        scores[row] = 1 / (1 + math.exp(-odds))
+    scores, again_odds = seen.scores.copy(), np.full(len(seen.scores), _odds(settings.unseen))
+    looked_at = opinions(seen, picture, sees, hows, settings)
+    for row, again in looked_at.items():
+        again_odds[row] = _odds(again).mean()
+    for label, how in hows.items():
+        rows = (seen.labels == label) & (seen.scores < how.least)
+        rows[[row for row in looked_at if seen.labels[row] == label]] = True
+        odds = how.shift + how.own * _odds(scores[rows]) + how.again * again_odds[rows]
+        scores[rows] = 1 / (1 + np.exp(-odds))
     order = np.argsort(-scores, kind="stable")
     return Seen(seen.boxes_px[order], scores[order], seen.labels[order])
 
