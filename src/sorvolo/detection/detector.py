@@ -20,10 +20,7 @@ from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Labels
 from sorvolo.survey.flight import Notice
-from sorvolo.survey.objects import Detections
-
-Early = Callable[[tuple[str, ...], Detections], None]
-"""Is given some of the classes that are searched for, and what was found of them: all that will be."""
+from sorvolo.survey.objects import Detections, Early
 
 
 class Detector:

@@ -1,7 +1,8 @@
 """People, cars and small objects: seen in a picture, placed on the ground, and followed over time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
@@ -58,6 +59,10 @@ class Detections:
     def surest(self, most: int) -> "Detections":
         """At most this many rows, those of the highest scores first."""
         return self.only(np.argsort(-self.scores, kind="stable")[:most])
+
+
+Early: TypeAlias = Callable[[tuple[str, ...], Detections], None]
+"""Is given some of the classes that are searched for, and what was found of them: all that will be."""
 
 
 def no_detections(classes: Sequence[str]) -> Detections:

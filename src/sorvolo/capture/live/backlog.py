@@ -5,6 +5,9 @@ from dataclasses import dataclass
 
 from sorvolo.geometry.units import SECOND_NS
 
+STAMP_JUMP_NS = 10 * SECOND_NS
+"""By which a stream's time stamps may step forward; further, its sender began anew or set its clock."""
+
 
 @dataclass(frozen=True)
 class BacklogSettings:
@@ -14,7 +17,6 @@ class BacklogSettings:
     lately_s: float = 30.0  # the least delay of this time is what the stream itself takes
     looked_at_s: float = 0.5  # of packets that are left out: so long their stamps are held against the clock
     live_rate: float = 1.5  # stamps that run no faster than that come from the sender, not from what waited
-    jump_s: float = 10.0  # of time stamps, in which a sender began anew
 
 
 class Backlog:
@@ -28,7 +30,7 @@ class Backlog:
     def __init__(self, settings: BacklogSettings = BacklogSettings()) -> None:
         self._settings = settings
         self._delays_s: deque[tuple[float, float]] = deque()  # when, and how much: ever more, so the first is the least
-        self._stamp_s = float("nan")
+        self._stamp_ns: int | None = None
         self._leaves_out_since: tuple[float, float] | None = None  # the clock and the stamp
         self._has_caught_up = False
 
@@ -36,10 +38,9 @@ class Backlog:
         """Whether a packet that was read at `now_s` is to be decoded; without a stamp it shares the last one's fate."""
         if stamp_ns is None:
             return self._leaves_out_since is None
-        stamp_s = stamp_ns / SECOND_NS
-        if not abs(stamp_s - self._stamp_s) < self._settings.jump_s:
+        if self._stamp_ns is None or abs(stamp_ns - self._stamp_ns) >= STAMP_JUMP_NS:
             self._begin_anew()
-        self._stamp_s = stamp_s
+        self._stamp_ns, stamp_s = stamp_ns, stamp_ns / SECOND_NS
         behind_s = self._behind_s(now_s, now_s - stamp_s)
         if self._leaves_out_since is None:
             if behind_s > self._settings.most_behind_s:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import av
 
 from sorvolo.capture.live.addresses import StreamAddress
-from sorvolo.capture.live.backlog import Backlog
+from sorvolo.capture.live.backlog import STAMP_JUMP_NS, Backlog
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import klv_streams
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
@@ -22,7 +22,6 @@ from sorvolo.survey.flight import Notice
 
 _OPEN_S = 6.0  # to be dialled and looked at
 _LISTEN_S = 3.0  # a listener that nobody speaks to is opened anew so often, so that it can be stopped
-_STAMP_JUMP_NS = 10 * SECOND_NS
 REFUSALS = (
     av.error.ProtocolNotFoundError, av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError,
     av.error.HTTPNotFoundError, av.error.PermissionError,
@@ -235,7 +234,7 @@ class StreamReader:
         if stamp_ns is None:
             self._counts["missing"] += 1
             stamp_ns = self._stamp_ns + self._step_ns
-        elif self._stamp_ns >= 0 and not 0 < stamp_ns - self._stamp_ns < _STAMP_JUMP_NS:
+        elif self._stamp_ns >= 0 and not 0 < stamp_ns - self._stamp_ns < STAMP_JUMP_NS:
             self._listener.restarted()  # the sender began anew, or set its clock
         self._stamp_ns = stamp_ns
         return stamp_ns

@@ -1,12 +1,12 @@
 """What missions ask of a detector, so that a test's own or a plug-in's can stand in for Sorvolo's."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, Protocol
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import Notice
-from sorvolo.survey.objects import Detections
+from sorvolo.survey.objects import Detections, Early
 
 
 class ObjectDetector(Protocol):
@@ -37,7 +37,7 @@ class ObjectDetector(Protocol):
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        early: Callable[[tuple[str, ...], Detections], None] | None = None,
+        early: Early | None = None,
     ) -> Detections:
         """The objects in one picture, (H, W, 3), best first.
 

@@ -194,8 +194,7 @@ def _write_kmz(small: Picture, site_grid: SiteGrid, name: str, path: Path) -> No
     counts = -(-size // _KMZ_PIECE_PX)
     longitudes = np.linspace(west, east, counts[0] + 1)
     latitudes = np.linspace(north, south, counts[1] + 1)
-    images: dict[str, bytes] = {}
-    boxes: dict[str, tuple[str, tuple[float, float, float, float]]] = {}
+    pieces: list[tuple[str, str, tuple[float, float, float, float], bytes]] = []  # title, file, box, picture
     for row in range(counts[1]):
         for column in range(counts[0]):
             box = (longitudes[column], latitudes[row + 1], longitudes[column + 1], latitudes[row])
@@ -203,10 +202,9 @@ def _write_kmz(small: Picture, site_grid: SiteGrid, name: str, path: Path) -> No
             if not rgba[..., 3].any():
                 continue
             file = f"files/{name_safe(name)}_{row}_{column}.png"
-            boxes[file] = f"{name} {row}-{column}", box
-            images[file] = png_from_rgba(rgba)
+            pieces.append((f"{name} {row}-{column}", file, box, png_from_rgba(rgba)))
     with kml_from_one(name) as kml:
-        for file, (title, (west, south, east, north)) in boxes.items():
+        for title, file, (west, south, east, north), _ in pieces:
             overlay = kml.newgroundoverlay(name=title)
             overlay.icon.href = file
             overlay.latlonbox.west, overlay.latlonbox.south = wrapped_deg(west), south
@@ -215,7 +213,7 @@ def _write_kmz(small: Picture, site_grid: SiteGrid, name: str, path: Path) -> No
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         # without the time at which it was made: the same map gives the same bytes
         archive.writestr(zipfile.ZipInfo("doc.kml"), text, zipfile.ZIP_DEFLATED)
-        for file, data in images.items():
+        for _, file, _, data in pieces:
             archive.writestr(zipfile.ZipInfo(file), data, zipfile.ZIP_STORED)
 
 

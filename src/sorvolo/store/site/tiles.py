@@ -316,11 +316,9 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
             return
         tile, written = self._writing.pop(index)
         try:
-            try:
-                sha256 = written.result()
-            except OSError:  # there may be room by now
-                sha256 = self._blobs.save(tile)
-            self._replace_hash(index, sha256)
+            failed = written.exception()
+            # where the disk was full, there may be room by now
+            self._replace_hash(index, self._blobs.save(tile) if isinstance(failed, OSError) else written.result())
         except BaseException:  # a full disk, Ctrl-C: it is still to be written
             if index not in self._loaded:
                 self._loaded[index] = tile
