@@ -58,7 +58,7 @@ def test_what_is_far_too_short_for_its_class_is_set_aside():
         (one([400.0, 300.0], side_px=5.0 * window_px), PRIOR),
         (one([400.0, 300.0], "person", window_px), PRIOR),
         (one([window_px / 2 - 0.5, 300.0], side_px=window_px), PRIOR),  # the picture's edge cuts it
-        (one([400.0, 300.0], side_px=window_px), replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 60.0]))),
+        (one([400.0, 300.0], side_px=window_px), replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 40.0]))),
     ):
         sighting, unlocated = place(found, prior)
         assert sighting is not None and not unlocated

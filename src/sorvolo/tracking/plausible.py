@@ -16,7 +16,7 @@ TOO_SHORT_CUT_PX = 3.0
 class SizeSettings:
     """Which sizes a class may have."""
 
-    least_length: float = 0.5  # of its usual length, 2.2 m for cars, as the smallest sold: what is shorter is none
+    least_length: float = 0.4  # of its usual length: what is shorter is none, however sure the detector is
     most_width: float = 2.5  # times its largest dimension: what is wider is none; trucks are as wide as cars are long
     scale_sigmas: float = 2.0  # by which heights may be off before something is called too short or too wide
 
