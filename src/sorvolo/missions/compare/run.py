@@ -205,11 +205,12 @@ class CompareRun:
                 f"no frame of {self._setup.source.name} could be compared: {self._counts.commonest_reason}; is it "
                 "another place, another season, or night? `sorvolo inspect` shows what the flight holds"
             )
+        concluding = self._comparing.submit(self._found)  # which takes about as long as the map's extension
+        shown_as_well = self._extend_map()
         with self._log.stage(Stage.EVIDENCE):
-            found = self._found()
+            found = concluding.result()
             changes = self._reported(found)
         suppressed = len(found) - len(changes)
-        shown_as_well = self._extend_map()
         with self._log.stage(Stage.PAINT):
             if self._settings.updates_map:
                 paint_changes(changes, self._writer.tiles, self._archive.site_grid())

@@ -6,11 +6,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sorvolo.missions.simulate.ahead import in_order
 from sorvolo.missions.simulate.simulation_folder import PICTURES_MARK, simulation_description, simulation_folder
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.pictures import PictureSettings, SimulatedPicture, simulate_picture
 from sorvolo.simulation.truth import coco_categories
+from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.flight_files import read_orthophoto, write_json
 from sorvolo.store.images import jpeg_from_image
@@ -50,7 +50,8 @@ def simulate_pictures(
         with writing(folder):
             (partial / "images").mkdir()
         pictures = in_order(
-            lambda index: simulate_picture(settings, index, ground), settings.pictures, most_threads=_MOST_THREADS
+            lambda index: simulate_picture(settings, index, ground), range(settings.pictures),
+            most_threads=_MOST_THREADS,
         )
         for picture in pictures:
             row = _image_row(picture, settings.seed)

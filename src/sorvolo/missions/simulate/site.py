@@ -8,7 +8,6 @@ from typing import Any
 
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.missions.simulate.ahead import in_order
 from sorvolo.missions.simulate.simulation_folder import MARK, simulation_description, simulation_folder
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.ground import orthophoto_ground
@@ -23,6 +22,7 @@ from sorvolo.simulation.truth import (
     object_features,
 )
 from sorvolo.simulation.world import orthophoto
+from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import writing
 from sorvolo.store.exports.flight_files import (
     read_orthophoto,
@@ -97,14 +97,14 @@ def _write_flight(flight: SimulatedFlight, folder: Path) -> Iterator[int]:
         with writing(folder):
             (folder / "photos").mkdir()
         rows = _photo_rows(flight)
-        for frame in in_order(flight.frame, len(flight), most_threads=_MOST_THREADS):
+        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
             write_photo(folder / "photos" / frame.name, frame, flight.camera, rows[frame.index])
             yield frame.index + 1
         return
     size_px = flight.camera.width_px, flight.camera.height_px
     imaging, crf = flight.settings.imaging, flight.settings.output.crf
     with video_writer(folder / f"{flight.name}.mp4", size_px, imaging.fps, flight.started_ns, crf) as write:
-        for frame in in_order(flight.frame, len(flight), most_threads=_MOST_THREADS):
+        for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
             write(frame.image)
             yield frame.index + 1
 

@@ -26,6 +26,7 @@ from rasterio.windows import Window
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.grid import Grid, SiteGrid, TileIndex
+from sorvolo.store.ahead import in_order
 from sorvolo.store.atomic import atomic_path, scratch_folder, writing
 from sorvolo.store.images import shrink
 from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal, transform_on_grid
@@ -68,10 +69,10 @@ def write_cog(
 ) -> None:
     """Write the map as a Cloud Optimized GeoTIFF with alpha and overviews, in place of what was at `path`.
 
-    Tiles are read one at a time, and each is shown to `pass_by`. `crs` reprojects (bilinear); the site's own CRS is the
-    default, a local site has none. `compress` is one of COMPRESSIONS; JPEG has three bands and a mask. The file is read
-    back before it takes its place. Raises SettingsError for an unknown `crs` or `compress`, and StoreError for an empty
-    map, a full disk, or a file that reads back differently.
+    Tiles are read one at a time, a few ahead in a thread, and each is shown to `pass_by`. `crs` reprojects (bilinear);
+    the site's own CRS is the default, a local site has none. `compress` is one of COMPRESSIONS; JPEG has three bands
+    and a mask. The file is read back before it takes its place. Raises SettingsError for an unknown `crs` or
+    `compress`, and StoreError for an empty map, a full disk, or a file that reads back differently.
     """
     if not tiles:
         raise StoreError("the map has no tiles; there is nothing to write as GeoTIFF")
@@ -134,10 +135,10 @@ def _write_plain(
     verified = dict.fromkeys(_spread(sorted(tiles), _VERIFIED_BLOCKS), 0)  # and the CRC-32 of their pixels
     with rasterio.open(path, "w", **profile) as sink:
         sink.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
-        for index in sorted(tiles, key=lambda index: (index[1], index[0])):
+        by_row = sorted(tiles, key=lambda index: (index[1], index[0]))
+        for index, tile in zip(by_row, in_order(tiles.__getitem__, by_row, most_threads=1)):
             x0, y0, _, _ = grid.tile_window(index)
             window = Window(x0 - left, y0 - top, grid.tile_px, grid.tile_px)
-            tile = tiles[index]
             sink.write(_bands(tile), window=window)
             pass_by(index, tile)
             if index in verified:
