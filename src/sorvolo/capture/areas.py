@@ -31,8 +31,8 @@ CORRIDOR_M = 30.0
 """How far to either side of a path its area reaches: about half a frame's width from 50 m, so that frames
 taken along the path are kept although GPS is off by some metres."""
 
-_MOST_BYTES = 20_000_000
-_MOST_POLYGONS = 10_000
+_MOST_BYTES = 20_000_000  # a field's outline has kilobytes; by choice
+_MOST_POLYGONS = 10_000  # in one file; a field has a few; by choice
 # zipfile trusts the offsets in a file: a negative one is a ValueError, one beyond 63 bits an OverflowError
 _BROKEN_ZIP = (
     zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, OverflowError, zlib.error,

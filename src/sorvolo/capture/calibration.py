@@ -21,7 +21,7 @@ from sorvolo.survey.flight import CameraModel
 GUESSED_AOV_DEG = 70.0
 """Horizontal angle of view of a camera that nothing is known of: the middle of most drones' 62 to 84 deg."""
 
-_FULL_FRAME_DIAGONAL_MM = 43.267
+_FULL_FRAME_DIAGONAL_MM = 43.267  # of 36 x 24 mm, which focal lengths "in 35 mm" are of
 _BETTER = "give --camera FILE, or make one with `sorvolo calibrate`"
 
 

@@ -21,7 +21,7 @@ from sorvolo.geometry.arrays import Floats
 
 Node: TypeAlias = float | str | Floats
 
-_MOST_BYTES = 4_000_000
+_MOST_BYTES = 4_000_000  # a camera file has kilobytes; by choice
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.?(?:inf|nan)", re.IGNORECASE)
 
 

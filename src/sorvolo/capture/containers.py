@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import BinaryIO
 
-_TS_PACKET_BYTES = 188
-_MOST_BOXES = 100_000
+_TS_PACKET_BYTES = 188  # ISO/IEC 13818-1
+_MOST_BOXES = 100_000  # at the top of an MP4; a fragmented one has two a fragment; by choice
 _EBML_UNKNOWN_SIZES = frozenset((1 << 7 * length) - 1 for length in range(1, 9))
 
 

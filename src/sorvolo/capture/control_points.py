@@ -23,7 +23,7 @@ LEAST_POINTS = 3
 """Fewer cannot show that one of them is wrong."""
 
 _KIND, _NEEDED = "control point file", "a CRS in the first line, then x y z px py image a line"
-_MOST_BYTES = 10_000_000
+_MOST_BYTES = 10_000_000  # some hundred thousand lines; by choice
 _PROJ_KEYS = frozenset({
     "proj", "zone", "south", "ellps", "datum", "units", "to_meter", "no_defs", "type", "lat_0", "lon_0", "lat_1",
     "lat_2", "lat_ts", "k", "k_0", "x_0", "y_0", "a", "b", "rf", "towgs84", "axis", "gamma", "alpha", "lonc",

@@ -24,6 +24,7 @@ _DISTORTION_KEYS = (
 _WIDTH_KEYS = ("imagewidth", "imgwidth", "framewidth", "widthpx", "width")
 _HEIGHT_KEYS = ("imageheight", "imgheight", "frameheight", "heightpx", "height")
 _SIZE_KEYS = ("imagesize", "imgsize", "framesize", "size", "resolution")
+# of cameras and videos on the market; a guessed size is rounded to one
 _COMMON_WIDTHS_PX = (
     640, 720, 800, 848, 960, 1024, 1280, 1440, 1600, 1920, 2000, 2048, 2704, 2720, 3840, 4000, 4032, 4056,
     4096, 5280, 5472, 6016, 8000, 8192,

@@ -28,7 +28,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.units import KM_AN_HOUR_M_S, KNOT_M_S, MILE_AN_HOUR_M_S
 
 _Tags: TypeAlias = Mapping[int, Any]
-_XMP_TAG = 700
+_XMP_TAG = 700  # TIFF's number (XMP specification, part 3)
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 # the EXIF FocalPlaneResolutionUnit: inch, centimetre, millimetre, micrometre
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}

@@ -21,11 +21,11 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
-_LOOK_AHEAD = 1
+_LOOK_AHEAD = 1  # photos decoded while one is worked on; each takes tens of megabytes
 _STEP_NS = 1_000_000  # between photos of the same second
-_UNTIMED_STEP_NS = 1_000_000_000
+_UNTIMED_STEP_NS = 1_000_000_000  # between photos that state no time: their order is kept, a second each by choice
 _QUARTER_TURN = 6  # EXIF's number for clockwise
-_EDGE_BYTES = 65_536
+_EDGE_BYTES = 65_536  # of a photo's beginning and end, by which a copy of it is recognised; by choice
 _EXIF_UTC = "UTC in the photos' EXIF"
 
 

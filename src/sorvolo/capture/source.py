@@ -37,7 +37,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
 
-_HEAD_BYTES = 262_144
+_HEAD_BYTES = 262_144  # of a file, by which a flight is recognised again; by choice
 _SITE_MARKS = ("site.db", "site-catalogue.json")  # in a folder whose pictures are a map, no photos
 
 LiveSource = LiveStream | GrowingFolder

@@ -34,7 +34,7 @@ VIDEO_SUFFIXES = frozenset({
 })
 """How videos in a folder are recognised; a file given by name may have any name."""
 
-_FALLBACK_RATE_HZ = 25.0
+_FALLBACK_RATE_HZ = 25.0  # of a video that states none: PAL's
 
 
 @dataclass(frozen=True)

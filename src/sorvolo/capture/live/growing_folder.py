@@ -24,9 +24,9 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, TimesNs
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
-_POLL_S = 0.25
+_POLL_S = 0.25  # photos are seconds apart; by choice
 _ENDS = (b"\xff\xd9", b"IEND")  # of a JPEG, of a PNG
-_TAIL_BYTES = 32
+_TAIL_BYTES = 32  # of a file, which hold the mark of its end and what a camera appends; by choice
 
 
 class GrowingFolder:

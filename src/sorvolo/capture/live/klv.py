@@ -12,8 +12,8 @@ UNIVERSAL_KEY = bytes.fromhex("060E2B34020B01010E01030101000000")
 
 TIME_TAG, CHECKSUM_TAG, VERSION_TAG = 2, 1, 65
 
-_LONGEST_SET_BYTES = 65_536
-_LONGEST_KEY_BYTES = 4
+_LONGEST_SET_BYTES = 65_536  # MISB ST 0601's sets have hundreds; by choice
+_LONGEST_KEY_BYTES = 4  # of a BER-OID tag: 28 bits, far more than ST 0601 needs
 
 
 @dataclass(frozen=True)

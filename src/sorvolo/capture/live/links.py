@@ -20,10 +20,10 @@ from sorvolo.survey.flight import Notice
 LINK_FORMS = "serial:/dev/ttyUSB0?baud=9600, tcp://HOST:PORT, udp://:PORT or follow:LOG"
 """What a link looks like, for messages."""
 
-_DEFAULT_BAUD = 9600
+_DEFAULT_BAUD = 9600  # of many receivers; NMEA 0183 itself has 4800
 _POLL_S = 0.1  # a sentence that nothing follows for so long ends its moment
-_CALL_S = 3.0
-_LONGEST_LINE = 4096
+_CALL_S = 3.0  # for a connection to be made; by choice
+_LONGEST_LINE = 4096  # bytes; NMEA 0183 has 82 at most, receivers a few hundred; by choice
 
 
 class Wire(Protocol):

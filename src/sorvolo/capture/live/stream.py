@@ -41,7 +41,7 @@ _FIRST_FIXES_S = 10.0  # waited for them; then the flight begins without
 _CLOCKS_AGREE_NS = 5_000_000_000  # further apart, one of the two clocks was set wrong; by choice
 _DELAYS_KEPT = 60  # of the newest fixes, whose least delay ties the clocks: a minute at one a second
 _ZOOMED = 0.03  # relative change of the field of view: more than its rounding in the metadata
-_POLL_S = 0.25
+_POLL_S = 0.25  # how soon an end is noticed; by choice
 _TIMELY_NS = 5_000_000  # a frame so little before its turn is taken: the next one comes a whole frame later
 
 

@@ -12,7 +12,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, TimesNs
 from sorvolo.survey.flight import TELEMETRY_COLUMNS, Notice, Telemetry, no_telemetry
 
-_FIRST_ROWS = 1024
+_FIRST_ROWS = 1024  # some minutes at 5 Hz; then it doubles
 _PLACE = TELEMETRY_COLUMNS.index("latitude_deg")
 
 

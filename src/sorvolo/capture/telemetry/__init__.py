@@ -11,7 +11,7 @@ from sorvolo.survey.flight import Telemetry
 LARGEST_FILE_BYTES = 500_000_000
 """A telemetry file beyond this is some other file; a day at 10 Hz with 60 columns is a tenth of it."""
 
-_HEAD_BYTES = 65_536
+_HEAD_BYTES = 65_536  # of a file, by which its format is recognised; a flight table's header has thousands
 _SUFFIXES = (".srt", ".csv", ".nmea", ".gpx", ".log", ".txt", ".tsv", ".gps", ".dat")
 _VIDEO_SUFFIXES = frozenset(
     (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m2ts", ".mts", ".m4v", ".webm", ".mpg", ".mpeg")

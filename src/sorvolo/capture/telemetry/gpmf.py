@@ -32,9 +32,8 @@ FORMAT = "gpmf"
 """The name that `Telemetry.format` carries."""
 
 _CODES = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "j": "q", "J": "Q", "f": "f", "d": "d"}
-_HEAD_BYTES = 8
-_DEEPEST = 8
-_MOST_ITEMS = 100_000
+_HEAD_BYTES = 8  # of an item: key, type, size, repeats
+_MOST_ITEMS = 100_000  # of one level; far more than GoPro writes; by choice
 _EPOCH_2000_NS = 946_684_800 * SECOND_NS
 _DAY_S = 86_400
 _DATED_S = (1.2e9, 7e9)  # 2008 to 2191: GoPro's first camera with GPS is of 2016
