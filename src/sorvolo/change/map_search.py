@@ -31,23 +31,23 @@ class SearchSettings:
     """How far frames are searched around their telemetry, and what counts as found; pixels are those of the search."""
 
     margin: float = 0.25  # of the frame's size: map searched beyond each side
-    frame_points: int = 2048
-    map_points: int = 4096
+    frame_points: int = 2048  # learned features of a frame, the strongest ...
+    map_points: int = 4096  # ... and of the map around, which shows more ground
     rim_px: int = 15  # window of known ground that a point of the map stands in
     most_scale: float = 1.35  # heights of consumer drones err by a fifth
     coarse_px: float = 6.0  # band of the first fit
     near_px: float = 24.0  # pairs around the first fit that compete for the second
     band_px: float = 5.0  # band of the final fit: 1 m from 100 m, what maps differ by locally
-    least_pairs: int = 20
+    least_pairs: int = 20  # that agree; chance leaves fewer
     weak_pairs: int = 10  # of a place that something else must confirm ...
     weak_ratio: float = 1.6  # ... and its least ratio
     first_ratio: float = 4.0  # times the pairs that chance leaves in the band; other ground leaves 0.3 to 2.8
     least_ratio: float = 2.5  # the same once the flight is known to lie on this map
     least_surplus: float = 3.0  # beside a neighbour, whose place is known: standard deviations above chance
-    neighbours: int = 3
+    neighbours: int = 3  # placed frames nearest in time, beside which a frame is tried
     most_kept: int = 200  # frames remembered: 0.2 MB each
     strong_ratio: float = 5.0  # frames that correct the flight's telemetry have so many times chance's pairs
-    least_strong: int = 3
+    least_strong: int = 3  # frames; by choice
     odd: float = 4.0  # sigmas off telemetry: a homography that swings
 
 

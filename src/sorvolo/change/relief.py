@@ -14,7 +14,7 @@ class ReliefSettings:
     """How finely rays are followed to what stands on the ground."""
 
     coarser: int = 4  # pixels of a picture, either way, for which one ray is followed
-    most_steps: int = 60
+    most_steps: int = 60  # of a ray through the surface; by choice
     least_m: float = 0.3  # lower things move by less than the comparison's own reach
     same_m: float = 0.5  # heights that differ by less are the same surface
 

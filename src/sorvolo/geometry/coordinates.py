@@ -10,7 +10,7 @@ from sorvolo.geometry.geodesy import Projection, utm_epsg
 _BANDS = "CDEFGHJKLMNPQRSTUVWX"  # of latitude, 8 deg each from 80 S; the last has 12
 _COLUMNS = ("ABCDEFGH", "JKLMNPQR", "STUVWXYZ")  # of 100 km squares, in zones 1, 2, 3, 4 (as 1) ...
 _ROWS = "ABCDEFGHJKLMNPQRSTUV"  # repeat every 2,000 km; even zones begin at F
-_SQUARE_M = 100_000
+_SQUARE_M = 100_000  # MGRS's squares of 100 km
 
 
 class Coordinates(StrEnum):

@@ -11,7 +11,7 @@ from pyproj.exceptions import CRSError
 from sorvolo.errors import GeometryError, SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM
 
-_SEMI_MAJOR_M = 6378137.0
+_SEMI_MAJOR_M = 6378137.0  # WGS84's defining figures, this and the next
 _FLATTENING = 1 / 298.257223563
 _ECCENTRICITY2 = _FLATTENING * (2 - _FLATTENING)
 

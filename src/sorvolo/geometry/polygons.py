@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, PointsM
 
-_MOST_HULL_CORNERS = 1000
+_MOST_HULL_CORNERS = 1000  # what follows takes the square of their number
 _HULL_TOLERANCE = 1e-6  # of the extent, where a hull has more corners than that
 _LOCATION = re.compile(r"\[(\S+) (\S+)\]$")
 

@@ -10,7 +10,7 @@ M_PER_DEG_LATITUDE = 111_320.0
 """A degree of latitude on the ground, right to 0.6 %: enough for search distances and for the rounding of a fix."""
 
 KNOT_M_S = 1852 / 3600
-MILE_AN_HOUR_M_S = 0.44704
+MILE_AN_HOUR_M_S = 0.44704  # exactly: 1609.344 m in an hour
 KM_AN_HOUR_M_S = 1 / 3.6
 
 SECOND_NS = 1_000_000_000

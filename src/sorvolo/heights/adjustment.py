@@ -28,7 +28,7 @@ class AdjustmentSettings:
     radial_sigma: tuple[float, float] = (0.02, 0.02)  # of third and fifth order
     centre_sigma: float = 0.01  # of the optical centre, in focal lengths
     attitude_sigma_deg: float = 3.0  # of all the map's attitudes in common: they lean where the ground is not level
-    iterations: int = 25
+    iterations: int = 25  # at most; by choice
     least_sigma_px: float = 0.1  # of a feature's place, however well all fit
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats32, ImageRGBA
 from sorvolo.heights.surface import Surface
 
-_LONGEST_PX = 1600
+_LONGEST_PX = 1600  # a screen's width; by choice
 _SUN = np.array([-0.5, 0.5, 0.7]) / np.linalg.norm([-0.5, 0.5, 0.7])
 
 

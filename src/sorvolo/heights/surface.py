@@ -27,7 +27,7 @@ class SurfaceSettings:
     sweep: SweepSettings = field(default_factory=SweepSettings)
     coarse: SweepSettings = field(default_factory=lambda: _NARROW)  # to find what heights a tile has
     coarser: int = 2  # cells of the first sweep, in those of the model
-    tile_cells: int = 320
+    tile_cells: int = 320  # side of a tile: with its apron it fits the memory of a small computer
     tile_share: float = 0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
     apron_cells: int = 10  # beyond a tile, so that neighbouring tiles agree: more than half a patch
     coarse_apron_cells: int = 5  # of the first sweep, whose patches are smaller

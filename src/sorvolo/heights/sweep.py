@@ -37,7 +37,7 @@ class SweepSettings:
     pair_share: float = 0.5  # of the pairs of photos that see a cell: the others may be hidden from it
     noise_levels: float = 3.0  # gray levels; texture below it decides nothing
     level_px: float = 0.8  # parallax between two planes, of the two photos farthest apart
-    most_levels: int = 160
+    most_levels: int = 160  # planes of one sweep: bounds time and memory
     least_score: float = 0.1  # of agreement, 0 to 1, below which a cell stays a hole
     smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
 

@@ -21,7 +21,7 @@ class TerrainSettings:
     cell_m: float = 0.5  # the filter's own cells, at least
     widest_m: float = 30.0  # of a building or a grove
     slope: float = 0.2  # of the ground, at most
-    least_height_m: float = 0.3
+    least_height_m: float = 0.3  # above the ground around: lower things are ground
 
 
 def terrain(lattice: Lattice, up_m: Floats32, settings: TerrainSettings = TerrainSettings()) -> tuple[Floats32, Mask]:

@@ -23,7 +23,7 @@ class TrackSettings:
     features: int = 2500  # a picture
     ratio: float = 0.8  # Lowe's
     inlier_px: float = 1.5  # about the epipolar line
-    least_inliers: int = 20
+    least_inliers: int = 20  # matches of two photos; by choice
     least_overlap: float = 0.15  # of two views that are matched
     neighbours: int = 14  # views matched with each at most
     margin: float = 0.2  # of a picture: features so far beside what two views share on level ground may be shared too

@@ -17,7 +17,7 @@ from sorvolo.survey.findings import HeightChange
 class VolumeSettings:
     """How two dates are tied to each other, and how errors of cells add up."""
 
-    rounds: int = 6
+    rounds: int = 6  # of a robust fit
     clip_sigmas: float = 3.0  # of the spread: what changed outside the area does not tie
     block_m: float = 5.0  # errors of a height model hold on for about as long
     least_stable: int = 500  # cells

@@ -32,7 +32,7 @@ from sorvolo.mosaic.blending import (
 from sorvolo.mosaic.canvas_frame import CELL_PX, CanvasFrame, cell_merits, coverage, warp
 from sorvolo.mosaic.known_ground import SETTLING_PX, KnownGround, settled
 
-_CHUNK_CELLS = 64
+_CHUNK_CELLS = 64  # a side: cells are looked up in blocks, so that an endless map needs no array
 _NOBODY = -1  # in place of a frame's number
 _FILLINGS = 32  # kept: each has a 64th of its picture's pixels
 # A changed winner is felt as far as the bands spread (62 px) and its outline is smoothed (2 cells) around it.

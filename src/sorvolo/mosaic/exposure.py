@@ -31,8 +31,8 @@ class ExposureSettings:
     gain_sigma: float = 0.15  # prior about gain 1: keeps the whole map from drifting along a chain of links
     vignette_sigma: float = 0.3  # prior about no vignette: where radii do not differ it stays at 0
     colour_sigma: float = 0.03  # least spread of a point's colour: noise, texture and misplacement
-    points_per_link: int = 48
-    largest_gain: float = 2.0
+    points_per_link: int = 48  # colours of the ground that both pictures show
+    largest_gain: float = 2.0  # a picture that would need more is left darker; by choice
 
     def __post_init__(self) -> None:
         if min(self.gain_sigma, self.vignette_sigma, self.colour_sigma, self.points_per_link) <= 0:

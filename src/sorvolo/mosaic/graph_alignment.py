@@ -19,7 +19,7 @@ class AlignmentSettings:
     most_uncertain: float = 0.15  # relative, of scale and turn by these fixes: beyond, they leave them open
     least_sigmas: float = 3.0  # of scale or turn, or ...
     least_scale: float = 0.02  # ... relative, ...
-    least_turn_rad: float = 0.03
+    least_turn_rad: float = 0.03  # 1.7 degrees
     times_nearer: float = 3.0  # known ground: the places have to come so much nearer
 
 

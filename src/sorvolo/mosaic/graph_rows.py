@@ -15,7 +15,7 @@ from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
 _UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
-_FIRST_ROOM = 16
+_FIRST_ROOM = 16  # rows; then they double
 
 
 class _Columns:

@@ -32,7 +32,7 @@ class OffsetSettings:
 class PoseGraphSettings:
     """What the graph may move and when it solves."""
 
-    pairs_per_link: int = 40
+    pairs_per_link: int = 40  # matches that stand for a link, spread over it
     independent_pairs: float = 20.0  # matches of one link share lens and relief errors: they count as so many
     sigma_px: float = 0.3  # floor of a match's noise; calibration and rolling shutter never are better
     window: int = 6  # recent keyframes freed by each local solve

@@ -31,7 +31,7 @@ from sorvolo.mosaic.blending import fill_invalid
 from sorvolo.registration.features import gray_from_rgb
 from sorvolo.survey.named_values import named_values, positive_number, whole_number
 
-_CHUNK_PX = 1024
+_CHUNK_PX = 1024  # by which the picture grows: fewer copies for some empty ground
 
 MosaicOffset: TypeAlias = tuple[int, int]
 """Mosaic coordinates (x, y) of the picture's pixel (0, 0); the mosaic frame is the first frame's pixels."""
@@ -45,12 +45,12 @@ class RoiStitchingSettings:
     akaze_threshold: float = 8e-5  # OpenCV's 1e-3 finds next to nothing on low-contrast ground
     max_features: int = 6000  # the strongest, in frame and region each: matching costs their product
     matching: Literal["cross-check", "ratio"] = "cross-check"  # both read "only identical patterns match"
-    ratio: float = 0.8
+    ratio: float = 0.8  # Lowe's (2004)
     transform: Literal["similarity", "homography"] = "similarity"  # homography: the thesis's Figure 3.12a
-    ransac_px: float = 3.0
+    ransac_px: float = 3.0  # OpenCV's own for homographies
     min_inliers: int = 12
     roi_frames: float = 3.0  # side of the region, in frames ("three times the size of a frame")
-    bands: int = 5
+    bands: int = 5  # OpenCV's own of its blender
     largest_px: int = 300_000_000  # of the whole picture: beyond, a frame was surely misplaced
 
     def __post_init__(self) -> None:

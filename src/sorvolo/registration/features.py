@@ -19,8 +19,8 @@ class FeatureSettings:
     """How many points are looked for, and on what."""
 
     detection_side_px: int = 640  # longest side for ORB: pairs are refined at full size, so coarse is enough
-    orb_count: int = 700
-    sift_count: int = 2500
+    orb_count: int = 700  # points of a picture, the strongest
+    sift_count: int = 2500  # points where ORB fails: SIFT is slower and surer
     corner_count: int = 150  # points that a link is refined on
     corner_cells: int = 12  # a corner quota per cell of this many columns keeps them spread
 

@@ -27,7 +27,7 @@ class LinkSettings:
     features: FeatureSettings = field(default_factory=FeatureSettings)
     min_inliers: int = 18  # below this a wrong homography is not rare
     threshold_px: float = 3.0  # inlier band of the first fit; trees' parallax stays inside
-    refine_window_px: int = 15
+    refine_window_px: int = 15  # side of the patch around a corner (Lucas and Kanade)
     refine_reach_px: float = 8.0  # a refined point may leave the first fit by this much
     max_pairs: int = 40  # pairs kept per link, spread over the overlap
     min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit

@@ -19,7 +19,7 @@ class PlaceSettings:
 
     most_scale: float = 40.0  # between the two pictures' pixels
     band_px: float = 6.0  # of pairs that agree: the map's own errors and the ground's relief
-    least_pairs: int = 16
+    least_pairs: int = 16  # that agree
     least_share: float = 0.08  # of the pairs; chance leaves a hundredth
     turn_deg: float = 30.0  # learned features bear half of it
     step: float = 1.35  # from scale to scale, of which they bear half as well

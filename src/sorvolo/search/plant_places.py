@@ -18,7 +18,7 @@ class PlaceSettings:
     """How long places are searched for."""
 
     tries: int = 40  # cells for one plant, until there is no room for it in a round
-    most_rounds: int = 40
+    most_rounds: int = 40  # by choice: a map without room ends
 
 
 @dataclass(frozen=True, eq=False)

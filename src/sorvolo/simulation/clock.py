@@ -12,7 +12,7 @@ from sorvolo.simulation.settings import DEFAULT_ORIGIN, SimulationSettings
 
 _FIRST_NS = 1_775_133_840 * 10**9  # 2026-04-02 12:44 UTC at the default origin; elsewhere at the same solar time
 _YEAR_DAYS = 365  # so long after a flight, at the same hour, the sun stands where it stood within 0.1 degrees
-_STEP_NS = 60 * 10**9
+_STEP_NS = 60 * 10**9  # the minute in which a flight begins is drawn
 
 
 @dataclass(frozen=True)

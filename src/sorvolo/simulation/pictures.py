@@ -25,7 +25,7 @@ from sorvolo.simulation.world import Day, World, build_day, is_free, scenery
 SMALLEST_PX = 4
 """An object whose box has no side this long, or of which less than `LEAST_VISIBLE` shows, is a region to ignore."""
 
-LEAST_VISIBLE = 0.3
+LEAST_VISIBLE = 0.3  # share of an object; less is not to be recognised; by choice
 
 _SIZES_PX = ((640, 640), (960, 540), (832, 624), (768, 768))
 _THERMAL_SIZE_PX = (640, 512)  # of the common sensors

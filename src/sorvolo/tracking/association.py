@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from sorvolo.geometry.arrays import Floats, PointsM, Rows
 from sorvolo.tracking.motion import Motions
 
-_NEVER = -1e6
+_NEVER = -1e6  # a logarithm of odds that adds nothing beside any other
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight, LocateSetting
 from sorvolo.tracking.scene_scale import SceneScale
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
-_MOST_DRONE_PLACES = 200_000
+_MOST_DRONE_PLACES = 200_000  # frames: an hour and fifty minutes at 30 a second; by choice
 _GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since its pictures measure tilt; here nothing else does
 _LEAST_DOWN = 0.1  # of the optical axis: nearer to the horizon a sampling distance means nothing
 _OVER_MODEL = LocateSettings(ground_sigma_m=1.0)  # of a height model, where it stands on its own

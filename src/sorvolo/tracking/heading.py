@@ -14,7 +14,7 @@ class HeadingSettings:
 
     window_s: float = 20.0  # of the way that is laid on the fixes
     least_m: float = 6.0  # of way, rms: less is within the fixes' own errors
-    least_sigma_deg: float = 4.0
+    least_sigma_deg: float = 4.0  # however well the way fits
     steps_per_error: float = 8.0  # neighbouring fixes, and neighbouring frames' tilts, err alike
 
 
@@ -26,7 +26,7 @@ class CompassSettings:
     least_way_m: float = 15.0  # a shorter one counts less: the fixes wander
     gain_per_s: float = 0.3  # of what is seen
     learns_s: float = 15.0  # after that the way back over the map moves the shift
-    most_deg: float = 15.0
+    most_deg: float = 15.0  # corrected at most: a compass that is off by more is broken
     broken_s: float = 10.0  # a gap in time after which it begins anew
 
 

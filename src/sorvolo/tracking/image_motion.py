@@ -19,7 +19,7 @@ class FlowSettings:
     width_px: int = 480  # of the pictures in which motion is looked for
     points: int = 180  # that are followed, ...
     least_points: int = 90  # ... new ones where fewer are left
-    window_px: tuple[int, int] = (17, 17)
+    window_px: tuple[int, int] = (17, 17)  # around a point that is followed (Lucas and Kanade)
     levels: int = 4  # of smaller pictures, for longer steps
     there_and_back_px: float = 0.7  # points that miss by more on the way back are left out
     fit_px: float = 1.5  # a point that agrees lies so near
@@ -33,9 +33,9 @@ class ImageMotionSettings:
 
     failures: int = 4  # pictures in a row after which the way is lost
     cut_likeness: float = 0.2  # of small thumbnails: less is another scene
-    thumbnail_px: tuple[int, int] = (32, 18)
+    thumbnail_px: tuple[int, int] = (32, 18)  # columns, rows of those thumbnails
     box_sigma: float = 0.08  # of a box's middle, in shares of its side
-    least_sigma_px: float = 1.0
+    least_sigma_px: float = 1.0  # however small the box
     drift_share: float = 0.004  # of the way gone over the ground, as one goes from points to new points
     guess_share: float = 0.3  # of a step that was guessed
     flow: FlowSettings = field(default_factory=FlowSettings)

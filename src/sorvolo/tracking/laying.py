@@ -19,8 +19,8 @@ class LayingSettings:
     """How well a detection's place on a map is known."""
 
     box_sigma: float = 0.06  # of a box's middle, in shares of its side
-    least_sigma_px: float = 1.0
-    least_sigma_m: float = 0.03
+    least_sigma_px: float = 1.0  # of a box's middle, however small the box
+    least_sigma_m: float = 0.03  # of a place, however fine the map
     height_sigma: float = 0.15  # of a class's usual height, along the lean
     aside: float = 0.4  # of what a cut box is off outwards: along the edge, where a slanting body's corner shows
     farthest: float = 6.0  # times the height: beyond it, a pixel's error is many metres

@@ -27,7 +27,7 @@ class LocateSettings:
     """How well the parts of a place are known, and what is too little to call it a place."""
 
     box_sigma_share: float = 0.08  # of a box's side: how far its middle is off the object's
-    least_box_sigma_px: float = 1.0
+    least_box_sigma_px: float = 1.0  # however small the box
     height_sigma_share: float = 0.35  # of half an object's height: people sit and lie, cars are vans
     ground_sigma_m: float = 0.0  # of the ground's height, beside what is in the camera's own height
     most_sigma_m: float = 50.0  # a place known no better is none

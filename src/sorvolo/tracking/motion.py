@@ -31,7 +31,7 @@ class TurnSettings:
     """How often objects start and stop."""
 
     starts_every_s: float = 60.0  # of one whose class moves half of the time; seldom movers start more seldom
-    stops_every_s: float = 60.0
+    stops_every_s: float = 60.0  # by choice, as starts
 
 
 HABITS = {

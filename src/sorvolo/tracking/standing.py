@@ -41,8 +41,8 @@ class BodySettings:
     """What is known of a class's bodies beside their usual sizes, in shares of these."""
 
     top: float = 0.85  # of a body's height: tops are narrower than feet
-    height_sigma: float = 0.3
-    size_sigma: float = 0.3
+    height_sigma: float = 0.3  # people stand, sit and lie
+    size_sigma: float = 0.3  # of length and width
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ class GatherThingSettings:
 
     cell_px: int = 3  # a cell's side, in pixels of the views
     most_cells: int = 12_000_000  # of the raster, which bounds its memory (190 MB): views beyond are left out
-    least_views: int = 2
+    least_views: int = 2  # what one view alone shows is not announced
     spreads: float = 1.2  # by which the views of a cell lie apart on the mean
     of_height: float = 0.6  # its outline runs where this part of what lies farthest apart in it is left
     own_spreads: float = 0.8  # from which on a view by itself agrees

@@ -29,7 +29,7 @@ _MOST_REASONS = 250  # a byte holds which one
 class CoverageSettings:
     """When a view's ground counts as compared."""
 
-    cell_m: float = 1.0
+    cell_m: float = 1.0  # a reader of coverage.geojson needs no finer; by choice
     least_views: int = 2  # as the evidence: what one view alone shows is not announced
     black: float = 14.0  # mean grey level of ground in whose shadow nothing can be seen
     least_sharpness: float = 0.5  # of the flight's usual one: a view with less is blurred

@@ -87,7 +87,7 @@ class EvidenceSettings:
     n: int = 5  # ... of the last ones that saw its ground
     least_views: int = 2  # where fewer than n ever see it
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and are no news
-    least_area_m2: float = 0.02
+    least_area_m2: float = 0.02  # 14 cm a side: smaller things are not looked for; by choice
     join_m: float = 0.3  # a smaller gap does not make two things of one
     single_view_score: float = 0.9  # what one view shows, and no other could, must be so sure, and confirmed: 0048
     gathering: GatherSettings = field(default_factory=GatherSettings)

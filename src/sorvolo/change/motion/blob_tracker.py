@@ -45,7 +45,7 @@ class SightingSettings:
 class MovingSettings:
     """When something counts as moving."""
 
-    least_views: int = 5
+    least_views: int = 5  # of a video
     least_photos: int = 3  # of views so far apart in time as photos are: chance seldom fits three of them
     least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
     least_lengths: float = 1.0  # of its own: then its places do not overlap, and nothing that grew explains it

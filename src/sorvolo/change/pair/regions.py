@@ -54,13 +54,13 @@ class RegionSettings:
     """What is looked at as a possible change. Lengths in px of the (half size) pictures."""
 
     reach_px: int = 2  # a value counts as known where it occurs this near in the other picture
-    chroma_weight: int = 2
+    chroma_weight: int = 2  # times a gray difference: ground that changes differs less in colour
     least_difference: float = 9.0  # grey levels, weak threshold where nothing disturbs
     noise_factor: float = 0.8  # of the frame's own 95 % quantile of differences
     activity_factor: float = 1.4  # of the mean difference around
     strong_factor: float = 1.5  # strong over weak threshold
     core: float = 0.45  # a region keeps what exceeds this part of its own height
-    least_area_px: int = 6
+    least_area_px: int = 6  # smaller ones are noise
     least_noise: float = 0.0  # what the flight shows elsewhere: a frame is not taken for quieter than this
     speck_px: int = 9  # small differences are clutter, which raises thresholds around; a large thing's inside is none
     most_clutter: float = 48.0  # grey levels that a small difference counts as clutter at most

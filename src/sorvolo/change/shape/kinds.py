@@ -22,7 +22,7 @@ _REPLACED_PRIOR = 0.5  # seldom does one thing leave where another comes; else s
 # light, with the thing's contrast shrunk to 45 %, and replaced by a thing of other colours
 _OWN = np.array([0.88, 0.39, 0.61, 1.53, 1.5, 0.17])  # of the date's own signs
 _OTHER = np.array([-0.32, -0.12, -0.3, -0.36, -0.4, 0.11])  # of the other date's
-_BIAS = 0.55
+_BIAS = 0.55  # of the same fit
 _LEVELS = np.arange(256, dtype=np.float32)
 
 
