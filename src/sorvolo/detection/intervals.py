@@ -12,7 +12,7 @@ import numpy as np
 from sorvolo.detection.metrics import IOUS, ClassMatch
 from sorvolo.geometry.arrays import Floats, Rows
 
-DRAWS = 1000
+DRAWS = 1000  # resamplings, the usual number for limits of 95 % (Efron and Tibshirani 1993)
 _RECALLS = np.linspace(0.0, 1.0, 101)
 _AT_ONCE = 200  # draws: the tables of all at once would be large
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Numbers
 
-_MOST_TEXT_BYTES = 1 << 28
-_MOST_DATA_BYTES = 3 << 29
-_MOST_ROWS = 100_000
+_MOST_TEXT_BYTES = 1 << 28  # settings and boxes as JSON, far more than any; by choice
+_MOST_DATA_BYTES = 3 << 29  # of pictures, 1.6 GB: a batch of the largest that a mission takes
+_MOST_ROWS = 100_000  # boxes of a batch; by choice
 _TYPES = {"boxes": np.float32, "scores": np.float32, "labels": np.int64, "pictures": np.int64}
 
 

@@ -23,7 +23,7 @@ class ProbeSettings:
     size_px: tuple[int, int] = (480, 640)  # of the middle, height and width: it costs as much as nine times its pixels
     times: tuple[float, ...] = (1.0, 2.0, 3.0)  # as large as it is
     first_again: int = 30  # frames until it is done again, then three times as many, and so on: drones climb
-    growth: int = 3
+    growth: int = 3  # times as many frames until the next
 
 
 class SceneMagnifier:

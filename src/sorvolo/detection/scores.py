@@ -28,7 +28,7 @@ from sorvolo.geometry.arrays import Counts, Floats, Rows
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
 
-_CURVE_POINTS = 200
+_CURVE_POINTS = 200  # of a curve that a page draws some hundred pixels wide
 
 
 @dataclass(frozen=True, eq=False)

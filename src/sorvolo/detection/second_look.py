@@ -26,7 +26,7 @@ class SheetSettings:
     """How cut-outs are laid side by side on one picture. Weights hold for the values that they were fitted with."""
 
     cell_px: int = 128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
-    columns: int = 8
+    columns: int = 8  # cut-outs in a row of the sheet
     share: float = 0.25  # of the picture's pixels that the sheet has at most; in a crowd the others keep their score
     cuts: tuple[int, int] = (8, 96)  # cut-outs of one picture, best reports first: at least so many may be, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object

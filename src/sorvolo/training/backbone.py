@@ -7,7 +7,7 @@ from torch.nn import functional
 
 from sorvolo.training.depthwise import depthwise
 
-_EPSILON = 1e-3
+_EPSILON = 1e-3  # of EfficientNet-Lite's batch norms
 _BLOCKS = (  # repeats, kernel, stride, growth, out channels
     (1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112), (4, 5, 2, 6, 192),
     (1, 3, 1, 6, 320),

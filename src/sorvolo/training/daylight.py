@@ -21,7 +21,7 @@ class JudgeSettings:
     levels: tuple[int, ...] = (1, 2)  # strides 8 and 16
     grown: tuple[float, ...] = (1.3, 2.0)  # the box and its surroundings, in sides of the box
     cells: tuple[int, ...] = (4, 3)  # pooled to this many cells a side
-    width: int = 48
+    width: int = 48  # channels of its layers; by choice
 
 
 class Judge(nn.Module):
@@ -66,9 +66,9 @@ class DaylightSettings:
     """The class that NanoDet finds too, and what is reported in the end."""
 
     person: int = 0
-    most: int = 300
-    suppress_iou: float = 0.5
-    least_score: float = 0.02
+    most: int = 300  # detections of one picture
+    suppress_iou: float = 0.5  # of two boxes of a class that overlap more, the better one stays
+    least_score: float = 0.02  # thresholds are far above
 
 
 class Daylight(nn.Module):

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 _CANONICAL_PX = 56.0  # a box of this size is looked at on the level of stride 8 (Lin et al. 2017, eq. 1)
-_SAMPLES = 2
+_SAMPLES = 2  # a side of a cell, averaged: Mask R-CNN's four points (He et al. 2017)
 
 
 class _RoiAlign(torch.autograd.Function):

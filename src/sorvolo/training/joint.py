@@ -25,9 +25,9 @@ class JointSettings:
     steps: int = 8000
     batch: int = 4
     rate: float = 1e-3  # of AdamW for the new parts, at its height
-    backbone_rate: float = 2e-4
-    decay: float = 0.02
-    warm_steps: int = 200
+    backbone_rate: float = 2e-4  # a fifth for what is trained already
+    decay: float = 0.02  # of AdamW's weights
+    warm_steps: int = 200  # over which the rate rises
     regions: int = 96  # per picture for the head, a third of them positives at most
     averaging: float = 0.998  # of the weights that are kept in the end (an exponential mean)
     mixed_precision: bool = True  # bfloat16 in the convolutions

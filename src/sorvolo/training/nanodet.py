@@ -12,12 +12,12 @@ from sorvolo.errors import InputError
 from sorvolo.training.boxes import at_most, clipped, suppress
 from sorvolo.training.tfjs_graph import TfjsGraph
 
-COCO_CLASSES = 80
+COCO_CLASSES = 80  # that NanoDet was trained on
 BINS = 11
 """A box's side lies 0 to 10 strides from its cell's centre; a distribution over this many bins gives the place."""
 
 _MEAN_BGR, _STD_BGR = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
-_SLOPE = 0.1
+_SLOPE = 0.1  # of NanoDet's leaky ReLU
 _PREFIX = "PartitionedCall/"
 
 
@@ -28,7 +28,7 @@ class CocoSettings:
     before: int = 1000  # cells kept by their score before suppression (NanoDet's own number)
     most: int = 300  # detections of one picture
     suppress_iou: float = 0.6  # NanoDet's own; of two boxes of a class that overlap more, the better one stays
-    least_score: float = 0.02
+    least_score: float = 0.02  # thresholds are far above
 
 
 class NanoDetBackbone(nn.Module):

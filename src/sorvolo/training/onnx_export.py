@@ -18,8 +18,8 @@ from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.training.faster_rcnn import FasterRCNN
 
-OPSET = 17
-_TRACED_PX = (256, 320)
+OPSET = 17  # of ONNX, that of 2021, which all runtimes know
+_TRACED_PX = (256, 320)  # rows, columns; the model takes any size, different sides show a mix-up
 _SAME_PX, _SAME_SCORE = 0.5, 1e-3
 _ROUNDING, _SHAKES = 1e-4, 4  # of scores before the sigmoid; how often they are changed by that
 

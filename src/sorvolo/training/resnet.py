@@ -6,13 +6,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+# of red, green and blue, 0 to 1: torchvision's, which the weights expect; so the next
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 """Of RGB 0 to 1, as torchvision's weights were trained."""
 
-_EPSILON = 1e-5
+_EPSILON = 1e-5  # PyTorch's of batch norms
 _STAGES = ((64, 3), (128, 4), (256, 6), (512, 3))  # inner width, blocks
-_GROWTH = 4
+_GROWTH = 4  # times the inner width (He et al. 2016)
 
 
 class FrozenNorm(nn.Module):

@@ -11,7 +11,7 @@ from sorvolo.geometry.arrays import Floats, ImageRGB
 Pixels: TypeAlias = NDArray[np.floating[Any]]
 """(height, width, 3) or (height, width) of float32 while a picture is worked on."""
 
-_MOST = 5
+_MOST = 5  # objects of a picture; by choice
 _FINE = 4  # sub-pixels a side while drawing
 
 
