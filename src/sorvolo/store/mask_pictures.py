@@ -12,7 +12,7 @@ MASK_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm
 """The files that are masks, in small letters."""
 
 _LOSSY = {".jpg", ".jpeg", ".webp"}
-_UNKNOWN = 128
+_UNKNOWN = 128  # in masks that `compare --masks` writes (docs/formats.md)
 
 
 def read_mask(path: Path, *, may_be_unknown: bool) -> tuple[Mask, Mask]:

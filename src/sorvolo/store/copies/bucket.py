@@ -42,7 +42,7 @@ _MOST_TILE_BYTES = 16_000_000  # 512 x 512 pixels take a megabyte
 SHOWN = ("mosaic.tif", "preview.png")
 """The newest map, which has plain names as well, for GIS and browsers."""
 
-_MOST_SUFFIX = 10
+_MOST_SUFFIX = 10  # characters of an ending, its point included
 
 
 @contextmanager

@@ -67,7 +67,7 @@ class ConflictError(Exception):
 class ObjectSettings:
     """Limits of one request, and of how often it is tried again, for links of 0.5 Mbit/s and better."""
 
-    connect_s: float = 10.0
+    connect_s: float = 10.0  # for a connection; by choice
     request_s: float = 150.0  # one part with all its bytes
     retries: int = 4  # by the library, of requests that were answered by 5xx or not at all
     retry_s: float = 120.0  # after which the library tries no more

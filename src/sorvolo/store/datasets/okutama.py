@@ -14,7 +14,7 @@ _LINE = re.compile(
     r"\s*(?P<track>\d+)\s+(?P<left>-?\d+)\s+(?P<top>-?\d+)\s+(?P<right>-?\d+)\s+(?P<bottom>-?\d+)\s+(?P<frame>\d+)"
     r"\s+(?P<lost>[01])\s+[01]\s+[01]\s+\"?(?P<name>[^\"\s]+)\"?(\s+\"[^\"]*\")*\s*"
 )
-_ORIGINAL_PX = (3840.0, 2160.0)
+_ORIGINAL_PX = (3840.0, 2160.0)  # Okutama-Action's videos are 4K; labels count these pixels
 _SIZE_IN_PATH = re.compile(r"(\d{3,4})x(\d{3,4})")
 
 

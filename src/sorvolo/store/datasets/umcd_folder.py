@@ -11,7 +11,7 @@ from sorvolo.store.mask_pictures import MASK_ENDINGS
 
 WITH, WITHOUT = "Videos With Telemetry", "Videos Without Telemetry"
 MOSAICKING, CHANGES = "Mosaicking", "Change Detection"
-CALIBRATION, BENCHMARK = "Camera Calibration", "Benchmark Mosaics"
+CALIBRATION = "Camera Calibration"
 """The names of the folders, as the thesis writes them; read in any case, with any separators."""
 
 MASKS_ENDING = "_masks"

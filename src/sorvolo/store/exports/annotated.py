@@ -16,7 +16,7 @@ from sorvolo.store.images import jpeg_from_image
 
 _COLOURS = ((255, 196, 0), (0, 200, 255), (255, 90, 160), (120, 230, 80), (190, 140, 255), (255, 140, 60))
 _VIDEO_SIDE_PX = 1920  # of the longer side: larger videos help no one on a screen and take long
-_TICKS_PER_S = 90_000
+_TICKS_PER_S = 90_000  # MPEG's clock
 
 _Bar = tuple[int, int, int, int]  # left, top, right, bottom edge of a bar with words
 

@@ -16,7 +16,7 @@ from sorvolo.survey.objects import Detections
 
 _MADE_BY = "sorvolo evaluate detector"
 _FORMAT = 2
-_CROP_PX = 220
+_CROP_PX = 220  # side of a picture on a page
 _LABEL_COLOUR, _FOUND_COLOUR = (40, 220, 90), (255, 150, 30)
 
 

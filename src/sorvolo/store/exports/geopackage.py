@@ -19,7 +19,7 @@ from sorvolo.store.atomic import atomic_path
 Feature = Mapping[str, Any]
 
 _APPLICATION = 0x47504B47  # "GPKG"
-_VERSION = 10300
+_VERSION = 10300  # GeoPackage 1.3.0, as its requirement 2 writes it
 _WGS84 = 4326
 _WGS84_WKT = (
     'GEOGCS["WGS 84",DATUM["WGS_1984",SPHEROID["WGS 84",6378137,298.257223563]],PRIMEM["Greenwich",0],'

@@ -17,9 +17,9 @@ from sorvolo.store.exports.places import near_longitudes, wrapped_deg
 from sorvolo.store.exports.plain import name_safe
 from sorvolo.store.images import png_from_rgba, shrink, unweighted, weighted
 
-PREVIEW_PX = 2048
-LIVE_PREVIEW_PX = 1024
-_KMZ_PX = 4096
+PREVIEW_PX = 2048  # longer side: a screen's width
+LIVE_PREVIEW_PX = 1024  # longer side; written again and again while a flight goes on, so small
+_KMZ_PX = 4096  # longer side; a map to a few pieces of what phones take
 _KMZ_PIECE_PX = 1024  # viewers on phones refuse textures much larger
 
 

@@ -24,7 +24,7 @@ _COLOURS = np.array([
     [196, 48, 43], [232, 126, 60], [243, 205, 90], [150, 200, 105], [26, 130, 92],
 ], np.float64)  # of the classes of probability, from the lowest
 _HOLE = np.array([70.0, 70, 78])
-_STRENGTH = 0.55
+_STRENGTH = 0.55  # opacity of the colours over the map
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from sorvolo.survey.corrected import CorrectedFrame
 
 _UNKNOWN_M = "9999999.0"
 _DRONE = "a-f-A-M-H-Q"  # friendly, air, military, rotary wing, unmanned: how TAK shows small drones
-_STALE_NS = 30_000_000_000
-_EARTH_M = 6_371_000.0
+_STALE_NS = 30_000_000_000  # after which TAK shows a drone as lost; by choice
+_EARTH_M = 6_371_000.0  # mean radius, good enough for a speed
 
 
 def geo_txt(frames: Sequence[CorrectedFrame]) -> str:

@@ -27,7 +27,7 @@ FORMAT = 1
 """An index of another format is rebuilt: everything in it comes from the sites."""
 
 _APPLICATION_ID = 0x536F7249  # "SorI"
-_WGS84 = 4326
+_WGS84 = 4326  # EPSG's number
 
 
 class _PostgisGeometry(UserDefinedType[bytes]):

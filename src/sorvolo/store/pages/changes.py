@@ -25,7 +25,7 @@ from sorvolo.survey.findings import ChangeKind, Verdict, ViewStatus
 from sorvolo.survey.flight import Site
 
 _MANY = 40  # changes on one map: their numbers become small
-_CROP_PX = 320
+_CROP_PX = 320  # longer side of a picture on a page
 _CROPS_BYTES = 6_000_000  # of all crops in the page together
 _RIM = 0.96  # of the map: where an outline reaches beyond, its number stands on the other side
 _UNKNOWN_SHARE = 0.1  # of the ground: more is announced first

@@ -13,7 +13,7 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.wording import counted_list
 
 _MOST_CROP_BYTES = 250_000  # of all pictures together: the page stays one that can be mailed
-_MOST_ROWS = 200
+_MOST_ROWS = 200  # more belong into a table of their own: the page names the file
 
 
 def objects_section(report: Mapping[str, Any], crops: Mapping[str, bytes], site: Site | None = None) -> Markup:

@@ -11,12 +11,12 @@ from markupsafe import Markup
 from sorvolo.geometry.arrays import Floats
 from sorvolo.store.pages.render import render
 
-_WIDE_PX = 720
+_WIDE_PX = 720  # of all drawings: a phone's screen and a page's column take it; the rest by choice too
 _LOW_PX = 250
 _MARGIN_PX = 46.0
 _PLAN_HIGHEST_PX = 620.0
 _SCATTER_PX = 360.0
-_COLOURS = 5
+_COLOURS = 5  # styles of a line, c0 to c4; c5 is for what was rejected
 _STATUS_WORDS = {"vision": "matched", "gps-only": "GPS only", "rejected": "not placed"}
 
 

@@ -31,8 +31,8 @@ from sorvolo.store.atomic import atomic_path, scratch_folder, writing
 from sorvolo.store.images import shrink
 from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal, transform_on_grid
 
-_BLOCK_PX = 512
-_VERIFIED_BLOCKS = 64
+_BLOCK_PX = 512  # GDAL's own for cloud-optimised GeoTIFFs
+_VERIFIED_BLOCKS = 64  # spread over the map: enough to notice a disk that writes rubbish, at no cost
 # zstd is the fastest to write and to read once; deflate is what every reader of the final file understands; its
 # level 6 takes 1.7 times as long as 1, all steps together, for files 4 % smaller
 _SCRATCH = {

@@ -31,7 +31,7 @@ never written: what a command chooses is passed on as `Catalogues`.
 
 _SCHEMES = ("postgresql", "postgres", "postgresql+psycopg")
 _NAME = re.compile(r"[a-z_][a-z0-9_]{0,62}")
-_MOST_BYTES = 100_000
+_MOST_BYTES = 100_000  # of a pointer's few lines
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ _HEAD = struct.Struct("<QI")  # an entry's bytes, and their CRC-32
 _TEXT = struct.Struct("<I")  # bytes of an entry's JSON
 _MOST_BYTES = 1 << 30  # of one entry: a picture of 20 megapixels takes a sixteenth
 _TYPES = {"<f8": np.float64, "<f4": np.float32, "<i8": np.int64, "<i4": np.int32, "|u1": np.uint8, "|b1": np.bool_}
-_MOST_DIMENSIONS = 4
+_MOST_DIMENSIONS = 4  # of an array; pictures have three
 _SYNC_EVERY_S = 1.0  # waiting for the disk after each entry would cost 4 to 5 ms each
 
 

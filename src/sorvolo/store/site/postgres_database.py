@@ -16,11 +16,11 @@ from sorvolo.store.site import schema
 from sorvolo.store.site.database import ConnectionLostError, Layout, damaged, numbers
 from sorvolo.store.site.sqlite_database import CATALOGUE_LAYOUT
 
-OLDEST_SERVER = 15
+OLDEST_SERVER = 15  # PostgreSQL's major version; older ones are not tested
 _PATIENCE_S = 20.0
 """How long a writer waits for a server that restarts, and for the lock of a process that was just killed."""
 
-_LOOK_AGAIN_S = 0.25
+_LOOK_AGAIN_S = 0.25  # at a lock that another process holds; by choice
 _WAITS = {  # of libpq, unless the URL has others: a server that is not there is noticed within a minute
     "connect_timeout": "10", "keepalives_idle": "20", "keepalives_interval": "10", "keepalives_count": "3",
     "tcp_user_timeout": "60000",
