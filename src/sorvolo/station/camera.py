@@ -25,7 +25,7 @@ _SPOOL_BYTES = 512_000_000  # what waits for a station that is away
 _STATION_AWAY_S = 300.0  # to wait for the flight's first picture at the station
 _END_S = 20.0  # to end a flight: a camera that is silent is noticed, what waits is sent
 _LEAVE_S = 3.0  # the same for a flight that nobody wants
-_TURN_S = 0.1
+_TURN_S = 0.1  # how soon an end is noticed; by choice
 
 
 @dataclass(frozen=True)

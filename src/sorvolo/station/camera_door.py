@@ -13,7 +13,7 @@ from sorvolo.station.ingest import Ingest, LinkClosed
 from sorvolo.station.settings import StationSettings
 
 _FOLDER, _NAME = "cameras", "station.sock"
-_MOST_MESSAGE_BYTES = 16_000_000
+_MOST_MESSAGE_BYTES = 16_000_000  # a key frame of 4K has one or two million; by choice
 _MOST_PATH_BYTES = 100  # that the address of a socket surely holds
 _LOG = logging.getLogger("sorvolo.station.cameras")
 

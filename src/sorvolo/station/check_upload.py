@@ -11,10 +11,10 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-_MEMORY_BYTES = 3 << 30
-_CPU_S = 600
+_MEMORY_BYTES = 3 << 30  # a picture of 200 megapixels takes 0.6 GB decoded, copies and libraries the rest
+_CPU_S = 600  # of processor time; by choice
 _MOST_PIXELS = 200_000_000  # of one picture: a 100-megapixel camera twice over
-_MOST_FILES = 20_000
+_MOST_FILES = 20_000  # photos of a day's flights; by choice
 _MOST_RATIO = 200  # unpacked over packed: photos hardly shrink
 _PHOTOS = (".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".heic", ".png")
 _TEXTS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".json", ".xml", ".mrk", ".obs", ".nav", ".bin", ".rtk")

@@ -23,12 +23,12 @@ from sorvolo.station.messages import Hello, Kind, Message, check_stream, hello_f
 from sorvolo.station.spool import Spool
 
 _TURN_S = 0.02  # how long the sender rests where there is nothing to send
-_CONNECT_S = 10.0
-_ANSWER_S = 10.0
+_CONNECT_S = 10.0  # over a weak link; by choice
+_ANSWER_S = 10.0  # to a greeting or a flight's end; by choice
 _MOST_SENT_BYTES = 4_000_000  # on the way and not acknowledged
-_MOST_WAY_S = 2.0
+_MOST_WAY_S = 2.0  # age of what is on the way; more waits in the spool, from where it can be left out
 _CATCH_UP = 0.5  # seconds of an outage that are made up for in a second
-_DELAYS_KEPT = 100_000
+_DELAYS_KEPT = 100_000  # acknowledgements: an hour of video at 25 pictures a second
 _SAME_FLIGHT_NS = 600_000_000_000  # a client that was away for longer comes with another flight
 _REFUSED_CODE = 4400
 """The WebSocket close code of a station that will not have the stream, whatever is tried again."""

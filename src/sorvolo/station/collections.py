@@ -41,7 +41,7 @@ SEARCH_FOLDER = "search"
 
 _POD_FILE = f"{SEARCH_FOLDER}/pod.geojson"
 _LIVE_COVERAGE = LIVE_COVERAGE.removesuffix(".geojson")
-_MOST_BYTES = 256_000_000
+_MOST_BYTES = 256_000_000  # of a GeoJSON file of a site; 10,000 frames have some ten; by choice
 _MOST_FLIGHTS = 400  # whose frames are kept by flight: of some ten kilobytes to a megabyte each
 
 Feature = dict[str, Any]

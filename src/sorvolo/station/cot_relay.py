@@ -15,7 +15,7 @@ from sorvolo.store.exports.cursor_on_target import COT_TYPES, DroneView, cot_dro
 WANTED = frozenset({"object.found", "change.announced", "change.withdrawn", "frame.placed"})
 """The events that a TAK server gets."""
 
-_DRONE_EVERY_S = 1.0
+_DRONE_EVERY_S = 1.0  # by choice
 _DRONE_STALE_S, _SPOT_STALE_S = 15.0, 3600.0
 _CHANGE_TYPE = COT_TYPES["small object"]
 

@@ -11,8 +11,8 @@ import numpy as np
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.store.images import jpeg_from_image
 
-_MEMORY_BYTES = 3 << 30
-_CPU_S = 25
+_MEMORY_BYTES = 3 << 30  # as for an upload's check
+_CPU_S = 25  # within the 30 s that the station waits
 _MOST_FRAMES = 2000  # decoded after the nearest key frame: some pictures apart in what drones write
 
 

@@ -12,8 +12,8 @@ from typing import Any
 
 from sorvolo.station.state import StationState, compact_json, utc_now
 
-_IN_MEMORY = 4000
-_AT_ONCE = 500
+_IN_MEMORY = 4000  # for browsers that come back after a break; older ones are read from the disk
+_AT_ONCE = 500  # in one answer, some 200 kB; by choice
 LOST = "events.lost"
 """What a page gets that asks for events that are no longer kept: it has to load the site anew."""
 

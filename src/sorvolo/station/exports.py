@@ -40,7 +40,7 @@ _OF_FLIGHT: Mapping[str, str] = {
     "terrain.tif": "bare ground, GeoTIFF",
 }
 _GEOPACKAGE = "site.gpkg"
-_PIECE_BYTES = 1 << 20
+_PIECE_BYTES = 1 << 20  # of a file that is sent
 _MOST_PROFILE_PLACES, _MOST_PROFILE_POINTS = 50, 2000
 
 

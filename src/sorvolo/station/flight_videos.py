@@ -24,8 +24,8 @@ from sorvolo.station.sites import SiteShelf
 from sorvolo.station.tokens import Role
 from sorvolo.store.site.archive import Archive
 
-_WITHIN_S = 30.0
-_CACHE_BYTES = 32_000_000
+_WITHIN_S = 30.0  # a browser gives up later; by choice
+_CACHE_BYTES = 32_000_000  # some hundred pictures; by choice
 _CUTTING = threading.Semaphore(1)
 _AT_ONCE = 3  # one is cut, others wait or are kept already; more would take threads from all other requests
 

@@ -30,9 +30,9 @@ from sorvolo.survey.flight import CameraModel
 _JUMP_US = 10_000_000  # a clock that leaps so far was set anew
 _TIME_EVERY_US = 1_000_000  # where there is no telemetry, the time alone is stated so often
 _KNOWN_LENS = 0.04  # a focal length that is known so well is worth stating
-_OPEN_S = 6.0
+_OPEN_S = 6.0  # for a camera's first answer; by choice
 _DRIFT = 5e-4  # of a camera's clock: 30 ms a minute
-_LATE_NS = 5_000_000_000
+_LATE_NS = 5_000_000_000  # more than a connection holds back: the clock begins anew; by choice
 _STEP_US = 33_333  # between pictures where a clock began anew
 
 

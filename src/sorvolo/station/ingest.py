@@ -44,7 +44,7 @@ class IngestLimits:
     """What a station takes from drones."""
 
     streams: int = 16  # that send at the same time
-    message_bytes: int = 8_000_000
+    message_bytes: int = 8_000_000  # a key frame of 4K has one or two million
     free_bytes: int = 2_000_000_000  # of the disk, which stay free
     sync_s: float = 0.25  # how often the disk is waited for, and what it has acknowledged
     silent_s: float = 30.0  # a link that sends nothing for so long is closed

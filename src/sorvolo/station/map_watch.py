@@ -14,8 +14,8 @@ from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.station.tiles import WebTiles
 from sorvolo.store.site.archive import Archive
 
-_LOOK_EVERY_S = 0.1
-_SETTLE_EVERY_S = 2.0
+_LOOK_EVERY_S = 0.1  # it delays what a page shows; by choice
+_SETTLE_EVERY_S = 2.0  # between two turns at verdicts that wait; by choice
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ _CONFORMS = [
     f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}" for name in ("core", "oas30", "geojson")
 ]
 _GEOJSON = "application/geo+json"
-_MOST = 10_000
+_MOST = 10_000  # features in one answer; by choice
 _REVIEWED = {"objects": "object", "changes": "change", "findings": "finding"}
 Limit = Query(1000, ge=1, le=_MOST, description="Features at most.")
 Offset = Query(0, ge=0, le=10**9)

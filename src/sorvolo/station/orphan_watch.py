@@ -12,7 +12,7 @@ from urllib.parse import quote
 from sorvolo.station.orders import ORDER_FILE
 from sorvolo.station.state import STATE_FILE
 
-_LOOK_EVERY_S = 2.0
+_LOOK_EVERY_S = 2.0  # by choice
 _LOOKS = 3  # that must agree: a disk may be away for a moment, and a record is written just after the process began
 _END_S = 30.0  # for a mission to end by itself, then its processes are killed
 

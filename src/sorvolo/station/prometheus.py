@@ -18,6 +18,7 @@ from sorvolo.station.security import needs
 from sorvolo.station.settings import StationSettings
 from sorvolo.station.tokens import Role
 
+# upper limits of the counted times, about threefold each, around the targets of tiles and pages
 _SECONDS = (0.005, 0.01, 0.03, 0.06, 0.1, 0.3, 1.0, 3.0, 10.0)
 
 RunCounts = Callable[[], Mapping[str, int]]

@@ -14,7 +14,7 @@ from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.site.tiles import TileView
 
-_MOST_LEVELS = 24
+_MOST_LEVELS = 24  # halvings; a map of a million tiles a side needs 20
 
 
 Key = TypeVar("Key")

@@ -22,7 +22,7 @@ PASSED_ON = frozenset({
 """The events that other systems get: what was found, what became of it, which missions ran."""
 
 _LOG = logging.getLogger("sorvolo.station.relays")
-_TURN_S = 0.2
+_TURN_S = 0.2  # at what waits to be sent; by choice
 _OLDEST_S = 86_400.0  # an event that could not be delivered for a day is given up
 
 

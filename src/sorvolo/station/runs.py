@@ -55,8 +55,8 @@ NOTHING_KEPT = "stopped; nothing was kept"
 """The headline of a mission that was stopped before it had anything."""
 
 _NEVER = "9999"
-_MOST_LINE_BYTES = 4_000_000
-_MOST_LOG_BYTES = 4000
+_MOST_LINE_BYTES = 4_000_000  # read of a journal at a time: a line must fit
+_MOST_LOG_BYTES = 4000  # some forty lines, enough for an error's trace
 _LOOK_EVERY_S = 0.1  # at all that runs
 _GLANCE_EVERY_S = 0.02  # whether a journal has grown: the boxes of a picture are in it
 _LOG = logging.getLogger("sorvolo.station.disk")

@@ -30,7 +30,7 @@ class StationLimits:
 
     most_connections: int = 1000  # of all clients; a browser opens six and a few live ones
     most_live_per_address: int = 64  # event and video channels: a crew behind one router is one address
-    most_missions: int = 4
+    most_missions: int = 4  # at the same time; each takes a core and a gigabyte or more
     most_streams: int = 16  # of drones that send at the same time
     most_uploads: int = 1000  # that are kept
     most_events: int = 200_000  # that are kept: who asks for older ones loads the site anew
@@ -66,8 +66,8 @@ class StationSettings:
     insecure_lan: bool = False
     names: tuple[str, ...] = ()
     stream_ranges: tuple[str, ...] = ()
-    free_floor_gb: float = 2.0
-    upload_most_gb: float = 64.0
+    free_floor_gb: float = 2.0  # of the disk, which stay free
+    upload_most_gb: float = 64.0  # of one upload
     public_url: str = ""
     base_map: Path | None = None
     limits: StationLimits = StationLimits()

@@ -21,8 +21,8 @@ from sorvolo.store.site.files import HeightFile
 from sorvolo.store.site.names import is_plain_name
 
 _DEEPEST = 2  # folders below the root: `sorvolo demo` puts its site one deeper than its folder
-_MOST_FOLDERS = 2000
-_LOOK_EVERY_S = 1.0
+_MOST_FOLDERS = 2000  # looked at below a root; by choice
+_LOOK_EVERY_S = 1.0  # through the folders; by choice
 _LOOK_AGAIN_S = 0.1  # for a site that was not there: it may have come since
 
 

@@ -14,7 +14,7 @@ from sorvolo.errors import InputError
 from sorvolo.station.messages import Kind, Message, message_from_bytes
 
 _RECORD = struct.Struct(">IIq")  # length, checksum, when it was taken (UTC, ns)
-_SEGMENT_BYTES = 16_000_000
+_SEGMENT_BYTES = 16_000_000  # of a file; what is acknowledged leaves the disk in such pieces; by choice
 _FLIGHT, _HELLO, _LOCK = "flight", "hello.json", "lock"
 
 _Reason = Literal["late", "overflow"]

@@ -20,7 +20,7 @@ from sorvolo.store.site.names import is_plain_name
 from sorvolo.store.site.origin import cache_folder
 
 _LOG = logging.getLogger("sorvolo.station.store_root")
-_EVERY_S = 20.0
+_EVERY_S = 20.0  # a store is asked for what is new; by choice: each question costs
 
 
 class StoreRoot:

@@ -11,7 +11,7 @@ CALLED = ("rtsp", "rtsps", "rtmp", "rtmps")
 """Schemes of streams that are called; HTTP is none: a playlist could name any other address."""
 
 _LISTENED = ("udp", "rtp", "rtmp", "tcp")
-_LOWEST_PORT = 1024
+_LOWEST_PORT = 1024  # below lie the system's
 
 Address = ipaddress.IPv4Address | ipaddress.IPv6Address
 Network = ipaddress.IPv4Network | ipaddress.IPv6Network

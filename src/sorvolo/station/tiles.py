@@ -17,13 +17,13 @@ from sorvolo.station.pyramid import BytesCache, Pyramid
 from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.store.site.archive import Archive
 
-TILE_PX = 256
+TILE_PX = 256  # a side, as web maps have it
 _SHALLOWEST_ZOOM = 8  # a tile of 150 km: a map is less than a pixel there, and the site's plane is no plane
-_DEEPEST_ZOOM = 26
+_DEEPEST_ZOOM = 26  # 2 mm a pixel at the equator: finer than any map
 _LATTICE = 17  # places a side that are projected exactly; between them it is linear to a hundredth of a pixel
 _PICTURES_BYTES, _ANSWERS_BYTES = 192_000_000, 64_000_000
 _LIVE = re.compile(r"live(-[0-9a-f]{1,64})?")
-_QUALITY = 88
+_QUALITY = 88  # of WebP, 0 to 100; by choice
 _QUICK_METHOD = 1  # of 0 to 6: 7 % more bytes than the usual 4 in 40 % of its time
 
 

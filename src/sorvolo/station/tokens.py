@@ -17,7 +17,7 @@ from sorvolo.station.state import StationState, utc_now
 
 _PREFIX = "sorvolo"
 _NO_HASH = "0" * 64
-_FREE_ATTEMPTS = 5
+_FREE_ATTEMPTS = 5  # wrong tokens of an address without a wait; by choice, as the next two
 _LONGEST_WAIT_S = 300.0
 _MOST_ADDRESSES = 10_000
 

@@ -14,7 +14,7 @@ from sorvolo.station.uploads import Upload, Uploads
 
 _VERSION = "1.0.0"
 _KIND = "application/offset+octet-stream"
-_MOST_LENGTH = 10**15
+_MOST_LENGTH = 10**15  # bytes; the free disk is asked before one is taken
 
 
 def upload_routes(uploads: Uploads, runs: Runs) -> APIRouter:

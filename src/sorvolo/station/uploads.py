@@ -31,9 +31,9 @@ TEXT_ENDINGS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".xml", ".yaml"
 """Files that are taken as telemetry, cameras and areas."""
 
 _ARCHIVE_ENDINGS = (".zip",)
-_MOST_TEXT_BYTES = 256_000_000
+_MOST_TEXT_BYTES = 256_000_000  # of telemetry: half of what a reader takes
 _PART, _INFO, _FILES = "part", "info.json", "files"
-_CHECK_WITHIN_S = 1800.0
+_CHECK_WITHIN_S = 1800.0  # for the check of a whole upload, by the clock; by choice
 _LOOK_EVERY_BYTES = 64_000_000  # written between two looks at the free space
 _SILENT_S = 30.0  # a request that sends nothing for so long has lost its link: another one may go on
 _ID = re.compile(r"[0-9a-f]{24}")

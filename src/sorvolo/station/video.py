@@ -20,10 +20,10 @@ _LOG = logging.getLogger("sorvolo.station.video")
 Mode = Literal["annexb", "fmp4"]
 
 _MOST_WAITING = 90  # pictures, three seconds
-_MOST_WAITING_BYTES = 8_000_000
+_MOST_WAITING_BYTES = 8_000_000  # three seconds at 20 Mbit/s
 _MOST_GROUP, _MOST_GROUP_BYTES = 900, 64_000_000  # pictures since a key frame that are kept for new viewers
-_STAMP_BYTES = 8
-_CLOCK_HZ = 1_000_000
+_STAMP_BYTES = 8  # of a picture's time before its data, us
+_CLOCK_HZ = 1_000_000  # us, as WebCodecs counts
 _STEP_US = 33_333  # how long a picture is shown where nobody states the rate
 
 

@@ -12,7 +12,7 @@ from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.names import is_plain_name
 
 _RESULTS = "results"
-_MOST_BYTES = 64_000_000
+_MOST_BYTES = 64_000_000  # of a watch's tracks; by choice
 _MOST_RUNS = 100  # of a site, the newest
 
 Feature = dict[str, Any]

@@ -16,7 +16,7 @@ from sorvolo.station.relays import NotTaken, Send
 SIGNATURE = "X-Sorvolo-Signature"
 """The header with `sha256=` and the HMAC of the body under the secret."""
 
-_LIMIT_S = 10.0
+_LIMIT_S = 10.0  # for a receiver's answer; by choice
 _LATER = frozenset({408, 425, 429})  # besides 5xx: the receiver may take it another time
 
 

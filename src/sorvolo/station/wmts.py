@@ -12,7 +12,7 @@ from sorvolo.station.tokens import Role
 from sorvolo.store.site.archive import Archive
 
 _FIRST_SCALE = 559082264.0287178  # of zoom 0 at 0.28 mm a pixel: WMTS 1.0.0, annex E.4 (GoogleMapsCompatible)
-_EDGE_M = 20037508.342789244
+_EDGE_M = 20037508.342789244  # half of the equator's length on the sphere of web maps (EPSG:3857)
 _ZOOMS = range(8, 25)
 _SET = "GoogleMapsCompatible"
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 FINISHED, FAILED, STOPPED = "run.finished", "run.failed", "run.stopped"
 """The types of a journal's last line."""
 
-_PROGRESS_EVERY_S = 0.25
+_PROGRESS_EVERY_S = 0.25  # as often as a page shows it; by choice
 _LIVE_S = 0.5  # how often the growing map is shown: a browser waits for it
 _NICE = 5  # the server answers first
 _WRONG, _STOPPED_CODE = 1, 130
