@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from sorvolo.cluster.sites import SiteBy
     from sorvolo.cluster.table import BatchTable, Row
 
-_MOST_ROWS = 40
+_MOST_ROWS = 40  # of a table on a terminal; longer ones show what failed first; by choice
 _STORE_HANGS_S = 300.0  # two requests of `ObjectSettings.request_s`
 _COLOURS = {"done": "green", "known": "green", "doubtful": "yellow", "duplicate": "blue", "skipped": "blue"}
 

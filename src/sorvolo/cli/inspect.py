@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from sorvolo.missions.inspect import Inspection
 
 _COLOURS = {"info": "blue", "warning": "yellow", "problem": "red"}
-_MOST_NAMES = 4
+_MOST_NAMES = 4  # of files in a line
 
 
 def inspect(

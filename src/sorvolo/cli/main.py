@@ -52,7 +52,7 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "reproduce": reproduce,
 }
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-_ASKED_AGAIN_S = 0.02
+_ASKED_AGAIN_S = 0.02  # an end that C code swallowed is asked for again so soon; by choice
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 for _name, _command in _COMMANDS.items():

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from sorvolo.store.site.catalogue_place import Catalogues
     from sorvolo.survey.mosaic import MosaicUpdate
 
-_MOST_REASONS = 6
+_MOST_REASONS = 6  # of frames that are not on the map, the commonest first
 
 
 class Method(StrEnum):

@@ -13,7 +13,7 @@ from sorvolo.survey.wording import counted
 if TYPE_CHECKING:
     from sorvolo.survey.mosaic import MosaicUpdate
 
-_LINE_EVERY_S = 10.0
+_LINE_EVERY_S = 10.0  # a log file of an hour stays one to read; by choice
 
 T = TypeVar("T")
 U = TypeVar("U")

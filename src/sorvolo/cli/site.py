@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 site_app = typer.Typer(no_args_is_help=True)
 
-_MOST_FAULTS = 20
+_MOST_FAULTS = 20  # lines on a terminal; by choice
 
 
 @site_app.callback()

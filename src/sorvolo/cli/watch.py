@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from sorvolo.survey.flight import Site
     from sorvolo.survey.objects import Track
 
-_MOST_ROWS = 40
+_MOST_ROWS = 40  # of a table on a terminal; by choice
 _COLUMNS_EXPLAINED = "score: 0 to 1, how sure; accuracy: 1 sigma; views: frames that show it"
 
 

@@ -14,9 +14,9 @@ from typing import Any
 
 from sorvolo.cluster.orders import FINISH, WORKER, Ending, Order, Outcome, ScoutOrder, answer_of
 
-_LOOK_EVERY_S = 1.0
+_LOOK_EVERY_S = 1.0  # at what a worker uses; by choice
 _LIVELY = 0.01  # seconds of processor time a second, below which a process does nothing
-_LOG_TAIL_BYTES = 4000
+_LOG_TAIL_BYTES = 4000  # some forty lines, enough for an error's trace
 _MB = 1024.0  # kilobytes, as ru_maxrss counts on Linux
 _MB_BYTES = 1024.0**2  # bytes, as it counts on macOS
 

@@ -18,8 +18,8 @@ from sorvolo.survey.wording import counted
 
 _PHOTOS = PHOTO_SUFFIXES - {".png"}  # of a camera: PNGs are masks, screenshots, maps
 _VIDEOS = VIDEO_SUFFIXES - {".lrv"}  # which is the small copy of a video beside it
-_LEAST_PHOTOS = 2
-_STALL_S = 120.0
+_LEAST_PHOTOS = 2  # one photo is no flight
+_STALL_S = 120.0  # a file on a slow disk may take that long to open; by choice
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from sorvolo.cluster.table import BatchTable, Row, State
 from sorvolo.cluster.watches import ENDING
 from sorvolo.errors import SettingsError
 
-_LOOK_S = 0.5
+_LOOK_S = 0.5  # how soon an end or a free place is noticed; by choice
 _NO_ROOM = "waits for memory or cores that others have; it starts when they are known to be free"
 
 

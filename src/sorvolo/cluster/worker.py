@@ -24,7 +24,7 @@ from sorvolo.errors import SorvoloError
 if TYPE_CHECKING:
     from sorvolo.missions.flight.detector_protocol import ObjectDetector
 
-_ALIVE_EVERY_S = 0.5
+_ALIVE_EVERY_S = 0.5  # far within what counts as standing still; by choice
 _SITE_BUSY_S = 90.0  # a worker of a cluster that is gone holds its site's lock until Ray ends it, after a minute
 _FIRST_TO_GO = 500  # for the kernel that looks for memory: the worker, not the batch
 

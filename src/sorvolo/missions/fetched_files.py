@@ -12,9 +12,9 @@ from typing import IO, Any, cast
 
 from sorvolo.errors import InputError
 
-_MOST_BYTES = 1 << 30
+_MOST_BYTES = 1 << 30  # a model has 10 to 300 MB; by choice
 _CHUNK_BYTES = 1 << 20
-_PATIENCE_S = 30.0
+_PATIENCE_S = 30.0  # without a byte; by choice
 _WEB = re.compile(r"(?i)https?://")
 
 

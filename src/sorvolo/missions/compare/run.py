@@ -59,7 +59,7 @@ class ViewSizes:
     """How large frames are compared where nothing else is asked for; how much of earlier pictures is kept at hand."""
 
     video_px: int = 1280  # longest side; a video's frames come faster than photos, and show a place more often
-    photo_px: int = 1600
+    photo_px: int = 1600  # photos are fewer and show more ground
     photo_finer: float = 2.0  # times a photo's and the map's own pixels, at most: the robust method sees half of them
     fine_m_per_px: float = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses (decision 0022)
     cache_bytes: int = 128 * 2**20

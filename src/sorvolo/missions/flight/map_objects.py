@@ -35,7 +35,7 @@ NO_MODEL, DEFAULT_MODEL = "none", "default"
 """The model that looks for nothing, and the one that comes with the package."""
 
 _AHEAD = 3  # frames of a recorded flight that may wait for the detector before the mapping waits for it
-_CROP_PX = 256
+_CROP_PX = 256  # longer side of a picture on a page
 _MOST_CROPS = 60  # of one frame, the surest
 
 

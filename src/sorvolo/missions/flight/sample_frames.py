@@ -9,7 +9,7 @@ from sorvolo.errors import InputError
 from sorvolo.mosaic.selection import SelectionSettings, evenly, every, has_texture
 from sorvolo.survey.flight import Frame
 
-_SAMPLES = 5
+_SAMPLES = 5  # frames of a flight; by choice
 _LIVE_STEP_S = 0.5  # between the frames of a live flight
 
 

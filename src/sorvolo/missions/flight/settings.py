@@ -9,7 +9,7 @@ from sorvolo.geometry.geodesy import check_map_crs
 from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
 
-_MOST_OFFSET_S = 86_400 * 365
+_MOST_OFFSET_S = 86_400 * 365  # a year: a clock that was never set
 
 
 def check_offset(offset_s: float | None) -> None:

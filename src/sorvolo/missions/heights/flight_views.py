@@ -10,7 +10,7 @@ from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 
-_MOST_BYTES = 256_000_000
+_MOST_BYTES = 256_000_000  # of frames.geojson; 10,000 frames have some ten; by choice
 _AXES = ("east", "north", "up")
 
 

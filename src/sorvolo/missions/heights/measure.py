@@ -25,7 +25,7 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.flight import Site
 
-_MOST_BYTES = 16_000_000
+_MOST_BYTES = 16_000_000  # of heights.json, which has kilobytes; by choice
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,8 +27,8 @@ from sorvolo.survey.objects import Detections
 HELD_OUT = 0.2
 """The share of the frames that is tested on, of whole videos where there are enough (thesis: 818 of 4,088 frames)."""
 
-_EXAMPLES = 4
-_DRAWS = 200
+_EXAMPLES = 4  # pictures of a figure
+_DRAWS = 200  # resamplings: the tables show no intervals
 
 
 @dataclass(frozen=True)

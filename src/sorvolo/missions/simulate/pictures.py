@@ -15,7 +15,7 @@ from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.flight_files import read_orthophoto, write_json
 from sorvolo.store.images import jpeg_from_image
 
-_MOST_THREADS = 8
+_MOST_THREADS = 8  # each holds a picture that is drawn, of tens of megabytes
 
 
 @dataclass(frozen=True)

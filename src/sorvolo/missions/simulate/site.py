@@ -35,7 +35,7 @@ from sorvolo.store.exports.flight_files import (
 )
 from sorvolo.store.rasters.geotiff import write_cog
 
-_MOST_THREADS = 4
+_MOST_THREADS = 4  # each holds a frame that is drawn, of tens of megabytes
 _SUFFIXES = {"csv": ".csv", "srt": ".srt", "nmea": ".nmea", "gpx": ".gpx"}
 
 

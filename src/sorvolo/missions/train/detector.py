@@ -51,7 +51,7 @@ _CHECKS, _CHECK_STEPS = 20, 50  # a run is checked so often, evenly over its ste
 _MOST_CHECKED, _MOST_CHECKED_LAST = 150, 1000  # held-out pictures
 _ROWS = 200  # of losses in the report
 _SAVE_S = 60.0  # a kill costs no more than this and the time between two checks
-_KEPT_PICTURES_BYTES = 2 << 30
+_KEPT_PICTURES_BYTES = 2 << 30  # decoded pictures in memory: two gigabytes of a small computer's eight; by choice
 _FINDS_NOTHING_AP50 = 0.05  # below which a model is of no use yet
 _EXPORT_PICTURES, _EXPORT_PX = 4, 1280  # by which the model file is compared with torch
 

@@ -24,9 +24,9 @@ from sorvolo.survey.wording import counted
 PLACEHOLDERS = ("flight", "id", "class", "score", "latitude", "longitude", "time", "crop")
 """What an alert command's words may hold in braces."""
 
-_MOST_WAITING = 1000
-_COMMAND_LIMIT_S = 30.0
-_URL_LIMIT_S = 10.0
+_MOST_WAITING = 1000  # alerts, then the oldest is given up; by choice
+_COMMAND_LIMIT_S = 30.0  # after which it is ended, so that others are called; by choice
+_URL_LIMIT_S = 10.0  # for an answer; by choice
 _CODE_OPTIONS = {  # of each interpreter, the options whose next word it runs as a program
     **dict.fromkeys(("sh", "bash", "dash", "ash", "ksh", "zsh", "fish"), re.compile(r"-\w*c")),
     **dict.fromkeys(("python", "python3"), re.compile(r"-\w*c")),

@@ -14,7 +14,7 @@ from sorvolo.errors import InputError, SettingsError
 Transport = Literal["udp", "tcp", "tls"]
 
 _DEFAULT_PORTS: dict[Transport, int] = {"udp": 6969, "tcp": 8087, "tls": 8089}
-_TIMEOUT_S = 3.0
+_TIMEOUT_S = 3.0  # for a connection and a message, which wait meanwhile; by choice
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.tracking.doubles import without_doubles
 
 _MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
-_TRACKS_EVERY_S = 5.0
+_TRACKS_EVERY_S = 5.0  # the file is whole each time and grows; by choice
 _LABELS_EVERY_NS = 1_000_000_000  # frames nearer in time show the same again
 _CROPS_BYTES = 96_000_000  # of the latest sightings, one of which may become a track's best
 
