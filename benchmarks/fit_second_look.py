@@ -29,6 +29,7 @@ from detection_data import hituav, tinyperson
 from fit_people import nobody
 from painted_grounds import painted_ground
 from people_samples import Source, ground, shown
+from provenance import commit
 from rendered_people import Scene, read_scenes
 from sorvolo.detection.contract import SecondLook
 from sorvolo.detection.detector import Detector
@@ -99,7 +100,7 @@ def main() -> None:
         columns = [file[name] for name in Report._fields]
     reports = [Report(*row) for row in zip(*columns)]
     trials = {name: fit_of(reports, photos, *how) for name, how in TRIED.items()}
-    found = {"person": trials[CHOSEN] | {"by": wishes.by}, "trials": trials}
+    found = {"commit": commit(), "person": trials[CHOSEN] | {"by": wishes.by}, "trials": trials}
     (wishes.out / "second_look.json").write_text(json.dumps(found, indent=1) + "\n")
     print(json.dumps(found, indent=1), flush=True)
 

@@ -3,8 +3,10 @@
 import importlib.util
 import json
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 
@@ -89,3 +91,23 @@ def test_a_comparison_of_programs_keeps_what_only_an_earlier_run_has(monkeypatch
         "beach": {"photos": 18, "colmap": {"cpu_s": 85}, "pyorthomosaic_3d": {"commit": "b", "cpu_s": 227}},
         "field": {"commit": "a", "photos": 75},
     }
+
+
+def test_each_result_states_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A commit; where the code differed from it, also what is known of the difference."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    commits = dict(importlib.import_module("quick_tables").measured_at(BENCHMARKS / "results"))
+    unnamed = {name for name, found in commits.items() if not found}
+    assert not unnamed
+    for name, found in commits.items():
+        if any(each.endswith("-dirty") for each in found):
+            for part in _dirty_parts(json.loads((BENCHMARKS / "results" / name).read_text())):
+                assert part.get("note") or part.get("remark"), (name, part["commit"])
+
+
+def _dirty_parts(value: Any) -> Iterator[dict[str, Any]]:
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    if isinstance(value, dict) and str(value.get("commit")).endswith("-dirty"):
+        yield value
+    for each in parts:
+        yield from _dirty_parts(each)
