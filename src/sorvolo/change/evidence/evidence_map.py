@@ -366,7 +366,12 @@ class EvidenceMap:
         shown = []
         for number in sorted({self._current(int(each)) for each in np.unique(owner[owner > 0])}):
             candidate = self._found[number]
-            if candidate.see(kept_view, self._without_passing(candidate, kept_view), self._cell_m):
+            evidence = self._grid.read(candidate.cells)
+            own = evidence.owner == candidate.number
+            if (passing := self._passing(evidence, own)) is not None:
+                own &= ~passing
+                self._give_up(candidate, passing, evidence, own, kept_view)
+            if candidate.see(kept_view, own, self._cell_m):
                 shown.append(candidate)
                 candidate.sights.show(view, *candidate.cells.box_m(self._cell_m), self._m_per_px)
                 if candidate.pictures.wants_votes and number not in new:
@@ -386,27 +391,29 @@ class EvidenceMap:
             candidate.pictures.show(view, *candidate.cells.box_m(self._cell_m), self._m_per_px)
         return len(wanted)
 
-    def _without_passing(self, candidate: Candidate, kept_view: KeptView) -> Mask:
-        """The candidate's own cells, (rows, columns) of its window, after it lost those that only passed by.
+    def _passing(self, evidence: CellEvidence, own: Mask) -> Mask | None:
+        """Which of a candidate's own cells only passed by, (rows, columns) of its window; None if too few would stay.
 
         What leaned over a thing's place for a few views joined it and is gone from most later ones, while the thing is
-        not: it is no part of it. The views that are counted then are those that its own cells had.
+        not: it is no part of it.
         """
-        evidence = self._grid.read(candidate.cells)
-        own = evidence.owner == candidate.number
         passing = _passing_cells(evidence, own, self._gathering.passing)
         lost, held = int(np.count_nonzero(passing)), int(np.count_nonzero(own))
-        if not lost or held - lost < self._least_cells:
-            return own
+        return passing if lost and held - lost >= self._least_cells else None
+
+    def _give_up(
+        self, candidate: Candidate, passing: Mask, evidence: CellEvidence, own: Mask, kept_view: KeptView
+    ) -> None:
+        """Take cells from a candidate whose `own` ones stay. The views that are counted then are those that its own
+        cells had, if it lost most."""
         self._grid.own(candidate.cells, passing, 0)
-        own &= ~passing
-        if lost > held / 2:
-            now = int(kept_view.counts)  # this view is counted apart
-            changed, seen = (int(np.median(each[own])) - now for each in (evidence.changed, evidence.seen))
-            candidate.recount(changed, seen)
-            if candidate.number in self._parts:
-                self._parts[candidate.number].join(())  # with fewer views: search for its things again
-        return own
+        if np.count_nonzero(passing) <= np.count_nonzero(own):
+            return
+        now = int(kept_view.counts)  # this view is counted apart
+        changed, seen = (int(np.median(each[own])) - now for each in (evidence.changed, evidence.seen))
+        candidate.recount(changed, seen)
+        if candidate.number in self._parts:
+            self._parts[candidate.number].join(())  # with fewer views: search for its things again
 
     # ---- announcing -------------------------------------------------------------------------------------------
 
