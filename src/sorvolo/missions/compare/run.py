@@ -4,15 +4,11 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from sorvolo.change.areas.area_map import AreaMap, with_areas
-from sorvolo.change.areas.gathered_things import GatheredThings
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.map_update import paint_changes
 from sorvolo.change.pair.thesis import thesis_steps
 from sorvolo.change.reference import ReferenceMap
@@ -23,10 +19,10 @@ from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecor
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.summary import median_of_known
-from sorvolo.geometry.sun import slide_of
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
+from sorvolo.missions.compare.flight_changes import FlightChanges
 from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal, KeptFrame
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import ViewCounts, comparison_summary, comparison_warnings
@@ -37,7 +33,6 @@ from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.missions.map.journal import Taken
 from sorvolo.store.exports.change_files import write_pictures
@@ -49,7 +44,7 @@ from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround
-from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Verdict, ViewStatus
+from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
@@ -99,9 +94,9 @@ class CompareRun:
         )
         self._journal = journal
         self._views = _view_maker(setup, archive, settings, base_version)
-        self._evidence: EvidenceMap | None = None
-        self._areas = AreaMap()
-        self._gathered = GatheredThings() if _is_coarse(setup, archive, settings) else None
+        self._changes = FlightChanges(
+            source.name, self._views, archive.site(), settings, is_coarse=_is_coarse(setup, archive, settings)
+        )
         self._rejected = [
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
@@ -205,7 +200,7 @@ class CompareRun:
                 f"no frame of {self._setup.source.name} could be compared: {self._counts.commonest_reason}; is it "
                 "another place, another season, or night? `sorvolo inspect` shows what the flight holds"
             )
-        concluding = self._comparing.submit(self._found)  # which takes about as long as the map's extension
+        concluding = self._comparing.submit(self._changes.conclude)  # which takes about as long as the map's extension
         shown_as_well = self._extend_map()
         with self._log.stage(Stage.EVIDENCE):
             found = concluding.result()
@@ -249,51 +244,13 @@ class CompareRun:
     def _add_view(self, view: ComparedView, leans: Mask | None) -> tuple[Change, ...]:
         """Add a compared view to the evidence; the changes announced by it."""
         with self._log.stage(Stage.EVIDENCE):
-            if self._evidence is None:
-                self._evidence = EvidenceMap(
-                    self._views.change_m_per_px(view),
-                    EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._setup.source.name,
-                    self._views.earlier_pictures, partial(sun_over, self._archive.site()),
-                )
-            announced: Sequence[Change] = self._reported(self._evidence.add(view))
-            if self._settings.method != "thesis":
-                self._areas.add(view, leans)
-            if self._gathered is not None:
-                self._gathered.add(view, leans)
+            announced: Sequence[Change] = self._reported(self._changes.add(view, leans))
         if announced:
             with self._log.stage(Stage.DETECT):
                 announced = self._objects.named(announced)
         with self._log.stage(Stage.STORE):
             self._write_masks(view)
         return tuple(announced)
-
-    def _found(self) -> Sequence[Change]:
-        """All changes of the flight, after its last view: things, ground that changed as an area, and what only all
-        views together show."""
-        if self._evidence is None:
-            return ()
-        evidence, gathered = self._evidence, self._gathered
-        things = evidence.conclude() if gathered is None else evidence.conclude(gathered.shows_once)
-        name, first = self._setup.source.name, self._evidence.next_number
-        areas = self._areas.conclude(name, first)
-        if gathered is None:
-            return with_areas(things, areas)
-        found = with_areas(things, areas, lies_apart=gathered.lies_apart)
-        found += gathered.conclude(name, first + len(areas), found)
-        return [each for each in found if not self._is_moved_shadow(each, gathered)]
-
-    def _is_moved_shadow(self, change: Change, gathered: GatheredThings) -> bool:
-        """Whether a change is the shadow of what stays, by where the sun stood on both dates."""
-        earlier = self._views.earlier_pictures
-        before_ns = None if earlier is None else earlier.time_ns(change.outline_m)
-        if before_ns is None or change.kind is ChangeKind.MOVING:
-            return False
-        before, after = (
-            slide_of(sun_over(self._archive.site(), each)) for each in (before_ns, change.first_seen_ns)
-        )
-        if before is None or after is None:
-            return False
-        return gathered.is_moved_shadow(change.outline_m, before, after)
 
     def _reported(self, changes: Sequence[Change]) -> list[Change]:
         return reported(changes, self._map_sigma_m, self._rejected)
@@ -331,7 +288,7 @@ class CompareRun:
             changes, suppressed, self._counts, self._views, self._settings, self._base_version, ground,
             is_local=self._archive.site().is_local,
         )
-        comparison["candidates"] = None if self._evidence is None else self._evidence.outcomes()
+        comparison["candidates"] = self._changes.candidates()
         comparison["heights_of"] = flight_with_heights(self._archive, but=self._setup.source.name)
         comparison["extension"] = {
             "frames": len(self._extension.frames), "shown_as_well": shown_as_well,

@@ -1,0 +1,75 @@
+"""What a later flight's views show to have changed: things, areas, and what only all its views together show."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from sorvolo.change.areas.area_map import AreaMap, with_areas
+from sorvolo.change.areas.gathered_things import GatheredThings
+from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.views import ViewMaker
+from sorvolo.geometry.arrays import Mask
+from sorvolo.geometry.sun import slide_of
+from sorvolo.missions.flight.settings import CompareSettings
+from sorvolo.missions.flight.sunlight import sun_over
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView
+from sorvolo.survey.flight import Site
+
+
+class FlightChanges:
+    """The changes of a flight. `add` takes a view in, `conclude` follows the last one.
+
+    `is_coarse`: photos over a map whose things have few pixels, of which learned differences are gathered too.
+    """
+
+    def __init__(
+        self, flight: str, views: ViewMaker, site: Site, settings: CompareSettings, *, is_coarse: bool
+    ) -> None:
+        self._flight, self._views, self._site, self._settings = flight, views, site, settings
+        self._evidence: EvidenceMap | None = None
+        self._areas = AreaMap()
+        self._gathered = GatheredThings() if is_coarse else None
+
+    def add(self, view: ComparedView, leans: Mask | None) -> Sequence[Change]:
+        """Add a compared view to the evidence; the changes announced by it."""
+        if self._evidence is None:
+            self._evidence = EvidenceMap(
+                self._views.change_m_per_px(view),
+                EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._flight,
+                self._views.earlier_pictures, partial(sun_over, self._site),
+            )
+        announced = self._evidence.add(view)
+        if self._settings.method != "thesis":
+            self._areas.add(view, leans)
+        if self._gathered is not None:
+            self._gathered.add(view, leans)
+        return announced
+
+    def conclude(self) -> Sequence[Change]:
+        """All changes of the flight, after its last view."""
+        if self._evidence is None:
+            return ()
+        evidence, gathered = self._evidence, self._gathered
+        things = evidence.conclude() if gathered is None else evidence.conclude(gathered.shows_once)
+        first = evidence.next_number
+        areas = self._areas.conclude(self._flight, first)
+        if gathered is None:
+            return with_areas(things, areas)
+        found = with_areas(things, areas, lies_apart=gathered.lies_apart)
+        found += gathered.conclude(self._flight, first + len(areas), found)
+        return [each for each in found if not self._is_moved_shadow(each, gathered)]
+
+    def candidates(self) -> dict[str, Any] | None:
+        """What became of all candidates, for the report; None if no view was compared."""
+        return None if self._evidence is None else self._evidence.outcomes()
+
+    def _is_moved_shadow(self, change: Change, gathered: GatheredThings) -> bool:
+        """Whether a change is the shadow of what stays, by where the sun stood on both dates."""
+        earlier = self._views.earlier_pictures
+        before_ns = None if earlier is None else earlier.time_ns(change.outline_m)
+        if before_ns is None or change.kind is ChangeKind.MOVING:
+            return False
+        before, after = (slide_of(sun_over(self._site, each)) for each in (before_ns, change.first_seen_ns))
+        if before is None or after is None:
+            return False
+        return gathered.is_moved_shadow(change.outline_m, before, after)
