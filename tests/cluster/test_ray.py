@@ -23,7 +23,7 @@ from sorvolo.cli.main import main
 from sorvolo.cluster import streams
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
-from sorvolo.cluster.orders import FlightWish, Mission, Order, WatchWish
+from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, WatchWish
 from sorvolo.cluster.ray_cluster import demand_same, probe_of, why_not
 from sorvolo.cluster.ray_executor import RayExecutor, _demand_fit, _LiveTry, _with_detector, ray_executor
 from sorvolo.cluster.shared_detector import SharingSettings
@@ -155,6 +155,27 @@ def test_what_a_watch_found_is_not_lost_when_its_answers_are_late(tmp_path: Path
         [], [], [(key, "car 1"), (key, "person 2"), (key, "object 3")], [], [], []
     ]
     assert actor.asked == 2
+
+
+class _FailedRay:
+    """Ray, whose task ended with an exception on its machine, as a machine with other code of Sorvolo's has it."""
+
+    exceptions = ray.exceptions
+
+    def get(self, task: Exception) -> None:
+        """What Ray raises of it: no traceback is lost, and the first line has only the task's name."""
+        failed = ray.exceptions.RayTaskError("sorvolo one", "Traceback: ...", task, pid=7, ip="10.0.0.2")
+        raise failed.as_instanceof_cause()
+
+
+def test_a_task_that_cannot_be_run_is_a_crash_with_its_cause(tmp_path: Path) -> None:
+    executor = RayExecutor("ray://127.0.0.1:1", None, 9.0, tmp_path)
+    executor._ray = _FailedRay()
+    ending, _ = executor._ending(TypeError("Order() takes 3 arguments\nand more"))
+    assert ending == Ending(Outcome.CRASHED, "its task could not be run (TypeError: Order() takes 3 arguments)")
+    with pytest.raises(InputError, match="install the same one") as caught:  # what all flights would meet
+        executor._ending(InputError("the machine far has Sorvolo 0; install the same one"))
+    assert type(caught.value) is InputError
 
 
 @pytest.mark.long

@@ -222,6 +222,9 @@ class RayExecutor:
             ending, found = self._ray.get(task)
         except (StoreError, InputError) as error:  # what every flight would meet on that machine
             raise getattr(error, "cause", error) from None  # Ray's own holds a whole traceback
+        except self._ray.exceptions.RayTaskError as error:  # raised by the task itself, before or after its process
+            cause = f"{type(error.cause).__name__}: {first_line(error.cause)}"
+            return Ending(Outcome.CRASHED, f"its task could not be run ({cause})"), []
         except self._ray.exceptions.RayError as error:
             words = str(error).strip().split("\n")[0]
             lost = f"its machine or Ray's worker was lost ({type(error).__name__}): {words}"
