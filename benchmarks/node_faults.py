@@ -34,6 +34,8 @@ KINDS = {
     "detector killed": (DETECTOR, signal.SIGKILL),
 }
 POISON_EVERY_S = 0.25
+MOST_STARTS = 5  # of one machine
+PATIENCE_MS = 60_000  # before Ray counts a machine as dead that does not answer: it may only be busy
 
 
 class NodeFaults:
@@ -79,8 +81,7 @@ class NodeFaults:
         name, fault = KINDS[kind]
         if not name:
             self._cluster.remove_node(self._draw.choice(sorted(self._cluster.worker_nodes, key=id)), False)
-            with mock.patch.object(signal, "signal"):  # which Ray would set, and cannot from a thread
-                self._cluster.add_node(num_cpus=1)
+            self._add_machine()
             return True
         found = sorted(self._processes(name))
         if not found:
@@ -88,6 +89,17 @@ class NodeFaults:
         with suppress(ProcessLookupError):
             os.kill(self._draw.choice(found), fault)
         return True
+
+    def _add_machine(self) -> None:
+        """One more machine. On a busy computer Ray may give one up that does not answer within 30 s."""
+        with mock.patch.object(signal, "signal"):  # which Ray would set, and cannot from a thread
+            for _ in range(MOST_STARTS):
+                try:
+                    self._cluster.add_node(num_cpus=1)
+                    return
+                except Exception as error:  # Ray raises no class of its own
+                    print(f"a machine did not start: {error}", flush=True)
+        raise RuntimeError("no machine starts here")
 
     def _poison(self) -> None:
         while not self._is_over.wait(POISON_EVERY_S):
@@ -111,7 +123,9 @@ class NodeFaults:
 @contextmanager
 def node_faults(root: Path, seed: int) -> Iterator[NodeFaults]:
     """The cluster, which the environment names meanwhile, and what strikes it."""
-    settings = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled"}
+    settings = {
+        "RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled", "RAY_health_check_timeout_ms": str(PATIENCE_MS),
+    }
     with mock.patch.dict(os.environ, settings):
         from ray.cluster_utils import Cluster
 

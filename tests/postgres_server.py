@@ -31,7 +31,9 @@ class PostgresServer:
     The user "guarded" needs a password, "kept_out" is let in nowhere.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, language: str = "C", locales: Path | None = None) -> None:
+        """Its messages are in `language`, one of the locales in the folder `locales`."""
+        self._language, self._locales = language, locales
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -57,7 +59,8 @@ class PostgresServer:
         """Start it; with `only_reads` as a standby, which takes no changes."""
         standby = self._data / "standby.signal"
         standby.touch() if only_reads else standby.unlink(missing_ok=True)
-        options = " ".join(f"-c {name}='{value}'" for name, value in (_SETTINGS | {"port": str(self.port)}).items())
+        settings = _SETTINGS | {"port": str(self.port), "lc_messages": self._language}
+        options = " ".join(f"-c {name}='{value}'" for name, value in settings.items())
         self._run([program("pg_ctl"), "-D", str(self._data), "-w", "-t", "60", "-l", str(self.folder / "log"), "-o",
                    options, "start"])
 
@@ -79,8 +82,10 @@ class PostgresServer:
             return cursor.fetchall() if cursor.description else []
 
     def _run(self, command: list[str | None]) -> None:
-        # C and a home of its own: neither the tester's language nor files are to matter
-        environment = {"PATH": os.environ["PATH"], "LC_ALL": "C", "HOME": str(self.folder)}
+        # a language and a home of its own: neither the tester's language nor files are to matter
+        environment = {"PATH": os.environ["PATH"], "LANG": "C", "HOME": str(self.folder)}
+        if self._locales is not None:
+            environment["LOCPATH"] = str(self._locales)
         with open(self.folder / "output", "w+") as output:  # no pipe: the server would keep it open
             done = subprocess.run(
                 [str(each) for each in command], user=self._user, cwd=self.folder, env=environment, stdout=output,

@@ -1,6 +1,7 @@
 """A catalogue in PostgreSQL: nothing is lost or doubled, whatever server, role, password or network do."""
 
 import json
+import os
 import shutil
 import socket
 import subprocess
@@ -14,7 +15,7 @@ import pytest
 from fake_flights import SITE, frame, image, map_flight, tile
 from sqlalchemy import Connection, create_engine, inspect
 
-from postgres_server import PostgresServer
+from postgres_server import PostgresServer, program
 from sorvolo.cli.main import main
 from sorvolo.errors import SettingsError, StoreError, UnavailableError
 from sorvolo.store.copies.folder import FolderEnd
@@ -360,7 +361,7 @@ def test_a_disk_of_the_server_that_fills_costs_one_flight(
 def test_a_server_so_full_that_nobody_can_connect_is_named_as_full() -> None:
     url = parsed_url("postgresql://sorvolo@127.0.0.1/small")
     assert url is not None
-    error = PostgresDatabase(url, "sorvolo_x", write=True)._unreachable("FATAL:  could not write init file")
+    error = PostgresDatabase(url, "sorvolo_x", write=True)._refused("FATAL:  could not write init file", ())
     assert str(error).startswith("disk full: could not write postgresql://127.0.0.1/small")
 
 
@@ -372,20 +373,97 @@ def test_a_server_so_full_that_nobody_can_connect_is_named_as_full() -> None:
         ("plain", "postgres", "sslmode=require", "does not support SSL.*correct sslmode"),
         ("kept_out", "postgres", "", "pg_hba.conf.*have the server's administrator let this user and computer in"),
         ("plain", "survey_x", "", r'"survey_x" does not exist.*make the database, or correct the address'),
+        ("guarded:wrong", "postgres", "", "password authentication failed.*give the password in"),
+        ("guarded", "postgres", "", "no password supplied.*give the password in"),
     ],
 )
+@pytest.mark.parametrize("has_codes", [True, False])
 def test_who_is_not_let_in_is_an_error_and_not_waited_for(
-    user: str, database: str, more: str, words: str, tmp_path: Path, postgres: PostgresServer,
+    user: str, database: str, more: str, words: str, has_codes: bool, tmp_path: Path, postgres: PostgresServer,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for role in ("plain", "kept_out"):
-        postgres.sql(f"DROP ROLE IF EXISTS {role}", f"CREATE ROLE {role} LOGIN")
-    postgres.sql("DROP DATABASE IF EXISTS closed", "CREATE DATABASE closed",
-                 "REVOKE CONNECT ON DATABASE closed FROM PUBLIC")
+    if not has_codes:  # as on a system where libpq has no trace
+        monkeypatch.delattr(os, "memfd_create")
+    _make_roles(postgres)
     monkeypatch.setenv(VARIABLE, f"postgresql://{user}@127.0.0.1:{postgres.port}/{database}?{more}".rstrip("?"))
     with pytest.raises(StoreError, match=words) as caught:
         Archive.open(tmp_path / "site", write=True)
     assert not isinstance(caught.value, UnavailableError)
+
+
+def _make_roles(server: PostgresServer) -> None:
+    for role in ("plain", "kept_out", "guarded"):
+        if not server.sql(f"SELECT 1 FROM pg_roles WHERE rolname = '{role}'"):
+            server.sql(f"CREATE ROLE {role} LOGIN PASSWORD '{PASSWORD}'")
+    if not server.sql("SELECT 1 FROM pg_database WHERE datname = 'closed'"):
+        server.sql("CREATE DATABASE closed", "REVOKE CONNECT ON DATABASE closed FROM PUBLIC")
+
+
+def test_what_a_server_refuses_for_another_reason_is_named_by_its_code(
+    tmp_path: Path, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, f"{postgres.url}?options=-cwork_mem=much")
+    with pytest.raises(StoreError, match=r'cannot use .*"work_mem".* \(22023\); ask') as caught:
+        Archive.open(tmp_path / "site", write=True)
+    assert not isinstance(caught.value, UnavailableError)
+
+
+@pytest.fixture(scope="module")
+def german(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PostgresServer]:
+    """A server whose messages are German."""
+    pytest.importorskip("psycopg")
+    locales = tmp_path_factory.mktemp("locales")
+    locales.chmod(0o755)
+    for each in (*locales.parents[:2], locales):
+        each.chmod(each.stat().st_mode | 0o055)  # the server's own user reads it
+    made = shutil.which("localedef") and subprocess.run(
+        ["localedef", "-i", "de_DE", "-f", "UTF-8", str(locales / "de_DE.UTF-8")], check=False, capture_output=True
+    )
+    if program("initdb") is None or not made or not (locales / "de_DE.UTF-8").is_dir():
+        pytest.skip("PostgreSQL or the source of German locales is not installed (Debian: postgresql, locales)")
+    server = PostgresServer(language="de_DE.UTF-8", locales=locales)
+    _make_roles(server)
+    yield server
+    server.remove()
+
+
+@pytest.mark.parametrize(
+    ("user", "database", "german_words", "advice"),
+    [
+        ("nobody_x", "postgres", "existiert nicht", "name another user"),
+        ("plain", "closed", "keine Berechtigung", "ask for a role that may connect"),
+        ("kept_out", "postgres", "lehnt Verbindung ab", "let this user and computer in"),
+        ("plain", "survey_x", "existiert nicht", "make the database"),
+        ("guarded:wrong", "postgres", "fehlgeschlagen", "give the password in"),
+    ],
+)
+def test_a_server_that_speaks_another_language_is_understood(
+    user: str, database: str, german_words: str, advice: str, tmp_path: Path, german: PostgresServer,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from psycopg.pq import version
+
+    if version() < 180_000 and german_words in ("lehnt Verbindung ab", "fehlgeschlagen"):
+        pytest.skip("libpq's trace has these codes since version 18")
+    monkeypatch.setenv(VARIABLE, f"postgresql://{user}@127.0.0.1:{german.port}/{database}")
+    with pytest.raises(StoreError, match=rf"refused {user.partition(':')[0]} .*{german_words}.*{advice}") as caught:
+        Archive.open(tmp_path / "site", write=True)
+    assert not isinstance(caught.value, UnavailableError)
+
+
+def test_a_server_of_another_language_whose_connections_are_all_taken_is_waited_for(
+    tmp_path: Path, german: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import psycopg
+
+    german.sql("GRANT CREATE ON DATABASE postgres TO plain", "ALTER ROLE plain CONNECTION LIMIT 1")
+    address = f"postgresql://plain@127.0.0.1:{german.port}/postgres"
+    monkeypatch.setenv(VARIABLE, address)
+    with psycopg.connect(address), pytest.raises(ConnectionLostError, match="zu viele Verbindungen"):
+        Archive.open(tmp_path / "site", write=True)
+    german.sql("ALTER ROLE plain CONNECTION LIMIT -1")
+    with Archive.open(tmp_path / "site", write=True):
+        pass
 
 
 @pytest.fixture

@@ -1,9 +1,9 @@
-"""A catalogue in PostgreSQL: one schema for each site. The only place that knows PostgreSQL."""
+"""A catalogue in PostgreSQL: one schema for each site. With postgres_refusal.py the only place that knows it."""
 
 import hashlib
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -14,6 +14,7 @@ from sqlalchemy.pool import QueuePool
 from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.store.site import schema
 from sorvolo.store.site.database import ConnectionLostError, Layout, damaged, numbers
+from sorvolo.store.site.postgres_refusal import refusal_codes
 from sorvolo.store.site.sqlite_database import CATALOGUE_LAYOUT
 
 OLDEST_SERVER = 15  # PostgreSQL's major version; older ones are not tested
@@ -25,20 +26,20 @@ _WAITS = {  # of libpq, unless the URL has others: a server that is not there is
     "connect_timeout": "10", "keepalives_idle": "20", "keepalives_interval": "10", "keepalives_count": "3",
     "tcp_user_timeout": "60000",
 }
-_LOST = ("08", "57P01", "57P02", "57P03", "57P05")
+_LOST = ("08", "53300", "57P01", "57P02", "57P03", "57P05")  # 53300: all its connections are taken
 _FULL = ("53100", "53400")
 _FORBIDDEN = ("42501",)
 _ONLY_READS = ("25006",)
 _NOT_OURS = ("3F000", "42P01", "42703", "22P02")
 _PASSWORD = "give the password in ~/.pgpass or PGPASSWORD"
 _ENCRYPTION = "correct sslmode and sslrootcert in the address, or have the server's certificate mended"
-_REFUSALS = (  # by words of a server that lets nobody in, which gives no code; the first that fits
-    ("role \"", "name another user in the address"),
-    ("pg_hba", "have the server's administrator let this user and computer in (pg_hba.conf)"),
-    ("permission denied", "ask for a role that may connect to this database"),
-    ("password", _PASSWORD), ("authentication failed", _PASSWORD),
-    ("certificate", _ENCRYPTION), ("does not support SSL", _ENCRYPTION),
-    ("does not exist", "make the database, or correct the address (--catalogue or SORVOLO_CATALOGUE)"),
+_REFUSALS = (  # by the server's code; by words where no code is known, which are English, as libpq's own always are
+    ("28P01", ("password", "authentication failed"), _PASSWORD),
+    ("28000", ("role \"", "pg_hba"), "name another user in the address, or have the server's administrator let this "
+     "user and computer in (pg_hba.conf)"),
+    ("42501", ("permission denied",), "ask for a role that may connect to this database"),
+    ("", ("certificate", "does not support SSL"), _ENCRYPTION),
+    ("3D000", ("does not exist",), "make the database, or correct the address (--catalogue or SORVOLO_CATALOGUE)"),
 )
 _FULL_WORDS = ("could not write init file", "No space left on device")  # where nobody can connect for that
 
@@ -213,21 +214,31 @@ class PostgresDatabase:
             )
         if state.startswith(_NOT_OURS):
             return damaged(self.place, fault)
-        if not state or _is_lost(error):
-            return self._unreachable(" ".join(lines))
-        return StoreError(f"cannot use {self.place}: {fault} ({state}); ask the server's administrator")
+        if _is_lost(error):
+            return self._lost(" ".join(lines))
+        if not state:
+            return self._refused(" ".join(lines), refusal_codes(self._url))
+        return self._unusable(fault, state)
 
-    def _unreachable(self, fault: str) -> StoreError:
-        for words, advice in _REFUSALS:
-            if words in fault:
+    def _refused(self, fault: str, codes: Sequence[str]) -> StoreError:
+        """What to do where no connection was made; `codes` are those of the server's errors, where they are known."""
+        for code, words, advice in _REFUSALS:
+            if code in codes or (not codes and any(each in fault for each in words)):
                 user = self._url.username or "this user"
                 return StoreError(f"{shown_url(self._url)} refused {user} ({fault}); {advice}")
-        if any(words in fault for words in _FULL_WORDS):
+        if any(code.startswith(_FULL) for code in codes) or any(words in fault for words in _FULL_WORDS):
             return self._full(fault)
+        unknown = next((code for code in codes if not code.startswith(_LOST)), "")
+        return self._unusable(fault, unknown) if unknown else self._lost(fault)
+
+    def _lost(self, fault: str) -> StoreError:
         return ConnectionLostError(
             f"no connection to {self.place} ({fault}); what was stored is safe: run the same command again when the "
             "server is there, it continues where it was"
         )
+
+    def _unusable(self, fault: str, state: str) -> StoreError:
+        return StoreError(f"cannot use {self.place}: {fault} ({state}); ask the server's administrator")
 
     def _full(self, fault: str) -> StoreError:
         return StoreError(
