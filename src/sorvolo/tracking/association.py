@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from sorvolo.geometry.arrays import Floats, PointsM, Rows
 from sorvolo.tracking.motion import Motions
@@ -80,9 +79,18 @@ def class_likelihoods(shares: Floats, labels: Rows, settings: PairSettings) -> F
     return np.log(settings.class_floor + (1 - settings.class_floor) * shares[:, labels])
 
 
+def least_cost(costs: Floats) -> tuple[Rows, Rows]:
+    """Rows and columns of the pairs with the least sum of costs (N, M); each is in one pair at most (Kuhn 1955)."""
+    # 14 MB and a tenth of a second, which a mission that looks for no objects need not spend
+    from scipy.optimize import linear_sum_assignment
+
+    rows, columns = linear_sum_assignment(costs)
+    return rows, columns
+
+
 def assigned(gains: Floats) -> Pairs:
-    """The pairs with the largest sum of gains (tracks, sightings); pairs without gain stay apart (Kuhn 1955)."""
-    rows, columns = linear_sum_assignment(np.minimum(-gains, 0.0))
+    """The pairs with the largest sum of gains (tracks, sightings); pairs without gain stay apart."""
+    rows, columns = least_cost(np.minimum(-gains, 0.0))
     keep = gains[rows, columns] > 0
     return Pairs(rows[keep], columns[keep])
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from sorvolo.geometry.arrays import Floats, Matrix3, frozen
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.objects import CLASSES
+from sorvolo.tracking.association import least_cost
 
 _REACH_M = 2.0  # a found object may lie so far from the true one, the map's own shift taken out
 _OTHER_CLASS_M = 1.0  # so much farther a true object of another class seems
@@ -105,7 +105,7 @@ def match_objects(
     apart_m = np.hypot(*_offsets_m(every, middle_ns, map_from_truth).T).reshape(len(found), len(true))
     differs = np.array([one.label != other.label for one, other in every]).reshape(apart_m.shape)
     cost = np.where(apart_m <= _REACH_M, apart_m + _OTHER_CLASS_M * differs, _APART)
-    rows, columns = linear_sum_assignment(cost)
+    rows, columns = least_cost(cost)
     pairs = tuple((found[row], true[column]) for row, column in zip(rows, columns) if cost[row, column] < _APART)
     return ObjectMatch(pairs, *_unpaired(found, pairs, (apart_m <= _REACH_M).any(axis=1)))
 

@@ -10,12 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.box_overlap import iou_matrix, nesting_matrix
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import TYPICAL_SIZE_M
+from sorvolo.tracking.association import least_cost
 from sorvolo.tracking.doubles import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
 from sorvolo.tracking.plausible import usual_length_m
@@ -226,7 +226,7 @@ def _gathered(laid: Sequence[LaidSighting], settings: MatchSettings) -> list[_Ga
         groups = without_twins([laid[k] for k in inside], settings)
         new = [_begin([inside[k] for k in group], laid) for group in groups]
         costs = _costs(new, objects, places_m, laid, settings)
-        rows, columns = linear_sum_assignment(costs)
+        rows, columns = least_cost(costs)
         matched = {row: column for row, column in zip(rows, columns) if costs[row, column] < settings.gate}
         for row, begun in enumerate(new):
             if row in matched:
