@@ -40,6 +40,7 @@ from sorvolo.cli.telemetry import telemetry_command
 from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
 from sorvolo.errors import SorvoloError, SorvoloWarning
+from sorvolo.store.freed_memory import share_arenas
 
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
@@ -76,6 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. The exit code: 0 success, 1 an error (one line on stderr), 2 wrong usage, 130 stopped."""
     # before NumPy is loaded: BLAS's threads only wait for each other over our small matrices (decision 0033)
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    share_arenas()
     wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
     try:
         with _interrupts_repeated(), _warnings_in_one_line():
