@@ -29,6 +29,7 @@ from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.planar_run import PlanarRun
+from sorvolo.store.freed_memory import share_arenas
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, PosedFrame, Telemetry
 from sorvolo.survey.mosaic import Status
@@ -51,6 +52,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    share_arenas()  # as commands do
     measured = commit()  # before anything could change
     source = DrawnFlight(options.seed, options.keyframes)
     with tempfile.TemporaryDirectory() as folder:
