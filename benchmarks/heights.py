@@ -6,7 +6,8 @@ python benchmarks/heights.py --relief 8 --output benchmarks/results/heights_reli
 Simulated: three strips of photos over a site with houses and trees, GPS noise 0.3 m; mapped, then heights. What all GPS
 fixes err in common is taken out: in height by the median, on the ground by the median shift of patches of bare ground
 against the simulator's own picture from above (phase correlation). Then: error of bare ground and of roofs (away from
-edges), also with the tilt out that GPS fixes leave, the share of cells within 2 sigma, and how far roofs lie from their
+edges), also with the tilt out that GPS fixes leave, and of the ground that two photos see past what stands on it, the
+share of cells within 2 sigma, and how far roofs lie from their
 place in the flat map and in the true orthophoto. In pixels of the map. With --relief the site lies on hills so many
 metres high.
 Real: seconds of the processor and memory of `sorvolo map` and `sorvolo heights`, each a process of its own, and, with
@@ -34,7 +35,7 @@ from sorvolo.missions.heights.measure import read_field
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.flight import simulate_flights
+from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.objects import Label
 from sorvolo.simulation.relief import Relief
 from sorvolo.simulation.settings import (
@@ -53,6 +54,8 @@ from sorvolo.store.site.files import HeightFile
 
 RESULTS = Path(__file__).parent / "results" / "heights.json"
 _M_PER_PX = 0.05  # of the truth
+_CLEAR_M, _STEP_M = 0.1, 0.1  # above a place from where on, and in which steps, its line to a camera is followed
+_LEAST_PHOTOS = 2  # that see a place: one gives no height
 _SURVEY = SimulationSettings(
     flights=1, scene=SceneSettings(ground="urban", people=0, cars=3, small_objects=3),
     path=PathSettings(height_m=30, speed_m_s=5, length_m=40, strips=3, strip_spacing_m=10),
@@ -91,7 +94,8 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
             pass
         list(map_flights([folder / "made" / "flight1" / "photos"], folder / "site", MapSettings(model="none")))
         list(make_heights(folder / "site", HeightSettings()))
-        day = next(iter(simulate_flights(settings))).day
+        flown = next(iter(simulate_flights(settings)))
+        day = flown.day
         with Archive.open(folder / "site", write=False) as archive:
             flight = archive.flights()[0].id
             field = read_field(archive, flight, HeightFile.SURFACE)
@@ -101,7 +105,8 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
         ground = orthophoto(day)
         size = tuple(int(side / _M_PER_PX) for side in ground.area.size_m)
         view = map_view(ground.area.west_m, ground.area.north_m, (_M_PER_PX, _M_PER_PX), size)
-        true = surface_heights(day.things, day.bodies, view, day.relief) - ground_heights(view, day.relief)
+        top = surface_heights(day.things, day.bodies, view, day.relief)
+        true = top - ground_heights(view, day.relief)
         houses = [thing for thing in day.things if thing.label is Label.HOUSE]
         paths = {
             "flat": folder / "site" / "mosaic.tif", "true": folder / "site" / "flights" / flight / "orthophoto.tif",
@@ -115,7 +120,7 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
         return {
             "photos": report["cameras"]["views"], "m_per_px": m_per_px, "cell_m": report["cell_m"],
             "common_px": {name: each.tolist() for name, each in common_px.items()},
-            **_height_errors(field, true, view, moved_m, m_per_px, day.relief),
+            **_height_errors(field, true, view, moved_m, m_per_px, day.relief, _PhotosOver(flown, top, view)),
             "roofs": _roofs(pictures, houses, shift_m, bare, bare_px, field),
             "holes_share": report["surface"]["holes_share"], "seconds": report["seconds"],
         }
@@ -129,8 +134,38 @@ def _site_shift(archive: Archive, settings: SimulationSettings) -> np.ndarray:
     return -place[0, :2]
 
 
+@dataclass(frozen=True, eq=False)
+class _PhotosOver:
+    """The photos of a simulated flight over its true surface `top`, (H, W) heights in m, seen in a map view."""
+
+    flown: SimulatedFlight
+    top: Any
+    view: Any
+
+    def that_see(self, ground_m: Any) -> Any:
+        """(N,) how many photos see each of these places on the ground, (N, 3) m: nothing stands between."""
+        counts = np.zeros(len(ground_m), int)
+        for index in range(len(self.flown)):
+            width_px, height_px = self.flown.camera.width_px, self.flown.camera.height_px
+            pixels = self.flown.view(index).project(ground_m)
+            seen = np.flatnonzero(np.all((pixels > -0.5) & (pixels < [width_px - 0.5, height_px - 0.5]), axis=1))
+            clear = ~self._is_hidden(ground_m[seen], self.flown.true_poses[index].translation_m)
+            counts[seen[clear]] += 1
+        return counts
+
+    def _is_hidden(self, ground_m: Any, eye_m: Any) -> Any:
+        hidden = np.zeros(len(ground_m), bool)
+        highest_m = float(self.top.max())
+        for up_m in np.arange(_CLEAR_M, highest_m, _STEP_M):
+            share = (up_m - ground_m[:, 2]) / (eye_m[2] - ground_m[:, 2])
+            at = ground_m[:, :2] + share[:, None] * (eye_m[:2] - ground_m[:, :2])
+            above = up_m > ground_m[:, 2] + _CLEAR_M
+            hidden |= above & (np.nan_to_num(_true_at(self.top, self.view, at), nan=-np.inf) > up_m)
+        return hidden
+
+
 def _height_errors(
-    field: HeightField, true: Any, view: Any, shift_m: Any, m_per_px: float, relief: Relief
+    field: HeightField, true: Any, view: Any, shift_m: Any, m_per_px: float, relief: Relief, photos: _PhotosOver
 ) -> dict[str, float]:
     points = field.lattice.points_m().reshape(-1, 2)
     at = _true_at(true, view, points + shift_m).reshape(field.up_m.shape)
@@ -143,7 +178,15 @@ def _height_errors(
     edges = cv2.dilate(np.nan_to_num(at), around) - cv2.erode(np.nan_to_num(at), around) > 0.3
     grounds, roofs = known & (at == 0) & ~edges, known & (at > 3) & ~edges
     inside = np.abs(off) < 2 * field.sigma_m
+    seen_by = np.zeros(off.shape, int)
+    places_m = points[grounds.ravel()] + shift_m
+    seen_by[grounds] = photos.that_see(np.column_stack([places_m, relief.up_m(places_m)]))
+    visible = grounds & (seen_by >= _LEAST_PHOTOS)
     return {
+        "visible_ground_rms_px": _rms(off[visible]) / m_per_px,
+        "visible_ground_rms_px_tilt_out": _rms(level[visible]) / m_per_px,
+        "visible_ground_worse_than_half_a_metre": float((np.abs(off[visible]) > 0.5).mean()),
+        "ground_not_visible_but_with_heights": 1 - float(visible.sum() / grounds.sum()),
         "ground_rms_px": _rms(off[grounds]) / m_per_px, "ground_median_px": _median(off[grounds]) / m_per_px,
         "ground_worse_than_half_a_metre": float((np.abs(off[grounds]) > 0.5).mean()),
         "ground_rms_px_tilt_out": _rms(level[grounds]) / m_per_px,

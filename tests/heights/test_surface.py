@@ -10,6 +10,7 @@ from scenes import HOUSE, hills, hills_with_houses, photo, survey_views, texture
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
+from sorvolo.heights.borders import beyond_borders
 from sorvolo.heights.figures import surface_figures, surface_warnings
 from sorvolo.heights.free_space import seen_through
 from sorvolo.heights.islands import IslandSettings
@@ -172,6 +173,36 @@ def _wall(lattice: Lattice) -> np.ndarray:
     """The heights of a wall of 6 m on level ground."""
     x, y = np.moveaxis(lattice.points_m(), 2, 0)
     return np.where((x > 5) & (x < 7) & (np.abs(y) < 3), np.float32(6), np.float32(0))
+
+
+def test_what_patches_gave_to_a_roof_is_given_back_to_the_ground(survey) -> None:
+    views, pictures, _ = survey
+    grays = [gray_from_rgb(each) for each in pictures]
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS))
+    true = true_heights(lattice).astype(np.float32)
+    points = lattice.points_m()
+    bare = hills(points[..., 0], points[..., 1])
+    stands = true - bare > 1
+    wide = cv2.dilate(stands.astype(np.uint8), np.ones((13, 13), np.uint8)) > 0
+    given = wide & ~stands
+    model = np.where(given, cv2.dilate(true, np.ones((13, 13), np.uint8)), true).astype(np.float32)
+    ground = beyond_borders(lattice, model, views, lambda i: grays[i], 150, SweepSettings())
+    moved = np.isfinite(ground)
+    assert moved[given].mean() > 0.9
+    inner = cv2.erode(stands.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+    assert moved[stands].mean() < 0.2 and not moved[inner].any()  # the border is right to some two cells
+    assert not moved[~wide].any()
+    assert np.abs(ground[moved & given] - bare[moved & given]).max() < 0.3
+
+
+def test_right_borders_stay(survey) -> None:
+    views, pictures, _ = survey
+    grays = [gray_from_rgb(each) for each in pictures]
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS))
+    true = true_heights(lattice).astype(np.float32)
+    stands = true - hills(lattice.points_m()[..., 0], lattice.points_m()[..., 1]) > 1
+    ground = beyond_borders(lattice, true, views, lambda i: grays[i], 150, SweepSettings())
+    assert np.isfinite(ground).sum() < 0.05 * stands.sum()
 
 
 def test_a_camera_does_not_see_the_ground_behind_what_stands() -> None:

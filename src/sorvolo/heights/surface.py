@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
+from sorvolo.heights.borders import BorderSettings, beyond_borders
 from sorvolo.heights.free_space import FreeSpaceSettings, seen_through
 from sorvolo.heights.islands import IslandSettings, islands
 from sorvolo.heights.lattice import Lattice
@@ -34,6 +35,7 @@ class SurfaceSettings:
     margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
     unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which one pair decides nothing
     islands: IslandSettings = field(default_factory=IslandSettings)
+    borders: BorderSettings = field(default_factory=BorderSettings)
     free_space: FreeSpaceSettings = field(default_factory=FreeSpaceSettings)
     match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
     relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
@@ -94,6 +96,12 @@ def sweep_surface(
             shown_by[y0:y1, x0:x1] = swept.shown_by[inner]
         yield (number + 1) / len(tiles)
     up_m[islands(up_m, shown_by, lattice.cell_m, settings.islands)] = np.nan
+    ground_m = beyond_borders(
+        lattice, up_m, views, lambda i: pictures(i, lattice.cell_m), side, settings.sweep, settings.borders
+    )
+    given = np.isfinite(ground_m)
+    sigma_m[given] = np.hypot(sigma_m[given], settings.relief_share * (up_m[given] - ground_m[given]))
+    up_m[given] = ground_m[given]
     up_m[_seen_through(lattice, up_m, views, pictures, settings)] = np.nan
     sigma_m[np.isnan(up_m)] = np.nan
     yield Surface(lattice, up_m, sigma_m, covered)
