@@ -179,7 +179,8 @@ class PlanarRun(FlightRun):
         if self._times_ns:
             with self._log.stage(Stage.REGISTER):
                 self._mapper.release()
-                self._begin_flight().release_memory()  # room for the largest solve
+                if self._writer is not None:
+                    self._writer.release_memory()  # room for the largest solve
                 self._mapper.settle()
                 self._offset = self._find_offset()
                 self._tie_to_ground()
