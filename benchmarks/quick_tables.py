@@ -40,18 +40,16 @@ TABLES = {
     ),
     "watch_counts": QuickTable("watch_counts", (), 7.2),
     "peers": QuickTable(
-        "peers", ("{data}/flights", "--flights", "brighton_beach", "--peer-bin", "{peers}", "--three-d"), 6.5,
+        "peers", ("{data}/flights", "--flights", "brighton_beach", "--peer-bin", "{peers}", "--three-d"), 4.7,
     ),
     "change_methods": QuickTable("change_methods", ("--split", "test", "--data", "{data}", "--jobs", "1"), 4.1),
     "change_events": QuickTable("change_events", ("--count", "1", "--methods", "robust"), 8.5),
     "thesis_tables": QuickTable("thesis_tables", (), 8.5),
-    "alignment_speed": QuickTable("alignment_speed", (), 1.0),
     "planar_sand": QuickTable(
         "mosaic_methods", ("--count", "1", "--preset", "sand", "--methods", "planar", "--output",
-                           str(HERE / "results" / "planar_sand.json")), 0.5,
+                           str(HERE / "results" / "planar_sand.json")), 0.3,
     ),
     "real_flights": QuickTable("real_flights", ("{data}/flights",), 4.0),
-    "look_scales": QuickTable("look_scales", ("{data}",), 3.0),
     "first_look": QuickTable("first_look", (), 4.0),
     "change_heights": QuickTable("change_heights", (), 4.0),
 }
