@@ -6,9 +6,9 @@ python benchmarks/heights.py --relief 8 --output benchmarks/results/heights_reli
 Simulated: three strips of photos over a site with houses and trees, GPS noise 0.3 m; mapped, then heights. What all GPS
 fixes err in common is taken out: in height by the median, on the ground by the median shift of patches of bare ground
 against the simulator's own picture from above (phase correlation). Then: error of bare ground and of roofs (away from
-edges), also with the tilt out that GPS fixes leave, and of the ground that two photos see past what stands on it, the
-share of cells within 2 sigma, and how far roofs lie from their
-place in the flat map and in the true orthophoto. In pixels of the map. With --relief the site lies on hills so many
+edges), also with the tilt out that GPS fixes leave, and of the ground that two photos see past what stands on it, also
+up to the edges; the share of cells within 2 sigma; and how far roofs lie from their place in the flat map and in the
+true orthophoto. In pixels of the map. With --relief the site lies on hills so many
 metres high.
 Real: seconds of the processor and memory of `sorvolo map` and `sorvolo heights`, each a process of its own, and, with
 the cameras of COLMAP (benchmarks/peers.py writes them), the distance of cameras after the best similarity.
@@ -179,12 +179,16 @@ def _height_errors(
     grounds, roofs = known & (at == 0) & ~edges, known & (at > 3) & ~edges
     inside = np.abs(off) < 2 * field.sigma_m
     seen_by = np.zeros(off.shape, int)
-    places_m = points[grounds.ravel()] + shift_m
-    seen_by[grounds] = photos.that_see(np.column_stack([places_m, relief.up_m(places_m)]))
+    all_ground = known & (at == 0)
+    places_m = points[all_ground.ravel()] + shift_m
+    seen_by[all_ground] = photos.that_see(np.column_stack([places_m, relief.up_m(places_m)]))
     visible = grounds & (seen_by >= _LEAST_PHOTOS)
+    with_edges = all_ground & (seen_by >= _LEAST_PHOTOS)
     return {
         "visible_ground_rms_px": _rms(off[visible]) / m_per_px,
         "visible_ground_rms_px_tilt_out": _rms(level[visible]) / m_per_px,
+        "visible_ground_with_edges_rms_px_tilt_out": _rms(level[with_edges]) / m_per_px,
+        "visible_ground_with_edges_worse_than_half_a_metre": float((np.abs(off[with_edges]) > 0.5).mean()),
         "visible_ground_worse_than_half_a_metre": float((np.abs(off[visible]) > 0.5).mean()),
         "ground_not_visible_but_with_heights": 1 - float(visible.sum() / grounds.sum()),
         "ground_rms_px": _rms(off[grounds]) / m_per_px, "ground_median_px": _median(off[grounds]) / m_per_px,
