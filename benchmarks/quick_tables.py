@@ -49,8 +49,8 @@ TABLES = {
         "mosaic_methods", ("--count", "1", "--preset", "sand", "--methods", "planar", "--output",
                            str(HERE / "results" / "planar_sand.json")), 0.3,
     ),
-    "real_flights": QuickTable("real_flights", ("{data}/flights",), 4.0),
-    "first_look": QuickTable("first_look", (), 4.0),
+    "real_flights": QuickTable("real_flights", ("{data}/flights",), 3.0),
+    "first_look": QuickTable("first_look", (), 2.6),
     "change_heights": QuickTable("change_heights", (), 4.0),
 }
 
