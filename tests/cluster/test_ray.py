@@ -388,8 +388,7 @@ def test_a_head_that_dies_ends_the_batch_and_the_same_command_goes_on(
     for processes in cluster.head_node.all_processes.values():
         for each in processes:
             each.process.kill()
-    for pid in held:
-        os.kill(pid, signal.SIGCONT)
+    _let_go(held)
     for name, process in batches.items():
         _, printed = process.communicate(timeout=120)
         assert process.returncode == 1, printed

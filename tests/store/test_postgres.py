@@ -408,6 +408,19 @@ def test_what_a_server_refuses_for_another_reason_is_named_by_its_code(
     assert not isinstance(caught.value, UnavailableError)
 
 
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [("sslmod=require", 'invalid connection option "sslmod"'), ("sslmode=must", 'invalid sslmode value: "must"')],
+)
+def test_an_option_of_an_address_that_nobody_knows_is_named(
+    more: str, words: str, tmp_path: Path, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, f"{postgres.url}?{more}")
+    with pytest.raises(StoreError, match=f"{words}; correct the address") as caught:
+        Archive.open(tmp_path / "site", write=True)
+    assert not isinstance(caught.value, UnavailableError)
+
+
 @pytest.fixture(scope="module")
 def german(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PostgresServer]:
     """A server whose messages are German."""

@@ -314,7 +314,7 @@ class MachineDetectors:
             wanted = f"{self._gpus:g} of its graphics card and " if self._gpus else ""
             raise SettingsError(
                 f"--share-detector: a machine does not have {wanted}{self.memory_bytes / 1e6:,.0f} MB of memory free "
-                f"within {WAITS.probe_s:.0f} s; another batch may hold it: wait until it ends, "
+                f"within {WAITS.probe_s:.0f} s; another batch may hold it, or it is too busy: wait until that ends, "
                 f"{'give a smaller --gpus, ' if self._gpus else ''}or give --own-detectors"
             ) from error
         except self._ray.exceptions.RayActorError:

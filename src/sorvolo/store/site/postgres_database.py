@@ -217,7 +217,8 @@ class PostgresDatabase:
         if _is_lost(error):
             return self._lost(" ".join(lines))
         if not state:
-            return self._refused(" ".join(lines), refusal_codes(self._url))
+            fault = " ".join(lines)
+            return self._misspelt(fault) if "invalid" in fault else self._refused(fault, refusal_codes(self._url))
         return self._unusable(fault, state)
 
     def _refused(self, fault: str, codes: Sequence[str]) -> StoreError:
@@ -230,6 +231,10 @@ class PostgresDatabase:
             return self._full(fault)
         unknown = next((code for code in codes if not code.startswith(_LOST)), "")
         return self._unusable(fault, unknown) if unknown else self._lost(fault)
+
+    def _misspelt(self, fault: str) -> StoreError:
+        """Of an option or a value in the address that libpq does not know, or a server that is no PostgreSQL."""
+        return StoreError(f"{shown_url(self._url)}: {fault}; correct the address (--catalogue or SORVOLO_CATALOGUE)")
 
     def _lost(self, fault: str) -> StoreError:
         return ConnectionLostError(
