@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, func, select, text, update
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy.exc import DBAPIError, ProgrammingError
 from sqlalchemy.pool import QueuePool
 
 from sorvolo.errors import StoreError, UnavailableError
@@ -216,9 +216,10 @@ class PostgresDatabase:
             return damaged(self.place, fault)
         if _is_lost(error):
             return self._lost(" ".join(lines))
+        if isinstance(error, ProgrammingError) and not state:  # an option of the address that libpq does not know
+            return self._misspelt(fault)
         if not state:
-            fault = " ".join(lines)
-            return self._misspelt(fault) if "invalid" in fault else self._refused(fault, refusal_codes(self._url))
+            return self._refused(" ".join(lines), refusal_codes(self._url))
         return self._unusable(fault, state)
 
     def _refused(self, fault: str, codes: Sequence[str]) -> StoreError:
@@ -227,13 +228,14 @@ class PostgresDatabase:
             if code in codes or (not codes and any(each in fault for each in words)):
                 user = self._url.username or "this user"
                 return StoreError(f"{shown_url(self._url)} refused {user} ({fault}); {advice}")
+        if not codes and "invalid" in fault:
+            return self._misspelt(fault)
         if any(code.startswith(_FULL) for code in codes) or any(words in fault for words in _FULL_WORDS):
             return self._full(fault)
         unknown = next((code for code in codes if not code.startswith(_LOST)), "")
         return self._unusable(fault, unknown) if unknown else self._lost(fault)
 
     def _misspelt(self, fault: str) -> StoreError:
-        """Of an option or a value in the address that libpq does not know, or a server that is no PostgreSQL."""
         return StoreError(f"{shown_url(self._url)}: {fault}; correct the address (--catalogue or SORVOLO_CATALOGUE)")
 
     def _lost(self, fault: str) -> StoreError:
