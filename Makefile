@@ -23,7 +23,7 @@ check: $(TRAINS)
 	$(BIN)/mypy --num-workers 2
 	$(BIN)/lint-imports
 
-# The published tables that take minutes (some 45 in all), at this commit: make bench [TABLES=NAME...] [DATA=FOLDER] [PEERS=ENVIRONMENT/bin]
+# The published tables that take minutes (some 42 in all), at this commit: make bench [TABLES=NAME...] [DATA=FOLDER] [PEERS=ENVIRONMENT/bin]
 bench: $(READY)
 	$(BIN)/python benchmarks/quick_tables.py $(TABLES) $(if $(DATA),--data $(DATA)) $(if $(PEERS),--peer-bin $(PEERS))
 

@@ -51,7 +51,7 @@ TABLES = {
     ),
     "real_flights": QuickTable("real_flights", ("{data}/flights",), 3.0),
     "first_look": QuickTable("first_look", (), 2.6),
-    "change_heights": QuickTable("change_heights", (), 4.0),
+    "change_heights": QuickTable("change_heights", (), 0.7),
 }
 
 
