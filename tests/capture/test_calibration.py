@@ -392,7 +392,7 @@ def test_a_drones_cameras_are_distinguished(model, width_px, height_px, focal_mm
     # the fields of view across the diagonal that DJI's pages state; lenses that bend differ by some degrees
     ("Mavic 3T", 84), ("Mavic 3T thermal", 61), ("Matrice 30", 84), ("Zenmuse H30", 82.1), ("Air 3", 82),
     ("Air 3 tele", 35), ("Zenmuse H20T thermal", 40.6), ("Zenmuse H30T thermal", 45.2), ("Matrice 4E", 84),
-    ("Matrice 4T", 82), ("Matrice 4T thermal", 45), ("Mavic 3M multispectral", 73.9),
+    ("Mini 5 Pro", 84), ("Matrice 4T", 82), ("Matrice 4T thermal", 45), ("Mavic 3M multispectral", 73.9),
     # from memory, as the presets are: that they agree shows no more than that these have no slip of the pen
     ("Autel EVO II", 79), ("Autel EVO Nano", 84), ("Autel EVO Nano Plus", 85), ("Autel EVO Max 4T", 85),
     ("Autel EVO Max 4T thermal", 61),

@@ -770,6 +770,26 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
     page.locator(".delay", has_text="ended").wait_for()
 
 
+@pytest.mark.parametrize("width_px", [1280, 900, 390])
+def test_the_drone_s_video_lies_beside_what_is_reviewed(
+    browser: Any, served: Served, tmp_path: Path, width_px: int
+) -> None:
+    """On a phone it gives way."""
+    context = browser.new_context(viewport={"width": width_px, "height": 720})
+    watched = Watched(context, served.url)
+    page = watched.page
+    show(watched, served)
+    with video_shown(served, page, tmp_path, f"{width_px:016x}"):
+        page.get_by_label("Larger or smaller").click()
+        page.locator("[data-panel=review]").first.click()
+        gallery, pane = page.locator(".gallery").bounding_box(), page.locator("aside.video").bounding_box()
+        assert gallery["width"] > 0.55 * page.locator(".stage").bounding_box()["width"]
+        assert (pane is None) == (width_px < 760)
+        assert pane is None or pane["x"] >= gallery["x"] + gallery["width"]
+    assert watched.faults == []
+    context.close()
+
+
 SLOW_DECODER = """window.VideoDecoder = class {  // five pictures a second, as a weak tablet has it
   constructor({output}) { this.output = output; this.waiting = []; setInterval(() => this.next(), 200); }
   get decodeQueueSize() { return this.waiting.length; }

@@ -46,6 +46,7 @@ CAMERA_PRESETS = (
     CameraPreset("Zenmuse L1", (), 13.2, 8.8, 8.8, 5472, 3648),
     CameraPreset("Mavic 2 Pro", ("L1D-20c",), 13.2, 8.8, 10.26, 5472, 3648),
     CameraPreset("Air 2S", ("FC3411",), 13.2, 8.8, 8.38, 5472, 3648, 0.03),
+    CameraPreset("Mini 5 Pro", (), 12.8, 9.6, 8.88, 8192, 6144, 0.05),
     CameraPreset("senseFly S.O.D.A.", ("S.O.D.A.", "SODA"), 12.75, 8.5, 10.6, 5472, 3648),
     # 1/2 and 1/1.3 inch
     CameraPreset("Mavic Air 2", ("FC3170",), 6.4, 4.8, 4.5, 4000, 3000, 0.03),
