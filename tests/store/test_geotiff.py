@@ -176,10 +176,10 @@ class Watched(Mapping[tuple[int, int], np.ndarray]):
         return len(self._indices)
 
 
-def test_tiles_are_read_one_at_a_time(tmp_path: Path, site_grid: SiteGrid) -> None:
+def test_few_tiles_are_held_at_a_time(tmp_path: Path, site_grid: SiteGrid) -> None:
     tiles = Watched(4)
     write_cog(tiles, site_grid, tmp_path / "mosaic.tif")
-    assert 1 <= tiles.most <= 3
+    assert 1 <= tiles.most <= 5  # one is written, another is at hand, three were begun ahead
 
 
 def test_a_written_map_reads_back_thinned_in_its_place(tmp_path: Path, site_grid: SiteGrid) -> None:

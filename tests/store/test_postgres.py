@@ -6,6 +6,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -422,22 +423,21 @@ def test_an_option_of_an_address_that_nobody_knows_is_named(
 
 
 @pytest.fixture(scope="module")
-def german(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PostgresServer]:
+def german() -> Iterator[PostgresServer]:
     """A server whose messages are German."""
     pytest.importorskip("psycopg")
-    locales = tmp_path_factory.mktemp("locales")
-    locales.chmod(0o755)
-    for each in (*locales.parents[:2], locales):
-        each.chmod(each.stat().st_mode | 0o055)  # the server's own user reads it
-    made = shutil.which("localedef") and subprocess.run(
-        ["localedef", "-i", "de_DE", "-f", "UTF-8", str(locales / "de_DE.UTF-8")], check=False, capture_output=True
-    )
-    if program("initdb") is None or not made or not (locales / "de_DE.UTF-8").is_dir():
-        pytest.skip("PostgreSQL or the source of German locales is not installed (Debian: postgresql, locales)")
-    server = PostgresServer(language="de_DE.UTF-8", locales=locales)
-    _make_roles(server)
-    yield server
-    server.remove()
+    with tempfile.TemporaryDirectory(prefix="sorvolo-locales-") as folder:  # pytest's own are closed to other users
+        locales = Path(folder)
+        locales.chmod(0o755)  # the server's own user reads it
+        made = shutil.which("localedef") and subprocess.run(
+            ["localedef", "-i", "de_DE", "-f", "UTF-8", str(locales / "de_DE.UTF-8")], check=False, capture_output=True
+        )
+        if program("initdb") is None or not made or not (locales / "de_DE.UTF-8").is_dir():
+            pytest.skip("PostgreSQL or the source of German locales is not installed (Debian: postgresql, locales)")
+        server = PostgresServer(language="de_DE.UTF-8", locales=locales)
+        _make_roles(server)
+        yield server
+        server.remove()
 
 
 @pytest.mark.parametrize(
