@@ -18,7 +18,7 @@ from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, Rows
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.sweep import SweepSettings, choose_views, likeness_on
 from sorvolo.heights.terrain import filled
-from sorvolo.heights.views import View, inside
+from sorvolo.heights.views import View, inside, laid_pixels
 
 _CAPACITY = 1000  # of the cut, which counts in whole numbers, for a likeness of 1
 _WAYS = tuple(  # to the eight neighbours, down and right, and what a tie to each weighs
@@ -132,14 +132,12 @@ def _mean_picture(
     chosen: Sequence[int],
 ) -> Floats32:
     """(H, W) the mean of the photos laid on heights: sharp where those are right, blurred elsewhere."""
-    places_m = np.column_stack([lattice.points_m().reshape(-1, 2), up_m.ravel()])
     total, count = (np.zeros(up_m.shape, np.float32) for _ in range(2))
     for number in chosen:
         view, picture = views[number], pictures(number)
         camera = view.camera.resized(picture.shape[1], picture.shape[0])
-        pixels = np.nan_to_num(replace(view, camera=camera).pixels_from_site(places_m), nan=-1e6)
-        seen = inside(pixels, camera).reshape(up_m.shape)
-        x, y = pixels.T.reshape(2, *up_m.shape).astype(np.float32)
+        x, y = laid_pixels(replace(view, camera=camera), lattice.site_from_cells, up_m)
+        seen = inside(np.stack([x, y], axis=-1), camera)
         total += np.where(seen, cv2.remap(picture.astype(np.float32), x, y, cv2.INTER_LINEAR), 0)
         count += seen
     return np.asarray(total / np.maximum(count, 1), np.float32)

@@ -11,7 +11,7 @@ from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.surface import Surface
 from sorvolo.heights.terrain import filled
-from sorvolo.heights.views import View, ground_outlines_m
+from sorvolo.heights.views import View, ground_outlines_m, laid_pixels
 from sorvolo.mosaic.blending import (
     ALIGN_PX,
     LAYER_APRON_PX,
@@ -171,7 +171,7 @@ class _Painter:
             x1, y1 = (
                 min(side, -(-(each + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX) for each in (left + width, top + height)
             )
-            u, v = _project(self._views[number], self._site_from_grid @ shift @ _shift(x0, y0), up_m[y0:y1, x0:x1])
+            u, v = laid_pixels(self._views[number], self._site_from_grid @ shift @ _shift(x0, y0), up_m[y0:y1, x0:x1])
             seen = cv2.remap(self._pictures(number), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
             yield Layer(number, x0, y0, np.asarray(seen, np.uint8))
 
@@ -194,7 +194,7 @@ def _window_of(view: View, lattice: Lattice, up_m: Floats32) -> tuple[int, int, 
 
 def _merit(window: Lattice, up_m: Floats32, view: View) -> Floats:
     """(H, W) how well a view shows each cell, 0 (not at all) to 1: from above, and not at the picture's border."""
-    u, v = _project(view, window.site_from_cells, up_m)
+    u, v = laid_pixels(view, window.site_from_cells, up_m)
     across = (u - (view.camera.width_px - 1) / 2) / (view.camera.width_px / 2)
     down = (v - (view.camera.height_px - 1) / 2) / (view.camera.height_px / 2)
     eye = window.cells_from_site(view.site_from_camera.translation_m[None, :2])[0]
@@ -205,17 +205,3 @@ def _merit(window: Lattice, up_m: Floats32, view: View) -> Floats:
     border = np.clip(1 - across**2, 0, 1) * np.clip(1 - down**2, 0, 1)
     inside = (np.abs(across) < 1) & (np.abs(down) < 1)
     return np.where(inside, 0.05 + 0.95 * steep**4 * np.sqrt(border), 0.0)
-
-
-def _project(view: View, site_from_pixels: Matrix3, up_m: Floats32) -> tuple[Floats32, Floats32]:
-    """(H, W) float32 picture x and y of raster pixels on their heights."""
-    turn = view.site_from_camera.rotation.T
-    project = view.camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
-    level = project[:, :2] @ site_from_pixels[:2] + np.outer(project[:, 3], [0, 0, 1])
-    columns, rows = np.arange(up_m.shape[1], dtype=np.float32), np.arange(up_m.shape[0], dtype=np.float32)
-    x, y, z = (
-        np.float32(a) * columns[None, :] + (np.float32(b) * rows[:, None] + np.float32(c)) + np.float32(up) * up_m
-        for (a, b, c), up in zip(level, project[:, 2])
-    )
-    z = np.where(z > 1e-6, z, np.float32(np.nan))
-    return np.nan_to_num(x / z, nan=-1e6), np.nan_to_num(y / z, nan=-1e6)

@@ -219,7 +219,7 @@ class PostgresDatabase:
         if isinstance(error, ProgrammingError) and not state:  # an option of the address that libpq does not know
             return self._misspelt(fault)
         if not state:
-            return self._refused(" ".join(lines), refusal_codes(self._url))
+            return self._refused(" ".join(lines), refusal_codes(self._url, float(_WAITS["connect_timeout"])))
         return self._unusable(fault, state)
 
     def _refused(self, fault: str, codes: Sequence[str]) -> StoreError:

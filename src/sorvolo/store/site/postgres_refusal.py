@@ -7,11 +7,10 @@ import time
 
 from sqlalchemy import URL
 
-_LONGEST_S = 10.0  # for the answer of a server that has just answered; as long as for any connection
 _CODE = re.compile(rb'ErrorResponse\t.*? C "([0-9A-Z]{5})"')
 
 
-def refusal_codes(url: URL) -> tuple[str, ...]:
+def refusal_codes(url: URL, within_s: float) -> tuple[str, ...]:
     """The SQLSTATEs of the errors with which a server refuses one more connection, in their order.
 
     psycopg has only the words of these errors, in the server's language: libpq keeps the code of an error before the
@@ -22,14 +21,14 @@ def refusal_codes(url: URL) -> tuple[str, ...]:
         return ()
     trace = os.memfd_create("trace")  # in memory alone: the trace has what the client sends, too
     try:
-        _connect(url, trace)
+        _connect(url, trace, within_s)
         sent = os.pread(trace, os.fstat(trace).st_size, 0)
     finally:
         os.close(trace)
     return tuple(code.decode() for code in _CODE.findall(sent))
 
 
-def _connect(url: URL, trace: int) -> None:
+def _connect(url: URL, trace: int, within_s: float) -> None:
     """Connect and hang up, with all messages written into a file."""
     from psycopg.conninfo import make_conninfo
     from psycopg.pq import PGconn, PollingStatus
@@ -38,7 +37,7 @@ def _connect(url: URL, trace: int) -> None:
     connection = PGconn.connect_start(make_conninfo(**options).encode())
     try:
         connection.trace(trace)
-        end_s = time.monotonic() + _LONGEST_S
+        end_s = time.monotonic() + within_s
         while time.monotonic() < end_s:
             status = connection.connect_poll()
             if status in (PollingStatus.OK, PollingStatus.FAILED):
