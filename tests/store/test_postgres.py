@@ -469,12 +469,13 @@ def test_a_server_of_another_language_whose_connections_are_all_taken_is_waited_
 ) -> None:
     import psycopg
 
-    german.sql("GRANT CREATE ON DATABASE postgres TO plain", "ALTER ROLE plain CONNECTION LIMIT 1")
-    address = f"postgresql://plain@127.0.0.1:{german.port}/postgres"
+    # a role of its own: connections of others' tests may still be ending
+    german.sql("CREATE ROLE crowded LOGIN CONNECTION LIMIT 1", "GRANT CREATE ON DATABASE postgres TO crowded")
+    address = f"postgresql://crowded@127.0.0.1:{german.port}/postgres"
     monkeypatch.setenv(VARIABLE, address)
     with psycopg.connect(address), pytest.raises(ConnectionLostError, match="zu viele Verbindungen"):
         Archive.open(tmp_path / "site", write=True)
-    german.sql("ALTER ROLE plain CONNECTION LIMIT -1")
+    german.sql("ALTER ROLE crowded CONNECTION LIMIT -1")
     with Archive.open(tmp_path / "site", write=True):
         pass
 
