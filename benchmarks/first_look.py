@@ -23,7 +23,6 @@ import numpy as np
 from provenance import commit, drawn_seeds, machine
 from sorvolo.capture.source import open_sources
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen
 from sorvolo.detection.tiling import whole_m_per_px
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
@@ -118,7 +117,7 @@ def glanced(detector: Detector, image: ImageRGB, *, again: bool) -> Boxes:
     session, info = detector._session, detector.info  # the look that nothing offers, as it was not worth it
     seen: Seen = session.see(image, 0.5)
     if again:
-        seen = looked_again(seen, image, session.see, {info.classes.index(k): v for k, v in info.second_look.items()})
+        seen = detector._seen_again(session, image, seen, _CLASSES)
     least = np.array([info.thresholds[each] for each in info.classes])
     kept = seen.scores >= least[seen.labels]
     return {name: seen.boxes_px[kept & (seen.labels == info.classes.index(name))] for name in _CLASSES}

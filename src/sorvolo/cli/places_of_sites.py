@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 SiteArgument = Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")]
 
 
-class _Timed(Protocol):
+class _OfFlight(Protocol):
     @property
-    def seconds(self) -> float:
-        """Since the flight was begun."""
+    def flight(self) -> str:
+        """The flight that is being worked on."""
         ...
 
 
 T = TypeVar("T")
-U = TypeVar("U", bound=_Timed)
+U = TypeVar("U", bound=_OfFlight)
 
 
 class Passing(Protocol):
@@ -56,16 +56,16 @@ class OpenedSite:
 
     def sent(self, updates: Generator[U, None, T], /) -> Generator[U, None, T]:
         """The updates of a mission; after each of its flights but the last what it added is sent to the store."""
-        before_s = 0.0
+        flight = ""
         with closing(updates):
             while True:
                 try:
                     update = next(updates)
                 except StopIteration as end:
                     return end.value
-                if update.seconds < before_s:  # another flight has begun
+                if flight not in ("", update.flight):
                     self._send()
-                before_s = update.seconds
+                flight = update.flight
                 yield update
 
     def _send(self) -> None:

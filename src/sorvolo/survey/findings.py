@@ -202,8 +202,10 @@ class Change(ChangeFacts):
 
 @dataclass(frozen=True)
 class CompareUpdate:
-    """What one step of a comparison did: the frame, how it ended, the changes announced just now, running counts."""
+    """What one step of a comparison did: the flight and its frame, how it ended, the changes announced just now,
+    running counts."""
 
+    flight: str
     frame_name: str
     time_ns: int
     status: ViewStatus

@@ -143,11 +143,12 @@ class FrameView:
 
 @dataclass(frozen=True)
 class MosaicUpdate:
-    """What one step of a mapping mission did: the frame, how it ended for now, and the running counts.
+    """What one step of a mapping mission did: the flight and its frame, how it ended for now, the running counts.
 
     `view` is None for a frame that has no place yet.
     """
 
+    flight: str
     frame_name: str
     status: Status
     reason: str

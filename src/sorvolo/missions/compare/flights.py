@@ -160,8 +160,8 @@ def _compare_one(
                 view, is_resumed = None, False
                 frame, status, reason, residual_px, announced = each, ViewStatus.LOST, each.reason, float("nan"), ()
             yield CompareUpdate(
-                frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced, frame.index + 1,
-                source.frame_count, run.views, run.compared, time.monotonic() - started_s, view,
+                source.name, frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced,
+                frame.index + 1, source.frame_count, run.views, run.compared, time.monotonic() - started_s, view,
                 is_resumed,
             )
         run.finish(source.notices(), started_s)

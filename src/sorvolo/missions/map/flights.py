@@ -136,7 +136,7 @@ def _map_one(
         def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
             view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
             return MosaicUpdate(
-                frame.name, ended[0], ended[1], read, source.frame_count, run.selected,
+                source.name, frame.name, ended[0], ended[1], read, source.frame_count, run.selected,
                 max(setup.plan.expected, run.selected), run.by_vision, ended[2], time.monotonic() - started_s, view,
                 isinstance(frame, Step),
             )

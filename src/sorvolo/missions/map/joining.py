@@ -116,6 +116,6 @@ def _update(
     run: PlanarRun, step: Step, ended: tuple[Status, str], setup: FlightSetup, count: int, started_s: float
 ) -> MosaicUpdate:
     return MosaicUpdate(
-        step.name, *ended, step.index + 1, setup.source.frame_count, run.selected, count, run.by_vision, 0,
-        time.monotonic() - started_s, run.view(step.index, step.time_ns),
+        setup.source.name, step.name, *ended, step.index + 1, setup.source.frame_count, run.selected, count,
+        run.by_vision, 0, time.monotonic() - started_s, run.view(step.index, step.time_ns),
     )
