@@ -1,17 +1,16 @@
 """Weights of people's second look: benchmarks/fit_second_look.py DATA OUT --model FILE --scenes DIR --things DIR
 
 The model searches development pictures, without a second look. What it reports is cut out and shown to another model
-(--by). A logistic regression of the report's own log-odds and the mean of the looks' states how likely the report is
-right. Which looks (TRIED) was chosen by what lies above the threshold, each set judged by weights that did not see it.
-The threshold is the least of THRESHOLDS at which photos of each real ground without people have at most ALARMS false
-reports each.
+(--by), its longer side LOOK_PX long. A logistic regression of the report's own log-odds and the other's states how
+likely the report is right; each set is judged by weights that did not see it. The threshold is the least of THRESHOLDS
+at which photos of each real ground have at most ALARMS false reports each.
 
-Development pictures: real ground without people (the flights `caliterra` to its 46th photo, `fixed_wing` and
-`brighton_beach`, the first painted over as well), tinyperson's and hituav's validation parts (the latter black hot and
-tinted: real people from above, which the head for people learnt only of other flights), and people and things of
-rendered_people.py (DIR: scenes of seeds that no shipped model learnt from) on `fixed_wing`. No set that
-detection_data.py holds out. Writes OUT/reports.npz, read again where it is there, and OUT/second_look.json, which
-pack_second_look.py takes.
+Development pictures: real ground (the flights `caliterra` to its 46th photo and `fixed_wing`, without people, and
+`brighton_beach`, whose people are in brighton_people.json; the second painted over as well), tinyperson's and hituav's
+validation parts (the latter black hot and tinted: real people from above, which the head for people learnt only of
+other flights), and people and things of rendered_people.py (DIR: scenes of seeds that no shipped model learnt from) on
+`fixed_wing`. No set that detection_data.py holds out. Writes OUT/reports.npz, read again where it is there, and
+OUT/second_look.json, which pack_second_look.py takes.
 """
 
 import argparse
@@ -27,6 +26,7 @@ import numpy as np
 
 from detection_data import hituav, tinyperson
 from fit_people import nobody
+from pack_yolox import LOOK_PX
 from painted_grounds import painted_ground
 from people_samples import Source, ground, shown
 from provenance import commit
@@ -44,29 +44,23 @@ from train_default_model import reader
 from train_judge import RIGHT_IOU, UNSURE_IOU, fitted
 
 PERSON, THERMAL = 0, "hituav"
-LOOKS_PX, LEAST = (34.0, 68.0), 0.3
+LEAST = 0.3
+PEOPLE = Path(__file__).parent / "brighton_people.json"
 RENDERED, PAINTED, FRAMES, SIDE_PX, SEED = 60, 15, 60, 640, 5
 THRESHOLDS, ALARMS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9), 0.12  # 2 of brighton_beach's 18 photos
 BARE = ("caliterra", "fixed_wing", "brighton_beach")
 TINT = (8, 0, -8)  # levels
 MOST_CUTS, MOST_OF_A_SET = 160, 60  # right reports, and false ones, of a set count as so many at most
-TRIED = {  # looks, how much larger one may show a report
-    "34 px": ((34.0,), np.inf), "68 px": ((68.0,), np.inf), "34 and 68 px": ((34.0, 68.0), np.inf),
-    "34 px, 68 if no larger": ((34.0, 68.0), 1.0), "34 px, 68 if 1.5 times as large at most": ((34.0, 68.0), 1.5),
-    "34 px, 68 if 2 times as large at most": ((34.0, 68.0), 2.0),
-}
-CHOSEN = "34 px"  # decision 0054
 ALOFT = "IMG_9364.jpg"  # before it the ground is nearer and shows the crew
 
 
 class Report(NamedTuple):
-    """A report of a development picture: its set and picture, its score and the looks', and if it is right."""
+    """A report of a development picture: its set and picture, its score and the other look's, and if it is right."""
 
     place: str
     picture: str
     score: float
-    side_px: float  # its longer side
-    again: np.ndarray  # (looks,)
+    again: float
     is_right: bool
 
 
@@ -99,8 +93,7 @@ def main() -> None:
         photos = json.loads(str(file["photos"]))
         columns = [file[name] for name in Report._fields]
     reports = [Report(*row) for row in zip(*columns)]
-    trials = {name: fit_of(reports, photos, *how) for name, how in TRIED.items()}
-    found = {"commit": commit(), "person": trials[CHOSEN] | {"by": wishes.by}, "trials": trials}
+    found = {"commit": commit(), "person": fit_of(reports, photos) | {"by": wishes.by}}
     (wishes.out / "second_look.json").write_text(json.dumps(found, indent=1) + "\n")
     print(json.dumps(found, indent=1), flush=True)
 
@@ -128,7 +121,7 @@ def shots(data: Path, scenes: list[Scene], things: list[Scene]) -> Iterator[Shot
     plan: list[tuple[LabelledSet, int, tuple[float, ...], float | None]] = [
         (ground(data, "caliterra", ALOFT, "IMG_9399.jpg"), 2, (1.0,), 0.035),
         (flight, 2, (1.0, 1.5), None),
-        (ground(data, "brighton_beach"), 1, (1.0,), 0.0172),
+        (with_people(ground(data, "brighton_beach")), 1, (1.0,), 0.0172),
         (tinyperson(data)["val"], 1, (2.5,), None),
         (thermal(hituav(data)["val"], read), 1, (2.0,), None),
     ]
@@ -157,6 +150,20 @@ def shots(data: Path, scenes: list[Scene], things: list[Scene]) -> Iterator[Shot
             yield Shot(place, str(number), made.image, _nobody(made.boxes, made.ignored), None)
 
 
+def with_people(flight: LabelledSet) -> LabelledSet:
+    """The flight with its people."""
+    known = json.loads(PEOPLE.read_text())
+
+    def labelled(picture: LabelledPicture) -> LabelledPicture:
+        people, around = (
+            np.array(known[what].get(Path(picture.path).stem, []), np.float32).reshape(-1, 4)
+            for what in ("people", "around")
+        )
+        return replace(picture, boxes_px=people, labels=np.full(len(people), PERSON), ignored_px=around)
+
+    return flight.only([labelled(each) for each in flight.pictures])
+
+
 def thermal(frames: LabelledSet, read: Callable[[str], ImageRGB]) -> LabelledSet:
     """Frames from the air that show people: real ones from above, of which neither network for people learnt."""
     own = [each for each in frames.pictures if np.any(each.labels == PERSON)]
@@ -178,7 +185,7 @@ def reported(detector: Detector, by: Session, shot: Shot) -> Iterator[Report]:
         shot.image, tiles="auto", m_per_px=shot.m_per_px, classes=("person",), least_score=LEAST
     )
     seen = Seen(first.boxes_px, first.scores, first.labels)
-    how = SecondLook(LOOKS_PX, own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf)
+    how = SecondLook((LOOK_PX,), own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf)
     again = opinions(seen, shot.image, by.see, {PERSON: how}, SheetSettings(cuts=(MOST_CUTS, MOST_CUTS)))
     hidden = cover_matrix(seen.boxes_px, shot.truth.ignored_px).max(1, initial=0) > 0.5
     own = shot.truth.boxes_px[shot.truth.labels == PERSON]
@@ -190,16 +197,13 @@ def reported(detector: Detector, by: Session, shot: Shot) -> Iterator[Report]:
         if is_right:
             taken.add(nearest)
         if is_right or (best <= UNSURE_IOU and not hidden[row]):
-            side_px = float(max(seen.boxes_px[row, 2:] - seen.boxes_px[row, :2]))
-            looks = again.get(row, np.full(len(LOOKS_PX), np.nan))
-            yield Report(shot.place, shot.name, score, side_px, looks, is_right)
+            yield Report(shot.place, shot.name, score, float(again[row][0]) if row in again else np.nan, is_right)
 
 
-def fit_of(
-    reports: Sequence[Report], photos: Mapping[str, int], looks_px: tuple[float, ...], enlarged: float
-) -> dict[str, Any]:
+def fit_of(reports: Sequence[Report], photos: Mapping[str, int]) -> dict[str, Any]:
     """Weights and threshold, and what every set keeps at the thresholds by weights that did not see that set."""
-    own, again = bounded_odds(np.array([each.score for each in reports])), mean_odds(reports, looks_px, enlarged)
+    own = bounded_odds(np.minimum([each.score for each in reports], SheetSettings().surest))
+    again = bounded_odds(np.array([each.again for each in reports]))
     right, places = np.array([each.is_right for each in reports]), np.array([each.place for each in reports])
     inputs, counts = np.column_stack([own, again]), balanced(places, right)
     crossed = np.zeros(len(reports))
@@ -217,23 +221,16 @@ def fit_of(
         each for each in THRESHOLDS if all(above(place, each)[1] <= ALARMS * photos[place] for place in BARE)
     ]
     weights = {
-        "own": fit[0], "again": fit[1], "shift": fit[2], "least": LEAST, "enlarged": min(enlarged, 1000.0),
+        "own": fit[0], "again": fit[1], "shift": fit[2], "least": LEAST, "enlarged": 1000.0,
         "threshold": min(quiet, default=max(THRESHOLDS)),
     }
     return {
-        "looks_px": list(looks_px), **{name: round(float(each), 3) for name, each in weights.items()},
+        "looks_px": [LOOK_PX], **{name: round(float(each), 3) for name, each in weights.items()},
         "reports": len(reports), "photos": dict(photos),
         "right_and_false": {
             str(each): {place: above(place, each) for place in photos} for each in THRESHOLDS
         },
     }
-
-
-def mean_odds(reports: Sequence[Report], looks_px: tuple[float, ...], enlarged: float) -> np.ndarray:
-    """(N,) the mean log-odds of the looks that each report would get."""
-    how = SecondLook(looks_px, own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=enlarged)
-    own = np.array([[side_px in how.sides_px(each.side_px) for side_px in LOOKS_PX] for each in reports])
-    return np.asarray(np.average(bounded_odds(np.stack([each.again for each in reports])), axis=1, weights=own))
 
 
 def bounded_odds(scores: np.ndarray) -> np.ndarray:

@@ -117,8 +117,15 @@ class Samples:
     def made(self, number: int) -> Shown:
         """One of them."""
         rng = np.random.default_rng((self._seed, number))
-        source = self._plan[int(rng.choice(len(self._plan), p=self._shares))]
+        source = self._plan[self._drawn(rng)]
         return shown(source, self._scenes, self._read, self._side_px, rng, self._stones)
+
+    def source(self, number: int) -> int:
+        """Of which source it is, by its place in the plan."""
+        return self._drawn(np.random.default_rng((self._seed, number)))
+
+    def _drawn(self, rng: np.random.Generator) -> int:
+        return int(rng.choice(len(self._plan), p=self._shares))
 
     def _stones(self, below: Shown, rng: np.random.Generator) -> Shown:
         if rng.random() >= STONES:

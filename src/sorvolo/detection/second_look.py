@@ -30,6 +30,7 @@ class SheetSettings:
     share: float = 0.25  # of the picture's pixels that the sheet has at most; in a crowd the others keep their score
     cuts: tuple[int, int] = (8, 96)  # cut-outs of one picture, best reports first: at least so many may be, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
+    surest: float = 0.98  # no first score counts for more, so that the second look can overrule it (decision 0075)
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
     filling: int = 114  # beyond the picture's edge, as in training
 
@@ -60,7 +61,8 @@ def looked_again(
     for label, how in hows.items():
         rows = (seen.labels == label) & (seen.scores < how.least)
         rows[[row for row in looked_at if seen.labels[row] == label]] = True
-        odds = how.shift + how.own * _odds(scores[rows]) + how.again * again_odds[rows]
+        own_odds = _odds(np.minimum(scores[rows], settings.surest))
+        odds = how.shift + how.own * own_odds + how.again * again_odds[rows]
         scores[rows] = 1 / (1 + np.exp(-odds))
     order = np.argsort(-scores, kind="stable")
     return Seen(seen.boxes_px[order], scores[order], seen.labels[order])
