@@ -64,7 +64,8 @@ model: $(TRAINS)
 	  --aerial $(AERIAL)/default.onnx
 	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
 	  --people $(PEOPLE) --aerial $(AERIAL)/default.onnx
-	$(BIN)/python benchmarks/pack_yolox.py $(YOLOX)
+	$(BIN)/python benchmarks/train_opinion.py $(DATA) $(PEOPLE)/opinion --wheel $(YOLOX) --scenes $(PEOPLE)/scenes
+	$(BIN)/python benchmarks/pack_yolox.py $(YOLOX) $(PEOPLE)/opinion/judge.npz
 	$(BIN)/python benchmarks/fit_second_look.py $(DATA) $(PEOPLE)/fit --scenes $(PEOPLE)/other --things $(PEOPLE)/other
 	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
 	$(BIN)/python benchmarks/pack_second_look.py $(PEOPLE)/fit/second_look.json

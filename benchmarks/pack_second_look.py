@@ -26,7 +26,7 @@ def main() -> None:
     """Rewrite both files and their cards."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights", type=Path)
-    parser.add_argument("--version", default="8")
+    parser.add_argument("--version", default="9")
     parser.add_argument("--measured", type=Path, help="results of second_look.py")
     parser.add_argument("--home", type=Path, default=HOME)
     wishes = parser.parse_args()

@@ -40,7 +40,7 @@ SOURCES = (
 )
 INFO = {
     "name": NAME, "version": "2", "preset": "yolox-nano", "classes": ["person"], "thermal": False, "stride": CELL_PX,
-    "thresholds": {"person": 0.5}, "best_px": {"person": [24, 200]}, "licence": "CC-BY-4.0",
+    "thresholds": {"person": 0.5}, "best_px": {"person": [24, 200]}, "licence": "CC-BY-SA-4.0",
     "created": f"{datetime.now(UTC):%Y-%m-%d}",
     "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in SOURCES), "format": FORMAT,
 }

@@ -11,10 +11,12 @@ from toy_models import draw, rectangle_model
 
 from sorvolo.detection.contract import SecondLook
 from sorvolo.detection.detector import Detector
+from sorvolo.detection.models import find_model
 from sorvolo.detection.second_look import SheetSettings, cut_out, looked_again, opinions
-from sorvolo.detection.session import Seen
+from sorvolo.detection.session import Seen, Session, read_info
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.geometry.box_overlap import iou_matrix
 
 HOW = {"looks_px": [34, 68], "own": 0.5, "again": 0.5, "shift": 0.0, "least": 0.5, "enlarged": 1.5}
 _PERSON, _BOULDER = (40, 60, 160, 200), (240, 40, 400, 220)
@@ -67,6 +69,42 @@ def test_weak_reports_stay_behind_those_that_were_looked_at() -> None:
     after = looked_again(seen, np.zeros((800, 800, 3), np.uint8), lambda sheet: none, {0: how})
     np.testing.assert_array_equal(after.boxes_px, boxes)
     assert (np.diff(after.scores) < 0).all() and after.scores[0] < seen.scores[0]
+
+
+def test_no_report_is_so_sure_that_the_second_look_cannot_overrule_it() -> None:
+    boxes = np.array([[20, 10, 40, 60], [80, 10, 100, 60], [140, 10, 160, 60]], np.float32)
+    seen = Seen(boxes, np.array([0.9999, 0.99, 0.9]), np.zeros(3, np.int64))
+    settings, how = SheetSettings(), SecondLook((34.0,), own=1.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0)
+    none = Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
+    after = looked_again(seen, np.zeros((300, 300, 3), np.uint8), lambda sheet: none, {0: how})
+    unseen = math.log(settings.unseen / (1 - settings.unseen))
+    most = 1 / (1 + math.exp(-math.log(settings.surest / (1 - settings.surest)) - unseen))
+    np.testing.assert_allclose(after.scores[:2], most)
+    assert after.scores[2] < most, "below that, the first look's order stays"
+
+
+def test_the_packaged_opinion_answers_for_each_cut_out_in_its_cell() -> None:
+    """A report of any shape overlaps one of its cell's boxes enough, and each cell has an answer of its own."""
+    session, settings = Session(find_model("second-opinion"), "cpu", 1), SheetSettings()
+    (look_px,) = read_info(find_model("default")).second_look["person"].looks_px
+    rng = np.random.default_rng(3)
+    picture = rng.integers(0, 255, (400, 500, 3), np.uint8)
+    for rows, columns in ((1, 1), (1, 8), (3, 8)):
+        cuts = []
+        for _ in range(rows * columns):
+            longer, aspect, is_wide = rng.uniform(10, 90), rng.uniform(0.15, 1), rng.random() < 0.5
+            size = np.array([longer, longer * aspect] if is_wide else [longer * aspect, longer])
+            corner = rng.uniform(0, np.array([500, 400]) - size)
+            cuts.append(cut_out(picture, np.concatenate([corner, corner + size]), look_px))
+        cells = np.stack([shown for shown, _ in cuts]).reshape(rows, columns, settings.cell_px, settings.cell_px, 3)
+        seen = session.see(np.concatenate(np.concatenate(cells, axis=1), axis=1))
+        for number, (_, box_px) in enumerate(cuts):
+            row, column = divmod(number, columns)
+            there = box_px + settings.cell_px * np.array([column, row, column, row])
+            overlaps = iou_matrix(there.astype(np.float32)[None], seen.boxes_px)[0]
+            answers = set(seen.scores[overlaps >= settings.same_iou].tolist())
+            assert len(answers) == 1, "one answer, its own"
+        assert len(set(seen.scores.tolist())) == rows * columns
 
 
 def test_lists_tiles_and_a_shared_process_judge_alike(detector: Detector, model: Path, tmp_path: Path) -> None:
