@@ -90,9 +90,19 @@ async function route() {
     if (mine !== turn) return;
     if (!(problem instanceof Problem)) throw problem;
     if (problem.status === 401) return;
+    const isAwaited = problem.status === 404 && kind === "site";
     fill(main, el("div", { class: "starting" }, el("h1", {}, problem.title), el("p", {}, problem.detail),
+      isAwaited ? el("p", {}, "Once a first mission has put something on its map, it is shown here.") : null,
       el("p", {}, el("a", { href: "#/" }, "All sites"), " ", button("Try again", () => route()))));
+    if (isAwaited) screen = whenMade(id, route);
   }
+}
+
+/** Call back once something of a site that is not there is on its map: its first mission may just have begun. */
+function whenMade(id, then) {
+  const heard = ({ detail }) => { if (detail.site === id) then(); };
+  for (const type of ["map.tiles", "site.changed"]) station.events.addEventListener(type, heard);
+  return { close() { for (const type of ["map.tiles", "site.changed"]) station.events.removeEventListener(type, heard); } };
 }
 
 let loginBox = null;
