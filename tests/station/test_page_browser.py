@@ -416,6 +416,18 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     page.locator(".message", has_text="all done").wait_for()
 
 
+def test_the_api_can_be_read_as_a_page(served: Served, opened: Watched) -> None:
+    page, paths = opened.page, served.ask("/openapi.json")["paths"]
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_role("link", name="Addresses for programs").click()
+    line = page.locator("summary", has_text="POST /api/runs").first
+    line.click()
+    page.locator("details[open] th", has_text="mission").first.wait_for()
+    assert page.locator("summary").count() == sum(map(len, paths.values()))
+    page.evaluate(AXE)
+    assert serious(page) == []
+
+
 def test_of_two_missions_at_once_the_map_s_figures_are_shown(served: Served, opened: Watched) -> None:
     """A watch beside a map knows of no matched frames, and its end is not the map's."""
     page = opened.page

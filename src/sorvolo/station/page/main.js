@@ -81,6 +81,8 @@ async function route() {
     if (kind === "site" && id) {
       const { showSite } = await siteScreen();
       made = await showSite(main, title, numbers, station, id, view || "map", at.length === 2 && at.every(Number.isFinite) ? at : null);
+    } else if (kind === "api") {
+      made = await (await import("./api_page.js")).showApi(main, title);
     } else {
       made = await showSites(main, title, station);
     }
@@ -146,6 +148,7 @@ function showSettings() {
         ["1 … 7", "panels"], ["J / K", "next and previous in the review"], ["C / R / U", "confirm, reject, withdraw"],
         ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["Esc", "end drawing, close"],
       ].map(([key, words]) => [el("dt", {}, key), el("dd", {}, words)])),
+      el("p", { class: "note" }, el("a", { href: "#/api" }, "Addresses for programs (API)")),
       who ? el("p", { class: "note" }, `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,
         who.name && who.name !== "this machine" ? button("Log out", logOut, { class: "quiet" }) : null) : null));
 }
