@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from mutations import mutated
 from sorvolo.capture import decoding
@@ -34,10 +34,12 @@ from sorvolo.capture.live.links import SentenceBuffer
 from sorvolo.capture.live.reader import StreamFacts
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
+from sorvolo.capture.photo_metadata import read_photo_metadata
 from sorvolo.capture.photos import read_album, read_picture
 from sorvolo.capture.source import open_sources
 from sorvolo.capture.telemetry import read_telemetry
 from sorvolo.errors import InputError
+from sorvolo.store.datasets.picture_files import shown_size_px
 
 
 def png_of(width_px: int, height_px: int) -> bytes:
@@ -60,6 +62,18 @@ def test_a_small_png_of_many_pixels_is_refused_before_it_is_decoded(tmp_path: Pa
         read_album([bomb])
     with pytest.raises(InputError, match="64 megapixels"):
         decode_photo(bomb.read_bytes(), bomb.name)
+
+
+def test_the_size_of_a_png_is_read_without_its_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pillow decodes a PNG that has no EXIF before its pixels to look for it behind them: 1.2 GB for a small file."""
+    def decoded(_: PngImagePlugin.PngImageFile) -> None:
+        pytest.fail("the pixels were decoded")
+
+    monkeypatch.setattr(PngImagePlugin.PngImageFile, "load", decoded)
+    (tmp_path / "bomb.png").write_bytes(png_of(17_000, 17_000))
+    with pytest.raises(InputError, match="64 megapixels"):
+        read_photo_metadata(tmp_path / "bomb.png")
+    assert shown_size_px(tmp_path / "bomb.png") == (17_000, 17_000, 1)
 
 
 def test_the_largest_photos_are_decoded_at_half_their_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 import shutil
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from live_sender import EPOCH_NS, RATE, Sender, number_of, packet_of, picture
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
+from sorvolo.capture.flight_telemetry import FlightTelemetry
 from sorvolo.capture.live.growing import GrowingFile
 from sorvolo.capture.live.growing_folder import GrowingFolder
 from sorvolo.capture.live.klv import encode
@@ -149,6 +151,44 @@ def test_a_video_is_read_while_it_is_written(
     assert np.allclose(steps_s, 1 / RATE, atol=2e-3) and time.monotonic() - began_s < 30
     if has_metadata:
         assert times_ns[0] == EPOCH_NS and len(source.telemetry) == 100
+
+
+def test_of_a_file_that_waits_itself_few_decoded_frames_do(tmp_path: Path) -> None:
+    """A mission that is slower than the drone would hold 256 MB of them through the flight."""
+    film = write_ts(tmp_path / "film.ts", count=40)
+    (source,) = open_sources([f"follow:{film}"], live=replace(ALL, most_bytes_of_file=400_000))
+    assert isinstance(source, LiveStream)
+    frames = source.frames(every_frame)
+    first = next(frames)
+    assert isinstance(first, Frame)
+    frame_bytes = first.image.nbytes // 2  # as it is decoded
+    time.sleep(0.5)
+    assert frame_bytes <= source._queue._held_bytes <= 400_000 < 39 * frame_bytes
+    assert [each.index for each in frames] == list(range(1, 40)) and source.skipped == 0
+
+
+def test_the_newest_telemetry_places_frames_as_all_of_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    film = write_ts(tmp_path / "film.ts", count=60, klv=True)
+
+    def flown() -> tuple[FlightTelemetry, list[Any]]:
+        (source,) = open_sources([f"follow:{film}"], live=ALL)
+        setup = prepare(source, MapSettings(), None, telemetry_named=False)
+        priors = [setup.prior(each, first=False) for each in source.frames(every_frame) if isinstance(each, Frame)]
+        assert setup.telemetry is not None and len(source.telemetry) == 60
+        return setup.telemetry, priors
+
+    telemetry, wanted = flown()
+    assert len(telemetry.samples) == 60
+    monkeypatch.setattr("sorvolo.capture.live.stream._NEWEST_SAMPLES", 12)
+    telemetry, found = flown()
+    assert len(telemetry.samples) == 12
+    for each, other in zip(found, wanted, strict=True):
+        assert each.position_m == pytest.approx(other.position_m, abs=0.02)
+        assert each.rotation == pytest.approx(other.rotation, abs=1e-3)
+    seconds = [index / RATE for index in range(60)]  # long past: a map asks anew once it knows the clocks' offset
+    for index, each in enumerate(telemetry.priors(seconds, 0.0, 0.0)):
+        assert each.position_m == pytest.approx(wanted[index].position_m, abs=0.02)
+        assert telemetry.prior(seconds[index], 0.0).position_m == pytest.approx(each.position_m, abs=0.02)
 
 
 def test_a_film_that_is_no_film_is_refused(tmp_path: Path) -> None:

@@ -100,6 +100,18 @@ def test_a_file_waits_for_its_reader() -> None:
     assert taken == [0, 1, 2, 3, 4, 5] and queue.skipped == 0
 
 
+def test_of_long_telemetry_the_newest_samples_are_given_alone() -> None:
+    log = TelemetryLog("klv", "udp://:1")
+    for second in range(3000):  # more than there is room for at first
+        log.add(UTC + second * S, {"latitude_deg": 46.5, "longitude_deg": 11.3, "speed_m_s": second % 100})
+    newest = log.telemetry(newest=10)
+    assert newest.time_ns.tolist() == [UTC + second * S for second in range(2990, 3000)]
+    assert newest["speed_m_s"].tolist() == list(range(90, 100)) and np.isnan(newest["course_deg"]).all()
+    assert len(log.telemetry()) == log.version == 3000 and len(log.telemetry(newest=5000)) == 3000
+    times_ns, samples = log.samples(2998)
+    assert times_ns.tolist() == newest.time_ns[-2:].tolist() and len(samples) == 2
+
+
 def test_telemetry_grows_and_is_waited_for() -> None:
     log = TelemetryLog("nmea", "udp://:1")
     assert not len(log.telemetry()) and not log.wait_for_fixes(1, time.monotonic() + 0.01)

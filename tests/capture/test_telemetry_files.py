@@ -41,8 +41,9 @@ def test_every_reader_is_listed_by_its_own_name():
 @pytest.mark.parametrize("data, words", [
     (b"", "empty file"),
     (bytes(range(256)) * 10, "binary"),
-    (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", r"binary file, it starts with b'\\x89PNG"),
-    (b"dear diary, today I flew\n", "no known telemetry format"),
+    (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "a binary file, not a log in text; read are DJI subtitles"),
+    (b"\0\0\0\x14ftypmp41\x13\x10\x18mp41\0", r"a video, no log \(telemetry inside a GoPro video"),
+    (b"dear diary, today I flew\nand back\n", "no known telemetry format, it begins with 'dear diary, today I flew';"),
     (b"a,b,c\n1,2,3\n", "no known telemetry format"),
     (b"offsetTime,Longitude,Latitude\n", "no usable table"),
     (b"offsetTime,Longitude,Latitude\n0,0,0\n", "0/0"),

@@ -112,7 +112,7 @@ def test_what_was_not_compared_and_how_small_a_thing_is_found_are_shown(tmp_path
     text = console.export_text()
     assert "Flight b: 1 change in 100 m2; 20 m2 could not be compared" in text
     assert "not compared: 20 m2, crowns or walls lean there" in text and "too dark" not in text
-    assert "distinct ones are found from 0.3 m; faint ones are not found" in text
+    assert "plain ones are found from 0.3 m; faint ones are not found" in text
 
 
 @pytest.mark.parametrize(("changes", "compared_m2", "missing_m2", "is_enough", "text"), [

@@ -20,7 +20,7 @@ pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 
 import av
 import numpy as np
-from browsers import Served, Watched, chromium
+from browsers import WAIT_MS, Served, Watched, chromium
 from live_sender import free_port, sending, udp_url
 from PIL import Image
 from playwright.sync_api import expect
@@ -414,6 +414,53 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     assert page.evaluate("window.pwned") is None
     announce(served, "run.finished", {"headline": "all done"})
     page.locator(".message", has_text="all done").wait_for()
+
+
+def test_the_api_can_be_read_as_a_page(served: Served, opened: Watched) -> None:
+    page, paths = opened.page, served.ask("/openapi.json")["paths"]
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_role("link", name="Addresses for programs").click()
+    line = page.locator("summary", has_text="POST /api/runs").first
+    line.click()
+    page.locator("details[open] th", has_text="mission").first.wait_for()
+    assert page.locator("summary").count() == sum(map(len, paths.values()))
+    page.evaluate(AXE)
+    assert serious(page) == []
+
+
+def test_of_two_missions_at_once_the_map_s_figures_are_shown(served: Served, opened: Watched) -> None:
+    """A watch beside a map knows of no matched frames, and its end is not the map's."""
+    page = opened.page
+
+    def happens(run: str, kind: str, data: dict[str, Any]) -> None:
+        served.station.events.append(NewEvent(kind, data, "field", run))
+
+    figure = page.locator(".figure", has_text="matched").locator("b")
+    happens("run-map", "run.started", {"id": "run-map"})
+    happens("run-map", "run.progress", {"frames": 9, "selected": 5, "matched": 3, "frames_per_second": 7.5})
+    expect(figure).to_have_text("3")
+    happens("run-watch", "run.started", {"id": "run-watch"})
+    happens("run-watch", "run.progress", {"frames": 8, "searched": 2, "frames_per_second": 0.6, "latency_s": 1.2})
+    happens("run-watch", "run.finished", {"headline": "two cars found"})
+    page.locator(".message", has_text="two cars found").wait_for()
+    expect(page.locator(".figure", has_text="frames/s").locator("b")).to_have_text("7.5")
+    expect(figure).to_have_text("3")
+    happens("run-map", "run.finished", {"headline": "all mapped"})
+    page.locator(".message", has_text="all mapped").wait_for()
+    expect(page.locator(".figure", has_text="frames/s")).to_have_count(0)
+
+
+def test_a_link_to_a_site_shows_it_once_its_first_mission_made_it(
+    browser: Any, made_site: Path, tmp_path: Path
+) -> None:
+    with Served(tmp_path) as station:
+        page = browser.new_context().new_page()
+        page.set_default_timeout(WAIT_MS)
+        page.goto(f"{station.url}/#/site/field/map")
+        page.get_by_text("Not found").wait_for()
+        shutil.copytree(made_site, tmp_path / "field")
+        page.locator(".figure", has_text="matched").wait_for()
+        page.context.close()
 
 
 def test_tiles_of_a_site_whose_name_looks_like_a_growing_map(browser: Any, made_site: Path, tmp_path: Path) -> None:

@@ -405,6 +405,15 @@ def test_streams_of_the_own_network_are_not_called(url: str) -> None:
     assert problem.value.status == 400
 
 
+@pytest.mark.parametrize(("url", "words"), [
+    ("file:///etc/passwd", "streams of file are not called"), ("rtsp:///x", "names no host"), ("/etc/x", "no scheme"),
+    ("udp://:80", "with a port from 1024 on"),
+])
+def test_an_address_that_is_refused_states_what_was_found(url: str, words: str) -> None:
+    with pytest.raises(Problem, match=words):
+        checked_stream(url, ())
+
+
 def test_a_stream_that_may_be_called_is_called_where_it_was_checked() -> None:
     """The name is asked for once: an answer that changes afterwards changes nothing."""
     answers = iter([["203.0.113.9"], ["127.0.0.1"]])

@@ -147,7 +147,7 @@ def test_the_ground_that_was_not_compared_lies_on_the_map_and_in_a_table() -> No
     assert "No change was found in 2.13 ha; 4 100 m² could not be compared." in text
     assert "its views could not be compared: no single plane <fits>" in text
     assert "black shadow or night on one of the dates" in text
-    assert "0.30 m" in text and "not known" in text
+    assert "0.30 m" in text and "none of the drawn sizes" in text
     assert page.count('<path class="gaps"') == 2 and page.count('<path class="sizes"') == 1
     assert 'id="show-gaps"' in page and 'id="show-sizes"' in page
     path = re.search(r'<path class="gaps" d="M([^Z]+)Z', page)

@@ -146,7 +146,7 @@ def _camera_of_preset(
         focal_mm / preset.sensor_width_mm * width_px,
         focal_mm / preset.sensor_height_mm * height_px,
     )
-    words = f"preset {preset.name}: {focal_mm:g} mm before {preset.sensor_width_mm:g} mm of sensor"
+    words = f"preset {preset.name}: {focal_mm:g} mm lens, sensor {preset.sensor_width_mm:g} mm wide"
     if preset.changes_lens and not _known(focal_length_mm):
         return _plain_camera(width_px, height_px, focal_px, f"{words}; the lens is a GUESS, {_BETTER}", 0.2)
     if width_px == preset.width_px:

@@ -39,7 +39,11 @@ class TelemetryWishes:
 
 class FlightTelemetry:
     """A flight's telemetry tied to its frames and laid into the site frame. Only `renew` changes it: a live flight's
-    goes on."""
+    goes on.
+
+    `samples` and `track` are of all that is known at first; of a live flight that goes on, of its newest samples: to
+    lay two hours anew for each frame takes 20 ms, and ever more memory. What concerns the whole flight asks for all.
+    """
 
     def __init__(self, source: Source, samples: Telemetry, frame: LocalFrame, wishes: TelemetryWishes) -> None:
         self._source, self._frame = source, frame
@@ -68,7 +72,9 @@ class FlightTelemetry:
         source.wait_for_telemetry(time_ns)
         if source.telemetry_version == self.version:
             return
-        self.version, self.samples = source.telemetry_version, source.telemetry
+        self.version, self.samples = source.telemetry_version, source.latest_telemetry
+        if np.isfinite(self.samples["latitude_deg"]).mean() < _LARGELY:
+            self.samples = source.telemetry  # fixes failed for minutes: heights are tied to what was before
         self.clock = _live_clock(source, self.samples)
         found, _ = track_from_telemetry(self.samples, self.clock, self._frame, ground_elevation_m=self._ground_m)
         self.track = _continued(self.track, shifted(found, self.offset_s))
@@ -105,12 +111,17 @@ class FlightTelemetry:
         tied = np.isfinite(seen_m[:, 0])
         reach_s = _SEARCHED_AGAIN_S if applied_s else _SEARCHED_SIGMAS * self.clock.sigma_s
         return estimate_offset(
-            shifted(self.track, applied_s), np.array(seconds)[tied], seen_m[tied, :2], reach_s=reach_s
+            shifted(self._whole(), applied_s), np.array(seconds)[tied], seen_m[tied, :2], reach_s=reach_s
         )
+
+    def prior(self, seconds: float, smooth_s: float) -> CameraPrior:
+        """What telemetry gives of the camera at this second of the video. See `Track.prior`."""
+        track = self.track if seconds >= self.track.sample_s[0] else self._whole()
+        return track.prior(seconds, smooth_s=smooth_s)
 
     def priors(self, seconds: Sequence[float], offset_s: float, smooth_s: float) -> list[CameraPrior]:
         """What telemetry gives of the camera at these seconds of the video, under another clock offset."""
-        moved = shifted(self.track, offset_s)
+        moved = shifted(self._whole(), offset_s)
         return [moved.prior(each, smooth_s=smooth_s) for each in seconds]
 
     def ground_height(self, ground_up_m: float) -> tuple[float, str]:
@@ -126,6 +137,16 @@ class FlightTelemetry:
     def knows_ground(self) -> bool:
         """Whether the zero of heights is known to be the ground, however well."""
         return bool(np.isfinite(self.track.altitude_offset_sigma_m))
+
+    def _whole(self) -> Track:
+        """The track of all samples so far, its heights counted from the same zero."""
+        source = self._source
+        if not isinstance(source, LiveSource) or len(samples := source.telemetry) == len(self.samples):
+            return self.track
+        found, _ = track_from_telemetry(
+            samples, _live_clock(source, samples), self._frame, ground_elevation_m=self._ground_m
+        )
+        return _continued(self.track, shifted(found, self.offset_s))
 
     @property
     def _known(self) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

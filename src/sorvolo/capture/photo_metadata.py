@@ -85,7 +85,6 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
     not installed; damaged EXIF or XMP is named in `unreadable`.
     """
     header = _dng_header(path) if is_dng(path) else _picture_header(path)
-    check_size(path.name, header.width_px, header.height_px, is_jpeg=header.is_jpeg)
     unreadable = header.unreadable
     properties: dict[str, str] = {}
     if header.xmp:
@@ -112,7 +111,6 @@ class _Header:
 
     width_px: int
     height_px: int
-    is_jpeg: bool
     tags: tuple[_Tags, _Tags, _Tags]
     xmp: bytes
     unreadable: tuple[str, ...]
@@ -122,7 +120,9 @@ def _picture_header(path: Path) -> _Header:
     try:
         with warnings.catch_warnings(record=True) as caught, open_picture(path, path.name) as picture:
             warnings.simplefilter("always")
-            (width_px, height_px), mode, kind = picture.size, picture.mode, picture.format
+            (width_px, height_px), mode = picture.size, picture.mode
+            # first: for EXIF that stands behind a PNG's pixels, Pillow decodes them
+            check_size(path.name, width_px, height_px, is_jpeg=picture.format in ("JPEG", "MPO"))
             tags, unreadable = _exif_of(picture.getexif)
             xmp = picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b""
     except BROKEN_PICTURE as error:
@@ -132,7 +132,7 @@ def _picture_header(path: Path) -> _Header:
     if caught and not unreadable:  # Pillow leaves damaged tags out and warns
         unreadable = ("EXIF",)
     packet = xmp if isinstance(xmp, bytes) else str(xmp).encode()
-    return _Header(width_px, height_px, kind in ("JPEG", "MPO"), tags, packet, unreadable)
+    return _Header(width_px, height_px, tags, packet, unreadable)
 
 
 def _dng_header(path: Path) -> _Header:
@@ -142,6 +142,7 @@ def _dng_header(path: Path) -> _Header:
     except OSError as error:
         raise InputError(f"{path.name} is not a readable picture: {reason_in_words(error)}") from error
     width_px, height_px = dng_size_px(data, path.name)
+    check_size(path.name, width_px, height_px, is_jpeg=False)
 
     def loaded() -> Image.Exif:
         exif = Image.Exif()
@@ -152,7 +153,7 @@ def _dng_header(path: Path) -> _Header:
         warnings.simplefilter("always")
         tags, unreadable = _exif_of(loaded)
     xmp = tags[0].get(_XMP_TAG, b"")
-    return _Header(width_px, height_px, False, tags, xmp if isinstance(xmp, bytes) else b"", unreadable)
+    return _Header(width_px, height_px, tags, xmp if isinstance(xmp, bytes) else b"", unreadable)
 
 
 def _exif_of(load: Callable[[], Image.Exif]) -> tuple[tuple[_Tags, _Tags, _Tags], tuple[str, ...]]:

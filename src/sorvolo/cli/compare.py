@@ -313,7 +313,7 @@ def _size_words(coverage: Mapping[str, Any]) -> str:
     if plain is None:
         return f"only {large:.0%} of even the largest are found"
     faint_words = "faint ones are not found" if faint is None else f"faint ones from {faint:g} m"
-    return f"on half of the ground, distinct ones are found from {plain:g} m; {faint_words}"
+    return f"on half of the ground, plain ones are found from {plain:g} m; {faint_words}"
 
 
 def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool) -> None:

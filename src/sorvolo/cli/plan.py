@@ -139,7 +139,7 @@ def _camera_rows(answers: "FlightAnswers") -> list[tuple[str, str]]:
     camera = answers.camera.camera
     return [
         ("camera", answers.camera.origin),
-        ("pictures", f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.0f} px"),
+        ("picture size", f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.0f} px"),
         ("angle of view", "{:.1f} x {:.1f} deg".format(*answers.angle_of_view_deg)),
     ]
 
@@ -149,15 +149,15 @@ def _height_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tup
     for name, highest_m in answers.maximum_heights_m.items():
         by_resolution = f"{highest_m:,.2f} m by resolution alone, {answers.required_px_per_m[name]:.2f} px/m"
         bounded_m = min(highest_m, settings.max_height_m)
-        rows.append((f"height for {name}", f"at most {bounded_m:.2f} m ({by_resolution})"))
+        rows.append((f"height for {name}", f"at most {bounded_m:,.2f} m ({by_resolution})"))
     detector_m = answers.height_bounds_m.get("detector")
     if detector_m is not None:
-        rows.append(("height for the detector", f"at most {detector_m:.2f} m (model {settings.model}, for people)"))
+        rows.append(("height for the detector", f"at most {detector_m:,.2f} m (model {settings.model}, for people)"))
     reasons = {
         "asked": "as asked", "task": f"the most for {settings.task.value}", "detector": "the most for the detector",
         "ceiling": "the highest flight allowed",
     }
-    rows.append(("flight height", f"{answers.height_m:.2f} m above ground ({reasons[answers.bounded_by]})"))
+    rows.append(("flight height", f"{answers.height_m:,.2f} m above ground ({reasons[answers.bounded_by]})"))
     return rows
 
 
@@ -169,7 +169,7 @@ def _rate_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple
     return [
         ("ground resolution", f"{100 * answers.ground_sampling_m:.2f} cm a pixel"),
         ("a picture covers", "{:.1f} x {:.1f} m".format(*answers.footprint_m)),
-        ("pictures", rate),
+        ("picture rate", rate),
         ("strips", f"{answers.strip_spacing_m:.1f} m apart for {settings.side_overlap:.0%} overlap"),
     ]
 

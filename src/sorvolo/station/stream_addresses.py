@@ -28,10 +28,12 @@ def checked_stream(
     """
     parts, port = _parts(url)
     scheme, host = parts.scheme.lower(), parts.hostname
-    if not host:
+    if not host and scheme in _LISTENED:
         return _waited_for(url, scheme, port)
     if scheme not in CALLED:
         raise _refused(f"streams of {scheme[:20] or 'no scheme'} are not called from here")
+    if not host:
+        raise _refused("this address names no host")
     found = (resolve or _resolved)(host, port or 554)
     if not found:
         raise _refused(f"the host {host[:100]} is not known")
@@ -64,7 +66,7 @@ def _demand_allowed(host: str, found: Sequence[str], allowed: Sequence[Network])
 
 
 def _waited_for(url: str, scheme: str, port: int | None) -> str:
-    if scheme not in _LISTENED or port is None or port < _LOWEST_PORT:
+    if port is None or port < _LOWEST_PORT:
         raise _refused("a stream without a host is waited for: udp, rtp, tcp or rtmp with a port from 1024 on")
     if urlsplit(url).query:
         raise _refused("options behind a ? are not taken")

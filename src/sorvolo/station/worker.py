@@ -31,6 +31,7 @@ from sorvolo.station.orphan_watch import ended_when_orphaned, why_orphaned
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
 from sorvolo.store.exports.plain import plain_json, utc_text
+from sorvolo.store.freed_memory import share_arenas
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.change_records import stored_changes
@@ -388,6 +389,7 @@ def _begin(folder: Path) -> int:
     if lock.isdecimal():
         fcntl.fcntl(int(lock), fcntl.F_SETFD, fcntl.FD_CLOEXEC)
     os.nice(_NICE)
+    share_arenas()
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     return main(folder)
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, TimesNs
+from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.tracking.laying import LaidSighting
 
 _MOST_M_S = {"person": 4.0, "car": 20.0}  # a runner; a car in town; what is neither walks
@@ -45,7 +45,7 @@ def walks(laid: Sequence[LaidSighting], settings: WalkSettings = WalkSettings())
     part of it.
     """
     times_s = np.array([each.sighting.time_ns for each in laid], np.int64) / 1e9
-    order: TimesNs = np.argsort(times_s, kind="stable")
+    order: Rows = np.argsort(times_s, kind="stable")
     candidates = []
     for at, first in enumerate(order):
         for second in order[at + 1:]:
@@ -66,7 +66,7 @@ def walks(laid: Sequence[LaidSighting], settings: WalkSettings = WalkSettings())
 
 
 def _followed(
-    first: int, second: int, laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs,
+    first: int, second: int, laid: Sequence[LaidSighting], times_s: Floats, order: Rows,
     settings: WalkSettings,
 ) -> tuple[list[int], float] | None:
     """The sightings on the way that two begin, and how far they lie off it, rms in sigmas; None where it is no way."""
@@ -90,7 +90,7 @@ def _followed(
 
 
 def _prolonged(
-    way: list[int], laid: Sequence[LaidSighting], times_s: Floats, order: TimesNs, settings: WalkSettings
+    way: list[int], laid: Sequence[LaidSighting], times_s: Floats, order: Rows, settings: WalkSettings
 ) -> list[int]:
     """A way with the later sightings of its class that lie on it."""
     members, label = list(way), laid[way[0]].sighting.label

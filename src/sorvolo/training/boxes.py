@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sorvolo.geometry.arrays import Floats, TimesNs
+from sorvolo.geometry.arrays import Floats, Rows
 
 _MOST_GROWTH = 4.135  # log(1000 / 16): a box never grows more than 62 times from its anchor
 
@@ -67,7 +67,8 @@ def giou_loss(boxes: Tensor, wanted: Tensor) -> Tensor:
     return 1 - shared / union + (around - union) / around
 
 
-def _suppressed(boxes: Floats, scores: Floats, most: int, iou: float, least_score: float) -> TimesNs:
+def _suppressed(boxes: Floats, scores: Floats, most: int, iou: float, least_score: float) -> Rows:
+    """(K, 3) rows of 0, class, index."""
     rows = []
     x1, y1, x2, y2 = boxes.T
     areas = np.maximum(x2 - x1, 0) * np.maximum(y2 - y1, 0)

@@ -71,6 +71,11 @@ class GrowingFolder:
         return self._log.telemetry()
 
     @property
+    def latest_telemetry(self) -> Telemetry:
+        """The same: each photo carries its own."""
+        return self.telemetry
+
+    @property
     def telemetry_version(self) -> int:
         """Grows with every sample."""
         return self._log.version

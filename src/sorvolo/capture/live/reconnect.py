@@ -23,6 +23,7 @@ class LiveSettings:
     give_up_s: float = 30.0  # a source that was silent for so long has ended
     fix_wait_s: float = 1.0  # a frame waits so long for the fix that follows it, if every frame is kept
     most_bytes: int = 256_000_000  # of decoded frames that wait
+    most_bytes_of_file: int = 32_000_000  # the same of a growing file, which itself keeps what nobody has read yet
     same_flight_s: float = 900.0  # a run that was killed goes on with a stream that returns within so long
 
     def __post_init__(self) -> None:

@@ -40,6 +40,7 @@ _FIRST_FIXES = 2  # enough for where a flight begins, and how fast
 _FIRST_FIXES_S = 10.0  # waited for them; then the flight begins without
 _CLOCKS_AGREE_NS = 5_000_000_000  # further apart, one of the two clocks was set wrong; by choice
 _DELAYS_KEPT = 60  # of the newest fixes, whose least delay ties the clocks: a minute at one a second
+_NEWEST_SAMPLES = 4096  # of telemetry, which place the frames that come: seven minutes at ten a second; by choice
 _ZOOMED = 0.03  # relative change of the field of view: more than its rounding in the metadata
 _POLL_S = 0.25  # how soon an end is noticed; by choice
 _TIMELY_NS = 5_000_000  # a frame so little before its turn is taken: the next one comes a whole frame later
@@ -93,7 +94,8 @@ class LiveStream:
     ) -> None:
         self._settings, self._until, self._is_file = settings, until, path is not None
         self._closing = threading.Event()
-        self._queue = FrameQueue(holds_all=settings.keeps_all, most_bytes=settings.most_bytes, blocks=self._is_file)
+        most_bytes = settings.most_bytes_of_file if self._is_file else settings.most_bytes
+        self._queue = FrameQueue(holds_all=settings.keeps_all, most_bytes=most_bytes, blocks=self._is_file)
         self._clock = StreamClock()
         self._log = TelemetryLog("nmea" if link else FORMAT, link or address.shown)
         self._link = NmeaLink(link, settings, self._fix) if link else None
@@ -162,9 +164,12 @@ class LiveStream:
     @property
     def telemetry(self) -> Telemetry:
         """What is known so far, its times on the frames' clock."""
-        found = self._link.notices() if self._link else klv_notices(self._reader.metadata_counts)
-        known = self._log.telemetry(found)
-        return replace(known, time_ns=known.time_ns + self._later_ns) if self._later_ns else known
+        return self._telemetry(None)
+
+    @property
+    def latest_telemetry(self) -> Telemetry:
+        """What places the frames that come: the newest samples of a long flight."""
+        return self._telemetry(_NEWEST_SAMPLES)
 
     @property
     def telemetry_version(self) -> int:
@@ -453,6 +458,11 @@ class LiveStream:
         self._queue.end()
 
     # ---- telemetry on the frames' clock -----------------------------------------------------------------------
+
+    def _telemetry(self, newest: int | None) -> Telemetry:
+        found = self._link.notices() if self._link else klv_notices(self._reader.metadata_counts)
+        known = self._log.telemetry(found, newest)
+        return replace(known, time_ns=known.time_ns + self._later_ns) if self._later_ns else known
 
     def _log_metadata(self, stamp_ns: int, stated: LocalSet) -> None:
         if self._link is not None:

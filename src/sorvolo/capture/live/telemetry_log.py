@@ -24,13 +24,13 @@ class TelemetryLog:
 
     def __init__(self, reader: str, name: str) -> None:
         self._reader, self._name = reader, name
-        self._times_ns = np.zeros(_FIRST_ROWS, np.int64)
-        self._rows: Floats = np.full((_FIRST_ROWS, len(TELEMETRY_COLUMNS)), np.nan)
+        self._times_ns = np.empty(_FIRST_ROWS, np.int64)
+        self._rows: Floats = np.empty((_FIRST_ROWS, len(TELEMETRY_COLUMNS)))
         self._count = self._fixes = self._late = 0
         self._newest_ns = -(2**62)
         self._changed = threading.Condition()
         self._known = no_telemetry()
-        self._known_count = 0
+        self._known_rows = (0, 0)  # of which it was made: from, to
 
     def add(self, time_ns: int, columns: Mapping[str, float]) -> None:
         """One more sample (UTC on the frames' clock); one that is not newer than the last is counted and left out."""
@@ -39,9 +39,9 @@ class TelemetryLog:
                 self._late += 1
                 return
             if self._count == len(self._times_ns):
-                self._times_ns = np.concatenate([self._times_ns, np.zeros_like(self._times_ns)])
-                self._rows = np.concatenate([self._rows, np.full_like(self._rows, np.nan)])
+                self._hold(self._times_ns, self._rows)
             self._times_ns[self._count] = self._newest_ns = time_ns
+            self._rows[self._count] = np.nan
             for name, value in columns.items():
                 self._rows[self._count, TELEMETRY_COLUMNS.index(name)] = value
             self._fixes += bool(np.isfinite(self._rows[self._count, _PLACE]))
@@ -57,11 +57,9 @@ class TelemetryLog:
             newer = self._times_ns[: self._count] > times_ns[-1]
             times_ns = np.concatenate([times_ns, self._times_ns[: self._count][newer]])
             samples = np.concatenate([samples, self._rows[: self._count][newer]])
-            room = max(_FIRST_ROWS, 2 * len(times_ns))
-            self._times_ns, self._rows = np.zeros(room, np.int64), np.full((room, len(TELEMETRY_COLUMNS)), np.nan)
-            self._times_ns[: len(times_ns)], self._rows[: len(times_ns)] = times_ns, samples
-            self._count, self._newest_ns = len(times_ns), int(times_ns[-1])
-            self._fixes, self._known_count = int(np.isfinite(samples[:, _PLACE]).sum()), -1
+            self._hold(times_ns, samples)
+            self._newest_ns = int(times_ns[-1])
+            self._fixes, self._known_rows = int(np.isfinite(samples[:, _PLACE]).sum()), (0, -1)
             self._changed.notify_all()
 
     def samples(self, since: int) -> tuple[TimesNs, Floats]:
@@ -74,20 +72,23 @@ class TelemetryLog:
         """How many samples there are: it grows with every one."""
         return self._count
 
-    def telemetry(self, notices: Sequence[Notice] = ()) -> Telemetry:
-        """What is known so far, with the notices of whoever read it; `no_telemetry()` while nothing is."""
+    def telemetry(self, notices: Sequence[Notice] = (), newest: int | None = None) -> Telemetry:
+        """What is known so far, with the notices of whoever read it; `no_telemetry()` while nothing is.
+
+        With `newest` only of so many samples: all of a long flight take 10 to 20 ms, and the more memory the longer.
+        """
         with self._changed:
-            count = self._count
-            if count == self._known_count:
+            chosen = (0 if newest is None else max(0, self._count - newest), self._count)
+            if chosen == self._known_rows:
                 return self._known
-            times_ns, rows = self._times_ns[:count].copy(), self._rows[:count].copy()
+            times_ns, rows = self._times_ns[slice(*chosen)].copy(), self._rows[slice(*chosen)].copy()
             late = notice("backward_time", self._late, "{} samples came out of order and are not used")
         try:
             columns = {name: rows[:, place] for place, name in enumerate(TELEMETRY_COLUMNS)}
             found = clean(self._reader, self._name, times_ns, columns, notices=[*notices, *late])
         except InputError:  # nothing usable yet
             found = replace(no_telemetry(), notices=tuple(notices))
-        self._known, self._known_count = found, count
+        self._known, self._known_rows = found, chosen
         return found
 
     def wait_for_fixes(self, count: int, until_s: float) -> bool:
@@ -99,3 +100,10 @@ class TelemetryLog:
         """Wait for a sample at or after a time (UTC), at most until that moment; whether there is one."""
         with self._changed:
             return self._changed.wait_for(lambda: self._newest_ns >= time_ns, max(0.0, until_s - time.monotonic()))
+
+    def _hold(self, times_ns: TimesNs, samples: Floats) -> None:
+        """Keep these, with room for as many more."""
+        self._count = len(times_ns)
+        room = max(_FIRST_ROWS, 2 * self._count)
+        self._times_ns, self._rows = np.empty(room, np.int64), np.empty((room, len(TELEMETRY_COLUMNS)))
+        self._times_ns[: self._count], self._rows[: self._count] = times_ns, samples

@@ -43,12 +43,9 @@ def read_telemetry(path: Path) -> Telemetry:
     data = _bytes_of(path)
     reader = _reader_for(data[:_HEAD_BYTES])
     if reader is None:
-        head = data[:24]
-        what = "a binary file" if _is_binary(data[:_HEAD_BYTES]) else "text of no known telemetry format"
         raise InputError(
-            f"{path}: {what}, it starts with {head!r}; read are DJI subtitles (.SRT), GPX tracks with times, "
-            "tables with Latitude and Longitude columns (DatCon, Airdata, DJI logs as .csv), and NMEA 0183 with GGA or "
-            "RMC sentences"
+            f"{path}: {_unknown(data)}; read are DJI subtitles (.SRT), GPX tracks with times, tables with Latitude and "
+            "Longitude columns (DatCon, Airdata, DJI logs as .csv), and NMEA 0183 with GGA or RMC sentences"
         )
     return TELEMETRY_READERS[reader].read(data, str(path))
 
@@ -138,5 +135,11 @@ def _reader_for(head: bytes) -> str | None:
     return next((name for name, reader in TELEMETRY_READERS.items() if reader.recognises(head)), None)
 
 
-def _is_binary(head: bytes) -> bool:
-    return b"\0" in head and head[:2] not in (b"\xff\xfe", b"\xfe\xff")
+def _unknown(data: bytes) -> str:
+    """What a file that no reader recognises is, in words."""
+    if data[4:8] == b"ftyp":
+        return "a video, no log (telemetry inside a GoPro video is used where that video itself is the flight)"
+    if b"\0" in data[:_HEAD_BYTES] and data[:2] not in (b"\xff\xfe", b"\xfe\xff"):
+        return "a binary file, not a log in text"
+    begins = data[:40].decode("utf-8", "replace").split("\n")[0].strip()
+    return f"text of no known telemetry format, it begins with {begins!r}"

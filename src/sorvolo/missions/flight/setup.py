@@ -67,7 +67,7 @@ class FlightSetup:
         if self.telemetry is None:
             return local_prior(self.source.camera.camera, first=first)
         self.telemetry.renew(frame.time_ns)
-        return self.telemetry.track.prior(self.seconds(frame.time_ns), smooth_s=self.plan.smooth_s)
+        return self.telemetry.prior(self.seconds(frame.time_ns), self.plan.smooth_s)
 
     def seconds(self, time_ns: int) -> float:
         """Seconds of a frame's time on the frames' clock."""

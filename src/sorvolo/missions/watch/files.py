@@ -42,7 +42,7 @@ from sorvolo.tracking.doubles import without_doubles
 _MOST_WAITING = 4  # frames; a disk that is slower than the detector slows the watch, it does not fill the memory
 _TRACKS_EVERY_S = 5.0  # the file is whole each time and grows; by choice
 _LABELS_EVERY_NS = 1_000_000_000  # frames nearer in time show the same again
-_CROPS_BYTES = 96_000_000  # of the latest sightings, one of which may become a track's best
+_CROPS_BYTES = 96_000_000  # of the tracks' best sightings, where there are very many tracks
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,6 @@ class WatchFiles:
         self.folder = folder
         self._outputs, self._site = outputs, site
         self._crops: OrderedDict[tuple[int, bytes], ImageRGB] = OrderedDict()
-        self._crops_bytes = 0
         self._best: dict[int, Sighting] = {}
         self.crop_names: dict[int, str] = {}
         self._segments: dict[int, int] = {}  # by track
@@ -130,6 +129,11 @@ class WatchFiles:
                 self.crop_names[track.id] = write_crop(self.folder, track.id, crop)
                 self._best[track.id] = track.best
         return self.crop_names.get(track.id)
+
+    def keep_crops_of(self, tracks: Iterable[Track]) -> None:
+        """Of the crops in memory keep those of all these tracks' best views; no other can become a track's best."""
+        best = {_key(track.best) for track in tracks}
+        self._crops = OrderedDict((key, crop) for key, crop in self._crops.items() if key in best)
 
     def forget(self, track_ids: Iterable[int]) -> None:
         """The crops of tracks that turned out to be others belong to nothing any more; `clear` removes them."""
@@ -234,10 +238,10 @@ class WatchFiles:
 
     def _keep_crop(self, sighting: Sighting, crop: ImageRGB) -> None:
         self._crops[_key(sighting)] = crop
-        self._crops_bytes += crop.nbytes
-        while self._crops_bytes > _CROPS_BYTES and len(self._crops) > 1:
+        held = sum(each.nbytes for each in self._crops.values())
+        while held > _CROPS_BYTES and len(self._crops) > 1:
             _, dropped = self._crops.popitem(last=False)
-            self._crops_bytes -= dropped.nbytes
+            held -= dropped.nbytes
 
 
 def _file_name(frame: Frame) -> str:

@@ -89,8 +89,9 @@ def utc_ns(setup: FlightSetup, frame_ns: int) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """The confirmed tracks after a frame, those that it shows, and those that it confirmed."""
+    """All tracks after a frame, the confirmed ones, those of them that it shows, and those that it confirmed."""
 
+    known: Sequence[Track]
     confirmed: Sequence[Track]
     seen: Sequence[Track]
     new: Sequence[Track]
@@ -224,9 +225,10 @@ class WatchRun:
         )
 
     def _tracks_after(self, taken: Taken) -> "_Tracks":
-        confirmed = [track for track in self._places.tracks() if track.confirmed]
+        known = self._places.tracks()
+        confirmed = [track for track in known if track.confirmed]
         seen = [track for track in confirmed if track.id in set(taken.track_ids)]
-        return _Tracks(confirmed, seen, [each for each in confirmed if each.id in taken.new_ids])
+        return _Tracks(known, confirmed, seen, [each for each in confirmed if each.id in taken.new_ids])
 
     def _write(self, written: SeenFrame, size_px: tuple[int, int], seen: Sequence[Track]) -> None:
         """Write a frame's part of the files; of one whose picture is not there any more, what does without it."""
@@ -241,6 +243,7 @@ class WatchRun:
         for track in tracks.seen:
             self._files.crop_of(track)
         self._files.forget(taken.merged)
+        self._files.keep_crops_of(tracks.known)
         self._notifier.report(
             tracks.new, tracks.seen, self._files.crop_names, taken.segment, is_resumed=is_resumed
         )

@@ -20,7 +20,7 @@ export function followLive(screen) {
 
 class Live {
   constructor(screen) {
-    Object.assign(this, { screen, trail: [], places: [], progress: null, run: null, ends: [], alerted: new Set(), statuses: {}, reasons: {}, follows: false });
+    Object.assign(this, { screen, flown: new Map(), ends: [], alerted: new Set(), follows: false });
     const on = (type, listener) => {
       const mine = ({ detail }) => { if (detail.site === screen.data.id) listener(detail.data ?? {}, detail); };
       screen.station.events.addEventListener(type, mine);
@@ -61,30 +61,44 @@ class Live {
     } catch { /* the connection's own sign shows it; the next change loads it */ } finally { this.covering = false; }
   }
 
+  /** What a running mission has reported so far. */
+  of(run) {
+    if (!this.flown.has(run)) this.flown.set(run, { trail: [], places: [], progress: null, statuses: {}, reasons: {} });
+    return this.flown.get(run);
+  }
+
+  /** The mission whose figures and track are shown: where several run, one that places frames by their pictures. */
+  get shown() {
+    const all = [...this.flown.values()];
+    return all.find((each) => each.progress?.selected !== undefined) ?? all.at(-1);
+  }
+
   started(_, event) {
-    Object.assign(this, { trail: [], run: event.run, progress: null, statuses: {}, reasons: {} });
+    this.flown.delete(event.run);
+    this.of(event.run);
     this.show();
   }
 
   progressed(data, event) {
-    this.run = event.run;
-    this.progress = data;
-    if (data.reason) this.reasons[data.reason] = (this.reasons[data.reason] ?? 0) + 1;
+    const run = this.of(event.run);
+    run.progress = data;
+    if (data.reason) run.reasons[data.reason] = (run.reasons[data.reason] ?? 0) + 1;
     this.show();
   }
 
   placed(data, event) {
-    this.run = event.run;
+    const run = this.of(event.run);
     const { position } = data;
-    this.places.push(Date.now());
-    this.statuses[data.status] = (this.statuses[data.status] ?? 0) + 1;
+    run.places.push(Date.now());
+    run.statuses[data.status] = (run.statuses[data.status] ?? 0) + 1;
     const delay_s = (new Date(event.at) - new Date(data.time)) / 1000;
     // a recorded flight has none, and a drone whose clock is ahead of the station's has none that is known
-    this.delay_s = delay_s > -CLOCKS_AGREE_S && delay_s < LONGEST_DELAY_S ? Math.max(0, delay_s) : undefined;
+    run.delay_s = delay_s > -CLOCKS_AGREE_S && delay_s < LONGEST_DELAY_S ? Math.max(0, delay_s) : undefined;
+    if (position) run.trail.push(position.slice(0, 2));
+    if (run !== this.shown) return;
     this.last = data;
-    if (position) this.trail.push(position.slice(0, 2));
     const { view, data: site } = this.screen;
-    if (position && view && !site.detail.bounds_wgs84 && this.trail.length === 1) view.go(position.slice(0, 2), 18);
+    if (position && view && !site.detail.bounds_wgs84 && run.trail.length === 1) view.go(position.slice(0, 2), 18);
     this.drawSoon();
   }
 
@@ -92,7 +106,7 @@ class Live {
   heard(telemetry) {
     this.telemetry = telemetry;
     const { latitude_deg: lat, longitude_deg: lon, camera_yaw_deg: camera, body_yaw_deg: body } = telemetry ?? {};
-    if (lat !== undefined && Date.now() - (this.places.at(-1) ?? 0) > PLACED_FOR_MS) {
+    if (lat !== undefined && Date.now() - (this.shown?.places.at(-1) ?? 0) > PLACED_FOR_MS) {
       this.last = { position: [lon, lat], heading_deg: body ?? camera ?? 0 };
       this.drawSoon();
     } else this.show();
@@ -111,7 +125,8 @@ class Live {
     const { view, data } = this.screen;
     if (!view || this.screen.closed || !this.last) return;
     view.put("drone", droneFeatures(this.last));
-    const line = this.trail.length > 1 ? [{ type: "Feature", properties: { live: true }, geometry: { type: "LineString", coordinates: this.trail } }] : [];
+    const trail = this.shown?.trail ?? [];
+    const line = trail.length > 1 ? [{ type: "Feature", properties: { live: true }, geometry: { type: "LineString", coordinates: trail } }] : [];
     view.put("track", [...data.all.track, ...line]);
     if (this.follows && this.last.position) view.go(this.last.position.slice(0, 2), view.map.getZoom());
   }
@@ -134,12 +149,12 @@ class Live {
     if (choices.get("sound")) beep();
   }
 
-  ended(type, data) {
-    this.progress = null;
-    this.run = null;
-    this.trail = [];
-    this.last = null;
-    this.screen.view?.put("drone", []);
+  ended(type, data, event) {
+    this.flown.delete(event.run);
+    if (!this.flown.size) {
+      this.last = null;
+      this.screen.view?.put("drone", []);
+    }
     this.show();
     if (type === "run.failed") message("The mission failed", { kind: "error", todo: data.error || data.headline || "See “Missions” for why." });
     else if (data.state === "incomplete") message("The mission ended before its flight", { kind: "warning", todo: data.headline });
@@ -147,11 +162,11 @@ class Live {
   }
 
   /** Figures of the mission that runs. */
-  ofRun() {
-    const { matched, selected, frames_per_second: rate, latency_s: delay_s } = this.progress ?? {};
-    const by_gps = this.statuses["gps-only"] ?? 0;
-    return { matched, by_gps, rejected: selected === undefined ? undefined : Math.max(0, selected - matched - by_gps), reasons: this.reasons,
-      rate: rate ?? this.rate(), delay_s: delay_s ?? this.delay_s };
+  ofRun(run) {
+    const { matched, selected, frames_per_second: rate, latency_s: delay_s } = run.progress ?? {};
+    const by_gps = run.statuses["gps-only"] ?? 0;
+    return { matched, by_gps, rejected: selected === undefined ? undefined : Math.max(0, selected - matched - by_gps), reasons: run.reasons,
+      rate: rate ?? rateOf(run), delay_s: delay_s ?? run.delay_s };
   }
 
   /** Figures of all flights of the site. */
@@ -163,13 +178,6 @@ class Live {
     return { matched: sum("matched"), by_gps: sum("by_gps"), rejected: sum("rejected"), reasons };
   }
 
-  /** Frames a second over the last seconds, as they came to this page. */
-  rate() {
-    const since = Date.now() - RATE_WINDOW_MS;
-    this.places = this.places.filter((each) => each > since);
-    return this.places.length / (RATE_WINDOW_MS / 1000);
-  }
-
   async look() {
     try {
       this.screen.station.status = { ...this.screen.station.status, ...await get("/api/status") };
@@ -179,11 +187,12 @@ class Live {
 
   show() {
     const status = this.screen.station.status;
-    const figures = this.run ? this.ofRun() : this.ofSite();
+    const run = this.shown;
+    const figures = run ? this.ofRun(run) : this.ofSite();
     const low = status.disk_floor_gb !== undefined && status.disk_free_gb < 2 * status.disk_floor_gb;
     const rows = [
-      this.run && ["frames/s", words.number(figures.rate), "Frames that the mission takes in a second"],
-      this.run && ["latency", figures.delay_s === undefined ? "–" : `${words.number(figures.delay_s, 2)} s`, "From the drone's picture to its place on the map"],
+      run && ["frames/s", words.number(figures.rate), "Frames that the mission takes in a second"],
+      run && ["latency", figures.delay_s === undefined ? "–" : `${words.number(figures.delay_s, 2)} s`, "From the drone's picture to its place on the map"],
       ["matched", words.number(figures.matched, 0), "Frames placed by vision"],
       ["by GPS", words.number(figures.by_gps, 0), "Frames placed by GPS alone"],
       this.telemetry && ["GPS", this.telemetry.horizontal_sigma_m === undefined ? "on" : words.length(this.telemetry.horizontal_sigma_m), gpsWords(this.telemetry)],
@@ -201,6 +210,13 @@ class Live {
     cancelAnimationFrame(this.drawing);
     for (const end of this.ends) end();
   }
+}
+
+/** Frames a second over the last seconds, as they came to this page. */
+function rateOf(run) {
+  const since = Date.now() - RATE_WINDOW_MS;
+  run.places = run.places.filter((each) => each > since);
+  return run.places.length / (RATE_WINDOW_MS / 1000);
 }
 
 /** An object that a watch reported: it stands on no map, so its id is the mission's own. */

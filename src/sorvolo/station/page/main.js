@@ -81,6 +81,8 @@ async function route() {
     if (kind === "site" && id) {
       const { showSite } = await siteScreen();
       made = await showSite(main, title, numbers, station, id, view || "map", at.length === 2 && at.every(Number.isFinite) ? at : null);
+    } else if (kind === "api") {
+      made = await (await import("./api_page.js")).showApi(main, title);
     } else {
       made = await showSites(main, title, station);
     }
@@ -90,9 +92,19 @@ async function route() {
     if (mine !== turn) return;
     if (!(problem instanceof Problem)) throw problem;
     if (problem.status === 401) return;
+    const isAwaited = problem.status === 404 && kind === "site";
     fill(main, el("div", { class: "starting" }, el("h1", {}, problem.title), el("p", {}, problem.detail),
+      isAwaited ? el("p", {}, "Once a first mission has put something on its map, it is shown here.") : null,
       el("p", {}, el("a", { href: "#/" }, "All sites"), " ", button("Try again", () => route()))));
+    if (isAwaited) screen = whenMade(id, route);
   }
+}
+
+/** Call back once something of a site that is not there is on its map: its first mission may just have begun. */
+function whenMade(id, then) {
+  const heard = ({ detail }) => { if (detail.site === id) then(); };
+  for (const type of ["map.tiles", "site.changed"]) station.events.addEventListener(type, heard);
+  return { close() { for (const type of ["map.tiles", "site.changed"]) station.events.removeEventListener(type, heard); } };
 }
 
 let loginBox = null;
@@ -136,6 +148,7 @@ function showSettings() {
         ["1 … 7", "panels"], ["J / K", "next and previous in the review"], ["C / R / U", "confirm, reject, withdraw"],
         ["N", "note"], ["M", "show on the map"], ["B", "blink before and after"], ["Esc", "end drawing, close"],
       ].map(([key, words]) => [el("dt", {}, key), el("dd", {}, words)])),
+      el("p", { class: "note" }, el("a", { href: "#/api" }, "Addresses for programs (API)")),
       who ? el("p", { class: "note" }, `Sorvolo ${who.version}. Logged in as ${who.name || "this machine"} (${who.role}). `,
         who.name && who.name !== "this machine" ? button("Log out", logOut, { class: "quiet" }) : null) : null));
 }

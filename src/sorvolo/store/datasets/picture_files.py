@@ -59,7 +59,8 @@ def shown_size_px(path: Path) -> tuple[int, int, int]:
 
 def _orientation(picture: Image.Image) -> int:
     try:
-        value = int(picture.getexif().get(ExifTags.Base.Orientation, 1))
+        # a PNG's own method decodes its pixels where no EXIF stands before them
+        value = int(Image.Image.getexif(picture).get(ExifTags.Base.Orientation, 1))
     except _BROKEN:
         return 1  # damaged EXIF: viewers show the picture as stored
     return value if 1 <= value <= 8 else 1

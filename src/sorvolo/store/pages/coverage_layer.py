@@ -84,4 +84,4 @@ def coverage_words(comparison: Mapping[str, Any]) -> tuple[str, str] | None:
 
 
 def _size_words(size_m: float) -> str:
-    return length_words(size_m) or "" if np.isfinite(size_m) else "not known"
+    return length_words(size_m) or "" if np.isfinite(size_m) else "none of the drawn sizes"
