@@ -450,6 +450,19 @@ def test_of_two_missions_at_once_the_map_s_figures_are_shown(served: Served, ope
     expect(page.locator(".figure", has_text="frames/s")).to_have_count(0)
 
 
+def test_a_map_that_grows_is_not_called_missing(browser: Any, served: Served) -> None:
+    page = browser.new_context().new_page()
+    page.set_default_timeout(WAIT_MS)
+    page.goto(f"{served.url}/#/site/fresh/missions")
+    page.locator("button[data-panel=map]").click()
+    page.locator(".panel", has_text="nothing mapped yet").wait_for()
+    tiles = {"revision": "abc123", "bounds": [12.6, 41.89, 12.61, 41.9]}
+    served.station.events.append(NewEvent("map.tiles", tiles, "fresh", "run-1"))
+    page.locator(".panel", has_text="a first one is being mapped").wait_for()
+    assert not page.get_by_text("This site has no map yet").count()
+    page.context.close()
+
+
 def test_a_link_to_a_site_shows_it_once_its_first_mission_made_it(
     browser: Any, made_site: Path, tmp_path: Path
 ) -> None:

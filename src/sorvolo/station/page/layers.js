@@ -21,7 +21,7 @@ export function layersPanel(screen, body) {
   function refresh() {
     const { detail } = data;
     fill(legend, el("p", { class: "soft" }, counted(detail.flights?.length ?? 0, "flight"), " · ",
-      detail.versions?.length ? `newest of ${day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at)}` : "nothing mapped yet"),
+      detail.versions?.length ? `newest of ${day(detail.versions.at(-1).flown_at ?? detail.versions.at(-1).made_at)}` : detail.bounds_wgs84 ? "a first one is being mapped" : "nothing mapped yet"),
       whyEmpty(data));
     fill(found, kinds(data, "changes", "Changes"), kinds(data, "objects", "Objects"), placedLegend(data));
   }
@@ -30,7 +30,7 @@ export function layersPanel(screen, body) {
 }
 
 function whyEmpty(data) {
-  if (data.detail.versions?.length || data.detail.is_new) return null;
+  if (data.detail.versions?.length || data.detail.is_new || data.detail.bounds_wgs84) return null;
   return el("p", { class: "hint" }, "This site has no map yet. Start a mission under “Missions”.");
 }
 

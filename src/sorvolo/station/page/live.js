@@ -45,6 +45,7 @@ class Live {
     if (!data.detail.bounds_wgs84 && bounds) {
       data.detail.bounds_wgs84 = bounds;
       this.screen.view.go(bounds);
+      this.screen.opened?.refresh?.();
     }
     if (!this.screen.opened?.versions) this.screen.view.refresh(revision, bounds);
   }
