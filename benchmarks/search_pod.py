@@ -24,6 +24,7 @@ import numpy as np
 
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.detection.detector import Detector
+from sorvolo.detection.turning import is_from_above
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
@@ -52,6 +53,7 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.tracking.laying import lay_on_ground
 from sorvolo.tracking.planted import reported_plants
+from sorvolo.tracking.view_evidence import least_seen
 
 RESULTS = Path(__file__).parent / "results" / "search_pod.json"
 SUN_DEG = (215.0, 48.0)  # of every first day in the simulation
@@ -159,12 +161,20 @@ def rows_of(
 ) -> list[dict]:
     """What was stated and what came true."""
     laid, boxes = [], {}
+    least: dict[str, float] = {}
     for index, (each, image) in enumerate(zip(frames, images)):
-        m_per_px = float(flight.true_poses[index].translation_m[2]) / flight.camera.fx_px
-        found = detector.detect(image, tiles="auto", m_per_px=m_per_px, classes=("person", "car")).surest(60)
+        pose = flight.true_poses[index]
+        from_above = is_from_above(pose.rotation)
+        own = detector.thresholds_for(image, from_above=from_above)
+        least = {name: max(score, least.get(name, 0.0)) for name, score in own.items()}
+        found = detector.detect(
+            image, tiles="auto", m_per_px=float(pose.translation_m[2]) / flight.camera.fx_px,
+            classes=("person", "car"), from_above=from_above, least_score=least_seen(own),
+        ).surest(60)
         laid += [one for one in lay_on_ground(found, each.placed) if one is not None]
         boxes[index] = boxes_px(flight, index, targets)
-    reported = reported_plants(laid, [each.placed for each in frames], boxes, [str(each.label) for each in targets])
+    labels = [str(each.label) for each in targets]
+    reported = reported_plants(laid, [each.placed for each in frames], boxes, labels, least)
     empty = without_targets(flight)
     bare = [taken(empty, index, measured.is_thermal) for index in range(len(images))]
     looks = [
