@@ -9,7 +9,7 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.contours import contours
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import MOST_SIDE, CellSettings, Lattice
-from sorvolo.heights.volumes import above_rim, between, height_changes, tie
+from sorvolo.heights.volumes import VolumeSettings, above_rim, between, height_changes, tie
 
 GRID = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.2, "EPSG:32615")
 COARSE = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.25, "EPSG:32615")
@@ -43,7 +43,7 @@ def test_a_later_model_that_lies_off_is_tied_and_its_volume_is_right() -> None:
     tied = tie(first, second, ~inside)
     np.testing.assert_allclose(tied.shift_m, [-0.3, 0.2, -0.7], atol=0.02)
     assert tied.sigma_m < 0.02
-    found = between(first, second, inside, tied)
+    found = between(first, second, SQUARE, tied)
     # noise of each cell, whose sign is not known, is cut or fill as well: compare their difference exactly
     assert found.net_m3 == pytest.approx(12 - 2, abs=0.5)
     assert found.fill_m3 == pytest.approx(12, abs=1.5) and found.cut_m3 == pytest.approx(2, abs=1.5)
@@ -53,7 +53,7 @@ def test_a_later_model_that_lies_off_is_tied_and_its_volume_is_right() -> None:
 
 def test_a_pile_is_measured_from_the_ground_around_it() -> None:
     pile = field(GRID, lambda x, y: 0.1 * x + np.maximum(0, 2 - np.hypot(x, y)))
-    found = above_rim(pile, pile.inside(SQUARE))
+    found = above_rim(pile, SQUARE)
     assert found.net_m3 == pytest.approx(np.pi * 4 * 2 / 3, abs=2.0)  # a cone
 
 
@@ -64,9 +64,22 @@ def test_areas_without_heights_or_ground_to_tie_by_are_refused() -> None:
         tie(first, second, ~everywhere)
     holes = HeightField(first.lattice, np.full_like(first.up_m, np.nan), first.sigma_m)
     with pytest.raises(InputError, match="has heights"):
-        between(first, holes, first.inside(SQUARE), tie(first, second, everywhere))
+        between(first, holes, SQUARE, tie(first, second, everywhere))
     with pytest.raises(InputError, match="around the area"):
-        above_rim(first, everywhere)
+        above_rim(first, [[20 * SQUARE[0][0]]])
+
+
+def test_what_lies_beyond_the_heights_is_not_known() -> None:
+    """An area half beside the height model: half of its volume is not known, and one elsewhere is named as such."""
+    pile = field(GRID, lambda x, y: 0.1 * x + np.maximum(0, 2 - np.hypot(x, y)))
+    reach = float(BOX[:, 0].max())
+    half = np.array([[-2, -4], [2 * reach + 2, -4], [2 * reach + 2, 4], [-2, 4]], float)
+    found = above_rim(pile, [[half]], VolumeSettings(least_known=0.3))
+    assert found.area_m2 == pytest.approx(8 * (2 * reach + 4)) and found.known_share == pytest.approx(0.5, abs=0.02)
+    with pytest.raises(InputError, match="beyond the flight's heights"):
+        above_rim(pile, [[half + np.array([reach / 2, 0])]])
+    with pytest.raises(InputError, match=r"only 0% of the area has heights.*100% of it is beyond"):
+        above_rim(pile, [[half + np.array([4 * reach, 0])]])
 
 
 def test_heights_along_a_line() -> None:

@@ -169,6 +169,15 @@ def test_single_cells_of_a_wide_roof_that_photos_see_through_are_found(survey) -
     assert found[roof].mean() < 0.02 and found[~beside & ~roof].mean() < 0.01
 
 
+def test_a_photo_of_which_no_cell_can_be_compared_sees_through_nothing(survey) -> None:
+    """Photos from very different heights may show the same ground and yet look alike nowhere (a crash before)."""
+    views, _, _ = survey
+    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
+    true = true_heights(lattice).astype(np.float32)
+    black = np.zeros((views[0].camera.height_px, views[0].camera.width_px), np.uint8)
+    assert not seen_through(lattice, true, views, lambda _: black, 60, SweepSettings(window_cells=(3, 7))).any()
+
+
 def _wall(lattice: Lattice) -> np.ndarray:
     """The heights of a wall of 6 m on level ground."""
     x, y = np.moveaxis(lattice.points_m(), 2, 0)

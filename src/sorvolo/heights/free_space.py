@@ -91,7 +91,9 @@ def _compared(
             cell = ((rows + y0) * lattice.width + columns + x0).astype(np.int32)
             found.setdefault(number, []).append(_Places(cell, inner[rows, columns].astype(np.float16)))
     for number, parts in found.items():
-        yield number, _Places(*(np.concatenate([getattr(each, name) for each in parts]) for name in ("cell", "alike")))
+        places = _Places(*(np.concatenate([getattr(each, name) for each in parts]) for name in ("cell", "alike")))
+        if len(places.cell):
+            yield number, places
 
 
 def _seen_at(

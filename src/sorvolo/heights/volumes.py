@@ -2,15 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, Floats32, Mask, PointsM
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.polygons import polygon_area
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.heights.field import HeightField
 from sorvolo.heights.terrain import filled
 from sorvolo.survey.findings import HeightChange
+
+Polygons: TypeAlias = Sequence[Sequence[PointsM]]
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,7 @@ class VolumeSettings:
     block_m: float = 5.0  # errors of a height model hold on for about as long
     least_stable: int = 500  # cells
     least_known: float = 0.5  # of the area
+    beyond: float = 0.1  # of the area outside of the height model: an area drawn elsewhere, not a hole; by choice
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +45,10 @@ class Tie:
 
 @dataclass(frozen=True)
 class Volume:
-    """`cut_m3` was taken away, `fill_m3` came; `sigma_m3` of their difference. Holes in the area count as unchanged."""
+    """`cut_m3` was taken away, `fill_m3` came; `sigma_m3` of their difference.
+
+    Holes in the area, and what of it lies beyond the heights, count as unchanged: `known_share` of it is known.
+    """
 
     cut_m3: float
     fill_m3: float
@@ -86,13 +94,13 @@ def tie(earlier: HeightField, later: HeightField, stable: Mask, settings: Volume
 
 
 def between(
-    earlier: HeightField, later: HeightField, inside: Mask, tied: Tie, settings: VolumeSettings = VolumeSettings()
+    earlier: HeightField, later: HeightField, polygons: Polygons, tied: Tie, settings: VolumeSettings = VolumeSettings()
 ) -> Volume:
-    """Cut and fill within cells of `earlier`, (H, W). Raises InputError where most of them have no heights."""
+    """Cut and fill within polygons of rings, site metres. Raises InputError where most of them has no heights."""
     moved = later.on(earlier.lattice, tied.shift_m[:2])
     rise = np.asarray(moved.up_m + tied.shift_m[2] - earlier.up_m, np.float32)
     sigma = np.asarray(np.hypot(earlier.sigma_m, moved.sigma_m), np.float32)
-    return _added_up(rise, sigma, inside, earlier.lattice.cell_m, tied.sigma_m, settings)
+    return _added_up(HeightField(earlier.lattice, rise, sigma), polygons, tied.sigma_m, settings)
 
 
 def height_changes(
@@ -108,47 +116,49 @@ def height_changes(
         tied = tie(earlier, later, ~earlier.inside([[each] for each in changed_m]), settings)
     except InputError:
         return [None] * len(outlines_m)
-    return [_height_change(earlier, later, earlier.inside([[each]]), tied, settings) for each in outlines_m]
+    return [_height_change(earlier, later, [[each]], tied, settings) for each in outlines_m]
 
 
 def _height_change(
-    earlier: HeightField, later: HeightField, inside: Mask, tied: Tie, settings: VolumeSettings
+    earlier: HeightField, later: HeightField, polygons: Polygons, tied: Tie, settings: VolumeSettings
 ) -> HeightChange | None:
     try:
-        volume = between(earlier, later, inside, tied, settings)
+        volume = between(earlier, later, polygons, tied, settings)
     except InputError:
         return None
     known_m2 = volume.area_m2 * volume.known_share
     return HeightChange(volume.net_m3 / known_m2, volume.sigma_m3 / known_m2)
 
 
-def above_rim(surface: HeightField, inside: Mask, settings: VolumeSettings = VolumeSettings()) -> Volume:
-    """What stands above (fill) and lies below (cut) the ground that goes on from around the area, (H, W)."""
+def above_rim(surface: HeightField, polygons: Polygons, settings: VolumeSettings = VolumeSettings()) -> Volume:
+    """What stands above (fill) and below (cut) the ground that goes on from around polygons of rings, site metres."""
+    inside = surface.inside(polygons)
     around = np.isfinite(surface.up_m) & ~inside
     if not around.any():
         raise InputError("no heights around the area to measure from; give a smaller area, or two flights")
     base = filled(surface.up_m, around)
     rim = _rim_sigma(surface, inside)
-    return _added_up(surface.up_m - base, surface.sigma_m, inside, surface.lattice.cell_m, rim, settings)
+    return _added_up(HeightField(surface.lattice, surface.up_m - base, surface.sigma_m), polygons, rim, settings)
 
 
-def _added_up(
-    rise: Floats32, sigma: Floats32, inside: Mask, cell_m: float, common_m: float, settings: VolumeSettings
-) -> Volume:
-    known = inside & np.isfinite(rise) & np.isfinite(sigma)
-    share = float(known.sum() / max(int(inside.sum()), 1))
+def _added_up(risen: HeightField, polygons: Polygons, common_m: float, settings: VolumeSettings) -> Volume:
+    inside, rise, sigma, cell_m = risen.inside(polygons), risen.up_m, risen.sigma_m, risen.lattice.cell_m
+    known, cell_m2 = inside & np.isfinite(rise) & np.isfinite(sigma), cell_m**2
+    area_m2 = max(sum(polygon_area(each) for each in polygons), float(inside.sum()) * cell_m2)
+    share = float(known.sum()) * cell_m2 / area_m2 if area_m2 > 0 else 0.0
     if share < settings.least_known:
-        raise InputError(
-            f"only {share:.0%} of the area has heights, {settings.least_known:.0%} are needed; fly it with more overlap"
-        )
-    cell_m2 = cell_m**2
+        beyond = 1 - float(inside.sum()) * cell_m2 / area_m2 if area_m2 > 0 else 0.0
+        advice = "fly it with more overlap"
+        if beyond > settings.beyond:
+            advice = f"{beyond:.0%} of it is beyond the flight's heights: draw it on flown ground (check its CRS)"
+        raise InputError(f"only {share:.0%} of the area has heights, {settings.least_known:.0%} are needed; {advice}")
     alike = max(1.0, (settings.block_m / cell_m) ** 2)  # cells whose errors are one
     scatter = float(np.sqrt((sigma[known].astype(np.float64) ** 2).sum() * min(alike, float(known.sum()))))
     return Volume(
         cut_m3=float(-np.minimum(rise[known], 0).sum(dtype=np.float64) * cell_m2),
         fill_m3=float(np.maximum(rise[known], 0).sum(dtype=np.float64) * cell_m2),
         sigma_m3=cell_m2 * float(np.hypot(scatter, common_m * known.sum())),
-        area_m2=float(inside.sum() * cell_m2), known_share=share,
+        area_m2=area_m2, known_share=share,
     )
 
 

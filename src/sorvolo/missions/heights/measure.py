@@ -63,13 +63,12 @@ def measure_volume(
         later = read_field(archive, later_id, HeightFile.SURFACE)
         polygons = wanted.polygons_m(archive.site().frame)
         if not since:
-            return MeasuredVolume(later_id, "", above_rim(later, later.inside(polygons), settings), None)
+            return MeasuredVolume(later_id, "", above_rim(later, polygons, settings), None)
         if since == later_id:
             raise SettingsError(f"--since {since} is the flight that is measured; name an earlier one")
         earlier = read_field(archive, since, HeightFile.SURFACE)
-        inside = earlier.inside(polygons)
-        tied = tie(earlier, later, ~inside, settings)
-        return MeasuredVolume(later_id, since, between(earlier, later, inside, tied, settings), tied)
+        tied = tie(earlier, later, ~earlier.inside(polygons), settings)
+        return MeasuredVolume(later_id, since, between(earlier, later, polygons, tied, settings), tied)
 
 
 def measure_profile(site: Path, places: Sequence[str], *, flight: str = "", step_m: float = 0.0) -> list[ProfilePoint]:
