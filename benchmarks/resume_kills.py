@@ -40,11 +40,11 @@ TIMED = {"report.html", "changes.html"}
 """Pages that show it."""
 
 
-def simulated(width_px: int) -> SimulationSettings:
+def simulated(width_px: int, length_m: float) -> SimulationSettings:
     """Two flights over one small site, the second with changes."""
     demo = preset("demo")
     imaging = replace(demo.imaging, width_px=width_px, height_px=width_px * 9 // 16, fps=6)
-    return replace(demo, path=replace(demo.path, length_m=40, strips=2, strip_spacing_m=6), imaging=imaging)
+    return replace(demo, path=replace(demo.path, length_m=length_m, strips=2, strip_spacing_m=6), imaging=imaging)
 
 
 def content(site: Path) -> dict[str, bytes]:
@@ -94,7 +94,7 @@ class Trial:
         self._options, self._folder = options, folder
         self._base = folder / "base" / "site"
         self._alerts = folder / "alerts"
-        for _ in simulate_site(folder / "flown", simulated(options.width)):
+        for _ in simulate_site(folder / "flown", simulated(options.width, options.length)):
             pass
         if options.mission == "compare":
             self._base.parent.mkdir()
@@ -152,7 +152,8 @@ def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, obje
         })
         print(len(rows), rows[-1], flush=True)
         yield {
-            "mission": options.mission, "seed": options.seed, "width_px": options.width, "model": options.model,
+            "mission": options.mission, "seed": options.seed, "width_px": options.width,
+            "length_m": options.length, "model": options.model,
             "undisturbed_s": round(whole_s, 2), "alerts": announced.total(), "kills": len(rows),
             "same": sum(bool(each["same"]) for each in rows),
             "resumed": sum(bool(each["frames_taken_over"]) for each in rows), "rounds": rows,
@@ -166,6 +167,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--width", type=int, default=480)
+    parser.add_argument("--length", type=float, default=40.0, help="of a strip, m")
     parser.add_argument("--model", default="none")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from batch_flights import another, content
 
@@ -18,15 +19,19 @@ from sorvolo.cluster.local_executor import LocalExecutor
 from sorvolo.cluster.orders import FlightWish, Order, Part, PartKind
 from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
 from sorvolo.cluster.table import BatchTable, State
+from sorvolo.detection.models import find_model
+from sorvolo.detection.sharing import SharedDetectorGone, shared_engine
 from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.flight.memory import available_bytes
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
+from waiting import wait_for
 
 
 class Disturbed(LocalExecutor):
-    """A local executor that kills the shared detector as the first try begins."""
+    """A local executor that kills or holds the shared detector as the first try begins."""
 
+    how = signal.SIGKILL
     pids: tuple[int, ...] = ()
     memory_mb = 0.0
 
@@ -36,17 +41,21 @@ class Disturbed(LocalExecutor):
         self.pids = (*self.pids, self._detector.pid)
         self.memory_mb = max(self.memory_mb, self._detector.memory_mb)
         if len(self.pids) == 1:
-            os.kill(self._detector.pid, signal.SIGKILL)
+            os.kill(self._detector.pid, self.how)
 
 
 @pytest.mark.long
-def test_a_shared_detector_that_dies_is_started_again_and_finds_the_same(flown: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_shared_detector_that_dies_or_hangs_is_started_again_and_finds_the_same(
+    flown: Path, tmp_path: Path, how: signal.Signals
+) -> None:
     flight = another(flown, tmp_path / "in" / "one")
     made: list[Disturbed] = []
 
     @contextmanager
     def executor(table: BatchTable) -> Iterator[LocalExecutor]:
         with Disturbed(2, 60.0, table.lock, shares_detector=True) as one:
+            one.how = how
             made.append(one)
             yield one
 
@@ -63,6 +72,21 @@ def test_a_shared_detector_that_dies_is_started_again_and_finds_the_same(flown: 
     for _ in map_flights([flight], own, MapSettings(), camera=flown / "camera.xml"):
         pass
     assert content(tmp_path / "maps" / "one") == content(own)
+
+
+def test_a_shared_detector_that_hangs_is_ended_and_who_waits_for_it_learns_that() -> None:
+    with SharedDetector(silent_s=12.0) as shared:
+        address = shared.address
+        engine = shared_engine(address, find_model("thermal"))
+        planes = np.zeros((1, 3, 64, 64), np.uint8)
+        assert len(engine.run(planes)) == 3
+        held = shared.pid
+        os.kill(held, signal.SIGSTOP)
+        with pytest.raises(SharedDetectorGone):
+            engine.run(planes)
+        wait_for(lambda: shared.address != address)  # who waits may learn it before the system has buried it
+        assert len(shared_engine(shared.address, find_model("thermal")).run(planes)) == 3
+        assert shared.pid != held
 
 
 @pytest.mark.parametrize(("shares", "fits"), [(False, True), (True, False)])

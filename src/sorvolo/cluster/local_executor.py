@@ -11,7 +11,7 @@ from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.cluster.cost import Cost, CostSettings
 from sorvolo.cluster.orders import Ending, Order
 from sorvolo.cluster.process import WorkerProcess, most_memory_mb, run_order
-from sorvolo.cluster.shared_detector import SharedDetector, searches
+from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
 from sorvolo.missions.flight.memory import MemorySettings, available_bytes, memory_budget_bytes
 
 Key = tuple[str, str]
@@ -30,7 +30,8 @@ class LocalExecutor:
         shares_detector: bool = False,
     ) -> None:
         self.workers, self._costs = workers, costs
-        self._detector = SharedDetector() if shares_detector else None
+        silent_s = min(SharingSettings.silent_s, stall_s / 3)  # before those who wait for it count as hanging
+        self._detector = SharedDetector(silent_s) if shares_detector else None
         self._stall_s, self._lock = stall_s, lock
         self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
         self._live: set[Key] = set()

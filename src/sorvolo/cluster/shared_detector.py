@@ -3,13 +3,15 @@
 import subprocess
 import sys
 import tempfile
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
 from sorvolo.cluster.orders import Order
 from sorvolo.cluster.process import most_memory_mb
-from sorvolo.detection.sharing import READY
+from sorvolo.detection.sharing import READY, answers
 from sorvolo.errors import SettingsError, StoreError
 
 
@@ -19,6 +21,7 @@ class SharingSettings:
 
     is_shared: bool = False
     gpus: float = 0.0
+    silent_s: float = 60.0  # without an answer of its process, which takes milliseconds: it hangs. By choice
 
     def __post_init__(self) -> None:
         if not 0 <= self.gpus <= 1:
@@ -33,9 +36,13 @@ def searches(order: Order) -> bool:
 
 
 class SharedDetector:
-    """One such process. `address` starts it; a context manager: leaving ends it."""
+    """One such process. `address` starts it; a context manager: leaving ends it.
 
-    def __init__(self) -> None:
+    One that hangs is killed after `silent_s`, so that those who wait for it learn that it is gone.
+    """
+
+    def __init__(self, silent_s: float = SharingSettings.silent_s) -> None:
+        self._silent_s = silent_s
         self._folder = tempfile.TemporaryDirectory(prefix="sorvolo-")  # readable by this user alone
         self._process: subprocess.Popen[bytes] | None = None
         self._starts = 0
@@ -85,6 +92,9 @@ class SharedDetector:
                 f"the detector that flights share could not be started (its socket: {self._socket()}); set TMPDIR to a "
                 "folder of this machine with a short path, or give --own-detectors"
             )
+        threading.Thread(
+            target=_end_where_it_hangs, args=(self._process, self._socket(), self._silent_s), daemon=True
+        ).start()
 
     def _stop(self) -> None:
         if (process := self._process) is None:
@@ -92,3 +102,14 @@ class SharedDetector:
         process.kill()
         process.communicate()
         self._process = None
+
+
+def _end_where_it_hangs(process: "subprocess.Popen[bytes]", address: str, silent_s: float) -> None:
+    """Kill the process where it gives no answer at its socket for so long; ends with it."""
+    heard_s, look_s = time.monotonic(), silent_s / 6
+    while process.poll() is None:
+        if answers(address, look_s):
+            heard_s = time.monotonic()
+        elif time.monotonic() - heard_s > silent_s:
+            process.kill()
+        time.sleep(look_s)

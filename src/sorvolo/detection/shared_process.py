@@ -50,6 +50,9 @@ def _answer(connection: socket.socket, models: Models) -> None:
     """Answer one asker until it has ended."""
     with connection, connection.makefile("rwb") as stream, suppress(OSError, EOFError):
         head, _ = read_message(stream)
+        if "model" not in head:  # whether anybody is here
+            write_message(stream, {})
+            return
         try:
             engine, batcher = models.batcher(Path(str(head["model"])))
             write_message(stream, about_engine(engine))

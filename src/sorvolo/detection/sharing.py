@@ -34,6 +34,20 @@ def shared_engine(address: str, path: Path) -> Engine:
     return engine_from(about[0], str(path), asker.run)
 
 
+def answers(address: str, within_s: float) -> bool:
+    """Whether the process at the socket `address` answers within so many seconds; no model is asked."""
+    with socket.socket(socket.AF_UNIX) as asking:
+        asking.settimeout(within_s)
+        try:
+            asking.connect(address)
+            with asking.makefile("rwb") as stream:
+                write_message(stream, {})
+                read_message(stream)
+        except (OSError, EOFError):
+            return False
+    return True
+
+
 class _Asker:
     """One connection to the process. It ends with this object."""
 
