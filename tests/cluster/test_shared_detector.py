@@ -82,6 +82,7 @@ def test_a_shared_detector_that_hangs_is_ended_and_who_waits_for_it_learns_that(
         assert len(engine.run(planes)) == 3
         held = shared.pid
         os.kill(held, signal.SIGSTOP)
+        os.waitid(os.P_PID, held, os.WSTOPPED)  # it may answer once more before it stands still
         with pytest.raises(SharedDetectorGone):
             engine.run(planes)
         wait_for(lambda: shared.address != address)  # who waits may learn it before the system has buried it
