@@ -187,17 +187,26 @@ def reported(detector: Detector, by: Session, shot: Shot) -> Iterator[Report]:
     seen = Seen(first.boxes_px, first.scores, first.labels)
     how = SecondLook((LOOK_PX,), own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf)
     again = opinions(seen, shot.image, by.see, {PERSON: how}, SheetSettings(cuts=(MOST_CUTS, MOST_CUTS)))
-    hidden = cover_matrix(seen.boxes_px, shot.truth.ignored_px).max(1, initial=0) > 0.5
-    own = shot.truth.boxes_px[shot.truth.labels == PERSON]
-    taken: set[int] = set()
-    for row, score in enumerate(seen.scores.tolist()):
-        overlaps = iou_matrix(seen.boxes_px[row : row + 1], own)[0]
-        best = float(overlaps.max(initial=0))
-        is_right = best >= RIGHT_IOU and (nearest := int(overlaps.argmax())) not in taken
-        if is_right:
-            taken.add(nearest)
-        if is_right or (best <= UNSURE_IOU and not hidden[row]):
-            yield Report(shot.place, shot.name, score, float(again[row][0]) if row in again else np.nan, is_right)
+    rows, right = judged_reports(seen.boxes_px, shot.truth.boxes_px[shot.truth.labels == PERSON], shot.truth.ignored_px)
+    for row in rows.tolist():
+        looked = float(again[row][0]) if row in again else np.nan
+        yield Report(shot.place, shot.name, float(seen.scores[row]), looked, bool(right[row]))
+
+
+def judged_reports(
+    boxes_px: np.ndarray, people_px: np.ndarray, ignored_px: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the reports (N, 4), best first, of which it is known whether they are right; (N,) which are."""
+    hidden = cover_matrix(boxes_px, ignored_px).max(1, initial=0) > 0.5
+    overlaps = iou_matrix(boxes_px, people_px)
+    right, unsure, taken = np.zeros(len(boxes_px), bool), np.zeros(len(boxes_px), bool), set()
+    for row in range(len(boxes_px)):
+        best = overlaps[row].max(initial=0)
+        right[row] = best >= RIGHT_IOU and int(overlaps[row].argmax()) not in taken
+        if right[row]:
+            taken.add(int(overlaps[row].argmax()))
+        unsure[row] = not right[row] and (best > UNSURE_IOU or hidden[row])
+    return np.flatnonzero(~unsure), right
 
 
 def fit_of(reports: Sequence[Report], photos: Mapping[str, int]) -> dict[str, Any]:
@@ -205,7 +214,7 @@ def fit_of(reports: Sequence[Report], photos: Mapping[str, int]) -> dict[str, An
     own = bounded_odds(np.minimum([each.score for each in reports], SheetSettings().surest))
     again = bounded_odds(np.array([each.again for each in reports]))
     right, places = np.array([each.is_right for each in reports]), np.array([each.place for each in reports])
-    inputs, counts = np.column_stack([own, again]), balanced(places, right)
+    inputs, counts = np.column_stack([own, again]), balanced(places, right, MOST_OF_A_SET)
     crossed = np.zeros(len(reports))
     for place in photos:
         mine = places == place
@@ -239,13 +248,13 @@ def bounded_odds(scores: np.ndarray) -> np.ndarray:
     return np.asarray(np.log(inside / (1 - inside)))
 
 
-def balanced(places: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N,) weights by which no set's right or false reports outweigh the others'."""
+def balanced(places: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
+    """(N,) weights by which no set's right reports, nor its false ones, count for more than `most`."""
     weights = np.zeros(len(places))
     for place in set(places.tolist()):
         for kind in (False, True):
             own = (places == place) & (right == kind)
-            weights[own] = min(1.0, MOST_OF_A_SET / max(1, np.count_nonzero(own)))
+            weights[own] = min(1.0, most / max(1, np.count_nonzero(own)))
     return weights
 
 

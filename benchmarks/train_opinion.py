@@ -22,17 +22,15 @@ import onnxruntime
 import torch
 from torch import nn
 
-from fit_second_look import bounded_odds
+from fit_second_look import balanced, bounded_odds, judged_reports
 from pack_yolox import CELL_PX, LOOK_PX, looking, published
-from people_samples import Shown, Source, sources
+from people_samples import Source, sources
 from provenance import commit
 from rendered_people import read_scenes
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.second_look import cut_out
 from sorvolo.detection.session import Session
-from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
-from train_judge import RIGHT_IOU, UNSURE_IOU
 from train_people import Samples, simulated
 
 SAMPLES = (*range(10000, 14000), *range(20000, 24000))  # numbers of the draws, by choice
@@ -111,7 +109,7 @@ class Cutter:
         shown, source = self._samples.made(number), self._samples.source(number)
         image = np.ascontiguousarray(shown.image)
         found = self._detector.detect(image, tiles="auto", classes=("person",), least_score=LEAST)
-        rows, right = judged_reports(found.boxes_px, shown)
+        rows, right = judged_reports(found.boxes_px, shown.boxes, shown.ignored)
         rng = np.random.default_rng((5, number % 10000))
         false = rows[~right]
         chosen = [
@@ -126,20 +124,6 @@ class Cutter:
 
 def _name(source: Source) -> str:
     return source.share.labelled.name
-
-
-def judged_reports(boxes_px: np.ndarray, shown: Shown) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the reports, best first, of which it is known whether they are right, and for which row they are."""
-    hidden = cover_matrix(boxes_px, shown.ignored).max(1, initial=0) > 0.5
-    overlaps = iou_matrix(boxes_px, shown.boxes)
-    right, unsure, taken = np.zeros(len(boxes_px), bool), np.zeros(len(boxes_px), bool), set()
-    for row in range(len(boxes_px)):
-        best = overlaps[row].max(initial=0)
-        right[row] = best >= RIGHT_IOU and int(overlaps[row].argmax()) not in taken
-        if right[row]:
-            taken.add(int(overlaps[row].argmax()))
-        unsure[row] = not right[row] and (best > UNSURE_IOU or hidden[row])
-    return np.flatnonzero(~unsure), right
 
 
 def together(cuts: Sequence[Cutouts]) -> Cutouts:
@@ -186,7 +170,7 @@ def learnt(pooled: np.ndarray, cutouts: Cutouts, seed: int) -> nn.Sequential:
     mean, spread = scaled(pooled)
     inputs, right = torch.tensor((pooled - mean) / spread), torch.tensor(cutouts.right, dtype=torch.float32)
     own = torch.tensor(bounded_odds(cutouts.scores), dtype=torch.float32)
-    counts = torch.tensor(weighed(cutouts.places, cutouts.right), dtype=torch.float32)
+    counts = torch.tensor(balanced(cutouts.places, cutouts.right, MOST_OF_A_SET), dtype=torch.float32)
     network = nn.Sequential(
         nn.Dropout(DROPPED[0]), nn.Linear(inputs.shape[2], HIDDEN), nn.ReLU(), nn.Dropout(DROPPED[1]),
         nn.Linear(HIDDEN, 1),
@@ -212,16 +196,6 @@ def scaled(pooled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(D,) the features' means and spreads, float32."""
     rows = pooled.reshape(-1, pooled.shape[-1])
     return rows.mean(0, dtype=np.float32), rows.astype(np.float32).std(0) + np.float32(1e-3)
-
-
-def weighed(places: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(N,) weights by which no source's right or false reports outweigh the others'."""
-    weights = np.ones(len(places))
-    for place in set(places.tolist()):
-        for kind in (False, True):
-            own = (places == place) & (right == kind)
-            weights[own] = min(1.0, MOST_OF_A_SET / max(1, np.count_nonzero(own)))
-    return weights
 
 
 def folded(networks: Sequence[nn.Sequential], pooled: np.ndarray) -> dict[str, np.ndarray]:

@@ -100,7 +100,8 @@ def between(
     moved = later.on(earlier.lattice, tied.shift_m[:2])
     rise = np.asarray(moved.up_m + tied.shift_m[2] - earlier.up_m, np.float32)
     sigma = np.asarray(np.hypot(earlier.sigma_m, moved.sigma_m), np.float32)
-    return _added_up(HeightField(earlier.lattice, rise, sigma), polygons, tied.sigma_m, settings)
+    risen = HeightField(earlier.lattice, rise, sigma)
+    return _added_up(risen, risen.inside(polygons), polygons, tied.sigma_m, settings)
 
 
 def height_changes(
@@ -138,11 +139,14 @@ def above_rim(surface: HeightField, polygons: Polygons, settings: VolumeSettings
         raise InputError("no heights around the area to measure from; give a smaller area, or two flights")
     base = filled(surface.up_m, around)
     rim = _rim_sigma(surface, inside)
-    return _added_up(HeightField(surface.lattice, surface.up_m - base, surface.sigma_m), polygons, rim, settings)
+    risen = HeightField(surface.lattice, surface.up_m - base, surface.sigma_m)
+    return _added_up(risen, inside, polygons, rim, settings)
 
 
-def _added_up(risen: HeightField, polygons: Polygons, common_m: float, settings: VolumeSettings) -> Volume:
-    inside, rise, sigma, cell_m = risen.inside(polygons), risen.up_m, risen.sigma_m, risen.lattice.cell_m
+def _added_up(
+    risen: HeightField, inside: Mask, polygons: Polygons, common_m: float, settings: VolumeSettings
+) -> Volume:
+    rise, sigma, cell_m = risen.up_m, risen.sigma_m, risen.lattice.cell_m
     known, cell_m2 = inside & np.isfinite(rise) & np.isfinite(sigma), cell_m**2
     area_m2 = max(sum(polygon_area(each) for each in polygons), float(inside.sum()) * cell_m2)
     share = float(known.sum()) * cell_m2 / area_m2 if area_m2 > 0 else 0.0
