@@ -137,5 +137,35 @@ def sending_apart(url: str, **kwargs: Any) -> Iterator["subprocess.Popen[bytes]"
         process.wait()
 
 
+@contextmanager
+def dialling(port: int, at_s: float) -> Iterator[tuple[threading.Event, int]]:
+    """A port that a sender may dial at once; what it sends goes on to `port`, dialled once, `at_s` after the event."""
+    listens = threading.Event()
+    with ExitStack() as stack:
+        door = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+
+        def pass_on() -> None:
+            with suppress(OSError):
+                sender = stack.enter_context(door.accept()[0])
+                listens.wait()
+                time.sleep(at_s)
+                receiver = stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+                threading.Thread(target=copy, args=(receiver, sender), daemon=True).start()
+                copy(sender, receiver)
+
+        threading.Thread(target=pass_on, daemon=True).start()
+        yield listens, door.getsockname()[1]
+
+
+def copy(source: socket.socket, target: socket.socket) -> None:
+    """Pass on bytes until either side hangs up, which the other one is then made to notice."""
+    with suppress(OSError):
+        while data := source.recv(65_536):
+            target.sendall(data)
+    for each in (source, target):
+        with suppress(OSError):
+            each.shutdown(socket.SHUT_RDWR)
+
+
 if __name__ == "__main__":
     Sender(sys.argv[1], **json.loads(sys.argv[2])).run()

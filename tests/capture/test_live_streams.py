@@ -10,7 +10,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from live_sender import EPOCH_NS, RATE, free_port, number_of, sending, sending_apart, udp_url
+from live_sender import EPOCH_NS, RATE, dialling, free_port, number_of, sending, sending_apart, udp_url
 from rtsp_server import RtspServer
 
 from sorvolo.capture.live.addresses import StreamAddress, live_address
@@ -277,23 +277,23 @@ def test_a_server_that_refuses_is_an_error_at_once() -> None:
     assert time.monotonic() - began_s < 10 and "secret" not in str(refused.value)
 
 
+@pytest.mark.parametrize("dialled_s", [
+    pytest.param(0.5, id="at once"),
+    pytest.param(2.8, id="just before nobody calling would be noticed"),  # once it was hung up on at 3 s
+])
 @pytest.mark.parametrize(("here", "there", "container"), [
     ("rtmp://:{}/live/x", "rtmp://127.0.0.1:{}/live/x", "flv"), ("tcp://:{}", "tcp://127.0.0.1:{}", "mpegts"),
 ])
-def test_streams_that_are_pushed(here: str, there: str, container: str) -> None:
+def test_streams_that_are_pushed(here: str, there: str, container: str, dialled_s: float) -> None:
     port = free_port(socket.SOCK_STREAM)
-
-    def push() -> None:
-        time.sleep(0.5)  # the drone is switched on after the ground station
-        with sending_apart(there.format(port), container=container, count=10_000):
-            done.wait(30)
-
-    done = threading.Event()
-    threading.Thread(target=push, daemon=True).start()
-    source = open_live(here.format(port))
-    numbers = [number_of(frame.image) for _, frame in taken(source.arrivals(every_frame), 5)]
-    source.close()
-    done.set()
+    with (
+        dialling(port, at_s=dialled_s) as (listens, own),
+        sending_apart(there.format(own), container=container, count=10_000),
+    ):
+        listens.set()
+        source = open_live(here.format(port))
+        numbers = [number_of(frame.image) for _, frame in taken(source.arrivals(every_frame), 5)]
+        source.close()
     assert all((b - a) % 38 == 1 for a, b in pairwise(numbers))
 
 

@@ -30,7 +30,6 @@ from sorvolo.survey.flight import CameraModel
 _JUMP_US = 10_000_000  # a clock that leaps so far was set anew
 _TIME_EVERY_US = 1_000_000  # where there is no telemetry, the time alone is stated so often
 _KNOWN_LENS = 0.04  # a focal length that is known so well is worth stating
-_OPEN_S = 6.0  # for a camera's first answer; by choice
 _DRIFT = 5e-4  # of a camera's clock: 30 ms a minute
 _LATE_NS = 5_000_000_000  # more than a connection holds back: the clock begins anew; by choice
 _STEP_US = 33_333  # between pictures where a clock began anew
@@ -269,7 +268,8 @@ class LiveFootage:
                     raise InputError(
                         f"{self._address.shown}: {why}; check the address, the name and the password"
                     ) from error
-                self._stop.wait(min(left_s, backoff.next_s()))
+                if not self._address.waits:
+                    self._stop.wait(min(left_s, backoff.next_s()))
         raise InputError(
             f"{self._address.shown}: no picture within {self._settings.first_s:.0f} s ({why}); is the camera sending, "
             "to this address and port?"
@@ -278,7 +278,7 @@ class LiveFootage:
     def _open(self, left_s: float) -> Any:
         container = av.open(
             self._address.url, format=self._address.container, options=dict(self._address.options),
-            timeout=(min(_OPEN_S, left_s), self._settings.silent_s),
+            timeout=(min(self._address.opens_s, left_s), self._settings.silent_s),
         )
         if not container.streams.video:
             container.close()

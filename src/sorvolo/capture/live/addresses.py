@@ -17,10 +17,14 @@ ADDRESS_FORMS = "rtsp://HOST/live, rtmp://HOST/live, udp://:PORT, tcp://:PORT, h
 """What a live source looks like, for messages."""
 
 _WAITING = frozenset({"udp", "rtp"})  # a sender may begin at any time; nothing has to be dialled
-# without a host: the usual port, and FFmpeg's options to be the server that a drone pushes its video to
+_OPEN_S = 6.0  # for the other side's first answer and pictures; by choice
+_LISTEN_S = 3  # a listener that nobody calls is opened anew so often, so that it can be stopped; by choice
+# without a host: the usual port, and FFmpeg's options to be the server that a drone pushes its video to; what ends is
+# the wait for a call, not a call that has come
 _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
-    "rtmp": (1935, {"listen": "1"}), "tcp": (0, {"listen": "1"}),
-    "rtsp": (554, {"rtsp_flags": "listen", "listen_timeout": "3"}),
+    "rtmp": (1935, {"listen": "1", "timeout": f"{_LISTEN_S}"}),
+    "tcp": (0, {"listen": "1", "listen_timeout": f"{1000 * _LISTEN_S}"}),
+    "rtsp": (554, {"rtsp_flags": "listen", "listen_timeout": f"{_LISTEN_S}"}),
 }
 # live: nothing is held back for a smoother picture, and a damaged packet does not end the stream; not `nobuffer`, which
 # throws away what came while the stream was looked at, and makes what comes later no sooner; twenty pictures for the
@@ -42,13 +46,17 @@ _BY_SCHEME: Mapping[str, Mapping[str, str]] = {
 
 @dataclass(frozen=True)
 class StreamAddress:
-    """A stream that can be opened. `shown` has no password in it; `waits`: it is listened to rather than called."""
+    """A stream that can be opened. `shown` has no password in it; `waits`: it is listened to rather than called.
+
+    `opens_s`: how long one attempt to open it may take.
+    """
 
     url: str
     shown: str
     container: str | None
     options: Mapping[str, str]
     waits: bool = False
+    opens_s: float = _OPEN_S
 
 
 @dataclass(frozen=True)
@@ -115,7 +123,9 @@ def _stream(text: str) -> StreamAddress:
         url = urlunsplit(parts._replace(netloc=f"0.0.0.0:{port or _LISTENING[scheme][0]}"))
         options |= _LISTENING[scheme][1] if scheme in _LISTENING else {}
     container = "mpegts" if scheme == "udp" else None
-    return StreamAddress(url, shown_address(text), container, options, not parts.hostname or scheme in _WAITING)
+    waits = not parts.hostname or scheme in _WAITING
+    opens_s = (_LISTEN_S if waits else 0) + (0 if scheme in _WAITING else _OPEN_S)
+    return StreamAddress(url, shown_address(text), container, options, waits, opens_s)
 
 
 def _check_stream(text: str, scheme: str, host: str | None, port: int | None) -> None:

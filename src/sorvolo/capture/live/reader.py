@@ -20,8 +20,6 @@ from sorvolo.capture.video_stream import PIXEL_LIMIT
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice
 
-_OPEN_S = 6.0  # to be dialled and looked at
-_LISTEN_S = 3.0  # a listener that nobody speaks to is opened anew so often, so that it can be stopped
 REFUSALS = (
     av.error.ProtocolNotFoundError, av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError,
     av.error.HTTPNotFoundError, av.error.PermissionError,
@@ -96,9 +94,9 @@ class StreamReader:
         self._thread.start()
 
     def join(self) -> None:
-        """Wait until the reader has ended, which it does within `silent_s` of being stopped."""
+        """Wait until the reader has ended, which it does within `silent_s` of being stopped, or its attempt to open."""
         if self._thread.is_alive():
-            self._thread.join(_OPEN_S + self._settings.silent_s)
+            self._thread.join(self._address.opens_s + self._settings.silent_s)
 
     def notices(self) -> list[Notice]:
         """What was found in the stream so far and survived."""
@@ -175,7 +173,7 @@ class StreamReader:
         if self._file is not None:
             file = stack.enter_context(closing(self._file(self.outages)))
             return stack.enter_context(av.open(file, options=dict(self._address.options)))
-        open_s = min(_LISTEN_S if self._address.waits else _OPEN_S, max(0.2, self._left_s()))
+        open_s = min(self._address.opens_s, max(0.2, self._left_s()))
         return stack.enter_context(av.open(
             self._address.url, format=self._address.container, options=dict(self._address.options),
             timeout=(open_s, self._settings.silent_s),
