@@ -7,7 +7,7 @@ import numpy as np
 from sorvolo.geometry.arrays import BoxesPx
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.tracking.laying import LaidSighting
-from sorvolo.tracking.standing import fuse
+from sorvolo.tracking.standing import Standing, fuse
 
 _AROUND = 0.3  # of a plant's sides: so far beside its box the middle of a detection may lie
 
@@ -23,13 +23,17 @@ def reported_plants(
     """
     reported: set[int] = set()
     for each in fuse(laid, frames, least).objects:
-        owners = [_owner(laid[k], boxes_px) for k in each.members]
-        known = [owner for owner in owners if owner is not None]
-        if known and 2 * len(known) >= len(owners):
-            owner = max(set(known), key=known.count)
-            if labels[owner] == each.label:
-                reported.add(owner)
+        owner = shown_plant(each, laid, boxes_px)
+        if owner is not None and labels[owner] == each.label:
+            reported.add(owner)
     return reported
+
+
+def shown_plant(each: Standing, laid: Sequence[LaidSighting], boxes_px: Mapping[int, BoxesPx]) -> int | None:
+    """The plant (row) that most of an object's known sightings show, if at least half of all are known."""
+    owners = [_owner(laid[k], boxes_px) for k in each.members]
+    known = [owner for owner in owners if owner is not None]
+    return max(set(known), key=known.count) if known and 2 * len(known) >= len(owners) else None
 
 
 def _owner(sighting: LaidSighting, boxes_px: Mapping[int, BoxesPx]) -> int | None:
