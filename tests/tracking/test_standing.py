@@ -157,8 +157,8 @@ def test_what_is_far_too_short_for_its_class_is_not_laid() -> None:
     assert [each is None for each in lay_on_ground(seen, frame)] == [CLASSES[1] == "car", False, False]
 
 
-@pytest.mark.parametrize(("score", "count"), [(0.95, 1), (0.6, 0)])
-def test_what_one_frame_alone_shows_must_be_sure(score: float, count: int) -> None:
+@pytest.mark.parametrize(("score", "count"), [(0.95, 1), (0.6, 1), (0.5, 0)])
+def test_what_one_frame_alone_shows_counts_as_in_that_frame(score: float, count: int) -> None:
     frames = [placed(0, 0.0, 0.0), placed(1, 60.0, 0.0)]
     seen = Detections(np.array([[400.0, 200.0, 416.0, 215.0]]), np.array([score]), np.array([2]), CLASSES)
     laid = [each for each in lay_on_ground(seen, frames[0]) if each is not None]
@@ -181,12 +181,26 @@ def test_weak_views_are_evidence() -> None:
     """Half of the views score 0.85: with 0.8 in the others it is a car, with 0.3 nothing; neither is a mover."""
     least = {"car": 0.72}
     (car,) = fuse(seen_with([0.85, 0.8]), survey()[:10], least).objects
-    assert car.score < 0.82 and car.possible_views == len(car.members)
+    assert 0.85 < car.score < 0.95 and car.possible_views == len(car.members)
     doubtful = fuse(seen_with([0.85, 0.3]), survey()[:10], least)
     assert doubtful.objects == ()
     strong = [each for each in seen_with([0.85, 0.3]) if each.sighting.score >= 0.72]
     assert doubtful.dropped == len(strong)
     assert fuse(seen_with([0.6]), survey()[:10], least) == Fused((), 0)
+
+
+@pytest.mark.parametrize(("length_m", "count"), [(4.4, 1), (3.9, 1), (2.6, 0)])
+def test_a_bench_is_no_car(length_m: float, count: int) -> None:
+    """Four views of 0.85: as long as a car it is one, as long as a bench not, nor does it walk."""
+    laid: list[LaidSighting] = []
+    for frame in survey()[:10]:
+        box = box_of(frame, "car", 18.0, 2.0, 90.0)
+        if box is not None:
+            middle, half = (box[:2] + box[2:]) / 2, (box[2:] - box[:2]) / 2 * length_m / 4.4
+            boxes = np.concatenate([middle - half, middle + half])[None]
+            seen = Detections(boxes, np.array([0.85]), np.array([CLASSES.index("car")]), CLASSES)
+            laid += [each for each in lay_on_ground(seen, frame) if each is not None]
+    assert len(fuse(laid, survey()[:10], {"car": 0.72}).objects) == count
 
 
 def test_what_few_frames_saw_is_left_out() -> None:

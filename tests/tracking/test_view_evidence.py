@@ -13,11 +13,19 @@ def test_views_without_it_count_against_it() -> None:
     assert scores[0] > 0.78 and scores[-1] < 0.3
 
 
-def test_more_views_make_it_better_known_not_surer() -> None:
-    """What every view scores 0.7 comes nearer to 0.7 with each, and never above: views of one thing err together."""
-    scores = [score_from_views([0.7] * views, views) for views in (1, 2, 5, 20, 200)]
+@pytest.mark.parametrize("score", [0.3, 0.7, 0.94])
+def test_one_view_counts_for_what_it_is(score: float) -> None:
+    """A single photo reports it with the same score as a map that it alone shows."""
+    assert score_from_views([score], 1) == pytest.approx(score)
+
+
+def test_many_views_are_worth_a_few_that_err_apart() -> None:
+    """What every view scores 0.7 becomes surer with each, but never surer than 1 / shared views that err apart."""
+    scores = [score_from_views([0.7] * views, views) for views in (1, 2, 5, 20, 2000)]
     assert all(np.diff(scores) > 0)
-    assert scores[0] < 0.6 and scores[-1] == pytest.approx(0.7, abs=0.005)
+    bound = np.log(0.7 / 0.3) / EvidenceSettings().shared
+    assert scores[-1] == pytest.approx(1 / (1 + np.exp(-bound)), abs=0.001)
+    assert scores[-1] < 0.8
 
 
 def test_a_weak_sighting_is_less_against_it_than_none() -> None:

@@ -1,7 +1,9 @@
-"""Whether a detection's size on the ground is one that its class can have."""
+"""Whether a detection's size on the ground is one that its class can have, and how likely it is there."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import exp, log
+from types import MappingProxyType
 
 import numpy as np
 
@@ -19,6 +21,18 @@ class SizeSettings:
     least_length: float = 0.4  # of its usual length: what is shorter is none, however sure the detector is
     most_width: float = 2.5  # times its largest dimension: what is wider is none; trucks are as wide as cars are long
     scale_sigmas: float = 2.0  # by which heights may be off before something is called too short or too wide
+
+
+@dataclass(frozen=True)
+class LengthSettings:
+    """How much shorter than usual a class's members look from above, in logarithms.
+
+    Cars: boxes of whole cars lie 0.06 to 0.11 (rms) below their median in `cats` (6 videos) and 395 cars of HIT-UAV,
+    under 1 in 300 of them 0.3 or more; the scale of a map is off by up to 0.1.
+    """
+
+    shorter_sigma: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({"car": 0.15}))
+    partly_seen: float = 0.05  # of a class's members, of which a tree or a roof hides a part; by choice
 
 
 def usual_length_m(name: str) -> float:
@@ -43,3 +57,17 @@ def impossible_size(
     largest_m = np.array([max(TYPICAL_SIZE_M.get(name, (np.inf,))) for name in names])
     wide: Mask = shortest_m > settings.most_width * largest_m
     return np.asarray(short | wide, bool)
+
+
+def length_log_odds(name: str, length_m: float, settings: LengthSettings = LengthSettings()) -> float:
+    """What a length on the ground counts for a thing's being of a class: below 0 where it is shorter than usual.
+
+    The logarithm of how likely members of the class look so short, beside those of usual length. 0 where nothing is
+    known of the class's lengths, or of the thing's (NaN): what is longer is not judged, since vans and what is seen
+    aslant are.
+    """
+    sigma = settings.shorter_sigma.get(name, 0.0)
+    if not sigma or not length_m < usual_length_m(name):
+        return 0.0
+    off = log(max(length_m, 1e-3) / usual_length_m(name)) / sigma
+    return log((1.0 - settings.partly_seen) * exp(-off * off / 2) + settings.partly_seen)

@@ -18,7 +18,7 @@ from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.association import least_cost
 from sorvolo.tracking.doubles import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
-from sorvolo.tracking.plausible import usual_length_m
+from sorvolo.tracking.plausible import LengthSettings, length_log_odds, usual_length_m
 from sorvolo.tracking.view_evidence import EvidenceSettings, score_from_views
 from sorvolo.tracking.walking import Walk, WalkSettings, walks
 
@@ -52,6 +52,7 @@ class StandingSettings:
     least_score: float = 0.3  # from which on a class is reported for which none is given
     standing_share: float = 0.3  # of the frames that show a place: what so many saw there is no part of a way
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
+    lengths: LengthSettings = field(default_factory=LengthSettings)
     matches: MatchSettings = field(default_factory=MatchSettings)
     bodies: BodySettings = field(default_factory=BodySettings)
     walks: WalkSettings = field(default_factory=WalkSettings)
@@ -369,7 +370,7 @@ def _standing_or_not(
     objects: list[Standing] = []
     unlikely: list[int] = []
     for group, possible in zip(groups, _possible_views(groups, laid, frames)):
-        label, score = _score(group, possible, laid, settings.evidence)
+        label, score = _score(group, possible, laid, settings)
         if score >= least.get(label, settings.least_score):
             objects.append(_standing(group, laid, possible, score, settings))
         elif len(_frames_of(group, laid)) < max(2.0, settings.standing_share * possible):
@@ -378,16 +379,24 @@ def _standing_or_not(
 
 
 def _score(
-    group: Sequence[int], possible: int, laid: Sequence[LaidSighting], settings: EvidenceSettings
+    group: Sequence[int], possible: int, laid: Sequence[LaidSighting], settings: StandingSettings
 ) -> tuple[str, float]:
-    """What these sightings show, and the score of its being there: each frame's best score of that class counts."""
+    """What these sightings show, and the score of its being there: each frame's best score of that class counts, and
+    how long it is."""
     label, _, _ = _named(group, laid)
     best: dict[int, float] = {}
     for k in group:
         seen = laid[k].sighting
         if seen.label == label:
             best[seen.frame_index] = max(seen.score, best.get(seen.frame_index, 0.0))
-    return label, score_from_views(list(best.values()), possible, settings)
+    of_length = length_log_odds(label, _seen_length_m([laid[k] for k in group]), settings.lengths)
+    return label, score_from_views(list(best.values()), possible, settings.evidence, of_length)
+
+
+def _seen_length_m(chosen: Sequence[LaidSighting]) -> float:
+    """The median of the boxes' longer sides; NaN where no frame shows it whole, or on a map without metres."""
+    whole_m = [each.sighting.size_m[0] for each in chosen if not each.is_cut and each.middle_up_m]
+    return float(np.median(whole_m)) if whole_m else float("nan")
 
 
 def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, float, dict[str, float]]:
