@@ -64,6 +64,20 @@ def test_what_is_far_too_short_for_its_class_is_set_aside():
         assert sighting is not None and not unlocated
 
 
+def test_a_length_that_cars_seldom_have_counts_against_one():
+    """As long as a bench: hardly a car, less surely so where the height is not known; people are not judged by it."""
+    m_px = CAMERA.fx_px / 59.25
+    high = replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 20.0]))
+    scores = [
+        place(one([400.0, 300.0], label, length_m * m_px), prior)[0].score
+        for label, length_m, prior in (("car", 4.5, PRIOR), ("car", 2.6, high), ("car", 2.6, PRIOR))
+    ]
+    assert scores[0] == 0.9 and 0.7 < scores[1] < 0.9 and scores[2] < 0.4
+    assert place(one([400.0, 300.0], "person", 0.4 * m_px))[0].score == 0.9
+    cut = one([1.3 * m_px - 0.5, 300.0], "car", 2.6 * m_px)
+    assert place(cut)[0].score == 0.9
+
+
 def test_what_is_far_too_wide_for_its_class_is_set_aside():
     m_px = CAMERA.fx_px / 59.25
     sighting, unlocated = place(one([400.0, 300.0], "person", 6 * m_px))

@@ -13,7 +13,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import TYPICAL_SIZE_M, Detections, Sighting
 from sorvolo.tracking.cut_boxes import beyond_edges, cut_edges
-from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size
+from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size, length_log_odds, with_log_odds
 
 GroundHeight = Callable[[PointsM], Floats]
 """Heights (N,) of the ground above the site's level plane, m, at east, north (N, 2); NaN where it is not known."""
@@ -75,10 +75,10 @@ def locate(
     sizes_m = slopes_m * sides_px
     axes = per_px.transpose(0, 2, 1) / np.maximum(slopes_m, 1e-9)[:, :, None]
     cut = cut_edges(boxes, camera.width_px, camera.height_px)
-    is_impossible = impossible_size(
-        found.names, sizes_m, cut_edges(boxes, camera.width_px, camera.height_px, TOO_SHORT_CUT_PX),
-        _scale_sigma(prior, ends.reach * -ends.rays_site[:, 2], focal_sigma, settings),
-    )
+    scale_sigmas = _scale_sigma(prior, ends.reach * -ends.rays_site[:, 2], focal_sigma, settings)
+    cut_short = cut_edges(boxes, camera.width_px, camera.height_px, TOO_SHORT_CUT_PX)
+    is_impossible = impossible_size(found.names, sizes_m, cut_short, scale_sigmas)
+    scores = _scores_by_length(found, sizes_m.max(axis=1), np.asarray(cut_short.any(axis=1), bool), scale_sigmas)
     outward_m, beyond_m2 = beyond_edges(found.names, cut, axes, sizes_m)
     places_m, covariances = ends.places_m + outward_m, shared + (own + beyond_m2)
     sizes_m = np.sort(sizes_m, axis=1)[:, ::-1]
@@ -86,7 +86,7 @@ def locate(
     reasons = _reasons(ends, places_m - prior.position_m[:2], covariances, is_impossible, settings)
     sightings = [
         None if reason else Sighting(
-            frame_index, frame_name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places_m[row],
+            frame_index, frame_name, time_ns, label, scores[row], found.boxes_px[row], places_m[row],
             covariances[row], sizes_m[row], float(shared_sigmas[row]),
         )
         for row, (label, reason) in enumerate(zip(found.names, reasons))
@@ -192,6 +192,18 @@ def _scale_sigma(prior: CameraPrior, drop_m: Floats, focal_sigma: float, setting
     """(N,) how well lengths on the ground are known, relative; `drop_m` (N,) is how far it lies below the camera."""
     height_sigma_m = np.hypot(prior.position_sigma_m[2], settings.ground_sigma_m)
     return np.asarray(np.hypot(height_sigma_m / np.maximum(drop_m, 1e-6), focal_sigma), np.float64)
+
+
+def _scores_by_length(
+    found: Detections, lengths_m: Floats, is_cut: NDArray[np.bool_], scale_sigmas: Floats
+) -> list[float]:
+    """The scores with what each length counts; of what the picture's edge cuts as they are."""
+    return [
+        score if cut else with_log_odds(score, length_log_odds(name, length_m, sigma))
+        for name, score, length_m, cut, sigma in zip(
+            found.names, found.scores.tolist(), lengths_m.tolist(), is_cut.tolist(), scale_sigmas.tolist()
+        )
+    ]
 
 
 def _rays_with_slopes(camera: Camera, middles_px: PointsPx) -> tuple[PointsM, Floats]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import exp, log
+from math import exp, hypot, log
 from types import MappingProxyType
 
 import numpy as np
@@ -28,10 +28,10 @@ class LengthSettings:
     """How much shorter than usual a class's members look from above, in logarithms.
 
     Cars: boxes of whole cars lie 0.06 to 0.11 (rms) below their median in `cats` (6 videos) and 395 cars of HIT-UAV,
-    under 1 in 300 of them 0.3 or more; the scale of a map is off by up to 0.1.
+    under 1 in 300 of them 0.36 or more.
     """
 
-    shorter_sigma: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({"car": 0.15}))
+    shorter_sigma: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({"car": 0.11}))
     partly_seen: float = 0.05  # of a class's members, of which a tree or a roof hides a part; by choice
 
 
@@ -59,15 +59,25 @@ def impossible_size(
     return np.asarray(short | wide, bool)
 
 
-def length_log_odds(name: str, length_m: float, settings: LengthSettings = LengthSettings()) -> float:
+def length_log_odds(
+    name: str, length_m: float, scale_sigma: float, settings: LengthSettings = LengthSettings()
+) -> float:
     """What a length on the ground counts for a thing's being of a class: below 0 where it is shorter than usual.
 
-    The logarithm of how likely members of the class look so short, beside those of usual length. 0 where nothing is
-    known of the class's lengths, or of the thing's (NaN): what is longer is not judged, since vans and what is seen
-    aslant are.
+    The logarithm of how likely members of the class look so short, beside those of usual length; the length is known to
+    the relative error `scale_sigma`. 0 where nothing is known of the class's lengths, or of the thing's (NaN): what is
+    longer is not judged, since vans and what is seen aslant are.
     """
     sigma = settings.shorter_sigma.get(name, 0.0)
     if not sigma or not length_m < usual_length_m(name):
         return 0.0
-    off = log(max(length_m, 1e-3) / usual_length_m(name)) / sigma
+    off = log(max(length_m, 1e-3) / usual_length_m(name)) / hypot(sigma, scale_sigma)
     return log((1.0 - settings.partly_seen) * exp(-off * off / 2) + settings.partly_seen)
+
+
+def with_log_odds(score: float, more: float) -> float:
+    """A score, 0 to 1, with what else is known, in log-odds."""
+    if not more:
+        return score
+    inside = min(max(score, 1e-3), 1.0 - 1e-3)
+    return 1.0 / (1.0 + exp(-log(inside / (1.0 - inside)) - more))

@@ -18,7 +18,7 @@ from sorvolo.survey.objects import TYPICAL_SIZE_M
 from sorvolo.tracking.association import least_cost
 from sorvolo.tracking.doubles import WITHIN
 from sorvolo.tracking.laying import LaidSighting, shows, usual_height_m
-from sorvolo.tracking.plausible import LengthSettings, length_log_odds, usual_length_m
+from sorvolo.tracking.plausible import length_log_odds, usual_length_m
 from sorvolo.tracking.view_evidence import EvidenceSettings, score_from_views
 from sorvolo.tracking.walking import Walk, WalkSettings, walks
 
@@ -52,7 +52,7 @@ class StandingSettings:
     least_score: float = 0.3  # from which on a class is reported for which none is given
     standing_share: float = 0.3  # of the frames that show a place: what so many saw there is no part of a way
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
-    lengths: LengthSettings = field(default_factory=LengthSettings)
+    scale_sigma: float = 0.1  # by which the map's lengths may be off, relative: that of GPS heights over a flight
     matches: MatchSettings = field(default_factory=MatchSettings)
     bodies: BodySettings = field(default_factory=BodySettings)
     walks: WalkSettings = field(default_factory=WalkSettings)
@@ -389,7 +389,7 @@ def _score(
         seen = laid[k].sighting
         if seen.label == label:
             best[seen.frame_index] = max(seen.score, best.get(seen.frame_index, 0.0))
-    of_length = length_log_odds(label, _seen_length_m([laid[k] for k in group]), settings.lengths)
+    of_length = length_log_odds(label, _seen_length_m([laid[k] for k in group]), settings.scale_sigma)
     return label, score_from_views(list(best.values()), possible, settings.evidence, of_length)
 
 
