@@ -96,6 +96,20 @@ def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
     assert (mapped / "mosaic.tif").read_bytes() == map_before
 
 
+def test_heights_of_a_map_that_contradicts_itself_or_mixes_lenses_state_it(
+    mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = Path(shutil.copytree(mapped, tmp_path / "site"))
+    (path,) = site.glob("flights/*/report.json")
+    report = json.loads(path.read_text())
+    report["headline"] = {"quality": "contradictory", "text": "a map that contradicts itself: two scales"}
+    report["notices"] = [{"code": "zoom", "count": 2, "text": "different focal lengths"}]
+    path.write_text(json.dumps(report))
+    assert main(["heights", str(site), "--no-orthophoto", "--json"]) == 3
+    warnings = " ".join(json.loads(capsys.readouterr().out)["heights"]["warnings"])
+    assert "two scales" in warnings and "each focal length as a flight of their own" in warnings
+
+
 def test_heights_name_what_is_missing(mapped: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nowhere"):
         list(make_heights(mapped, flight="nowhere"))

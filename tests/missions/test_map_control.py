@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from pyproj import Transformer
 
 from sorvolo.capture.calibration import camera_from_option
 from sorvolo.cli import main as cli
+from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.pose import Pose
 
@@ -59,19 +60,25 @@ def surveyed(photographed: Path) -> Surveyed:
     with Image.open(next(photos.iterdir())) as first:
         width_px, height_px = first.size
     camera = camera_from_option(str(photographed / "camera.xml"), width_px, height_px).camera
-    rng = np.random.default_rng(4)
-    marks = []
     places = [(x, y) for x in (-14.0, -4.0, 6.0, 16.0) for y in (-7.0, 6.0)]
-    for number, (x, y) in enumerate(places):
-        place_m = np.array([x, y, 0.0])
+    names = [f"{'CP' if number in (2, 5) else 'G'}{number}" for number in range(len(places))]
+    on_ground = {name: np.array([x, y, 0.0]) for name, (x, y) in zip(names, places, strict=True)}
+    made = Surveyed(photos, photographed / "camera.xml", frame, marks_of(on_ground, camera, truth), truth)
+    assert len({each.label for each in made.marks}) >= 7
+    return made
+
+
+def marks_of(places_m: dict[str, np.ndarray], camera: Camera, truth: dict[str, Any]) -> tuple[Mark, ...]:
+    """Where photos show these places, right to a tenth of a pixel."""
+    frame, rng = LocalFrame(Geodetic(**truth["site"])), np.random.default_rng(4)
+    marks = []
+    for label, place_m in places_m.items():
         for each in truth["features"]:
             known = each["properties"]
             pixel = camera.pixels_from_points(_pose(known, frame).inverse().apply(place_m[None]))[0]
-            if (pixel > 5).all() and (pixel < [width_px - 5, height_px - 5]).all():
-                pixel = pixel + rng.normal(0, 0.1, 2)
-                marks.append(Mark(f"{'CP' if number in (2, 5) else 'G'}{number}", place_m, *pixel, known["frame"]))
-    assert len({each.label for each in marks}) >= 7
-    return Surveyed(photos, photographed / "camera.xml", frame, tuple(marks), truth)
+            if (pixel > 5).all() and (pixel < [camera.width_px - 5, camera.height_px - 5]).all():
+                marks.append(Mark(label, place_m, *(pixel + rng.normal(0, 0.1, 2)), known["frame"]))
+    return tuple(marks)
 
 
 def _pose(known: dict[str, Any], frame: LocalFrame) -> Pose:
@@ -178,6 +185,25 @@ def test_two_points_whose_places_are_exchanged_are_named_and_left_out(
     assert sorted(control["excluded"]) == ["G0", "G6"]
     assert control["control_rms_m"] < 0.05 and absolute_m(tmp_path / "site", surveyed) < 0.2
     assert "G0" in capsys.readouterr().out
+
+
+def test_heights_of_points_in_feet_are_named(surveyed: Surveyed, tmp_path: Path) -> None:
+    """Points on roofs and poles: heights in metres fit, in feet they do not, and the report states which was meant."""
+    with Image.open(next(surveyed.photos.iterdir())) as first:
+        camera = camera_from_option(str(surveyed.camera), *first.size).camera
+    up_m = dict(zip(sorted({each.label for each in surveyed.marks}), (0.0, 2.5, 0.5, 3.0, 1.0, 4.0, 0.0, 1.5)))
+    places_m = {each.label: np.array([*each.place_m[:2], up_m[each.label]]) for each in surveyed.marks}
+    raised = replace(surveyed, marks=marks_of(places_m, camera, surveyed.frames))
+
+    def in_feet(mark: Mark) -> Mark:
+        return replace(mark, place_m=mark.place_m / (1.0, 1.0, 0.3048))
+
+    for name, change, words in (("metres", lambda mark: mark, ""), ("feet", in_feet, "fit far better as feet")):
+        gcp = raised.write(tmp_path / f"{name}.txt", change=change)
+        assert run(tmp_path / name, raised.photos, raised, gcp) == 0
+        report = json.loads(next((tmp_path / name).glob("flights/*/report.json")).read_text())
+        missed = [each for each in report["warnings"] if "the control points miss the map" in each]
+        assert len(missed) == bool(words) and all(words in each for each in missed), report["warnings"]
 
 
 def exchanged(text: str, first: int, second: int) -> str:

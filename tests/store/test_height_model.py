@@ -1,5 +1,6 @@
 """Heights of the ground by place, from models of several kinds, and what is no model of the ground asked for."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from rasterio.transform import Affine
 
 from sorvolo.errors import InputError
 from sorvolo.store.rasters import height_model
+from sorvolo.store.rasters.base_map import BaseMap
 from sorvolo.store.rasters.height_model import read_height_model
 
 _BOUNDS_DEG = (12.60, 41.89, 12.61, 41.90)
@@ -109,3 +111,13 @@ def in_fathoms(path: Path) -> Path:
 def test_what_is_no_model_of_this_ground(make: Any, words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=words):
         read_height_model(make(tmp_path / "model.tif"), _BOUNDS_DEG)
+
+
+def test_a_file_without_a_place_is_refused_in_one_line(tmp_path: Path) -> None:
+    with rasterio.open(tmp_path / "plain.tif", "w", driver="GTiff", width=9, height=9, count=1, dtype="uint8") as sink:
+        sink.write(np.ones((1, 9, 9), np.uint8))
+    for read in (lambda path: read_height_model(path, _BOUNDS_DEG), BaseMap.open):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # rasterio's warning names lines of Python, which help nobody
+            with pytest.raises(InputError, match=r"coordinate reference|no place on Earth"):
+                read(tmp_path / "plain.tif")

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from sorvolo.cli.exit_codes import TO_CHECK
 from sorvolo.cli.options import AsJson
 from sorvolo.cli.places_of_sites import SiteArgument, opened_site
 from sorvolo.cli.progress import ProgressReport
@@ -42,6 +43,8 @@ def heights(
             typer.echo(json.dumps({"site": str(place.folder), "heights": report}, indent=1))
         else:
             show_heights(place.folder, report, Console())
+    if report["contradicts_itself"]:
+        raise typer.Exit(TO_CHECK)
 
 
 def make_and_read(

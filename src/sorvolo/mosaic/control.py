@@ -1,7 +1,7 @@
 """A map tied to control points: what they are held against, which of them cannot be right, and how well it fits."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -9,7 +9,8 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.geometry.units import FOOT_M
 from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
 from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.survey.control import ControlMark, ControlReport, ControlResidual, ControlRole, GroundControl
@@ -31,6 +32,7 @@ class ControlSettings:
     most_off_gps_m: float = 60.0  # no receiver errs so far: the points' CRS is another
     most_scale: float = 1.3  # between GPS and the points
     on_line: float = 0.1  # spread across over spread along, or over that of a picture's ground: less is one line
+    clearly_better: float = 0.5  # times the rms miss, by choice: heights in feet that fit so much better are in feet
     in_corner: float = 0.3  # their spread over that of the flight's cameras, below which they hold a corner of it
 
     def holds_back(self, label: str) -> bool:
@@ -100,13 +102,46 @@ def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: Control
     residuals = tuple(
         _residual(problem.control, number, rows, used, excluded) for number in range(len(problem.control.points))
     )
-    return ControlReport(
-        problem.control.name, problem.control.crs, settings.sigma_m, residuals,
-        _remarks(mapper, problem, seen.of(used), settings),
+    remarks = (
+        *_misfit_remarks(mapper, problem, seen, used, expected_m, settings),
+        *_layout_remarks(mapper, problem, seen.of(used), settings),
     )
+    return ControlReport(problem.control.name, problem.control.crs, settings.sigma_m, residuals, remarks)
 
 
-def _remarks(
+def _misfit_remarks(
+    mapper: PlanarMapper, problem: ControlProblem, seen: _Seen, used: set[str], expected_m: float,
+    settings: ControlSettings,
+) -> tuple[str, ...]:
+    """In words, that the points miss the tied map by more than they err: its ground is not level, or their heights are
+    wrong. Whether heights in feet would fit is judged by how well map and points fit each other after a similarity."""
+    misses, _ = seen.misses(mapper.ground_places_m(seen.ties))
+    is_used = np.array([label in used for label in seen.labels], bool)
+    missed_m = _rms_m(misses[is_used])
+    if missed_m <= settings.excluded_sigmas * expected_m:
+        return ()
+    found = f"the control points miss the map by {missed_m:.2f} m (rms), and {expected_m:.2f} m was to be expected"
+    in_feet = replace(seen, ties=replace(seen.ties, place_m=seen.ties.place_m * (1.0, 1.0, FOOT_M)))
+    as_read_m, as_feet_m = (_unlike_m(mapper, each, is_used) for each in (seen, in_feet))
+    if as_feet_m < settings.clearly_better * as_read_m:
+        return (f"{found}; their heights (z) fit far better as feet: give them in metres",)
+    return (f"{found}: the ground is not level, or their heights (z) are wrong",)
+
+
+def _unlike_m(mapper: PlanarMapper, seen: _Seen, is_used: Rows) -> float:
+    """Rms miss of some of the points after the best similarity."""
+    misses, _ = seen.misses(mapper.ground_places_m(seen.ties))
+    first = [int(np.argmax(seen.point == k)) for k in range(len(seen.labels))]
+    places_m = seen.ties.place_m[first, :2][is_used]
+    on_map_m = places_m + misses[is_used]
+    return _rms_m(apply_homography(fit_similarity(places_m, on_map_m), on_map_m) - places_m)
+
+
+def _rms_m(off_m: PointsM) -> float:
+    return float(np.sqrt((off_m**2).sum(axis=1).mean()))
+
+
+def _layout_remarks(
     mapper: PlanarMapper, problem: ControlProblem, ties: GroundTies, settings: ControlSettings
 ) -> tuple[str, ...]:
     cameras_m = np.array([mapper.pose(each).translation_m for each in mapper.placed()])

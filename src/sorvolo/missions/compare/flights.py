@@ -17,7 +17,7 @@ from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.frames_ahead import read_ahead
-from sorvolo.missions.flight.headline import MapQuality
+from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import check_classes, open_detector
@@ -110,11 +110,11 @@ def _check_map(archive: Archive, site: Path, settings: CompareSettings) -> None:
     if settings.trusts_map:
         return
     for each in archive.flights():
-        headline = archive.report(each.id).get("headline")
-        if isinstance(headline, dict) and headline.get("quality") == MapQuality.CONTRADICTORY:
+        report = archive.report(each.id)
+        if contradicts_itself(report):
             raise StoreError(
-                f"the map in {site} contradicts itself (flight {each.id}): {headline.get('text')}; map that flight "
-                "again with what it lacks, or compare all the same with --trust-map"
+                f"the map in {site} contradicts itself (flight {each.id}): {report['headline'].get('text')}; map that "
+                "flight again with what it lacks, or compare all the same with --trust-map"
             )
 
 

@@ -1,8 +1,9 @@
 """A mapped flight in one line: whether it is a map at all, whether the map can be trusted, and how good it is."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 from sorvolo.missions.flight.warnings import OBLIQUE_DEG, doubts
 from sorvolo.mosaic.consistency import NOTHING_KNOWN, Consistency
@@ -46,6 +47,12 @@ def map_headline(
         return Headline(MapQuality.DOUBTFUL, f"a map to check before use: {'; '.join(found)}")
     matched = sum(each.status is Status.VISION for each in placed)
     return Headline(MapQuality.MAP, f"{matched:,} of {counted(len(placed), 'frame')} matched")
+
+
+def contradicts_itself(report: Mapping[str, Any]) -> bool:
+    """Whether the map of a flight, by its report, contradicts itself."""
+    headline = report.get("headline")
+    return isinstance(headline, dict) and headline.get("quality") == MapQuality.CONTRADICTORY
 
 
 def _one_view(figures: FlightFigures, seen: int) -> str:

@@ -2,7 +2,7 @@
 
 import resource
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.terrain import TerrainSettings, terrain
 from sorvolo.heights.views import View, ground_outlines_m
+from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.heights.flight_views import flight_views, run_of
 from sorvolo.missions.heights.pictures import FlightPictures, SmallPictures
 from sorvolo.store.atomic import atomic_write_bytes, scratch_folder
@@ -84,6 +85,7 @@ def make_heights(
         give_back()
         swept = yield from _sweep(archive, solved, pictures, settings, flight_id)
         surface, judgement = judged_by_points(swept, solved, settings.own_points)
+        mapped = archive.report(flight_id)
         yield HeightsUpdate(flight_id, "ground", 0.0)
         ground, shows_ground = terrain(surface.lattice, surface.up_m, settings.terrain)
         _write_models(archive, flight_id, surface, ground)
@@ -95,12 +97,26 @@ def make_heights(
             "flight": flight_id, "run": run_of(keyframes), "cell_m": surface.lattice.cell_m,
             "height_reference": archive.site().height_reference,
             "cameras": camera_figures(solved), "surface": surface_figures(surface, shows_ground, judgement),
-            "warnings": [*camera_warnings(solved), *surface_warnings(surface)],
+            "warnings": [*_map_warnings(mapped), *camera_warnings(solved), *surface_warnings(surface)],
+            "contradicts_itself": contradicts_itself(mapped),
             "seconds": {"cameras": cameras_s, "heights": heights_s, "total": time.monotonic() - started_s},
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
         atomic_write_bytes(archive.height_path(flight_id, HeightFile.REPORT), json_bytes(report))
         yield HeightsUpdate(flight_id, "done", 1.0)
+
+
+def _map_warnings(mapped: Mapping[str, Any]) -> list[str]:
+    """What of a flight's report, of its map, spoils its heights too."""
+    warnings = []
+    if contradicts_itself(mapped):
+        warnings.append(f"the flight has {mapped['headline'].get('text')}; do not build on its heights")
+    if any(each.get("code") == "zoom" for each in mapped.get("notices", ())):
+        warnings.append(
+            "the photos have different focal lengths and were taken as of one lens: heights are wrong by more than "
+            "their stated error; map the photos of each focal length as a flight of their own"
+        )
+    return warnings
 
 
 def newest_flight(archive: Archive) -> str:

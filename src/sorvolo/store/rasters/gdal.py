@@ -1,6 +1,7 @@
 """GDAL behind a locked door: one driver, plain local files, no network, no neighbours of a file; and its half pixel."""
 
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -8,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from rasterio.crs import CRS
-from rasterio.errors import CRSError, RasterioIOError
+from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioIOError
 from rasterio.transform import Affine
 
 from sorvolo.errors import InputError, SettingsError
@@ -60,13 +61,15 @@ def transform_on_grid(grid: Grid, column: int, row: int) -> Affine:
 
 
 def _opened(path: Path, drivers: Sequence[str]) -> rasterio.DatasetReader:
-    """The file, by the first of the drivers that can read it."""
-    for driver in drivers[:-1]:
-        try:
-            return rasterio.open(path, driver=driver, sharing=False)
-        except RasterioIOError:
-            continue
-    return rasterio.open(path, driver=drivers[-1], sharing=False)
+    """The file, by the first of the drivers that can read it. One without a place is refused by who asked for it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        for driver in drivers[:-1]:
+            try:
+                return rasterio.open(path, driver=driver, sharing=False)
+            except RasterioIOError:
+                continue
+        return rasterio.open(path, driver=drivers[-1], sharing=False)
 
 
 def crs_of_epsg(code: str) -> CRS:
