@@ -1,6 +1,7 @@
 """Mode 2 on small simulated flights with a truth-fed detector: what is found, placed, written, and sent."""
 
 import json
+import shlex
 import socket
 import sys
 from collections import deque
@@ -398,6 +399,25 @@ def test_photos_without_anything_else(photographs: Path, detector: TruthDetector
     assert sorted(path.name for path in (tmp_path / "out" / "annotated").iterdir()) == [
         f"IMG_{number}.jpg" for number in range(4)
     ]
+
+
+@pytest.mark.parametrize("shown_by", [1, 2])
+def test_a_photo_that_alone_shows_something_is_enough(shown_by: int, detector: TruthDetector, tmp_path: Path) -> None:
+    """Three photos of different ground, one of them, or the last, with a person, who is alerted of once."""
+    random = np.random.default_rng(2)
+    (tmp_path / "photos").mkdir()
+    for number, picture in enumerate(random.integers(0, 150, (3, 240, 320, 3), np.uint8)):
+        picture[100:110, 160:170] = 255 if number == shown_by else 90
+        cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), picture)
+    save = "import pathlib, sys; pathlib.Path(sys.argv[1]).open('a').write(sys.stdin.read() + chr(10))"
+    command = shlex.join([sys.executable, "-c", save, str(tmp_path / "alerts")])
+    outputs = WatchOutputs(folder=tmp_path / "out", alert_command=command)
+    updates = list(watch(tmp_path / "photos", outputs=outputs, detector=_Squares(detector.info)))
+    assert [len(update.detections) for update in updates] == [int(number == shown_by) for number in range(3)]
+    (track,) = [each["properties"] for each in _read(tmp_path / "out" / "tracks.json")["features"]]
+    (alert,) = [json.loads(line) for line in (tmp_path / "alerts").read_text().splitlines()]
+    assert track["views"] == 1 and alert["id"] == track["id"] and alert["segment"] == track["segment"]
+    assert Path(alert["crop"]).is_file()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import CLASSES, Detections
 from sorvolo.tracking.following import PictureFollower
 from sorvolo.tracking.image_motion import ImageMotion
-from sorvolo.tracking.tracker import IN_PICTURES, Tracker
+from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings
 
 WIDTH, HEIGHT = 640, 360
 
@@ -112,7 +112,7 @@ def test_an_object_that_the_camera_passes_is_one_track_that_stands():
 def test_a_car_that_drives_is_one_moving_track_beside_one_that_stands(step_px):
     """Without telemetry, from a camera that flies on and turns; one in five views of each is missed."""
     random = np.random.default_rng(5)
-    follower, picture, stands = PictureFollower(0.3), ground(), np.array([700.0, 430.0])
+    follower, picture, stands = PictureFollower(TrackerSettings(sure_score=0.3)), ground(), np.array([700.0, 430.0])
     for number in range(40):
         image, ground_from_view = cut(picture, (560 + 6 * number, 500), turn_deg=0.4 * number)
         drives = np.array([620.0, 520.0]) + number * np.array(step_px)

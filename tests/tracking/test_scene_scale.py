@@ -13,6 +13,7 @@ from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import CLASSES, Detections
 from sorvolo.tracking.following import PictureFollower
 from sorvolo.tracking.scene_scale import SceneScale, impossible_beside_cars
+from sorvolo.tracking.tracker import TrackerSettings
 
 SIZE_PX = (480, 640)
 INFO = ModelInfo("toy", CLASSES, dict.fromkeys(CLASSES, 0.5), dict.fromkeys(CLASSES, (16.0, 200.0)))
@@ -111,7 +112,7 @@ def test_people_alone_magnify_and_never_shrink() -> None:
 def test_a_watch_without_telemetry_sets_aside_what_its_cars_contradict() -> None:
     rng = np.random.default_rng(3)
     picture = rng.integers(0, 255, (*SIZE_PX, 3), np.uint8)
-    follower = PictureFollower(0.3)
+    follower = PictureFollower(TrackerSettings(sure_score=0.3))
     cars = street(10.0)
     window = found([("car", 320, 240, 9, 9)])
     both = Detections(

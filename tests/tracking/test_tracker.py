@@ -181,6 +181,29 @@ def test_a_glimpse_is_no_object():
     assert tracker.tracks() == [] and tracker.finish() == []
 
 
+ALONE = TrackerSettings(alone={"person": 0.7})
+"""For photos, where one that alone shows a place is enough."""
+
+
+@pytest.mark.parametrize(("score", "then_m", "is_reported"), [
+    (0.8, ASIDE_M, True), (0.6, ASIDE_M, False),  # the next photo shows other ground
+    (0.8, np.zeros(2), False),  # it shows the place, and nothing there
+])
+def test_what_one_photo_alone_shows_is_reported_when_it_goes_out_of_view(score, then_m, is_reported):
+    tracker = Tracker(ALONE)
+    assert not tracker.update([sighting(0, [3.0, 4.0], score=score)], time_ns=0, footprint_m=AROUND_M).new
+    update = tracker.update([], time_ns=int(5e9), footprint_m=AROUND_M + then_m)
+    assert len(update.new) == len(tracker.finish()) == is_reported
+
+
+def test_what_the_last_photo_alone_shows_is_reported_at_the_end():
+    tracker = Tracker(ALONE)
+    tracker.update([], time_ns=0, footprint_m=AROUND_M + ASIDE_M)
+    tracker.update([sighting(1, [3.0, 4.0])], time_ns=int(2e8), footprint_m=AROUND_M)
+    (track,) = tracker.finish()
+    assert track.confirmed and track.views == 1
+
+
 def test_low_scores_prolong_and_do_not_begin():
     tracker = Tracker()
     weak = sighting(0, [0.0, 0.0], score=0.2)

@@ -30,6 +30,7 @@ class Followed:
     best: Sighting
     confirmed: bool = False
     ended: bool = False
+    was_missed: bool = False  # by a frame that shows its place whole
     views: int = 0
     passes: int = 1
     is_out: bool = False  # of the frames' view since it was last seen
@@ -103,6 +104,7 @@ class Followed:
         self.views = total
         self.confirmed |= other.confirmed
         self.ended &= other.ended
+        self.was_missed |= other.was_missed
         self.is_out &= other.is_out
         self._join_counts(other)
         self._reported = None

@@ -71,16 +71,16 @@ class GroundFollower:
     """Detections of a flight with telemetry, placed on the ground and tracked in site metres. Only `take` and `recall`
     change it.
 
-    All detections score `sure_score` or more. `ground` gives the ground's height over the flight's zero; None: it is
+    `settings` are the tracker's, in metres. `ground` gives the ground's height over the flight's zero; None: it is
     level. Without `knows_heading` the camera's heading comes from the pictures' motion. `unlocated` counts detections
     without a place by reason.
     """
 
     def __init__(
-        self, camera: CameraModel, sure_score: float, ground: GroundHeight | None, *, knows_heading: bool
+        self, camera: CameraModel, settings: TrackerSettings, ground: GroundHeight | None, *, knows_heading: bool
     ) -> None:
         self._camera, self._ground = camera, ground
-        self._tracker = Tracker(TrackerSettings(sure_score=sure_score))
+        self._tracker = Tracker(settings)
         self._heading = None if knows_heading else _HeadingFromPictures()
         self._compass = CompassError()
         self._path: list[Floats] = []
@@ -188,8 +188,8 @@ class PictureFollower:
     too large for their class beside the scene's cars: they are in no track.
     """
 
-    def __init__(self, sure_score: float) -> None:
-        self._settings = replace(IN_PICTURES, sure_score=sure_score)
+    def __init__(self, settings: TrackerSettings) -> None:
+        self._settings = replace(settings, unit_m=IN_PICTURES.unit_m)
         self._motion, self._tracker = ImageMotion(), Tracker(self._settings)
         self._earlier, self._scene = list[Track](), SceneScale()
         self.segment, self.impossible_size = 1, 0
@@ -224,15 +224,22 @@ class PictureFollower:
         return is_impossible
 
     def _follow(self, located: Located) -> Taken:
-        if located.segment != self.segment:
-            self.segment = located.segment
-            self._earlier += self._tracker.finish()
-            self._tracker = Tracker(self._settings, first_id=self._tracker.next_id)
+        late = self._finished() if located.segment != self.segment else frozenset()
+        self.segment = located.segment
         update = self._tracker.update(
             [each for each in located.sightings if each is not None], time_ns=located.time_ns,
             footprint_m=located.outline_m,
         )
-        return replace(_taken(located, update), segment=self.segment)
+        taken = _taken(located, update)
+        return replace(taken, new_ids=taken.new_ids | late, segment=self.segment)
+
+    def _finished(self) -> frozenset[int]:
+        """End the segment's tracks and begin anew; the ids that its end confirms."""
+        known = {track.id for track in self._tracker.tracks() if track.confirmed}
+        ended = self._tracker.finish()
+        self._earlier += ended
+        self._tracker = Tracker(self._settings, first_id=self._tracker.next_id)
+        return frozenset(track.id for track in ended) - known
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,13 +55,15 @@ class TrackerSettings:
     """When sightings make an object. `unit_m` is how many metres a unit of the places is, for speeds and distances.
 
     `evidence` grows with each sighting by its score's log odds plus one, and shrinks by `missed` with each frame that
-    shows the place without the object.
+    shows the place without the object. `alone` has the score of each class from which one frame that alone shows a
+    place is enough: photos, which may show it once; empty for a video, which shows it in many frames.
     """
 
     sure_score: float = 0.4  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
     least_views: int = 3  # two are enough where they lie a second apart
     least_evidence: float = 3.5
     missed: float = 0.7
+    alone: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     new_per_m2: float = 5e-4  # how densely objects lie that nobody has seen yet
     neighbour_m: float = 4.0  # within which two tracks may be one object
     unit_m: float = 1.0
@@ -138,6 +141,7 @@ class Tracker:
         fresh = seen.fresh_rows(pairs.sightings, self._settings.sure_score)
         started = self._begin(seen, fresh)
         missing, ended = self._missed(near, motions, unmatched, time_ns, elapsed_s, footprint_m)
+        new += self._alone([each for each in self._followed if each.is_out])
         ids = np.zeros(len(sightings), np.int64)
         ids[pairs.sightings] = [each.id for each in prolonged]
         ids[fresh] = [each.id for each in started]
@@ -158,7 +162,8 @@ class Tracker:
         return [each.track(self._shift.variance_m2(each.id)) for each in self._followed]
 
     def finish(self) -> list[Track]:
-        """All confirmed tracks; tentative ones are given up."""
+        """All confirmed tracks, with those of the last frame alone; other tentative ones are given up."""
+        self._alone(self._followed)
         self._keep([each for each in self._followed if each.confirmed])
         return self.tracks()
 
@@ -316,6 +321,16 @@ class Tracker:
         followed.confirmed = True
         return True
 
+    def _alone(self, gone: Sequence[Followed]) -> list[int]:
+        """Confirm what the only frame that shows its place was sure of; the ids."""
+        confirmed = []
+        for followed in gone:
+            least = self._settings.alone.get(followed.label, np.inf)
+            if followed.views == 1 and not (followed.confirmed or followed.was_missed) and followed.score_sum >= least:
+                followed.confirmed = True
+                confirmed.append(followed.id)
+        return confirmed
+
     def _begin(self, seen: "_Seen", fresh: list[int]) -> list[Followed]:
         """New tracks, one for each of these rows of sightings."""
         if not fresh:
@@ -356,6 +371,7 @@ class Tracker:
             missing.append(followed)
             if depth > 2 * sigma + followed.sides_m[0] / 2 or footprint_m is None:
                 usual_step_s = self._settings.evidence.usual_step_s
+                followed.was_missed = True
                 followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / usual_step_s)
                 if followed.confirmed and not followed.ended and followed.evidence < 0:
                     followed.ended = True

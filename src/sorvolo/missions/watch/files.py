@@ -68,7 +68,7 @@ class WatchFiles:
         self._crops: OrderedDict[tuple[int, bytes], ImageRGB] = OrderedDict()
         self._best: dict[int, Sighting] = {}
         self.crop_names: dict[int, str] = {}
-        self._segments: dict[int, int] = {}  # by track
+        self.segments: dict[int, int] = {}  # by track
         self._forgotten: list[str] = []
         self._shown_s = time.monotonic()
         self._labelled: list[tuple[LabelledPicture, Floats]] = []
@@ -96,7 +96,7 @@ class WatchFiles:
     def add(self, seen: SeenFrame) -> None:
         """Write one frame's part soon. Raises what went wrong with an earlier one (StoreError on a full disk)."""
         self._raise_earlier()
-        self._segments |= dict.fromkeys(seen.track_ids, seen.segment)
+        self.segments |= dict.fromkeys(seen.track_ids, seen.segment)
         for sighting in seen.sightings:
             if sighting is not None:
                 self._keep_crop(sighting, crop_around(seen.frame.image, sighting.box_px))
@@ -105,7 +105,7 @@ class WatchFiles:
     def recall(self, seen: SeenFrame, size_px: tuple[int, int]) -> None:
         """Write the lines of a frame of this height and width that an earlier process searched, whose picture is not
         there any more; its crops, pictures and labels are as that process left them."""
-        self._segments |= dict.fromkeys(seen.track_ids, seen.segment)
+        self.segments |= dict.fromkeys(seen.track_ids, seen.segment)
         self._lines.append(_rows(seen, self._site))
         if self._outputs.labels and seen.time_ns >= self._label_due_ns:
             self._label_due_ns = seen.time_ns + _LABELS_EVERY_NS
@@ -160,7 +160,7 @@ class WatchFiles:
         rows = [each["properties"] for each in collection["features"]]
         if self._site.is_local:
             for row in rows:
-                row["segment"] = self._segments[row["id"]]
+                row["segment"] = self.segments[row["id"]]
         name = features_name(TRACKS, is_local=self._site.is_local)
         atomic_write_bytes(self.folder / name, geojson_bytes(collection), durable=False)
         if not self._site.is_local:

@@ -183,7 +183,7 @@ def _prepared(source: Source, order: WatchOrder, *, telemetry_named: bool) -> tu
     else:
         setup, ground = prepared(mapping), None
     thresholds = order.detector.info.thresholds
-    least = settings.least_score if settings.least_score is not None else min(thresholds.values())
+    least = thresholds if settings.least_score is None else dict.fromkeys(thresholds, settings.least_score)
     return setup, places_of(setup, least, ground)
 
 

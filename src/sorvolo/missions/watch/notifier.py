@@ -44,16 +44,19 @@ class Notifier:
             self._add_receiver(_URL, alert_url(outputs.alert_url), f"the alert to {outputs.alert_url}")
 
     def report(
-        self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str], segment: int, *,
+        self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str], segments: Mapping[int, int], *,
         is_resumed: bool = False,
     ) -> None:
         """Send one alert for each new track, and the TAK server all tracks that are seen, each at its pace.
+
+        `crops` are their pictures' names, `segments` their stretches of the flight (`tracking.following.Taken`), by
+        track.
 
         Of frames that a killed watch searched (`is_resumed`) only alerts that it did not send are sent; the TAK server
         gets each of their tracks once, with the first frame after them.
         """
         for track in new:
-            self._alert(track, crops.get(track.id), segment)
+            self._alert(track, crops.get(track.id), segments.get(track.id, 0))
         if is_resumed:
             self._caught_up |= {track.id: track for track in seen}
             return

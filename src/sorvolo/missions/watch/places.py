@@ -1,7 +1,7 @@
 """Where what a watch sees lies and which object it is: on the ground if telemetry allows it, else in the picture."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -60,23 +60,27 @@ class Places(Protocol):
         """(N, 2) where the camera was, in site metres; none where it is not known."""
 
 
-def places_of(setup: FlightSetup, least_score: float, ground: GroundHeight | None = None) -> Places:
-    """The way to place a flight's detections that its telemetry allows; all of them score `least_score` or more.
+def places_of(setup: FlightSetup, least: Mapping[str, float], ground: GroundHeight | None = None) -> Places:
+    """The way to place a flight's detections that its telemetry allows; those of a class score `least` or more.
 
+    What one photo alone shows is reported from there on; a video shows a place in many frames.
     `ground` gives the ground's height over the flight's zero; None: it is level.
     """
     why_not = _why_not_on_ground(setup)
-    sure_score = min(TrackerSettings.sure_score, least_score)  # lower ones would never begin a track
-    return GroundPlaces(setup, sure_score, ground) if why_not is None else ImagePlaces(setup, sure_score, why_not)
+    settings = TrackerSettings(
+        sure_score=min(TrackerSettings.sure_score, *least.values()),  # lower ones would never begin a track
+        alone=least if setup.source.kind == "photos" else {},
+    )
+    return GroundPlaces(setup, settings, ground) if why_not is None else ImagePlaces(setup, settings, why_not)
 
 
 class GroundPlaces:
     """Detections on the ground of a flight with telemetry, tracked in metres."""
 
-    def __init__(self, setup: FlightSetup, sure_score: float, ground: GroundHeight | None) -> None:
+    def __init__(self, setup: FlightSetup, settings: TrackerSettings, ground: GroundHeight | None) -> None:
         self._setup, self._over_model = setup, ground is not None
         knows_heading = setup.track is None or setup.track.attitude != "none"
-        self._follower = GroundFollower(setup.source.camera, sure_score, ground, knows_heading=knows_heading)
+        self._follower = GroundFollower(setup.source.camera, settings, ground, knows_heading=knows_heading)
         self._site = new_site(setup, setup.source.name, 1.0, 0.0)
         if self._over_model:  # one height would stand for all objects
             self._site = replace(self._site, height_reference="above ground")
@@ -166,9 +170,9 @@ class GroundPlaces:
 class ImagePlaces:
     """Detections of a flight that nothing places, tracked in the first frame's pixels; after a cut all begins anew."""
 
-    def __init__(self, setup: FlightSetup, sure_score: float, why_not: str) -> None:
+    def __init__(self, setup: FlightSetup, settings: TrackerSettings, why_not: str) -> None:
         self._setup, self._why_not = setup, why_not
-        self._follower = PictureFollower(sure_score)
+        self._follower = PictureFollower(settings)
         self._site = Site(setup.source.name, setup.frame.origin, "", 1.0, is_local=True)
 
     @property

@@ -211,7 +211,7 @@ class WatchRun:
                 frame, time_ns, found, taken.sightings, taken.track_ids,
                 frozenset(each.id for each in tracks.confirmed),
                 f"frame {frame.name}, counted so far: {counted_list(tracks.counts)}", taken.segment,
-            ), size_px, tracks.seen)
+            ), size_px, [*tracks.seen, *tracks.new])
             self._hand_over(taken, tracks, is_resumed=is_resumed)
         latency_s = time.monotonic() - arrived_s
         if not is_resumed:
@@ -230,22 +230,22 @@ class WatchRun:
         seen = [track for track in confirmed if track.id in set(taken.track_ids)]
         return _Tracks(known, confirmed, seen, [each for each in confirmed if each.id in taken.new_ids])
 
-    def _write(self, written: SeenFrame, size_px: tuple[int, int], seen: Sequence[Track]) -> None:
+    def _write(self, written: SeenFrame, size_px: tuple[int, int], shown: Sequence[Track]) -> None:
         """Write a frame's part of the files; of one whose picture is not there any more, what does without it."""
         if written.frame.image.size:
             self._files.add(written)
         else:
             self._files.recall(written, size_px)
-            self._files.recall_crops(seen)
+            self._files.recall_crops(shown)
 
     def _hand_over(self, taken: Taken, tracks: "_Tracks", *, is_resumed: bool) -> None:
         """Crops, reports and withdrawals of one frame, and the files that show all tracks so far."""
-        for track in tracks.seen:
+        for track in (*tracks.seen, *tracks.new):
             self._files.crop_of(track)
         self._files.forget(taken.merged)
         self._files.keep_crops_of(tracks.known)
         self._notifier.report(
-            tracks.new, tracks.seen, self._files.crop_names, taken.segment, is_resumed=is_resumed
+            tracks.new, tracks.seen, self._files.crop_names, self._files.segments, is_resumed=is_resumed
         )
         self._notifier.withdraw(taken.merged)
         self._files.show(tracks.confirmed)
@@ -253,10 +253,13 @@ class WatchRun:
     def finish(self, *, ended: str, skipped: int) -> None:
         """The last word on every track, the files for other programs, and the report."""
         with self.log.stage("finish"):
+            known = {track.id for track in self._places.tracks() if track.confirmed}
             tracks = [track for track in self._places.finish() if track.confirmed]
             for track in tracks:
                 self._files.crop_of(track)
             self._files.close()
+            late = [track for track in tracks if track.id not in known]
+            self._notifier.report(late, [], self._files.crop_names, self._files.segments)
             self._notifier.report_final(tracks)
             self._notifier.close(_LAST_ALERTS_S, _LAST_EVENTS_S)
             self._files.clear()
