@@ -4,12 +4,13 @@
 
 Two small simulated flights; `map` makes the map of the first, `compare` compares the second with it, `watch` searches
 the second, two frames a second, with the model that is installed, and runs a program for each object. Each round starts
-the command in a process of its own, kills it (SIGKILL) after a share of the undisturbed run's time that is drawn from 0
-to 1, and runs the same command again to its end. A run that was through before its kill counts for nothing, and another
-moment is drawn. All files are compared with those of the undisturbed run, byte by
-byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report states of the time and the
-memory that it took (docs/formats.md). Of a watch, each alert must have been sent once: one that was sent in the moment
-of the kill, before that was noted, may come twice, and is counted.
+the command in a process of its own, waits until it has noted its first frame (`run.journal` begins), kills it (SIGKILL)
+after a share, drawn from 0 to 1, of the time that the undisturbed run took from there to its end, and runs the same
+command again to its end. A run that was through before its kill counts for nothing, and another moment is drawn. A kill
+before the first frame is noted only tests that a run begins. All files are compared with those of the undisturbed run,
+byte by byte, but for the catalogue (`site.db`, which holds when a run was made) and what a report states of the time
+and the memory that it took (docs/formats.md). Of a watch, each alert must have been sent once: one that was sent in the
+moment of the kill, before that was noted, may come twice, and is counted.
 """
 
 import argparse
@@ -38,6 +39,9 @@ EFFORT = (
 """Of report.json: what a run took."""
 TIMED = {"report.html", "changes.html"}
 """Pages that show it."""
+JOURNALS = ("flights/*/run.journal", "run.journal")
+"""Of a site's flight, of a watch's folder."""
+POLLED_S = 0.02
 
 
 def simulated(width_px: int, length_m: float) -> SimulationSettings:
@@ -64,27 +68,35 @@ def content(site: Path) -> dict[str, bytes]:
 
 @dataclass(frozen=True)
 class Ran:
-    """A run: how long it took, what it printed, and whether it was killed."""
+    """A run: how long it took, when it had noted its first frame, what it printed, and whether it was killed."""
 
     seconds: float
+    noted_s: float
     printed: str
     killed: bool
 
 
-def run(command: list[str], kill_s: float | None = None) -> Ran:
-    """Run it, or kill it after so many seconds."""
+def run(command: list[str], place: Path, kill_s: float | None = None) -> Ran:
+    """Run it over the files of `place`, or kill it so many seconds after it has noted its first frame there."""
     started_s, killed = time.monotonic(), False
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+    with (
+        tempfile.TemporaryFile("w+") as printed,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=printed) as process,
+    ):
+        while process.poll() is None and not any(any(place.glob(each)) for each in JOURNALS):
+            time.sleep(POLLED_S)
+        noted_s = time.monotonic() - started_s
         try:
-            _, printed = process.communicate(timeout=kill_s)
+            process.wait(kill_s)
         except subprocess.TimeoutExpired:
             process.kill()
+            process.wait()
             killed = True
-            _, printed = process.communicate()
-        else:
-            if process.returncode not in (0, 3):
-                raise SystemExit(printed)
-    return Ran(time.monotonic() - started_s, printed, killed)
+        printed.seek(0)
+        words = printed.read()
+    if not killed and process.returncode not in (0, 3):
+        raise SystemExit(words)
+    return Ran(time.monotonic() - started_s, noted_s, words, killed)
 
 
 class Trial:
@@ -98,7 +110,7 @@ class Trial:
             pass
         if options.mission == "compare":
             self._base.parent.mkdir()
-            run(self._command("map", self._base))
+            run(self._command("map", self._base), self._base)
 
     def begin(self, name: str) -> Path:
         """A folder of this name, the same each time, as it is before the mission."""
@@ -112,7 +124,7 @@ class Trial:
 
     def run(self, place: Path, kill_s: float | None = None) -> Ran:
         """The mission, perhaps killed: see `run`."""
-        return run(self._command(self._options.mission, place), kill_s)
+        return run(self._command(self._options.mission, place), place, kill_s)
 
     def alerts(self) -> Counter[str]:
         """How often each object was announced since `begin`."""
@@ -133,20 +145,22 @@ def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, obje
     """The result so far, after each killed run."""
     trial = Trial(options, folder)
     whole = trial.begin("undisturbed")
-    whole_s = trial.run(whole).seconds
+    undisturbed = trial.run(whole)
     wanted, announced = content(whole), trial.alerts()
     draw, rows = random.Random(options.seed), []
     while len(rows) < options.kills:
         place = trial.begin("killed")
-        kill_s = draw.random() * whole_s
-        if not trial.run(place, kill_s).killed:
+        kill_s = draw.random() * (undisturbed.seconds - undisturbed.noted_s)
+        stopped = trial.run(place, kill_s)
+        if not stopped.killed:
             continue
         again = trial.run(place)
         found = content(place)
         differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
-        resumed = re.search(r"continuing after (\d+) frame", again.printed)
+        resumed = re.search(r"continu(?:ing|ed) after (?:all )?(\d+) frame", again.printed)
         rows.append({
-            "kill_s": round(kill_s, 2), "again_s": round(again.seconds, 2), "same": not differing,
+            "noted_s": round(stopped.noted_s, 2), "kill_s": round(stopped.seconds, 2),
+            "again_s": round(again.seconds, 2), "same": not differing,
             "frames_taken_over": int(resumed[1]) if resumed else 0, "differing": differing[:10],
             "alerts_lost": len(announced - trial.alerts()), "alerts_twice": len(trial.alerts() - announced),
         })
@@ -154,7 +168,8 @@ def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, obje
         yield {
             "mission": options.mission, "seed": options.seed, "width_px": options.width,
             "length_m": options.length, "model": options.model,
-            "undisturbed_s": round(whole_s, 2), "alerts": announced.total(), "kills": len(rows),
+            "undisturbed_s": round(undisturbed.seconds, 2), "noted_s": round(undisturbed.noted_s, 2),
+            "alerts": announced.total(), "kills": len(rows),
             "same": sum(bool(each["same"]) for each in rows),
             "resumed": sum(bool(each["frames_taken_over"]) for each in rows), "rounds": rows,
         }

@@ -4,7 +4,7 @@ from io import StringIO
 
 from rich.console import Console
 
-from sorvolo.cli.progress import ProgressReport
+from sorvolo.cli.progress import ProgressReport, Resumed
 
 
 class _Clock:
@@ -41,3 +41,18 @@ def test_a_terminal_gets_a_bar() -> None:
     with ProgressReport(Console(file=out, force_terminal=True, width=120), stays=True) as progress:
         progress.show("mapping, frame", 3, 10, "7 of 8 frames matched")
     assert "mapping, frame" in out.getvalue() and "7 of 8 frames matched" in out.getvalue()
+
+
+def _resumed(*are_resumed: bool) -> list[str]:
+    out = StringIO()
+    resumed = Resumed(Console(file=out, width=120))
+    for count, is_resumed in enumerate(are_resumed, start=1):
+        resumed.take(count, is_resumed=is_resumed)
+    resumed.end()
+    return out.getvalue().splitlines()
+
+
+def test_a_run_that_goes_on_is_announced_once_also_where_no_frame_was_left() -> None:
+    assert _resumed(True, True, False, False) == ["continuing after 2 frames of a stopped run"]
+    assert _resumed(True, True) == ["continued after all 2 frames of a stopped run"]
+    assert _resumed(False, False) == []

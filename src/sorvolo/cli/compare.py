@@ -219,6 +219,7 @@ def _show_progress(
                 "comparing, frame", update.frames_read, max(update.frames_expected, update.frames_read),
                 f"{rate_words(update.frames_read, update.seconds)}{compared}, {counted(len(announced), 'change')}",
             )
+        resumed.end()
     return announced
 
 

@@ -77,7 +77,10 @@ def shown_work(work: Generator[U, None, T], show: Callable[[ProgressReport, U], 
 
 
 class Resumed:
-    """Announces once, when the first new frame comes, that a run goes on after frames of one that was stopped."""
+    """Announces once that a run goes on after frames of one that was stopped.
+
+    When the first new frame comes, or, where that one had taken all frames, at the `end`.
+    """
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -87,9 +90,16 @@ class Resumed:
         """An update, and how many frames there are with it."""
         if is_resumed:
             self._count = count
-        elif self._count:
-            words = f"continuing after {counted(self._count, 'frame')} of a stopped run"
-            self._console.print(words, highlight=False)
+        else:
+            self._announce("continuing after")
+
+    def end(self) -> None:
+        """No more updates come."""
+        self._announce("continued after all")
+
+    def _announce(self, words: str) -> None:
+        if self._count:
+            self._console.print(f"{words} {counted(self._count, 'frame')} of a stopped run", highlight=False)
             self._count = 0
 
 
@@ -108,6 +118,7 @@ def show_progress(updates: Iterable["MosaicUpdate"], console: Console) -> int:
             task = "mapping, frame" if flight == 1 else f"mapping flight {flight}, frame"
             expected = max(update.frames_expected, update.frames_read)
             progress.show(task, update.frames_read, expected, words_of(update))
+        resumed.end()
     return count
 
 

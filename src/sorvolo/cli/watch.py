@@ -227,6 +227,7 @@ def _show_progress(
                 f"{rate_words(update.frames_detected, update.seconds)}{delay}, {counted_list(update.counts)}",
             )
             yield update.folder
+        resumed.end()
 
 
 def _words_of(track: "Track", site: "Site", form: PlaceFormat) -> str:
