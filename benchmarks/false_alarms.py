@@ -5,9 +5,9 @@ there) and `caliterra` (from its 47th photo on; the ground up to there taught th
 figures are too good; one white car and some machines). Photos are shown at half size (--scale), as they would be at
 half the resolution, and counted at each model's own thresholds. As in a map, photos are shown at the scale of their
 ground (M_PER_PX, roughly known), models that ask for it look twice, and boxes of a size on the ground that their
-class cannot have do not count; with --plain each photo is shown as it is, once, and every box counts. With --out
-FOLDER, each report's crop is drawn there; how many of them are right was counted by eye, and is given with --right
-MODEL:FLIGHT:CLASS=COUNT.
+class cannot have, or whose length there leaves less than the threshold, do not count; with --plain each photo is shown
+as it is, once, and every box counts. With --out FOLDER, each report's crop is drawn there; how many of them are right
+was counted by eye, and is given with --right MODEL:FLIGHT:CLASS=COUNT.
 
 Writes results/false_alarms.json: reports a photo, and false ones where --right is given.
 """
@@ -15,6 +15,7 @@ Writes results/false_alarms.json: reports a photo, and false ones where --right 
 import argparse
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -25,11 +26,12 @@ from provenance import note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.survey.objects import Detections
 from sorvolo.tracking.cut_boxes import cut_edges
-from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size
+from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size, length_log_odds, with_log_odds
 
 RESULTS = Path(__file__).parent / "results" / "false_alarms.json"
 FIRST = {"brighton_beach": "", "caliterra": "IMG_9400.jpg"}
 M_PER_PX = {"brighton_beach": 0.034, "caliterra": 0.07}  # of a photo at half size
+SCALE_SIGMA = 0.1  # by which that may be off, relative
 SHOWN = ("person", "car")
 SCALE, CROP_PX, IN_A_ROW = 0.5, 120, 10
 
@@ -85,7 +87,7 @@ def looked(detector: Detector, folder: Path, out: Path | None, scale: float, *, 
         else:
             m_per_px = M_PER_PX[folder.name] * SCALE / scale
             seen = detector.detect(picture, tiles="auto", m_per_px=m_per_px, classes=SHOWN, from_above=True)
-            seen = possible(seen, shown, m_per_px)
+            seen = possible(seen, shown, m_per_px, detector.info.turned or detector.info.thresholds)
         for box, score, label in zip(seen.boxes_px, seen.scores, seen.names):
             scores[label].append(float(score))
             crops[label].append(crop(shown, box, f"{score:.2f} {path.stem[-4:]}"))
@@ -104,11 +106,17 @@ def looked(detector: Detector, folder: Path, out: Path | None, scale: float, *, 
     }
 
 
-def possible(seen: Detections, shown: np.ndarray, m_per_px: float) -> Detections:
-    """Without boxes of a size that their class cannot have, as maps leave them out."""
+def possible(
+    seen: Detections, shown: np.ndarray, m_per_px: float, thresholds: Mapping[str, float]
+) -> Detections:
+    """Without boxes of a size that their class cannot have, or hardly has, as maps and watches leave them out."""
     cut = cut_edges(seen.boxes_px, shown.shape[1], shown.shape[0], TOO_SHORT_CUT_PX)
     sides_m = (seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]).astype(float) * m_per_px
-    return seen.only(~impossible_size(seen.names, sides_m, cut))
+    likely = [
+        is_cut or with_log_odds(score, length_log_odds(name, length_m, SCALE_SIGMA)) >= thresholds[name]
+        for name, score, length_m, is_cut in zip(seen.names, seen.scores.tolist(), sides_m.max(axis=1), cut.any(axis=1))
+    ]
+    return seen.only(~impossible_size(seen.names, sides_m, cut) & np.array(likely, bool))
 
 
 def crop(picture: np.ndarray, box: np.ndarray, text: str) -> np.ndarray:
