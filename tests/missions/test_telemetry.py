@@ -13,14 +13,19 @@ import numpy as np
 import pytest
 
 from small_flights import simulate_into, small_flight
+from sorvolo.capture.correction import telemetry_faults
 from sorvolo.capture.live.klv_telemetry import read_klv_file
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
+from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
+from sorvolo.missions.telemetry.words import fault_sentences
 from sorvolo.missions.watch.cot_sender import CotPlace
 from sorvolo.simulation.settings import OutputSettings
+from sorvolo.survey.corrected import Bias
+from sorvolo.survey.flight import CameraPrior
 
 COMPASS_DEG, CLOCK_S, HEIGHT_M = 7.0, 0.4, 6.0
 
@@ -69,6 +74,25 @@ def test_the_known_faults_are_measured_and_put_in_words(corrected: tuple[dict[st
     assert faults["height_m"]["value"] == pytest.approx(HEIGHT_M, abs=1.0)
     words = "; ".join(corrected[0]["sentences"])
     assert "too far clockwise" in words and "too high" in words and "ahead of the pictures" in words
+
+
+def test_frames_whose_angles_are_far_beside_the_others_are_named() -> None:
+    """A compass 3 degrees off, and pictures of one strip turned by half a turn: the median alone would hide these."""
+    poses = [Pose(site_from_gimbal_rotation(45.0, -90.0, 0.0), np.array([4.0 * k, 0.0, 30.0])) for k in range(12)]
+    priors = [
+        CameraPrior(
+            pose.translation_m, np.ones(3), site_from_gimbal_rotation(48.0 + 180.0 * (4 <= k < 8), -90.0, 0.0),
+            np.ones(3),
+        ) for k, pose in enumerate(poses)
+    ]
+    faults = telemetry_faults(priors, poses, Bias(0.0, 0.01), Bias(1.0, 0.01), knows_height=True)
+    assert faults.outlying == (4, 5, 6, 7) and faults.outlying_deg == pytest.approx(180, abs=5)
+    assert faults.heading_deg.value == pytest.approx(3, abs=0.1)
+    names = [f"{k}.jpg" for k in range(12)]
+    (words,) = [each for each in fault_sentences(faults, names) if "far beside" in each]
+    assert "4 frames of 12" in words and words.endswith("4.jpg, 5.jpg, 6.jpg, 7.jpg")
+    straight = telemetry_faults(priors[:4], poses[:4], Bias(0.0, 0.01), Bias(1.0, 0.01), knows_height=True)
+    assert not straight.outlying and not any("far beside" in each for each in fault_sentences(straight, names))
 
 
 def test_corrected_cameras_lie_where_the_drone_flew(corrected: tuple[dict[str, Any], Path], faulty: Path) -> None:

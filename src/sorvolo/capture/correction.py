@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.corrected import Bias, TelemetryFaults
@@ -13,6 +13,7 @@ from sorvolo.survey.flight import CameraPrior
 
 _FIXES_ALIKE = 1.5  # neighbouring fixes err alike: they are fewer than they look
 _LEAST_SCALE = 0.01  # a change of scale that matters: 30 cm in 30 m of height
+_OUTLYING_DEG = 15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
 
 
@@ -63,10 +64,11 @@ def telemetry_faults(
     placed = np.array([each.knows_place for each in priors], bool)
     moved = np.array([prior.position_m - pose.translation_m for prior, pose in zip(priors, poses)]).reshape(-1, 3)
     scatter_m = _together([_bias(moved[placed, k]) for k in range(2)]).scatter / float(np.sqrt(2))
+    outlying, outlying_deg = _outlying(turned, knows_heading)
     return TelemetryFaults(
         clock_s, _bias(-turned[knows_heading, 2]), _together([_bias(turned[knows_heading, k]) for k in range(2)]),
         _height(moved[placed, 2], poses, scale) if knows_height else _UNKNOWN,
-        Bias(0.0, float("nan"), scatter_m),
+        Bias(0.0, float("nan"), scatter_m), outlying, outlying_deg,
     )
 
 
@@ -98,6 +100,20 @@ def even_times_s(key_s: Sequence[float], step_s: float) -> list[float]:
 def _turn(rotation: Floats, pose: Pose) -> Floats:
     """(3,) the turn about east, north and up that takes the pose's rotation to this one, degrees."""
     return np.degrees(Rotation.from_matrix(rotation @ pose.rotation.T).as_rotvec())
+
+
+def _outlying(turned_deg: Floats, knows_heading: Mask) -> tuple[tuple[int, ...], float]:
+    """Which frames' angles are far beside what the flight's usually are off, and by how much in the median, deg.
+
+    A compass that hangs, or a strip whose pictures are turned by half a turn, hides behind the flight's median.
+    """
+    rows = np.flatnonzero(knows_heading)
+    if not len(rows):
+        return (), 0.0
+    beside_deg = np.linalg.norm(turned_deg[rows] - np.median(turned_deg[rows], axis=0), axis=1)
+    beside_deg = np.minimum(beside_deg, 360.0 - beside_deg)
+    far = beside_deg > _OUTLYING_DEG
+    return tuple(rows[far].tolist()), float(np.median(beside_deg[far])) if far.any() else 0.0
 
 
 def _height(errors_m: Floats, poses: Sequence[Pose], scale: Bias) -> Bias:

@@ -47,10 +47,13 @@ class Bias:
 class TelemetryFaults:
     """What was wrong with a flight's telemetry. `clock_s` is telemetry's clock less the video's; `heading_deg` positive
     where the compass read too far clockwise; `tilt_deg` how far the camera looked from its stated direction, sideways
-    and forward together; `height_m` positive where the log was too high above the ground."""
+    and forward together; `height_m` positive where the log was too high above the ground. `outlying` are the rows of
+    compared frames whose stated angles are far beside what those of the others are off, `outlying_deg` their median."""
 
     clock_s: Bias
     heading_deg: Bias
     tilt_deg: Bias
     height_m: Bias
     position_m: Bias
+    outlying: tuple[int, ...] = ()
+    outlying_deg: float = 0.0

@@ -50,12 +50,14 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False)
 class _Compared:
-    """A flight whose own telemetry was compared with its map; the map shifted its clock by `applied_s`."""
+    """A flight whose own telemetry was compared with its map; the map shifted its clock by `applied_s`. `names` are
+    those of the compared frames."""
 
     setup: FlightSetup
     track: FlightTelemetry
     applied_s: float
     faults: TelemetryFaults
+    names: Sequence[str]
 
 
 def correct_telemetry(
@@ -126,7 +128,7 @@ def _compared(
     poses = rescaled([each.pose for each in solved], scale)
     faults = telemetry_faults(priors, [poses[k] for k in seen], clock, scale, knows_height=track.knows_ground)
     scaled = [replace(each, pose=pose) for each, pose in zip(solved, poses)]
-    return scaled, _Compared(setup, track, applied_s, faults)
+    return scaled, _Compared(setup, track, applied_s, faults, [solved[k].stored.name for k in seen])
 
 
 def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
@@ -159,7 +161,8 @@ def _written(
     report = dict(plain_json({
         "flight": name, "site": site.name, "frames": len(frames), "height_reference": site.height_reference,
         "faults": None if compared is None else asdict(compared.faults),
-        "sentences": [] if compared is None else fault_sentences(compared.faults), "files": files,
+        "sentences": [] if compared is None else fault_sentences(compared.faults, compared.names),
+        "files": files,
         "warnings": _warnings(site),
     }))
     atomic_write_bytes(folder / "telemetry.json", json_bytes(report))

@@ -1,16 +1,22 @@
 """What was wrong with a flight's telemetry, in sentences."""
 
+from collections.abc import Sequence
 from math import isfinite
 
 from sorvolo.survey.corrected import Bias, TelemetryFaults
+from sorvolo.survey.wording import counted
 
 _LEAST = {"clock": 0.04, "heading": 0.5, "tilt": 0.5, "height": 0.3}  # s, deg, deg, m: smaller ones matter to nobody
 
 
-def fault_sentences(faults: TelemetryFaults) -> list[str]:
-    """One sentence for each quantity that telemetry states."""
+_MOST_NAMED = 6  # frames in a sentence
+
+
+def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
+    """One sentence for each quantity that telemetry states; `names` are those of the compared frames."""
     return [
-        *_clock(faults.clock_s), *_heading(faults.heading_deg), *_tilt(faults.tilt_deg), *_height(faults.height_m),
+        *_clock(faults.clock_s), *_heading(faults.heading_deg), *_outlying(faults, names), *_tilt(faults.tilt_deg),
+        *_height(faults.height_m),
         f"fixes scatter by {faults.position_m.scatter:.2f} m about the path in the pictures (1 sigma per axis)",
     ]
 
@@ -33,6 +39,18 @@ def _heading(found: Bias) -> list[str]:
     return [
         f"the compass was {abs(found.value):.1f} deg off, too far {side} (1 sigma {found.sigma:.1f} deg; scatter "
         f"{found.scatter:.1f} deg)"
+    ]
+
+
+def _outlying(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
+    if not faults.outlying:
+        return []
+    known = [names[row] for row in faults.outlying]
+    more = f" and {len(known) - _MOST_NAMED} more" if len(known) > _MOST_NAMED else ""
+    return [
+        f"the stated angles of {counted(len(known), 'frame')} of {len(names)} are far beside that, by "
+        f"{faults.outlying_deg:.0f} deg in the median, so that places by telemetry alone are wrong there: "
+        f"{', '.join(known[:_MOST_NAMED])}{more}"
     ]
 
 
