@@ -57,8 +57,8 @@ def main() -> None:
         return
     run = {"commit": commit(), "machine": machine(), **measure(options)}
     if options.output is not None:
-        runs = json.loads(options.output.read_text())["runs"] if options.output.is_file() else []
-        found = {"benchmark": "forest_photos", "runs": [*runs, run]}
+        found = json.loads(options.output.read_text()) if options.output.is_file() else {"benchmark": "forest_photos"}
+        found["runs"] = [*found.get("runs", ()), run]
         options.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(run, indent=1))
 
