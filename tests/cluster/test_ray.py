@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,12 @@ from batch_flights import another, content, descendants, written_sites
 
 from ended_work import ended
 from sorvolo.cli.main import main
-from sorvolo.cluster import streams
+from sorvolo.cluster import ray_cluster, streams
+from sorvolo.cluster import ray_executor as ray_executor_module
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, WatchWish
-from sorvolo.cluster.ray_cluster import demand_same, probe_of, why_not
+from sorvolo.cluster.ray_cluster import WAITS, demand_same, probe_of, why_not
 from sorvolo.cluster.ray_executor import RayExecutor, _demand_fit, _LiveTry, _with_detector, ray_executor
 from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.streams import run_streams, streams_of
@@ -34,6 +36,7 @@ from sorvolo.detection.sharing import shared_engine
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
+from waiting import wait_for
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'sorvolo[fleet]'")
 
@@ -94,6 +97,71 @@ def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: An
         given = ray.get(ray.remote(_with_detector).remote(order, addresses))
         assert given.detector in addresses.values()
         assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order
+
+
+@pytest.mark.long
+def test_a_detector_whose_actor_hangs_is_ended_and_started_again(
+    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with ray_executor("ray", None, 60.0, tmp_path, SharingSettings(True)) as executor:
+        detectors = executor._detectors
+        assert detectors is not None
+        before = detectors.addresses()
+        node = next(iter(before))
+        (actor,) = [
+            pid for each in cluster.worker_nodes if each.node_id == node
+            for pid in descendants({each.all_processes["raylet"][0].process.pid})
+            if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::_Detector")
+        ]
+        os.kill(actor, signal.SIGSTOP)
+        threading.Timer(120, _let_go, [[actor]]).start()
+        monkeypatch.setattr(ray_executor_module, "WAITS", replace(WAITS, probe_s=20.0))
+        assert detectors.addresses().keys() == before.keys() - {node}  # a flight there has its own meanwhile
+        monkeypatch.undo()
+        wait_for(lambda: not Path(f"/proc/{actor}/cmdline").exists())
+        after = detectors.addresses()
+        assert after.keys() == before.keys() and after[node] != before[node]
+        engine = shared_engine(after[node], find_model("thermal"))
+        assert len(engine.run(np.zeros((1, 3, 64, 64), np.uint8))) == 3
+
+
+def _hold_the_parent_of_a_mission(cluster: Any) -> list[int]:
+    """Wait for a mission, and hold the process of Ray's that started it."""
+    missions = _held_missions(cluster)
+    held = [int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) for pid in missions]
+    for pid in held:
+        os.kill(pid, signal.SIGSTOP)
+    threading.Timer(150, _let_go, [held]).start()
+    _let_go(missions)
+    return held
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("is_live", [False, True])
+def test_a_worker_of_rays_that_hangs_is_killed_and_its_flight_goes_on(
+    cluster: Any, flown: Path, tmp_path: Path, is_live: bool
+) -> None:
+    another(flown, tmp_path / "in" / "one")
+    holder, found = ThreadPoolExecutor(1).submit(_hold_the_parent_of_a_mission, cluster), []
+    wish = FlightWish(camera=str(flown / "camera.xml"), model="none", give_up_s=2.0)
+    if is_live:
+        running: Any = run_streams(
+            streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]), tmp_path / "maps", BatchSettings(wish),
+            lambda table: ray_executor("ray", 1, 8.0, table.root), threading.Event(),
+        )
+    else:
+        running = run_batch(
+            [tmp_path / "in"], tmp_path / "maps", BatchSettings(wish),
+            lambda table: ray_executor("ray", 1, 8.0, table.root),
+        )
+    for update in running:
+        if update.row is not None:
+            found.append((update.row.state, update.row.words))
+    assert (State.WAITING, "Ray's worker hung for 8 s and was killed") in found
+    assert found[-1][0] is State.DONE
+    for pid in holder.result():
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
 
 
 @pytest.mark.long
@@ -306,12 +374,31 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
             "another version of Ray or Python than this machine (Ray 2.60",
         ),
         (ConnectionError("ray client connection timeout"), "a cluster with a token (set RAY_AUTH_MODE=token"),
-        (ConnectionError("Initialization failure from server:\nTraceback"), "one that is too busy or has just lost"),
+        (ConnectionError("Initialization failure from server:\nTraceback"), "started nothing to serve this batch"),
         (RuntimeError("Invalid authentication token"), "the cluster needs another token"),
     ],
 )
 def test_what_ray_reports_of_a_cluster_that_takes_no_batch_is_put_in_words(error: Exception, words: str) -> None:
     assert words in why_not("ray://10.0.0.1:10001", error)
+
+
+def test_a_head_that_has_just_started_is_asked_again_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    failures = [ConnectionError("Initialization failure from server:\nTraceback")] * 2
+    asked: list[int] = []
+
+    def connect() -> None:
+        asked.append(1)
+        if len(asked) <= len(failures):
+            raise failures[0]
+
+    monkeypatch.setattr(ray_cluster, "WAITS", replace(WAITS, again_s=0.01))
+    ray_cluster._connect_client(connect)
+    assert len(asked) == 3
+    monkeypatch.setattr(ray_cluster, "WAITS", replace(WAITS, start_s=-1.0))
+    asked.clear()
+    with pytest.raises(ConnectionError, match="Initialization failure"):
+        ray_cluster._connect_client(connect)
+    assert len(asked) == 1
 
 
 def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

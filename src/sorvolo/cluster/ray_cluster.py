@@ -5,6 +5,7 @@ import secrets
 import socket
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from sorvolo.errors import SettingsError, StoreError
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
 
 SCHEME = "ray://"
+_UNREADY = "Initialization failure from server"  # Ray's words where its process for one client does not start in time
 
 
 @dataclass(frozen=True)
@@ -21,6 +23,7 @@ class WaitSettings:
     """How long a cluster's answers are waited for, s. Chosen, not measured, for machines in one network."""
 
     reach_s: float = 8.0  # a connection to the head, which takes milliseconds
+    start_s: float = 90.0  # a head that has just started: Ray gives the process that serves a client 30 s, and fails
     probe_s: float = 90.0  # the first task on every machine: Ray starts a process for it before
     again_s: float = 0.5  # between two questions which machines are there
     ending_s: float = 2.0  # in one wait for a try to end, between which Ctrl-C and a dead head are noticed
@@ -55,7 +58,7 @@ def connect(name: str, workers: int | None) -> None:
         if name.startswith(SCHEME):
             _demand_reachable(name)
             with warnings.catch_warnings(action="ignore"):  # of what the error states
-                ray.init(address=name, **options)
+                _connect_client(lambda: ray.init(address=name, **options))
         elif address := started_cluster():
             _demand_listening(name, address)
             ray.init(address=address, **options)
@@ -70,6 +73,19 @@ def connect(name: str, workers: int | None) -> None:
         raise SettingsError(f"--executor {name}: {why_not(name, error)}") from error
 
 
+def _connect_client(connect: Callable[[], object]) -> None:
+    """Connect, again and again while a head that has just started cannot serve a client yet."""
+    end_s = time.monotonic() + WAITS.start_s
+    while True:
+        try:
+            connect()
+            return
+        except ConnectionError as error:
+            if _UNREADY not in str(error) or time.monotonic() > end_s:
+                raise
+            time.sleep(WAITS.again_s)
+
+
 def why_not(name: str, error: Exception) -> str:
     """What Ray's error about a connection means, and what to do."""
     import ray
@@ -80,10 +96,16 @@ def why_not(name: str, error: Exception) -> str:
         return f"the cluster has another version of Ray or Python than this machine (Ray {ray.__version__}): {both}"
     if "oken" in str(error) or "nauthenticated" in str(error):
         return f"the cluster needs another token: {words}; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH"
+    if _UNREADY in str(error):
+        return (
+            f"the cluster's head answers, but started nothing to serve this batch within {WAITS.start_s:.0f} s; it is "
+            "too busy, has just lost a machine, or is short of memory: look at its log (ray_client_server.err in "
+            "/tmp/ray/session_latest/logs there), or try again in a minute"
+        )
     if name.startswith(SCHEME):
         return (
             f"what listens there accepts no Ray client ({words}): a cluster with a token (set RAY_AUTH_MODE=token and "
-            "RAY_AUTH_TOKEN_PATH), one that is too busy or has just lost a machine (try again in a minute), or no Ray"
+            "RAY_AUTH_TOKEN_PATH), one that is too busy (try again in a minute), or no Ray"
         )
     return f"no Ray cluster answers: {words}"
 
@@ -249,3 +271,19 @@ def first_line(error: Exception) -> str:
     """The first line of an error's words."""
     lines = [line.strip() for line in str(error).split("\n") if line.strip()]
     return (lines or [type(error).__name__])[0][:300]
+
+
+def kill_process(ray: Any, node: str, pid: int) -> None:
+    """Have a machine kill a process of Ray's there that hangs, as Ray's own wishes reach only what still listens."""
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    def kill() -> None:  # travels whole, as `probe_of`
+        import os
+        import signal
+        from contextlib import suppress
+
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+    place = NodeAffinitySchedulingStrategy(node, soft=False)
+    ray.remote(kill).options(num_cpus=0, max_retries=0, scheduling_strategy=place).remote()

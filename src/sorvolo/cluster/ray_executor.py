@@ -29,15 +29,17 @@ from sorvolo.cluster.ray_cluster import (
     connect,
     demand_head,
     first_line,
+    kill_process,
     started_cluster,
     unshared,
     working_machines,
 )
 from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
+from sorvolo.cluster.signs_of_life import SignOfLife, shown_alive
 from sorvolo.cluster.table import LOCK
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.memory import MemorySettings
-from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes
+from sorvolo.store.atomic import TEMPORARY_PREFIX
 
 T = TypeVar("T")
 Key = tuple[str, str]
@@ -88,7 +90,8 @@ class RayExecutor:
         self._running: dict[Key, Any] = {}
         self._begun = root.resolve() / f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-begun"  # on the shared disk
         self._begun.mkdir()
-        self._notes: dict[Key, Path] = {}  # there: on which machine a try has begun
+        self._signs: dict[Key, SignOfLife] = {}  # there: of Ray's workers
+        self._hung: set[Key] = set()  # whose worker was killed because it hung
         self._actors: dict[Key, Any] = {}  # of those that are live
         self._asked_found: dict[Key, Any] = {}  # answers of theirs that are on their way
         self._taken: dict[Key, int] = {}  # how much of what they found was taken
@@ -140,21 +143,27 @@ class RayExecutor:
                 demand_head(self._head)
                 ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=wait_s)
                 if not ended and (lost := self._asked(self._lost)) is not None:
-                    del self._running[lost]
-                    self._notes.pop(lost).unlink(missing_ok=True)
+                    self._forget(lost, [])
                     return lost, Ending(Outcome.CRASHED, "its machine does not answer any more")
                 if not ended and timeout_s is not None:
                     return None
             key = next(each for each, task in self._running.items() if task == ended[0])
         ending, found = self._asked(lambda: self._ending(ended[0]))
+        if key in self._hung and ending.outcome is Outcome.CRASHED:
+            ending = replace(ending, words=f"Ray's worker hung for {self._stall_s:g} s and was killed")
+        self._forget(key, found)
+        return key, ending
+
+    def _forget(self, key: Key, found: list[str]) -> None:
+        """What is kept of a try that has ended; `found` is all that its watch found."""
         del self._running[key]
-        if (note := self._notes.pop(key, None)) is not None:
-            note.unlink(missing_ok=True)
+        self._hung.discard(key)
+        if (sign := self._signs.pop(key, None)) is not None:
+            sign.path.unlink(missing_ok=True)
         if (actor := self._actors.pop(key, None)) is not None:
             self._asked_found.pop(key, None)
             self._last_found += [(key, words) for words in found[self._taken.pop(key):]]
             self._ray.kill(actor)
-        return key, ending
 
     def end(self) -> None:
         """End what runs; a mapping goes on from its journal when it is asked for again.
@@ -181,25 +190,31 @@ class RayExecutor:
             "num_cpus": min(cost.cpus, max(each["CPU"] for each in machines)),
             "memory": int(min(cost.memory_mb * 1e6, most)), "scheduling_strategy": "SPREAD",
         }
-        given = (order, self._stall_s, self._root, sorvolo.__version__, shared)
+        sign = self._begun / secrets.token_hex(6)
+        self._signs[key] = SignOfLife(sign)
+        given = (order, self._stall_s, self._root, sorvolo.__version__, shared, str(sign))
         if is_live_address(order.source):
             actor = self._ray.remote(_LiveTry).options(max_concurrency=3, max_restarts=0, **asked).remote()
             self._actors[key], self._running[key], self._taken[key] = actor, actor.run.remote(*given), 0
             return
-        name, note = f"sorvolo {Path(order.source).name}", self._begun / secrets.token_hex(6)
-        task = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given, str(note))
-        self._running[key], self._notes[key] = task, note
+        name = f"sorvolo {Path(order.source).name}"
+        self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
 
     def _lost(self) -> Key | None:
-        """A try on a machine that Ray counts as dead.
+        """A try on a machine that Ray counts as dead; workers that hang are killed, and then noticed by Ray.
 
         Ray ends it by itself only when the connection to it breaks: where a cable was cut, not for minutes.
         """
         there = {each["NodeID"] for each in working_machines(self._ray)}
-        for key, note in self._notes.items():
-            with suppress(FileNotFoundError):  # it has not begun
-                if note.read_text() not in there:
-                    return key
+        for key, sign in self._signs.items():
+            if (look := sign.look()) is None:  # it has not begun
+                continue
+            node, pid, silent_s = look
+            if node not in there:
+                return key
+            if silent_s > self._stall_s and key not in self._hung:
+                self._hung.add(key)
+                kill_process(self._ray, node, pid)
         return None
 
     def _taken_found(self) -> list[tuple[Key, str]]:
@@ -287,11 +302,13 @@ class MachineDetectors:
     def __init__(self, ray: Any, gpus: float, memory_mb: float = CostSettings().detector_mb) -> None:
         self._ray, self._gpus, self.memory_bytes = ray, gpus, 1e6 * memory_mb
         self._actors: dict[str, Any] = {}  # by the machine's id
+        self._pids: dict[str, int] = {}  # of those that have answered
 
     def addresses(self) -> dict[str, str]:
         """The sockets by machine, of those that are there and answer.
 
-        Raises SettingsError where the card or the memory is not free.
+        One that hangs is killed, and the next flight there has another. Raises SettingsError where the card or the
+        memory was not free from the beginning.
         """
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
@@ -307,10 +324,15 @@ class MachineDetectors:
         return {node: address for node, task in asked.items() if (address := self._answer(node, task))}
 
     def _answer(self, node: str, task: Any) -> str:
-        """The socket on a machine; "" where its actor was lost, which the next flight there has anew."""
+        """The socket on a machine; "" where its actor was lost or hangs, which the next flight there has anew."""
         try:
-            return str(self._ray.get(task, timeout=WAITS.probe_s))
+            address, self._pids[node] = self._ray.get(task, timeout=WAITS.probe_s)
+            return str(address)
         except self._ray.exceptions.GetTimeoutError as error:
+            if node in self._pids:
+                kill_process(self._ray, node, self._pids[node])
+                del self._actors[node]
+                return ""
             wanted = f"{self._gpus:g} of its graphics card and " if self._gpus else ""
             raise SettingsError(
                 f"--share-detector: a machine does not have {wanted}{self.memory_bytes / 1e6:,.0f} MB of memory free "
@@ -328,9 +350,9 @@ class _Detector:
     def __init__(self) -> None:
         self._shared = SharedDetector()
 
-    def address(self) -> str:
-        """Its socket."""
-        return self._shared.address
+    def address(self) -> tuple[str, int]:
+        """Its socket, and the process of Ray's that holds it."""
+        return self._shared.address, os.getpid()
 
 
 def _with_detector(order: Order, shared: Mapping[str, str]) -> Order:
@@ -348,12 +370,15 @@ class _LiveTry:
         self._found: list[str] = []  # grows only
 
     def run(
-        self, order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str]
+        self, order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str], sign: str
     ) -> tuple[Ending, list[str]]:
         """The try in a process of its own, which ends with this one: how it ended, and all that its watch found."""
+        import ray
+
         _demand_fit(root, version)
-        self._worker = WorkerProcess(_with_detector(order, shared))
-        return run_order(self._worker, stall_s, self._found.append), self._found
+        with shown_alive(Path(sign), ray.get_runtime_context().get_node_id(), stall_s):
+            self._worker = WorkerProcess(_with_detector(order, shared))
+            return run_order(self._worker, stall_s, self._found.append), self._found
 
     def found_after(self, taken: int) -> list[str]:
         """What its watch found after the first so many. An answer that gets lost loses nothing: ask again."""
@@ -366,21 +391,20 @@ class _LiveTry:
 
 
 def _try(
-    order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str], note: str
+    order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str], sign: str
 ) -> tuple[Ending, list[str]]:
     """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker, as of `_LiveTry`.
 
-    The file `note` then names the machine.
+    The file `sign` then shows that the worker lives.
     """
     import ray
 
     _demand_fit(root, version)
-    with suppress(StoreError):  # of a batch that has ended
-        atomic_write_bytes(Path(note), ray.get_runtime_context().get_node_id().encode(), durable=False)
     if not Path(order.source).exists():
         host = socket.gethostname()
         raise StoreError(f"the machine {host} does not have {order.source}; flights need the same path on all machines")
-    return run_order(WorkerProcess(_with_detector(order, shared)), stall_s), []
+    with shown_alive(Path(sign), ray.get_runtime_context().get_node_id(), stall_s):
+        return run_order(WorkerProcess(_with_detector(order, shared)), stall_s), []
 
 
 def _demand_fit(root: str, version: str) -> None:
