@@ -16,6 +16,7 @@ from sorvolo.geometry.arrays import Floats, PointsM
 
 _MOST_HULL_CORNERS = 1000  # what follows takes the square of their number
 _HULL_TOLERANCE = 1e-6  # of the extent, where a hull has more corners than that
+_PARTED = 1e-3  # of the reach: what touches is parted so far, by choice; far above rounding, far below what is flown
 _LOCATION = re.compile(r"\[(\S+) (\S+)\]$")
 
 
@@ -139,8 +140,11 @@ def swollen(polygons: Sequence[Sequence[PointsM]], reach: float) -> list[list[Po
     Gaps narrower than `reach` all over are filled.
     """
     widened = shapely.buffer(shapely.union_all([_polygon(rings) for rings in polygons]), reach, join_style="mitre")
+    simple = shapely.simplify(widened, reach / 2)
+    # rings that touch themselves at a corner cross by rounding once they are laid on the Earth: opened there
+    parted = shapely.buffer(simple, -_PARTED * reach, join_style="mitre")
     found = []
-    for polygon in shapely.get_parts(shapely.simplify(widened, reach / 2)):
+    for polygon in shapely.get_parts(parted):
         rings = [_open(ring) for ring in shapely.get_rings(polygon)]
         found.append([rings[0], *(ring for ring in rings[1:] if narrowest_extent(ring)[0] > reach)])
     return found
