@@ -27,18 +27,23 @@ COMMANDS = {
     "compare": ["compare", FLIGHT.format(2), *CAMERA, "--site", "field"],
     "watch": ["watch", FLIGHT.format(2), *CAMERA, "--out", "search"],
     "review": ["review", "field"],
+    "search": ["search", "field", "--out", "found"],
     "labelled": ["simulate", "labelled", "--pictures", "60", "--seed", "7"],
+    "train": ["train", "labelled", "--out", "model", "--weights", "default", "--steps", "60", "--device", "cpu"],
     "detector": ["evaluate", "detector", "default", "labelled", "--out", "measured"],
     "reproduce": ["reproduce", "--simulated", "--quick", "--train-steps", "0", "--out", "chapter4"],
 }
 MAKES = {  # the folder that a command makes
-    "map": "field", "watch": "search", "labelled": "labelled", "detector": "measured", "reproduce": "chapter4",
+    "map": "field", "watch": "search", "search": "found", "labelled": "labelled", "train": "model",
+    "detector": "measured", "reproduce": "chapter4",
 }
 PRINTED = ("inspect", "plan", "map", "compare", "review")  # of these also what they print
 PAGES = {  # name: page, width and height of the window, px
     "report": ("field/flights/flight1/report.html", 1100, 1500),
     "changes": ("field/flights/flight2/changes.html", 1100, 1500),
     "watch": ("search/report.html", 1100, 1500),
+    "search": ("found/search.html", 1100, 1100),
+    "train": ("model/training.html", 1100, 900),
     "detector": ("measured/detector.html", 1100, 900),
     "reproduce": ("chapter4/reproduction.html", 1100, 1100),
 }
