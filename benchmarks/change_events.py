@@ -27,7 +27,7 @@ from statistics import median
 from rich.console import Console
 from rich.table import Table
 
-from child import run_child
+from child import peak_mb, run_child
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.changes import as_json, evaluate_changes
@@ -167,7 +167,7 @@ def run_method(method: str, masks: bool, simulation: Path, site: Path) -> None:
         "frames_per_s": round(last.frames_expected / wall_s, 2),
         "cpu_ms_per_view": round(1000 * cpu_s / max(last.views, 1), 1),
         "cpu_ms_per_frame": round(1000 * cpu_s / max(last.frames_expected, 1), 1),
-        "load_1_min": round(os.getloadavg()[0], 1), "peak_mb": round(after.ru_maxrss / 1024),
+        "load_1_min": round(os.getloadavg()[0], 1), "peak_mb": peak_mb(),
     }))
 
 

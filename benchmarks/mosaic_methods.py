@@ -22,7 +22,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from child import run_child
+from child import peak_mb, run_child
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
@@ -121,7 +121,7 @@ def run_method(method: str, simulation: Path, site: Path) -> None:
     frames = len(list(photos.iterdir()))
     print(json.dumps({
         "cpu_ms_per_frame": 1000 * cpu_s / frames, "wall_s": time.monotonic() - started,
-        "peak_mb": after.ru_maxrss / 1024, "frames": frames,
+        "peak_mb": peak_mb(), "frames": frames,
     }))
 
 
