@@ -1,5 +1,7 @@
 """The errors a person must act on; every message states what was found, what was needed and what to do."""
 
+import errno
+
 
 class SorvoloError(Exception):
     """Root of all errors that Sorvolo raises on purpose."""
@@ -23,6 +25,20 @@ class StoreError(SorvoloError):
 
 class UnavailableError(StoreError):
     """A database or store cannot be reached, or somebody else writes: later the same may succeed."""
+
+
+class DiskFullError(StoreError):
+    """A disk has no room for what was to be written: with room, the same will succeed."""
+
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""Numbers of the operating system's errors where a disk, or what a user may take of it, is full."""
+
+
+def goes_on(error: BaseException | None) -> bool:
+    """Whether a run that ended so is left as a killed one, for the same command to go on with."""
+    is_full = isinstance(error, OSError) and error.errno in FULL
+    return is_full or isinstance(error, DiskFullError | UnavailableError)
 
 
 class SorvoloWarning(RuntimeWarning):

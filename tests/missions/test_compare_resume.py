@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_map_resume import Seeing, content
+from test_map_resume import Seeing, content, failing
 
 from killed_copy import copy_as_killed
 from small_flights import simulate_into, small_flight
 from sorvolo.change.views import ViewMaker
-from sorvolo.errors import SorvoloWarning
+from sorvolo.errors import DiskFullError, SorvoloWarning
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
@@ -98,6 +98,19 @@ def test_it_goes_on_where_it_was(whole: tuple[Path, Path], flown: Path, tmp_path
     report = json.loads((site / "flights" / "flight2" / "report.json").read_text())
     assert 0 < worked.count("register") < report["comparison"]["extension"]["frames"]  # both parts extended the map
     assert report["objects"]["sightings"] and sum(report["comparison"]["changes"].values())
+    assert not list(site.rglob("run.journal"))
+
+
+def test_after_a_full_disk_it_goes_on(
+    whole: tuple[Path, Path], flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = copy(whole[1], tmp_path)
+    with monkeypatch.context() as patch:
+        failing(patch, DiskFullError("disk full: could not write it"), count=4)
+        with pytest.raises(DiskFullError):
+            compared(flown, site)
+    assert sum(each.is_resumed for each in compared(flown, site)) > _KILLED_AT
+    assert content(site) == content(whole[0])
     assert not list(site.rglob("run.journal"))
 
 

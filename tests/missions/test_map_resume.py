@@ -1,5 +1,6 @@
 """A mapping that was killed goes on where it was, and ends with the bytes of one that was not."""
 
+import errno
 import json
 import re
 import shutil
@@ -12,13 +13,15 @@ from truth_detector import TruthDetector
 
 from killed_copy import copy_as_killed
 from sorvolo.cli.main import main
-from sorvolo.errors import InputError
+from sorvolo.errors import DiskFullError, InputError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.mosaic.planar import PlanarMapper
+from sorvolo.store.site.database import ConnectionLostError
 from sorvolo.store.site.flight_writer import FlightWriter
+from sorvolo.store.site.journal import Entry, RunJournal, _packed
 from sorvolo.survey.flight import PosedFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
 from sorvolo.survey.objects import Detections
@@ -70,6 +73,23 @@ def mapped(
     return updates
 
 
+def failing(patch: pytest.MonkeyPatch, fault: Exception, count: int) -> None:
+    """Entries of journals fail from the `count`-th on, in the middle of being written."""
+    begun, appended = RunJournal._begun, []
+
+    def half(self: RunJournal, entry: Entry) -> None:
+        appended.append(entry)
+        with self._lock:
+            file = self._file or begun(self)
+            data = _packed(entry)
+            file.write(data if len(appended) < count else data[: len(data) // 2])
+            file.flush()
+        if len(appended) >= count:
+            raise fault
+
+    patch.setattr(RunJournal, "append", half)
+
+
 def copy_at(count: int, site: Path, amid: Path) -> None:
     """Copy the site in the middle of the flight."""
     if count == _KILLED_AT:
@@ -116,6 +136,27 @@ def test_it_goes_on_where_it_was(whole: tuple[Path, ...], filmed: Path, tmp_path
     updates = mapped(filmed, site)
     assert [each.is_resumed for each in updates] == [number < _KILLED_AT for number in range(len(updates))]
     assert len(registered) == len(updates) - _KILLED_AT > 3
+    assert content(site) == content(whole[0])
+    assert not list(site.rglob("run.journal")) and not list(site.rglob(".tmp-*"))
+
+
+FAULTS = (
+    DiskFullError("disk full: could not write it"), OSError(errno.ENOSPC, "No space left on device"),
+    ConnectionLostError("no connection to the catalogue"),
+)
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: type(fault).__name__)
+def test_after_a_full_disk_or_a_lost_catalogue_it_goes_on(
+    whole: tuple[Path, ...], filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
+) -> None:
+    site = tmp_path / "site"
+    with monkeypatch.context() as patch:
+        failing(patch, fault, count=_KILLED_AT)
+        with pytest.raises(type(fault)):
+            mapped(filmed, site)
+    assert not (site / "mosaic.tif").exists()
+    assert sum(each.is_resumed for each in mapped(filmed, site)) > 1
     assert content(site) == content(whole[0])
     assert not list(site.rglob("run.journal")) and not list(site.rglob(".tmp-*"))
 

@@ -1,6 +1,5 @@
 """The command `sorvolo`: its commands, and the one place where errors become exit codes."""
 
-import errno
 import os
 import signal
 import sys
@@ -39,7 +38,7 @@ from sorvolo.cli.stream import stream
 from sorvolo.cli.telemetry import telemetry_command
 from sorvolo.cli.train import train
 from sorvolo.cli.watch import watch_command
-from sorvolo.errors import SorvoloError, SorvoloWarning
+from sorvolo.errors import FULL, SorvoloError, SorvoloWarning
 from sorvolo.store.freed_memory import share_arenas
 
 if TYPE_CHECKING:
@@ -52,7 +51,6 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "heights": heights, "serve": serve, "stream": stream, "token": token, "batch": batch,
     "reproduce": reproduce,
 }
-_FULL = (errno.ENOSPC, errno.EDQUOT)
 _ASKED_AGAIN_S = 0.02  # an end that C code swallowed is asked for again so soon; by choice
 
 app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
@@ -169,7 +167,7 @@ def _words_of(error: Exception) -> str:
     """What happened and what to do, in one line."""
     if isinstance(error, SorvoloError):
         return str(error)
-    if isinstance(error, OSError) and error.errno in _FULL:
+    if isinstance(error, OSError) and error.errno in FULL:
         where = f" while writing {error.filename}" if error.filename else ""
         return f"the disk is full{where}; free some space and run the same command again"
     if isinstance(error, OSError) and error.strerror:

@@ -8,12 +8,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import FULL, DiskFullError, StoreError
 
 TEMPORARY_PREFIX = ".tmp-"
 """Whatever a killed process left behind starts with this; `remove_leftovers` deletes it."""
 
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FORBIDDEN = {errno.EACCES, errno.EPERM, errno.EROFS}
 
 
@@ -73,8 +72,8 @@ def writing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        if error.errno in _FULL:
-            raise StoreError(
+        if error.errno in FULL:
+            raise DiskFullError(
                 f"disk full: could not write {path} ({error.strerror}); free some space and run it again"
             ) from error
         if error.errno in _FORBIDDEN:

@@ -127,7 +127,7 @@ class CompareRun:
         finally:  # also when Ctrl-C strikes again meanwhile
             self._writer.__exit__(kind, error, trace)
             if self._journal is not None:
-                self._journal.file.remove()
+                self._journal.file.end(error)
 
     @property
     def views(self) -> int:

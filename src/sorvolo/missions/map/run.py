@@ -51,7 +51,7 @@ class FlightRun(ABC):
         if self._writer is not None and self._began_writer:
             self._writer.__exit__(kind, error, trace)
         if self._journal is not None:
-            self._journal.file.remove()
+            self._journal.file.end(error)
 
     @property
     def taken(self) -> Taken | None:

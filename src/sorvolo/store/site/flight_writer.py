@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from sorvolo.errors import StoreError, UnavailableError
+from sorvolo.errors import StoreError, UnavailableError, goes_on
 from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
@@ -70,7 +70,8 @@ class FlightWriter:
         if not self._is_open:
             return
         self._is_open = False
-        if isinstance(error, UnavailableError):  # as after a kill: the same command goes on from the journal
+        has_journal = self._files.journal_path(self._flight_id).is_file()
+        if isinstance(error, UnavailableError) or (has_journal and goes_on(error)):
             return
         try:
             # files that no reader can see go first: on a full disk, forgetting the run needs their space

@@ -9,6 +9,7 @@ import threading
 import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from io import BufferedRandom
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sorvolo.errors import goes_on
 from sorvolo.store.atomic import writing
 
 _MAGIC = b"sorvolo journal 1\n"
@@ -118,8 +120,18 @@ class RunJournal:
     def close(self) -> None:
         """Let go of the file, which stays."""
         if self._file is not None:
-            self._file.close()
+            with suppress(OSError):  # on a full disk half an entry may wait to be written, which nobody can read
+                self._file.close()
             self._file = None
+
+    def end(self, error: BaseException | None) -> None:
+        """The run ended, with this error or none: remove the journal, unless the same command can go on with it."""
+        if not goes_on(error):
+            self.remove()
+            return
+        with self._lock:
+            self._is_over = True
+            self.close()
 
     def remove(self) -> None:
         """The run is over: remove the journal."""

@@ -11,7 +11,7 @@ from sqlalchemy import URL, Connection, Engine, NullPool, create_engine, func, s
 from sqlalchemy.exc import DBAPIError, ProgrammingError
 from sqlalchemy.pool import QueuePool
 
-from sorvolo.errors import StoreError, UnavailableError
+from sorvolo.errors import DiskFullError, StoreError, UnavailableError
 from sorvolo.store.site import schema
 from sorvolo.store.site.database import ConnectionLostError, Layout, damaged, numbers
 from sorvolo.store.site.postgres_refusal import refusal_codes
@@ -248,7 +248,7 @@ class PostgresDatabase:
         return StoreError(f"cannot use {self.place}: {fault} ({state}); ask the server's administrator")
 
     def _full(self, fault: str) -> StoreError:
-        return StoreError(
+        return DiskFullError(
             f"disk full: could not write {self.place} ({fault}); free some space on the server and run it again"
         )
 

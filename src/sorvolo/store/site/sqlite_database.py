@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Engine, create_engine, event
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import PoolProxiedConnection, QueuePool
 
-from sorvolo.errors import StoreError
+from sorvolo.errors import DiskFullError, StoreError
 from sorvolo.store.atomic import atomic_path
 from sorvolo.store.site import schema
 from sorvolo.store.site.database import Layout, damaged, numbers
@@ -76,7 +76,7 @@ class SqliteDatabase:
         try:
             connection.cursor().execute("PRAGMA wal_checkpoint(TRUNCATE)")
         except sqlite3.OperationalError as error:
-            raise StoreError(f"disk full: could not tidy {self._path} ({error}); free some space") from error
+            raise DiskFullError(f"disk full: could not tidy {self._path} ({error}); free some space") from error
         finally:
             connection.close()
 
@@ -146,7 +146,7 @@ def _fault(path: Path, error: Exception) -> StoreError:
     """What to do about a fault of SQLite's."""
     fault = str(error.orig if isinstance(error, DBAPIError) else error)
     if "full" in fault:
-        return StoreError(f"disk full: could not write {path} ({fault}); free some space and run it again")
+        return DiskFullError(f"disk full: could not write {path} ({fault}); free some space and run it again")
     if any(words in fault for words in ("readonly", "locked", "unable to open", "disk I/O")):
         return StoreError(f"cannot use {path}: {fault}; check the disk and its permissions")
     return damaged(str(path), fault)
