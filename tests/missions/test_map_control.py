@@ -204,6 +204,8 @@ def test_heights_of_points_in_feet_are_named(surveyed: Surveyed, tmp_path: Path)
         report = json.loads(next((tmp_path / name).glob("flights/*/report.json")).read_text())
         missed = [each for each in report["warnings"] if "the control points miss the map" in each]
         assert len(missed) == bool(words) and all(words in each for each in missed), report["warnings"]
+        rms_m = report["control"]["control_rms_m"]
+        assert report["sigma_m"] > 0.5 * rms_m, "what the points show is in the stated accuracy"
 
 
 def exchanged(text: str, first: int, second: int) -> str:

@@ -106,6 +106,8 @@ def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: Control
         *_misfit_remarks(mapper, problem, seen, used, expected_m, settings),
         *_layout_remarks(mapper, problem, seen.of(used), settings),
     )
+    missed_m = _rms_m(misses[np.array([label not in excluded for label in seen.labels], bool)])
+    mapper.note_ground_miss(float(np.sqrt(max(0.0, missed_m**2 - expected_m**2) / 2)))
     return ControlReport(problem.control.name, problem.control.crs, settings.sigma_m, residuals, remarks)
 
 

@@ -118,6 +118,7 @@ class PlanarMapper:
     ) -> None:
         self._settings = settings
         self._graph = PoseGraph(graph, shelf)
+        self._ground_miss_m = 0.0  # per axis: see `note_ground_miss`
         self._cache = LinkCache(settings.links.features)
         self._keyframes = Keyframes(shelf, keyframe_bytes)
         self._own: list[int] = []
@@ -195,6 +196,10 @@ class PlanarMapper:
     def tie_to_ground(self, ties: GroundTies, *, is_datum: bool) -> frozenset[int]:
         """See `PoseGraph.tie_to_ground`; the keyframes that moved."""
         return self._graph.tie_to_ground(ties, is_datum=is_datum)
+
+    def note_ground_miss(self, miss_m: float) -> None:
+        """Known ground lies so far beside the tied map, rms per axis, beyond what is expected: a part of `sigmas_m`."""
+        self._ground_miss_m = miss_m
 
     def ground_places_m(self, ties: GroundTies) -> PointsM:
         """See `PoseGraph.ground_places_m`."""
@@ -277,13 +282,13 @@ class PlanarMapper:
         """One-sigma error on the ground of each keyframe, per axis: its own and what all of the flight err in common.
 
         What a flight errs in common is its receiver's, or that of the known map it is tied to. Over ground that is not
-        level what its slopes may move the map by is added.
+        level what its slopes may move the map by is added, and by what known ground was seen to miss it.
         """
         tied_to = [self._known[each].sigma_m for each in self._known if each in self._graph]
         common_m = float(np.nanmedian(tied_to)) if np.isfinite(tied_to).any() else self._graph.common_sigma_m()
         leans_m = self._graph.leans_m()
         return {
-            each: float(np.sqrt(sigma_m**2 + common_m**2 + leans_m[each]**2))
+            each: float(np.sqrt(sigma_m**2 + common_m**2 + leans_m[each]**2 + self._ground_miss_m**2))
             for each, sigma_m in self._graph.sigmas_m().items()
         }
 
