@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,9 @@ from test_map_resume import Seeing, content, failing
 from killed_copy import copy_as_killed
 from small_flights import simulate_into, small_flight
 from sorvolo.change.views import ViewMaker
-from sorvolo.errors import DiskFullError, SorvoloWarning
+from sorvolo.errors import DiskFullError, SorvoloWarning, StoreError
 from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.compare.run import CompareRun
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.mosaic.planar import PlanarMapper
@@ -112,6 +114,26 @@ def test_after_a_full_disk_it_goes_on(
     assert sum(each.is_resumed for each in compared(flown, site)) > _KILLED_AT
     assert content(site) == content(whole[0])
     assert not list(site.rglob("run.journal"))
+
+
+@pytest.mark.parametrize(("free", "expected"), [(10**8, ""), (10**6, "may become full"), (2 * 10**5, "free some")])
+def test_a_disk_too_full_for_the_new_version_is_announced(
+    whole: tuple[Path, Path], flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int, expected: str
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
+    monkeypatch.setattr(CompareRun, "__enter__", begun)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        with pytest.raises((StoreError, InterruptedError)) as ended:
+            compared(flown, copy(whole[1], tmp_path))
+    texts = [str(ended.value), *(str(each.message) for each in caught)]
+    found = [each for each in texts if "the new version of the map after comparing flight2 needs about" in each]
+    assert len(found) == bool(expected) and all(expected in each for each in found), texts
+    assert isinstance(ended.value, InterruptedError) == (expected != "free some")
+
+
+def begun(_: CompareRun) -> CompareRun:
+    raise InterruptedError("the work began")
 
 
 def test_other_settings_begin_anew_and_report_it(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:

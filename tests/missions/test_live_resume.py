@@ -4,6 +4,7 @@ import json
 import shutil
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Generator
 from pathlib import Path
 from types import SimpleNamespace
@@ -60,6 +61,17 @@ def write_film(path: Path, flight: FilmedFlight, count: int, *, metadata: bool) 
         rate=flight.rate, speed=1000.0,
     ).run()
     path.with_name("film.ts.ended").touch()
+
+
+def test_a_disk_that_fills_while_the_flight_goes_on_is_announced_once(
+    followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 9 * 10**8, 6 * 10**7))  # type: ignore[attr-defined]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        assert len(mapped(f"follow:{followed}", tmp_path / "site", _FILE)) > 3
+    found = [str(each.message) for each in caught if "more frame" in str(each.message)]
+    assert len(found) == 1 and "has 60 MB free" in found[0] and "of film will fit" in found[0]
 
 
 def mapped(

@@ -16,6 +16,7 @@ from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import CompareRun, Pending
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
@@ -137,6 +138,8 @@ def _compare_one(
     started_s, source = time.monotonic(), setup.source
     notices = (*setup.notices, *repeated(archive, source, "compared"), *_without_heights(archive, source.name))
     setup = replace(setup, notices=notices)
+    if settings.updates_map:
+        check_room(setup, archive, archive.site().m_per_px, keeps_pictures=False)
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
     file, notes, keeps_pictures = begun_journal(setup, archive, request, anew=anew), None, False

@@ -15,7 +15,7 @@ from sorvolo.errors import SettingsError, SorvoloWarning
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.flight.disk import check_room
+from sorvolo.missions.flight.disk import LiveRoom, check_room
 from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
@@ -125,7 +125,9 @@ def _map_one(
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
-    check_room(setup, archive.folder, archive.site().m_per_px if archive.has_site else settings.m_per_px)
+    m_per_px = archive.site().m_per_px if archive.has_site else settings.m_per_px
+    check_room(setup, archive, m_per_px)
+    room = LiveRoom(setup, archive.folder, m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source, "mapped")))
     live_folder = archive.folder if isinstance(source, LiveSource) else None
     finder = None if detector is None else ObjectFinder(
@@ -155,6 +157,7 @@ def _map_one(
         )
         for each in selected:
             ended = run.take(each)
+            room.look(run.selected)
             coverage.show(run.pictures_on_ground)
             yield update(each if isinstance(each, LostFrame) else each.posed.frame, ended, reader.read)
         run.finish(source.notices(), started_s)

@@ -40,7 +40,7 @@ def plan_blocks(
             request = request_of(setup, replace(settings, live_s=0.0, memory_mb=None), None, looks)
             if (mapped := already_done(archive, setup, request)) is not None:
                 return mapped
-            check_room(setup, archive.folder, settings.m_per_px)
+            check_room(setup, archive, settings.m_per_px)
         return Division(folder, request, min(count, most_blocks(setup)), isinstance(sources[0], VideoSource))
 
 
