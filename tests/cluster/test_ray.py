@@ -371,7 +371,7 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
     [
         (
             RuntimeError("Version mismatch: The cluster was started with:\n    Ray: 2.59.0\n    Python: 3.11.7"),
-            "another version of Ray or Python than this machine (Ray 2.60",
+            "another version of Ray or Python than this machine; install the same ones on all machines (here Ray 2.60",
         ),
         (ConnectionError("ray client connection timeout"), "a cluster with a token (set RAY_AUTH_MODE=token"),
         (ConnectionError("Initialization failure from server:\nTraceback"), "started nothing to serve this batch"),

@@ -93,7 +93,10 @@ def why_not(name: str, error: Exception) -> str:
     words = first_line(error)
     if "ersion" in str(error):
         both = " ".join(str(error).split())[:300]
-        return f"the cluster has another version of Ray or Python than this machine (Ray {ray.__version__}): {both}"
+        return (
+            "the cluster has another version of Ray or Python than this machine; install the same ones on all machines "
+            f"(here Ray {ray.__version__}; {both})"
+        )
     if "oken" in str(error) or "nauthenticated" in str(error):
         return f"the cluster needs another token: {words}; set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN_PATH"
     if _UNREADY in str(error):
