@@ -99,7 +99,10 @@ SearchedClasses = Annotated[
 ]
 Memory = Annotated[
     float | None,
-    typer.Option(help="Memory for pictures that are needed again, MB. Without it: 512, or a quarter of the machine's."),
+    typer.Option(
+        help="Memory for pictures that are needed again, MB, 64 or more. Without it: 512, or a quarter of the "
+        "machine's if that is less."
+    ),
 ]
 
 CatalogueAddress = Annotated[
