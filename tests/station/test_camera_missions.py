@@ -80,20 +80,23 @@ def own_processes(station: Served, run: str) -> list[tuple[int, bytes]]:
 
 
 async def viewed(station: Served, stream: str) -> tuple[list[int], dict[str, Any]]:
-    """The times of the pictures that a viewer gets until boxes of one of them come, and those.
+    """The times of the pictures that a viewer gets until boxes of one of them have come, and those.
 
-    Whoever joins gets the pictures since the last key frame. On a busy machine the first boxes may be of an older one.
+    Whoever joins gets the pictures since the last key frame. On a busy machine the first boxes may be of an older one,
+    or come before their picture.
     """
     pictures: list[int] = []
-    first_us = 2**62
+    boxes: dict[str, Any] | None = None
     async with connect(f"{station.url.replace('http', 'ws')}/api/streams/{stream}/video") as socket:
-        while True:
+        while boxes is None or pictures[-1] < boxes["pts_us"] - HALF_US:
             item = await asyncio.wait_for(socket.recv(), 60)
             if isinstance(item, bytes):
                 pictures.append(int.from_bytes(item[:8], "big"))
-                first_us = pictures[0]
-            elif (words := json.loads(item))["type"] == "boxes" and words["pts_us"] > first_us - HALF_US:
-                return pictures, words
+                continue
+            words = json.loads(item)
+            if boxes is None and words["type"] == "boxes" and pictures and words["pts_us"] > pictures[0] - HALF_US:
+                boxes = words
+        return pictures, boxes
 
 
 def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(camera: RtspServer, tmp_path: Path) -> None:
