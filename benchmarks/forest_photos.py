@@ -12,17 +12,14 @@ draws smaller photos of the same ground, for a trial. `--output` adds the run to
 
 import argparse
 import json
-import os
-import resource
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from child import map_costs
 from long_video import FRAME
 from provenance import commit, machine
 from sorvolo.geometry.camera import Camera
@@ -88,20 +85,10 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
     truth = json.loads((options.folder / "truth.json").read_text())
     with tempfile.TemporaryDirectory() as temporary:
         site = Path(temporary) / "site"
-        command = [
-            sys.executable, "-m", "sorvolo", "map", str(options.folder / "photos"), "--site", str(site),
-            "--model", "none", *options.options,
-        ]
-        before, started_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-        done = subprocess.run(command, check=False, capture_output=True, text=True)
-        seconds, after = time.monotonic() - started_s, resource.getrusage(resource.RUSAGE_CHILDREN)
-        if done.returncode not in (0, 3):
-            sys.exit(done.stderr)
+        costs = map_costs(options.folder / "photos", site, options.options)
         report = json.loads((site / "flights/photos/report.json").read_text())
     return {
-        **truth, "options": options.options, "seconds": round(seconds, 1), "load_before": os.getloadavg()[0],
-        "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-        "peak_mb": round(after.ru_maxrss / 1024), "stages_cpu_s": report["cpu_s"],
+        **truth, "options": options.options, **costs, "stages_cpu_s": report["cpu_s"],
         "paint_cpu_s_a_photo": round(report["cpu_s"]["paint"] / truth["photos"], 2),
         "frames_of_report": report["frames"], "verdict": report.get("headline"),
     }

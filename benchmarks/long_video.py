@@ -11,9 +11,6 @@ in a process of its own and prints the figures beside those of decoding it alone
 import argparse
 import csv
 import json
-import os
-import resource
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,6 +20,7 @@ import av
 import cv2
 import numpy as np
 
+from child import map_costs
 from long_flight import rms
 from provenance import commit, machine
 from sorvolo.geometry.camera import Camera
@@ -107,21 +105,11 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
     decoding = {"every_frame_cpu_s": decode_s(flight, "DEFAULT"), "key_frames_cpu_s": decode_s(flight, "NONKEY")}
     with tempfile.TemporaryDirectory() as temporary:
         site = Path(temporary) / "site"
-        command = [
-            sys.executable, "-m", "sorvolo", "map", str(flight), "--site", str(site), "--camera", "aov=62",
-            "--model", "none", *options.options,
-        ]
-        before, started_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
-        done = subprocess.run(command, check=False, capture_output=True, text=True)
-        seconds, after = time.monotonic() - started_s, resource.getrusage(resource.RUSAGE_CHILDREN)
-        if done.returncode not in (0, 3):
-            sys.exit(done.stderr)
+        costs = map_costs(flight, site, ["--camera", "aov=62", *options.options])
         report = json.loads((site / "flights/flight/report.json").read_text())
         return {
             **json.loads((options.folder / "truth.json").read_text()), "options": options.options,
-            "seconds": round(seconds, 1), "load_before": os.getloadavg()[0],
-            "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
-            "peak_mb": round(after.ru_maxrss / 1024), "decoding": decoding, "stages_cpu_s": report["cpu_s"],
+            **costs, "decoding": decoding, "stages_cpu_s": report["cpu_s"],
             "frames_of_report": report["frames"], "reading": report.get("reading"), **fit(site),
         }
 

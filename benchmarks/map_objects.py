@@ -16,18 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from provenance import commit, machine, seeds_or_drawn
-from search_pod import boxes_px, flown, placed
+from search_pod import CLASSES, flown, placed, seen_by_map
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.turning import is_from_above
 from sorvolo.simulation.flight import SimulatedFlight
-from sorvolo.tracking.laying import lay_on_ground
 from sorvolo.tracking.planted import shown_plant
 from sorvolo.tracking.standing import fuse
-from sorvolo.tracking.view_evidence import least_seen
 
 RESULTS = Path(__file__).parent / "results" / "map_objects.json"
-CLASSES = ("person", "car")
-MOST = 60  # sightings of a frame, the surest, as a map takes them
 
 
 def main() -> None:
@@ -54,18 +49,7 @@ def counted(flight: SimulatedFlight, images: list[np.ndarray], detector: Detecto
     """How many hidden things a frame shows, how many of them are reported, and how many reports are of none."""
     targets = [thing for thing in flight.day.things if thing.label.is_target]
     frames = [placed(flight, index) for index in range(len(images))]
-    laid, boxes, least = [], {}, {}
-    for index, (frame, image) in enumerate(zip(frames, images)):
-        pose = flight.true_poses[index]
-        from_above = is_from_above(pose.rotation)
-        own = detector.thresholds_for(image, from_above=from_above)
-        least = {name: max(score, least.get(name, 0.0)) for name, score in own.items()}
-        found = detector.detect(
-            image, tiles="auto", m_per_px=float(pose.translation_m[2]) / flight.camera.fx_px, classes=CLASSES,
-            from_above=from_above, least_score=least_seen(own),
-        ).surest(MOST)
-        laid += [one for one in lay_on_ground(found, frame) if one is not None]
-        boxes[index] = boxes_px(flight, index, targets)
+    laid, boxes, least = seen_by_map(flight, frames, images, detector, targets)
     counts: Counter[str] = Counter()
     right: set[int] = set()
     for each in fuse(laid, frames, least).objects:

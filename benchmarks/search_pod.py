@@ -51,13 +51,15 @@ from sorvolo.simulation.thermal import heat_picture, warm_day
 from sorvolo.simulation.world import build_day, is_free
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
-from sorvolo.tracking.laying import lay_on_ground
+from sorvolo.tracking.laying import LaidSighting, lay_on_ground
 from sorvolo.tracking.planted import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
 
 RESULTS = Path(__file__).parent / "results" / "search_pod.json"
 SUN_DEG = (215.0, 48.0)  # of every first day in the simulation
 PEOPLE, CARS = 28, 12  # hidden in a flight
+CLASSES = ("person", "car")
+MOST = 60  # sightings of a frame, the surest, as a map takes them
 GROUNDS = ("countryside", "dirt", "urban", "sand")
 HEIGHTS_M = (25.0, 35.0, 45.0)
 
@@ -146,7 +148,7 @@ def searched(
     outlines_m = [each.placed.outline_m for each in frames]
     cells = cells_over(outlines_m, SiteGrid.at(origin, cell_side_m(outlines_m), crs), None)
     targets = [thing for thing in flight.day.things if thing.label.is_target]
-    settings = SearchSettings(plants=plants, classes=("person", "car"), sun_deg=SUN_DEG, seed=flight.settings.seed + 1)
+    settings = SearchSettings(plants=plants, classes=CLASSES, sun_deg=SUN_DEG, seed=flight.settings.seed + 1)
     *_, measured = measure_flight(
         flight.name, frames, cells, Site("search", origin, crs, 0.02, height_reference="ellipsoidal"), detector,
         settings, np.array([thing.place_m(0)[:2] for thing in targets]),
@@ -160,19 +162,7 @@ def rows_of(
     measured: MeasuredFlight, targets: Sequence[Thing], number: int,
 ) -> list[dict]:
     """What was stated and what came true."""
-    laid, boxes = [], {}
-    least: dict[str, float] = {}
-    for index, (each, image) in enumerate(zip(frames, images)):
-        pose = flight.true_poses[index]
-        from_above = is_from_above(pose.rotation)
-        own = detector.thresholds_for(image, from_above=from_above)
-        least = {name: max(score, least.get(name, 0.0)) for name, score in own.items()}
-        found = detector.detect(
-            image, tiles="auto", m_per_px=float(pose.translation_m[2]) / flight.camera.fx_px,
-            classes=("person", "car"), from_above=from_above, least_score=least_seen(own),
-        ).surest(60)
-        laid += [one for one in lay_on_ground(found, each.placed) if one is not None]
-        boxes[index] = boxes_px(flight, index, targets)
+    laid, boxes, least = seen_by_map(flight, [each.placed for each in frames], images, detector, targets)
     labels = [str(each.label) for each in targets]
     reported = reported_plants(laid, [each.placed for each in frames], boxes, labels, least)
     empty = without_targets(flight)
@@ -197,6 +187,28 @@ def rows_of(
                     "trees": bool(seen.under_trees[row]), "height_m": round(flight.path.height_m, 1),
                 })
     return rows
+
+
+def seen_by_map(
+    flight: SimulatedFlight, frames: Sequence[PlacedFrame], images: Sequence[np.ndarray], detector: Detector,
+    targets: Sequence[Thing],
+) -> tuple[list[LaidSighting], dict[int, np.ndarray], dict[str, float]]:
+    """What a map's search sees in the frames, each frame's boxes of the targets (NaN: out of sight), and from which
+    score on each class is reported."""
+    laid, boxes = [], {}
+    least: dict[str, float] = {}
+    for index, (frame, image) in enumerate(zip(frames, images)):
+        pose = flight.true_poses[index]
+        from_above = is_from_above(pose.rotation)
+        own = detector.thresholds_for(image, from_above=from_above)
+        least = {name: max(score, least.get(name, 0.0)) for name, score in own.items()}
+        found = detector.detect(
+            image, tiles="auto", m_per_px=float(pose.translation_m[2]) / flight.camera.fx_px, classes=CLASSES,
+            from_above=from_above, least_score=least_seen(own),
+        ).surest(MOST)
+        laid += [one for one in lay_on_ground(found, frame) if one is not None]
+        boxes[index] = boxes_px(flight, index, targets)
+    return laid, boxes, least
 
 
 def without_targets(flight: SimulatedFlight) -> SimulatedFlight:
