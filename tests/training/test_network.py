@@ -16,7 +16,13 @@ from onnx import TensorProto, helper  # noqa: E402
 from sorvolo.errors import SettingsError  # noqa: E402
 from sorvolo.survey.labels import LabelledPicture, LabelledSet  # noqa: E402
 from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
-from sorvolo.training.boxes import boxes_from_offsets, iou_matrix, offsets_from_boxes, suppress  # noqa: E402
+from sorvolo.training.boxes import (  # noqa: E402
+    boxes_from_offsets,
+    iou_matrix,
+    offsets_from_boxes,
+    suppress,
+    suppress_all_pairs,
+)
 from sorvolo.training.faster_rcnn import FasterRCNN, Reach  # noqa: E402
 from sorvolo.training.feature_pyramid import Pyramid  # noqa: E402
 from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align  # noqa: E402
@@ -261,6 +267,18 @@ def test_suppression_keeps_no_two_that_overlap_and_loses_none_that_stands_alone(
     for index in set(range(len(boxes))) - set(kept.tolist()):
         better = [int(k) for k in kept if scores[0, k] >= scores[0, index]]
         assert (overlap[index][better] > 0.5 - 1e-6).any()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(_BOX, max_size=40), st.integers(0, 100), st.integers(1, 40), st.booleans())
+def test_suppression_over_all_pairs_keeps_the_same_in_the_same_order(boxes, seed, most, are_ties):
+    b = torch.tensor(boxes).reshape(-1, 4)
+    scores = torch.rand(2, len(boxes), generator=torch.Generator().manual_seed(seed))
+    if are_ties:
+        scores = torch.round(scores * 4) / 4
+    for iou in (0.3, 0.7):
+        at_once = suppress_all_pairs(b, scores, most, iou, 0.1)[:, 1:]
+        assert torch.equal(at_once, suppress(b, scores, most, iou, 0.1))
 
 
 def test_regions_are_cut_as_onnx_cuts_them():
