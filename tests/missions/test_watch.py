@@ -1,6 +1,7 @@
 """Mode 2 on small simulated flights with a truth-fed detector: what is found, placed, written, and sent."""
 
 import json
+import re
 import shlex
 import socket
 import sys
@@ -399,6 +400,38 @@ def test_photos_without_anything_else(photographs: Path, detector: TruthDetector
     assert sorted(path.name for path in (tmp_path / "out" / "annotated").iterdir()) == [
         f"IMG_{number}.jpg" for number in range(4)
     ]
+
+
+def test_a_gimbal_that_is_half_a_turn_off_for_some_photos(photographed: Path, tmp_path: Path) -> None:
+    """What they show lies where it lay with the right angles, and the report names them."""
+    detector = TruthDetector(photographed, misses=0, false_alarms=0)
+    paths = sorted((photographed / "flight1" / "photos").glob("*.jpg"))[::3]
+    reports, places = {}, {}
+    for name, turned in {"right": paths[:0], "wrong": paths[2:]}.items():
+        (tmp_path / name).mkdir()
+        for path in paths:
+            photo = path.read_bytes()
+            if path in turned:
+                stated = re.search(rb'GimbalYawDegree="([^"]+)"', photo)
+                assert stated is not None
+                yaw_deg = (float(stated[1]) + 360) % 360 - 180
+                photo = photo.replace(stated[1], f"{yaw_deg:+{len(stated[1])}.3f}"[: len(stated[1])].encode())
+            (tmp_path / name / path.name).write_bytes(photo)
+        out = tmp_path / f"{name}-watch"
+        list(watch(
+            tmp_path / name, outputs=WatchOutputs(folder=out), camera=photographed / "camera.xml", detector=detector
+        ))
+        reports[name] = json.loads((out / "report.json").read_text())
+        places[name] = sorted(
+            (each["properties"]["class"], *each["geometry"]["coordinates"][:2])
+            for each in json.loads((out / "tracks.geojson").read_text())["features"]
+        )
+    assert [each[0] for each in places["wrong"]] == [each[0] for each in places["right"]] and places["right"]
+    off_deg = np.array([each[1:] for each in places["wrong"]]) - np.array([each[1:] for each in places["right"]])
+    assert np.abs(off_deg).max() < 2e-5  # 2 m
+    notices = {row["code"]: row for row in reports["wrong"]["notices"]}
+    assert notices["headings_wrong"]["count"] == len(paths[2:])
+    assert all(row["code"] != "headings_wrong" for row in reports["right"]["notices"])
 
 
 @pytest.mark.parametrize("shown_by", [1, 2])

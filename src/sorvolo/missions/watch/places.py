@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from statistics import median
 from typing import Protocol
 
 from sorvolo.detection.turning import is_from_above
@@ -15,6 +16,7 @@ from sorvolo.survey.objects import Detections, Track
 from sorvolo.survey.wording import counted
 from sorvolo.tracking.following import GroundFollower, Located, PictureFollower, Taken, watched_prior
 from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight
+from sorvolo.tracking.photo_headings import PhotoHeadings
 from sorvolo.tracking.tracker import TrackerSettings
 
 _COMPASS_REPORTED_DEG = 2.0  # by which a compass is off: less is not worth a notice; by choice
@@ -79,6 +81,8 @@ class GroundPlaces:
 
     def __init__(self, setup: FlightSetup, settings: TrackerSettings, ground: GroundHeight | None) -> None:
         self._setup, self._over_model = setup, ground is not None
+        self._headings = PhotoHeadings(setup.source.camera.camera) if setup.source.kind == "photos" else None
+        self._taken: tuple[int, CameraPrior] | None = None  # the last frame taken, and its prior
         knows_heading = setup.track is None or setup.track.attitude != "none"
         self._follower = GroundFollower(setup.source.camera, settings, ground, knows_heading=knows_heading)
         self._site = new_site(setup, setup.source.name, 1.0, 0.0)
@@ -105,13 +109,18 @@ class GroundPlaces:
 
     def view(self, frame: Frame) -> FrameView | None:
         """What ground the frame shows, taken as level."""
-        prior = self._prior(frame)
+        taken = self._taken
+        prior = taken[1] if taken is not None and taken[0] == frame.index else self._prior(frame)
         pose = Pose(prior.rotation, prior.position_m) if prior.knows_place else None
         return self._setup.view(frame.time_ns, self._setup.source.camera.camera, pose)
 
     def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
         """Place a frame's detections on the ground and give them to their tracks."""
-        return self._follower.take(frame, time_ns, found, self._prior(frame))
+        prior = self._prior(frame)
+        if self._headings is not None:
+            prior = self._headings.take(frame.image, prior)
+        self._taken = frame.index, prior
+        return self._follower.take(frame, time_ns, found, prior)
 
     def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
         """See `Places.recall`."""
@@ -136,7 +145,7 @@ class GroundPlaces:
             height = f"{height.split(',')[0]}, over the height model's ground"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         return (
-            *self._setup.notices, Notice("placed_by", 1, text), *self._compass_notices(),
+            *self._setup.notices, Notice("placed_by", 1, text), *self._heading_notices(), *self._compass_notices(),
             *(Notice("not_placed", count, f"{counted(count, 'detection')} without a place on the ground: {reason}")
               for reason, count in self._follower.unlocated.most_common() if reason != IMPOSSIBLE_SIZE),
             *self._size_notices(),
@@ -145,6 +154,21 @@ class GroundPlaces:
     def path_m(self) -> Floats:
         """(N, 2) where the camera was."""
         return self._follower.path_m()
+
+    def _heading_notices(self) -> tuple[Notice, ...]:
+        headings = self._headings
+        if headings is None or not (headings.turns_deg or headings.first_is_wrong):
+            return ()
+        texts = []
+        if count := len(headings.turns_deg):
+            usual_deg = median(map(abs, headings.turns_deg))
+            texts.append(
+                f"the headings of {counted(count, 'photo')} are about {usual_deg:.0f} degrees off, as the ground shows "
+                "that they share with the photo before: corrected"
+            )
+        if headings.first_is_wrong:
+            texts.append("the first photo's heading seems wrong and is not corrected: what it shows may be misplaced")
+        return (Notice("headings_wrong", count + headings.first_is_wrong, "; ".join(texts)),)
 
     def _compass_notices(self) -> tuple[Notice, ...]:
         clockwise_deg = self._follower.compass_clockwise_deg

@@ -1,0 +1,134 @@
+"""Headings of photos that telemetry has wrong, found by the ground that neighbours share."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sorvolo.geometry.arrays import ImageRGB, Matrix3, PointsM, PointsPx
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.level_ground import ground_from_pixels
+from sorvolo.geometry.pose import Pose, rotation_from_vector
+from sorvolo.registration.shared_view import SmallView, second_from_first, small_view
+from sorvolo.survey.flight import CameraPrior
+
+_LEAST_DOWN = 0.8  # of the optical axis: 37 degrees off straight down or less; the heading of others is not checked
+
+
+@dataclass(frozen=True)
+class PhotoHeadingSettings:
+    """When the ground that two photos share shows a heading, and when that counts against the telemetry's."""
+
+    least_sigma_deg: float = 4.0  # of what is shown, however far apart the photos; as of `heading.HeadingSettings`
+    most_sigma_deg: float = 20.0  # a heading shown less well is not used; by choice
+    wrong_deg: float = 30.0  # less is within what tilts, winds and small compasses do; by choice
+    wrong_sigmas: float = 4.0  # and it must be beyond what both sides may err by
+    alike_deg: float = 45.0  # a photo that shows nothing shares its predecessor's error if their headings are as alike
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """By how much a heading has to turn clockwise, and how well that is known."""
+
+    turn_deg: float
+    sigma_deg: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Last:
+    """The photo before: what is kept of it, its prior as telemetry has it, and by how much that was turned."""
+
+    view: SmallView
+    prior: CameraPrior
+    turned: _Turn | None
+
+
+class PhotoHeadings:
+    """The headings of photos, one after another, in order of time. Only `take` changes it.
+
+    The middle of the photo before lies on the ground where telemetry has it, almost straight below that camera,
+    whatever its heading. Where the new photo shows that place, the direction to it from the new camera must be the
+    same: the turn about the vertical by which it is not is the heading's error. (Angles of a gimbal that are wrong by
+    half a turn, for a whole strip, occur in real flights.) `turns_deg` are the turns, clockwise, of the photos that
+    were corrected; `first_is_wrong`: the flight's first photo, which has none before it, seems to need one, too.
+    """
+
+    def __init__(self, camera: Camera, settings: PhotoHeadingSettings = PhotoHeadingSettings()) -> None:
+        self._camera, self._settings = camera, settings
+        self._last: _Last | None = None
+        self._photos = 0
+        self.turns_deg: list[float] = []
+        self.first_is_wrong = False
+
+    def take(self, image: ImageRGB, prior: CameraPrior) -> CameraPrior:
+        """A photo's prior, with the heading that its picture shows where telemetry's is wrong, else as it is."""
+        self._photos += 1
+        is_known = prior.knows_place and bool(np.isfinite(prior.attitude_sigma_deg[2])) and prior.position_m[2] > 0
+        if not is_known or -float(prior.rotation[2, 2]) < _LEAST_DOWN:
+            self._last = None
+            return prior
+        view = small_view(image)
+        turned = None if self._last is None else self._turned(view, prior, self._last)
+        self._last = _Last(view, prior, turned)
+        if turned is None:
+            return prior
+        self.turns_deg.append(turned.turn_deg)
+        turn = rotation_from_vector(np.array([0.0, 0.0, -np.radians(turned.turn_deg)]))
+        sigma_deg = np.array([*prior.attitude_sigma_deg[:2], turned.sigma_deg])
+        return replace(prior, rotation=turn @ prior.rotation, attitude_sigma_deg=sigma_deg)
+
+    def _turned(self, view: SmallView, prior: CameraPrior, before: _Last) -> _Turn | None:
+        """The turn of a photo that shows, or shares, a wrong heading; None where it stays as it is."""
+        here_from_before = second_from_first(before.view, view)
+        if here_from_before is None:
+            return _carried(before, prior, self._settings.alike_deg)
+        if self._photos == 2:
+            before_from_here = np.asarray(np.linalg.inv(here_from_before), np.float64)
+            first = self._shown(before.prior, prior, view.size_px, before_from_here)
+            self.first_is_wrong = first is not None and self._is_wrong(first, before.prior)
+        shown = self._shown(prior, before.prior, before.view.size_px, here_from_before)
+        if shown is None:
+            return _carried(before, prior, self._settings.alike_deg)
+        return shown if self._is_wrong(shown, prior) else None
+
+    def _shown(
+        self, prior: CameraPrior, other: CameraPrior, other_size_px: tuple[int, int], here_from_other: Matrix3
+    ) -> _Turn | None:
+        """What the middle of another photo shows of a photo's heading; None where that is known too badly."""
+        middle_px = (np.array([other_size_px[::-1]], np.float64) - 1) / 2
+        seen_m = self._on_ground(apply_homography(here_from_other, middle_px), prior) - prior.position_m[:2]
+        true_m = self._on_ground(middle_px, other) - prior.position_m[:2]
+        reach_m = min(float(np.linalg.norm(seen_m)), float(np.linalg.norm(true_m)))
+        if not reach_m > 0:  # at the horizon there is none
+            return None
+        tilt_deg = max(each.attitude_sigma_deg[:2].max() for each in (prior, other))
+        fix_m = max(each.position_sigma_m[:2].max() for each in (prior, other))
+        miss_m = np.sqrt(2) * np.hypot(fix_m, prior.position_m[2] * np.radians(tilt_deg))  # of both photos
+        sigma_deg = float(np.hypot(np.degrees(miss_m / reach_m), self._settings.least_sigma_deg))
+        turn_deg = (_bearing_deg(true_m) - _bearing_deg(seen_m) + 180) % 360 - 180
+        return _Turn(turn_deg, sigma_deg) if sigma_deg <= self._settings.most_sigma_deg else None
+
+    def _on_ground(self, pixels: PointsPx, prior: CameraPrior) -> PointsM:
+        """(2,) where a pixel, (1, 2), lies on the level ground."""
+        return ground_from_pixels(self._camera, Pose(prior.rotation, prior.position_m), pixels)[0]
+
+    def _is_wrong(self, shown: _Turn, prior: CameraPrior) -> bool:
+        """Whether the heading by telemetry is one that cannot be."""
+        rules = self._settings
+        both_deg = float(np.hypot(shown.sigma_deg, prior.attitude_sigma_deg[2]))
+        return abs(shown.turn_deg) > max(rules.wrong_deg, rules.wrong_sigmas * both_deg)
+
+
+def _carried(before: _Last, prior: CameraPrior, alike_deg: float) -> _Turn | None:
+    """The turn of the photo before, for one with about the same heading by telemetry: it is wrong by the same."""
+    if before.turned is None:
+        return None
+    cosine = (np.trace(before.prior.rotation.T @ prior.rotation) - 1) / 2
+    if np.degrees(np.arccos(np.clip(cosine, -1, 1))) > alike_deg:
+        return None
+    return _Turn(before.turned.turn_deg, float(np.hypot(before.turned.sigma_deg, prior.attitude_sigma_deg[2])))
+
+
+def _bearing_deg(east_north_m: PointsM) -> float:
+    """Clockwise from north, of (2,)."""
+    return float(np.degrees(np.arctan2(east_north_m[0], east_north_m[1])))
