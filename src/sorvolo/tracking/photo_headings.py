@@ -12,7 +12,7 @@ from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.registration.shared_view import SmallView, second_from_first, small_view
 from sorvolo.survey.flight import CameraPrior
 
-_LEAST_DOWN = 0.8  # of the optical axis: 37 degrees off straight down or less; the heading of others is not checked
+_LEAST_DOWN = 0.96  # of the optical axis: 16 degrees off straight down or less; the heading of others is not checked
 
 
 @dataclass(frozen=True)
@@ -36,57 +36,55 @@ class _Turn:
 
 @dataclass(frozen=True, eq=False)
 class _Last:
-    """The photo before: what is kept of it, its prior as telemetry has it, and by how much that was turned."""
+    """The photo before: what is kept of it, its prior as telemetry has it, and turned right, and by how much."""
 
     view: SmallView
     prior: CameraPrior
-    turned: _Turn | None
+    right: CameraPrior
+    turned: _Turn | None = None
 
 
 class PhotoHeadings:
-    """The headings of photos, one after another, in order of time. Only `take` changes it.
+    """The headings of photos, one after another, in order of time. `see` and `take` change it.
 
     The middle of the photo before lies on the ground where telemetry has it, almost straight below that camera,
     whatever its heading. Where the new photo shows that place, the direction to it from the new camera must be the
     same: the turn about the vertical by which it is not is the heading's error. (Angles of a gimbal that are wrong by
-    half a turn, for a whole strip, occur in real flights.) `turns_deg` are the turns, clockwise, of the photos that
-    were corrected; `first_is_wrong`: the flight's first photo, which has none before it, seems to need one, too.
+    half a turn, for a whole strip, occur in real flights.) The first photo is held against the one after it, which
+    `see` is given before. `turns_deg` are the turns, clockwise, of the photos that were corrected.
     """
 
     def __init__(self, camera: Camera, settings: PhotoHeadingSettings = PhotoHeadingSettings()) -> None:
         self._camera, self._settings = camera, settings
         self._last: _Last | None = None
-        self._photos = 0
         self.turns_deg: list[float] = []
-        self.first_is_wrong = False
+
+    def see(self, image: ImageRGB, prior: CameraPrior) -> None:
+        """Hold the next photo given to `take` against this one."""
+        self._last = _Last(small_view(image), prior, prior) if _is_usable(prior) else None
 
     def take(self, image: ImageRGB, prior: CameraPrior) -> CameraPrior:
         """A photo's prior, with the heading that its picture shows where telemetry's is wrong, else as it is."""
-        self._photos += 1
-        is_known = prior.knows_place and bool(np.isfinite(prior.attitude_sigma_deg[2])) and prior.position_m[2] > 0
-        if not is_known or -float(prior.rotation[2, 2]) < _LEAST_DOWN:
+        if not _is_usable(prior):
             self._last = None
             return prior
         view = small_view(image)
         turned = None if self._last is None else self._turned(view, prior, self._last)
-        self._last = _Last(view, prior, turned)
-        if turned is None:
-            return prior
-        self.turns_deg.append(turned.turn_deg)
-        turn = rotation_from_vector(np.array([0.0, 0.0, -np.radians(turned.turn_deg)]))
-        sigma_deg = np.array([*prior.attitude_sigma_deg[:2], turned.sigma_deg])
-        return replace(prior, rotation=turn @ prior.rotation, attitude_sigma_deg=sigma_deg)
+        right = prior
+        if turned is not None:
+            self.turns_deg.append(turned.turn_deg)
+            turn = rotation_from_vector(np.array([0.0, 0.0, -np.radians(turned.turn_deg)]))
+            sigma_deg = np.array([*prior.attitude_sigma_deg[:2], turned.sigma_deg])
+            right = replace(prior, rotation=turn @ prior.rotation, attitude_sigma_deg=sigma_deg)
+        self._last = _Last(view, prior, right, turned)
+        return right
 
     def _turned(self, view: SmallView, prior: CameraPrior, before: _Last) -> _Turn | None:
         """The turn of a photo that shows, or shares, a wrong heading; None where it stays as it is."""
         here_from_before = second_from_first(before.view, view)
         if here_from_before is None:
             return _carried(before, prior, self._settings.alike_deg)
-        if self._photos == 2:
-            before_from_here = np.asarray(np.linalg.inv(here_from_before), np.float64)
-            first = self._shown(before.prior, prior, view.size_px, before_from_here)
-            self.first_is_wrong = first is not None and self._is_wrong(first, before.prior)
-        shown = self._shown(prior, before.prior, before.view.size_px, here_from_before)
+        shown = self._shown(prior, before.right, before.view.size_px, here_from_before)
         if shown is None:
             return _carried(before, prior, self._settings.alike_deg)
         return shown if self._is_wrong(shown, prior) else None
@@ -117,6 +115,12 @@ class PhotoHeadings:
         rules = self._settings
         both_deg = float(np.hypot(shown.sigma_deg, prior.attitude_sigma_deg[2]))
         return abs(shown.turn_deg) > max(rules.wrong_deg, rules.wrong_sigmas * both_deg)
+
+
+def _is_usable(prior: CameraPrior) -> bool:
+    """Whether a camera's place and heading are known at all, and it looks about straight down."""
+    is_known = prior.knows_place and bool(np.isfinite(prior.attitude_sigma_deg[2])) and prior.position_m[2] > 0
+    return is_known and -float(prior.rotation[2, 2]) >= _LEAST_DOWN
 
 
 def _carried(before: _Last, prior: CameraPrior, alike_deg: float) -> _Turn | None:

@@ -118,6 +118,8 @@ class GroundPlaces:
         """Place a frame's detections on the ground and give them to their tracks."""
         prior = self._prior(frame)
         if self._headings is not None:
+            if self._taken is None:
+                self._see_next(frame, self._headings)
             prior = self._headings.take(frame.image, prior)
         self._taken = frame.index, prior
         return self._follower.take(frame, time_ns, found, prior)
@@ -155,20 +157,22 @@ class GroundPlaces:
         """(N, 2) where the camera was."""
         return self._follower.path_m()
 
+    def _see_next(self, first: Frame, headings: PhotoHeadings) -> None:
+        """Hold the first photo's heading against the photo after it."""
+        for frame in self._setup.source.frames(lambda index, _: index == first.index + 1):
+            if isinstance(frame, Frame):
+                headings.see(frame.image, self._prior(frame))
+            return
+
     def _heading_notices(self) -> tuple[Notice, ...]:
-        headings = self._headings
-        if headings is None or not (headings.turns_deg or headings.first_is_wrong):
+        turns_deg = [] if self._headings is None else self._headings.turns_deg
+        if not turns_deg:
             return ()
-        texts = []
-        if count := len(headings.turns_deg):
-            usual_deg = median(map(abs, headings.turns_deg))
-            texts.append(
-                f"the headings of {counted(count, 'photo')} are about {usual_deg:.0f} degrees off, as the ground shows "
-                "that they share with the photo before: corrected"
-            )
-        if headings.first_is_wrong:
-            texts.append("the first photo's heading seems wrong and is not corrected: what it shows may be misplaced")
-        return (Notice("headings_wrong", count + headings.first_is_wrong, "; ".join(texts)),)
+        text = (
+            f"headings about {median(map(abs, turns_deg)):.0f} degrees off, as the ground shows that photos share with "
+            f"the one before: corrected in {counted(len(turns_deg), 'photo')}"
+        )
+        return (Notice("headings_wrong", len(turns_deg), text),)
 
     def _compass_notices(self) -> tuple[Notice, ...]:
         clockwise_deg = self._follower.compass_clockwise_deg
