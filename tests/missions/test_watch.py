@@ -1,5 +1,6 @@
 """Mode 2 on small simulated flights with a truth-fed detector: what is found, placed, written, and sent."""
 
+import csv
 import json
 import re
 import shlex
@@ -433,6 +434,36 @@ def test_a_gimbal_that_is_half_a_turn_off(wrong: slice, photographed: Path, tmp_
     notices = {row["code"]: row for row in reports["wrong"]["notices"]}
     assert notices["headings_wrong"]["count"] == len(paths[wrong])
     assert all(row["code"] != "headings_wrong" for row in reports["right"]["notices"])
+
+
+@pytest.mark.parametrize(("off_deg", "part"), [(180.0, slice(60, 100)), (-90.0, slice(60, 100)), (12.0, slice(None))])
+def test_headings_of_a_video_that_are_far_off_are_set_right(
+    off_deg: float, part: slice, flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
+    """The same objects in the same places; a compass that is a little off is not one of those."""
+    lines = list(csv.DictReader((flown / "flight1" / "flight1.csv").open()))
+    for line in lines[part]:
+        for name in ("Yaw", "Gimbal:yaw"):
+            line[name] = f"{(float(line[name]) + off_deg + 180) % 360 - 180:.4f}"
+    with (tmp_path / "off.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, lines[0])
+        table.writeheader()
+        table.writerows(lines)
+    places = {}
+    for name, telemetry in {"right": flown / "flight1" / "flight1.csv", "off": tmp_path / "off.csv"}.items():
+        list(watch(
+            _video(flown), outputs=WatchOutputs(folder=tmp_path / name), camera=flown / "camera.xml", detector=detector,
+            telemetry=telemetry,
+        ))
+        places[name] = sorted(
+            (each["properties"]["class"], *each["geometry"]["coordinates"][:2])
+            for each in _read(tmp_path / name / "tracks.geojson")["features"]
+        )
+    notices = [row["code"] for row in _read(tmp_path / "off" / "report.json")["notices"]]
+    assert [each[0] for each in places["off"]] == [each[0] for each in places["right"]] and places["right"]
+    beside_deg = np.array([each[1:] for each in places["off"]]) - np.array([each[1:] for each in places["right"]])
+    assert np.abs(beside_deg).max() < 6e-5  # 6 m: what 12 degrees are over 25 m
+    assert ("headings_wrong" in notices) == (abs(off_deg) > 30)
 
 
 @pytest.mark.parametrize("shown_by", [1, 2])

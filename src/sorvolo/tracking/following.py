@@ -11,7 +11,8 @@ from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
 from sorvolo.survey.flight import CameraModel, CameraPrior, Frame
 from sorvolo.survey.objects import Detections, Sighting, Track
-from sorvolo.tracking.heading import CompassError, HeadingFromMotion
+from sorvolo.tracking.heading import CompassError, Heading, HeadingFromMotion
+from sorvolo.tracking.heading_check import HeadingTurn, heading_deg, is_checked, is_wrong, turned
 from sorvolo.tracking.image_motion import ImageMotion
 from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight, LocateSettings, locate
 from sorvolo.tracking.scene_scale import SceneScale
@@ -72,16 +73,18 @@ class GroundFollower:
     change it.
 
     `settings` are the tracker's, in metres. `ground` gives the ground's height over the flight's zero; None: it is
-    level. Without `knows_heading` the camera's heading comes from the pictures' motion. `unlocated` counts detections
-    without a place by reason.
+    level. Without `knows_heading` the camera's heading comes from the pictures' motion, which corrects one in a video
+    that is known and far off, too. `unlocated` counts detections without a place by reason.
     """
 
     def __init__(
-        self, camera: CameraModel, settings: TrackerSettings, ground: GroundHeight | None, *, knows_heading: bool
+        self, camera: CameraModel, settings: TrackerSettings, ground: GroundHeight | None, *, knows_heading: bool,
+        is_video: bool,
     ) -> None:
         self._camera, self._ground = camera, ground
         self._tracker = Tracker(settings)
         self._heading = None if knows_heading else _HeadingFromPictures()
+        self._check = _HeadingCheck() if knows_heading and is_video else None
         self._compass = CompassError()
         self._path: list[Floats] = []
         self.unlocated: Counter[str] = Counter()
@@ -103,6 +106,11 @@ class GroundFollower:
     def compass_clockwise_deg(self) -> float:
         """How far too far clockwise the compass reads, by what stands."""
         return self._compass.clockwise_deg
+
+    @property
+    def turns_deg(self) -> Sequence[float]:
+        """By how much, clockwise, headings of a video's frames were turned that were far off, a number each."""
+        return () if self._check is None else self._check.turns_deg
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Taken:
         """Place a frame's detections, seen from `prior`, on the ground and give them to their tracks."""
@@ -147,6 +155,8 @@ class GroundFollower:
         """The prior with its heading from the pictures, or with its compass corrected by what stands."""
         if self._heading is not None:
             return self._heading.take(frame, time_ns, found, prior)
+        if self._check is not None:
+            prior = self._check.take(frame, time_ns, found, prior)
         site_from_read = rotation_from_vector(np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)]))
         return replace(prior, rotation=site_from_read @ prior.rotation)
 
@@ -167,18 +177,48 @@ class _HeadingFromPictures:
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
         """The prior with the heading in it, where that is known by now."""
-        _, outline_px = self._motion.locate(found, frame, time_ns)
-        if self._motion.segments != self._segments:
-            self._segments = self._motion.segments
-            self._heading.lose()
-        if not prior.knows_place:
-            return prior
-        heading = self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
+        heading = self.heading(frame, time_ns, found, prior)
         if not np.isfinite(heading.sigma_deg):
             return prior
         sigma_deg = np.array([*prior.attitude_sigma_deg[:2], heading.sigma_deg])
         rotation = site_from_gimbal_rotation(heading.heading_deg, -90.0, 0.0)
         return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)
+
+    def heading(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Heading:
+        """The heading of a frame, which has to be given each; its sigma is infinite where it is not known by now."""
+        _, outline_px = self._motion.locate(found, frame, time_ns)
+        if self._motion.segments != self._segments:
+            self._segments = self._motion.segments
+            self._heading.lose()
+        if not prior.knows_place:
+            return Heading(0.0, float("inf"))
+        return self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
+
+
+class _HeadingCheck:
+    """A video's headings held against the motion that its pictures show, where the camera looks about straight down.
+
+    A heading that cannot be (`headings.is_wrong`) is turned to what the pictures show, and the next ones by as much
+    until they show otherwise. `turns_deg` are these turns, clockwise, one for each such frame.
+    """
+
+    def __init__(self) -> None:
+        self._pictures = _HeadingFromPictures()
+        self._turn: HeadingTurn | None = None
+        self.turns_deg: list[float] = []
+
+    def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
+        """The prior, turned where its heading is wrong."""
+        shown = self._pictures.heading(frame, time_ns, found, prior)
+        if not is_checked(prior):
+            return prior
+        if np.isfinite(shown.sigma_deg):
+            turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
+            self._turn = turn if is_wrong(turn, prior) else None
+        if self._turn is None:
+            return prior
+        self.turns_deg.append(self._turn.turn_deg)
+        return turned(prior, self._turn)
 
 
 class PictureFollower:

@@ -1,6 +1,6 @@
 """Headings of photos that telemetry has wrong, found by the ground that neighbours share."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,30 +8,19 @@ from sorvolo.geometry.arrays import ImageRGB, Matrix3, PointsM, PointsPx
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.level_ground import ground_from_pixels
-from sorvolo.geometry.pose import Pose, rotation_from_vector
+from sorvolo.geometry.pose import Pose
 from sorvolo.registration.shared_view import SmallView, second_from_first, small_view
 from sorvolo.survey.flight import CameraPrior
-
-_LEAST_DOWN = 0.96  # of the optical axis: 16 degrees off straight down or less; the heading of others is not checked
+from sorvolo.tracking.heading_check import HeadingTurn, is_checked, is_wrong, turned
 
 
 @dataclass(frozen=True)
 class PhotoHeadingSettings:
-    """When the ground that two photos share shows a heading, and when that counts against the telemetry's."""
+    """When the ground that two photos share shows a heading."""
 
     least_sigma_deg: float = 4.0  # of what is shown, however far apart the photos; as of `heading.HeadingSettings`
     most_sigma_deg: float = 20.0  # a heading shown less well is not used; by choice
-    wrong_deg: float = 30.0  # less is within what tilts, winds and small compasses do; by choice
-    wrong_sigmas: float = 4.0  # and it must be beyond what both sides may err by
     alike_deg: float = 45.0  # a photo that shows nothing shares its predecessor's error if their headings are as alike
-
-
-@dataclass(frozen=True)
-class _Turn:
-    """By how much a heading has to turn clockwise, and how well that is known."""
-
-    turn_deg: float
-    sigma_deg: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +30,7 @@ class _Last:
     view: SmallView
     prior: CameraPrior
     right: CameraPrior
-    turned: _Turn | None = None
+    turn: HeadingTurn | None = None
 
 
 class PhotoHeadings:
@@ -61,25 +50,23 @@ class PhotoHeadings:
 
     def see(self, image: ImageRGB, prior: CameraPrior) -> None:
         """Hold the next photo given to `take` against this one."""
-        self._last = _Last(small_view(image), prior, prior) if _is_usable(prior) else None
+        self._last = _Last(small_view(image), prior, prior) if is_checked(prior) else None
 
     def take(self, image: ImageRGB, prior: CameraPrior) -> CameraPrior:
         """A photo's prior, with the heading that its picture shows where telemetry's is wrong, else as it is."""
-        if not _is_usable(prior):
+        if not is_checked(prior):
             self._last = None
             return prior
         view = small_view(image)
-        turned = None if self._last is None else self._turned(view, prior, self._last)
+        turn = None if self._last is None else self._turn(view, prior, self._last)
         right = prior
-        if turned is not None:
-            self.turns_deg.append(turned.turn_deg)
-            turn = rotation_from_vector(np.array([0.0, 0.0, -np.radians(turned.turn_deg)]))
-            sigma_deg = np.array([*prior.attitude_sigma_deg[:2], turned.sigma_deg])
-            right = replace(prior, rotation=turn @ prior.rotation, attitude_sigma_deg=sigma_deg)
-        self._last = _Last(view, prior, right, turned)
+        if turn is not None:
+            self.turns_deg.append(turn.turn_deg)
+            right = turned(prior, turn)
+        self._last = _Last(view, prior, right, turn)
         return right
 
-    def _turned(self, view: SmallView, prior: CameraPrior, before: _Last) -> _Turn | None:
+    def _turn(self, view: SmallView, prior: CameraPrior, before: _Last) -> HeadingTurn | None:
         """The turn of a photo that shows, or shares, a wrong heading; None where it stays as it is."""
         here_from_before = second_from_first(before.view, view)
         if here_from_before is None:
@@ -87,11 +74,11 @@ class PhotoHeadings:
         shown = self._shown(prior, before.right, before.view.size_px, here_from_before)
         if shown is None:
             return _carried(before, prior, self._settings.alike_deg)
-        return shown if self._is_wrong(shown, prior) else None
+        return shown if is_wrong(shown, prior) else None
 
     def _shown(
         self, prior: CameraPrior, other: CameraPrior, other_size_px: tuple[int, int], here_from_other: Matrix3
-    ) -> _Turn | None:
+    ) -> HeadingTurn | None:
         """What the middle of another photo shows of a photo's heading; None where that is known too badly."""
         middle_px = (np.array([other_size_px[::-1]], np.float64) - 1) / 2
         seen_m = self._on_ground(apply_homography(here_from_other, middle_px), prior) - prior.position_m[:2]
@@ -103,34 +90,22 @@ class PhotoHeadings:
         fix_m = max(each.position_sigma_m[:2].max() for each in (prior, other))
         miss_m = np.sqrt(2) * np.hypot(fix_m, prior.position_m[2] * np.radians(tilt_deg))  # of both photos
         sigma_deg = float(np.hypot(np.degrees(miss_m / reach_m), self._settings.least_sigma_deg))
-        turn_deg = (_bearing_deg(true_m) - _bearing_deg(seen_m) + 180) % 360 - 180
-        return _Turn(turn_deg, sigma_deg) if sigma_deg <= self._settings.most_sigma_deg else None
+        turn_deg = _bearing_deg(true_m) - _bearing_deg(seen_m)
+        return HeadingTurn(turn_deg, sigma_deg) if sigma_deg <= self._settings.most_sigma_deg else None
 
     def _on_ground(self, pixels: PointsPx, prior: CameraPrior) -> PointsM:
         """(2,) where a pixel, (1, 2), lies on the level ground."""
         return ground_from_pixels(self._camera, Pose(prior.rotation, prior.position_m), pixels)[0]
 
-    def _is_wrong(self, shown: _Turn, prior: CameraPrior) -> bool:
-        """Whether the heading by telemetry is one that cannot be."""
-        rules = self._settings
-        both_deg = float(np.hypot(shown.sigma_deg, prior.attitude_sigma_deg[2]))
-        return abs(shown.turn_deg) > max(rules.wrong_deg, rules.wrong_sigmas * both_deg)
 
-
-def _is_usable(prior: CameraPrior) -> bool:
-    """Whether a camera's place and heading are known at all, and it looks about straight down."""
-    is_known = prior.knows_place and bool(np.isfinite(prior.attitude_sigma_deg[2])) and prior.position_m[2] > 0
-    return is_known and -float(prior.rotation[2, 2]) >= _LEAST_DOWN
-
-
-def _carried(before: _Last, prior: CameraPrior, alike_deg: float) -> _Turn | None:
+def _carried(before: _Last, prior: CameraPrior, alike_deg: float) -> HeadingTurn | None:
     """The turn of the photo before, for one with about the same heading by telemetry: it is wrong by the same."""
-    if before.turned is None:
+    if before.turn is None:
         return None
     cosine = (np.trace(before.prior.rotation.T @ prior.rotation) - 1) / 2
     if np.degrees(np.arccos(np.clip(cosine, -1, 1))) > alike_deg:
         return None
-    return _Turn(before.turned.turn_deg, float(np.hypot(before.turned.sigma_deg, prior.attitude_sigma_deg[2])))
+    return HeadingTurn(before.turn.turn_deg, float(np.hypot(before.turn.sigma_deg, prior.attitude_sigma_deg[2])))
 
 
 def _bearing_deg(east_north_m: PointsM) -> float:

@@ -81,10 +81,13 @@ class GroundPlaces:
 
     def __init__(self, setup: FlightSetup, settings: TrackerSettings, ground: GroundHeight | None) -> None:
         self._setup, self._over_model = setup, ground is not None
-        self._headings = PhotoHeadings(setup.source.camera.camera) if setup.source.kind == "photos" else None
+        is_video = setup.source.kind != "photos"
+        self._headings = None if is_video else PhotoHeadings(setup.source.camera.camera)
         self._taken: tuple[int, CameraPrior] | None = None  # the last frame taken, and its prior
         knows_heading = setup.track is None or setup.track.attitude != "none"
-        self._follower = GroundFollower(setup.source.camera, settings, ground, knows_heading=knows_heading)
+        self._follower = GroundFollower(
+            setup.source.camera, settings, ground, knows_heading=knows_heading, is_video=is_video
+        )
         self._site = new_site(setup, setup.source.name, 1.0, 0.0)
         if self._over_model:  # one height would stand for all objects
             self._site = replace(self._site, height_reference="above ground")
@@ -165,13 +168,12 @@ class GroundPlaces:
             return
 
     def _heading_notices(self) -> tuple[Notice, ...]:
-        turns_deg = [] if self._headings is None else self._headings.turns_deg
+        turns_deg = self._follower.turns_deg if self._headings is None else self._headings.turns_deg
         if not turns_deg:
             return ()
-        text = (
-            f"headings about {median(map(abs, turns_deg)):.0f} degrees off, as the ground shows that photos share with "
-            f"the one before: corrected in {counted(len(turns_deg), 'photo')}"
-        )
+        shown_by = "their motion shows" if self._headings is None else "the ground shows that photos share"
+        what = counted(len(turns_deg), "frame" if self._headings is None else "photo")
+        text = f"headings about {median(map(abs, turns_deg)):.0f} degrees off, as {shown_by}: corrected in {what}"
         return (Notice("headings_wrong", len(turns_deg), text),)
 
     def _compass_notices(self) -> tuple[Notice, ...]:
