@@ -459,11 +459,13 @@ def test_headings_of_a_video_that_are_far_off_are_set_right(
             (each["properties"]["class"], *each["geometry"]["coordinates"][:2])
             for each in _read(tmp_path / name / "tracks.geojson")["features"]
         )
-    notices = [row["code"] for row in _read(tmp_path / "off" / "report.json")["notices"]]
+    right, notices = (
+        [row["code"] for row in _read(tmp_path / name / "report.json")["notices"]] for name in ("right", "off")
+    )
     assert [each[0] for each in places["off"]] == [each[0] for each in places["right"]] and places["right"]
     beside_deg = np.array([each[1:] for each in places["off"]]) - np.array([each[1:] for each in places["right"]])
     assert np.abs(beside_deg).max() < 6e-5  # 6 m: what 12 degrees are over 25 m
-    assert ("headings_wrong" in notices) == (abs(off_deg) > 30)
+    assert ("headings_wrong" in notices) == (abs(off_deg) > 30) and "headings_wrong" not in right
 
 
 @pytest.mark.parametrize("shown_by", [1, 2])

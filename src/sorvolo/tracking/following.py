@@ -21,6 +21,8 @@ from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, Trac
 _MOST_DRONE_PLACES = 200_000  # frames: an hour and fifty minutes at 30 a second; by choice
 _GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since its pictures measure tilt; here nothing else does
 _LEAST_DOWN = 0.1  # of the optical axis: nearer to the horizon a sampling distance means nothing
+_TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
+_CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
 _OVER_MODEL = LocateSettings(ground_sigma_m=1.0)  # of a height model, where it stands on its own
 
 
@@ -169,11 +171,12 @@ class GroundFollower:
 
 
 class _HeadingFromPictures:
-    """The heading of a camera whose telemetry has none, from the motion that its pictures show."""
+    """The heading of a camera from the motion that its pictures show; without `over_guesses` the way begins anew where
+    a picture shows no motion that fits."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, over_guesses: bool = True) -> None:
         self._motion, self._heading = ImageMotion(), HeadingFromMotion()
-        self._segments = 1
+        self._segments, self._guessed, self._over_guesses = 1, 0, over_guesses
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
         """The prior with the heading in it, where that is known by now."""
@@ -187,9 +190,10 @@ class _HeadingFromPictures:
     def heading(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> Heading:
         """The heading of a frame, which has to be given each; its sigma is infinite where it is not known by now."""
         _, outline_px = self._motion.locate(found, frame, time_ns)
-        if self._motion.segments != self._segments:
-            self._segments = self._motion.segments
+        is_guess = self._motion.guessed != self._guessed and not self._over_guesses
+        if self._motion.segments != self._segments or is_guess:
             self._heading.lose()
+        self._segments, self._guessed = self._motion.segments, self._motion.guessed
         if not prior.knows_place:
             return Heading(0.0, float("inf"))
         return self._heading.add(time_ns / 1e9, outline_px, prior.position_m[:2])
@@ -198,13 +202,16 @@ class _HeadingFromPictures:
 class _HeadingCheck:
     """A video's headings held against the motion that its pictures show, where the camera looks about straight down.
 
-    A heading that cannot be (`headings.is_wrong`) is turned to what the pictures show, and the next ones by as much
-    until they show otherwise. `turns_deg` are these turns, clockwise, one for each such frame.
+    A heading that cannot be (`heading_check.is_wrong`) is turned to what the pictures show, and the next ones by as
+    much until they show otherwise. While the drone turns nothing is judged: telemetry's clock may be off. `turns_deg`
+    are these turns, clockwise, one for each such frame.
     """
 
     def __init__(self) -> None:
-        self._pictures = _HeadingFromPictures()
+        self._pictures = _HeadingFromPictures(over_guesses=False)
         self._turn: HeadingTurn | None = None
+        self._last: tuple[int, float] | None = None  # when the pictures last showed a heading, and which
+        self._steady_ns = 0  # the drone turns until then
         self.turns_deg: list[float] = []
 
     def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
@@ -212,13 +219,22 @@ class _HeadingCheck:
         shown = self._pictures.heading(frame, time_ns, found, prior)
         if not is_checked(prior):
             return prior
-        if np.isfinite(shown.sigma_deg):
+        if np.isfinite(shown.sigma_deg) and self._is_steady(time_ns, shown):
             turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
             self._turn = turn if is_wrong(turn, prior) else None
         if self._turn is None:
             return prior
         self.turns_deg.append(self._turn.turn_deg)
         return turned(prior, self._turn)
+
+    def _is_steady(self, time_ns: int, shown: Heading) -> bool:
+        """Whether the drone does not turn now, and did not a moment ago."""
+        before, self._last = self._last, (time_ns, shown.heading_deg)
+        if before is not None and time_ns > before[0]:
+            turned_deg = abs(HeadingTurn(shown.heading_deg - before[1], shown.sigma_deg).turn_deg)
+            if turned_deg * 1e9 / (time_ns - before[0]) > _TURNS_DEG_S:
+                self._steady_ns = time_ns + _CLOCK_OFF_NS
+        return time_ns >= self._steady_ns
 
 
 class PictureFollower:
