@@ -23,6 +23,7 @@ _GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since its picture
 _LEAST_DOWN = 0.1  # of the optical axis: nearer to the horizon a sampling distance means nothing
 _TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
 _CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
+_JUMP_DEG = 60.0  # from one frame to the next, against the pictures' own turning; by choice
 _OVER_MODEL = LocateSettings(ground_sigma_m=1.0)  # of a height model, where it stands on its own
 
 
@@ -203,14 +204,14 @@ class _HeadingCheck:
     """A video's headings held against the motion that its pictures show, where the camera looks about straight down.
 
     A heading that cannot be (`heading_check.is_wrong`) is turned to what the pictures show, and the next ones by as
-    much until they show otherwise. While the drone turns nothing is judged: telemetry's clock may be off. `turns_deg`
-    are these turns, clockwise, one for each such frame.
+    much until they show otherwise. While the drone turns nothing but a jump is judged: telemetry's clock may be off.
+    `turns_deg` are these turns, clockwise, one for each such frame.
     """
 
     def __init__(self) -> None:
         self._pictures = _HeadingFromPictures(over_guesses=False)
         self._turn: HeadingTurn | None = None
-        self._last: tuple[int, float] | None = None  # when the pictures last showed a heading, and which
+        self._last: tuple[int, float, float] | None = None  # time, heading, turn, as last shown
         self._steady_ns = 0  # the drone turns until then
         self.turns_deg: list[float] = []
 
@@ -219,22 +220,27 @@ class _HeadingCheck:
         shown = self._pictures.heading(frame, time_ns, found, prior)
         if not is_checked(prior):
             return prior
-        if np.isfinite(shown.sigma_deg) and self._is_steady(time_ns, shown):
-            turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
-            self._turn = turn if is_wrong(turn, prior) else None
+        if np.isfinite(shown.sigma_deg):
+            self._judge(time_ns, shown, prior)
         if self._turn is None:
             return prior
         self.turns_deg.append(self._turn.turn_deg)
         return turned(prior, self._turn)
 
-    def _is_steady(self, time_ns: int, shown: Heading) -> bool:
-        """Whether the drone does not turn now, and did not a moment ago."""
-        before, self._last = self._last, (time_ns, shown.heading_deg)
+    def _judge(self, time_ns: int, shown: Heading, prior: CameraPrior) -> None:
+        """Decide anew by how much headings have to turn, where the frame allows it."""
+        turn = HeadingTurn(shown.heading_deg - heading_deg(prior), shown.sigma_deg)
+        before, self._last = self._last, (time_ns, shown.heading_deg, turn.turn_deg)
+        jump_deg = 0.0
         if before is not None and time_ns > before[0]:
-            turned_deg = abs(HeadingTurn(shown.heading_deg - before[1], shown.sigma_deg).turn_deg)
-            if turned_deg * 1e9 / (time_ns - before[0]) > _TURNS_DEG_S:
+            turns_deg_s = abs(HeadingTurn(shown.heading_deg - before[1], 0.0).turn_deg) * 1e9 / (time_ns - before[0])
+            jump_deg = abs(HeadingTurn(turn.turn_deg - before[2], 0.0).turn_deg)
+            if turns_deg_s > _TURNS_DEG_S:
                 self._steady_ns = time_ns + _CLOCK_OFF_NS
-        return time_ns >= self._steady_ns
+        if time_ns >= self._steady_ns:
+            self._turn = turn if is_wrong(turn, prior) else None
+        elif jump_deg > _JUMP_DEG:  # no clock that is off does that
+            self._turn = turn if abs(turn.turn_deg) > _JUMP_DEG else None
 
 
 class PictureFollower:
