@@ -6,6 +6,7 @@ from dataclasses import replace
 from statistics import median
 from typing import Protocol
 
+from sorvolo.capture.source import LiveSource
 from sorvolo.detection.turning import is_from_above
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.pose import Pose
@@ -121,7 +122,7 @@ class GroundPlaces:
         """Place a frame's detections on the ground and give them to their tracks."""
         prior = self._prior(frame)
         if self._headings is not None:
-            if self._taken is None:
+            if self._taken is None and not isinstance(self._setup.source, LiveSource):
                 self._see_next(frame, self._headings)
             prior = self._headings.take(frame.image, prior)
         self._taken = frame.index, prior
