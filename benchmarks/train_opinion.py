@@ -111,14 +111,14 @@ class Cutter:
         found = self._detector.detect(image, tiles="auto", classes=("person",), least_score=LEAST)
         rows, right = judged_reports(found.boxes_px, shown.boxes, shown.ignored)
         rng = np.random.default_rng((5, number % 10000))
-        false = rows[~right]
+        false = rows[~right[rows]]
         chosen = [
-            *rng.permutation(rows[right])[:RIGHT], *false[:WORST], *rng.permutation(false[WORST:])[:OTHERS],
+            *rng.permutation(rows[right[rows]])[:RIGHT], *false[:WORST], *rng.permutation(false[WORST:])[:OTHERS],
         ]
         pictures = [cut_out(image, found.boxes_px[row].astype(float), LOOK_PX)[0] for row in chosen]
         return Cutouts(
             np.array(pictures, np.uint8).reshape(-1, CELL_PX, CELL_PX, 3), found.scores[chosen],
-            np.isin(chosen, rows[right]), np.full(len(chosen), _name(self._plan[source])),
+            right[np.array(chosen, int)], np.full(len(chosen), _name(self._plan[source])),
         )
 
 
