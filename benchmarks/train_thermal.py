@@ -135,7 +135,7 @@ def learnt(run: Descent, samples: Sequence[Sample]) -> float:
 
 
 def wanted(sample: Sample) -> Wanted:
-    """What a sample's cells should say."""
+    """What a sample's cells are to give."""
     boxes, ignored = (torch.tensor(np.reshape(each, (-1, 4)), dtype=torch.float32) for each in
                       (sample.boxes, sample.ignored))
     return Wanted(boxes, ignored, torch.tensor(sample.labels, dtype=torch.int64), torch.tensor(sample.known))

@@ -137,12 +137,13 @@ def test_a_leaky_unit_carries_features_on(model: Path, tmp_path: Path) -> None:
 def test_parts_that_are_named_stay_in_float(model: Path) -> None:
     packaged = find_model("thermal")
     whole = quantise(packaged, _pictures(8))
-    backbone = quantise(packaged, _pictures(8), float_parts=("neck", "proposals"))
+    backbone = quantise(packaged, _pictures(8), float_parts=("aerial/neck", "aerial/proposals"))
     assert 20 < backbone.convolutions < whole.convolutions
-    assert {weight.data_type for weight in _weights(backbone.model, "neck")} == {onnx.TensorProto.FLOAT}
-    piece = quantise(packaged, _pictures(8), float_parts=("neck", "proposals", "backbone/_blocks.1"))
+    assert {weight.data_type for weight in _weights(backbone.model, "aerial/neck")} == {onnx.TensorProto.FLOAT}
+    parts = "aerial/neck", "aerial/proposals", "aerial/backbone/_blocks.1"
+    piece = quantise(packaged, _pictures(8), float_parts=parts)
     assert backbone.convolutions - 3 == piece.convolutions, "the three of block 1, none of block 10"
-    with pytest.raises(SettingsError, match=r"no part tail; it has backbone, head, neck, proposals"):
+    with pytest.raises(SettingsError, match=r"no part tail; it has aerial/backbone, aerial/head, .*coco/head"):
         quantise(packaged, _pictures(8), float_parts=("tail",))
     with pytest.raises(SettingsError, match="no part neck"):
         quantise(model, _pictures(8), float_parts=("neck",))

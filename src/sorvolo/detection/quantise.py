@@ -99,12 +99,20 @@ def _chosen(graph: Any, path: Path, float_parts: Sequence[str]) -> list[str]:
     """The nodes to quantise. Raises SettingsError for a part that the graph lacks, InputError where none is left."""
     names = [node.name for node in graph.node]
     if unknown := [part for part in float_parts if not _has_part(names, part)]:
-        there = ", ".join(part for part in _PARTS if _has_part(names, part))
-        raise SettingsError(f"{path} has no part {', '.join(unknown)}; it has {there}")
+        raise SettingsError(f"{path} has no part {', '.join(unknown)}; it has {', '.join(_parts_of(names))}")
     chosen = [name for name in _quantisable(graph) if not _lies_in_any(name, float_parts)]
     if not chosen:
         raise InputError(f"{path} has no convolutions that lead to others: eight bits would gain nothing")
     return chosen
+
+
+def _parts_of(nodes: Sequence[str]) -> list[str]:
+    """The parts of a network, or of each network in a file that holds several, such as "aerial/neck"."""
+    networks = sorted({node.split("/")[1] for node in nodes if node.count("/") > 1} - set(_PARTS))
+    return [
+        part for part in (*_PARTS, *(f"{network}/{each}" for network in networks for each in _PARTS))
+        if _has_part(nodes, part)
+    ]
 
 
 def _has_part(nodes: Sequence[str], part: str) -> bool:
