@@ -187,7 +187,8 @@ def quantise(
     float_parts: Annotated[
         list[str] | None,
         typer.Option(
-            "--float", help="Leave a part in float: backbone, neck, proposals, backbone/_blocks.0. Can be repeated."
+            "--float", help="Leave a part in float: backbone, neck, proposals, backbone/_blocks.0; in a model of two "
+            "networks aerial/neck. Can be repeated."
         ),
     ] = None,
     weight_bits: Annotated[
