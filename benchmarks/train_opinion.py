@@ -1,17 +1,18 @@
-"""A judge of what is reported as people, on YOLOX-Nano's features (decision 0070).
+"""A judge of what is reported as people, on NanoDet's and EfficientNet-Lite0's features (decisions 0075 and 0082).
 
-python benchmarks/train_opinion.py DATA OUT --wheel WHEEL --scenes DIR
+python benchmarks/train_opinion.py DATA OUT --nanodet NANODET.json --lite0 LITE0 --scenes DIR
 
-WHEEL as in pack_yolox.py, DIR as in train_people.py. The packaged model searches pictures like those that its head for
-people learnt from (other draws), without a second look; some right and some false reports of each are cut out. YOLOX's
-features of a cut-out, pooled over its middle, go into a small network, which learns what to add to the report's own
-log-odds. YOLOX itself stays as COCO taught it. The flights `fixed_wing` and `brighton_beach`, aerial cars (people are
-in them, unlabelled) and all that detection_data.py holds out stay out.
+NANODET.json and LITE0 as in pack_opinion.py, DIR as in train_people.py. The packaged model searches pictures like those
+that its head for people learnt from (other draws), without a second look; some right and some false reports of each are
+cut out. Both networks' features of a cut-out, pooled over its middle, go into a small network, which learns what to add
+to the report's own log-odds. The networks themselves stay as COCO and ImageNet taught them. The flights `fixed_wing`
+and `brighton_beach`, aerial cars (people are in them, unlabelled) and all that detection_data.py holds out stay out.
 
-Writes OUT/cutouts-N.npz, read again where they are there, and OUT/judge.npz, which pack_yolox.py takes.
+Writes OUT/cutouts-N.npz, read again where they are there, and OUT/judge.npz, which pack_opinion.py takes.
 """
 
 import argparse
+import io
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,14 +24,15 @@ import torch
 from torch import nn
 
 from fit_second_look import balanced, bounded_odds, judged_reports
-from pack_yolox import CELL_PX, LOOK_PX, looking, published
+from pack_opinion import CELL_PX, LOOK_PX, Looking, looking
 from people_samples import Source, sources
 from provenance import commit
 from rendered_people import read_scenes
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.second_look import cut_out
+from sorvolo.detection.second_look import cut_out, turned
 from sorvolo.detection.session import Session
+from sorvolo.training.onnx_export import OPSET
 from train_people import Samples, simulated
 
 SAMPLES = (*range(10000, 14000), *range(20000, 24000))  # numbers of the draws, by choice
@@ -39,9 +41,10 @@ RIGHT, WORST, OTHERS = 4, 3, 2  # reports kept of a picture: right ones; false o
 LEFT_OUT, BARE = "aerial_cars", ("caliterra", "painted")  # not used; used without rendered people, too
 PART = 1000  # samples in a file
 ROWS, COLUMNS = 4, 8  # cells of a sheet
-TURNS = ((0, False), (1, False), (2, True), (3, True))  # quarters, and whether mirrored
+POSITIONS = 2  # in which a cut-out is learnt from: upright, turned by a quarter
 HIDDEN, NETWORKS, ROUNDS, BATCH, RATE, DECAY = 48, 3, 20, 128, 2e-3, 0.03
 DROPPED = 0.2, 0.3  # of the features, and of the hidden values
+MOST_TAKEN = 1500  # right reports, and false ones, of a source that are learnt from
 MOST_OF_A_SET = 600  # right reports, and false ones, of a source count as so many at most
 
 
@@ -60,19 +63,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--wheel", type=Path, required=True)
+    parser.add_argument("--nanodet", type=Path, required=True)
+    parser.add_argument("--lite0", type=Path, required=True)
     parser.add_argument("--scenes", type=Path, required=True)
     wishes = parser.parse_args()
     torch.set_num_threads(1)
     wishes.out.mkdir(parents=True, exist_ok=True)
-    cutouts = together(list(parts(wishes)))
+    cutouts = some(together(list(parts(wishes))))
     counts = {
         place: [int(np.count_nonzero((cutouts.places == place) & (cutouts.right == kind))) for kind in (True, False)]
         for place in sorted(set(cutouts.places.tolist()))
     }
     print("right and false:", counts, flush=True)
-    looks = Looks(wishes.wheel)
-    pooled = np.stack([looks.pooled(turned(cutouts.pictures, *how)) for how in TURNS], 1)
+    looks = Looks(looking(wishes.nanodet, wishes.lite0))
+    pooled = np.stack([looks.pooled(in_position(cutouts.pictures, each)) for each in range(POSITIONS)], 1)
     networks = [learnt(pooled, cutouts, seed) for seed in range(NETWORKS)]
     about = {"commit": commit(), "samples": len(SAMPLES), "right_and_false": counts, "networks": NETWORKS}
     np.savez(wishes.out / "judge.npz", **folded(networks, pooled), about=json.dumps(about))
@@ -134,20 +138,33 @@ def together(cuts: Sequence[Cutouts]) -> Cutouts:
     )
 
 
-def turned(pictures: np.ndarray, quarters: int, is_mirrored: bool) -> np.ndarray:
+def some(cutouts: Cutouts) -> Cutouts:
+    """At most MOST_TAKEN right ones and false ones of each source, drawn by chance."""
+    rng, taken = np.random.default_rng(SEED), []
+    for place in sorted(set(cutouts.places.tolist())):
+        for kind in (True, False):
+            own = np.flatnonzero((cutouts.places == place) & (cutouts.right == kind))
+            taken += rng.permutation(own)[:MOST_TAKEN].tolist()
+    rows = np.sort(taken)
+    return Cutouts(cutouts.pictures[rows], cutouts.scores[rows], cutouts.right[rows], cutouts.places[rows])
+
+
+def in_position(pictures: np.ndarray, position: int) -> np.ndarray:
     """The cut-outs (N, S, S, 3) in another position."""
-    way = np.rot90(pictures, quarters, axes=(1, 2))
-    return np.ascontiguousarray(way[:, :, ::-1] if is_mirrored else way)
+    return np.stack([turned(each, position) for each in pictures])
 
 
 class Looks:
-    """YOLOX's features of cut-outs, as the packed model sees them: side by side on sheets."""
+    """The features of cut-outs, as the packed model sees them: side by side on sheets."""
 
-    def __init__(self, wheel: Path) -> None:
-        options = onnxruntime.SessionOptions()
+    def __init__(self, network: Looking) -> None:
+        options, buffer = onnxruntime.SessionOptions(), io.BytesIO()
         options.intra_op_num_threads = 1
-        model = looking(published(wheel)).SerializeToString()
-        self._session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+        sheet = torch.zeros(1, 3, ROWS * CELL_PX, COLUMNS * CELL_PX, dtype=torch.uint8)
+        torch.onnx.export(
+            network, (sheet,), buffer, input_names=["image"], output_names=["pooled"], opset_version=OPSET, dynamo=False
+        )
+        self._session = onnxruntime.InferenceSession(buffer.getvalue(), options, providers=["CPUExecutionProvider"])
 
     def pooled(self, pictures: np.ndarray) -> np.ndarray:
         """(N, D) float16. Neighbours on a sheet are drawn by chance: a network sees beyond a cell's edge."""

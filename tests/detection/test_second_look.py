@@ -145,6 +145,32 @@ def test_a_crowd_costs_no_more_than_its_share() -> None:
     assert opinions(none, np.zeros((640, 640, 3), np.uint8), sees, how) == {} and not shown, "nothing to look at"
 
 
+def test_each_position_shows_the_report_where_it_is_said_to_be_and_all_count_alike() -> None:
+    """A bar with a mark at one end: upright, turned by a quarter, by two and mirrored, by three and mirrored."""
+    picture = np.zeros((300, 300, 3), np.uint8)
+    picture[100:180, 140:160] = 255
+    picture[100:110, 140:145] = (255, 0, 0)
+    bar = Seen(np.array([[140, 100, 160, 180]], np.float32), np.array([0.9]), np.zeros(1, np.int64))
+    sheets: list[ImageRGB] = []
+
+    def sees(sheet: ImageRGB) -> Seen:
+        sheets.append(sheet)
+        rows, columns = np.nonzero(sheet[..., 0] > 200)
+        box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
+        return Seen(np.array([box], np.float32), np.array([0.1 * len(sheets)]), np.zeros(1, np.int64))
+
+    how = SecondLook((60.0,), own=0.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0, positions=4)
+    np.testing.assert_allclose(opinions(bar, picture, sees, {0: how})[0], [0.1, 0.2, 0.3, 0.4])
+    upright, quarter, mirrored_half, mirrored_quarter = sheets
+    np.testing.assert_array_equal(quarter, np.rot90(upright))
+    np.testing.assert_array_equal(mirrored_half, upright[::-1], err_msg="half a turn, mirrored, is upside down")
+    np.testing.assert_array_equal(mirrored_quarter, np.rot90(upright, 3)[:, ::-1])
+    sheets.clear()
+    odds = np.log(np.array([0.1, 0.2, 0.3, 0.4]) / np.array([0.9, 0.8, 0.7, 0.6]))
+    after = looked_again(bar, picture, sees, {0: how})
+    assert after.scores[0] == pytest.approx(1 / (1 + math.exp(-odds.mean()))), "the mean of the positions' log-odds"
+
+
 def test_looks_that_would_only_blur_are_left_out() -> None:
     how = SecondLook((34.0, 68.0), 0.5, 0.5, 0.0, 0.5, enlarged=1.5)
     assert how.sides_px(10) == (34.0,), "the smallest stays"
@@ -167,7 +193,8 @@ def test_cut_outs_at_the_edge_show_the_report_where_it_is_said_to_be(box: tuple[
     "wrong",
     [
         {"dog": HOW}, {"person": HOW | {"looks_px": []}}, {"person": HOW | {"looks_px": [0]}},
-        {"person": HOW | {"least": 1.5}}, {"person": HOW | {"own": float("nan")}}, {"person": {}}, ["person"],
+        {"person": HOW | {"positions": 0}}, {"person": HOW | {"positions": 5}}, {"person": HOW | {"least": 1.5}},
+        {"person": HOW | {"own": float("nan")}}, {"person": {}}, ["person"],
     ],
 )
 def test_weights_that_cannot_be(tmp_path: Path, wrong: Any) -> None:

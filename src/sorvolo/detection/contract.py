@@ -19,13 +19,17 @@ _FALLBACK_STRIDE = 32  # px: what a picture's sides are multiples of, in a model
 _NEEDED = ("name", "classes", "thresholds", "best_px")
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 
+MOST_POSITIONS = 4
+"""In which a second look may show a report."""
+
 
 @dataclass(frozen=True)
 class SecondLook:
     """How reports of a class are looked at again (`second_look`).
 
     `looks_px`: in each look the report's longer side has so many pixels. A look that would show it more than `enlarged`
-    times as large is left out, but for the smallest: blur shows nothing. A report's log-odds become `shift`,
+    times as large is left out, but for the smallest: blur shows nothing. Each look is taken in so many `positions`: as
+    it is, turned by a quarter, by two and mirrored, by three and mirrored. A report's log-odds become `shift`,
     `own` times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked
     at. `by`: the installed model that looks, "" for the same one; another errs in other places.
     """
@@ -37,6 +41,7 @@ class SecondLook:
     least: float
     enlarged: float
     by: str = ""
+    positions: int = 1
 
     def sides_px(self, longer_px: float) -> tuple[float, ...]:
         """The looks at a report whose longer side has so many pixels in its picture."""
@@ -156,8 +161,11 @@ def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str,
             raise ValueError(f"its second_look must name classes and sizes of theirs, not {name} {list(looks_px)}")
         if not all(map(math.isfinite, weights)) or not 0 <= weights[3] <= 1:
             raise ValueError(f"its second_look must have finite weights and a least score, not {weights}")
+        positions = int(each.get("positions", 1))
+        if not 1 <= positions <= MOST_POSITIONS:
+            raise ValueError(f"its second_look must have 1 to {MOST_POSITIONS} positions, not {positions}")
         own, again, shift, least, enlarged = weights
-        found[name] = SecondLook(looks_px, own, again, shift, least, enlarged, str(each.get("by", "")))
+        found[name] = SecondLook(looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions)
     return found
 
 

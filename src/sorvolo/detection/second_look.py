@@ -17,6 +17,8 @@ from sorvolo.detection.session import Seen
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.box_overlap import iou_matrix
 
+_MIRRORED = 2  # positions from this one on are mirrored
+
 Sees = Callable[[ImageRGB], Seen]
 """What a model finds in a picture, (H, W, 3) RGB, in the labels of the one that reported."""
 
@@ -26,9 +28,9 @@ class SheetSettings:
     """How cut-outs are laid side by side on one picture. Weights hold for the values that they were fitted with."""
 
     cell_px: int = 128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
-    columns: int = 8  # cut-outs in a row of the sheet
-    share: float = 0.25  # of the picture's pixels that the sheet has at most; in a crowd the others keep their score
-    cuts: tuple[int, int] = (8, 96)  # cut-outs of one picture, best reports first: at least so many may be, and at most
+    columns: int = 8  # cut-outs in a row of a sheet
+    share: float = 0.25  # of the picture's pixels that a position has at most; in a crowd the others keep their score
+    cuts: tuple[int, int] = (8, 96)  # cut-outs of one picture in one position, best first: at least, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
     surest: float = 0.98  # no first score counts for more, so that the second look can overrule it (decision 0075)
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
@@ -72,7 +74,7 @@ def opinions(
     seen: Seen, picture: ImageRGB, sees: Sees, hows: Mapping[int, SecondLook],
     settings: SheetSettings = SheetSettings(),
 ) -> dict[int, Floats]:
-    """The scores (looks,) of each report's looks, by its row, for those that are looked at again."""
+    """The scores (looks in all positions,) of each report, by its row, for those that are looked at again."""
     cuts: list[_Cut] = []
     room = _most_cuts(picture, settings)
     for looks in _cuts(seen, picture, hows, settings):
@@ -81,8 +83,29 @@ def opinions(
         cuts += looks
     if not cuts:
         return {}
-    scores, rows = _scores(cuts, sees, settings), np.array([each.row for each in cuts])
-    return {row: scores[rows == row] for row in dict.fromkeys(rows.tolist())}
+    found: dict[int, list[float]] = {}
+    for position in range(max(how.positions for how in hows.values())):
+        shown = [_in_position(each, position) for each in cuts if position < hows[each.label].positions]
+        for each, score in zip(shown, _scores(shown, sees, settings).tolist()):
+            found.setdefault(each.row, []).append(score)
+    return {row: np.array(scores) for row, scores in found.items()}
+
+
+def turned(cell: ImageRGB, position: int) -> ImageRGB:
+    """A cut-out (S, S, 3) in another position: turned so many quarters counter-clockwise, from two on mirrored, too."""
+    way = np.rot90(cell, position)
+    return np.ascontiguousarray(way[:, ::-1] if position >= _MIRRORED else way)
+
+
+def _in_position(cut: _Cut, position: int) -> _Cut:
+    side, box_px = cut.picture.shape[0], cut.box_px
+    for _ in range(position):
+        left, top, right, bottom = box_px
+        box_px = np.array([top, side - right, bottom, side - left])
+    if position >= _MIRRORED:
+        left, top, right, bottom = box_px
+        box_px = np.array([side - right, top, side - left, bottom])
+    return _Cut(cut.row, cut.label, turned(cut.picture, position), box_px)
 
 
 def _most_cuts(picture: ImageRGB, settings: SheetSettings) -> int:
@@ -124,7 +147,7 @@ def cut_out(
 
 
 def _scores(cuts: Sequence[_Cut], sees: Sees, settings: SheetSettings) -> Floats:
-    """(looks,) what each look makes of its report; all on one sheet."""
+    """(cuts,) what is made of each cut-out; all on one sheet."""
     cell, columns = settings.cell_px, min(settings.columns, len(cuts))
     rows = math.ceil(len(cuts) / columns)
     sheet = np.full((rows * cell, columns * cell, 3), settings.filling, np.uint8)
