@@ -124,7 +124,8 @@ def flight(looker: Looker, data: Path, name: str, out: Path | None) -> dict[str,
         shown = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
         picture, m_per_px = np.ascontiguousarray(shown[..., ::-1]), M_PER_PX[name] * SCALE
         least = min(how.least for how in looker.whole.info.second_look.values())
-        first, after = (possible(each, shown, m_per_px) for each in looker.looks(picture, SHOWN, m_per_px, least))
+        looks = looker.looks(picture, SHOWN, m_per_px, least)
+        first, after = (possible(each, shown, m_per_px, thresholds) for each in looks)
         for label, box, was, score in followed(first, after):
             stages = was >= thresholds[label], score >= thresholds[label]
             counts[label]["before"] += stages[0]
