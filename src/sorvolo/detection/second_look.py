@@ -1,8 +1,8 @@
-"""Reports looked at again: cut out with their surroundings and shown at other sizes, to the same model or another one.
+"""Reports looked at again: cut out with what is around them, shown at other sizes and turned, to this model or another.
 
-A boulder that looks like a person at one size seldom does at others (decision 0049), and one that fools one network
-seldom fools another that learnt from other pictures (decision 0054). Only what was reported is looked at again, all of
-a picture side by side on one sheet, so that it costs little.
+A boulder that looks like a person once seldom does so at other sizes (decision 0049) and turned, nor to a judge that
+learnt what fools the first look (decision 0082). Only what was reported is looked at again, all of a picture side by
+side on one sheet a position, so that it costs little.
 """
 
 import math
