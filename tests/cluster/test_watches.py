@@ -72,8 +72,8 @@ def test_a_killed_watch_goes_on_and_leaves_what_an_undisturbed_one_leaves(flown:
     row, copy = sorted(report.rows, key=lambda each: each.state)
     assert (row.state, row.tries, report.crashes, row.site, row.flight) == (State.DONE, 2, 1, "one-watch", "one")
     assert (copy.state, copy.words) == (State.DUPLICATE, f"the same flight as {flight}")
-    assert row.words == "1 car found in 4 frames"
-    assert alerts.read_text().split("\n") == ["one car", ""]
+    assert row.words == "1 car, 1 person found in 4 frames"
+    assert sorted(alerts.read_text().splitlines()) == ["one car", "one person"]
 
     again = ended(run_batch([tmp_path / "in"], tmp_path / "out", settings, local()))
     assert (again.tries, again.counts()) == (0, {"known": 1, "duplicate": 1})
@@ -102,7 +102,7 @@ def test_a_stream_whose_watch_dies_goes_on_in_the_same_folder(flown: Path, tmp_p
         "waits for memory or cores that others have; it starts when they are known to be free", ""
     ]
     assert (row.state, row.tries, row.site, row.flight) == (State.DONE, 2, "north-watch", "one")
-    assert row.words == "1 car found in 4 frames"
+    assert row.words == "1 car, 1 person found in 4 frames"
     assert [path.name for path in (tmp_path / "out" / "north-watch").iterdir()] == ["one"]
     folder = tmp_path / "out" / "north-watch" / "one"
     lines = (folder / "detections.jsonl").read_text().splitlines()
