@@ -180,7 +180,7 @@ def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
     assert {each.found.partition(" at ")[0] for each in updates if each.found} == {"car 1"}
     last = updates[-1].row
     assert last is not None and (last.state, last.tries, last.words) == (
-        State.DONE, 1, "1 car found in 4 frames"
+        State.DONE, 1, "1 car, 1 person found in 4 frames"
     )
     assert (tmp_path / "out" / "north-watch" / "one" / "report.html").is_file()
 
@@ -261,7 +261,7 @@ def test_a_stream_whose_actor_dies_goes_on_in_the_same_folder(cluster: Any, flow
     ))
     (row,) = report.rows
     assert (row.state, row.tries, report.crashes) == (State.DONE, 2, 1)
-    assert row.words == "1 car found in 4 frames"
+    assert row.words == "1 car, 1 person found in 4 frames"
     assert [path.name for path in (tmp_path / "out" / "north-watch").iterdir()] == ["one"]
 
 
