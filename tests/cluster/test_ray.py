@@ -177,7 +177,7 @@ def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
         lambda table: ray_executor("ray", 1, 60.0, table.root), threading.Event(),
     )
     updates = list(running)
-    assert {each.found.partition(" at ")[0] for each in updates if each.found} == {"car 1"}
+    assert {each.found.partition(" at ")[0] for each in updates if each.found} == {"car 2", "person 1"}
     last = updates[-1].row
     assert last is not None and (last.state, last.tries, last.words) == (
         State.DONE, 1, "1 car, 1 person found in 4 frames"
