@@ -85,6 +85,7 @@ $(WRITING)/.ready: requirements-docs.lock
 # the locks' packages are unpacked, one lock after the other: both name some of the same.
 PIP := pip install --quiet --disable-pip-version-check --no-deps --no-compile
 MAKEFLAGS += --jobs=2
+unexport PYTHONDONTWRITEBYTECODE  # set in many containers: each process would compile all that it imports
 
 $(READY): $(VENV)/.locked $(VENV)/.built
 	touch $@
