@@ -1,10 +1,9 @@
 """Weights of people's second look: benchmarks/fit_second_look.py DATA OUT --model FILE --scenes DIR --things DIR
 
 The model searches development pictures, without a second look. What it reports is cut out and shown to another model
-(--by), its longer side LOOK_PX long, and gets the box that it sees, from PLACED_FROM_PX on. A logistic regression of
-the report's own log-odds and the other's states how likely the report is right; each set is judged by weights that did
-not see it. The threshold is the least of THRESHOLDS at which photos of each real ground have at most ALARMS false
-reports each.
+(--by), its longer side LOOK_PX long. A logistic regression of the report's own log-odds and the other's states how
+likely the report is right; each set is judged by weights that did not see it. The threshold is the least of THRESHOLDS
+at which photos of each real ground have at most ALARMS false reports each.
 
 Development pictures: real ground (the flights `caliterra` to its 46th photo and `fixed_wing`, without people, and
 `brighton_beach`, whose people are in brighton_people.json; the second painted over as well), tinyperson's and hituav's
@@ -35,7 +34,7 @@ from rendered_people import Scene, read_scenes
 from sorvolo.detection.contract import SecondLook
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.second_look import SheetSettings, opinions, placed_again
+from sorvolo.detection.second_look import SheetSettings, opinions
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
@@ -46,7 +45,6 @@ from train_judge import RIGHT_IOU, UNSURE_IOU, fitted
 
 PERSON, THERMAL = 0, "hituav"
 LEAST, POSITIONS = 0.3, 2
-PLACED_FROM_PX = 20.0  # a third of LOOK_PX: of what is enlarged more a cut-out shows blur (decision 0083)
 PEOPLE = Path(__file__).parent / "brighton_people.json"
 RENDERED, PAINTED, FRAMES, SIDE_PX, SEED = 60, 15, 60, 640, 5
 THRESHOLDS, ALARMS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9), 0.12  # 2 of brighton_beach's 18 photos
@@ -187,18 +185,12 @@ def reported(detector: Detector, by: Session, shot: Shot) -> Iterator[Report]:
         shot.image, tiles="auto", m_per_px=shot.m_per_px, classes=("person",), least_score=LEAST
     )
     seen = Seen(first.boxes_px, first.scores, first.labels)
-    how = SecondLook(
-        (LOOK_PX,), own=0.0, again=1.0, shift=0.0, least=LEAST, enlarged=np.inf, positions=POSITIONS,
-        placed_from_px=PLACED_FROM_PX,
-    )
+    how = SecondLook((LOOK_PX,), own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf, positions=POSITIONS)
     again = opinions(seen, shot.image, by.see, {PERSON: how}, SheetSettings(cuts=(MOST_CUTS, MOST_CUTS)))
-    looked = {row: float(1 / (1 + np.exp(-bounded_odds(each.scores).mean()))) for row, each in again.items()}
-    boxes_px = placed_again(seen, again, {PERSON: how}).boxes_px
-    order = np.argsort([-looked.get(row, 0.0) for row in range(len(boxes_px))], kind="stable")
-    people_px = shot.truth.boxes_px[shot.truth.labels == PERSON]
-    rows, right = judged_reports(boxes_px[order], people_px, shot.truth.ignored_px)
-    for row, is_right in zip(order[rows].tolist(), right[rows].tolist()):
-        yield Report(shot.place, shot.name, float(seen.scores[row]), looked.get(row, np.nan), is_right)
+    rows, right = judged_reports(seen.boxes_px, shot.truth.boxes_px[shot.truth.labels == PERSON], shot.truth.ignored_px)
+    for row in rows.tolist():
+        looked = float(1 / (1 + np.exp(-bounded_odds(again[row]).mean()))) if row in again else np.nan
+        yield Report(shot.place, shot.name, float(seen.scores[row]), looked, bool(right[row]))
 
 
 def judged_reports(
@@ -242,7 +234,7 @@ def fit_of(reports: Sequence[Report], photos: Mapping[str, int]) -> dict[str, An
         "threshold": min(quiet, default=max(THRESHOLDS)),
     }
     return {
-        "looks_px": [LOOK_PX], "positions": POSITIONS, "placed_from_px": PLACED_FROM_PX,
+        "looks_px": [LOOK_PX], "positions": POSITIONS,
         **{name: round(float(each), 3) for name, each in weights.items()},
         "reports": len(reports), "photos": dict(photos),
         "right_and_false": {

@@ -18,7 +18,7 @@ from pack_default_model import HOME
 from sorvolo.detection.contract import METADATA_KEY
 
 MODELS = ("default", "default-int8")
-KEYS = ("looks_px", "positions", "own", "again", "shift", "least", "enlarged", "by", "placed_from_px")
+KEYS = ("looks_px", "positions", "own", "again", "shift", "least", "enlarged", "by")
 FIGURES = "before and after the second look (benchmarks/second_look.py)"
 
 
@@ -26,7 +26,7 @@ def main() -> None:
     """Rewrite both files and their cards."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights", type=Path)
-    parser.add_argument("--version", default="11")
+    parser.add_argument("--version", default="10")
     parser.add_argument("--measured", type=Path, help="results of second_look.py")
     parser.add_argument("--home", type=Path, default=HOME)
     wishes = parser.parse_args()

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 import detection_data
 from false_alarms import FIRST, M_PER_PX, SCALE, SHOWN, crop, possible, sheet
@@ -28,7 +27,6 @@ from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import score_set
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.geometry.box_overlap import iou_matrix
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
@@ -141,13 +139,10 @@ def flight(looker: Looker, data: Path, name: str, out: Path | None) -> dict[str,
 
 
 def followed(first: Detections, after: Detections) -> Iterator[tuple[str, np.ndarray, float, float]]:
-    """Each report's class, box (4,), and its scores before and after; 0 after for one that another's new box took."""
-    overlaps = iou_matrix(first.boxes_px, after.boxes_px)
-    overlaps[np.array(first.names)[:, None] != np.array(after.names)[None]] = 0
-    rows, columns = linear_sum_assignment(-overlaps)
-    became = {row: column for row, column in zip(rows, columns) if overlaps[row, column] > 0}
-    for row, (label, box, score) in enumerate(zip(first.names, first.boxes_px, first.scores)):
-        yield label, box, float(score), float(after.scores[became[row]]) if row in became else 0.0
+    """Each report's class, box (4,), and its scores before and after."""
+    for label, box, score in zip(first.names, first.boxes_px, first.scores):
+        same = (after.boxes_px == box).all(axis=1) & (np.array(after.names) == label)
+        yield label, box, float(score), float(after.scores[same].max(initial=0.0))
 
 
 def labelled(looker: Looker, data: Path, name: str) -> dict[str, object]:

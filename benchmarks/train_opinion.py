@@ -1,14 +1,12 @@
-"""A judge of what is reported as people, and who draws their boxes anew (decisions 0075, 0082 and 0083).
+"""A judge of what is reported as people, on NanoDet's and EfficientNet-Lite0's features (decisions 0075 and 0082).
 
 python benchmarks/train_opinion.py DATA OUT --nanodet NANODET.json --lite0 LITE0 --scenes DIR
 
 NANODET.json and LITE0 as in pack_opinion.py, DIR as in train_people.py. The packaged model searches pictures like those
-that its head for people learnt from (other draws), without a second look; some of what it reports near people and some
-of what else it reports is cut out. Both networks' features of a cut-out go into two small networks. One learns where
-the person's box is. The other, on features pooled over the middle, learns what to add to the report's own log-odds;
-right is a report whose new box is. NanoDet and EfficientNet-Lite0 stay as COCO and ImageNet taught them. The
-flights `fixed_wing` and `brighton_beach`, aerial cars (people are in them, unlabelled) and all that detection_data.py
-holds out stay out.
+that its head for people learnt from (other draws), without a second look; some right and some false reports of each are
+cut out. Both networks' features of a cut-out, pooled over its middle, go into a small network, which learns what to add
+to the report's own log-odds. The networks themselves stay as COCO and ImageNet taught them. The flights `fixed_wing`
+and `brighton_beach`, aerial cars (people are in them, unlabelled) and all that detection_data.py holds out stay out.
 
 Writes OUT/cutouts-N.npz, read again where they are there, and OUT/judge.npz, which pack_opinion.py takes.
 """
@@ -25,46 +23,37 @@ import onnxruntime
 import torch
 from torch import nn
 
-from fit_second_look import POSITIONS, balanced, bounded_odds
-from pack_opinion import CELL_PX, LOOK_PX, PLACER, STRIDES, Looking, Placer, looking, pooled
+from fit_second_look import POSITIONS, balanced, bounded_odds, judged_reports
+from pack_opinion import CELL_PX, LOOK_PX, Looking, looking
 from people_samples import Source, sources
 from provenance import commit
 from rendered_people import read_scenes
-from sorvolo.detection.contract import POSITIONS as ALL_POSITIONS
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.second_look import box_back, box_in_position, cut_out, in_position
+from sorvolo.detection.second_look import cut_out, in_position
 from sorvolo.detection.session import Session
-from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
 from sorvolo.training.onnx_export import OPSET
-from train_judge import RIGHT_IOU, UNSURE_IOU
 from train_people import Samples, simulated
 
 SAMPLES = (*range(10000, 14000), *range(20000, 24000))  # numbers of the draws, by choice
 LEAST, SIDE_PX, SEED = 0.15, 512, 7177
-NEAR, WORST, OTHERS = 5, 3, 2  # reports kept of a picture: near people; of others the surest, and some by chance
-NEAR_IOU = 0.15  # a report that overlaps a person so much is near; a box is learnt from it
-MOVED, GROWN, STRETCHED = 0.12, 0.15, 0.1  # spreads by which a box near a person is moved for one cut-out more
+RIGHT, WORST, OTHERS = 4, 3, 2  # reports kept of a picture: right ones; false ones, the surest, and by chance
 LEFT_OUT, BARE = "aerial_cars", ("caliterra", "painted")  # not used; used without rendered people, too
 PART = 1000  # samples in a file
 ROWS, COLUMNS = 4, 8  # cells of a sheet
 HIDDEN, NETWORKS, ROUNDS, BATCH, RATE, DECAY = 48, 3, 20, 128, 2e-3, 0.03
 DROPPED = 0.2, 0.3  # of the features, and of the hidden values
-PLACER_ROUNDS, PLACER_BATCH, PLACER_RATE, EDGES = 12, 64, 1.5e-3, 2.0  # EDGES: how much more they count than overlap
-MOST_PLACED, MOST_TAKEN = 4000, 1500  # cut-outs of a source near people, and away from them, that are learnt from
+MOST_TAKEN = 1500  # right reports, and false ones, of a source that are learnt from
 MOST_OF_A_SET = 600  # right reports, and false ones, of a source count as so many at most
 
 
 @dataclass(frozen=True, eq=False)
 class Cutouts:
-    """Reports cut out, (N, cell, cell, 3), with their scores, their sources, and the nearest person's box (N, 4) px.
-
-    Boxes lie in the cut-outs; NaN where nobody is near.
-    """
+    """Reports cut out, (N, cell, cell, 3), with their scores, whether they are right, and from which source."""
 
     pictures: np.ndarray
     scores: np.ndarray
-    people: np.ndarray
+    right: np.ndarray
     places: np.ndarray
 
 
@@ -79,27 +68,18 @@ def main() -> None:
     wishes = parser.parse_args()
     torch.set_num_threads(1)
     wishes.out.mkdir(parents=True, exist_ok=True)
-    cutouts = together(list(parts(wishes)))
-    looks = Looks(looking(wishes.nanodet, wishes.lite0))
-    draws = placed(looks, some(cutouts, (True,), MOST_PLACED))
-    chosen = some(cutouts, (True, False), MOST_TAKEN)
-    features, boxes = zip(*(looked(looks, draws, chosen, number) for number in range(POSITIONS)))
-    overlaps = ious(np.mean(boxes, axis=0), chosen.people)
-    known = ~((overlaps > UNSURE_IOU) & (overlaps < RIGHT_IOU))
-    right, places, scores = overlaps[known] >= RIGHT_IOU, chosen.places[known], chosen.scores[known]
+    cutouts = some(together(list(parts(wishes))))
     counts = {
-        place: [int(np.count_nonzero((places == place) & (right == kind))) for kind in (True, False)]
-        for place in sorted(set(places.tolist()))
+        place: [int(np.count_nonzero((cutouts.places == place) & (cutouts.right == kind))) for kind in (True, False)]
+        for place in sorted(set(cutouts.places.tolist()))
     }
     print("right and false:", counts, flush=True)
-    shown = np.stack(features, 1)[known]
-    networks = [learnt(shown, scores, right, places, seed) for seed in range(NETWORKS)]
+    looks = Looks(looking(wishes.nanodet, wishes.lite0))
+    shown = (np.stack([in_position(each, number) for each in cutouts.pictures]) for number in range(POSITIONS))
+    pooled = np.stack([looks.pooled(each) for each in shown], 1)
+    networks = [learnt(pooled, cutouts, seed) for seed in range(NETWORKS)]
     about = {"commit": commit(), "samples": len(SAMPLES), "right_and_false": counts, "networks": NETWORKS}
-    drawn = {
-        PLACER + name: each.numpy() if name.startswith("scale") else each.half().float().numpy()
-        for name, each in draws.state_dict().items()
-    }
-    np.savez(wishes.out / "judge.npz", **folded(networks, shown), **drawn, about=json.dumps(about))
+    np.savez(wishes.out / "judge.npz", **folded(networks, pooled), about=json.dumps(about))
 
 
 def parts(wishes: argparse.Namespace) -> Iterator[Cutouts]:
@@ -110,10 +90,10 @@ def parts(wishes: argparse.Namespace) -> Iterator[Cutouts]:
         if not path.is_file():
             cutter = cutter or Cutter(wishes)
             cut = together([cutter.cut(number) for number in SAMPLES[first : first + PART]])
-            np.savez(path, pictures=cut.pictures, scores=cut.scores, people=cut.people, places=cut.places)
+            np.savez(path, pictures=cut.pictures, scores=cut.scores, right=cut.right, places=cut.places)
             print(path.name, len(cut.scores), flush=True)
         with np.load(path) as file:
-            yield Cutouts(file["pictures"], file["scores"], file["people"], file["places"])
+            yield Cutouts(file["pictures"], file["scores"], file["right"], file["places"])
 
 
 class Cutter:
@@ -133,36 +113,17 @@ class Cutter:
         shown, source = self._samples.made(number), self._samples.source(number)
         image = np.ascontiguousarray(shown.image)
         found = self._detector.detect(image, tiles="auto", classes=("person",), least_score=LEAST)
-        boxes = found.boxes_px.astype(float)
-        shows = cover_matrix(boxes, shown.ignored).max(1, initial=0) <= 0.5
-        overlaps = iou_matrix(boxes, shown.boxes)
-        is_near = overlaps.max(1, initial=0) > NEAR_IOU
+        rows, right = judged_reports(found.boxes_px, shown.boxes, shown.ignored)
         rng = np.random.default_rng((5, number % 10000))
-        false = np.flatnonzero(shows & ~is_near)
-        cuts: list[tuple[int, np.ndarray, np.ndarray]] = []
-        for row in rng.permutation(np.flatnonzero(shows & is_near))[:NEAR]:
-            person = shown.boxes[overlaps[row].argmax()]
-            cuts += [(row, boxes[row], person), (row, _moved(boxes[row], rng), person)]
-        for row in (*false[:WORST], *rng.permutation(false[WORST:])[:OTHERS]):
-            cuts.append((row, boxes[row], np.full(4, np.nan)))
-        pictures, people = [], []
-        for _, box_px, person in cuts:
-            picture, edges_px = cut_out(image, box_px, LOOK_PX)
-            scale = (edges_px[2:] - edges_px[:2]) / (box_px[2:] - box_px[:2])
-            pictures.append(picture)
-            people.append(edges_px + (person - box_px) * np.tile(scale, 2))
+        false = rows[~right[rows]]
+        chosen = [
+            *rng.permutation(rows[right[rows]])[:RIGHT], *false[:WORST], *rng.permutation(false[WORST:])[:OTHERS],
+        ]
+        pictures = [cut_out(image, found.boxes_px[row].astype(float), LOOK_PX)[0] for row in chosen]
         return Cutouts(
-            np.array(pictures, np.uint8).reshape(-1, CELL_PX, CELL_PX, 3), found.scores[[row for row, _, _ in cuts]],
-            np.array(people).reshape(-1, 4), np.full(len(cuts), _name(self._plan[source])),
+            np.array(pictures, np.uint8).reshape(-1, CELL_PX, CELL_PX, 3), found.scores[chosen],
+            right[np.array(chosen, int)], np.full(len(chosen), _name(self._plan[source])),
         )
-
-
-def _moved(box_px: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The box of another look at the same, less well placed."""
-    size = box_px[2:] - box_px[:2]
-    middle = (box_px[:2] + box_px[2:]) / 2 + rng.normal(0, MOVED, 2) * size
-    half = size / 2 * np.exp(rng.normal(0, GROWN) + rng.normal(0, STRETCHED, 2))
-    return np.concatenate([middle - half, middle + half])
 
 
 def _name(source: Source) -> str:
@@ -173,19 +134,19 @@ def together(cuts: Sequence[Cutouts]) -> Cutouts:
     """All of them."""
     return Cutouts(
         np.concatenate([each.pictures for each in cuts]), np.concatenate([each.scores for each in cuts]),
-        np.concatenate([each.people for each in cuts]), np.concatenate([each.places for each in cuts]),
+        np.concatenate([each.right for each in cuts]), np.concatenate([each.places for each in cuts]),
     )
 
 
-def some(cutouts: Cutouts, kinds: Sequence[bool], most: int) -> Cutouts:
-    """At most so many of each source, drawn by chance: of those near people (True), of the others (False)."""
-    rng, taken, is_near = np.random.default_rng(SEED), [], np.isfinite(cutouts.people[:, 0])
+def some(cutouts: Cutouts) -> Cutouts:
+    """At most MOST_TAKEN right ones and false ones of each source, drawn by chance."""
+    rng, taken = np.random.default_rng(SEED), []
     for place in sorted(set(cutouts.places.tolist())):
-        for kind in kinds:
-            own = np.flatnonzero((cutouts.places == place) & (is_near == kind))
-            taken += rng.permutation(own)[:most].tolist()
+        for kind in (True, False):
+            own = np.flatnonzero((cutouts.places == place) & (cutouts.right == kind))
+            taken += rng.permutation(own)[:MOST_TAKEN].tolist()
     rows = np.sort(taken)
-    return Cutouts(cutouts.pictures[rows], cutouts.scores[rows], cutouts.people[rows], cutouts.places[rows])
+    return Cutouts(cutouts.pictures[rows], cutouts.scores[rows], cutouts.right[rows], cutouts.places[rows])
 
 
 class Looks:
@@ -196,125 +157,45 @@ class Looks:
         options.intra_op_num_threads = 1
         sheet = torch.zeros(1, 3, ROWS * CELL_PX, COLUMNS * CELL_PX, dtype=torch.uint8)
         torch.onnx.export(
-            network, (sheet,), buffer, input_names=["image"], output_names=[f"stride_{each}" for each in STRIDES],
-            opset_version=OPSET, dynamo=False,
+            network, (sheet,), buffer, input_names=["image"], output_names=["pooled"], opset_version=OPSET, dynamo=False
         )
         self._session = onnxruntime.InferenceSession(buffer.getvalue(), options, providers=["CPUExecutionProvider"])
 
-    def levels(self, pictures: np.ndarray) -> Iterator[tuple[np.ndarray, list[torch.Tensor]]]:
-        """Rows of the cut-outs, and their features (rows, D, side, side) of each stride, a sheet at a time.
-
-        Neighbours on a sheet are drawn by chance: a network sees beyond a cell's edge.
-        """
+    def pooled(self, pictures: np.ndarray) -> np.ndarray:
+        """(N, D) float16. Neighbours on a sheet are drawn by chance: a network sees beyond a cell's edge."""
         order = np.random.default_rng(1).permutation(len(pictures))
+        rows = []
         for start in range(0, len(order), ROWS * COLUMNS):
-            rows = order[start : start + ROWS * COLUMNS]
+            own = pictures[order[start : start + ROWS * COLUMNS]]
             cells = np.full((ROWS * COLUMNS, CELL_PX, CELL_PX, 3), 114, np.uint8)
-            cells[: len(rows)] = pictures[rows]
+            cells[: len(own)] = own
             grid = cells.reshape(ROWS, COLUMNS, CELL_PX, CELL_PX, 3).transpose(4, 0, 2, 1, 3)
-            found = self._session.run(None, {"image": grid.reshape(1, 3, ROWS * CELL_PX, COLUMNS * CELL_PX)})
-            yield rows, [torch.from_numpy(_cells(each)[: len(rows)]) for each in found]
+            (found,) = self._session.run(["pooled"], {"image": grid.reshape(1, 3, ROWS * CELL_PX, COLUMNS * CELL_PX)})
+            rows.append(found[0].reshape(found.shape[1], -1).T[: len(own)].astype(np.float16))
+        pooled = np.concatenate(rows)
+        return pooled[np.argsort(order)]
 
 
-def _cells(level: np.ndarray) -> np.ndarray:
-    """A sheet's features (1, D, H, W) cell by cell, (cells, D, side, side)."""
-    side = level.shape[2] // ROWS
-    apart = level[0].reshape(level.shape[1], ROWS, side, COLUMNS, side).transpose(1, 3, 0, 2, 4)
-    return np.ascontiguousarray(apart.reshape(-1, level.shape[1], side, side))
-
-
-def placed(looks: Looks, cutouts: Cutouts) -> Placer:
-    """Who draws the boxes of those near people, learnt from each cut-out in one position drawn by chance."""
-    torch.manual_seed(SEED)
-    drawn = np.random.default_rng(SEED).integers(0, len(ALL_POSITIONS), len(cutouts.scores))
-    pictures = np.stack([in_position(each, number) for each, number in zip(cutouts.pictures, drawn)])
-    boxes_px = np.stack([box_in_position(each, number, CELL_PX) for each, number in zip(cutouts.people, drawn)])
-    people = torch.tensor(boxes_px, dtype=torch.float32)
-    features: list[torch.Tensor] = []
-    for rows, levels in looks.levels(pictures):
-        features = features or [torch.empty((len(pictures), *each.shape[1:]), dtype=torch.float16) for each in levels]
-        for whole, part in zip(features, levels):
-            whole[rows] = part.half()
-    scales = [_scale(each) for each in features]
-    network = Placer(scales).train()
-    counts = torch.tensor(balanced(cutouts.places, np.ones(len(people), bool), MOST_OF_A_SET), dtype=torch.float32)
-    steps = PLACER_ROUNDS * -(-len(people) // PLACER_BATCH)
-    optimiser = torch.optim.AdamW(network.parameters(), PLACER_RATE, weight_decay=DECAY)
-    rates = torch.optim.lr_scheduler.OneCycleLR(optimiser, PLACER_RATE, total_steps=steps)
-    for turn in range(PLACER_ROUNDS):
-        met = []
-        for rows in torch.randperm(len(people)).split(PLACER_BATCH):
-            boxes = network([each[rows].float() for each in features])[:, :, 0, 0]
-            overlaps, losses = place_loss(boxes, people[rows])
-            optimiser.zero_grad()
-            (losses * counts[rows]).mean().backward()
-            optimiser.step()
-            rates.step()
-            met.append(float(overlaps.detach().mean()))
-        print(f"boxes, round {turn}: overlap {np.mean(met):.3f}", flush=True)
-    return network.eval()
-
-
-def _scale(features: torch.Tensor) -> np.ndarray:
-    """(2, D) means and spreads of a level's features (N, D, side, side), of a tenth of them."""
-    some_of = features[::10].float()
-    return torch.stack([some_of.mean((0, 2, 3)), some_of.std((0, 2, 3)) + 1e-2]).numpy()
-
-
-def place_loss(boxes: torch.Tensor, people: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """(N,) overlaps of boxes (N, 4) px with people's, and losses: generalised IoU (Rezatofighi 2019) and edges."""
-    near, far = torch.maximum(boxes[:, :2], people[:, :2]), torch.minimum(boxes[:, 2:], people[:, 2:])
-    shared = (far - near).clamp(min=0).prod(1)
-    union = (boxes[:, 2:] - boxes[:, :2]).clamp(min=1e-3).prod(1) + (people[:, 2:] - people[:, :2]).prod(1) - shared
-    around = torch.maximum(boxes[:, 2:], people[:, 2:]) - torch.minimum(boxes[:, :2], people[:, :2])
-    hull = around.prod(1)
-    edges = nn.functional.smooth_l1_loss(boxes / LOOK_PX, people / LOOK_PX, beta=0.1, reduction="none").mean(1)
-    return shared / union, 1 - shared / union + (hull - union) / hull + EDGES * edges
-
-
-def ious(boxes: np.ndarray, people: np.ndarray) -> np.ndarray:
-    """(N,) overlap of each box (N, 4) with its person's (N, 4); 0 where that is NaN."""
-    near, far = np.maximum(boxes[:, :2], people[:, :2]), np.minimum(boxes[:, 2:], people[:, 2:])
-    shared = np.clip(far - near, 0, None).prod(1)
-    union = (boxes[:, 2:] - boxes[:, :2]).prod(1) + (people[:, 2:] - people[:, :2]).prod(1) - shared
-    return np.nan_to_num(shared / union)
-
-
-@torch.inference_mode()
-def looked(looks: Looks, draws: Placer, cutouts: Cutouts, number: int) -> tuple[np.ndarray, np.ndarray]:
-    """Cut-outs in one position: features (N, D) float16, and boxes (N, 4) px in the cut-outs as they were."""
-    pictures = np.stack([in_position(each, number) for each in cutouts.pictures])
-    features, boxes = None, np.zeros((len(pictures), 4))
-    for rows, levels in looks.levels(pictures):
-        own = pooled(levels)[:, :, 0, 0].numpy().astype(np.float16)
-        features = np.zeros((len(pictures), own.shape[1]), np.float16) if features is None else features
-        features[rows] = own
-        boxes[rows] = draws(levels)[:, :, 0, 0].numpy()
-    return features, np.stack([box_back(each, number, CELL_PX) for each in boxes])
-
-
-def learnt(
-    features: np.ndarray, scores: np.ndarray, right: np.ndarray, places: np.ndarray, seed: int
-) -> nn.Sequential:
+def learnt(pooled: np.ndarray, cutouts: Cutouts, seed: int) -> nn.Sequential:
     """A network for features (N, turns, D): what it adds to a report's own log-odds, times a number that it learns."""
     torch.manual_seed(seed)
-    mean, spread = scaled(features)
-    inputs, is_right = torch.tensor((features - mean) / spread), torch.tensor(right, dtype=torch.float32)
-    own = torch.tensor(bounded_odds(scores), dtype=torch.float32)
-    counts = torch.tensor(balanced(places, right, MOST_OF_A_SET), dtype=torch.float32)
+    mean, spread = scaled(pooled)
+    inputs, right = torch.tensor((pooled - mean) / spread), torch.tensor(cutouts.right, dtype=torch.float32)
+    own = torch.tensor(bounded_odds(cutouts.scores), dtype=torch.float32)
+    counts = torch.tensor(balanced(cutouts.places, cutouts.right, MOST_OF_A_SET), dtype=torch.float32)
     network = nn.Sequential(
         nn.Dropout(DROPPED[0]), nn.Linear(inputs.shape[2], HIDDEN), nn.ReLU(), nn.Dropout(DROPPED[1]),
         nn.Linear(HIDDEN, 1),
     )
     share = nn.Parameter(torch.tensor(0.5))
     optimiser = torch.optim.AdamW([*network.parameters(), share], RATE, weight_decay=DECAY)
-    steps = ROUNDS * -(-len(is_right) // BATCH)
+    steps = ROUNDS * -(-len(right) // BATCH)
     rates = torch.optim.lr_scheduler.OneCycleLR(optimiser, RATE, total_steps=steps)
     for _ in range(ROUNDS):
-        for rows in torch.randperm(len(is_right)).split(BATCH):
+        for rows in torch.randperm(len(right)).split(BATCH):
             turn = int(torch.randint(inputs.shape[1], ()))
             odds = network(inputs[rows, turn])[:, 0] + share * own[rows]
-            losses = nn.functional.binary_cross_entropy_with_logits(odds, is_right[rows], reduction="none")
+            losses = nn.functional.binary_cross_entropy_with_logits(odds, right[rows], reduction="none")
             optimiser.zero_grad()
             (losses * counts[rows]).mean().backward()
             optimiser.step()
@@ -323,15 +204,15 @@ def learnt(
     return network.eval()
 
 
-def scaled(features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def scaled(pooled: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(D,) the features' means and spreads, float32."""
-    rows = features.reshape(-1, features.shape[-1])
+    rows = pooled.reshape(-1, pooled.shape[-1])
     return rows.mean(0, dtype=np.float32), rows.astype(np.float32).std(0) + np.float32(1e-3)
 
 
-def folded(networks: Sequence[nn.Sequential], features: np.ndarray) -> dict[str, np.ndarray]:
+def folded(networks: Sequence[nn.Sequential], pooled: np.ndarray) -> dict[str, np.ndarray]:
     """The mean of the networks as one, for features as they are: its two layers, float32."""
-    mean, spread = scaled(features)
+    mean, spread = scaled(pooled)
     firsts = [each[1].weight.detach().numpy() / spread for each in networks]
     biases = [each[1].bias.detach().numpy() - first @ mean for each, first in zip(networks, firsts)]
     lasts = [each[4].weight.detach().numpy()[0] / len(networks) for each in networks]

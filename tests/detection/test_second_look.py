@@ -1,28 +1,18 @@
 """A second look at reports: what stands it, what falls, what it costs, and who gets it."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from test_sharing import sharing
 from toy_models import draw, rectangle_model
 
-from sorvolo.detection.contract import POSITIONS, SecondLook
+from sorvolo.detection.contract import SecondLook
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.detection.second_look import (
-    SheetSettings,
-    box_back,
-    box_in_position,
-    cut_out,
-    in_position,
-    looked_again,
-    opinions,
-)
+from sorvolo.detection.second_look import SheetSettings, cut_out, looked_again, opinions
 from sorvolo.detection.session import Seen, Session, read_info
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
@@ -170,7 +160,7 @@ def test_each_position_shows_the_report_where_it_is_said_to_be_and_all_count_ali
         return Seen(np.array([box], np.float32), np.array([0.1 * len(sheets)]), np.zeros(1, np.int64))
 
     how = SecondLook((60.0,), own=0.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0, positions=4)
-    np.testing.assert_allclose(opinions(bar, picture, sees, {0: how})[0].scores, [0.1, 0.2, 0.3, 0.4])
+    np.testing.assert_allclose(opinions(bar, picture, sees, {0: how})[0], [0.1, 0.2, 0.3, 0.4])
     upright, quarter, mirrored_half, mirrored_quarter = sheets
     np.testing.assert_array_equal(quarter, np.rot90(upright))
     np.testing.assert_array_equal(mirrored_half, upright[::-1], err_msg="half a turn, mirrored, is upside down")
@@ -179,55 +169,6 @@ def test_each_position_shows_the_report_where_it_is_said_to_be_and_all_count_ali
     odds = np.log(np.array([0.1, 0.2, 0.3, 0.4]) / np.array([0.9, 0.8, 0.7, 0.6]))
     after = looked_again(bar, picture, sees, {0: how})
     assert after.scores[0] == pytest.approx(1 / (1 + math.exp(-odds.mean()))), "the mean of the positions' log-odds"
-
-
-def whole_bars(sheet: ImageRGB) -> Seen:
-    """Sees the whole of each bar of a sheet."""
-    shown = (sheet[..., 1] > 200).astype(np.uint8)
-    _, _, stats, _ = cv2.connectedComponentsWithStats(shown)
-    boxes = [[left, top, left + width, top + height] for left, top, width, height, _ in stats[1:].tolist()]
-    return Seen(np.array(boxes, np.float32).reshape(-1, 4), np.full(len(boxes), 0.9), np.zeros(len(boxes), np.int64))
-
-
-@pytest.mark.parametrize("positions", [1, 2, 4])
-def test_a_report_gets_the_box_that_the_looks_see_and_two_of_one_thing_become_one(positions: int) -> None:
-    picture = np.zeros((300, 400, 3), np.uint8)
-    picture[100:140, 140:172] = 255
-    picture[220:232, 20:40] = 255
-    picture[40:100, 300:330] = 255
-    wide, tall, small, near = [118, 84, 194, 152], [130, 76, 174, 178], [22, 218, 36, 230], [298, 44, 334, 104]
-    seen = Seen(np.array([wide, tall, small, near], np.float32), np.array([0.9, 0.8, 0.7, 0.6]), np.zeros(4, int))
-    how = SecondLook((60.0,), 0.5, 0.5, 0.0, 0.5, 9.0, positions=positions, placed_from_px=20.0)
-    after = looked_again(seen, picture, whole_bars, {0: how})
-    np.testing.assert_allclose(after.boxes_px, [[140, 100, 172, 140], small, near], atol=2.0)
-    np.testing.assert_array_equal(after.boxes_px[1], small, err_msg="too small to be seen better")
-    np.testing.assert_array_equal(after.boxes_px[2], near, err_msg="seen where it was reported")
-    as_they_were = looked_again(seen, picture, whole_bars, {0: replace(how, placed_from_px=math.inf)})
-    np.testing.assert_array_equal(as_they_were.boxes_px, seen.boxes_px)
-    np.testing.assert_array_equal(as_they_were.scores[[0, 2, 3]], after.scores)
-
-
-def test_a_new_box_does_not_reach_beyond_the_picture() -> None:
-    picture = np.full((120, 160, 3), 255, np.uint8)
-    seen = Seen(np.array([[100, 60, 158, 110]], np.float32), np.array([0.9]), np.zeros(1, np.int64))
-
-    def all_of_it(sheet: ImageRGB) -> Seen:
-        return Seen(np.array([[0, 0, 128, 128]], np.float32), np.array([0.9]), np.zeros(1, np.int64))
-
-    how = SecondLook((60.0,), 0.5, 0.5, 0.0, 0.5, 9.0, placed_from_px=20.0)
-    left, top, right, bottom = looked_again(seen, picture, all_of_it, {0: how}).boxes_px[0].tolist()
-    assert left < 100 and top < 60 and (right, bottom) == (160, 120)
-
-
-@pytest.mark.parametrize("position", range(len(POSITIONS)))
-def test_a_box_comes_back_from_every_position(position: int) -> None:
-    box = np.array([10.0, 20, 50, 100])
-    there = box_in_position(box, position, 128)
-    shown = np.zeros((128, 128, 3), np.uint8)
-    shown[20:100, 10:50] = 255
-    rows, columns = np.nonzero(in_position(shown, position)[..., 0])
-    np.testing.assert_allclose(there, [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1])
-    np.testing.assert_allclose(box_back(there, position, 128), box)
 
 
 def test_looks_that_would_only_blur_are_left_out() -> None:
@@ -253,7 +194,6 @@ def test_cut_outs_at_the_edge_show_the_report_where_it_is_said_to_be(box: tuple[
     [
         {"dog": HOW}, {"person": HOW | {"looks_px": []}}, {"person": HOW | {"looks_px": [0]}},
         {"person": HOW | {"positions": 0}}, {"person": HOW | {"positions": 5}}, {"person": HOW | {"least": 1.5}},
-        {"person": HOW | {"placed_from_px": 0}},
         {"person": HOW | {"own": float("nan")}}, {"person": {}}, ["person"],
     ],
 )

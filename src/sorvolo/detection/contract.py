@@ -31,9 +31,7 @@ class SecondLook:
     times as large is left out, but for the smallest: blur shows nothing. Each look is taken in the first
     `positions` of POSITIONS. A report's log-odds become `shift`,
     `own` times themselves and `again` times the mean of the looks'. `least`: the score from which on a report is looked
-    at. `by`: the installed model that looks, "" for the same one; another errs in other places. `placed_from_px`: a
-    report whose longer side has so many pixels or more gets the looks' mean box, where that lies elsewhere; of
-    smaller ones a cut-out shows no more than the picture did.
+    at. `by`: the installed model that looks, "" for the same one; another errs in other places.
     """
 
     looks_px: tuple[float, ...]
@@ -44,7 +42,6 @@ class SecondLook:
     enlarged: float
     by: str = ""
     positions: int = 1
-    placed_from_px: float = math.inf
 
     def sides_px(self, longer_px: float) -> tuple[float, ...]:
         """The looks at a report whose longer side has so many pixels in its picture."""
@@ -167,13 +164,8 @@ def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str,
         positions = int(each.get("positions", 1))
         if not 1 <= positions <= len(POSITIONS):
             raise ValueError(f"its second_look must have 1 to {len(POSITIONS)} positions, not {positions}")
-        placed_from_px = float(each.get("placed_from_px", math.inf))
-        if not placed_from_px > 0:
-            raise ValueError(f"its second_look must place anew from some pixels on, not from {placed_from_px}")
         own, again, shift, least, enlarged = weights
-        found[name] = SecondLook(
-            looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions, placed_from_px
-        )
+        found[name] = SecondLook(looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions)
     return found
 
 
