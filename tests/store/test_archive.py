@@ -5,6 +5,7 @@ import json
 import sqlite3
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.schema import SCHEMA_VERSION
+from sorvolo.store.site.tiles import TileBlobs
 from sorvolo.survey.mosaic import Status
 
 
@@ -147,6 +149,31 @@ def test_leaving_without_commit_changes_nothing(folder: Path) -> None:
         assert (archive.flights(), archive.versions(), sorted(folder.rglob("*.[pj]*g"))) == before
         assert np.array_equal(archive.live_tiles()[0, 0], tile(23))
         assert not (folder / "flights" / "b").exists()
+
+
+def test_a_flight_that_is_left_writes_no_more(file_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads write tiles: what they had begun has ended, and gone, before another may write the site."""
+    with opened(file_folder) as archive:
+        map_flight(archive, "a", 20)
+        before = sorted(file_folder.rglob("*.png"))
+        keep, begun, ended = TileBlobs.keep, [], []
+
+        def slow(self: TileBlobs, data: bytes) -> str:
+            begun.append(data)
+            time.sleep(0.2)
+            sha256 = keep(self, data)
+            ended.append(data)
+            return sha256
+
+        monkeypatch.setattr(TileBlobs, "keep", slow)
+        with pytest.raises(ZeroDivisionError), archive.begin_flight("b", "", {}, tiles_mb=1) as writer:
+            for column in range(4):
+                writer.tiles[column, 7] = tile(200 + column)
+            raise ZeroDivisionError
+        assert len(begun) == len(ended)
+        assert sorted(file_folder.rglob("*.png")) == before
+        time.sleep(0.5)
+        assert sorted(file_folder.rglob("*.png")) == before
 
 
 def test_mapping_again_keeps_the_rank_and_shows_the_former_run_until_the_commit(folder: Path) -> None:

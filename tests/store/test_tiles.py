@@ -62,7 +62,7 @@ def test_growing_tiles_are_a_dict(steps: list[tuple[str, TileIndex, int]], limit
                 assert blobs.stored() == set(rows.values()) | set(base.values())
             assert set(tiles) == set(truth) and len(tiles) == len(truth)
         assert {key: int(tile[0, 0, 0]) for key, tile in tiles.items()} == truth
-        tiles.save()  # waits for the threads that write, before their folder goes
+        tiles.close()  # before their folder goes
         blobs.sync()
 
 

@@ -71,10 +71,11 @@ def paint_share(
         alive()
         return image_from_jpeg(files[frame_id].read_bytes(), str(files[frame_id]))
 
-    painted = GrowingTiles(tile_blobs(folder), {}, plan.grid.tile_px, memory_bytes // 4)
-    canvas = Canvas(plan.grid, painted, ImageCache(picture, memory_bytes // 2).get, within=tiles)
-    canvas.paint([plan.frames[at] for at in near])
-    rows = [[*tile, sha256] for tile, sha256 in sorted(painted.save().items()) if sha256 is not None]
+    with closing(GrowingTiles(tile_blobs(folder), {}, plan.grid.tile_px, memory_bytes // 4)) as painted:
+        canvas = Canvas(plan.grid, painted, ImageCache(picture, memory_bytes // 2).get, within=tiles)
+        canvas.paint([plan.frames[at] for at in near])
+        saved = painted.save()
+    rows = [[*tile, sha256] for tile, sha256 in sorted(saved.items()) if sha256 is not None]
     atomic_write_bytes(_share_path(folder, number), json.dumps(rows).encode())
 
 

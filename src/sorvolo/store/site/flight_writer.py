@@ -67,6 +67,7 @@ class FlightWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._growing.close()
         if not self._is_open:
             return
         self._is_open = False

@@ -271,6 +271,10 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self._changed.clear()
         return changed
 
+    def close(self) -> None:
+        """End the threads that write; what they have not begun is not written any more."""
+        self._writers.shutdown(cancel_futures=True)
+
     def release(self) -> None:
         """Drop from memory what is on the disk."""
         for index in self._loaded.keys() - self._unsaved:
