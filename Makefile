@@ -1,4 +1,4 @@
-# make demo: a map of a simulated flight. make test: what has to pass, in 12 minutes; make test-long: the few tests of
+# make demo: a map of a simulated flight. make test: what has to pass, in 15 minutes; make test-long: the few tests of
 # much work beside it. They make their own environment in .venv.
 PYTHON ?= python3
 VENV := .venv

@@ -135,6 +135,15 @@ def test_band_spans_hold_exactly_the_x_of_points_in_the_band(corners, low, width
         assert min(abs(b - end) for end in ends) < 1e-9
 
 
+@pytest.mark.parametrize("east", [0.0, 4000.0])
+@pytest.mark.parametrize("low", [-1.2e-153, -1e-14, 0.0, 1e-14])
+def test_a_band_whose_edge_misses_a_corner_by_rounding(east, low):
+    ring = np.array([[east, 0], [east, -1], [east + 1, -1]])
+    beside, within = band_spans([ring], [(low, low + 1), (low - 1, low)])
+    assert np.allclose(beside, east, atol=1e-9)
+    assert np.allclose(within, [(east, east + 1)], atol=1e-9)
+
+
 def test_a_hole_splits_a_narrow_band_only():
     split, whole = band_spans([SQUARE, HOLE], [(1.8, 2.2), (0.5, 2.2)])
     assert split == [(0.0, 1.0), (3.0, 4.0)] and whole == [(0.0, 4.0)]

@@ -17,6 +17,7 @@ from sorvolo.geometry.arrays import Floats, PointsM
 _MOST_HULL_CORNERS = 1000  # what follows takes the square of their number
 _HULL_TOLERANCE = 1e-6  # of the extent, where a hull has more corners than that
 _PARTED = 1e-3  # of the reach: what touches is parted so far, by choice; far above rounding, far below what is flown
+_ROUNDING_M = 1e-9  # parts of a band so near touch
 _LOCATION = re.compile(r"\[(\S+) (\S+)\]$")
 
 
@@ -63,7 +64,7 @@ def band_spans(
 ) -> list[list[tuple[float, float]]]:
     """For each band low <= y <= high the x-extents of the polygon's parts in it, in order, touching ones joined.
 
-    A polygon that crosses itself is first made one that does not, by the even-odd rule.
+    A polygon that crosses itself is first made one that does not, by the even-odd rule. What has no area is no part.
     """
     polygon = _polygon(rings)
     if not shapely.is_valid(polygon):
@@ -71,8 +72,11 @@ def band_spans(
     left, _, right, _ = shapely.bounds(polygon)
     found = []
     for low, high in bands:
-        bounds = shapely.bounds(shapely.get_parts(shapely.clip_by_rect(polygon, left - 1.0, low, right + 1.0, high)))
-        found.append(join_spans([(float(x0), float(x1)) for x0, _, x1, _ in bounds if np.isfinite(x0)], 0.0))
+        # not clip_by_rect, which fails where a band's edge and a corner differ by rounding alone
+        parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(left - 1.0, low, right + 1.0, high)))
+        is_area = shapely.area(parts) > 0
+        spans = [(float(x0), float(x1)) for x0, _, x1, _ in shapely.bounds(parts[is_area])]
+        found.append(join_spans(spans, _ROUNDING_M))
     return found
 
 
