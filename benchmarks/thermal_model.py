@@ -2,8 +2,8 @@
 
 BEFORE and AFTER are model files or names of installed models. Both are shown frames as `tiles="auto"` shows them; AP by
 pycocotools, differences over the same draws of flights; seconds by the clock for a frame of 640x512, in turn. Writes
-results/thermal_together.json (results/thermal_model.json is that of version 1 of `thermal` against `default`); sets
-that are not asked for stay as they are there.
+results/thermal_finer.json, of version 3 of `thermal` against 2 (thermal_together.json is that of 2 against 1,
+thermal_model.json of 1 against `default`); sets that are not asked for stay as they are there.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 from train_default_model import reader
 
-RESULTS = Path(__file__).parent / "results" / "thermal_together.json"
+RESULTS = Path(__file__).parent / "results" / "thermal_finer.json"
 THRESHOLDS = dict.fromkeys(CLASSES, 0.5)
 TIMED, SHOWN_PX = 10, (768, 960)  # frames; (height, width) as which 640x512 is shown
 

@@ -16,6 +16,7 @@ from sorvolo.errors import InputError  # noqa: E402
 from sorvolo.training.nanodet import (  # noqa: E402
     BINS,
     CocoDetector,
+    FinerNanoDetHead,
     NanoDetBackbone,
     NanoDetHead,
     boxes_from_bins,
@@ -147,6 +148,26 @@ def test_a_head_of_one_class_sees_what_the_whole_head_sees_until_it_learns() -> 
     assert [len(each.bias) for each in own.outputs] == [1 + 4 * BINS] * 3
 
 
+def test_a_finer_head_gives_a_level_more_and_the_others_as_before() -> None:
+    torch.manual_seed(6)
+    finer = FinerNanoDetHead(3)
+    strides_and_widths = zip(NanoDetBackbone.strides, NanoDetBackbone.channels)
+    levels = [torch.randn(1, width, 64 // stride, 96 // stride) for stride, width in strides_and_widths]
+    with torch.no_grad():
+        fine, *others = finer(levels)
+        assert fine.shape == (1, 3 + 4 * BINS, 16, 24)
+        for one, known in zip(others, finer.coarse(levels)):
+            np.testing.assert_array_equal(one, known)
+        before = fine.clone()
+        levels[0][:, :, 0, 0] += 5.0  # what only the finest features show
+        after, *still = finer(levels)
+    assert not np.allclose(after[..., 0, 0], before[..., 0, 0], atol=1e-3)
+    np.testing.assert_array_equal(after[..., 8:, 8:], before[..., 8:, 8:])
+    for one, known in zip(still, others):
+        np.testing.assert_array_equal(one, known)
+    assert finer.strides == (4, 8, 16, 32) == NanoDetBackbone.strides
+
+
 def test_bins_and_cells_are_boxes_around_the_cells_centre() -> None:
     output = torch.zeros(1, 1 + 4 * BINS, 2, 3)
     for side, strides_away in enumerate((1, 2, 3, 4)):
@@ -158,10 +179,11 @@ def test_bins_and_cells_are_boxes_around_the_cells_centre() -> None:
     np.testing.assert_allclose(boxes[4], [12 - 8, 12 - 16, 12 + 24, 12 + 32], atol=1e-4)
 
 
-def test_the_onnx_file_gives_what_torch_gives_at_any_size(tmp_path: Path) -> None:
+@pytest.mark.parametrize("finer", [False, True])
+def test_the_onnx_file_gives_what_torch_gives_at_any_size(tmp_path: Path, finer: bool) -> None:
     torch.manual_seed(4)
-    head = NanoDetHead(6)
-    for layer in head.outputs:
+    head = FinerNanoDetHead(6) if finer else NanoDetHead(6)
+    for layer in [*head.coarse.outputs, head.fine_output] if isinstance(head, FinerNanoDetHead) else head.outputs:
         torch.nn.init.normal_(layer.weight, std=0.3)
     model = CocoDetector(NanoDetBackbone(), head, ((0,), (2, 5))).eval()
     info = {

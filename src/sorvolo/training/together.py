@@ -10,6 +10,10 @@ from sorvolo.training.daylight import odds_from_scores, one_hot
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.nanodet import CocoDetector
 
+_SECOND = 1 - 1e-4
+"""How the second network's box of a thing ranks behind the first's: both mostly have one score, and which of them stays
+must not hang on rounding."""
+
 
 @dataclass(frozen=True)
 class TogetherSettings:
@@ -41,8 +45,10 @@ class Together(nn.Module):
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
         reach = self.settings
-        boxes, scores, labels = fused(self.aerial(images), self.coco(images), reach)
-        by_class = (scores[:, None] * one_hot(labels, reach.classes)).T
+        one, other = self.aerial(images), self.coco(images)
+        boxes, scores, labels = fused(one, other, reach)
+        ranks = scores * torch.cat([torch.ones_like(one[1]), torch.ones_like(other[1]) * _SECOND])
+        by_class = (ranks[:, None] * one_hot(labels, reach.classes)).T
         kept = suppress(boxes, by_class.contiguous(), reach.most, reach.suppress_iou, reach.least_score)
         rows = kept[:, 1]
         best, order = torch.topk(scores[rows], at_most(reach.most, scores[rows]))
