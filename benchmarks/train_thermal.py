@@ -40,7 +40,7 @@ from sorvolo.training.nanodet import (
     cells,
     nanodet_from_graph,
 )
-from sorvolo.training.samples import Share
+from sorvolo.training.samples import Share, boxes_in_crop
 from sorvolo.training.tfjs_graph import read_graph
 from train_default_model import frames_of_heat
 
@@ -50,6 +50,7 @@ SIDE_PX, MOST_THINGS, LEAST_SEEN, LEAST_PX = 384, 48, 0.4, 3.0
 GREY = 114.0  # beyond a picture's edge
 WARM, LEAST_RATE, DECAY, CLIP, AVERAGED = 150, 0.02, 0.02, 10.0, 0.999
 BOX_WEIGHT, BIN_WEIGHT = 2.0, 0.25  # NanoDet's own
+RARE = -4.6  # log-odds of a class in a cell that has learnt nothing: one in a hundred (Lin et al. 2017)
 ANCHOR_STRIDES = 5.0  # side of a cell's anchor
 FEEDERS, AHEAD = 2, 8  # threads that draw crops, and batches drawn ahead
 
@@ -159,6 +160,8 @@ def started(nanodet: Path) -> Net:
         name: values[rows] if name.startswith("outputs.") else values for name, values in coco.state_dict().items()
     }
     head.coarse.load_state_dict(head.coarse.state_dict() | known)
+    with torch.no_grad():
+        head.fine_output.bias[:len(CLASSES)] = RARE
     return Net(backbone, head)
 
 
@@ -217,8 +220,9 @@ def placed(picture: LabelledPicture, share: Share, rng: np.random.Generator) -> 
     crop_from_picture = np.eye(3)
     crop_from_picture[:2, :2] = [[c * mirror, -s], [s * mirror, c]]
     crop_from_picture[:2, 2] = SIDE_PX / 2 - crop_from_picture[:2, :2] @ centre
-    boxes, seen = carried(boxes, crop_from_picture)
-    ignored, in_sight = carried(np.asarray(picture.ignored_px, float).reshape(-1, 4), crop_from_picture)
+    boxes, seen = boxes_in_crop(boxes, crop_from_picture, SIDE_PX)
+    ignored = np.asarray(picture.ignored_px, float).reshape(-1, 4)
+    ignored, in_sight = boxes_in_crop(ignored, crop_from_picture, SIDE_PX)
     keep = (seen >= LEAST_SEEN) & ((boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) >= LEAST_PX)
     ignored = np.vstack([ignored[in_sight > 0], boxes[~keep & (seen > 0.02)]])
     ends = np.array([[2 / size[0], 0, -1], [0, 2 / size[1], -1], [0, 0, 1]])  # pixels to -1 and 1 at the edges
@@ -233,16 +237,6 @@ def rows_of(values: np.ndarray, empty: int = 0) -> np.ndarray:
     out = np.full((MOST_THINGS, *values.shape[1:]), empty, kind)
     out[:min(len(values), MOST_THINGS)] = values[:MOST_THINGS]
     return out
-
-
-def carried(boxes: np.ndarray, crop_from_picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(N, 4) boxes in the crop, cut at its edges, and the share of each that it shows, (N,)."""
-    turn = crop_from_picture[:2, :2]
-    centre = (boxes[:, :2] + boxes[:, 2:]) / 2 @ turn.T + crop_from_picture[:2, 2]
-    half = np.sqrt(((boxes[:, 2:] - boxes[:, :2]) / 2) ** 2 @ (turn**2).T)  # the box around a turned ellipse
-    cut = np.clip(np.hstack([centre - half, centre + half]), 0, SIDE_PX)
-    sides = np.clip(cut[:, 2:] - cut[:, :2], 0, None)
-    return cut, sides.prod(1) / np.maximum((2 * half).prod(1), 1e-6)
 
 
 def crops(stored: Tensor, batch: Batch) -> Tensor:

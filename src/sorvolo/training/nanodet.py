@@ -18,7 +18,6 @@ BINS = 11
 
 _MEAN_BGR, _STD_BGR = (103.53, 116.28, 123.675), (57.375, 57.12, 58.395)
 _SLOPE = 0.1  # of NanoDet's leaky ReLU
-_RARE = -4.6  # log-odds that a cell which has learnt nothing gives a class: one in a hundred (Lin et al. 2017)
 _PREFIX = "PartitionedCall/"
 
 
@@ -114,8 +113,6 @@ class FinerNanoDetHead(nn.Module):
         self.fine_down = nn.Conv2d(width, fine, 1)
         self.fine_tower = nn.ModuleList(_convolution(fine, fine) for _ in range(2))
         self.fine_output = nn.Conv2d(fine, classes + 4 * BINS, 1)
-        with torch.no_grad():
-            self.fine_output.bias[:classes] = _RARE  # type: ignore[index]
 
     def forward(self, levels: Sequence[Tensor]) -> list[Tensor]:
         """Of each stride (N, classes + 44, H, W), as `NanoDetHead.forward` gives them."""

@@ -67,8 +67,8 @@ def cut_sample(
     turns = augmentation.turns and not share.aslant
     crop_from_picture = _placement(image.shape[:2], boxes, share.scale, side, turns, rng)
     out, crop_from_picture = _warped(image, crop_from_picture, side)
-    boxes, seen = _carried(boxes, crop_from_picture, side)
-    ignored, in_sight = _carried(np.asarray(picture.ignored_px, float), crop_from_picture, side)
+    boxes, seen = boxes_in_crop(boxes, crop_from_picture, side)
+    ignored, in_sight = boxes_in_crop(np.asarray(picture.ignored_px, float), crop_from_picture, side)
     small = np.max(boxes[:, 2:] - boxes[:, :2], axis=1, initial=0) < _LEAST_PX
     keep = (seen >= _LEAST_SEEN) & ~small
     spoilt = boxes[~keep & (seen > 0.02)]
@@ -128,7 +128,7 @@ def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> tuple[Ima
     return np.asarray(out, np.uint8), crop_from_picture
 
 
-def _carried(boxes: Floats, crop_from_picture: Matrix3, side: int) -> tuple[Floats, Floats]:
+def boxes_in_crop(boxes: Floats, crop_from_picture: Matrix3, side: int) -> tuple[Floats, Floats]:
     """(N, 4) boxes in the crop, cut at its edges, and the share of each that it shows, (N,)."""
     if not len(boxes):
         return np.zeros((0, 4)), np.zeros(0)

@@ -10,10 +10,6 @@ from sorvolo.training.daylight import odds_from_scores, one_hot
 from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.nanodet import CocoDetector
 
-_SECOND = 1 - 1e-4
-"""How the second network's box of a thing ranks behind the first's: both mostly have one score, and which of them stays
-must not hang on rounding."""
-
 
 @dataclass(frozen=True)
 class TogetherSettings:
@@ -22,6 +18,7 @@ class TogetherSettings:
     classes: int = 3
     same_iou: float = 0.5  # of a class, and overlapping so much, two boxes are one thing
     unseen_odds: float = -4.5  # log-odds of what a detector does not report: it reports from -3.9 on
+    second_rank: float = 1 - 1e-4  # of what the second found, times its score: of equals the first's stays
     most: int = 300  # detections of one picture
     suppress_iou: float = 0.5  # of two boxes of a class that overlap more, the better one stays
     least_score: float = 0.02  # thresholds are far above
@@ -47,7 +44,7 @@ class Together(nn.Module):
         reach = self.settings
         one, other = self.aerial(images), self.coco(images)
         boxes, scores, labels = fused(one, other, reach)
-        ranks = scores * torch.cat([torch.ones_like(one[1]), torch.ones_like(other[1]) * _SECOND])
+        ranks = scores * torch.cat([torch.ones_like(one[1]), torch.ones_like(other[1]) * reach.second_rank])
         by_class = (ranks[:, None] * one_hot(labels, reach.classes)).T
         kept = suppress(boxes, by_class.contiguous(), reach.most, reach.suppress_iou, reach.least_score)
         rows = kept[:, 1]
