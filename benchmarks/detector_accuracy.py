@@ -47,12 +47,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, help="folder of the data sets")
     parser.add_argument("--sets", nargs="+", default=[*REAL, "simulated", "pictures", "pictures_thermal"])
     parser.add_argument("--seeds", type=int, default=4, help="so many simulated flights of each preset")
-    parser.add_argument("--tiles", default=None, help="auto, or pixels a side; none by default")
+    parser.add_argument("--tiles", default="auto", help="auto, none, or pixels a side")
     parser.add_argument("--from-above", action="store_true", help="the pictures look straight down")
     parser.add_argument("--out", type=Path, help="folder for the pages")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the file that is written")
     options = parser.parse_args()
-    tiles = int(options.tiles) if options.tiles and options.tiles.isdecimal() else options.tiles
+    tiles = int(options.tiles) if options.tiles.isdecimal() else options.tiles if options.tiles != "none" else None
     settings = EvaluationSettings(tiles, from_above=options.from_above)
     scoring = note_scoring(f"detector_accuracy, {' '.join(options.sets)}{' from above' * options.from_above}")
     runs = {}

@@ -101,7 +101,7 @@ def main() -> None:
 def collected(wishes: argparse.Namespace, path: Path) -> None:
     """Search all development pictures by the model without a second look, and write what it reports."""
     session = Session(find_model(wishes.model), "cpu", 1)
-    session.info = replace(session.info, second_look={})
+    session.info = replace(session.info, second_look={}, pyramid={})
     by = Session(find_model(wishes.by), "cpu", 1) if wishes.by else session
     reports: list[Report] = []
     photos: Counter[str] = Counter()

@@ -54,8 +54,7 @@ class Looker:
     ) -> tuple[Detections, Detections]:
         """What is found at first and after the second look."""
         began_s = time.process_time()
-        tiles = "auto" if m_per_px else None
-        found = self.detector.detect(picture, tiles=tiles, m_per_px=m_per_px, classes=classes, least_score=least)
+        found = self.detector.detect(picture, tiles="auto", m_per_px=m_per_px, classes=classes, least_score=least)
         looked_s = time.process_time()
         seen = Seen(found.boxes_px, found.scores, found.labels)
         seen = self.whole._seen_again(self.whole._session, picture, seen, classes)

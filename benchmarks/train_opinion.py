@@ -105,7 +105,7 @@ class Cutter:
         self._plan = plan + [replace(each, pasted=0.0) for each in plan if _name(each) in BARE]
         self._samples = Samples(self._plan, read_scenes(wishes.scenes), SIDE_PX, SEED)
         session = Session(find_model("default"), "cpu", 1)
-        session.info = replace(session.info, second_look={})
+        session.info = replace(session.info, second_look={}, pyramid={})
         self._detector = Detector(session)
 
     def cut(self, number: int) -> Cutouts:

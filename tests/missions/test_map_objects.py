@@ -43,6 +43,7 @@ class Knowing(TruthDetector):
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        overlapping: bool = False,
     ) -> Detections:
         """See `TruthDetector.detect`."""
         try:
@@ -214,6 +215,7 @@ class Sees(Knowing):
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        overlapping: bool = False,
     ) -> Detections:
         """See `Knowing.detect`."""
         x, y = image.shape[1] / 2, image.shape[0] / 2
@@ -256,6 +258,7 @@ def test_a_changes_own_pictures_are_searched_for_the_classes_asked_for(simulated
         def detect(
             self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
             least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+            overlapping: bool = False,
         ) -> Detections:
             asked.append(classes)
             return super().detect(image)
@@ -291,6 +294,7 @@ def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, 
         def detect(
             self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
             least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+            overlapping: bool = False,
         ) -> Detections:
             asked.append(tuple(classes or ()))
             return no_detections(self.classes)

@@ -49,6 +49,7 @@ class Comparing:
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        overlapping: bool = False,
     ) -> Detections:
         """Boxes around what differs from the frame that is most like the picture; cars are the large ones."""
         apart = [int(cv2.norm(each, image, cv2.NORM_L1)) for each in self._frames]

@@ -373,10 +373,13 @@ class _Squares:
 
     def __init__(self, info: Any) -> None:
         self.info = info
+        self.overlapping: set[object] = set()
 
-    def detect(self, image: ImageRGB, **_: object) -> Any:
+    def detect(self, image: ImageRGB, *, tiles: object = None, overlapping: bool = False, **_: object) -> Any:
         from sorvolo.survey.objects import Detections
 
+        if tiles == "auto":  # of frames, not of their middle
+            self.overlapping.add(overlapping)
         _, _, stats, _ = cv2.connectedComponentsWithStats((image[..., 0] > 200).astype(np.uint8))
         boxes = [[x, y, x + w, y + h] for x, y, w, h, area in stats[1:] if area > 20]
         count = len(boxes)
@@ -396,11 +399,20 @@ def photographs(tmp_path: Path) -> Iterator[Path]:
 
 def test_photos_without_anything_else(photographs: Path, detector: TruthDetector, tmp_path: Path) -> None:
     outputs = WatchOutputs(folder=tmp_path / "out", save="pictures")
-    updates = list(watch(photographs, outputs=outputs, camera="aov=60", detector=_Squares(detector.info)))
+    finder = _Squares(detector.info)
+    updates = list(watch(photographs, outputs=outputs, camera="aov=60", detector=finder))
     assert [len(update.detections) for update in updates] == [1] * 4
+    assert finder.overlapping == {False}, "each may be searched in several sizes"
     assert sorted(path.name for path in (tmp_path / "out" / "annotated").iterdir()) == [
         f"IMG_{number}.jpg" for number in range(4)
     ]
+
+
+def test_frames_of_a_video_are_not_worth_several_sizes(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+    finder = _Squares(detector.info)
+    settings = WatchSettings(frames_per_second=1)
+    assert list(watch(_video(flown), settings, WatchOutputs(folder=tmp_path / "out"), detector=finder))
+    assert finder.overlapping == {True}
 
 
 @pytest.mark.parametrize("wrong", [slice(2, None), slice(None)])

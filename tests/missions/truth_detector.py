@@ -57,6 +57,7 @@ class TruthDetector:
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        overlapping: bool = False,
     ) -> Detections:
         """The boxes of a frame of the flight; KeyError for any other picture, nothing in one without tiles: a part."""
         if tiles is None:

@@ -38,7 +38,7 @@ HeldOutShare = Annotated[
     float, typer.Option(help="Use only the share that `sorvolo train --val SHARE` with the same seed holds out.")
 ]
 Tiles = Annotated[
-    str, typer.Option(help="Cut pictures into tiles: none, auto (by ground resolution), or pixels a side.")
+    str, typer.Option(help="How pictures are shown: auto (as to watch and map), none (as they are), pixels of a tile.")
 ]
 FromAbove = Annotated[
     bool, typer.Option("--from-above", help="The pictures look straight down: models that want it look twice.")
@@ -60,7 +60,7 @@ def detector(
     group_pattern: GroupPattern = None,
     videos: VideoPattern = "",
     held_out: HeldOutShare = 0.0,
-    tiles: Tiles = "none",
+    tiles: Tiles = "auto",
     from_above: FromAbove = False,
     out: ReportFolder = None,
     draws: BootstrapDraws = 1000,

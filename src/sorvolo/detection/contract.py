@@ -7,7 +7,10 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import BoxesPx, Floats
 
 METADATA_KEY = "sorvolo"
 """The key among an ONNX file's `metadata_props` under which the JSON lies."""
@@ -17,6 +20,8 @@ FORMAT = 1
 
 _FALLBACK_STRIDE = 32  # px: what a picture's sides are multiples of, in a model whose file does not state it
 _NEEDED = ("name", "classes", "thresholds", "best_px")
+_MOST_TIMES = 4  # as large as a picture is: more only blurs
+_LEAST_TRUST = 1e-6  # of an opinion, beside the best one: it stays above zero, and its logarithm finite
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 
 POSITIONS = ((0, False), (1, False), (2, True), (3, True))
@@ -50,6 +55,27 @@ class SecondLook:
 
 
 @dataclass(frozen=True)
+class Pyramid:
+    """In which sizes a class is looked for where a picture's scale is not known (`pyramid`, decision 0084).
+
+    `times`: so many times as large as it is, besides as it is. `known_px`: the side (the root of a box's area) at which
+    the model knows the class best; `octaves`: the standard deviation, in powers of two, of the normal curve by which a
+    look's opinion counts less where it shows an object larger or smaller.
+    """
+
+    times: tuple[float, ...]
+    known_px: float
+    octaves: float
+
+    def trust(self, boxes_px: BoxesPx, times: Floats) -> Floats:
+        """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large."""
+        area_px = (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
+        off = np.log2(np.sqrt(np.maximum(area_px, 1.0))[:, None] * times / self.known_px) / self.octaves
+        trust = np.exp(-0.5 * (off**2 - (off**2).min(axis=1, keepdims=True))) + _LEAST_TRUST
+        return np.asarray(trust / trust.sum(axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
 class ModelInfo:
     """One model, as its file describes it.
 
@@ -59,6 +85,7 @@ class ModelInfo:
     in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
     person asks for them. `turned`: pictures from straight above are looked at twice, once turned by a quarter, and each
     class is reported from this mean score on; empty: once. `second_look`: classes whose reports are looked at again.
+    `pyramid`: classes that are looked for in several sizes where a picture's scale is not known.
     """
 
     name: str
@@ -78,6 +105,7 @@ class ModelInfo:
     on_request: tuple[str, ...] = ()
     turned: Mapping[str, float] = field(default_factory=dict)
     second_look: Mapping[str, SecondLook] = field(default_factory=dict)
+    pyramid: Mapping[str, Pyramid] = field(default_factory=dict)
 
     @property
     def usual_classes(self) -> tuple[str, ...]:
@@ -127,7 +155,8 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
     return ModelInfo(
         str(fields["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
         bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request,
-        turned=MappingProxyType(turned), second_look=MappingProxyType(_second_look(fields, classes)), **texts,
+        turned=MappingProxyType(turned), second_look=MappingProxyType(_second_look(fields, classes)),
+        pyramid=MappingProxyType(_pyramid(fields, classes)), **texts,
     )
 
 
@@ -150,6 +179,19 @@ def _best_px(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, tup
     if not all(0 < least < most for least, most in best_px.values()):
         raise ValueError(f"its best_px must be smallest and largest side, not {best_px}")
     return best_px
+
+
+def _pyramid(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Pyramid]:
+    found = {}
+    for name, each in fields.get("pyramid", {}).items():
+        times = tuple(float(one) for one in each["times"])
+        known_px, octaves = float(each["known_px"]), float(each["octaves"])
+        if name not in classes or not times or not all(0 < one <= _MOST_TIMES and one != 1 for one in times):
+            raise ValueError(f"its pyramid must name classes and times up to {_MOST_TIMES}, not {name} {list(times)}")
+        if not (0 < known_px < math.inf and 0 < octaves < math.inf):
+            raise ValueError(f"its pyramid must have a size and octaves above 0, not {known_px} and {octaves}")
+        found[name] = Pyramid(times, known_px, octaves)
+    return found
 
 
 def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, SecondLook]:

@@ -3,6 +3,7 @@
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import overload
 
@@ -12,15 +13,25 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import find_model, thermal_model
+from sorvolo.detection.pyramid import agreed_in_sizes
 from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
-from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles
+from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles, pyramid_times
 from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Labels
 from sorvolo.survey.flight import Notice
 from sorvolo.survey.objects import Detections, Early
+
+
+@dataclass(frozen=True, eq=False)
+class _SizedLook:
+    """What was seen in a picture, in its own pixels, shown `scale` times as large, and the classes looked for."""
+
+    seen: Seen
+    scale: float
+    names: tuple[str, ...]
 
 
 class Detector:
@@ -98,19 +109,20 @@ class Detector:
     def detect(
         self, image: Picture, *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        early: Early | None = None,
+        overlapping: bool = False, early: Early | None = None,
     ) -> Detections: ...
 
     @overload
     def detect(
         self, image: Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        overlapping: bool = False,
     ) -> list[Detections]: ...
 
     def detect(
         self, image: Picture | Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        early: Early | None = None,
+        overlapping: bool = False, early: Early | None = None,
     ) -> Detections | list[Detections]:
         """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
 
@@ -119,6 +131,7 @@ class Detector:
         sampling distance; None or NaN: not known), a number of its pixels a side, or None for the picture as a whole;
         docs/detector.md gives the rule. `least_score` None means each class's own threshold; `classes` None means all.
         `from_above`: the camera looked about straight down; a model whose file asks for it (`turned`) then looks twice.
+        `overlapping`: others show the same (a video's frames), and none is worth looks in several sizes (`pyramid`).
         `early`, for one picture, is given the classes that have a look of their own (see `looks_for`), and what was
         found of them, while the picture is searched for the others; in the end the same objects are among all.
         Raises InputError for anything that is no picture, SettingsError for a class, score or tile that cannot be.
@@ -128,8 +141,8 @@ class Detector:
             raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
         sampling = math.nan if m_per_px is None else float(m_per_px)
         if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
-            return self._seen(image, tiles, sampling, wanted, least_score, from_above, early)
-        return [self._seen(each, tiles, sampling, wanted, least_score, from_above) for each in image]
+            return self._seen(image, tiles, sampling, wanted, least_score, from_above, overlapping, early)
+        return [self._seen(each, tiles, sampling, wanted, least_score, from_above, overlapping) for each in image]
 
     def thresholds_for(self, picture: Picture, *, from_above: bool = False) -> Mapping[str, float]:
         """From which score on each class is reported in such a picture: those of the model that looks at it."""
@@ -156,7 +169,7 @@ class Detector:
 
     def _seen(
         self, picture: Picture, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
-        least_score: float | None, from_above: bool, early: Early | None = None,
+        least_score: float | None, from_above: bool, overlapping: bool, early: Early | None = None,
     ) -> Detections:
         thermal = is_thermal(picture)
         session = self._session_for(thermal)
@@ -176,20 +189,27 @@ class Detector:
             groups = looks_for(session.info, m_per_px, asked, thermal) if tiles == "auto" else (tuple(asked),)
             looks: dict[tuple[str, ...], Seen] = {}
             for names in reversed(groups):  # the smaller look first: it is known soon
-                looks[names] = look(shown, names)
+                looks[names] = in_sizes(shown, names)
                 is_last = names == groups[0]
                 if early is not None and not (is_last or looks_twice or session.info.second_look.keys() & set(names)):
                     early(names, reported(looks[names], names))
             return _together([looks[names] for names in groups], groups, session.info.classes)
 
-        def look(shown: ImageRGB, names: Sequence[str]) -> Seen:
+        def in_sizes(shown: ImageRGB, names: Sequence[str]) -> Seen:
+            whole_px = shown.shape[0], shown.shape[1]
+            sizes = {} if overlapping else pyramid_times(whole_px, session.info, names, tiles, m_per_px)
+            looks = [look(shown, names), *(look(shown, of, times) for times, of in sizes.items())]
+            return _in_sizes(looks, names, session.info) if sizes else looks[0].seen
+
+        def look(shown: ImageRGB, names: Sequence[str], times: float = 1.0) -> _SizedLook:
             size_px = shown.shape[0], shown.shape[1]
             plan = plan_tiles(
                 size_px, session.info, names, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px,
-                thermal=thermal,
+                thermal=thermal, times=times,
             )
-            looks = [SeenTile(place, _look(session, shown, place, plan.scale)) for place in plan.places_px]
-            return looks[0].seen if len(looks) == 1 else merge_tiles(looks, size_px)
+            tiles_seen = [SeenTile(place, _look(session, shown, place, plan.scale)) for place in plan.places_px]
+            seen = tiles_seen[0].seen if len(tiles_seen) == 1 else merge_tiles(tiles_seen, size_px)
+            return _SizedLook(seen, plan.scale, tuple(names))
 
         seen = _seen_turned(rgb, whole) if looks_twice else whole(rgb)
         return reported(self._seen_again(session, rgb, seen, asked), asked)
@@ -251,6 +271,18 @@ def _together(looks: Sequence[Seen], groups: Sequence[Sequence[str]], classes: S
         np.concatenate([look.boxes_px[mine] for look, mine in zip(looks, kept)])[order], scores[order],
         np.concatenate([look.labels[mine] for look, mine in zip(looks, kept)])[order],
     )
+
+
+def _in_sizes(looks: Sequence[_SizedLook], names: Sequence[str], info: ModelInfo) -> Seen:
+    """What looks at one picture saw together of `names`, best first; the first looked for all of them."""
+    groups, seen = [[name for name in names if name not in info.pyramid]], [looks[0].seen]
+    for name in (name for name in names if name in info.pyramid):
+        own = [each for each in looks if name in each.names]
+        groups.append([name])
+        seen.append(agreed_in_sizes(
+            [each.seen for each in own], [each.scale for each in own], info.classes.index(name), info.pyramid[name]
+        ))
+    return _together(seen, groups, info.classes)
 
 
 def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:

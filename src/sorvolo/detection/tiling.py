@@ -21,6 +21,9 @@ MOST_WHOLE_PX = 2_400_000
 MOST_AT_ONCE_PX = 8_400_000
 """A larger picture than a 4K frame is cut into tiles even if it was asked for whole: it would take gigabytes."""
 
+MOST_MAGNIFIED_PX = 20_000_000
+"""A picture of unknown scale is magnified (`Pyramid`) to so many pixels at most: what a large photo costs."""
+
 TASK = Task.RECOGNITION
 """What a person must at least be shown for (Johnson's criteria): 6 px over the critical dimension."""
 
@@ -97,9 +100,27 @@ def whole_m_per_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, size
     return m_per_px * min(1.0, most / scale)
 
 
+def pyramid_times(
+    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], tiles: Tiles, m_per_px: float
+) -> dict[float, tuple[str, ...]]:
+    """How many times as large a picture of (height, width) `size_px` is shown besides as it is, and for which classes.
+
+    Where "auto" does not know its scale, those of the model's `pyramid` at which it has `MOST_MAGNIFIED_PX` or less.
+    """
+    if tiles != "auto" or not math.isnan(m_per_px):
+        return {}
+    area_px = size_px[0] * size_px[1]
+    asked = {name: info.pyramid[name].times for name in wanted if name in info.pyramid}
+    return {
+        each: tuple(name for name, times in asked.items() if each in times)
+        for each in sorted({each for times in asked.values() for each in times})
+        if area_px * each**2 <= MOST_MAGNIFIED_PX
+    }
+
+
 def plan_tiles(
     size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], *, tiles: Tiles = "auto",
-    m_per_px: float = math.nan, fixed_px: tuple[int, int] | None = None, thermal: bool = False,
+    m_per_px: float = math.nan, fixed_px: tuple[int, int] | None = None, thermal: bool = False, times: float = 1.0,
 ) -> TilePlan:
     """The tiles of a picture of (height, width) `size_px`.
 
@@ -107,8 +128,8 @@ def plan_tiles(
     that is small. A picture that is still small is one tile; else it is cut into tiles of at most that size, which show
     the fewest pixels twice. A number: tiles of as many of the picture's pixels, not scaled. None: the picture as
     it is. Tiles overlap by the longest object that is wanted, as far as its size is known, at most by half. A model of
-    one input size, `fixed_px`, gets tiles of that size from "auto". Raises SettingsError for a tile size or a sampling
-    distance that cannot be.
+    one input size, `fixed_px`, gets tiles of that size from "auto". `times`: "auto" shows it so many times as large.
+    Raises SettingsError for a tile size or a sampling distance that cannot be.
     """
     height, width = size_px
     if m_per_px <= 0 or math.isinf(m_per_px):
@@ -118,7 +139,7 @@ def plan_tiles(
             return TilePlan(1.0, ((0, 0, width, height),))
         return _auto_plan(size_px, info, wanted, math.nan, 1.0, fixed_px)
     if tiles == "auto":
-        scale = _auto_scale(height * width, info, wanted, m_per_px, thermal)
+        scale = times * _auto_scale(height * width, info, wanted, m_per_px, thermal)
         return _auto_plan(size_px, info, wanted, m_per_px, scale, fixed_px)
     if type(tiles) is not int or tiles < _LEAST_SIDE_PX:
         raise SettingsError(f"tiles must be 'auto' or at least {_LEAST_SIDE_PX} px a side, not {tiles!r}")

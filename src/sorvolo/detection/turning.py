@@ -60,8 +60,8 @@ def agreed(looks: Sequence[Seen], settings: LookSettings = LookSettings()) -> Se
     for label in np.unique(labels).tolist():
         rows = np.flatnonzero(labels == label)
         rows = rows[np.argsort(-scores[rows], kind="stable")]
-        for alike in _alike(boxes[rows], settings.same_iou):
-            members = rows[alike]
+        for group in alike(boxes[rows], settings.same_iou):
+            members = rows[group]
             best = np.full(len(looks), settings.unseen)
             np.maximum.at(best, of_look[members], scores[members])
             kept.append((np.average(boxes[members], axis=0, weights=scores[members]), float(best.mean()), label))
@@ -72,12 +72,13 @@ def agreed(looks: Sequence[Seen], settings: LookSettings = LookSettings()) -> Se
     )
 
 
-def _alike(boxes_px: Floats, same_iou: float) -> Iterator[Rows]:
-    """Indices of boxes (N, 4), best first, that overlap the best one that is left."""
+def alike(boxes_px: Floats, same_iou: float) -> Iterator[Rows]:
+    """Rows of boxes (N, 4) that are one object: of what is left the first, and all that overlap it more than so."""
     overlap = iou_matrix(boxes_px, boxes_px)
     is_free = np.ones(len(boxes_px), bool)
     for first in range(len(boxes_px)):
         if is_free[first]:
-            alike = np.union1d(np.flatnonzero(is_free & (overlap[first] > same_iou)), [first])
-            is_free[alike] = False
-            yield alike
+            others = np.flatnonzero(is_free & (overlap[first] > same_iou))
+            group = np.concatenate([[first], others[others != first]])
+            is_free[group] = False
+            yield group

@@ -42,7 +42,7 @@ _NAMED = 5  # damaged pictures
 class EvaluationSettings:
     """`tiles`, `from_above` as Detector.detect takes them; `draws` of the bootstrap; `seed` of whatever is random."""
 
-    tiles: Literal["auto"] | int | None = None
+    tiles: Literal["auto"] | int | None = "auto"
     draws: int = DRAWS
     seed: int = 1
     from_above: bool = False

@@ -37,12 +37,13 @@ class ObjectDetector(Protocol):
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        early: Early | None = None,
+        overlapping: bool = False, early: Early | None = None,
     ) -> Detections:
         """The objects in one picture, (H, W, 3), best first.
 
         `tiles` cuts a large picture: "auto" by `m_per_px` (the ground's sampling distance), a number of pixels a side,
         or None for the picture as a whole. None for `least_score` means each class's own; for `classes`, all.
-        `from_above`: the camera looked about straight down. `early` may be given classes, and all that is found of
-        them, while the picture is still searched for others.
+        `from_above`: the camera looked about straight down. `overlapping`: others show the same, so that none is worth
+        much time. `early` may be given classes, and all that is found of them, while the picture is still searched for
+        others.
         """

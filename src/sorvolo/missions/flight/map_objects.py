@@ -190,7 +190,7 @@ class ObjectFinder:
         least = self._detector.thresholds_for(frame.image, from_above=from_above)
         found = self._detector.detect(
             frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes, from_above=from_above,
-            least_score=least_seen(least),
+            overlapping=True, least_score=least_seen(least),
         )
         surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)

@@ -90,7 +90,7 @@ def held_out(labels: Labels, seed: int) -> LabelledSet:
 
 def measure_model(model: str, labelled: LabelledSet) -> dict[str, Any]:
     """The thesis's mAP (eqs 4.3, 4.4) and COCO's AP of a model on labelled pictures, and of each class."""
-    measured = evaluate_detector([[model]], [labelled], EvaluationSettings(draws=_DRAWS))
+    measured = evaluate_detector([[model]], [labelled], EvaluationSettings(tiles=None, draws=_DRAWS))
     (scores,) = measured.sets
     return {
         "set": labelled.name, "pictures": scores.pictures, "videos": scores.groups, "thesis_map": scores.thesis_map,

@@ -162,11 +162,13 @@ class WatchRun:
 
         if magnifier is not None:
             m_per_px = magnifier.m_per_px(frame.image, look)
-        if m_per_px is not None and self._setup.source.kind != "photos":
+        overlapping = self._setup.source.kind != "photos"
+        if m_per_px is not None and overlapping:
             m_per_px = whole_m_per_px(self._detector.info, classes, m_per_px, frame.image.shape[:2])
         found = self._detector.detect(
             frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes,
-            from_above=self._places.is_from_above(frame), **({} if self._early is None else {"early": known}),
+            from_above=self._places.is_from_above(frame), overlapping=overlapping,
+            **({} if self._early is None else {"early": known}),
         ) if earlier is None else earlier.found
         if magnifier is not None:
             magnifier.see(found, frame.image)

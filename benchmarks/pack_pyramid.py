@@ -1,0 +1,45 @@
+"""In which sizes pictures of unknown scale are searched, into the packaged models: benchmarks/pack_pyramid.py
+
+The last step of packing (decision 0084); no weight of the networks changes, only the metadata of default.onnx,
+default-int8.onnx and thermal.onnx and their cards. benchmarks/pyramid.py and benchmarks/pyramid_thermal.py give the
+figures that SIZES were chosen by. A thermal frame is shown one and a half times as large as it is, and so at each of
+its sizes.
+"""
+
+import argparse
+import hashlib
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from pack_default_model import HOME
+from pack_second_look import with_fields
+
+DAYLIGHT = {"times": [0.5, 0.75, 1.5, 2.0, 3.0], "known_px": 32, "octaves": 1.0}
+THERMAL = {"times": [0.667, 1.333], "known_px": 44, "octaves": 1.0}
+MODELS = {"default": ("11", DAYLIGHT), "default-int8": ("11", DAYLIGHT), "thermal": ("4", THERMAL)}
+CLASSES = ("person", "car")
+
+
+def main() -> None:
+    """Rewrite the files and their cards."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--home", type=Path, default=HOME)
+    wishes = parser.parse_args()
+    for name, (version, sizes) in MODELS.items():
+        fields: dict[str, Any] = {
+            "version": version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
+            "pyramid": {each: sizes for each in CLASSES},
+        }
+        path = wishes.home / f"{name}.onnx"
+        path.write_bytes(with_fields(path.read_bytes(), fields))
+        card = json.loads(path.with_suffix(".json").read_text()) | fields
+        if "of" in card:
+            card["of"] = f"default, version {version}"
+        card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
+        path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
