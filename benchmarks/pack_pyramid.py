@@ -16,8 +16,8 @@ from typing import Any
 from pack_default_model import HOME
 from pack_second_look import with_fields
 
-DAYLIGHT = {"times": [0.5, 0.75, 1.5, 2.0, 3.0], "known_px": 32, "octaves": 1.0}
-THERMAL = {"times": [0.667, 1.333], "known_px": 44, "octaves": 1.0}
+DAYLIGHT = {"times": [0.5, 0.75, 1.5, 2.0, 3.0], "known_px": 32, "octaves": 1.0, "shift": 0.6}
+THERMAL = {"times": [0.667, 1.333], "known_px": 44, "octaves": 1.0, "shift": 0.6}
 MODELS = {"default": ("11", DAYLIGHT), "default-int8": ("11", DAYLIGHT), "thermal": ("4", THERMAL)}
 CLASSES = ("person", "car")
 

@@ -3,7 +3,7 @@
 Decision 0084. Development pictures of fit_second_look.py (DIR: its scenes), shown as large as BASES names, as if their
 scale were not known; and, for cars, every tenth picture of the videos of `cats` that are not held out. Each is searched
 at every one of SIZES without a second look. Written are AP50 of each size alone and of pyramids of some of them
-(PYRAMIDS, at each of KNOWN_PX and OCTAVES); and, with the second look, what the model reports at its threshold, right
+(SETTINGS: sizes, `known_px`, `octaves`); and, with the second look, what the model reports at its threshold, right
 and false, at one size and by its pyramid. No set that detection_data.py holds out, but for `cats`' other videos.
 Writes results/pyramid.json.
 """
@@ -41,9 +41,11 @@ BASES: Mapping[str, tuple[float, ...]] = {
     "fixed_wing": (1.0,), "painted": (1.0,), "brighton_beach": (0.5,), "caliterra": (0.5,), "cats": (1.0,),
 }
 SIZES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-PYRAMIDS = (SIZES, (1.0, 1.5), (1.0, 1.5, 2.0), (1.0, 1.5, 2.0, 3.0), (0.5, 0.75, 1.0))
-KNOWN_PX, OCTAVES = (24, 32, 44), (0.7, 1.0, 1.5)
-HALF = 2  # every second frame of HIT-UAV
+SETTINGS = (
+    *((sizes, 32, 1.0) for sizes in ((1.0, 1.5), (1.0, 1.5, 2.0), (1.0, 1.5, 2.0, 3.0), (0.5, 0.75, 1.0))),
+    *((SIZES, known_px, octaves) for known_px in (24, 32, 44) for octaves in (0.7, 1.0, 1.5)),
+)
+EVERY = 4  # HIT-UAV has many frames: those whose number this divides
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,7 @@ def streets(data: Path) -> Iterator[Shot]:
 
 def searched(looker: Looker, shot: Shot) -> Iterator[Searched]:
     """A picture in each of its bases, searched in all sizes."""
-    if shot.place == THERMAL and int(shot.name[-1]) % HALF:
+    if shot.place == THERMAL and int(shot.name[-4:]) % EVERY:
         return
     label = CAR if shot.place == "cats" else PERSON
     for base in BASES[shot.place]:
@@ -99,7 +101,8 @@ def searched(looker: Looker, shot: Shot) -> Iterator[Searched]:
             shot.name, picture.shape[1], picture.shape[0], shot.truth.group, shot.truth.boxes_px * base,
             shot.truth.labels, shot.truth.ignored_px * base,
         )
-        packed = pyramid_of((1.0, *PACKED["times"]), seen, label, PACKED["known_px"], PACKED["octaves"])
+        sizes = (1.0, *PACKED["times"])
+        packed = pyramid_of(sizes, seen, label, PACKED["known_px"], PACKED["octaves"], PACKED["shift"])
         reports = {"one size": only(seen[1.0], label), "pyramid": packed}
         again = {
             name: looker.whole._seen_again(looker.whole._session, picture, each, (CLASSES[label],))
@@ -133,12 +136,13 @@ def only(seen: Seen, label: int) -> Seen:
 
 
 def pyramid_of(
-    sizes: Sequence[float], seen: Mapping[float, Seen], label: int, known_px: float, octaves: float
+    sizes: Sequence[float], seen: Mapping[float, Seen], label: int, known_px: float, octaves: float,
+    shift: float = 0.0,
 ) -> Seen:
     """What the looks in these sizes agree on."""
     there = [size for size in sizes if size in seen]
     return agreed_in_sizes(
-        [seen[size] for size in there], there, label, Pyramid(tuple(sizes), float(known_px), float(octaves))
+        [seen[size] for size in there], there, label, Pyramid(tuple(sizes), float(known_px), float(octaves), shift)
     )
 
 
@@ -157,7 +161,7 @@ def sizes_of(pictures: Sequence[Searched]) -> dict[str, object]:
         {"sizes": sizes, "known_px": known_px, "octaves": octaves} | accuracy(
             pictures, [pyramid_of(sizes, each.seen, label, known_px, octaves) for each in pictures], label
         )
-        for sizes in PYRAMIDS for known_px in KNOWN_PX for octaves in OCTAVES
+        for sizes, known_px, octaves in SETTINGS
     ]
     return rows
 

@@ -67,7 +67,7 @@ def test_videos_folders_and_single_photos_become_flights(tmp_path: Path) -> None
     assert len(found[0].telemetry) == len(found[1].telemetry) == 0
 
 
-def test_a_folder_overlappings_is_as_many_flights(tmp_path: Path) -> None:
+def test_a_folder_of_videos_is_as_many_flights(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4"), write_video(tmp_path / "b.mkv")
     (tmp_path / "readme.txt").write_text("x")
     assert [source.name for source in open_sources([tmp_path])] == ["a", "b"]

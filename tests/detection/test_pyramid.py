@@ -1,6 +1,7 @@
 """Pictures of unknown scale searched in several sizes: which look is believed, and when one look is enough."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from sorvolo.detection.tiling import MOST_MAGNIFIED_PX
 from sorvolo.errors import InputError
 
 _BOXES = [(20, 40, 60, 80), (140, 60, 170, 90)]
-_SIZES = {"times": [0.5, 2], "known_px": 32, "octaves": 1}
+_SIZES = {"times": [0.5, 2], "known_px": 32, "octaves": 1, "shift": 0}
 
 
 def _seen(*rows: tuple[tuple[float, float, float, float], float, int]) -> Seen:
@@ -27,7 +28,7 @@ def _seen(*rows: tuple[tuple[float, float, float, float], float, int]) -> Seen:
 
 
 def test_the_look_that_shows_an_object_at_the_known_size_counts_most() -> None:
-    pyramid = Pyramid((2.0, 4.0), 32.0, 1.0)
+    pyramid = Pyramid((2.0, 4.0), 32.0, 1.0, 0.0)
     boxes = np.array([[0, 0, 16, 16], [0, 0, 8, 8], [0, 0, 4000, 4000]], np.float32)
     trust = pyramid.trust(boxes, np.array([1.0, 2.0, 4.0]))
     np.testing.assert_allclose(trust.sum(axis=1), 1)
@@ -38,12 +39,14 @@ def test_the_look_that_shows_an_object_at_the_known_size_counts_most() -> None:
 
 
 def test_log_odds_are_averaged_by_trust_and_what_a_look_does_not_show_counts_against() -> None:
-    pyramid = Pyramid((2.0,), 32.0, 1.0)
+    pyramid = Pyramid((2.0,), 32.0, 1.0, 0.0)
     small = (100.0, 100.0, 116.0, 116.0)  # 16 px: the look that shows it twice as large knows it best
     trust = pyramid.trust(np.array([small], np.float32), np.array([1.0, 2.0]))[0]
     both = agreed_in_sizes([_seen((small, 0.5, 0)), _seen((small, 0.9, 0))], (1.0, 2.0), 0, pyramid)
     assert len(both.scores) == 1
     assert both.scores[0] == pytest.approx(1 / (1 + math.exp(-trust[1] * math.log(9))), rel=1e-6)
+    more = agreed_in_sizes([_seen((small, 0.5, 0)), _seen((small, 0.9, 0))], (1.0, 2.0), 0, replace(pyramid, shift=0.6))
+    assert np.log(more.scores / (1 - more.scores)) == pytest.approx(trust[1] * math.log(9) + 0.6, rel=1e-6)
     one = agreed_in_sizes([_seen(), _seen((small, 0.9, 0))], (1.0, 2.0), 0, pyramid)
     other = agreed_in_sizes([_seen((small, 0.9, 0)), _seen()], (1.0, 2.0), 0, pyramid)
     assert both.scores[0] > one.scores[0] > other.scores[0]
@@ -51,7 +54,7 @@ def test_log_odds_are_averaged_by_trust_and_what_a_look_does_not_show_counts_aga
 
 
 def test_objects_of_one_class_stay_apart_and_other_classes_are_left_out() -> None:
-    pyramid = Pyramid((2.0,), 32.0, 1.0)
+    pyramid = Pyramid((2.0,), 32.0, 1.0, 0.0)
     near, far = (0.0, 0.0, 20.0, 20.0), (200.0, 0.0, 220.0, 20.0)
     looks = [_seen((near, 0.8, 0), (far, 0.6, 1)), _seen((far, 0.9, 0), (near, 0.7, 0))]
     people = agreed_in_sizes(looks, (1.0, 2.0), 0, pyramid)
@@ -112,6 +115,7 @@ def test_a_large_picture_is_not_magnified(tmp_path: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("wrong", [
     {"times": []}, {"times": [9]}, {"times": [-1]}, {"times": [1]}, {"known_px": 0}, {"octaves": math.inf},
+    {"shift": math.nan},
 ])
 def test_a_pyramid_that_cannot_be_is_an_error(tmp_path: Path, wrong: dict[str, object]) -> None:
     with pytest.raises(InputError, match="its pyramid must"):

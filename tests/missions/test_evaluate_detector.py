@@ -26,7 +26,7 @@ from sorvolo.store.exports.detector_files import FoundSet, FoundSets, read_found
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 
-QUICK = EvaluationSettings(draws=50)
+QUICK = EvaluationSettings(tiles=None, draws=50)
 THRESHOLDS = dict.fromkeys(CLASSES, 0.5)
 
 
@@ -220,7 +220,7 @@ def coco(labelled, tmp_path_factory):
 
 
 def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco, tmp_path, capsys):
-    printed = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
+    printed = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20", "--tiles", "none"]
     assert main(["evaluate", "detector", str(toy), str(coco), *printed, "--out", str(tmp_path / "out"), "--json"]) == 0
     numbers = json.loads(capsys.readouterr().out)
     assert numbers["sets"][0]["confusion"] == [[2, 1, 0], [0, 1, 1], [1, 0, 0]]

@@ -89,8 +89,8 @@ def look_at_place(client: TestClient, longitude: float, latitude: float) -> None
     assert rows == sorted(rows, key=lambda each: each["time"]) and rows
     assert all(each["flight"] == "flight1" and 0 <= each["video_s"] < 10 for each in rows)
     assert client.get(rows[0]["crop_url"]).content[:2] == b"\xff\xd8"
-    overlapping = rows[0]["crop_url"].replace("/frame/", "/video/")
-    assert client.get(overlapping).content[:2] == b"\xff\xd8"
+    of_video = rows[0]["crop_url"].replace("/frame/", "/video/")
+    assert client.get(of_video).content[:2] == b"\xff\xd8"
     part = client.get(rows[0]["video_url"], headers={"range": "bytes=4-7"})
     assert part.status_code == 206 and part.content == b"ftyp"
 

@@ -96,13 +96,13 @@ def _done(order: Order, answers: Answers, until: threading.Event) -> tuple[str, 
 def _block(order: Order, part: Part, alive: Callable[..., None]) -> None:
     """Register the pictures of a block, or choose the frames of a video before its blocks."""
     from sorvolo.missions.flight.settings import MapSettings
-    from sorvolo.missions.map.blocks import Division, choose_overlapping, map_block
+    from sorvolo.missions.map.blocks import Division, choose_of_video, map_block
 
     wish = order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
     division = Division(Path(part.folder), part.key, part.count)
     if part.kind is PartKind.FRAMES:
-        choose_overlapping(Path(order.source), wish.camera or None, settings, division, alive)
+        choose_of_video(Path(order.source), wish.camera or None, settings, division, alive)
     else:
         map_block(Path(order.source), wish.camera or None, settings, division, part.number, alive)
 

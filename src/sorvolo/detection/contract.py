@@ -60,12 +60,14 @@ class Pyramid:
 
     `times`: so many times as large as it is, besides as it is. `known_px`: the side (the root of a box's area) at which
     the model knows the class best; `octaves`: the standard deviation, in powers of two, of the normal curve by which a
-    look's opinion counts less where it shows an object larger or smaller.
+    look's opinion counts less where it shows an object larger or smaller. `shift`: added to the mean log-odds, so that
+    thresholds hold that were chosen for one look: what looks of all sizes show is right more often.
     """
 
     times: tuple[float, ...]
     known_px: float
     octaves: float
+    shift: float
 
     def trust(self, boxes_px: BoxesPx, times: Floats) -> Floats:
         """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large."""
@@ -185,12 +187,14 @@ def _pyramid(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Pyr
     found = {}
     for name, each in fields.get("pyramid", {}).items():
         times = tuple(float(one) for one in each["times"])
-        known_px, octaves = float(each["known_px"]), float(each["octaves"])
+        known_px, octaves, shift = (float(each[key]) for key in ("known_px", "octaves", "shift"))
         if name not in classes or not times or not all(0 < one <= _MOST_TIMES and one != 1 for one in times):
             raise ValueError(f"its pyramid must name classes and times up to {_MOST_TIMES}, not {name} {list(times)}")
-        if not (0 < known_px < math.inf and 0 < octaves < math.inf):
-            raise ValueError(f"its pyramid must have a size and octaves above 0, not {known_px} and {octaves}")
-        found[name] = Pyramid(times, known_px, octaves)
+        if not (0 < known_px < math.inf and 0 < octaves < math.inf and math.isfinite(shift)):
+            raise ValueError(
+                f"its pyramid must have a size and octaves above 0 and a shift, not {known_px}, {octaves} and {shift}"
+            )
+        found[name] = Pyramid(times, known_px, octaves, shift)
     return found
 
 

@@ -32,8 +32,8 @@ def agreed_in_sizes(
 
     All boxes are in the picture's own pixels. Boxes that overlap are one object, at most one of each look. Its
     log-odds are the looks' mean, weighed by how well the model knows an object of the size at which each look shows
-    it (`Pyramid.trust`), a logarithmic opinion pool (Genest and Zidek 1986); its box is the mean of the looks' boxes
-    by these weights times their scores.
+    it (`Pyramid.trust`), a logarithmic opinion pool (Genest and Zidek 1986), and `Pyramid.shift`; its box is the mean
+    of the looks' boxes by these weights times their scores.
     """
     own = [look.labels == label for look in looks]
     boxes = np.concatenate([look.boxes_px[mine] for look, mine in zip(looks, own)])
@@ -49,7 +49,7 @@ def agreed_in_sizes(
         rows, weights = order[group], trust[order[group[0]]]
         best = np.full(len(looks), settings.unseen_odds)
         np.maximum.at(best, of_look[rows], odds[rows])
-        found_odds[count - 1] = weights @ best
+        found_odds[count - 1] = weights @ best + pyramid.shift
         found_px[count - 1] = np.average(boxes[rows], axis=0, weights=weights[of_look[rows]] * scores[rows])
     best_first = np.argsort(-found_odds[:count], kind="stable")
     return Seen(

@@ -133,7 +133,7 @@ def map_block(
     return len(block.home)
 
 
-def choose_overlapping(
+def choose_of_video(
     source: Path, camera: Path | str | None, settings: MapSettings, division: Division,
     alive: Callable[[], None] = lambda: None,
 ) -> None:
