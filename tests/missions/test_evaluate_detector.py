@@ -220,7 +220,8 @@ def coco(labelled, tmp_path_factory):
 
 
 def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco, tmp_path, capsys):
-    printed = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20", "--tiles", "none"]
+    printed = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
+    printed += ["--tiles", "none"]
     assert main(["evaluate", "detector", str(toy), str(coco), *printed, "--out", str(tmp_path / "out"), "--json"]) == 0
     numbers = json.loads(capsys.readouterr().out)
     assert numbers["sets"][0]["confusion"] == [[2, 1, 0], [0, 1, 1], [1, 0, 0]]
