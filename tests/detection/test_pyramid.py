@@ -11,9 +11,8 @@ from toy_models import draw, rectangle_model
 
 from sorvolo.detection.contract import Pyramid
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.pyramid import agreed_in_sizes
+from sorvolo.detection.pyramid import PyramidSettings, agreed_in_sizes, trust
 from sorvolo.detection.session import Seen, Session
-from sorvolo.detection.tiling import MOST_MAGNIFIED_PX
 from sorvolo.errors import InputError
 
 _BOXES = [(20, 40, 60, 80), (140, 60, 170, 90)]
@@ -30,23 +29,23 @@ def _seen(*rows: tuple[tuple[float, float, float, float], float, int]) -> Seen:
 def test_the_look_that_shows_an_object_at_the_known_size_counts_most() -> None:
     pyramid = Pyramid((2.0, 4.0), 32.0, 1.0, 0.0)
     boxes = np.array([[0, 0, 16, 16], [0, 0, 8, 8], [0, 0, 4000, 4000]], np.float32)
-    trust = pyramid.trust(boxes, np.array([1.0, 2.0, 4.0]))
-    np.testing.assert_allclose(trust.sum(axis=1), 1)
+    shares = trust(boxes, np.array([1.0, 2.0, 4.0]), pyramid)
+    np.testing.assert_allclose(shares.sum(axis=1), 1)
     curve = np.exp([-0.5, 0, -0.5])
-    np.testing.assert_allclose(trust[0], curve / curve.sum(), rtol=1e-5)
-    assert trust[1].argmax() == 2 and trust[2].argmax() == 0
-    assert trust[2, 0] > 0.99 and (trust > 0).all()
+    np.testing.assert_allclose(shares[0], curve / curve.sum(), rtol=1e-5)
+    assert shares[1].argmax() == 2 and shares[2].argmax() == 0
+    assert shares[2, 0] > 0.99 and (shares > 0).all()
 
 
 def test_log_odds_are_averaged_by_trust_and_what_a_look_does_not_show_counts_against() -> None:
     pyramid = Pyramid((2.0,), 32.0, 1.0, 0.0)
     small = (100.0, 100.0, 116.0, 116.0)  # 16 px: the look that shows it twice as large knows it best
-    trust = pyramid.trust(np.array([small], np.float32), np.array([1.0, 2.0]))[0]
+    shares = trust(np.array([small], np.float32), np.array([1.0, 2.0]), pyramid)[0]
     both = agreed_in_sizes([_seen((small, 0.5, 0)), _seen((small, 0.9, 0))], (1.0, 2.0), 0, pyramid)
     assert len(both.scores) == 1
-    assert both.scores[0] == pytest.approx(1 / (1 + math.exp(-trust[1] * math.log(9))), rel=1e-6)
+    assert both.scores[0] == pytest.approx(1 / (1 + math.exp(-shares[1] * math.log(9))), rel=1e-6)
     more = agreed_in_sizes([_seen((small, 0.5, 0)), _seen((small, 0.9, 0))], (1.0, 2.0), 0, replace(pyramid, shift=0.6))
-    assert np.log(more.scores / (1 - more.scores)) == pytest.approx(trust[1] * math.log(9) + 0.6, rel=1e-6)
+    assert np.log(more.scores / (1 - more.scores)) == pytest.approx(shares[1] * math.log(9) + 0.6, rel=1e-6)
     one = agreed_in_sizes([_seen(), _seen((small, 0.9, 0))], (1.0, 2.0), 0, pyramid)
     other = agreed_in_sizes([_seen((small, 0.9, 0)), _seen()], (1.0, 2.0), 0, pyramid)
     assert both.scores[0] > one.scores[0] > other.scores[0]
@@ -108,9 +107,21 @@ def test_a_large_picture_is_not_magnified(tmp_path: Path, monkeypatch: pytest.Mo
     detector = Detector.load(
         rectangle_model(tmp_path / "toy.onnx", pyramid={"person": _SIZES}), provider="cpu", threads=1
     )
-    side_px = math.isqrt(MOST_MAGNIFIED_PX // 4) + 8
+    side_px = math.isqrt(PyramidSettings().most_px // 4) + 8
     detector.detect(np.zeros((side_px, side_px, 3), np.uint8), tiles="auto")
     assert set(shown) == {0.5, 1.0}
+
+
+def test_a_class_of_which_no_other_size_is_left_keeps_its_scores(tmp_path: Path) -> None:
+    magnified, smaller = _SIZES | {"times": [3], "shift": 2}, _SIZES | {"times": [0.5], "shift": 2}
+    model = rectangle_model(tmp_path / "toy.onnx", pyramid={"person": magnified, "car": smaller})
+    detector = Detector.load(model, provider="cpu", threads=1)
+    side_px = math.isqrt(PyramidSettings().most_px // 9) + 8
+    picture = draw((side_px, side_px), _BOXES, labels=[0, 1], scores=[200, 200])
+    once, found = (detector.detect(picture, tiles=tiles) for tiles in (None, "auto"))
+    person, car = (found.names.index(name) for name in ("person", "car"))
+    assert found.scores[person] == once.scores[once.names.index("person")]
+    assert found.scores[car] > once.scores[once.names.index("car")]
 
 
 @pytest.mark.parametrize("wrong", [

@@ -10,6 +10,7 @@ from PIL import Image
 from toy_models import rectangle_model
 
 from sorvolo.cli.main import main
+from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.evaluate.detector import (
     FOUND,
@@ -233,6 +234,21 @@ def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco
     assert main(["evaluate", "detector", str(toy), str(coco), "--classes", "=person"]) == 1
     assert "THEIRS=OURS" in capsys.readouterr().err
     assert main(["evaluate", "detector", "no-such-model", str(coco), *printed]) == 1
+
+
+def test_pictures_are_shown_as_to_watch_unless_asked_otherwise(toy, coco, monkeypatch):
+    shown = []
+    detect = Detector.detect
+
+    def noted(self, image, **how):
+        shown.append(how["tiles"])
+        return detect(self, image, **how)
+
+    monkeypatch.setattr(Detector, "detect", noted)
+    command = ["evaluate", "detector", str(toy), str(coco), "--classes", "Walker=person,Truck=car", "--draws", "20"]
+    assert main(command) == 0 and set(shown) == {"auto"}
+    shown.clear()
+    assert main([*command, "--tiles", "none"]) == 0 and set(shown) == {None}
 
 
 def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_path, capsys):

@@ -7,10 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-import numpy as np
-
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import BoxesPx, Floats
 
 METADATA_KEY = "sorvolo"
 """The key among an ONNX file's `metadata_props` under which the JSON lies."""
@@ -20,9 +17,10 @@ FORMAT = 1
 
 _FALLBACK_STRIDE = 32  # px: what a picture's sides are multiples of, in a model whose file does not state it
 _NEEDED = ("name", "classes", "thresholds", "best_px")
-_MOST_TIMES = 4  # as large as a picture is: more only blurs
-_LEAST_TRUST = 1e-6  # of an opinion, beside the best one: it stays above zero, and its logarithm finite
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
+
+MOST_LARGER = 3.0
+"""So many times as large as it is a picture is shown at most: magnified further, it is only blurred more."""
 
 POSITIONS = ((0, False), (1, False), (2, True), (3, True))
 """In which a second look may show a report: turned by so many quarters counter-clockwise, and then mirrored or not."""
@@ -68,13 +66,6 @@ class Pyramid:
     known_px: float
     octaves: float
     shift: float
-
-    def trust(self, boxes_px: BoxesPx, times: Floats) -> Floats:
-        """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large."""
-        area_px = (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
-        off = np.log2(np.sqrt(np.maximum(area_px, 1.0))[:, None] * times / self.known_px) / self.octaves
-        trust = np.exp(-0.5 * (off**2 - (off**2).min(axis=1, keepdims=True))) + _LEAST_TRUST
-        return np.asarray(trust / trust.sum(axis=1, keepdims=True))
 
 
 @dataclass(frozen=True)
@@ -188,8 +179,8 @@ def _pyramid(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Pyr
     for name, each in fields.get("pyramid", {}).items():
         times = tuple(float(one) for one in each["times"])
         known_px, octaves, shift = (float(each[key]) for key in ("known_px", "octaves", "shift"))
-        if name not in classes or not times or not all(0 < one <= _MOST_TIMES and one != 1 for one in times):
-            raise ValueError(f"its pyramid must name classes and times up to {_MOST_TIMES}, not {name} {list(times)}")
+        if name not in classes or not times or not all(0 < one <= MOST_LARGER and one != 1 for one in times):
+            raise ValueError(f"its pyramid must name classes and times up to {MOST_LARGER}, not {name} {list(times)}")
         if not (0 < known_px < math.inf and 0 < octaves < math.inf and math.isfinite(shift)):
             raise ValueError(
                 f"its pyramid must have a size and octaves above 0 and a shift, not {known_px}, {octaves} and {shift}"

@@ -13,11 +13,11 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import find_model, thermal_model
-from sorvolo.detection.pyramid import agreed_in_sizes
+from sorvolo.detection.pyramid import agreed_in_sizes, sizes_for
 from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
-from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles, pyramid_times
+from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles
 from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Labels
@@ -197,7 +197,7 @@ class Detector:
 
         def in_sizes(shown: ImageRGB, names: Sequence[str]) -> Seen:
             whole_px = shown.shape[0], shown.shape[1]
-            sizes = {} if overlapping else pyramid_times(whole_px, session.info, names, tiles, m_per_px)
+            sizes = {} if overlapping else sizes_for(whole_px, session.info, names, tiles, m_per_px)
             looks = [look(shown, names), *(look(shown, of, times) for times, of in sizes.items())]
             return _in_sizes(looks, names, session.info) if sizes else looks[0].seen
 
@@ -275,8 +275,9 @@ def _together(looks: Sequence[Seen], groups: Sequence[Sequence[str]], classes: S
 
 def _in_sizes(looks: Sequence[_SizedLook], names: Sequence[str], info: ModelInfo) -> Seen:
     """What looks at one picture saw together of `names`, best first; the first looked for all of them."""
-    groups, seen = [[name for name in names if name not in info.pyramid]], [looks[0].seen]
-    for name in (name for name in names if name in info.pyramid):
+    several = [name for name in names if any(name in each.names for each in looks[1:])]
+    groups, seen = [[name for name in names if name not in several]], [looks[0].seen]
+    for name in several:
         own = [each for each in looks if name in each.names]
         groups.append([name])
         seen.append(agreed_in_sizes(

@@ -4,24 +4,48 @@ A network knows objects of some sizes better than of others. Where the ground th
 is shown at the right size (`tiling`); where it is not, nothing but the boxes themselves tells which look to believe.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.detection.contract import Pyramid
+from sorvolo.detection.contract import ModelInfo, Pyramid
+from sorvolo.detection.log_odds import log_odds
 from sorvolo.detection.session import Seen
+from sorvolo.detection.tiling import Tiles
 from sorvolo.detection.turning import alike
-from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.arrays import BoxesPx, Floats
 
 
 @dataclass(frozen=True)
 class PyramidSettings:
-    """How what looks of several sizes saw is put together."""
+    """Up to which size a picture is magnified, and how what looks of several sizes saw is put together."""
 
+    most_px: int = 20_000_000  # of a magnified picture: what a photo of that size costs; by choice
     same_iou: float = 0.5  # boxes of one class that overlap more are one object, as COCO counts them
     unseen_odds: float = -4.5  # log-odds of what a look does not show: models report from -3.9 on
-    surest: float = 1 - 1e-4  # a score counts for so much at most, and for as little at least
+    least_sure: float = 1e-4  # no score counts for less, nor for more than 1 less this
+    least_trust: float = 1e-6  # of a look, beside the best one: it stays above zero, and its logarithm finite
+
+
+def sizes_for(
+    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], tiles: Tiles, m_per_px: float,
+    settings: PyramidSettings = PyramidSettings(),
+) -> dict[float, tuple[str, ...]]:
+    """How many times as large a picture of (height, width) `size_px` is shown besides as it is, and for which classes.
+
+    Where "auto" does not know its scale, those of the model's `pyramid` at which it has `most_px` or less.
+    """
+    if tiles != "auto" or not math.isnan(m_per_px):
+        return {}
+    area_px = size_px[0] * size_px[1]
+    asked = {name: info.pyramid[name].times for name in wanted if name in info.pyramid}
+    return {
+        each: tuple(name for name, times in asked.items() if each in times)
+        for each in sorted({each for times in asked.values() for each in times})
+        if area_px * each**2 <= settings.most_px
+    }
 
 
 def agreed_in_sizes(
@@ -32,32 +56,36 @@ def agreed_in_sizes(
 
     All boxes are in the picture's own pixels. Boxes that overlap are one object, at most one of each look. Its
     log-odds are the looks' mean, weighed by how well the model knows an object of the size at which each look shows
-    it (`Pyramid.trust`), a logarithmic opinion pool (Genest and Zidek 1986), and `Pyramid.shift`; its box is the mean
-    of the looks' boxes by these weights times their scores.
+    it (`trust`), a logarithmic opinion pool (Genest and Zidek 1986), and `Pyramid.shift`; its box is the mean of the
+    looks' boxes by these weights times their scores.
     """
     own = [look.labels == label for look in looks]
     boxes = np.concatenate([look.boxes_px[mine] for look, mine in zip(looks, own)])
     scores = np.concatenate([look.scores[mine] for look, mine in zip(looks, own)])
     of_look = np.repeat(np.arange(len(looks)), [np.count_nonzero(mine) for mine in own])
-    odds = _odds(scores, settings)
-    trust = pyramid.trust(boxes, np.array(times))
-    claims = odds + np.log(trust[np.arange(len(boxes)), of_look])  # the look that knows the size best leads
+    odds = log_odds(scores, settings.least_sure)
+    weights = trust(boxes, np.array(times), pyramid, settings)
+    claims = odds + np.log(weights[np.arange(len(boxes)), of_look])  # the look that knows the size best leads
     order = np.argsort(-claims, kind="stable")
-    found_px, found_odds = np.zeros((len(boxes), 4), np.float32), np.zeros(len(boxes))
-    count = 0
-    for count, group in enumerate(alike(boxes[order], settings.same_iou), start=1):
-        rows, weights = order[group], trust[order[group[0]]]
+    found_px, found_odds = [np.zeros((0, 4))], []
+    for group in alike(boxes[order], settings.same_iou):
+        rows, own_weights = order[group], weights[order[group[0]]]
         best = np.full(len(looks), settings.unseen_odds)
         np.maximum.at(best, of_look[rows], odds[rows])
-        found_odds[count - 1] = weights @ best + pyramid.shift
-        found_px[count - 1] = np.average(boxes[rows], axis=0, weights=weights[of_look[rows]] * scores[rows])
-    best_first = np.argsort(-found_odds[:count], kind="stable")
+        found_odds.append(float(own_weights @ best) + pyramid.shift)
+        found_px.append(np.average(boxes[rows], axis=0, weights=own_weights[of_look[rows]] * scores[rows])[None])
+    best_first = np.argsort(-np.array(found_odds), kind="stable")
     return Seen(
-        found_px[:count][best_first], 1 / (1 + np.exp(-found_odds[:count][best_first])),
-        np.full(count, label, np.int64),
+        np.concatenate(found_px)[best_first].astype(np.float32), 1 / (1 + np.exp(-np.array(found_odds)[best_first])),
+        np.full(len(found_odds), label, np.int64),
     )
 
 
-def _odds(scores: Floats, settings: PyramidSettings) -> Floats:
-    inside = np.clip(scores, 1 - settings.surest, settings.surest)
-    return np.asarray(np.log(inside / (1 - inside)))
+def trust(
+    boxes_px: BoxesPx, times: Floats, pyramid: Pyramid, settings: PyramidSettings = PyramidSettings()
+) -> Floats:
+    """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large."""
+    area_px = (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
+    off = np.log2(np.sqrt(np.maximum(area_px, 1.0))[:, None] * times / pyramid.known_px) / pyramid.octaves
+    curve = np.exp(-0.5 * (off**2 - (off**2).min(axis=1, keepdims=True))) + settings.least_trust
+    return np.asarray(curve / curve.sum(axis=1, keepdims=True))

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from sorvolo.detection.contract import POSITIONS, SecondLook
+from sorvolo.detection.log_odds import log_odds
 from sorvolo.detection.session import Seen
 from sorvolo.detection.turning import turned, turned_back
 from sorvolo.geometry.arrays import Floats, ImageRGB
@@ -32,6 +33,7 @@ class SheetSettings:
     cuts: tuple[int, int] = (8, 96)  # cut-outs of one picture in one position, best first: at least, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
     surest: float = 0.98  # no first score counts for more, so that the second look can overrule it (decision 0075)
+    least_sure: float = 1e-3  # no score counts for less, nor for more than 1 less this: log-odds stay within 7
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
     filling: int = 114  # beyond the picture's edge, as in training
 
@@ -55,14 +57,14 @@ def looked_again(
     `hows` names for labels how their reports are looked at again; others keep their score. Reports below `least` are
     not looked at and count as not seen again, so that they stay behind those that were not.
     """
-    scores, again_odds = seen.scores.copy(), np.full(len(seen.scores), _odds(settings.unseen))
+    scores, again_odds = seen.scores.copy(), np.full(len(seen.scores), log_odds(settings.unseen, settings.least_sure))
     looked_at = opinions(seen, picture, sees, hows, settings)
     for row, again in looked_at.items():
-        again_odds[row] = _odds(again).mean()
+        again_odds[row] = log_odds(again, settings.least_sure).mean()
     for label, how in hows.items():
         rows = (seen.labels == label) & (seen.scores < how.least)
         rows[[row for row in looked_at if seen.labels[row] == label]] = True
-        own_odds = _odds(np.minimum(scores[rows], settings.surest))
+        own_odds = log_odds(np.minimum(scores[rows], settings.surest), settings.least_sure)
         odds = how.shift + how.own * own_odds + how.again * again_odds[rows]
         scores[rows] = 1 / (1 + np.exp(-odds))
     order = np.argsort(-scores, kind="stable")
@@ -157,8 +159,3 @@ def _scores(cuts: Sequence[_Cut], sees: Sees, settings: SheetSettings) -> Floats
     same = iou_matrix(boxes, seen.boxes_px) >= settings.same_iou
     same &= np.array([each.label for each in cuts])[:, None] == seen.labels[None]
     return np.where(same, seen.scores[None], 0.0).max(axis=1, initial=settings.unseen)
-
-
-def _odds(scores: Floats | float) -> Floats:
-    inside = np.clip(scores, 1e-3, 1 - 1e-3)
-    return np.asarray(np.log(inside / (1 - inside)))

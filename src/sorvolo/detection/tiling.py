@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.contract import MOST_LARGER, ModelInfo
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M, Task, required_px_per_m
 from sorvolo.survey.objects import TYPICAL_SIZE_M
@@ -21,13 +21,9 @@ MOST_WHOLE_PX = 2_400_000
 MOST_AT_ONCE_PX = 8_400_000
 """A larger picture than a 4K frame is cut into tiles even if it was asked for whole: it would take gigabytes."""
 
-MOST_MAGNIFIED_PX = 20_000_000
-"""A picture of unknown scale is magnified (`Pyramid`) to so many pixels at most: what a large photo costs."""
-
 TASK = Task.RECOGNITION
 """What a person must at least be shown for (Johnson's criteria): 6 px over the critical dimension."""
 
-_MOST_LARGER = 3.0  # magnified further, a picture is only blurred more
 _THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal optics blur, and clothes hide limbs
 _THERMAL_LARGER = 1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
 _MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a look of its own, which costs half or less
@@ -64,7 +60,7 @@ def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: 
         least *= _THERMAL_PX
     most = m_per_px * most_px / max(length_m, height_m)
     if least > 1:
-        return min(least, _MOST_LARGER)
+        return min(least, MOST_LARGER)
     return min(1.0, max(least, most))
 
 
@@ -98,24 +94,6 @@ def whole_m_per_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, size
     scale = scale_for(info, m_per_px, wanted)
     most = max(1.0, math.sqrt(MOST_WHOLE_PX / (size_px[0] * size_px[1])))
     return m_per_px * min(1.0, most / scale)
-
-
-def pyramid_times(
-    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], tiles: Tiles, m_per_px: float
-) -> dict[float, tuple[str, ...]]:
-    """How many times as large a picture of (height, width) `size_px` is shown besides as it is, and for which classes.
-
-    Where "auto" does not know its scale, those of the model's `pyramid` at which it has `MOST_MAGNIFIED_PX` or less.
-    """
-    if tiles != "auto" or not math.isnan(m_per_px):
-        return {}
-    area_px = size_px[0] * size_px[1]
-    asked = {name: info.pyramid[name].times for name in wanted if name in info.pyramid}
-    return {
-        each: tuple(name for name, times in asked.items() if each in times)
-        for each in sorted({each for times in asked.values() for each in times})
-        if area_px * each**2 <= MOST_MAGNIFIED_PX
-    }
 
 
 def plan_tiles(
