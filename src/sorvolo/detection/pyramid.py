@@ -1,7 +1,7 @@
 """A picture of unknown scale searched in several sizes, an image pyramid: what they agree on (decision 0084).
 
 A network knows objects of some sizes better than of others. Where the ground that a pixel covers is known, the picture
-is shown at the right size (`tiling`); where it is not, nothing but the boxes themselves tells which look to believe.
+is shown at the right size (`tiling`); where it is not, nothing but the boxes themselves shows which look to believe.
 """
 
 import math
