@@ -38,7 +38,7 @@ HeldOutShare = Annotated[
     float, typer.Option(help="Use only the share that `sorvolo train --val SHARE` with the same seed holds out.")
 ]
 Tiles = Annotated[
-    str, typer.Option(help="How pictures are shown: auto (as to watch and map), none (as they are), pixels of a tile.")
+    str, typer.Option(help="How pictures are shown: auto (as photos in watch), none (as they are), pixels of a tile.")
 ]
 FromAbove = Annotated[
     bool, typer.Option("--from-above", help="The pictures look straight down: models that want it look twice.")
