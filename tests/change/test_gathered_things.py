@@ -1,5 +1,7 @@
 """What no view shows surely and all views show together; learned features beside what unchanged ground differs by."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -83,7 +85,39 @@ def test_a_thing_that_no_view_flags_is_reported_with_its_place_and_once(ground):
     assert np.hypot(*(middle_of(change) - [(west + east) / 2, (south + north) / 2])) < 0.7
     assert 0.5 < change.area_m2 / ((east - west) * (north - south)) < 1.8
     assert change.patch.after[..., 3].any() and 0.3 < change.score <= 1
-    assert things.conclude("b", 8, [change]) == []
+
+
+def moved(change: Change, east_m: float, north_m: float, kind: ChangeKind, name: str) -> Change:
+    return replace(change, id=name, kind=kind, outline_m=change.outline_m + np.array([east_m, north_m]))
+
+
+def test_a_thing_that_was_announced_goes_on_with_its_id_and_times_and_is_reported_once(ground):
+    things = gathered(ground, with_car(ground), 4)
+    (thing,) = things.conclude("b", 7, [])
+    a_part = replace(
+        moved(thing, 0, 0, ChangeKind.REPLACED, "b-3"), announced_ns=5, first_seen_ns=2, last_seen_ns=9,
+        outline_m=thing.outline_m.mean(axis=0) + 0.8 * (thing.outline_m - thing.outline_m.mean(axis=0)),
+    )
+    square_m = np.array([[0, 0], [0.6, 0], [0.6, -0.6], [0, -0.6]])
+    corner = replace(a_part, id="b-2", outline_m=thing.outline_m.mean(axis=0) + square_m)
+    for others in ([a_part, corner], [corner, a_part]):
+        (one,) = things.conclude("b", 8, others)
+        assert one.id == "b-3" and one.kind is ChangeKind.APPEARED
+        assert (one.announced_ns, one.first_seen_ns, one.last_seen_ns) == (5, 2, 9)
+        assert np.array_equal(one.outline_m, thing.outline_m)
+
+
+def test_other_changes_stay_but_where_features_hold_the_ground_for_the_same(ground):
+    things = gathered(ground, with_car(ground), 4)
+    (thing,) = things.conclude("b", 7, [])
+    same = moved(thing, 0, 9, ChangeKind.APPEARED, "b-1")
+    unseen = moved(thing, -90, 0, ChangeKind.APPEARED, "b-2")
+    moves = moved(thing, 0, 9, ChangeKind.MOVING, "b-3")
+    area = moved(thing, 0, 0, ChangeKind.AREA, "b-4")
+    beside = moved(thing, 3.2, 0, ChangeKind.APPEARED, "b-5")  # the thing is a quarter of it
+    concluded = {each.id for each in things.conclude("b", 8, [same, unseen, moves, area, beside])}
+    assert concluded == {"b-2", "b-3", "b-4", "b-5", "b-8"}
+    assert GatheredThings().conclude("b", 1, [same]) == [same]
 
 
 def test_what_one_view_alone_shows_is_confirmed_where_it_lies_apart_and_not_as_a_shadow_or_twice_seen(ground):

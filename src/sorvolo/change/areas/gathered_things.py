@@ -1,5 +1,6 @@
-"""Things that no view shows surely and all views together do: learned differences gathered over a flight's views."""
+"""Things that all views of a flight together show: learned differences gathered over its views."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,10 +16,11 @@ from sorvolo.change.shape.outlines import mask_of, measures, outline_of
 from sorvolo.change.shape.place_sigma import place_sigma_m
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.survey.findings import Change, ComparedView, Shade
+from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
 _SUMS = ("seen", "apart", "agree", "came", "left")
 _SHADES = {"came": Shade.LATER_DARK, "left": Shade.EARLIER_DARK}  # shade of the later date alone, of the earlier alone
+_APART = ChangeKind.MOVING, ChangeKind.AREA  # what moves is no thing of the ground, and an area is more than one
 _HIGHEST = 95.0  # percentile of what lies farthest apart
 
 
@@ -29,16 +31,17 @@ class GatherThingSettings:
     cell_px: int = 3  # a cell's side, in pixels of the views
     most_cells: int = 12_000_000  # of the raster, which bounds its memory (190 MB): views beyond are left out
     least_views: int = 2  # what one view alone shows is not announced
-    spreads: float = 1.2  # by which the views of a cell lie apart on the mean
+    spreads: float = 1.0  # by which the views of a cell lie apart on the mean
     of_height: float = 0.6  # its outline runs where this part of what lies farthest apart in it is left
-    own_spreads: float = 0.8  # from which on a view by itself agrees
-    least_cells: int = 64  # smaller things are found by their outline
+    own_spreads: float = 0.5  # from which on a view by itself agrees
+    least_cells: int = 44  # smaller things are found by their outline
     most_of_cells: int = 2000  # larger ground is an area
     most_dark: float = 0.7  # share of it that is darker on one date as in a shadow: it may be one
     is_moved: float = 0.6  # 0056: share of an outline that is shade, and of it that lies on the other date's, moved
     tallest_m: float = 5.0  # 0056: what may throw a moved shadow; of higher things too many shades lie along the way
-    sure_spreads: float = 3.0  # what lies so far apart is sure
-    explained: float = 0.2  # share of it that other changes hold: it is reported with them
+    sure_spreads: float = 1.8  # what lies so far apart is sure
+    held: float = 0.3  # 0085: share of another change that things hold: it is reported as they are
+    least_apart: float = 0.4  # 0085: spreads; ground of another change that lies less apart is the same
     learned: LearnedSettings = field(default_factory=LearnedSettings)
     pictures: GroundPictureSettings = field(default_factory=GroundPictureSettings)
 
@@ -82,9 +85,7 @@ class GatheredThings:
 
     def lies_apart(self, outline_m: PointsM) -> bool:
         """Whether an outline's ground, (N, 2), differs on the mean as much as a thing that is found by that alone."""
-        part, own = self._around(outline_m)
-        seen, apart = (self._ground.sums[name][part][own] for name in ("seen", "apart"))
-        return bool(len(seen)) and float((apart / seen).mean()) > self._settings.spreads
+        return self._mean_apart(*self._around(outline_m)) > self._settings.spreads
 
     def is_moved_shadow(self, outline_m: PointsM, earlier: Floats, later: Floats) -> bool:
         """Whether an outline's ground, (N, 2), is shade of one date, and shade of the other lies where what stays
@@ -117,12 +118,42 @@ class GatheredThings:
         return part, own & seen
 
     def conclude(self, id_prefix: str, first_number: int, others: Sequence[Change]) -> list[Change]:
-        """After the last view: the things that `others` do not hold, numbered from `first_number` on."""
+        """After the last view: the things that all views together show, and those of `others` that they do not hold.
+
+        A thing that holds others goes on as the one it holds most of, with its id and times; others are numbered from
+        `first_number` on. Left out is also, of `others`, what lies on ground that is the same by its features. What
+        moves and areas are left as they are (0085).
+        """
         if self._ground.is_empty:
-            return []
-        explained = self._settings.explained
-        found = [each for each in self._things() if _explained(each, others) < explained]
-        return [replace(each, id=f"{id_prefix}-{first_number + place}") for place, each in enumerate(found)]
+            return list(others)
+        things = list(self._things())
+        holders = np.zeros(self._ground.window.shape, np.int32)
+        for place, thing in enumerate(things, 1):
+            part, own = self._around(thing.outline_m)
+            holders[part][own] = place
+        kept: list[Change] = []
+        held: dict[int, tuple[int, Change]] = {}
+        for each in others:
+            part, own = self._around(each.outline_m)
+            cells = holders[part][own]
+            in_things = cells[cells > 0]
+            if each.kind in _APART or not len(cells):
+                kept.append(each)
+            elif len(in_things) >= self._settings.held * len(cells):
+                place = int(np.bincount(in_things).argmax())
+                held[place] = max(held.get(place, (0, each)), (len(in_things), each), key=lambda of: of[0])
+            elif self._mean_apart(part, own) >= self._settings.least_apart:
+                kept.append(each)
+        numbers = itertools.count(first_number)
+        return kept + [
+            _going_on(thing, held[place][1]) if place in held else replace(thing, id=f"{id_prefix}-{next(numbers)}")
+            for place, thing in enumerate(things, 1)
+        ]
+
+    def _mean_apart(self, part: tuple[slice, slice], own: Mask) -> float:
+        """By how much some cells of a part of the raster lie apart on the mean, in spreads; NaN for no cells."""
+        seen, apart = (self._ground.sums[name][part][own] for name in ("seen", "apart"))
+        return float((apart / seen).mean()) if len(seen) else float("nan")
 
     def _things(self) -> Iterator[Change]:
         """Connected ground that lies apart, without an id."""
@@ -163,12 +194,9 @@ class GatheredThings:
         )
 
 
-def _explained(change: Change, others: Sequence[Change]) -> float:
-    """The share of a change that lies within others."""
-    shape, site_from_patch = change.patch.changed.shape, change.patch.site_from_patch
-    own, theirs = mask_of(change.outline_m, site_from_patch, shape), np.zeros(shape, bool)
-    low, high = change.outline_m.min(axis=0), change.outline_m.max(axis=0)
-    for each in others:
-        if (each.outline_m.max(axis=0) > low).all() and (each.outline_m.min(axis=0) < high).all():
-            theirs |= mask_of(each.outline_m, site_from_patch, shape)
-    return float((own & theirs).sum() / max(1, own.sum()))
+def _going_on(thing: Change, known: Change) -> Change:
+    """A thing as the change that is known already, perhaps to those who follow the flight."""
+    return replace(
+        thing, id=known.id, first_seen_ns=known.first_seen_ns, last_seen_ns=known.last_seen_ns,
+        announced_ns=known.announced_ns,
+    )

@@ -17,7 +17,7 @@ Image = NDArray[np.uint8]
 """(h, w, 3) uint8 BGR."""
 
 _WHOLE_PX = 32  # the network's input has sides that are multiples of this
-_LAYERS = ("fine", "middle", "coarse")  # at strides of 4, 8 and 16 px
+_LAYERS = ("finest", "fine", "coarse", "coarsest")  # at strides of 4, 8, 16 and 32 px
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ def learned_difference(
 ) -> Floats32:
     """(h, w) by how many spreads the features of two aligned pictures lie farther apart than they mostly do.
 
-    Features are those of NanoDet's backbone (`learned_difference.onnx`), each channel in units of its standard
+    Features are those of EfficientNet-Lite0 (`learned_difference.onnx`), each channel in units of its standard
     deviation over the pictures, compared with the nearest of those around: by their distance and by the cosine between
     them. Both are centred on the median of the `known` ground and divided by their spread there (1.48 times the median
     deviation): the scale is what light, season, traffic and alignment do to unchanged ground in this very pair, and at
-    least what they do between two dates. The mean over three layers; 0 where nothing is `known`.
+    least what they do between two dates. The mean over four layers; 0 where nothing is `known`.
     """
     height, width = query.shape[:2]
     seen = np.ones((height, width), bool) if known is None else known

@@ -56,7 +56,7 @@ class FlightChanges:
         if gathered is None:
             return with_areas(things, areas)
         found = with_areas(things, areas, lies_apart=gathered.lies_apart)
-        found += gathered.conclude(self._flight, first + len(areas), found)
+        found = gathered.conclude(self._flight, first + len(areas), found)
         return [each for each in found if not self._is_moved_shadow(each, gathered)]
 
     def candidates(self) -> dict[str, Any] | None:
