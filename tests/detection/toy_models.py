@@ -9,6 +9,7 @@ import pytest
 
 onnx = pytest.importorskip("onnx")  # comes with the extra "training"
 pytest.importorskip("onnx.parser")
+pytest.importorskip("onnx.reference")
 
 CLASSES = ("person", "car", "small object")
 METADATA: dict[str, Any] = {
