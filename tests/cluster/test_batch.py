@@ -128,6 +128,7 @@ def test_a_video_under_a_second_name_is_the_same_flight(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "maps").iterdir() if path.is_dir()] == ["DJI_0042"]
 
 
+@pytest.mark.long
 def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Path, tmp_path: Path) -> None:
     another(flown, tmp_path / "in" / "one")
     command = [

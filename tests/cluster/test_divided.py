@@ -192,6 +192,7 @@ def test_a_flight_in_blocks_is_known_afterwards(
     assert (report.tries, report.counts()) == (0, {"known": 1})
 
 
+@pytest.mark.long
 def test_a_video_in_blocks_is_the_map_of_one_machine(video: Flown, tmp_path: Path) -> None:
     root = tmp_path / "maps"
     (row,) = run(video, root, 2, Disturbed, most_tries=1).rows
@@ -204,6 +205,7 @@ def test_a_video_in_blocks_is_the_map_of_one_machine(video: Flown, tmp_path: Pat
     assert parts == [(PartKind.BLOCK, 1), (PartKind.TILES, 0), (PartKind.TILES, 1)]  # its frames were chosen before
 
 
+@pytest.mark.long
 def test_a_video_that_gives_other_frames_than_were_chosen_is_refused(video: Flown) -> None:
     with opened_sources([video.source], None, video.camera) as sources:
         setup = prepare_divided(sources[0], MapSettings(model="none"))

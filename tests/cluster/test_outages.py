@@ -119,6 +119,7 @@ def test_an_object_store_that_comes_late_has_every_map(
         assert failed.state is State.FAILED and "was not copied" in failed.words and os.fspath(tmp_path) in failed.words
 
 
+@pytest.mark.long
 def test_an_object_store_that_is_killed_in_the_middle_of_a_copy(
     flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

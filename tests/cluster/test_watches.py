@@ -84,6 +84,7 @@ def test_a_killed_watch_goes_on_and_leaves_what_an_undisturbed_one_leaves(flown:
     assert content(tmp_path / "out" / "one-watch") == content(whole)
 
 
+@pytest.mark.long
 def test_a_stream_whose_watch_dies_goes_on_in_the_same_folder(flown: Path, tmp_path: Path) -> None:
     another(flown, tmp_path / "in" / "one")
     settings = wished(flown, alert_command=killing_once(tmp_path / "killed", tmp_path / "alerts"))

@@ -443,7 +443,7 @@ def is_the_same(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("sign", [
-    "site.db", "flights/*/keyframes/*/000004.jpg",
+    pytest.param("site.db", marks=pytest.mark.long), "flights/*/keyframes/*/000004.jpg",
     pytest.param("tiles/*/*", marks=pytest.mark.long), pytest.param("mosaic.tif", marks=pytest.mark.long),
 ])
 def test_kill_at_any_moment_and_the_same_command_again(
@@ -486,6 +486,7 @@ def test_a_stop_by_the_keyboard_leaves_no_traceback(photos: Path, photographed: 
         assert not archive.flights() and not archive.tiles() and not archive.has_site
 
 
+@pytest.mark.long
 def test_a_stop_by_the_keyboard_keeps_the_flights_before(photos: Path, photographed: Path, tmp_path: Path) -> None:
     site, second = tmp_path / "site", tmp_path / "second"
     shutil.copytree(photos, second)

@@ -96,6 +96,7 @@ def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
     assert (mapped / "mosaic.tif").read_bytes() == map_before
 
 
+@pytest.mark.long
 def test_heights_of_a_map_that_contradicts_itself_or_mixes_lenses_state_it(
     mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -65,6 +65,7 @@ def rows(site: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
+@pytest.mark.long
 def test_the_same_rows_in_either(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], postgres: PostgresServer,
     monkeypatch: pytest.MonkeyPatch,

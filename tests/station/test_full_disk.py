@@ -158,6 +158,7 @@ def test_a_camera_whose_station_has_no_room_ends_incomplete(disk: Path) -> None:
         camera.close()
 
 
+@pytest.mark.long
 def test_an_upload_s_mission_on_a_full_disk_fails_in_words(flown: Path, disk: Path) -> None:
     """It is warned of before; the site is as it was, and the station goes on."""
     shutil.copytree(flown, disk / "flown")

@@ -193,6 +193,7 @@ def test_a_mission_that_cannot_be_noted_does_not_run(
     assert spawned[0].poll() == -signal.SIGKILL and runs.all() == []
 
 
+@pytest.mark.long
 def test_lines_that_cannot_be_read_are_passed_over(open_station: Callable[[], TestClient]) -> None:
     """A power cut tore one: what stands behind it counts."""
     client = open_station()

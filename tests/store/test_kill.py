@@ -12,7 +12,7 @@ from sorvolo.store.site.archive import Archive
 
 
 @pytest.mark.parametrize(("moments", "rounds", "kind"), [
-    ("steps", 6, "sqlite"), pytest.param("random", 5, "sqlite", marks=pytest.mark.long),
+    ("steps", 3, "sqlite"), pytest.param("random", 5, "sqlite", marks=pytest.mark.long),
     pytest.param("random", 3, "postgresql", marks=pytest.mark.long),
 ], indirect=["kind"])
 def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int, kind: str) -> None:

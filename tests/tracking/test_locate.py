@@ -200,6 +200,7 @@ def test_nothing_found_is_nothing_placed():
     assert locate(no_detections(CLASSES), 0, "0", 0, CAMERA, PRIOR)[0] == []
 
 
+@pytest.mark.long
 def test_places_from_sixty_metres_are_as_good_as_they_state():
     """Boxes of a simulated flight, GPS of 1.5 m, gimbal of 0.5 degrees: at most 2 m rms, 90 to 99 % in 2 sigma."""
     settings = SimulationSettings(

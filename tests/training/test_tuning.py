@@ -78,6 +78,7 @@ def test_a_tuned_run_goes_on_from_its_own_model_only(learnt: Path, tuned: Path, 
     assert main([*command, "--weights", "none", "--resume"]) == 1
 
 
+@pytest.mark.long
 def test_new_classes_are_learnt_from_the_beginning_and_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
