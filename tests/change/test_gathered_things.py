@@ -1,6 +1,7 @@
 """What no view shows surely and all views show together; learned features beside what unchanged ground differs by."""
 
 from dataclasses import replace
+from itertools import count
 
 import cv2
 import numpy as np
@@ -79,7 +80,7 @@ def gathered(before: ImageRGB, after: ImageRGB, views: int, shade: int | np.ndar
 
 def test_a_thing_that_no_view_flags_is_reported_with_its_place_and_once(ground):
     things = gathered(ground, with_car(ground), 4)
-    (change,) = things.conclude("b", 7, [])
+    (change,) = things.conclude("b", count(7), [])
     assert change.id == "b-7" and change.kind is ChangeKind.APPEARED and change.views == 4
     west, east, south, north = BOX_M
     assert np.hypot(*(middle_of(change) - [(west + east) / 2, (south + north) / 2])) < 0.7
@@ -93,7 +94,7 @@ def moved(change: Change, east_m: float, north_m: float, kind: ChangeKind, name:
 
 def test_a_thing_that_was_announced_goes_on_with_its_id_and_times_and_is_reported_once(ground):
     things = gathered(ground, with_car(ground), 4)
-    (thing,) = things.conclude("b", 7, [])
+    (thing,) = things.conclude("b", count(7), [])
     a_part = replace(
         moved(thing, 0, 0, ChangeKind.REPLACED, "b-3"), announced_ns=5, first_seen_ns=2, last_seen_ns=9,
         outline_m=thing.outline_m.mean(axis=0) + 0.8 * (thing.outline_m - thing.outline_m.mean(axis=0)),
@@ -101,7 +102,7 @@ def test_a_thing_that_was_announced_goes_on_with_its_id_and_times_and_is_reporte
     square_m = np.array([[0, 0], [0.6, 0], [0.6, -0.6], [0, -0.6]])
     corner = replace(a_part, id="b-2", outline_m=thing.outline_m.mean(axis=0) + square_m)
     for others in ([a_part, corner], [corner, a_part]):
-        (one,) = things.conclude("b", 8, others)
+        (one,) = things.conclude("b", count(8), others)
         assert one.id == "b-3" and one.kind is ChangeKind.APPEARED
         assert (one.announced_ns, one.first_seen_ns, one.last_seen_ns) == (5, 2, 9)
         assert np.array_equal(one.outline_m, thing.outline_m)
@@ -109,15 +110,15 @@ def test_a_thing_that_was_announced_goes_on_with_its_id_and_times_and_is_reporte
 
 def test_other_changes_stay_but_where_features_hold_the_ground_for_the_same(ground):
     things = gathered(ground, with_car(ground), 4)
-    (thing,) = things.conclude("b", 7, [])
+    (thing,) = things.conclude("b", count(7), [])
     same = moved(thing, 0, 9, ChangeKind.APPEARED, "b-1")
     unseen = moved(thing, -90, 0, ChangeKind.APPEARED, "b-2")
     moves = moved(thing, 0, 9, ChangeKind.MOVING, "b-3")
     area = moved(thing, 0, 0, ChangeKind.AREA, "b-4")
     beside = moved(thing, 3.2, 0, ChangeKind.APPEARED, "b-5")  # the thing is a quarter of it
-    concluded = {each.id for each in things.conclude("b", 8, [same, unseen, moves, area, beside])}
+    concluded = {each.id for each in things.conclude("b", count(8), [same, unseen, moves, area, beside])}
     assert concluded == {"b-2", "b-3", "b-4", "b-5", "b-8"}
-    assert GatheredThings().conclude("b", 1, [same]) == [same]
+    assert GatheredThings().conclude("b", count(1), [same]) == [same]
 
 
 def test_what_one_view_alone_shows_is_confirmed_where_it_lies_apart_and_not_as_a_shadow_or_twice_seen(ground):
@@ -139,18 +140,34 @@ def test_a_thing_within_an_area_lies_apart_and_unchanged_ground_or_none_does_not
     assert not gathered(ground, ground, 0).lies_apart(box_m)
 
 
+def test_an_object_of_one_date_is_a_change_where_the_ground_differs_and_no_other_change_holds_it(ground):
+    west, east, south, north = BOX_M
+    place_m = np.array([(west + east) / 2, (south + north) / 2])
+    things = gathered(ground, with_car(ground), 3)
+    change = things.standing_at(place_m, 5.0, [])
+    assert change is not None and np.hypot(*(middle_of(change) - place_m)) < 0.8
+    assert 0.4 < change.area_m2 / ((east - west) * (north - south)) < 1.8
+    (known,) = things.conclude("b", count(1), [])
+    assert things.standing_at(place_m, 5.0, [known]) is None
+    assert things.standing_at(place_m, 5.0, [replace(known, kind=ChangeKind.AREA)]) is not None
+    assert things.standing_at(place_m - [0, 9], 5.0, []) is None, "the same ground"
+    assert things.standing_at(place_m - [90, 0], 5.0, []) is None, "never seen"
+    assert gathered(ground, with_car(ground), 1).standing_at(place_m, 5.0, []) is None, "seen by one view"
+    assert GatheredThings().standing_at(place_m, 5.0, []) is None
+
+
 def middle_of(change: Change) -> np.ndarray:
     return (change.outline_m.min(axis=0) + change.outline_m.max(axis=0)) / 2
 
 
 @pytest.mark.parametrize("views, shade", [(1, 0), (4, 0xFF)])
 def test_what_one_view_shows_or_may_be_a_shadow_is_not_reported(ground, views, shade):
-    assert gathered(ground, with_car(ground), views, shade).conclude("b", 1, []) == []
+    assert gathered(ground, with_car(ground), views, shade).conclude("b", count(1), []) == []
 
 
 def test_unchanged_ground_in_another_light_and_no_flight_at_all_give_nothing(ground):
-    assert gathered(ground, (0.7 * ground).astype(np.uint8), 4).conclude("b", 1, []) == []
-    assert GatheredThings().conclude("b", 1, []) == []
+    assert gathered(ground, (0.7 * ground).astype(np.uint8), 4).conclude("b", count(1), []) == []
+    assert GatheredThings().conclude("b", count(1), []) == []
 
 
 EARLIER, LATER = slide_of(direction_from_angles(237, 29)), slide_of(direction_from_angles(165, 39))

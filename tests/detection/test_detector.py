@@ -2,6 +2,7 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -256,3 +257,18 @@ class TestThermalFramesAndDaylightModels:
         assert self.day.thresholds_for(picture) == self.day.info.thresholds
         assert set(self.day.thresholds_for(picture[:, :, 0]).values()) == {0.6}
         assert self.day.notices == (), "asking is not looking"
+
+
+def test_people_who_are_too_small_from_above_are_not_looked_for_and_a_notice_states_it(
+    picture: np.ndarray, tmp_path: Path
+) -> None:
+    detector = Detector.load(rectangle_model(tmp_path / "model.onnx"), provider="cpu", threads=1)
+    fine, coarse = 0.09, 0.12
+    look = partial(detector.detect, picture, from_above=True)
+    assert look(m_per_px=fine).names == look().names == ["person", "small object", "car"]
+    assert detector.notices == ()
+    assert look(m_per_px=coarse).names == ["small object", "car"]
+    assert not len(look(m_per_px=coarse, classes=["person"]))
+    assert detector.detect(picture, m_per_px=coarse).names == ["person", "small object", "car"], "from aslant"
+    (notice,) = detector.notices
+    assert (notice.code, notice.count) == ("people_too_small", 2) and "10 cm" in notice.text

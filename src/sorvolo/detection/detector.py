@@ -17,12 +17,12 @@ from sorvolo.detection.pyramid import agreed_in_sizes, sizes_for
 from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
-from sorvolo.detection.tiling import Tiles, looks_for, plan_tiles
+from sorvolo.detection.tiling import COARSEST_M, Tiles, is_too_small, looks_for, plan_tiles
 from sorvolo.detection.turning import LookSettings, agreed, turned, turned_back
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Labels
 from sorvolo.survey.flight import Notice
-from sorvolo.survey.objects import Detections, Early
+from sorvolo.survey.objects import Detections, Early, no_detections
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Detector:
         self._night_was_sought = False
         self._opinions: dict[str, Session] = {}  # by name, those who look a second time
         self._seeking = threading.Lock()
-        self._thermal_frames = self._daylight_frames = 0
+        self._thermal_frames = self._daylight_frames = self._too_small_frames = 0
 
     @classmethod
     def load(
@@ -103,6 +103,12 @@ class Detector:
                 "what it finds in them is unreliable; take another model"
             )
             notices.append(Notice("daylight_untrained", count, text))
+        if count := self._too_small_frames:
+            text = (
+                f"{count} frames are too coarse for people seen from above, who were not looked for in them: a pixel "
+                f"may cover {100 * COARSEST_M:.0f} cm; fly lower (`sorvolo plan` gives the height)"
+            )
+            notices.append(Notice("people_too_small", count, text))
         return tuple(notices)
 
     @overload
@@ -130,7 +136,8 @@ class Detector:
         (grey is stretched as a thermal camera's). `tiles` cuts a large one: "auto" by `m_per_px` (the ground's
         sampling distance; None or NaN: not known), a number of its pixels a side, or None for the picture as a whole;
         docs/detector.md gives the rule. `least_score` None means each class's own threshold; `classes` None means all.
-        `from_above`: the camera looked about straight down; a model whose file asks for it (`turned`) then looks twice.
+        `from_above`: the camera looked about straight down; a model whose file asks for it (`turned`) then looks twice,
+        and people by day are not looked for where they are too small to be recognised (`is_too_small`).
         `overlapping`: others show the same (a video's frames), and none is worth looks in several sizes (`pyramid`).
         `early`, for one picture, is given the classes that have a look of their own (see `looks_for`), and what was
         found of them, while the picture is searched for the others; in the end the same objects are among all.
@@ -175,6 +182,12 @@ class Detector:
         session = self._session_for(thermal)
         rgb = rgb_from_picture(picture)
         asked = [name for name in wanted if name in session.info.classes]
+        if from_above and not thermal:
+            small = [name for name in asked if is_too_small(name, m_per_px)]
+            self._too_small_frames += bool(small)
+            asked = [name for name in asked if name not in small]
+        if not asked:
+            return no_detections(self.classes)
         looks_twice = from_above and bool(session.info.turned)
 
         def reported(seen: Seen, names: Sequence[str]) -> Detections:

@@ -24,6 +24,9 @@ MOST_AT_ONCE_PX = 8_400_000
 TASK = Task.RECOGNITION
 """What a person must at least be shown for (Johnson's criteria): 6 px over the critical dimension."""
 
+COARSEST_M = 1 / required_px_per_m(TASK, BOTTOM_CRITICAL_M)
+"""The ground that a pixel may cover for a person from straight above to be recognised (eq. 3.9): 10 cm."""
+
 _THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal optics blur, and clothes hide limbs
 _THERMAL_LARGER = 1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
 _MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a look of its own, which costs half or less
@@ -62,6 +65,14 @@ def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: 
     if least > 1:
         return min(least, MOST_LARGER)
     return min(1.0, max(least, most))
+
+
+def is_too_small(name: str, m_per_px: float) -> bool:
+    """Whether a person from straight above fills fewer pixels, each covering `m_per_px`, than `TASK` takes (eq. 3.9).
+
+    What so few pixels show, a post with its shadow shows as well (0086). NaN, an unknown scale, is not too small.
+    """
+    return name == "person" and m_per_px > COARSEST_M
 
 
 def looks_for(

@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, frozen
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
 from sorvolo.survey.mosaic import PlacedFrame
+
+_LOOKS = 2  # frames that must show a place before what was not found there is not there
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,3 +82,17 @@ class ObjectSearch:
         """The search of these placed frames."""
         outlines_m = np.array([each.outline_m for each in frames])
         return cls(model, classes, objects, outlines_m, looked, sightings, dropped)
+
+
+def looked_at(places_m: PointsM, outlines_m: Floats) -> Mask:
+    """Which places, (N, 2), lie in enough of the outlines, (M, 4, 2), of a search's frames for what it did not find
+    there not to be there."""
+    needed = min(_LOOKS, len(outlines_m))
+    counts = np.zeros(len(places_m), int)
+    for outline_m in outlines_m:
+        low_m, high_m = outline_m.min(axis=0), outline_m.max(axis=0)
+        ring = np.ascontiguousarray(outline_m - low_m, np.float32)
+        for k in np.flatnonzero(((places_m >= low_m) & (places_m <= high_m)).all(axis=1)):
+            east, north = places_m[k] - low_m
+            counts[k] += cv2.pointPolygonTest(ring, (float(east), float(north)), False) >= 0
+    return np.asarray((counts >= needed) & (needed > 0), bool)

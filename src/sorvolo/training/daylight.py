@@ -1,5 +1,6 @@
 """The daylight model: people as NanoDet learnt them on COCO, and aerial candidates scored again by its features."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,24 @@ from sorvolo.training.heads import roi_means
 from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
 
 _SUPPORT_CELLS = 3  # a side, over a candidate's box
+_SOFTENED_PX = 1.0  # of a Gaussian; 0.9 to 1.6 find cars on sharp photos, more blurs small boxes (decision 0086)
+
+
+class Softened(nn.Module):
+    """A picture as soft as the video frames that the aerial network learnt cars from: photos are sharper (0086)."""
+
+    def __init__(self, sigma_px: float = _SOFTENED_PX) -> None:
+        super().__init__()
+        self.reach = math.ceil(2.5 * sigma_px)
+        across = torch.arange(-self.reach, self.reach + 1, dtype=torch.float32)
+        bell = torch.exp(-(across**2) / (2 * sigma_px**2))
+        self.register_buffer("bell", torch.outer(bell, bell).div(bell.sum() ** 2).expand(3, 1, -1, -1).contiguous())
+
+    def forward(self, images: Tensor) -> Tensor:
+        """(N, 3, H, W) of the pictures (N, 3, H, W); beyond their edges they go on as at them."""
+        padded = nn.functional.pad(images.float(), (self.reach,) * 4, mode="replicate")
+        softened: Tensor = nn.functional.conv2d(padded, self.get_buffer("bell"), groups=3)
+        return softened
 
 
 @dataclass(frozen=True)
@@ -91,7 +110,7 @@ class Daylight(nn.Module):
         """
         super().__init__()
         self.aerial, self.coco, self.judge, self.settings = aerial, coco, judge, settings
-        self.people = people
+        self.people, self.softened = people, Softened()
         self.judged, self.person, self.aerial_person = dict(judged), person, aerial_person
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -100,7 +119,7 @@ class Daylight(nn.Module):
         outputs = self.coco.head(levels)
         people, opinions, supporting = self.people_of(levels, outputs, (images.shape[2], images.shape[3]))
         people_scores = _calibrated(opinions, self.person, supporting)
-        boxes, scores, labels = self.aerial(images)
+        boxes, scores, labels = self.aerial(self.softened(images))
         scores = self._scored(levels, outputs, boxes, scores, labels)
         boxes, scores = torch.cat([people, boxes]), torch.cat([people_scores, scores])
         labels = torch.cat([torch.full_like(people_scores, self.settings.person).to(labels.dtype), labels])

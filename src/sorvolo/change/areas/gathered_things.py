@@ -1,6 +1,5 @@
 """Things that all views of a flight together show: learned differences gathered over its views."""
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -12,7 +11,7 @@ from sorvolo.change.areas.ground_sums import GroundSums
 from sorvolo.change.areas.moved_shade import share_moved
 from sorvolo.change.pair.learned_difference import LearnedSettings, learned_difference
 from sorvolo.change.shape.kinds import kind_of
-from sorvolo.change.shape.outlines import mask_of, measures, outline_of
+from sorvolo.change.shape.outlines import mask_of, measures, outline_of, overlap
 from sorvolo.change.shape.place_sigma import place_sigma_m
 from sorvolo.geometry.arrays import Floats, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -22,6 +21,7 @@ _SUMS = ("seen", "apart", "agree", "came", "left")
 _SHADES = {"came": Shade.LATER_DARK, "left": Shade.EARLIER_DARK}  # shade of the later date alone, of the earlier alone
 _APART = ChangeKind.MOVING, ChangeKind.AREA  # what moves is no thing of the ground, and an area is more than one
 _HIGHEST = 95.0  # percentile of what lies farthest apart
+_CIRCLE = np.column_stack([wave(np.linspace(0, 2 * np.pi, 24, endpoint=False)) for wave in (np.cos, np.sin)])
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,7 @@ class GatherThingSettings:
     sure_spreads: float = 1.8  # what lies so far apart is sure
     held: float = 0.3  # 0085: share of another change that things hold: it is reported as they are
     least_apart: float = 0.4  # 0085: spreads; ground of another change that lies less apart is the same
+    least_of_object: float = 0.2  # 0086: spreads; an object that one date alone shows is evidence of its own
     learned: LearnedSettings = field(default_factory=LearnedSettings)
     pictures: GroundPictureSettings = field(default_factory=GroundPictureSettings)
 
@@ -87,6 +88,23 @@ class GatheredThings:
         """Whether an outline's ground, (N, 2), differs on the mean as much as a thing that is found by that alone."""
         return self._mean_apart(*self._around(outline_m)) > self._settings.spreads
 
+    def standing_at(self, place_m: Floats, length_m: float, others: Sequence[Change]) -> Change | None:
+        """What an object of this length at a place (2,) changed, a change without an id (0086): the ground within half
+        a length that lies farthest apart. None where `others` hold it, or two views did not see it, or its ground is
+        the same by its features."""
+        settings = self._settings
+        around_m = place_m + 0.5 * length_m * _CIRCLE
+        part, own = self._around(around_m)
+        own &= self._ground.sums["seen"][part] >= settings.least_views
+        if not self._mean_apart(part, own) >= settings.least_of_object:
+            return None
+        standing = [each.outline_m for each in others if each.kind not in _APART]
+        if any(max(overlap(around_m, each)[1], overlap(each, around_m)[1]) >= settings.held for each in standing):
+            return None
+        apart = self._ground.sums["apart"][part] / np.maximum(self._ground.sums["seen"][part], 1)
+        own &= apart > settings.of_height * float(np.percentile(apart[own], _HIGHEST))
+        return self._record(own, (part[1].start, part[0].start), 1.0)
+
     def is_moved_shadow(self, outline_m: PointsM, earlier: Floats, later: Floats) -> bool:
         """Whether an outline's ground, (N, 2), is shade of one date, and shade of the other lies where what stays
         threw it; the shadow of a point 1 m up lies (2,) off, east and north: `earlier` and `later`."""
@@ -117,12 +135,12 @@ class GatheredThings:
         own = mask_of(outline_m, site_from_cell @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]]), seen.shape)
         return part, own & seen
 
-    def conclude(self, id_prefix: str, first_number: int, others: Sequence[Change]) -> list[Change]:
+    def conclude(self, id_prefix: str, numbers: Iterator[int], others: Sequence[Change]) -> list[Change]:
         """After the last view: the things that all views together show, and those of `others` that they do not hold.
 
-        A thing that holds others goes on as the one it holds most of, with its id and times; others are numbered from
-        `first_number` on. Left out is also, of `others`, what lies on ground that is the same by its features. What
-        moves and areas are left as they are (0085).
+        A thing that holds others goes on as the one it holds most of, with its id and times; others get
+        the next of `numbers`. Left out is also, of `others`, what lies on ground that is the same by its features.
+        What moves and areas are left as they are (0085).
         """
         if self._ground.is_empty:
             return list(others)
@@ -144,7 +162,6 @@ class GatheredThings:
                 held[place] = max(held.get(place, (0, each)), (len(in_things), each), key=lambda of: of[0])
             elif self._mean_apart(part, own) >= self._settings.least_apart:
                 kept.append(each)
-        numbers = itertools.count(first_number)
         return kept + [
             _going_on(thing, held[place][1]) if place in held else replace(thing, id=f"{id_prefix}-{next(numbers)}")
             for place, thing in enumerate(things, 1)

@@ -1,6 +1,8 @@
 """What a later flight's views show to have changed: things, areas, and what only all its views together show."""
 
+import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -14,6 +16,7 @@ from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.flight import Site
+from sorvolo.survey.map_objects import MapObject
 
 
 class FlightChanges:
@@ -29,6 +32,7 @@ class FlightChanges:
         self._evidence: EvidenceMap | None = None
         self._areas = AreaMap()
         self._gathered = GatheredThings() if is_coarse else None
+        self._numbers = itertools.count(1)  # of the changes' ids that are still free, after `conclude`
 
     def add(self, view: ComparedView, leans: Mask | None) -> Sequence[Change]:
         """Add a compared view to the evidence; the changes announced by it."""
@@ -56,8 +60,23 @@ class FlightChanges:
         if gathered is None:
             return with_areas(things, areas)
         found = with_areas(things, areas, lies_apart=gathered.lies_apart)
-        found = gathered.conclude(self._flight, first + len(areas), found)
+        self._numbers = itertools.count(first + len(areas))
+        found = gathered.conclude(self._flight, self._numbers, found)
         return [each for each in found if not self._is_moved_shadow(each, gathered)]
+
+    def with_objects(self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, MapObject]]) -> list[Change]:
+        """After `conclude`: its changes, and those objects, found on one date alone, on ground that differs as well
+        and is no change yet. Only where learned differences are gathered."""
+        if self._gathered is None:
+            return list(changes)
+        result = list(changes)
+        for kind, each in objects:
+            change = self._gathered.standing_at(each.position_m, each.length_m, result)
+            if change is not None:
+                result.append(replace(
+                    change, id=f"{self._flight}-{next(self._numbers)}", kind=kind, score=each.score,
+                ))
+        return result
 
     def candidates(self) -> dict[str, Any] | None:
         """What became of all candidates, for the report; None if no view was compared."""

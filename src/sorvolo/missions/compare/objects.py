@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from sorvolo.capture.source import LiveSource
+from sorvolo.change.object_changes import SearchedGround, on_one_date
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
@@ -12,9 +13,9 @@ from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive
-from sorvolo.survey.findings import Change
+from sorvolo.survey.findings import Change, ChangeKind
 from sorvolo.survey.flight import Notice, PosedFrame
-from sorvolo.survey.map_objects import ObjectSearch
+from sorvolo.survey.map_objects import MapObject, ObjectSearch
 from sorvolo.survey.mosaic import PlacedFrame
 
 _OVERLAP = 0.75  # of frames that are searched
@@ -32,10 +33,13 @@ class ComparisonObjects:
         self._selection = StretchSelection(_OVERLAP, keep_all=setup.source.kind != "video")
         self._finder: ObjectFinder | None = None
         self._classes: ChangeClasses | None = None
+        self._before = SearchedGround()
         if detector is not None:
             before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
-            known = archive.newest_objects(before - {self._name})
-            self._classes = ChangeClasses(detector, [each.thing for each in known], settings.classes)
+            known = [each.thing for each in archive.newest_objects(before - {self._name})]
+            searched = [each.outlines_m for each in archive.searches() if each.flight_id in before - {self._name}]
+            self._before = SearchedGround(known, searched)
+            self._classes = ChangeClasses(detector, known, settings.classes)
             live_folder = archive.folder if isinstance(setup.source, LiveSource) else None
             self._finder = ObjectFinder(
                 detector, setup.source.camera.camera, settings.classes, live_folder=live_folder
@@ -77,16 +81,23 @@ class ComparisonObjects:
             return tuple(announced)
         return tuple(self._classes.preliminary(each) for each in announced)
 
-    def conclude(
-        self, placed: Sequence[PlacedFrame], changes: Sequence[Change]
-    ) -> tuple[ObjectSearch | None, list[Change]]:
-        """The flight's objects by its frames' final places (None: nobody searched), and the changes with their
-        classes."""
-        if self._finder is None or self._classes is None:
-            return None, list(changes)
-        search = self._finder.conclude(placed, self._name, has_metres=True)
-        sightings = self._finder.sightings
-        return search, [self._classes.final(each, search.objects, sightings) for each in changes]
+    def conclude(self, placed: Sequence[PlacedFrame]) -> ObjectSearch | None:
+        """The flight's objects by its frames' final places; None: nobody searched."""
+        if self._finder is None:
+            return None
+        return self._finder.conclude(placed, self._name, has_metres=True)
+
+    def on_one_date(self, search: ObjectSearch | None) -> list[tuple[ChangeKind, MapObject]]:
+        """The objects that this flight or those before it found on ground where the other found none."""
+        if search is None:
+            return []
+        return list(on_one_date(self._before, SearchedGround(search.objects, [search.outlines_m])))
+
+    def classified(self, changes: Sequence[Change], search: ObjectSearch | None) -> list[Change]:
+        """The changes with their classes, after `conclude`."""
+        if self._finder is None or self._classes is None or search is None:
+            return list(changes)
+        return [self._classes.final(each, search.objects, self._finder.sightings) for each in changes]
 
     def summary(self, search: ObjectSearch | None) -> dict[str, Any]:
         """The report's part on objects."""

@@ -202,16 +202,18 @@ class CompareRun:
             )
         concluding = self._comparing.submit(self._changes.conclude)  # which takes about as long as the map's extension
         shown_as_well = self._extend_map()
+        placed = [self._placed[index] for index in sorted(self._placed)]
+        with self._log.stage(Stage.DETECT):
+            search = self._objects.conclude(placed)
         with self._log.stage(Stage.EVIDENCE):
-            found = concluding.result()
+            found = self._changes.with_objects(concluding.result(), self._objects.on_one_date(search))
             changes = self._reported(found)
         suppressed = len(found) - len(changes)
         with self._log.stage(Stage.PAINT):
             if self._settings.updates_map:
                 paint_changes(changes, self._writer.tiles, self._archive.site_grid())
-        placed = [self._placed[index] for index in sorted(self._placed)]
         with self._log.stage(Stage.DETECT):
-            search, changes = self._objects.conclude(placed, changes)
+            changes = self._objects.classified(changes, search)
             changes = with_height_changes(self._archive, self._setup.source.name, changes)
         with self._log.stage(Stage.REPORT):
             shown = picture(self._writer.tiles, 800)  # a day without change should cost little

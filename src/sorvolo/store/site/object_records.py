@@ -4,19 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 from sqlalchemy import Connection, insert, select
 
-from sorvolo.geometry.arrays import Floats, PointsM, frozen
+from sorvolo.geometry.arrays import Floats, frozen
 from sorvolo.store.exports.plain import number_or_null
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows
 from sorvolo.store.site.names import checked_name
-from sorvolo.survey.map_objects import MapObject, ObjectSearch
+from sorvolo.survey.map_objects import MapObject, ObjectSearch, looked_at
 
 _SAME_PLACE_M = 0.5  # beside what both places may err: a car parked again, a person who stood up
-_LOOKS = 2  # frames of a later flight that must show a place before what it did not find there is gone
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +86,9 @@ def newest_objects(objects: Sequence[StoredObject], searches: Sequence[StoredSea
     result: list[StoredObject] = []
     for search in sorted(searches, key=lambda each: each.rank):
         own = [each for each in objects if each.flight_id == search.flight_id]
-        seen_again = _looked_at(np.array([each.thing.position_m for each in result]).reshape(-1, 2), search)
+        seen_again = looked_at(
+            np.array([each.thing.position_m for each in result]).reshape(-1, 2), search.outlines_m
+        )
         before = [each for each, again in zip(result, seen_again) if again]
         result = [each for each, again in zip(result, seen_again) if not again]
         result += [_since(each, before) for each in own]
@@ -110,19 +110,6 @@ def _of_complete_runs(table: Any) -> Any:
         .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
         .where(schema.runs.c.status == "complete")
     )
-
-
-def _looked_at(places_m: PointsM, search: StoredSearch) -> list[bool]:
-    """Which places (N, 2) lie in enough of the search's outlines."""
-    needed = min(_LOOKS, len(search.outlines_m))
-    counts = np.zeros(len(places_m), int)
-    for outline_m in search.outlines_m:
-        low_m, high_m = outline_m.min(axis=0), outline_m.max(axis=0)
-        ring = np.ascontiguousarray(outline_m - low_m, np.float32)
-        for k in np.flatnonzero(((places_m >= low_m) & (places_m <= high_m)).all(axis=1)):
-            east, north = places_m[k] - low_m
-            counts[k] += cv2.pointPolygonTest(ring, (float(east), float(north)), False) >= 0
-    return [bool(count >= needed > 0) for count in counts]
 
 
 def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
