@@ -9,6 +9,7 @@ import pytest
 
 from sorvolo.change.areas.gathered_things import GatheredThings
 from sorvolo.change.pair.learned_difference import learned_difference
+from sorvolo.change.shape.shadows import without_shadow
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.sun import direction_from_angles, slide_of
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
@@ -147,6 +148,8 @@ def test_an_object_of_one_date_is_a_change_where_the_ground_differs_and_no_other
     change = things.standing_at(place_m, 5.0, [])
     assert change is not None and np.hypot(*(middle_of(change) - place_m)) < 0.8
     assert 0.4 < change.area_m2 / ((east - west) * (north - south)) < 1.8
+    dark = gathered(ground, with_car(ground), 3, shade=Shade.LATER).standing_at(place_m, 5.0, [])
+    assert dark is not None and without_shadow(dark).area_m2 > 0.9 * dark.area_m2
     (known,) = things.conclude("b", count(1), [])
     assert things.standing_at(place_m, 5.0, [known]) is None
     assert things.standing_at(place_m, 5.0, [replace(known, kind=ChangeKind.AREA)]) is not None

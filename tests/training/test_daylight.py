@@ -13,6 +13,7 @@ from sorvolo.training.daylight import (  # noqa: E402
     Calibration,
     Daylight,
     Judge,
+    Softened,
     odds_from_scores,
     one_hot,
 )
@@ -171,3 +172,13 @@ def test_its_onnx_file_takes_a_picture_without_any_aerial_candidate(tmp_path: Pa
     by_day, by_night = (session.see(np.full((64, 96, 3), value, np.uint8)) for value in (200, 0))
     assert {1, 2} <= set(by_day.labels.tolist())
     assert set(by_night.labels.tolist()) <= {0}
+
+
+def test_a_softened_picture_keeps_its_size_and_level_up_to_its_edges_and_loses_its_finest_pattern() -> None:
+    softened = Softened()
+    flat = torch.full((1, 3, 20, 32), 200, dtype=torch.uint8)
+    torch.testing.assert_close(softened(flat), flat.float())
+    rows = (torch.arange(20) % 2 * 200.0)[None, None, :, None].expand(1, 3, 20, 32)
+    assert softened(rows)[..., 6:14, :].std() < 0.02 * rows.std()
+    blocks = (torch.arange(20) // 10 * 200.0)[None, None, :, None].expand(1, 3, 20, 32)
+    assert softened(blocks)[..., :6, :].max() < 1 and softened(blocks)[..., -6:, :].min() > 199

@@ -103,7 +103,11 @@ class GatheredThings:
             return None
         apart = self._ground.sums["apart"][part] / np.maximum(self._ground.sums["seen"][part], 1)
         own &= apart > settings.of_height * float(np.percentile(apart[own], _HIGHEST))
-        return self._record(own, (part[1].start, part[0].start), 1.0)
+        change = self._record(own, (part[1].start, part[0].start), 1.0)
+        if change is None:
+            return None
+        lit = np.zeros_like(change.patch.shade)  # what is dark in its outline is the object, not its shadow
+        return replace(change, patch=replace(change.patch, shade=lit))
 
     def is_moved_shadow(self, outline_m: PointsM, earlier: Floats, later: Floats) -> bool:
         """Whether an outline's ground, (N, 2), is shade of one date, and shade of the other lies where what stays
