@@ -64,18 +64,17 @@ class FlightChanges:
         found = gathered.conclude(self._flight, self._numbers, found)
         return [each for each in found if not self._is_moved_shadow(each, gathered)]
 
-    def with_objects(self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, MapObject]]) -> list[Change]:
-        """After `conclude`: its changes, and those objects, found on one date alone, on ground that differs as well
-        and is no change yet. Only where learned differences are gathered."""
+    def of_objects(self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, MapObject]]) -> list[Change]:
+        """After `conclude`: those objects, found on one date alone, that none of `changes`, as they are reported,
+        holds, on ground that differs as well. Only where learned differences are gathered."""
+        result: list[Change] = []
         if self._gathered is None:
-            return list(changes)
-        result = list(changes)
+            return result
         for kind, each in objects:
-            change = self._gathered.standing_at(each.position_m, each.length_m, result)
+            change = self._gathered.standing_at(each.position_m, each.length_m, [*changes, *result])
             if change is not None:
-                result.append(replace(
-                    change, id=f"{self._flight}-{next(self._numbers)}", kind=kind, score=each.score,
-                ))
+                number = next(self._numbers)
+                result.append(replace(change, id=f"{self._flight}-{number}", kind=kind, score=each.score))
         return result
 
     def candidates(self) -> dict[str, Any] | None:

@@ -206,9 +206,11 @@ class CompareRun:
         with self._log.stage(Stage.DETECT):
             search = self._objects.conclude(placed)
         with self._log.stage(Stage.EVIDENCE):
-            found = self._changes.with_objects(concluding.result(), self._objects.on_one_date(search))
+            found = concluding.result()
             changes = self._reported(found)
-        suppressed = len(found) - len(changes)
+            of_objects = self._changes.of_objects(changes, self._objects.on_one_date(search))
+            changes += self._reported(of_objects)
+        suppressed = len(found) + len(of_objects) - len(changes)
         with self._log.stage(Stage.PAINT):
             if self._settings.updates_map:
                 paint_changes(changes, self._writer.tiles, self._archive.site_grid())
