@@ -30,7 +30,8 @@ MOST_LOST = 0.005  # of AP in a class of a set, beyond which nothing is written
 # 64 channels wide, and the first layers, a few channels of large values: in eight bits they lose most of what is lost
 FLOAT_PARTS = (
     "aerial/neck", "aerial/proposals", "aerial/backbone/_conv_stem", "aerial/backbone/_blocks.0",
-    "aerial/backbone/_blocks.1", "backbone/stem", "backbone/stages.0",
+    "aerial/backbone/_blocks.1", "aerial/backbone/_blocks.2", "aerial/backbone/_blocks.3",
+    "backbone/stem", "backbone/stages.0", "softened",
 )
 CALIBRATION_OF_EACH, MOST_PICTURES = 16, 60
 _KEPT = ("preset", "classes", "thresholds", "on_request", "licence", "trained_on", "fails")
