@@ -32,6 +32,7 @@ class GatherThingSettings:
     most_cells: int = 12_000_000  # of the raster, which bounds its memory (190 MB): views beyond are left out
     least_views: int = 2  # what one view alone shows is not announced
     spreads: float = 1.0  # by which the views of a cell lie apart on the mean
+    in_area: float = 0.7  # 0086: the same of a thing that stands out within an area, and is a region already
     of_height: float = 0.6  # its outline runs where this part of what lies farthest apart in it is left
     own_spreads: float = 0.5  # from which on a view by itself agrees
     least_cells: int = 44  # smaller things are found by their outline
@@ -85,8 +86,8 @@ class GatheredThings:
         return apart >= settings.own_spreads and came + left <= settings.most_dark
 
     def lies_apart(self, outline_m: PointsM) -> bool:
-        """Whether an outline's ground, (N, 2), differs on the mean as much as a thing that is found by that alone."""
-        return self._mean_apart(*self._around(outline_m)) > self._settings.spreads
+        """Whether an outline's ground, (N, 2), differs on the mean as much as a thing within an area must."""
+        return self._mean_apart(*self._around(outline_m)) > self._settings.in_area
 
     def standing_at(self, place_m: Floats, length_m: float, others: Sequence[Change]) -> Change | None:
         """What an object of this length at a place (2,) changed, a change without an id (0086): the ground within half
