@@ -34,6 +34,7 @@ FLOAT_PARTS = (
     "backbone/stem", "backbone/stages.0", "softened",
 )
 CALIBRATION_OF_EACH, MOST_PICTURES = 16, 60
+_LATER = ("version", "best_px", "second_look", "second_look_fit", "second_look_measured", "pyramid")
 _KEPT = ("preset", "classes", "thresholds", "on_request", "licence", "trained_on", "fails")
 
 
@@ -71,6 +72,7 @@ def main() -> None:
     card = {
         "name": "default-int8", "of": f"default, version {float_card['version']}", "precision": "int8",
         **{key: float_card[key] for key in _KEPT},
+        **{key: float_card[key] for key in _LATER if key in float_card},
         "created": f"{datetime.now(UTC):%Y-%m-%d}", "sha256": hashlib.sha256(found.model).hexdigest(),
         "bytes": len(found.model), "convolutions": f"{found.convolutions} of {found.of}",
         "calibrated_on": "pictures of the training sets: aerial cars, TinyPerson, simulated",

@@ -12,6 +12,7 @@ from sorvolo.survey.objects import CLASSES  # noqa: E402
 from sorvolo.training.daylight import (  # noqa: E402
     Calibration,
     Daylight,
+    DaylightSettings,
     Judge,
     Softened,
     odds_from_scores,
@@ -175,7 +176,7 @@ def test_its_onnx_file_takes_a_picture_without_any_aerial_candidate(tmp_path: Pa
 
 
 def test_a_softened_picture_keeps_its_size_and_level_up_to_its_edges_and_loses_its_finest_pattern() -> None:
-    softened = Softened()
+    softened = Softened(DaylightSettings().softened_px)
     flat = torch.full((1, 3, 20, 32), 200, dtype=torch.uint8)
     torch.testing.assert_close(softened(flat), flat.float())
     rows = (torch.arange(20) % 2 * 200.0)[None, None, :, None].expand(1, 3, 20, 32)

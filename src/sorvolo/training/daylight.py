@@ -13,13 +13,12 @@ from sorvolo.training.heads import roi_means
 from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
 
 _SUPPORT_CELLS = 3  # a side, over a candidate's box
-_SOFTENED_PX = 1.0  # of a Gaussian; 0.9 to 1.6 find cars on sharp photos, more blurs small boxes (decision 0086)
 
 
 class Softened(nn.Module):
     """A picture as soft as the video frames that the aerial network learnt cars from: photos are sharper (0086)."""
 
-    def __init__(self, sigma_px: float = _SOFTENED_PX) -> None:
+    def __init__(self, sigma_px: float) -> None:
         super().__init__()
         self.reach = math.ceil(2.5 * sigma_px)
         across = torch.arange(-self.reach, self.reach + 1, dtype=torch.float32)
@@ -88,6 +87,7 @@ class DaylightSettings:
     most: int = 300  # detections of one picture
     suppress_iou: float = 0.5  # of two boxes of a class that overlap more, the better one stays
     least_score: float = 0.02  # thresholds are far above
+    softened_px: float = 1.0  # 0086: sigma of a Gaussian; 0.9 to 1.6 find cars on sharp photos, more blurs small boxes
 
 
 class Daylight(nn.Module):
@@ -110,7 +110,7 @@ class Daylight(nn.Module):
         """
         super().__init__()
         self.aerial, self.coco, self.judge, self.settings = aerial, coco, judge, settings
-        self.people, self.softened = people, Softened()
+        self.people, self.softened = people, Softened(settings.softened_px)
         self.judged, self.person, self.aerial_person = dict(judged), person, aerial_person
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
