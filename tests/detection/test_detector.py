@@ -272,3 +272,7 @@ def test_people_who_are_too_small_from_above_are_not_looked_for_and_a_notice_sta
     assert detector.detect(picture, m_per_px=coarse).names == ["person", "small object", "car"], "from aslant"
     (notice,) = detector.notices
     assert (notice.code, notice.count) == ("people_too_small", 2) and "10 cm" in notice.text
+    above = partial(detector.thresholds_for, picture, from_above=True)
+    assert list(above(m_per_px=fine)) == list(above()) == list(detector.classes)
+    assert list(above(m_per_px=coarse)) == [each for each in detector.classes if each != "person"]
+    assert list(detector.thresholds_for(picture, m_per_px=coarse)) == list(detector.classes)

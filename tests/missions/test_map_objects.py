@@ -13,7 +13,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from truth_detector import TruthDetector
+from truth_detector import Knowing
 
 from small_flights import simulate_into, small_flight
 from sorvolo.change.classes import object_at, seen_at
@@ -35,21 +35,6 @@ from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting, no_detections
-
-
-class Knowing(TruthDetector):
-    """The truth's detector; what it does not know, such as a picture made from frames, shows nothing."""
-
-    def detect(
-        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False,
-    ) -> Detections:
-        """See `TruthDetector.detect`."""
-        try:
-            return super().detect(image, tiles=tiles, m_per_px=m_per_px, least_score=least_score, classes=classes)
-        except KeyError:
-            return no_detections(self.classes)
 
 
 @pytest.fixture(scope="module")

@@ -42,7 +42,9 @@ class Comparing:
     def rest(self) -> None:
         """There is nothing to give back."""
 
-    def thresholds_for(self, picture: ImageRGB, *, from_above: bool = False) -> Mapping[str, float]:
+    def thresholds_for(
+        self, picture: ImageRGB, *, from_above: bool = False, m_per_px: float | None = None,
+    ) -> Mapping[str, float]:
         """The same for all pictures."""
         return self.info.thresholds
 

@@ -50,7 +50,9 @@ class TruthDetector:
     def rest(self) -> None:
         """There is nothing to give back."""
 
-    def thresholds_for(self, picture: ImageRGB, *, from_above: bool = False) -> Mapping[str, float]:
+    def thresholds_for(
+        self, picture: ImageRGB, *, from_above: bool = False, m_per_px: float | None = None,
+    ) -> Mapping[str, float]:
         """The same for all pictures."""
         return self.info.thresholds
 
@@ -88,6 +90,21 @@ class TruthDetector:
         keep = [name in wanted and score >= (least_score or 0.3) for name, score in zip(found.names, found.scores)]
         found = found.only(np.array(keep, bool))
         return found.only(np.argsort(-found.scores))
+
+
+class Knowing(TruthDetector):
+    """The truth's detector; what it does not know, such as a picture made from frames, shows nothing."""
+
+    def detect(
+        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
+        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
+        overlapping: bool = False,
+    ) -> Detections:
+        """See `TruthDetector.detect`."""
+        try:
+            return super().detect(image, tiles=tiles, m_per_px=m_per_px, least_score=least_score, classes=classes)
+        except KeyError:
+            return no_detections(self.classes)
 
 
 def _digest(image: ImageRGB) -> bytes:

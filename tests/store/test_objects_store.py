@@ -14,7 +14,7 @@ from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.objects import objects_section
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
-from sorvolo.survey.map_objects import MapObject, ObjectSearch
+from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 
 CROP = jpeg_from_image(image(3))
 
@@ -29,11 +29,14 @@ def thing(object_id: str, east_m: float, north_m: float, label: str = "car", **o
 
 
 def search(
-    objects: tuple[MapObject, ...], west_m: float = -50.0, east_m: float = 50.0, frames: int = 3
+    objects: tuple[MapObject, ...], west_m: float = -50.0, east_m: float = 50.0, frames: int = 3,
+    classes: tuple[str, ...] = ("person", "car"),
 ) -> ObjectSearch:
     """A search of some frames over one rectangle of ground."""
     outline = [[west_m, 50.0], [east_m, 50.0], [east_m, -50.0], [west_m, -50.0]]
-    return ObjectSearch("fast", ("person", "car"), objects, np.array([outline] * frames), frames, 9, 1)
+    searched_for = {name: np.ones(frames, bool) for name in classes}
+    searched = SearchedFrames(np.array([outline] * frames), searched_for)
+    return ObjectSearch("fast", classes, objects, searched, frames, 9, 1)
 
 
 def commit(folder: Path, flight: str, found: ObjectSearch | None) -> None:
@@ -87,11 +90,29 @@ def test_one_frame_does_not_take_away(tmp_path: Path) -> None:
     """One of a later flight's frames may have missed it; a flight of one frame counts as it is."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0),)))
     mixed = search((), west_m=100.0, east_m=200.0, frames=2)
-    once = replace(mixed, outlines_m=np.concatenate([mixed.outlines_m, search(()).outlines_m[:1]]))
-    commit(tmp_path, "b", once)
+    outlines_m = np.concatenate([mixed.frames.outlines_m, search(()).frames.outlines_m[:1]])
+    commit(tmp_path, "b", replace(mixed, frames=SearchedFrames(outlines_m)))
     assert list(features(tmp_path / "objects.geojson")) == ["a-o1"]
     commit(tmp_path, "c", search((), frames=1))
     assert list(features(tmp_path / "objects.geojson")) == []
+
+
+@pytest.mark.usefixtures("kind")
+def test_a_flight_replaces_only_the_classes_that_it_looked_for(tmp_path: Path) -> None:
+    """A person found from low above stays where a later flight was too high for people, and asked for cars alone."""
+    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0, "person"))))
+    commit(tmp_path, "b", search((), classes=("car",)))
+    assert list(features(tmp_path / "objects.geojson")) == ["a-o2"]
+    both = {"car": np.array([True, True, True]), "person": np.array([False, True, False])}
+    once = search(())
+    commit(tmp_path, "c", replace(once, frames=SearchedFrames(once.frames.outlines_m[:2], {
+        name: rows[:2] for name, rows in both.items()
+    })))
+    assert list(features(tmp_path / "objects.geojson")) == [], "one frame looked for people, and it was the only one"
+    with Archive.open(tmp_path, write=False) as archive:
+        stored = archive.searches()
+    assert [len(each.frames.for_class("person")) for each in stored] == [3, 0, 1]
+    assert [len(each.frames.for_class("car")) for each in stored] == [3, 3, 2]
 
 
 @pytest.mark.usefixtures("kind")
@@ -127,6 +148,21 @@ def test_a_site_of_format_2(tmp_path: Path) -> None:
     assert list(features(tmp_path / "objects.geojson")) == ["b-o1"]
     with sqlite3.connect(tmp_path / "site.db") as connection:
         assert connection.execute("PRAGMA user_version").fetchone() == (schema.SCHEMA_VERSION,)
+
+
+def test_a_site_of_format_4(tmp_path: Path) -> None:
+    """Its searches count as searches for all classes; it is read as it is, and brought up to date when written."""
+    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0, "person"),), classes=("person",)))
+    connection = sqlite3.connect(tmp_path / "site.db")
+    connection.executescript("ALTER TABLE searches DROP COLUMN searched_for; PRAGMA user_version = 4;")
+    connection.close()
+    with Archive.open(tmp_path, write=False) as archive:
+        assert [len(each.frames.for_class("car")) for each in archive.searches()] == [3]
+    commit(tmp_path, "b", search((), classes=("car",)))
+    with Archive.open(tmp_path, write=False) as archive:
+        assert [len(each.frames.for_class("car")) for each in archive.searches()] == [3, 3]
+        assert [len(each.frames.for_class("person")) for each in archive.searches()] == [3, 0]
+        assert [each.thing.id for each in archive.newest_objects()] == ["a-o1"]
 
 
 def test_a_site_of_a_later_format_is_refused(tmp_path: Path) -> None:

@@ -151,11 +151,17 @@ class Detector:
             return self._seen(image, tiles, sampling, wanted, least_score, from_above, overlapping, early)
         return [self._seen(each, tiles, sampling, wanted, least_score, from_above, overlapping) for each in image]
 
-    def thresholds_for(self, picture: Picture, *, from_above: bool = False) -> Mapping[str, float]:
-        """From which score on each class is reported in such a picture: those of the model that looks at it."""
-        if self._is_own(thermal=is_thermal(picture)):
-            return _thresholds(self.info, from_above)
-        return {**self.info.thresholds, **_thresholds(self._night_session().info, from_above)}
+    def thresholds_for(
+        self, picture: Picture, *, from_above: bool = False, m_per_px: float | None = None,
+    ) -> Mapping[str, float]:
+        """From which score on each class is reported in such a picture, by the model that looks at it; of those that
+        `detect` looks for in it alone."""
+        thermal = is_thermal(picture)
+        info = self.info if self._is_own(thermal=thermal) else self._night_session().info
+        least = _thresholds(info, from_above)
+        sampling = math.nan if m_per_px is None else m_per_px
+        too_small = _too_small(list(least), sampling, thermal=thermal, from_above=from_above)
+        return {name: score for name, score in least.items() if name in self.classes and name not in too_small}
 
     def rest(self) -> None:
         """Give back memory that is kept for the next picture: before work that needs it, and after the last picture."""
@@ -182,10 +188,9 @@ class Detector:
         session = self._session_for(thermal)
         rgb = rgb_from_picture(picture)
         asked = [name for name in wanted if name in session.info.classes]
-        if from_above and not thermal:
-            small = [name for name in asked if is_too_small(name, m_per_px)]
-            self._too_small_frames += bool(small)
-            asked = [name for name in asked if name not in small]
+        small = _too_small(asked, m_per_px, thermal=thermal, from_above=from_above)
+        self._too_small_frames += bool(small)
+        asked = [name for name in asked if name not in small]
         if not asked:
             return no_detections(self.classes)
         looks_twice = from_above and bool(session.info.turned)
@@ -322,6 +327,11 @@ def _in_labels_of(session: Session, classes: Sequence[str]) -> Callable[[ImageRG
 def _places_in(classes: Sequence[str], names: Sequence[str]) -> Labels:
     """(names,) where each name stands in `classes`; -1 where it does not."""
     return np.array([classes.index(name) if name in classes else -1 for name in names], np.int64)
+
+
+def _too_small(names: Sequence[str], m_per_px: float, *, thermal: bool, from_above: bool) -> list[str]:
+    """Those of the classes that are not looked for in such a picture."""
+    return [name for name in names if from_above and not thermal and is_too_small(name, m_per_px)]
 
 
 def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:

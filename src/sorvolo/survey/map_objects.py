@@ -1,6 +1,6 @@
 """What stands on a map: each object once, however many frames of a flight saw it."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -11,6 +11,8 @@ from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
 from sorvolo.survey.mosaic import PlacedFrame
 
 _LOOKS = 2  # frames that must show a place before what was not found there is not there
+_BESIDE = 0.4  # of its own length, something may lie from where it was found on another date ...
+_BESIDE_M = 0.5  # ... and this much more: a person who turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,39 +56,69 @@ class MapObject:
         if not 1 <= self.views <= self.possible_views:
             raise GeometryError(f"object {self.id}: seen {self.views} times of {self.possible_views}")
 
+    def stands_where(self, other: "MapObject", sigma_m: float = 0.0) -> bool:
+        """Whether it stands where another date's object did, by its own size and twice what both places may err apart:
+        a car parked again. What moves stands nowhere."""
+        if self.moving or other.moving:
+            return False
+        reach_m = _BESIDE * float(np.nan_to_num(self.length_m)) + _BESIDE_M + 2 * float(np.nan_to_num(sigma_m))
+        return bool(np.hypot(*(self.position_m - other.position_m)) <= reach_m)
+
 
 @dataclass(frozen=True, eq=False)
-class ObjectSearch:
-    """What one flight was searched for, with which model, and all that was found.
+class SearchedFrames:
+    """The frames of one search by their outlines on the ground, (N, 4, 2) site metres, and by class which of them,
+    (N,), were searched for it; a class that is not named in none. No `searched_for` at all: each for all classes."""
 
-    `outlines_m` (N, 4, 2) are the outlines on the ground of the frames that were looked at, site metres. `looked`
-    counts the frames, `sightings` the detections in them, `dropped` those of them that belong to no object.
-    """
-
-    model: str
-    classes: tuple[str, ...]
-    objects: tuple[MapObject, ...]
     outlines_m: Floats
-    looked: int
-    sightings: int
-    dropped: int
+    searched_for: Mapping[str, Mask] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outlines_m", frozen(np.reshape(self.outlines_m, (-1, 4, 2))))
 
     @classmethod
-    def over(
-        cls, frames: Sequence[PlacedFrame], model: str, classes: tuple[str, ...], objects: tuple[MapObject, ...],
-        looked: int, sightings: int, dropped: int,
-    ) -> "ObjectSearch":
-        """The search of these placed frames."""
-        outlines_m = np.array([each.outline_m for each in frames])
-        return cls(model, classes, objects, outlines_m, looked, sightings, dropped)
+    def of(
+        cls, frames: Sequence[PlacedFrame], looked_for: Sequence[Collection[str]], classes: Sequence[str]
+    ) -> "SearchedFrames":
+        """These frames, of which each was searched for those of the classes that stand at its place in `looked_for`."""
+        searched_for = {name: np.array([name in each for each in looked_for], bool) for name in classes}
+        return cls(np.array([each.outline_m for each in frames]), searched_for)
+
+    def for_class(self, label: str) -> Floats:
+        """(M, 4, 2) the outlines of the frames that were searched for a class."""
+        if self.searched_for is None:
+            return self.outlines_m
+        return self.outlines_m[self.searched_for.get(label, np.zeros(len(self.outlines_m), bool))]
 
 
-def looked_at(places_m: PointsM, outlines_m: Floats) -> Mask:
-    """Which places, (N, 2), lie in enough of the outlines, (M, 4, 2), of a search's frames for what it did not find
-    there not to be there."""
+@dataclass(frozen=True, eq=False)
+class ObjectSearch:
+    """What one flight was searched for, with which model, and all that was found.
+
+    `looked` counts the frames, `sightings` the detections in them, `dropped` those of them that belong to no object.
+    """
+
+    model: str
+    classes: tuple[str, ...]
+    objects: tuple[MapObject, ...]
+    frames: SearchedFrames
+    looked: int
+    sightings: int
+    dropped: int
+
+
+def looked_at(places_m: PointsM, labels: Sequence[str], searches: Sequence[SearchedFrames]) -> Mask:
+    """Where, of places (N, 2), enough frames of these searches looked for that place's class for what they did not find
+    not to be there."""
+    result = np.zeros(len(places_m), bool)
+    for label in set(labels):
+        own = np.flatnonzero([each == label for each in labels])
+        outlines_m = np.concatenate([np.zeros((0, 4, 2)), *(each.for_class(label) for each in searches)])
+        result[own] = _shown_often(places_m[own], outlines_m)
+    return result
+
+
+def _shown_often(places_m: PointsM, outlines_m: Floats) -> Mask:
     needed = min(_LOOKS, len(outlines_m))
     counts = np.zeros(len(places_m), int)
     for outline_m in outlines_m:

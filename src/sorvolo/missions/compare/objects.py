@@ -37,7 +37,7 @@ class ComparisonObjects:
         if detector is not None:
             before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
             known = [each.thing for each in archive.newest_objects(before - {self._name})]
-            searched = [each.outlines_m for each in archive.searches() if each.flight_id in before - {self._name}]
+            searched = [each.frames for each in archive.searches() if each.flight_id in before - {self._name}]
             self._before = SearchedGround(known, searched)
             self._classes = ChangeClasses(detector, known, settings.classes)
             live_folder = archive.folder if isinstance(setup.source, LiveSource) else None
@@ -91,7 +91,7 @@ class ComparisonObjects:
         """The objects that this flight or those before it found on ground where the other found none."""
         if search is None:
             return []
-        return list(on_one_date(self._before, SearchedGround(search.objects, [search.outlines_m])))
+        return list(on_one_date(self._before, SearchedGround(search.objects, [search.frames])))
 
     def classified(self, changes: Sequence[Change], search: ObjectSearch | None) -> list[Change]:
         """The changes with their classes, after `conclude`."""

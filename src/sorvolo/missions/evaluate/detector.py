@@ -234,7 +234,8 @@ def _found(
                 ))
                 seconds += time.perf_counter() - started
                 count += 1
-                lights.append(detector.thresholds_for(image, from_above=settings.from_above))
+                least = detector.thresholds_for(image, from_above=settings.from_above)
+                lights.append({**detector.info.thresholds, **least})
             progress(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
         usual = max(lights, key=lights.count, default=detector.info.thresholds)
         if others := len(lights) - lights.count(usual):

@@ -38,7 +38,7 @@ def evaluate_objects(site: Path, truth: Path, *, flight: str | None = None) -> t
     folder = frames_file.parent
     with Archive.open(site, write=False) as archive:
         described = archive.site()
-        outlines_m = {each.flight_id: each.outlines_m for each in archive.searches()}
+        outlines_m = {each.flight_id: each.frames.outlines_m for each in archive.searches()}
     searched = _searched_flights(site, outlines_m)
     if flight is not None and flight not in searched:
         raise SettingsError(f"--flight {flight}: the flights of {site} that were searched are {', '.join(searched)}")

@@ -28,8 +28,10 @@ class ObjectDetector(Protocol):
     def notices(self) -> tuple[Notice, ...]:
         """What a user should know of the pictures seen so far."""
 
-    def thresholds_for(self, picture: ImageRGB, *, from_above: bool = False) -> Mapping[str, float]:
-        """From which score on each class is reported in a picture (H, W, 3) like this."""
+    def thresholds_for(
+        self, picture: ImageRGB, *, from_above: bool = False, m_per_px: float | None = None,
+    ) -> Mapping[str, float]:
+        """From which score on each class is reported that is looked for in a picture (H, W, 3) like this."""
 
     def rest(self) -> None:
         """Give back memory that is kept for the next picture; it may be asked for more pictures later."""

@@ -24,7 +24,7 @@ from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image
 from sorvolo.store.site.spill import FrameOnDisk
 from sorvolo.survey.flight import Frame, Notice, PosedFrame
-from sorvolo.survey.map_objects import MapObject, ObjectSearch
+from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.survey.objects import Detections, Sighting
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground
@@ -64,7 +64,8 @@ def check_classes(detector: ObjectDetector | None, classes: Sequence[str]) -> No
 class FrameDetections:
     """What the detector saw in the frame `index`, the crops (JPEG) around it, and how long it took.
 
-    `least` is the score from which on each class is reported; `found` holds weaker detections too, as evidence.
+    `least` is the score from which on each class is reported that was looked for; `found` holds weaker detections too,
+    as evidence.
     """
 
     index: int
@@ -167,8 +168,9 @@ class ObjectFinder:
         sightings = (each.sighting for each in laid)
         self._sightings = tuple(each for each in sightings if each.score >= least[each.label])
         found = objects_on_map(laid, crops, frames, flight_id, has_metres=has_metres, least=least)
-        return ObjectSearch.over(
-            frames, self._detector.info.name, self._classes, found.objects, len(self._seen), len(self._sightings),
+        searched = SearchedFrames.of(frames, [self._seen[each.index].least.keys() for each in frames], self._classes)
+        return ObjectSearch(
+            self._detector.info.name, self._classes, found.objects, searched, len(self._seen), len(self._sightings),
             found.dropped,
         )
 
@@ -187,7 +189,7 @@ class ObjectFinder:
     def _look(self, given: "Frame | FrameOnDisk", m_per_px: float | None, from_above: bool) -> FrameDetections:
         started_s = time.monotonic()
         frame = given.taken() if isinstance(given, FrameOnDisk) else given
-        least = self._detector.thresholds_for(frame.image, from_above=from_above)
+        least = self._detector.thresholds_for(frame.image, from_above=from_above, m_per_px=m_per_px)
         found = self._detector.detect(
             frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes, from_above=from_above,
             overlapping=True, least_score=least_seen(least),

@@ -1,30 +1,27 @@
 """What stands on the map, as rows of the catalogue: each flight's search, its objects, and the newest of each place."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, insert, select
+from sqlalchemy import Connection, Table, insert, select
 
-from sorvolo.geometry.arrays import Floats, frozen
 from sorvolo.store.exports.plain import number_or_null
 from sorvolo.store.site import schema
 from sorvolo.store.site.catalogue import reading_rows
 from sorvolo.store.site.names import checked_name
-from sorvolo.survey.map_objects import MapObject, ObjectSearch, looked_at
-
-_SAME_PLACE_M = 0.5  # beside what both places may err: a car parked again, a person who stood up
+from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames, looked_at
 
 
 @dataclass(frozen=True, eq=False)
 class StoredSearch:
-    """A complete run's search: its flight and rank, the model, and the outlines (N, 4, 2) of the frames looked at."""
+    """A complete run's search: its flight and rank, the model, and the frames looked at."""
 
     flight_id: str
     rank: int
     model: str
-    outlines_m: Floats
+    frames: SearchedFrames
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,8 +39,12 @@ class StoredObject:
 
 def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> None:
     """Note that this run's frames were searched for objects, and what was found."""
+    searched_for = search.frames.searched_for
     connection.execute(insert(schema.searches).values(
-        run_id=run_id, model=search.model, outlines_m=np.round(search.outlines_m, 3).tolist(),
+        run_id=run_id, model=search.model, outlines_m=np.round(search.frames.outlines_m, 3).tolist(),
+        searched_for=None if searched_for is None else {
+            name: np.asarray(rows, int).tolist() for name, rows in searched_for.items()
+        },
     ))
     if search.objects:
         connection.execute(insert(schema.objects), [
@@ -56,10 +57,16 @@ def load_searches(connection: Connection) -> list[StoredSearch]:
     """The searches of complete runs, by flight rank."""
     if _is_older(connection):
         return []
-    rows = connection.execute(_of_complete_runs(schema.searches).order_by(schema.flights.c.rank))
+    table = schema.searches
+    knows_classes = schema.format_of(connection) >= 5
+    columns = [each for each in table.c if knows_classes or each is not table.c.searched_for]
+    rows = connection.execute(_of_complete_runs(table, columns).order_by(schema.flights.c.rank))
     with reading_rows("search"):
         return [
-            StoredSearch(row.flight_id, row.rank, row.model, frozen(np.reshape(row.outlines_m, (-1, 4, 2))))
+            StoredSearch(
+                row.flight_id, row.rank, row.model,
+                _frames_of(row.outlines_m, row.searched_for if knows_classes else None),
+            )
             for row in rows
         ]
 
@@ -68,7 +75,7 @@ def load_objects(connection: Connection, flight_id: str | None = None) -> list[S
     """The objects of complete runs by flight rank and number; of one flight if its id is given."""
     if _is_older(connection):
         return []
-    query = _of_complete_runs(schema.objects).order_by(schema.flights.c.rank, schema.objects.c.number)
+    query = _of_complete_runs(schema.objects, schema.objects.c).order_by(schema.flights.c.rank, schema.objects.c.number)
     if flight_id is not None:
         query = query.where(schema.flights.c.id == flight_id)
     return [
@@ -80,14 +87,15 @@ def load_objects(connection: Connection, flight_id: str | None = None) -> list[S
 def newest_objects(objects: Sequence[StoredObject], searches: Sequence[StoredSearch]) -> list[StoredObject]:
     """What stands on the site by the newest look at each piece of ground.
 
-    What an earlier flight found where two frames of a later one looked is replaced by what that one found. What stands
-    there still keeps the time at which it was first seen, and names all flights that saw it.
+    What an earlier flight found where two frames of a later one looked for its class is replaced by what that one
+    found. What stands there still keeps the time at which it was first seen, and names all flights that saw it.
     """
     result: list[StoredObject] = []
     for search in sorted(searches, key=lambda each: each.rank):
         own = [each for each in objects if each.flight_id == search.flight_id]
         seen_again = looked_at(
-            np.array([each.thing.position_m for each in result]).reshape(-1, 2), search.outlines_m
+            np.array([each.thing.position_m for each in result]).reshape(-1, 2),
+            [each.thing.label for each in result], [search.frames],
         )
         before = [each for each, again in zip(result, seen_again) if again]
         result = [each for each, again in zip(result, seen_again) if not again]
@@ -103,9 +111,15 @@ def is_searched(connection: Connection, run_id: int) -> bool:
     return connection.execute(query).first() is not None
 
 
-def _of_complete_runs(table: Any) -> Any:
+def _frames_of(outlines_m: Any, searched_for: Any) -> SearchedFrames:
+    if searched_for is None:
+        return SearchedFrames(outlines_m)
+    return SearchedFrames(outlines_m, {str(name): np.array(rows, bool) for name, rows in searched_for.items()})
+
+
+def _of_complete_runs(table: Table, columns: Iterable[Any]) -> Any:
     return (
-        select(table, schema.runs.c.flight_id, schema.flights.c.rank)
+        select(*columns, schema.runs.c.flight_id, schema.flights.c.rank)
         .join(schema.runs, schema.runs.c.id == table.c.run_id)
         .join(schema.flights, schema.flights.c.id == schema.runs.c.flight_id)
         .where(schema.runs.c.status == "complete")
@@ -117,9 +131,8 @@ def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
     thing = found.thing
     for each in before:
         other = each.thing
-        reach_m = _SAME_PLACE_M + 2 * float(np.nan_to_num(np.hypot(thing.sigma_m, other.sigma_m)))
-        near = float(np.hypot(*(thing.position_m - other.position_m))) <= reach_m
-        if near and other.label == thing.label and not thing.moving and not other.moving:
+        sigma_m = float(np.hypot(thing.sigma_m, other.sigma_m))
+        if other.label == thing.label and thing.stands_where(other, sigma_m):
             kept = replace(thing, first_seen_ns=min(thing.first_seen_ns, other.first_seen_ns))
             return replace(found, thing=kept, flights=(*each.flights, found.flight_id))
     return found

@@ -19,7 +19,7 @@ from sqlalchemy import (
 )
 from sqlalchemy import String as AnyString
 
-SCHEMA_VERSION = 4
+SCHEMA_VERSION = 5
 OLDEST_VERSION = 1
 """The oldest format that is still read, and brought up to date when it is opened to be written."""
 
@@ -138,6 +138,7 @@ searches = Table(
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("model", String, nullable=False),
     Column("outlines_m", JSON, nullable=False),  # (N, 4, 2) of the frames that were looked at
+    Column("searched_for", JSON),  # class -> (N,) 0 or 1; NULL where a format before 5 wrote it: not known
 )
 objects = Table(
     "objects", metadata,
