@@ -243,11 +243,11 @@ def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
 def test_a_view_that_fails_beside_the_rest_is_reported_and_leaves_the_site_as_it_was(flown, site, monkeypatch):
     begun, compare_with_map = [], ViewMaker.compare_with_map
 
-    def fails(self, posed):
+    def fails(self, posed, *tried, **how):
         begun.append(posed.frame.index)
         if len(begun) == 6:
             raise StoreError("a tile is damaged")
-        return compare_with_map(self, posed)
+        return compare_with_map(self, posed, *tried, **how)
 
     monkeypatch.setattr(ViewMaker, "compare_with_map", fails)
     before, printed = files(site), []
@@ -292,7 +292,7 @@ def test_a_live_view_is_reported_at_once_unless_the_next_one_waits_already(waiti
         asked.append(5)
 
     setup = SimpleNamespace(prior=lambda frame, first: None)
-    run = SimpleNamespace(begin=lambda posed: posed.frame.index, lose=None)
+    run = SimpleNamespace(begin=lambda posed, *_, **__: posed.frame.index, lose=None)
     begun = _begun(frames(), setup, lambda posed: True, run, lambda: 2 * waiting[asked[-1]])
     found = [(each, asked[-1]) for each in begun]
     assert [each for each, _ in found] == [0, 1, 2, 3, 4]

@@ -74,7 +74,8 @@ class Aligned:
 
     `residual_px` is the median distance that paired points keep, in the frame's own pixels. `followed`: the last fit
     predicted this one, no features were needed. `local` is what the frame is moved by on the map beyond that
-    homography, None where nothing is; `local_m` how far a local fit moved it in all (median, m).
+    homography, None where nothing is; `local_m` how far a local fit moved it in all (median, m). `with_flight`: it lies
+    where its flight as a whole does.
     """
 
     site_from_image: Matrix3
@@ -83,6 +84,7 @@ class Aligned:
     followed: bool
     local: LocalFit | None = None
     local_m: float = 0.0
+    with_flight: bool = False
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,14 @@ class Place:
     residual_px: float
     followed: bool
     ratio: float
+
+
+@dataclass(frozen=True, eq=False)
+class FlightPlace:
+    """Where an undistorted frame lies by others of its flight, site_from_image (3, 3), and how well those fit."""
+
+    site_from_image: Matrix3
+    residual_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,8 +186,13 @@ class Aligner:
         self.step = AlignStep(None, 0, ())
         """What the last frame left."""
 
-    def align(self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int) -> Aligned | NotAligned:
-        """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map."""
+    def align(
+        self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, place: FlightPlace | None = None, *,
+        comes_again: bool = False,
+    ) -> Aligned | NotAligned:
+        """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map. `place` is
+        where it lies, where that is known already: only a local fit moves it then. A frame that `comes_again` where it
+        is not found is looked for only where that is cheap, and placed only where that is sure."""
         size, gray = self._small(image)
         scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
         small_camera = camera.resized(*size)
@@ -191,10 +206,16 @@ class Aligner:
         def telemetry_inside() -> Matrix3 | None:
             return telemetry_homography if share.known >= self._settings.least_known else None
 
-        placed = self._by_homographies(new, prior, time_ns, telemetry_inside)
         frame = _Frame(image, camera, gray, new, prior)
-        if self._is_doubtful(placed, prior) and self._may_search():
-            placed = self._by_search(frame, by_telemetry, is_inside=telemetry_inside() is not None) or placed
+        placed: Place | NotAligned
+        if place is not None:
+            placed = _as_known(place, camera, small_camera)
+        elif comes_again:
+            placed = self._surely(new, prior, time_ns, telemetry_inside)
+        else:
+            placed = self._by_homographies(new, prior, time_ns, telemetry_inside)
+            if self._is_doubtful(placed, prior) and self._may_search():
+                placed = self._by_search(frame, by_telemetry, is_inside=telemetry_inside() is not None) or placed
         if isinstance(placed, NotAligned):
             is_outside = share.known < self._settings.least_known
             reason = self._beside() if is_outside else placed.reason
@@ -206,7 +227,7 @@ class Aligner:
         small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
         return Aligned(
             moved.place.site_from_image @ small_from_full, moved.place.pose.translation_m, placed.residual_px / scale,
-            placed.followed, moved.left, moved.size_m,
+            placed.followed, moved.left, moved.size_m, with_flight=place is not None,
         )
 
     def recall(self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, step: AlignStep) -> None:
@@ -227,12 +248,24 @@ class Aligner:
         size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
         return size, np.asarray(cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8)
 
-    def _by_homographies(
+    def _surely(
         self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None]
+    ) -> Place | NotAligned:
+        """The frame placed by what is cheap, beyond doubt; misses of frames that come again do not count."""
+        misses = self._misses
+        placed = self._by_homographies(new, prior, time_ns, telemetry_inside, is_cheap=True)
+        self._misses = misses
+        if isinstance(placed, Place) and self._is_doubtful(placed, prior):
+            return NotAligned("its place is in doubt", placed.residual_px)
+        return placed
+
+    def _by_homographies(
+        self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None], *,
+        is_cheap: bool = False,
     ) -> Place | NotAligned:
         """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
         nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
-        for guess, followed in self._guesses(new, new.camera, prior, time_ns, telemetry_inside):
+        for guess, followed in self._guesses(new, prior, time_ns, telemetry_inside, is_cheap=is_cheap):
             found = self._fit(new, guess, self._settings.doubtful_px if followed else self._settings.most_residual_px)
             if isinstance(found, NotAligned):
                 nearest = _nearer(nearest, found)
@@ -317,24 +350,24 @@ class Aligner:
         return Pose(prior.rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
 
     def _guesses(
-        self, new: Keyframe, camera: Camera, prior: CameraPrior, time_ns: int,
-        telemetry_inside: Callable[[], Matrix3 | None],
+        self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None], *,
+        is_cheap: bool,
     ) -> Iterator[tuple[Matrix3, bool]]:
         """site_from_image good to a few pixels, the cheapest first; telemetry is asked where the past is no help."""
-        predicted = self._predicted(camera, prior, time_ns)
+        predicted = self._predicted(new.camera, prior, time_ns)
         if predicted is not None:
             yield self._shifted(new, predicted), True
         by_telemetry = telemetry_inside()
         features = orb_features(new.gray, self._settings.links.features)
         self._misses += 1
-        for attempt in self._tries(new, features, prior, predicted, by_telemetry):
+        for attempt in self._tries(new, features, prior, predicted, by_telemetry, is_cheap=is_cheap):
             found = attempt()
             if found is not None:
                 yield found, False
 
     def _tries(
         self, new: Keyframe, features: Features, prior: CameraPrior, predicted: Matrix3 | None,
-        by_telemetry: Matrix3 | None,
+        by_telemetry: Matrix3 | None, *, is_cheap: bool,
     ) -> Iterator[Callable[[], Matrix3 | None]]:
         """What may find a frame by its features, the cheapest first: around each place that it could have, then
         anywhere. The dear searches come every fifth time: a video's next frame may be found by its telemetry again."""
@@ -343,7 +376,7 @@ class Aligner:
                 yield partial(self._by_features, new, features, near, prior, is_free=False)
         if by_telemetry is not None:  # a compass may be off by any angle
             yield partial(self._by_features, new, features, by_telemetry, prior, is_free=True)
-        if self._misses % 5 != 1:
+        if is_cheap or self._misses % 5 != 1:
             return
         if by_telemetry is not None:
             yield partial(self._by_sift, new, by_telemetry)
@@ -506,6 +539,16 @@ class Aligner:
             _spread_of(found.new_px, seen[1], self._settings.cells) >= self._settings.least_spread
         )
         return _stiffened(fit, found, guess, new.camera), residual_px, is_held
+
+
+def _as_known(known: FlightPlace, full: Camera, camera: Camera) -> Place | NotAligned:
+    """The place of a frame of the `full` size in pixels of the size at which frames are aligned."""
+    site_from_image = known.site_from_image @ _small_from(camera, full)
+    pose = pose_from_homography(site_from_image, camera)
+    if pose is None:
+        return NotAligned("the fit is none that a camera above the ground could have", np.nan)
+    residual_px = known.residual_m * camera.fx_px / float(pose.translation_m[2])
+    return Place(site_from_image, pose, residual_px, False, 0.0)
 
 
 def _homography_of(camera: Camera, pose: Pose) -> Matrix3 | None:

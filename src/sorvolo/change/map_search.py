@@ -195,7 +195,7 @@ class MapSearch:
         settings, prior = self._settings, sought.prior
         start = self._prior(sought, sought.pose).pose
         start = Pose(start.rotation @ rotation_from_vector(np.array([0.0, 0.0, turn_rad])), start.translation_m)
-        seen = self._map_features(sought.camera, start, settings.margin)
+        seen = self.map_features(sought.camera, start, settings.margin)
         if seen is None:
             return None
         site_from_start, old = seen
@@ -235,7 +235,7 @@ class MapSearch:
         first = fit_camera(
             beside.image_px, beside.ground_m, sought.camera, prior, start_px=10.0, band_px=settings.band_px
         )
-        seen = None if first is None else self._map_features(sought.camera, first.pose, 0.1)
+        seen = None if first is None else self.map_features(sought.camera, first.pose, 0.1)
         if first is None or seen is None:
             return None
         near = self._near(features, seen[1], seen[0], np.eye(3))
@@ -264,7 +264,7 @@ class MapSearch:
         pairs = match_learned(features, old, new_from_old, self._settings.near_px)
         return _Pairs(features.points_px[pairs[:, 0]], apply_homography(site_from_old, old.points_px[pairs[:, 1]]))
 
-    def _map_features(self, camera: Camera, pose: Pose, margin: float) -> tuple[Matrix3, Features] | None:
+    def map_features(self, camera: Camera, pose: Pose, margin: float) -> tuple[Matrix3, Features] | None:
         """site_from_image of a frame at this pose, and the map's learned features there, in that frame's pixels."""
         try:
             site_from_image = site_from_image_homography(camera, pose)

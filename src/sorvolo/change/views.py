@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.change.alignment import Aligned, Aligner, AlignStep
+from sorvolo.change.alignment import Aligned, Aligner, AlignStep, FlightPlace
 from sorvolo.change.areas.signs import leaning, level_of
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
@@ -59,7 +59,7 @@ class ViewOutcome:
     as bright as the map the flight is so far, NaN where that is not known. `doubted` (h, w) is what surely differs from
     the map in a compared view and is contradicted by earlier pictures, `leans` (h, w) what leans another way in those,
     `planted` what is found of things drawn in. `local_m` is how far a local fit moved the frame on the map (median, m),
-    0 without any.
+    0 without any. `with_flight`: the frame lies where its flight as a whole does.
     """
 
     status: ViewStatus
@@ -73,6 +73,7 @@ class ViewOutcome:
     leans: Mask | None = None
     planted: tuple[Planted, ...] = ()
     local_m: float = 0.0
+    with_flight: bool = False
     traces: ViewTraces | None = None
 
 
@@ -157,11 +158,16 @@ class ViewMaker:
         self._tuning = FlightTuning() if thesis is None else None
         self._planting = Planting()
 
-    def compare_with_map(self, posed: PosedFrame) -> ViewOutcome | OneSided:
-        """Align one frame and compare it with the map; a `ViewOutcome` if that ended it."""
+    def compare_with_map(
+        self, posed: PosedFrame, place: FlightPlace | None = None, *, comes_again: bool = False
+    ) -> ViewOutcome | OneSided:
+        """Align one frame and compare it with the map; a `ViewOutcome` if that ended it. `place` and `comes_again` are
+        those of `Aligner.align`."""
         frame, small = posed.frame, self.pixels.small
         image = self.undistorted(posed)
-        aligned = self._aligner.align(image, self._lens.camera, posed.prior, frame.time_ns)
+        aligned = self._aligner.align(
+            image, self._lens.camera, posed.prior, frame.time_ns, place, comes_again=comes_again
+        )
         to_full = self._flight.full.width_px / small.width_px
         if not isinstance(aligned, Aligned):
             status = ViewStatus.OUTSIDE if aligned.is_outside else ViewStatus.NOT_ALIGNED
@@ -184,7 +190,8 @@ class ViewMaker:
         found, measured = self._difference(as_bgr(reference), query, valid)
         outcome = ViewOutcome(
             ViewStatus.COMPARED, "", residual_px, share, site_from_full, brightness=self.brightness,
-            local_m=aligned.local_m, traces=ViewTraces(self._aligner.step, aligned, measured),
+            local_m=aligned.local_m, with_flight=aligned.with_flight,
+            traces=ViewTraces(self._aligner.step, aligned, measured),
         )
         return OneSided(posed, aligned, image, reference, query, valid, found, self._settings_now(), outcome)
 
@@ -218,6 +225,11 @@ class ViewMaker:
         image, valid = _laid(aligned, image, known)
         found = Difference(np.where(record.changed, np.uint8(255), np.uint8(0)), boxes, scores)
         return replace(outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found))
+
+    @property
+    def undistorted_camera(self) -> Camera:
+        """The camera of `undistorted` pictures."""
+        return self._lens.camera
 
     def undistorted(self, posed: PosedFrame) -> ImageRGB:
         """A frame's picture at the size at which it is compared, without the lens's distortion."""

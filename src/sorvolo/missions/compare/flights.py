@@ -3,15 +3,17 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
+from sorvolo.change.alignment import FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import CompareRun, Pending
@@ -177,15 +179,26 @@ def _ended(
     """The frames as their comparisons end; photos that were not found on the map are tried again after the others,
     beside those that were (a video shows the same ground again anyway)."""
     again: set[int] = set()
+    has_places = source.kind == "photos" and not isinstance(source, LiveSource) and setup.track is not None
     yield from run.recalled()
-    for each in _begun(_frames(source, step_s), setup, inside, run, ahead):
+    for each in _begun(_frames(source, step_s), setup, inside, run, ahead, come_again=has_places):
         if source.kind == "photos" and isinstance(each, Pending) and each.is_unplaced:
             again.add(each.posed.frame.index)
             run.put_off(each)
         else:
             yield each
     if again:
-        yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead)
+        places = run.places_with_flight(_posed(source.frames(lambda *_: True), setup, inside)) if has_places else {}
+        yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead, places)
+
+
+def _posed(
+    frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool]
+) -> Iterator[PosedFrame]:
+    """The frames inside of the area with what telemetry has of their cameras; lost ones were counted before."""
+    for each in frames:
+        if isinstance(each, Frame) and inside(posed := PosedFrame(each, setup.prior(each, first=False))):
+            yield posed
 
 
 def _frames(source: Source, step_s: float) -> Generator[Frame | LostFrame]:
@@ -200,7 +213,8 @@ def _frames(source: Source, step_s: float) -> Generator[Frame | LostFrame]:
 
 def _begun(
     frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
-    ahead: Callable[[], int],
+    ahead: Callable[[], int], places: Mapping[int, FlightPlace] = MappingProxyType({}), *,
+    come_again: bool = False,
 ) -> Iterator[Pending | LostFrame]:
     """The frames inside of the area in order, each with its comparison begun, and that of up to `ahead()` after it."""
     waiting: deque[Pending | LostFrame] = deque()
@@ -208,7 +222,7 @@ def _begun(
         if isinstance(each, LostFrame):
             waiting.append(each)
         elif inside(posed := PosedFrame(each, setup.prior(each, first=False))):
-            waiting.append(run.begin(posed))
+            waiting.append(run.begin(posed, places.get(each.index), comes_again=come_again))
         while len(waiting) > ahead():
             yield waiting.popleft()
     yield from waiting

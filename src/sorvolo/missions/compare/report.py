@@ -6,6 +6,7 @@ from typing import Any
 
 from sorvolo.change.coverage.ground_coverage import CoverageSettings, GroundCoverage, coverage_summary
 from sorvolo.change.coverage.planting import recall_curve
+from sorvolo.change.flight_on_map import FlightFit
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.summary import median_of_known, percentile_of_known
@@ -13,6 +14,7 @@ from sorvolo.missions.compare.extension import NIGHT
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import Change, ChangeKind, ViewStatus
+from sorvolo.survey.flight import Notice
 from sorvolo.survey.wording import area_text, plural
 
 _DARK = 0.4  # times the map's brightness: less hides things
@@ -30,6 +32,7 @@ class ViewCounts:
         self._residuals_px: list[float] = []
         self._differing: list[float] = []
         self._local_m: list[float] = []
+        self.with_flight = 0
 
     def end(self, status: ViewStatus, reason: str) -> None:
         """Count a frame that ended so."""
@@ -42,6 +45,7 @@ class ViewCounts:
         self.end(outcome.status, outcome.reason)
         if outcome.site_from_image is not None:
             self._residuals_px.append(outcome.residual_px)
+        self.with_flight += outcome.with_flight
         if outcome.local_m > 0:
             self._local_m.append(outcome.local_m)
         if outcome.view is not None:
@@ -110,6 +114,25 @@ def comparison_summary(
         "map_updated": settings.updates_map,
         "most_missed": views.brightness < NIGHT,
     }
+
+
+def flight_summary(counts: ViewCounts, fit: FlightFit | None) -> dict[str, Any]:
+    """The report's part on photos that were placed with all others of their flight; `fit` is where that lies on the
+    map, None where it was not looked for, or not found."""
+    if fit is None:
+        return {"views": 0, "ratio": None, "residual_m": None}
+    return {"views": counts.with_flight, "ratio": fit.ratio, "residual_m": fit.residual_m}
+
+
+def flight_notices(counts: ViewCounts, fit: FlightFit | None) -> list[Notice]:
+    """What a user should know of photos that were placed with all others of their flight."""
+    if fit is None or not counts.with_flight:
+        return []
+    text = (
+        f"{counts.with_flight} photos were not found on the map for sure by themselves and lie where all photos of the "
+        f"flight together fit it, within {fit.residual_m:.1f} m (median)"
+    )
+    return [Notice("placed_with_flight", counts.with_flight, text)]
 
 
 def comparison_headline(changes: int, coverage: Mapping[str, Any], *, is_local: bool) -> dict[str, str]:

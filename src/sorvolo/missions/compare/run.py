@@ -1,14 +1,17 @@
 """One later flight on its way into a site: views to evidence, evidence to changes, changes into the map."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from sorvolo.change.alignment import FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
+from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
+from sorvolo.change.map_search import MapSearch
 from sorvolo.change.map_update import paint_changes
 from sorvolo.change.pair.thesis import thesis_steps
 from sorvolo.change.reference import ReferenceMap
@@ -25,7 +28,14 @@ from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.flight_changes import FlightChanges
 from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal, KeptFrame
 from sorvolo.missions.compare.objects import ComparisonObjects
-from sorvolo.missions.compare.report import ViewCounts, comparison_summary, comparison_warnings
+from sorvolo.missions.compare.report import (
+    ViewCounts,
+    comparison_summary,
+    comparison_warnings,
+    flight_notices,
+    flight_summary,
+)
+from sorvolo.missions.compare.whole_flight import WholeFlight
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import crops_of
@@ -108,6 +118,7 @@ class CompareRun:
         self._log = FlightLog()
         self._counts = ViewCounts()
         self._placed: dict[int, PlacedFrame] = {}
+        self._flight_fit: FlightFit | None = None
         sigmas_m = [each.sigma_m for each in archive.keyframes() if each.flight_id != source.name]
         self._map_sigma_m = median_of_known(sigmas_m) or 0.0
         self._comparing, self._corroborating = (
@@ -146,8 +157,9 @@ class CompareRun:
         time_ns = self._setup.utc_ns(lost.time_ns)
         self._placed[lost.index] = PlacedFrame.rejected(lost.index, lost.name, time_ns, lost.reason, camera)
 
-    def begin(self, posed: PosedFrame) -> Pending:
-        """Begin to compare a frame, in threads beside what `add` does with those before it."""
+    def begin(self, posed: PosedFrame, place: FlightPlace | None = None, *, comes_again: bool = False) -> Pending:
+        """Begin to compare a frame, in threads beside what `add` does with those before it. `place` and `comes_again`
+        are those of `Aligner.align`."""
         earlier = None if self._journal is None else self._journal.next_frame(posed.frame.index)
         if earlier is not None:
             record = earlier.record
@@ -155,7 +167,7 @@ class CompareRun:
                 lambda: self._views.recall(posed, self._views.undistorted(posed), record)
             )
             return Pending(posed, recalled, earlier)
-        compared = self._comparing.submit(self._views.compare_with_map, posed)
+        compared = self._comparing.submit(self._views.compare_with_map, posed, place, comes_again=comes_again)
         return Pending(posed, self._corroborating.submit(lambda: self._views.corroborate(compared.result())))
 
     def recalled(self) -> Iterator[Pending]:
@@ -180,6 +192,19 @@ class CompareRun:
             taken = self._extension.add(posed, outcome, earlier)
         self._keep(pending, taken)
         return outcome, announced
+
+    def places_with_flight(self, photos: Iterable[PosedFrame]) -> Mapping[int, FlightPlace]:
+        """Where all of the flight's photos lie, by index, laid on each other and found on the map as one; none where
+        they are not."""
+        on_map = FlightOnMap(MapSearch(self._reference(), self._archive.site_grid()))
+        with WholeFlight(self._setup, self._archive, self._views, on_map) as whole:
+            for each in photos:
+                with self._log.stage(Stage.REGISTER):
+                    whole.add(each)
+            with self._log.stage(Stage.REGISTER):
+                places = whole.places()
+        self._flight_fit = whole.fit
+        return places
 
     def put_off(self, pending: Pending) -> None:
         """A frame that was not found on the map is tried again after the others."""
@@ -230,6 +255,9 @@ class CompareRun:
         )
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _reference(self) -> ReferenceMap:
+        return ReferenceMap(self._archive.tiles(self._base_version), self._archive.site_grid().grid)
 
     def _keep(self, pending: Pending, taken: Taken | None) -> None:
         """Note a frame, and what the detector found meanwhile; nothing while those of a killed run are taken over."""
@@ -283,15 +311,17 @@ class CompareRun:
         shown: Picture, notices: Sequence[Notice], started_s: float, ground: Sequence[CoveredGround],
     ) -> dict[str, Any]:
         result = FlightResult(placed, self._setup.source.camera.camera, makes_map=False)
+        notices = [*notices, *self._objects.notices, *flight_notices(self._counts, self._flight_fit)]
         report = build_report(
-            self._setup, self._settings.mapping, self._log, result, self._archive.site(), shown,
-            [*notices, *self._objects.notices], time.monotonic() - started_s,
+            self._setup, self._settings.mapping, self._log, result, self._archive.site(), shown, notices,
+            time.monotonic() - started_s,
         )
         warnings = comparison_warnings(self._counts, self._views.brightness, self._views.times_coarser)
         comparison = comparison_summary(
             changes, suppressed, self._counts, self._views, self._settings, self._base_version, ground,
             is_local=self._archive.site().is_local,
         )
+        comparison["with_flight"] = flight_summary(self._counts, self._flight_fit)
         comparison["candidates"] = self._changes.candidates()
         comparison["heights_of"] = flight_with_heights(self._archive, but=self._setup.source.name)
         comparison["extension"] = {

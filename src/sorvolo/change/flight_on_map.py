@@ -1,0 +1,178 @@
+"""A flight whose photos were laid on each other, found on the map as one: what each shows too weakly adds up."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sorvolo.change.map_search import MapSearch
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM, Rows
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.geometry.pose import Pose
+from sorvolo.registration.features import gray_from_rgb
+from sorvolo.registration.learned import learned_features, match_learned
+from sorvolo.survey.mosaic import Features
+
+
+@dataclass(frozen=True)
+class FlightOnMapSettings:
+    """How photos whose places beside each other are known are looked for on the map together."""
+
+    side_px: int = 1024  # longest side of a photo
+    points: int = 2048  # learned features of a photo, the strongest
+    margin: float = 0.1  # of a photo's size: map searched beyond each side
+    reach_m: float = 10.0  # pairs of points lie so far apart at most ...
+    shift_m: float = 8.0  # ... and all photos in common: what GPS errs by on both dates
+    most_scale: float = 0.04  # by which the flight, laid by its GPS, is larger or smaller than the map
+    most_turn_deg: float = 1.0  # by which it is turned
+    step_m: float = 0.5  # at its rim, between scales and turns that are tried
+    least_likeness: float = 0.7  # of a pair's descriptors: likeness beyond that is its vote
+    cell_m: float = 0.175  # of the raster of shifts on which pairs vote
+    spread_m: float = 0.35  # one sigma of what right pairs scatter: maps are distorted
+    least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 6.0
+    least_agree: int = 100  # pairs within the band: few pairs in all stand out by chance
+    rounds: int = 10  # of the least squares that follow, over the pairs within ...
+    band_m: float = 1.0  # ... this, about three sigmas
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoFeatures:
+    """The learned features of an undistorted photo, of `camera`'s size."""
+
+    camera: Camera
+    features: Features
+
+
+@dataclass(frozen=True, eq=False)
+class FlightFit:
+    """Where a flight lies on a map: `map_from_flight` is a similarity (3, 3) of site metres. `ratio` is how many times
+    the votes of the mean place it has, `agree` how many pairs agree with it, `residual_m` how far photos miss it by
+    the mean of theirs (median)."""
+
+    map_from_flight: Matrix3
+    ratio: float
+    agree: int
+    residual_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Pairs:
+    """Ground of a flight, (N, 2), as its photos have it, with the map's that is most like it around; (N,) of which
+    photo, and votes."""
+
+    photo: Rows
+    flight_m: PointsM
+    map_m: PointsM
+    votes: Floats
+
+
+class FlightOnMap:
+    """Looks for the photos of one flight on the map that `search` knows."""
+
+    def __init__(self, search: MapSearch, settings: FlightOnMapSettings = FlightOnMapSettings()) -> None:
+        self._search, self._settings = search, settings
+
+    def features(self, image: ImageRGB, camera: Camera) -> PhotoFeatures:
+        """What `find` needs of an undistorted photo, (H, W, 3)."""
+        scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
+        size = round(image.shape[1] * scale), round(image.shape[0] * scale)
+        gray: ImageGray = cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
+        return PhotoFeatures(camera.resized(*size), learned_features(gray, self._settings.points))
+
+    def find(self, photos: Mapping[int, PhotoFeatures], poses: Mapping[int, Pose]) -> FlightFit | None:
+        """Where the flight lies on the map, by photos of it and where their cameras are beside each other (by index);
+        None where no place has many more votes than chance leaves."""
+        settings = self._settings
+        parts = [self._pairs(index, photo, poses[index]) for index, photo in photos.items()]
+        seen = [each for each in parts if each is not None]
+        if not seen:
+            return None
+        pairs = _Pairs(*(np.concatenate([getattr(each, name) for each in seen]) for name in vars(seen[0])))
+        started, ratio = _most_votes(pairs, settings)
+        if ratio < settings.least_ratio:
+            return None
+        fit = _refined(pairs, started, ratio, settings)
+        return None if fit.agree < settings.least_agree else fit
+
+    def _pairs(self, index: int, photo: PhotoFeatures, pose: Pose) -> _Pairs | None:
+        """What a photo shows of the map around where its pose puts it; None beside the map."""
+        settings, new = self._settings, photo.features
+        seen = self._search.map_features(photo.camera, pose, settings.margin)
+        if seen is None:
+            return None
+        site_from_image, old = seen
+        reach_px = settings.reach_m * photo.camera.fx_px / float(pose.translation_m[2])
+        pairs = match_learned(new, old, np.eye(3), reach_px)
+        ours, theirs = (np.asarray(each.descriptors, np.float32) for each in (new, old))
+        likeness = np.einsum("nd,nd->n", ours[pairs[:, 0]], theirs[pairs[:, 1]])
+        kept = pairs[likeness > settings.least_likeness]
+        return _Pairs(
+            np.full(len(kept), index), apply_homography(site_from_image, new.points_px[kept[:, 0]]),
+            apply_homography(site_from_image, old.points_px[kept[:, 1]]),
+            likeness[likeness > settings.least_likeness] - settings.least_likeness,
+        )
+
+
+def _most_votes(pairs: _Pairs, settings: FlightOnMapSettings) -> tuple[Matrix3, float]:
+    """The similarity, map_from_flight, that most votes fall to, and how many times those of the mean one it has."""
+    middle_m = pairs.flight_m.mean(axis=0)
+    arms_m = pairs.flight_m - middle_m
+    rim_m = max(float(np.percentile(np.hypot(*arms_m.T), 90)), settings.step_m)
+    scales, turns = (
+        _tried(min(most, settings.shift_m / rim_m), settings.step_m / rim_m)
+        for most in (settings.most_scale, float(np.radians(settings.most_turn_deg)))
+    )
+    best, ratio = np.eye(3), 0.0
+    for scale in scales:
+        for turn in turns:
+            linear = np.array([[1 + scale, -turn], [turn, 1 + scale]])
+            shift_m, own_ratio = _most_voted_shift(pairs, pairs.map_m - middle_m - arms_m @ linear.T, settings)
+            if own_ratio > ratio:
+                ratio, best = own_ratio, np.eye(3)
+                best[:2, :2], best[:2, 2] = linear, middle_m + shift_m - linear @ middle_m
+    return best, ratio
+
+
+def _most_voted_shift(pairs: _Pairs, apart_m: PointsM, settings: FlightOnMapSettings) -> tuple[Floats, float]:
+    """The shift (2,) that most of the pairs, (N, 2) apart, vote for, and how many times the mean one's votes it has."""
+    side = 2 * int(np.ceil(settings.reach_m / settings.cell_m))
+    cells = np.floor(apart_m / settings.cell_m).astype(np.int64) + side // 2
+    inside = ((cells >= 0) & (cells < side)).all(axis=1)
+    votes = np.bincount(cells[inside, 0] * side + cells[inside, 1], pairs.votes[inside], side * side)
+    smooth = cv2.GaussianBlur(
+        votes.reshape(side, side), (0, 0), settings.spread_m / settings.cell_m, borderType=cv2.BORDER_CONSTANT
+    )
+    middles_m = (np.arange(side) - side // 2 + 0.5) * settings.cell_m
+    is_within = np.hypot(*np.meshgrid(middles_m, middles_m)) < settings.shift_m
+    east, north = np.unravel_index(int(np.argmax(np.where(is_within, smooth, -1.0))), smooth.shape)
+    mean = max(float(smooth[is_within].mean()), 1e-9)
+    return np.array([middles_m[east], middles_m[north]]), float(smooth[east, north]) / mean
+
+
+def _tried(most: float, step: float) -> Floats:
+    """Values from -most to most, about a step apart, 0 among them."""
+    count = int(np.ceil(most / step))
+    return np.linspace(-most, most, 2 * count + 1)
+
+
+def _refined(pairs: _Pairs, started: Matrix3, ratio: float, settings: FlightOnMapSettings) -> FlightFit:
+    """The similarity of the pairs that agree with the one that had most votes."""
+    found, agree, miss_m = started, np.zeros(0, bool), np.zeros(0)
+    for _ in range(settings.rounds):
+        miss_m = np.linalg.norm(apply_homography(found, pairs.flight_m) - pairs.map_m, axis=1)
+        agree = miss_m < settings.band_m
+        if agree.sum() < settings.least_agree:
+            break
+        found = fit_similarity(pairs.map_m[agree], pairs.flight_m[agree])
+    return FlightFit(found, ratio, int(agree.sum()), _photos_miss_m(pairs, found, agree))
+
+
+def _photos_miss_m(pairs: _Pairs, map_from_flight: Matrix3, agree: Mask) -> float:
+    """How far photos lie off by the mean of their own agreeing pairs, the median over them; NaN without any."""
+    apart_m = apply_homography(map_from_flight, pairs.flight_m[agree]) - pairs.map_m[agree]
+    counts = np.bincount(pairs.photo[agree])
+    sums_m = (np.bincount(pairs.photo[agree], each) for each in apart_m.T)
+    means_m = np.hypot(*sums_m) / np.maximum(counts, 1)
+    return float(np.median(means_m[counts > 0])) if agree.any() else float("nan")
