@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,64 +21,83 @@ from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.simulation.settings import OutputSettings
 from sorvolo.store.site.archive import Archive
-
-PLAIN = CompareSettings(model="none")
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two flights of photos over the same ground, and the map of the first."""
-    settings = small_flight(
-        21, speed_m_s=8, length_m=90, height_m=60, size_px=(640, 480), fps=1, cars=4,
-        output=OutputSettings(photos=True),
-    )
-    folder = simulate_into(tmp_path_factory.mktemp("flown"), replace(settings, flights=2))
-    for _ in map_flights([folder / "flight1/photos"], folder / "site", MapSettings(model="none")):
-        pass
-    return folder
+from sorvolo.survey.findings import CompareUpdate, ViewStatus
+from sorvolo.survey.frame_rows import FrameRow
 
 
-def compared(flown: Path, site: Path) -> dict[str, Any]:
-    """The report of the second flight, compared in a copy of the site."""
-    shutil.copytree(flown / "site", site)
-    for _ in compare_flights([flown / "flight2/photos"], site, PLAIN):
-        pass
-    return dict(json.loads((site / "flights/photos-2/report.json").read_text()))
+class Flown:
+    """Two flights over the same ground, the map of the first, and what the second is compared by."""
+
+    def __init__(self, folder: Path, *, photos: bool) -> None:
+        settings = small_flight(
+            21, speed_m_s=8, length_m=80, height_m=60, size_px=(480, 360), fps=1 if photos else 3, cars=4,
+            output=OutputSettings(photos=photos),
+        )
+        simulate_into(folder, replace(settings, flights=2))
+        first, self._second = (
+            folder / (f"flight{number}/photos" if photos else f"flight{number}/flight{number}.mp4") for number in (1, 2)
+        )
+        self._site = folder / "site"
+        for _ in map_flights([first], self._site, MapSettings(model="none")):
+            pass
+
+    def compare(self, site: Path) -> Sequence[CompareUpdate]:
+        """Compare the second flight in a copy of the site."""
+        shutil.copytree(self._site, site)
+        return list(compare_flights([self._second], site, CompareSettings(model="none")))
 
 
-def outlines_m(site: Path) -> dict[str, np.ndarray]:
-    """(4, 2) of each photo of the second flight."""
+@pytest.fixture(scope="module", params=["photos", pytest.param("video", marks=pytest.mark.long)])
+def flown(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    return Flown(tmp_path_factory.mktemp("flown"), photos=request.param == "photos")
+
+
+def report_of(site: Path) -> dict[str, Any]:
+    """That of the second flight."""
+    (path,) = (site / "flights").glob("*2/report.json")
+    return dict(json.loads(path.read_text()))
+
+
+def frames_of(site: Path) -> dict[str, FrameRow]:
+    """Those of the second flight that were placed, by name."""
     with Archive.open(site, write=False) as archive:
-        return {each.name: each.outline_m for each in map_frames(site, archive.site())["photos-2"]}
+        flights = map_frames(site, archive.site())
+    (rows,) = (rows for name, rows in flights.items() if name.endswith("2"))
+    return {each.name: each for each in rows if each.status != "rejected"}
 
 
 def nowhere(*_: object, **__: object) -> NotAligned:
     return NotAligned("its features are found nowhere in the map where it could be", np.nan)
 
 
-def test_what_no_photo_shows_by_itself_is_placed_with_its_flight(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_no_picture_shows_by_itself_is_placed_with_its_flight(
+    flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    alone = compared(flown, tmp_path / "alone")
-    assert alone["comparison"]["with_flight"]["views"] == 0
+    with monkeypatch.context() as patched:
+        patched.setattr(FlightOnMap, "find", lambda *_: None)
+        flown.compare(tmp_path / "alone")
+    alone = report_of(tmp_path / "alone")["comparison"]
     monkeypatch.setattr(Aligner, "_by_homographies", nowhere)
     monkeypatch.setattr(MapSearch, "find", lambda *_: None)
-    together = compared(flown, tmp_path / "together")
-    views = alone["comparison"]["views"]["compared"]
-    assert together["comparison"]["views"]["compared"] == together["comparison"]["with_flight"]["views"] == views >= 6
-    assert [each["code"] for each in together["notices"]].count("placed_with_flight") == 1
-    ours, theirs = outlines_m(tmp_path / "together"), outlines_m(tmp_path / "alone")
-    apart_m = [np.linalg.norm(ours[name] - theirs[name], axis=1).max() for name in theirs]
-    assert len(apart_m) == views and max(apart_m) < 0.4
+    updates = flown.compare(tmp_path / "together")
+    assert len({each.frame_name for each in updates}) == len(updates), "each frame ends once"
+    together = report_of(tmp_path / "together")
+    views = together["comparison"]["views"]["compared"]
+    assert views == together["comparison"]["with_flight"]["views"] == sum(
+        each.status is ViewStatus.COMPARED for each in updates
+    )
+    assert [each["count"] for each in together["notices"] if each["code"] == "placed_with_flight"] == [views]
+    ours, theirs = frames_of(tmp_path / "together"), frames_of(tmp_path / "alone")
+    apart_m = [np.linalg.norm(ours[name].outline_m - theirs[name].outline_m, axis=1).mean() for name in ours]
+    assert views == len(ours) >= 5 and max(apart_m) < 0.4
+    assert together["comparison"]["compared_area_m2"] > 0.8 * alone["compared_area_m2"]
 
 
 def test_where_the_flight_is_not_found_either_nothing_is_compared(
-    flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Aligner, "_by_homographies", nowhere)
     monkeypatch.setattr(MapSearch, "find", lambda *_: None)
     monkeypatch.setattr(FlightOnMap, "find", lambda *_: None)
-    shutil.copytree(flown / "site", tmp_path / "site")
-    with pytest.raises(InputError, match="no frame of photos-2 could be compared: its features are found nowhere"):
-        for _ in compare_flights([flown / "flight2/photos"], tmp_path / "site", PLAIN):
-            pass
+    with pytest.raises(InputError, match="2 could be compared: its features are found nowhere"):
+        flown.compare(tmp_path / "site")

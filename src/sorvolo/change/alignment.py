@@ -74,8 +74,8 @@ class Aligned:
 
     `residual_px` is the median distance that paired points keep, in the frame's own pixels. `followed`: the last fit
     predicted this one, no features were needed. `local` is what the frame is moved by on the map beyond that
-    homography, None where nothing is; `local_m` how far a local fit moved it in all (median, m). `with_flight`: it lies
-    where its flight as a whole does.
+    homography, None where nothing is; `local_m` how far a local fit moved it in all (median, m). `with_flight`: it was
+    not found for sure by itself and lies where its flight as a whole has it.
     """
 
     site_from_image: Matrix3
@@ -190,9 +190,9 @@ class Aligner:
         self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, place: FlightPlace | None = None, *,
         comes_again: bool = False,
     ) -> Aligned | NotAligned:
-        """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map. `place` is
-        where it lies, where that is known already: only a local fit moves it then. A frame that `comes_again` where it
-        is not found is looked for only where that is cheap, and placed only where that is sure."""
+        """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map. `place` is where its
+        flight has it, where that is known: only a local fit moves it then. A frame that `comes_again` if it is not
+        found is placed only by what is cheap and sure."""
         size, gray = self._small(image)
         scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
         small_camera = camera.resized(*size)

@@ -59,7 +59,7 @@ class ViewOutcome:
     as bright as the map the flight is so far, NaN where that is not known. `doubted` (h, w) is what surely differs from
     the map in a compared view and is contradicted by earlier pictures, `leans` (h, w) what leans another way in those,
     `planted` what is found of things drawn in. `local_m` is how far a local fit moved the frame on the map (median, m),
-    0 without any. `with_flight`: the frame lies where its flight as a whole does.
+    0 without any. `with_flight` is that of `Aligned`.
     """
 
     status: ViewStatus

@@ -29,7 +29,7 @@ from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
 from sorvolo.missions.map.journal import begun_journal, go_on_live
-from sorvolo.mosaic.selection import every
+from sorvolo.mosaic.selection import StretchSelection, every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
@@ -38,6 +38,8 @@ from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 
 _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a thread for each
 _DECODED = 1  # frames of a video that wait to be compared
+_OVERLAP = 0.8  # of a video's frames that are laid on each other, as a first flight's are
+_MANY = 0.3  # share of these that is not found by itself, from which on the whole flight is looked for
 
 
 def compare_flights(
@@ -176,20 +178,37 @@ def _ended(
     source: Source, step_s: float, setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
     ahead: Callable[[], int],
 ) -> Iterator[Pending | LostFrame]:
-    """The frames as their comparisons end; photos that were not found on the map are tried again after the others,
-    beside those that were (a video shows the same ground again anyway)."""
+    """The frames as their comparisons end. What was not found on the map is tried again after the others, with the
+    whole flight where that can be read again: each photo, and of a video, which shows the same ground again anyway,
+    frames that overlap as photos do."""
+    is_photos = source.kind == "photos"
+    can_whole = setup.track is not None and not isinstance(source, LiveSource)
+    overlapping = StretchSelection(_OVERLAP, keep_all=False)
+
+    def is_chosen(posed: PosedFrame) -> bool:
+        if is_photos or not can_whole:
+            return is_photos
+        outline_m = run.outline_m(posed)
+        return outline_m is not None and overlapping.take(outline_m)
+
+    chosen: set[int] = set()
     again: set[int] = set()
-    has_places = source.kind == "photos" and not isinstance(source, LiveSource) and setup.track is not None
     yield from run.recalled()
-    for each in _begun(_frames(source, step_s), setup, inside, run, ahead, come_again=has_places):
-        if source.kind == "photos" and isinstance(each, Pending) and each.is_unplaced:
-            again.add(each.posed.frame.index)
-            run.put_off(each)
-        else:
-            yield each
-    if again:
-        places = run.places_with_flight(_posed(source.frames(lambda *_: True), setup, inside)) if has_places else {}
-        yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead, places)
+    for each in _begun(_frames(source, step_s), setup, inside, run, ahead, come_again=is_photos and can_whole):
+        if isinstance(each, Pending) and is_chosen(each.posed):
+            chosen.add(each.posed.frame.index)
+            if each.is_unplaced:
+                again.add(each.posed.frame.index)
+                run.put_off(each)
+                continue
+        yield each
+    if not again:
+        return
+    places: Mapping[int, FlightPlace] = {}
+    if can_whole and (is_photos or len(again) > _MANY * len(chosen)):
+        frames = source.frames(lambda index, _: index in chosen)
+        places = run.places_with_flight(_posed(frames, setup, inside), len(chosen))
+    yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead, places)
 
 
 def _posed(

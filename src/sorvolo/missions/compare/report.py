@@ -129,8 +129,8 @@ def flight_notices(counts: ViewCounts, fit: FlightFit | None) -> list[Notice]:
     if fit is None or not counts.with_flight:
         return []
     text = (
-        f"{counts.with_flight} photos were not found on the map for sure by themselves and lie where all photos of the "
-        f"flight together fit it, within {fit.residual_m:.1f} m (median)"
+        f"{counts.with_flight} pictures were not found on the map for sure by themselves and lie where all pictures of "
+        f"the flight together fit it, within {max(fit.residual_m, 0.1):.1f} m (median)"
     )
     return [Notice("placed_with_flight", counts.with_flight, text)]
 

@@ -20,7 +20,7 @@ from sorvolo.change.shape.outlines import KnownPlace
 from sorvolo.change.shape.reported import reported
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord, as_bgr
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Mask
+from sorvolo.geometry.arrays import Mask, PointsM
 from sorvolo.geometry.summary import median_of_known
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
@@ -193,11 +193,15 @@ class CompareRun:
         self._keep(pending, taken)
         return outcome, announced
 
-    def places_with_flight(self, photos: Iterable[PosedFrame]) -> Mapping[int, FlightPlace]:
-        """Where all of the flight's photos lie, by index, laid on each other and found on the map as one; none where
+    def outline_m(self, posed: PosedFrame) -> PointsM | None:
+        """(4, 2) the ground under a frame by telemetry; None where that does not place it."""
+        return self._views.pixels.ground_m(posed, None)
+
+    def places_with_flight(self, photos: Iterable[PosedFrame], count: int) -> Mapping[int, FlightPlace]:
+        """Where so many photos of the flight lie, by index, laid on each other and found on the map as one; none where
         they are not."""
         on_map = FlightOnMap(MapSearch(self._reference(), self._archive.site_grid()))
-        with WholeFlight(self._setup, self._archive, self._views, on_map) as whole:
+        with WholeFlight(self._setup, self._archive, self._views, on_map, count) as whole:
             for each in photos:
                 with self._log.stage(Stage.REGISTER):
                     whole.add(each)

@@ -26,14 +26,17 @@ class WholeFlight:
     A context manager: leaving it removes the file beside the site in which photos wait.
     """
 
-    def __init__(self, setup: FlightSetup, archive: Archive, views: ViewMaker, on_map: FlightOnMap) -> None:
+    def __init__(
+        self, setup: FlightSetup, archive: Archive, views: ViewMaker, on_map: FlightOnMap, count: int
+    ) -> None:
+        """`count` photos will be added."""
         model, track = setup.source.camera, setup.track
         self._views, self._on_map = views, on_map
         self._spill = SpillFile(archive.folder)
         offset_sigma_m = None if track is None else track.altitude_offset_sigma_m
         graph = PoseGraphSettings.of_flight(model.focal_sigma, offset_sigma_m, joins_map=False)
         self._mapper = PlanarMapper(graph, shelf=self._spill)
-        self._step = max(1, -(-setup.source.frame_count // _MOST_SOUGHT))
+        self._step, self._added = max(1, -(-count // _MOST_SOUGHT)), 0
         self._sought: dict[int, PhotoFeatures] = {}
         self.fit: FlightFit | None = None
         """Where the flight lies on the map, once `places` found it."""
@@ -53,8 +56,9 @@ class WholeFlight:
             return
         image = self._views.undistorted(posed)
         outcome = self._mapper.add(index, camera, image, posed.prior)
-        if outcome.status is not Status.REJECTED and index % self._step == 0:
+        if outcome.status is not Status.REJECTED and self._added % self._step == 0:
             self._sought[index] = self._on_map.features(image, camera)
+        self._added += 1
 
     def places(self) -> Mapping[int, FlightPlace]:
         """Where the photos lie that others of the flight overlap, by index: none where it is not found on the map."""
