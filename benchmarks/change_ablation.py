@@ -214,8 +214,8 @@ def record_dates(cache: Path, data: Path) -> None:
     second, _ = real_dates.fly(data, later, 3)
     mapped, flown = folder / "photos_earlier", folder / "photos_later"
     folder.mkdir(parents=True, exist_ok=True)
-    shown = real_dates.write_photos(first, mapped, size_px, "known", 0)
-    real_dates.write_photos(second, flown, size_px, "known", real_dates.LATER_NS)
+    shown = real_dates.write_photos(first, mapped, size_px, "known", real_dates.begins_ns(earlier))
+    real_dates.write_photos(second, flown, size_px, "known", real_dates.begins_ns(later))
     camera, site = folder / "camera.xml", folder / "site"
     for _ in map_flights([mapped], site, MapSettings(model="none"), camera=camera):
         pass

@@ -43,8 +43,7 @@ def main() -> None:
     truth = json.loads((real_dates.HERE / "real_dates.json").read_text())
     runs = []
     for name in options.pairs:
-        stored = truth["pairs"][name]
-        pair = real_dates.Pair(name, np.array(stored["b_to_a"]), np.array(stored["moved_px"]))
+        pair = real_dates.Pair.of(name, truth["pairs"])
         for gps in ("1 m", "none"):
             runs.append({"pair": name, "gps": gps, **tied(pair, gps, options.data, options.keep)})
             print(json.dumps(runs[-1]))
@@ -58,8 +57,8 @@ def tied(pair: real_dates.Pair, gps: str, data: Path, keep: Path) -> dict[str, A
     first, size_px = real_dates.fly(data, earlier, 2 * _SEED)
     second, _ = real_dates.fly(data, later, 2 * _SEED + 1)
     mapped, flown = keep / f"photos_{earlier}_{2 * _SEED}_known", keep / f"photos_{later}_{2 * _SEED + 1}_none"
-    shown = real_dates.write_photos(first, mapped, size_px, "known", 0)
-    seen = real_dates.write_photos(second, flown, size_px, "none", real_dates.LATER_NS)
+    shown = real_dates.write_photos(first, mapped, size_px, "known", real_dates.begins_ns(earlier))
+    seen = real_dates.write_photos(second, flown, size_px, "none", real_dates.begins_ns(later))
     base, site = keep / f"map_{earlier}_{2 * _SEED}", keep / "tied"
     if not (base / "mosaic.tif").is_file():
         shutil.rmtree(base, ignore_errors=True)

@@ -189,7 +189,7 @@ def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Na
     map_from_true = map_error(first, shown, rows[mapped.name], frame)
     views = placed_right(pair, second, seen, rows[flown.name], frame, map_from_true, size_px)
     report = json.loads((site / "flights" / flown.name / "report.json").read_text())["comparison"]
-    result = {**took, **views, "statuses": dict(Counter(each.status.value for each in updates)),
+    result = {**took, **views, "statuses": dict(Counter(each.status.value for each in updates if not each.comes_again)),
               "reasons": report["reasons"], "compared_m2": report["compared_area_m2"],
               "residual_px": report["residual_px"], "with_flight": report["with_flight"]}
     drawn_by_hand = drawn_of(truth, pair.name)

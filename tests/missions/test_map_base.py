@@ -10,6 +10,7 @@ import rasterio
 from PIL import Image
 from rasterio.transform import Affine
 
+from sorvolo.change.alignment import Aligner, NotAligned
 from sorvolo.cli import main as cli
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 
@@ -80,6 +81,16 @@ def test_photos_come_to_lie_where_the_base_map_has_them(
     assert absolute_m(site, photographed) < 0.15
     if shift_m:
         assert report["base"]["moved_m"] == pytest.approx(shift_m, abs=0.5)
+
+
+def test_photos_that_are_not_found_by_themselves_are_found_as_one(
+    photographed: Path, base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Aligner, "align", lambda *_: NotAligned("months have passed", np.nan))
+    photos, site = copied(photographed, tmp_path / "photos", 6.0), tmp_path / "site"
+    assert run(photos, site, photographed, base) == 0
+    assert report_of(site)["base"]["found"] >= 6
+    assert absolute_m(site, photographed) < 0.3
 
 
 def write_map(path: Path, place: Path, m_per_px: float, shift_m: float, seed: int | None) -> Path:

@@ -215,8 +215,9 @@ def _show_progress(
                 words = words or _announcement(folder, form)
                 console.print(words(change), highlight=False, soft_wrap=True)
             compared = f"{update.compared:,} of {counted(update.views, 'view')} compared"
+            doing = "looking for the flight, frame" if update.comes_again else "comparing, frame"
             progress.show(
-                "comparing, frame", update.frames_read, max(update.frames_expected, update.frames_read),
+                doing, update.frames_read, max(update.frames_expected, update.frames_read),
                 f"{rate_words(update.frames_read, update.seconds)}{compared}, {counted(len(announced), 'change')}",
             )
         resumed.end()

@@ -16,7 +16,7 @@ from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.change.alignment import FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
-from sorvolo.missions.compare.run import CompareRun, Pending
+from sorvolo.missions.compare.run import Again, CompareRun, Pending
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.frames_ahead import read_ahead
@@ -33,8 +33,9 @@ from sorvolo.mosaic.selection import StretchSelection, every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
-from sorvolo.survey.findings import CompareUpdate, ViewStatus
+from sorvolo.survey.findings import Change, CompareUpdate, ViewStatus
 from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
+from sorvolo.survey.mosaic import FrameView
 
 _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a thread for each
 _DECODED = 1  # frames of a video that wait to be compared
@@ -52,9 +53,9 @@ def compare_flights(
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
 
     `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
-    carries the changes that its frame announced. `steps` is a folder for the intermediate pictures of method thesis
-    (its Figure 3.14). The flights' findings and the new version of the map are part of the site when a flight's last
-    update was yielded.
+    carries the changes that its frame announced; after one that `comes_again` its frame has another. `steps` is a
+    folder for the intermediate pictures of method thesis (its Figure 3.14). The flights' findings and the new version
+    of the map are part of the site when a flight's last update was yielded.
     A run that was killed continues when the same is asked for again.
     A flight that was compared already, as it is asked for, is left out and returned, unless `again` is given.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
@@ -155,32 +156,42 @@ def _compare_one(
         def ahead() -> int:  # a live view's changes are announced at once, unless the next view waits already
             return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD
 
-        for each in _ended(source, step_s, setup, inside, run, ahead):
-            if isinstance(each, Pending):
-                outcome, announced = run.add(each)
-                is_resumed = each.earlier is not None
-                view = run.view(each.posed)
-                frame: Frame | LostFrame = each.posed.frame
-                status, reason, residual_px = outcome.status, outcome.reason, outcome.residual_px
-            else:
-                run.lose(each)
-                view, is_resumed = None, False
-                frame, status, reason, residual_px, announced = each, ViewStatus.LOST, each.reason, float("nan"), ()
-            yield CompareUpdate(
+        def updated(
+            frame: Frame | LostFrame, status: ViewStatus, reason: str, residual_px: float = float("nan"),
+            announced: tuple[Change, ...] = (), view: FrameView | None = None, *, is_resumed: bool = False,
+            comes_again: bool = False,
+        ) -> CompareUpdate:
+            return CompareUpdate(
                 source.name, frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced,
                 frame.index + 1, source.frame_count, run.views, run.compared, time.monotonic() - started_s, view,
-                is_resumed,
+                is_resumed, comes_again,
             )
+
+        for each in _ended(source, step_s, setup, inside, run, ahead):
+            if isinstance(each, LostFrame):
+                run.lose(each)
+                yield updated(each, ViewStatus.LOST, each.reason)
+            elif isinstance(each, Again):
+                yield updated(
+                    each.posed.frame, ViewStatus.NOT_ALIGNED, "it is looked for again with all of its flight",
+                    is_resumed=each.is_resumed, comes_again=True,
+                )
+            else:
+                outcome, announced = run.add(each)
+                yield updated(
+                    each.posed.frame, outcome.status, outcome.reason, outcome.residual_px, announced,
+                    run.view(each.posed), is_resumed=each.earlier is not None,
+                )
         run.finish(source.notices(), started_s)
 
 
 def _ended(
     source: Source, step_s: float, setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
     ahead: Callable[[], int],
-) -> Iterator[Pending | LostFrame]:
+) -> Iterator[Pending | LostFrame | Again]:
     """The frames as their comparisons end. What was not found on the map is tried again after the others, with the
     whole flight where that can be read again: each photo, and of a video, which shows the same ground again anyway,
-    frames that overlap as photos do."""
+    frames that overlap as photos do. Frames that come again are named until then."""
     is_photos = source.kind == "photos"
     can_whole = setup.track is not None and not isinstance(source, LiveSource)
     overlapping = StretchSelection(_OVERLAP, keep_all=False)
@@ -200,6 +211,7 @@ def _ended(
             if each.is_unplaced:
                 again.add(each.posed.frame.index)
                 run.put_off(each)
+                yield Again(each.posed, is_resumed=each.earlier is not None)
                 continue
         yield each
     if not again:
@@ -207,7 +219,7 @@ def _ended(
     places: Mapping[int, FlightPlace] = {}
     if can_whole and (is_photos or len(again) > _MANY * len(chosen)):
         frames = source.frames(lambda index, _: index in chosen)
-        places = run.places_with_flight(_posed(frames, setup, inside), len(chosen))
+        places = yield from run.places_with_flight(_posed(frames, setup, inside), len(chosen))
     yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead, places)
 
 

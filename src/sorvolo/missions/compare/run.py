@@ -1,7 +1,7 @@
 """One later flight on its way into a site: views to evidence, evidence to changes, changes into the map."""
 
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -82,6 +82,14 @@ class Pending:
     def is_unplaced(self) -> bool:
         """Whether the frame was not found on the map; waits for its comparison."""
         return self.outcome.result().status is ViewStatus.NOT_ALIGNED
+
+
+@dataclass(frozen=True, eq=False)
+class Again:
+    """A frame that is looked for again later; `is_resumed`: so a run that was killed found it."""
+
+    posed: PosedFrame
+    is_resumed: bool
 
 
 class CompareRun:
@@ -197,14 +205,17 @@ class CompareRun:
         """(4, 2) the ground under a frame by telemetry; None where that does not place it."""
         return self._views.pixels.ground_m(posed, None)
 
-    def places_with_flight(self, photos: Iterable[PosedFrame], count: int) -> Mapping[int, FlightPlace]:
+    def places_with_flight(
+        self, photos: Iterable[PosedFrame], count: int
+    ) -> Generator[Again, None, Mapping[int, FlightPlace]]:
         """Where so many photos of the flight lie, by index, laid on each other and found on the map as one; none where
-        they are not."""
+        they are not. Yields each as it is laid."""
         on_map = FlightOnMap(MapSearch(self._reference(), self._archive.site_grid()))
         with WholeFlight(self._setup, self._archive, self._views, on_map, count) as whole:
             for each in photos:
                 with self._log.stage(Stage.REGISTER):
                     whole.add(each)
+                yield Again(each, is_resumed=False)
             with self._log.stage(Stage.REGISTER):
                 places = whole.places()
         self._flight_fit = whole.fit

@@ -1,16 +1,19 @@
 """A flight tied to a map that exists already: an orthophoto, or the map of another site."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.capture.source import Source
 from sorvolo.change.alignment import Aligned, Aligner
+from sorvolo.change.flight_on_map import FlightOnMap
+from sorvolo.change.map_search import MapSearch
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame, utm_epsg
+from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.mosaic.base_ties import (
     BaseReport,
     FoundFrame,
@@ -71,7 +74,8 @@ class FlightBase:
         tiles = self.base.tiles(site_grid, around(mapper, _MARGIN))
         if not tiles:
             raise self._of_another_place(frame)
-        aligner = Aligner(ReferenceMap(tiles, site_grid.grid), site_grid)
+        reference = ReferenceMap(tiles, site_grid.grid)
+        aligner = Aligner(reference, site_grid)
         sought, found = sought_keyframes(mapper), []
         for number, each in enumerate(sought):
             image = picture(each)
@@ -83,7 +87,11 @@ class FlightBase:
                 found.append(FoundFrame(
                     each, camera.resized(width_px, height_px), aligned.site_from_image, misfit_m
                 ))
-        if len(found) < max(_LEAST_FRAMES, _LEAST_SHARE * len(sought)):
+        least = max(_LEAST_FRAMES, _LEAST_SHARE * len(sought))
+        if len(found) < least:
+            together = _found_as_one(mapper, sought, picture, camera, FlightOnMap(MapSearch(reference, site_grid)))
+            found = together or found
+        if len(found) < least:
             raise InputError(
                 f"{len(found)} of {len(sought)} frames of {self.source.name} were found on the base map "
                 f"{self.base.path}: it shows other ground, or the same at too coarse a scale or too different a time; "
@@ -133,6 +141,25 @@ class FlightBase:
                 f"{100 * native_m:.1f} cm: a base map may be {_COARSEST:.0f} times coarser at most"
             )
         return native_m
+
+
+def _found_as_one(
+    mapper: PlanarMapper, sought: Sequence[int], picture: Callable[[int], ImageRGB], camera: Camera, on_map: FlightOnMap
+) -> list[FoundFrame]:
+    """The keyframes where all of them together are found on the base map (0087); none where they are not."""
+    refined = mapper.refined(camera)
+    photos = {}
+    for each in sought:
+        image = picture(each)
+        photos[each] = on_map.features(image, refined.resized(image.shape[1], image.shape[0]))
+    poses = {each: mapper.pose(each) for each in sought}
+    fit = on_map.find(photos, poses)
+    if fit is None:
+        return []
+    return [
+        FoundFrame(each, camera, fit.map_from_flight @ site_from_image_homography(refined, poses[each]), fit.residual_m)
+        for each in sought
+    ]
 
 
 def open_base(path: Path, source: Source) -> FlightBase:
