@@ -1,6 +1,6 @@
 """A flight whose photos were laid on each other, found on the map as one: what each shows too weakly adds up."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -25,14 +25,16 @@ class FlightOnMapSettings:
     margin: float = 0.1  # of a photo's size: map searched beyond each side
     reach_m: float = 10.0  # pairs of points lie so far apart at most ...
     shift_m: float = 8.0  # ... and all photos in common: what GPS errs by on both dates
-    most_scale: float = 0.04  # by which the flight, laid by its GPS, is larger or smaller than the map
-    most_turn_deg: float = 1.0  # by which it is turned
+    most_scale: float = 0.1  # by which the flight, laid by its GPS, is larger or smaller than the map
+    most_turn_deg: float = 10.0  # by which it is turned; both, as far as that moves its rim by the most shift
     step_m: float = 0.5  # at its rim, between scales and turns that are tried
     least_likeness: float = 0.7  # of a pair's descriptors: likeness beyond that is its vote
+    ground_m: float = 4.0  # of which each square votes once for a shift
     cell_m: float = 0.175  # of the raster of shifts on which pairs vote
     spread_m: float = 0.35  # one sigma of what right pairs scatter: maps are distorted
-    least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 6.0
+    least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 6.8
     least_agree: int = 100  # pairs within the band: few pairs in all stand out by chance
+    least_spread: float = 1.4  # times the squares that chance would leave; other ground has about one
     rounds: int = 10  # of the least squares that follow, over the pairs within ...
     band_m: float = 1.0  # ... this, about three sigmas
 
@@ -48,12 +50,14 @@ class PhotoFeatures:
 @dataclass(frozen=True, eq=False)
 class FlightFit:
     """Where a flight lies on a map: `map_from_flight` is a similarity (3, 3) of site metres. `ratio` is how many times
-    the votes of the mean place it has, `agree` how many pairs agree with it, `residual_m` how far photos miss it by
-    the mean of theirs (median)."""
+    the votes of the mean place it has, `agree` how many pairs agree with it, `spread` on how many times as many
+    squares of ground as chance would leave pairs that agree, `residual_m` how far photos miss it by the mean of theirs
+    (median)."""
 
     map_from_flight: Matrix3
     ratio: float
     agree: int
+    spread: float
     residual_m: float
 
 
@@ -66,6 +70,15 @@ class _Pairs:
     flight_m: PointsM
     map_m: PointsM
     votes: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence["_Pairs"]) -> "_Pairs":
+        """Those of several photos."""
+        return cls(*(np.concatenate([getattr(each, name) for each in parts]) for name in vars(parts[0])))
+
+    def of(self, rows: Rows) -> "_Pairs":
+        """Some of them."""
+        return _Pairs(*(each[rows] for each in vars(self).values()))
 
 
 class FlightOnMap:
@@ -89,12 +102,13 @@ class FlightOnMap:
         seen = [each for each in parts if each is not None]
         if not seen:
             return None
-        pairs = _Pairs(*(np.concatenate([getattr(each, name) for each in seen]) for name in vars(seen[0])))
+        pairs = _once(_Pairs.joined(seen), settings)
         started, ratio = _most_votes(pairs, settings)
         if ratio < settings.least_ratio:
             return None
         fit = _refined(pairs, started, ratio, settings)
-        return None if fit.agree < settings.least_agree else fit
+        is_right = fit.agree >= settings.least_agree and fit.spread >= settings.least_spread
+        return fit if is_right else None
 
     def _pairs(self, index: int, photo: PhotoFeatures, pose: Pose) -> _Pairs | None:
         """What a photo shows of the map around where its pose puts it; None beside the map."""
@@ -113,6 +127,16 @@ class FlightOnMap:
             apply_homography(site_from_image, old.points_px[kept[:, 1]]),
             likeness[likeness > settings.least_likeness] - settings.least_likeness,
         )
+
+
+def _once(pairs: _Pairs, settings: FlightOnMapSettings) -> _Pairs:
+    """The likest pair of each piece of ground for each shift: overlapping photos, and ground that repeats itself, would
+    vote again and again."""
+    places = np.floor(pairs.flight_m / settings.ground_m)
+    shifts = np.floor((pairs.map_m - pairs.flight_m) / settings.spread_m)
+    likest = np.argsort(-pairs.votes, kind="stable")
+    _, first = np.unique(np.column_stack([places, shifts])[likest], axis=0, return_index=True)
+    return pairs.of(np.sort(likest[first]))
 
 
 def _most_votes(pairs: _Pairs, settings: FlightOnMapSettings) -> tuple[Matrix3, float]:
@@ -166,7 +190,18 @@ def _refined(pairs: _Pairs, started: Matrix3, ratio: float, settings: FlightOnMa
         if agree.sum() < settings.least_agree:
             break
         found = fit_similarity(pairs.map_m[agree], pairs.flight_m[agree])
-    return FlightFit(found, ratio, int(agree.sum()), _photos_miss_m(pairs, found, agree))
+    return FlightFit(
+        found, ratio, int(agree.sum()), _spread(pairs, agree, settings), _photos_miss_m(pairs, found, agree)
+    )
+
+
+def _spread(pairs: _Pairs, agree: Mask, settings: FlightOnMapSettings) -> float:
+    """Squares of ground with pairs that agree, over those that chance would leave some in: right ones lie all over the
+    ground that stayed; ground that repeats itself, and is taken for what is beside it, lies in few places."""
+    squares = np.floor(pairs.flight_m / settings.ground_m)
+    _, of_pair, counts = np.unique(squares, axis=0, return_inverse=True, return_counts=True)
+    by_chance = float((1 - (1 - (settings.band_m / settings.reach_m) ** 2) ** counts).sum())
+    return len(np.unique(of_pair.ravel()[agree])) / max(by_chance, 1.0)
 
 
 def _photos_miss_m(pairs: _Pairs, map_from_flight: Matrix3, agree: Mask) -> float:
