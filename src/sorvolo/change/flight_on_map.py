@@ -18,25 +18,27 @@ from sorvolo.survey.mosaic import Features
 
 @dataclass(frozen=True)
 class FlightOnMapSettings:
-    """How photos whose places beside each other are known are looked for on the map together."""
+    """How photos whose places beside each other are known are looked for on the map together; pixels are those of the
+    photos, at most `side_px` wide."""
 
     side_px: int = 1024  # longest side of a photo
     points: int = 2048  # learned features of a photo, the strongest
     margin: float = 0.1  # of a photo's size: map searched beyond each side
-    reach_m: float = 10.0  # pairs of points lie so far apart at most ...
-    shift_m: float = 8.0  # ... and all photos in common: what GPS errs by on both dates
+    reach_px: float = 73.0  # pairs of points lie so far apart at most (10 m from 100 m up) ...
+    shift_px: float = 58.0  # ... and all photos in common: what GPS errs by on both dates
     most_scale: float = 0.1  # by which the flight, laid by its GPS, is larger or smaller than the map
     most_turn_deg: float = 10.0  # by which it is turned; both, as far as that moves its rim by the most shift
-    step_m: float = 0.5  # at its rim, between scales and turns that are tried
+    least_rim_px: float = 220.0  # of its ground, from the middle: less fits too many places within what GPS errs
+    step_px: float = 3.5  # at its rim, between scales and turns that are tried
     least_likeness: float = 0.7  # of a pair's descriptors: likeness beyond that is its vote
-    ground_m: float = 4.0  # of which each square votes once for a shift
-    cell_m: float = 0.175  # of the raster of shifts on which pairs vote
-    spread_m: float = 0.35  # one sigma of what right pairs scatter: maps are distorted
+    ground_px: float = 28.0  # side of the squares of ground that vote once for a shift
+    cell_px: float = 1.2  # of the raster of shifts on which pairs vote
+    spread_px: float = 2.5  # one sigma of what right pairs scatter: another light, and maps are distorted
     least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 6.8
     least_agree: int = 100  # pairs within the band: few pairs in all stand out by chance
     least_spread: float = 1.4  # times the squares that chance would leave; other ground has about one
     rounds: int = 10  # of the least squares that follow, over the pairs within ...
-    band_m: float = 1.0  # ... this, about three sigmas
+    band_px: float = 7.0  # ... this, about three sigmas
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +104,14 @@ class FlightOnMap:
         seen = [each for each in parts if each is not None]
         if not seen:
             return None
-        pairs = _once(_Pairs.joined(seen), settings)
-        started, ratio = _most_votes(pairs, settings)
+        px_m = float(np.median([poses[index].translation_m[2] / each.camera.fx_px for index, each in photos.items()]))
+        pairs = _once(_Pairs.joined(seen), px_m, settings)
+        if _rim_m(pairs) < settings.least_rim_px * px_m:
+            return None
+        started, ratio = _most_votes(pairs, px_m, settings)
         if ratio < settings.least_ratio:
             return None
-        fit = _refined(pairs, started, ratio, settings)
+        fit = _refined(pairs, started, ratio, px_m, settings)
         is_right = fit.agree >= settings.least_agree and fit.spread >= settings.least_spread
         return fit if is_right else None
 
@@ -117,8 +122,7 @@ class FlightOnMap:
         if seen is None:
             return None
         site_from_image, old = seen
-        reach_px = settings.reach_m * photo.camera.fx_px / float(pose.translation_m[2])
-        pairs = match_learned(new, old, np.eye(3), reach_px)
+        pairs = match_learned(new, old, np.eye(3), settings.reach_px)
         ours, theirs = (np.asarray(each.descriptors, np.float32) for each in (new, old))
         likeness = np.einsum("nd,nd->n", ours[pairs[:, 0]], theirs[pairs[:, 1]])
         kept = pairs[likeness > settings.least_likeness]
@@ -129,47 +133,57 @@ class FlightOnMap:
         )
 
 
-def _once(pairs: _Pairs, settings: FlightOnMapSettings) -> _Pairs:
+def _once(pairs: _Pairs, px_m: float, settings: FlightOnMapSettings) -> _Pairs:
     """The likest pair of each piece of ground for each shift: overlapping photos, and ground that repeats itself, would
     vote again and again."""
-    places = np.floor(pairs.flight_m / settings.ground_m)
-    shifts = np.floor((pairs.map_m - pairs.flight_m) / settings.spread_m)
+    places = np.floor(pairs.flight_m / (settings.ground_px * px_m))
+    shifts = np.floor((pairs.map_m - pairs.flight_m) / (settings.spread_px * px_m))
     likest = np.argsort(-pairs.votes, kind="stable")
     _, first = np.unique(np.column_stack([places, shifts])[likest], axis=0, return_index=True)
     return pairs.of(np.sort(likest[first]))
 
 
-def _most_votes(pairs: _Pairs, settings: FlightOnMapSettings) -> tuple[Matrix3, float]:
+def _rim_m(pairs: _Pairs) -> float:
+    """How far from its middle the flight's ground reaches; but for a tenth of it."""
+    arms_m = np.linalg.norm(pairs.flight_m - pairs.flight_m.mean(axis=0), axis=1)
+    return float(np.percentile(arms_m, 90)) if len(arms_m) else 0.0
+
+
+def _most_votes(pairs: _Pairs, px_m: float, settings: FlightOnMapSettings) -> tuple[Matrix3, float]:
     """The similarity, map_from_flight, that most votes fall to, and how many times those of the mean one it has."""
     middle_m = pairs.flight_m.mean(axis=0)
     arms_m = pairs.flight_m - middle_m
-    rim_m = max(float(np.percentile(np.hypot(*arms_m.T), 90)), settings.step_m)
+    rim_m = _rim_m(pairs)
     scales, turns = (
-        _tried(min(most, settings.shift_m / rim_m), settings.step_m / rim_m)
+        _tried(min(most, settings.shift_px * px_m / rim_m), settings.step_px * px_m / rim_m)
         for most in (settings.most_scale, float(np.radians(settings.most_turn_deg)))
     )
     best, ratio = np.eye(3), 0.0
     for scale in scales:
         for turn in turns:
             linear = np.array([[1 + scale, -turn], [turn, 1 + scale]])
-            shift_m, own_ratio = _most_voted_shift(pairs, pairs.map_m - middle_m - arms_m @ linear.T, settings)
+            shift_m, own_ratio = _most_voted_shift(
+                pairs, pairs.map_m - middle_m - arms_m @ linear.T, px_m, settings
+            )
             if own_ratio > ratio:
                 ratio, best = own_ratio, np.eye(3)
                 best[:2, :2], best[:2, 2] = linear, middle_m + shift_m - linear @ middle_m
     return best, ratio
 
 
-def _most_voted_shift(pairs: _Pairs, apart_m: PointsM, settings: FlightOnMapSettings) -> tuple[Floats, float]:
+def _most_voted_shift(
+    pairs: _Pairs, apart_m: PointsM, px_m: float, settings: FlightOnMapSettings
+) -> tuple[Floats, float]:
     """The shift (2,) that most of the pairs, (N, 2) apart, vote for, and how many times the mean one's votes it has."""
-    side = 2 * int(np.ceil(settings.reach_m / settings.cell_m))
-    cells = np.floor(apart_m / settings.cell_m).astype(np.int64) + side // 2
+    side = 2 * int(np.ceil(settings.reach_px / settings.cell_px))
+    cells = np.floor(apart_m / (settings.cell_px * px_m)).astype(np.int64) + side // 2
     inside = ((cells >= 0) & (cells < side)).all(axis=1)
     votes = np.bincount(cells[inside, 0] * side + cells[inside, 1], pairs.votes[inside], side * side)
     smooth = cv2.GaussianBlur(
-        votes.reshape(side, side), (0, 0), settings.spread_m / settings.cell_m, borderType=cv2.BORDER_CONSTANT
+        votes.reshape(side, side), (0, 0), settings.spread_px / settings.cell_px, borderType=cv2.BORDER_CONSTANT
     )
-    middles_m = (np.arange(side) - side // 2 + 0.5) * settings.cell_m
-    is_within = np.hypot(*np.meshgrid(middles_m, middles_m)) < settings.shift_m
+    middles_m = (np.arange(side) - side // 2 + 0.5) * settings.cell_px * px_m
+    is_within = np.hypot(*np.meshgrid(middles_m, middles_m)) < settings.shift_px * px_m
     east, north = np.unravel_index(int(np.argmax(np.where(is_within, smooth, -1.0))), smooth.shape)
     mean = max(float(smooth[is_within].mean()), 1e-9)
     return np.array([middles_m[east], middles_m[north]]), float(smooth[east, north]) / mean
@@ -181,26 +195,28 @@ def _tried(most: float, step: float) -> Floats:
     return np.linspace(-most, most, 2 * count + 1)
 
 
-def _refined(pairs: _Pairs, started: Matrix3, ratio: float, settings: FlightOnMapSettings) -> FlightFit:
+def _refined(
+    pairs: _Pairs, started: Matrix3, ratio: float, px_m: float, settings: FlightOnMapSettings
+) -> FlightFit:
     """The similarity of the pairs that agree with the one that had most votes."""
     found, agree, miss_m = started, np.zeros(0, bool), np.zeros(0)
     for _ in range(settings.rounds):
         miss_m = np.linalg.norm(apply_homography(found, pairs.flight_m) - pairs.map_m, axis=1)
-        agree = miss_m < settings.band_m
+        agree = miss_m < settings.band_px * px_m
         if agree.sum() < settings.least_agree:
             break
         found = fit_similarity(pairs.map_m[agree], pairs.flight_m[agree])
     return FlightFit(
-        found, ratio, int(agree.sum()), _spread(pairs, agree, settings), _photos_miss_m(pairs, found, agree)
+        found, ratio, int(agree.sum()), _spread(pairs, agree, px_m, settings), _photos_miss_m(pairs, found, agree)
     )
 
 
-def _spread(pairs: _Pairs, agree: Mask, settings: FlightOnMapSettings) -> float:
+def _spread(pairs: _Pairs, agree: Mask, px_m: float, settings: FlightOnMapSettings) -> float:
     """Squares of ground with pairs that agree, over those that chance would leave some in: right ones lie all over the
     ground that stayed; ground that repeats itself, and is taken for what is beside it, lies in few places."""
-    squares = np.floor(pairs.flight_m / settings.ground_m)
+    squares = np.floor(pairs.flight_m / (settings.ground_px * px_m))
     _, of_pair, counts = np.unique(squares, axis=0, return_inverse=True, return_counts=True)
-    by_chance = float((1 - (1 - (settings.band_m / settings.reach_m) ** 2) ** counts).sum())
+    by_chance = float((1 - (1 - (settings.band_px / settings.reach_px) ** 2) ** counts).sum())
     return len(np.unique(of_pair.ravel()[agree])) / max(by_chance, 1.0)
 
 
