@@ -87,7 +87,7 @@ def test_photos_that_are_not_found_by_themselves_are_found_as_one(
     photographed: Path, base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Aligner, "align", lambda *_: NotAligned("months have passed", np.nan))
-    photos, site = copied(photographed, tmp_path / "photos", 6.0), tmp_path / "site"
+    photos, site = copied(photographed, tmp_path / "photos", 0.5), tmp_path / "site"
     assert run(photos, site, photographed, base) == 0
     assert report_of(site)["base"]["found"] >= 6
     assert absolute_m(site, photographed) < 0.3

@@ -28,7 +28,7 @@ class FlightOnMapSettings:
     shift_px: float = 58.0  # ... and all photos in common: what GPS errs by on both dates
     most_scale: float = 0.1  # by which the flight, laid by its GPS, is larger or smaller than the map
     most_turn_deg: float = 10.0  # by which it is turned; both, as far as that moves its rim by the most shift
-    least_rim_px: float = 220.0  # of its ground, from the middle: less fits too many places within what GPS errs
+    least_rim_px: float = 146.0  # of its ground, from the middle: less fits too many places within what GPS errs
     step_px: float = 3.5  # at its rim, between scales and turns that are tried
     least_likeness: float = 0.7  # of a pair's descriptors: likeness beyond that is its vote
     ground_px: float = 28.0  # side of the squares of ground that vote once for a shift
@@ -36,6 +36,7 @@ class FlightOnMapSettings:
     spread_px: float = 2.5  # one sigma of what right pairs scatter: another light, and maps are distorted
     least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 6.8
     least_agree: int = 100  # pairs within the band: few pairs in all stand out by chance
+    own_share: float = 0.25  # of a photo's pairs on another place, and twice those on the flight's: it lies elsewhere
     least_spread: float = 1.4  # times the squares that chance would leave; other ground has about one
     rounds: int = 10  # of the least squares that follow, over the pairs within ...
     band_px: float = 7.0  # ... this, about three sigmas
@@ -54,13 +55,14 @@ class FlightFit:
     """Where a flight lies on a map: `map_from_flight` is a similarity (3, 3) of site metres. `ratio` is how many times
     the votes of the mean place it has, `agree` how many pairs agree with it, `spread` on how many times as many
     squares of ground as chance would leave pairs that agree, `residual_m` how far photos miss it by the mean of theirs
-    (median)."""
+    (median). `elsewhere` are photos whose own pairs have them elsewhere: the flight is bent there."""
 
     map_from_flight: Matrix3
     ratio: float
     agree: int
     spread: float
     residual_m: float
+    elsewhere: frozenset[int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,8 +209,26 @@ def _refined(
             break
         found = fit_similarity(pairs.map_m[agree], pairs.flight_m[agree])
     return FlightFit(
-        found, ratio, int(agree.sum()), _spread(pairs, agree, px_m, settings), _photos_miss_m(pairs, found, agree)
+        found, ratio, int(agree.sum()), _spread(pairs, agree, px_m, settings), _photos_miss_m(pairs, found, agree),
+        _elsewhere(pairs, found, px_m, settings),
     )
+
+
+def _elsewhere(
+    pairs: _Pairs, map_from_flight: Matrix3, px_m: float, settings: FlightOnMapSettings
+) -> frozenset[int]:
+    """The photos of which many pairs agree on another place than the flight's."""
+    apart_m = apply_homography(map_from_flight, pairs.flight_m) - pairs.map_m
+    wide_m, reach_m = 2 * settings.band_px * px_m, settings.reach_px * px_m
+    edges_m = np.arange(-reach_m - wide_m / 2, reach_m + wide_m, wide_m)  # the flight's own place is the middle of one
+    result = set()
+    for photo in np.unique(pairs.photo):
+        own_m = apart_m[pairs.photo == photo]
+        counts, _, _ = np.histogram2d(own_m[:, 0], own_m[:, 1], bins=(edges_m, edges_m))
+        with_flight = int((np.abs(own_m) < wide_m / 2).all(axis=1).sum())
+        if counts.max() > max(settings.own_share * len(own_m), 2 * with_flight):
+            result.add(int(photo))
+    return frozenset(result)
 
 
 def _spread(pairs: _Pairs, agree: Mask, px_m: float, settings: FlightOnMapSettings) -> float:

@@ -72,5 +72,5 @@ class WholeFlight:
             return {}
         return {
             each: FlightPlace(fit.map_from_flight @ site_from_image(self._mapper, each, camera), fit.residual_m)
-            for each in tied
+            for each in tied if each not in fit.elsewhere
         }

@@ -158,7 +158,7 @@ def _found_as_one(
         return []
     return [
         FoundFrame(each, camera, fit.map_from_flight @ site_from_image_homography(refined, poses[each]), fit.residual_m)
-        for each in sought
+        for each in sought if each not in fit.elsewhere
     ]
 
 
