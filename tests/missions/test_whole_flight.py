@@ -76,7 +76,6 @@ def test_what_no_picture_shows_by_itself_is_placed_with_its_flight(
     with monkeypatch.context() as patched:
         patched.setattr(FlightOnMap, "find", lambda *_: None)
         flown.compare(tmp_path / "alone")
-    alone = report_of(tmp_path / "alone")["comparison"]
     monkeypatch.setattr(Aligner, "_by_homographies", nowhere)
     monkeypatch.setattr(MapSearch, "find", lambda *_: None)
     everything = flown.compare(tmp_path / "together")
