@@ -127,11 +127,12 @@ class FlightOnMap:
         pairs = match_learned(new, old, np.eye(3), settings.reach_px)
         ours, theirs = (np.asarray(each.descriptors, np.float32) for each in (new, old))
         likeness = np.einsum("nd,nd->n", ours[pairs[:, 0]], theirs[pairs[:, 1]])
-        kept = pairs[likeness > settings.least_likeness]
+        votes = likeness - settings.least_likeness
+        kept = pairs[votes > 0]
         return _Pairs(
             np.full(len(kept), index), apply_homography(site_from_image, new.points_px[kept[:, 0]]),
             apply_homography(site_from_image, old.points_px[kept[:, 1]]),
-            likeness[likeness > settings.least_likeness] - settings.least_likeness,
+            votes[votes > 0],
         )
 
 
@@ -219,14 +220,13 @@ def _elsewhere(
 ) -> frozenset[int]:
     """The photos of which many pairs agree on another place than the flight's."""
     apart_m = apply_homography(map_from_flight, pairs.flight_m) - pairs.map_m
-    wide_m, reach_m = 2 * settings.band_px * px_m, settings.reach_px * px_m
-    edges_m = np.arange(-reach_m - wide_m / 2, reach_m + wide_m, wide_m)  # the flight's own place is the middle of one
+    beside = int(np.ceil(settings.reach_px / (2 * settings.band_px)))
+    edges_m = np.arange(-beside - 0.5, beside + 1) * 2 * settings.band_px * px_m  # the flight's place is in the middle
     result = set()
     for photo in np.unique(pairs.photo):
         own_m = apart_m[pairs.photo == photo]
         counts, _, _ = np.histogram2d(own_m[:, 0], own_m[:, 1], bins=(edges_m, edges_m))
-        with_flight = int((np.abs(own_m) < wide_m / 2).all(axis=1).sum())
-        if counts.max() > max(settings.own_share * len(own_m), 2 * with_flight):
+        if counts.max() > max(settings.own_share * len(own_m), 2 * counts[beside, beside]):
             result.add(int(photo))
     return frozenset(result)
 
