@@ -180,7 +180,8 @@ class Aligner:
     ) -> None:
         self._reference, self._site_grid, self._settings = reference, site_grid, settings
         self._fits: list[_Fit] = []
-        self._search = MapSearch(reference, site_grid, settings.search, settings.links.features)
+        self.search = MapSearch(reference, site_grid, settings.search, settings.links.features)
+        """What looks for frames that no homography places."""
         self._count = 0
         self._misses = 0  # frames since the last fit
         self.step = AlignStep(None, 0, ())
@@ -280,7 +281,7 @@ class Aligner:
         """Whether a frame is nowhere, or where telemetry, as it was so far, hardly can have it."""
         if isinstance(placed, NotAligned):
             return True
-        return not placed.followed and (placed.ratio == 0 or self._search.is_odd(placed.pose, prior))
+        return not placed.followed and (placed.ratio == 0 or self.search.is_odd(placed.pose, prior))
 
     def _may_search(self) -> bool:
         """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
@@ -296,11 +297,11 @@ class Aligner:
             start = by_telemetry
         else:
             return None
-        found = self._search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
+        found = self.search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
         if found is None:
             return None
         place = Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
-        if found.is_sure and not self._search.is_odd(place.pose, frame.prior):
+        if found.is_sure and not self.search.is_odd(place.pose, frame.prior):
             return place
         local = self._local(frame, place)
         return place if local is not None and local.rest <= self._settings.confirms_rest else None
@@ -415,7 +416,7 @@ class Aligner:
         )
         self._fits = [*self._fits[-1:], fit]
         self._misses = 0
-        self._search.remember(new.gray, new.camera, prior, placed.pose, placed.site_from_image, placed.ratio)
+        self.search.remember(new.gray, new.camera, prior, placed.pose, placed.site_from_image, placed.ratio)
 
     def _on_grid(self, site_from_image: Matrix3, camera: Camera) -> Matrix3 | None:
         """grid_from_image of a guess; None when the image's centre sees no ground."""

@@ -85,6 +85,36 @@ class _Pairs:
         return _Pairs(*(each[rows] for each in vars(self).values()))
 
 
+@dataclass(frozen=True, eq=False)
+class _Raster:
+    """Shifts in cells of `cell_m`: their middles along an axis (n,), and which are sought, (n, n)."""
+
+    cell_m: float
+    blur: float  # cells, one sigma
+    middles_m: Floats
+    is_sought: Mask
+
+    @classmethod
+    def of(cls, px_m: float, settings: FlightOnMapSettings) -> "_Raster":
+        """That of pairs as far apart as they may be."""
+        side, cell_m = 2 * int(np.ceil(settings.reach_px / settings.cell_px)), settings.cell_px * px_m
+        middles_m: Floats = (np.arange(side, dtype=np.float64) - side // 2 + 0.5) * cell_m
+        is_sought = np.hypot(*np.meshgrid(middles_m, middles_m)) < settings.shift_px * px_m
+        return cls(cell_m, settings.spread_px / settings.cell_px, middles_m, is_sought)
+
+    def most_voted(self, apart_m: PointsM, votes: Floats) -> tuple[Floats, float]:
+        """The shift (2,) that most of the pairs, (N, 2) apart, vote for, and how many times the mean one's votes it
+        has."""
+        side = len(self.middles_m)
+        cells = np.floor(apart_m / self.cell_m).astype(np.int64) + side // 2
+        inside = ((cells >= 0) & (cells < side)).all(axis=1)
+        of_cell = np.bincount(cells[inside, 0] * side + cells[inside, 1], votes[inside], side * side)
+        smooth = cv2.GaussianBlur(of_cell.reshape(side, side), (0, 0), self.blur, borderType=cv2.BORDER_CONSTANT)
+        east, north = np.unravel_index(int(np.argmax(np.where(self.is_sought, smooth, -1.0))), smooth.shape)
+        mean = max(float(smooth[self.is_sought].mean()), 1e-9)
+        return np.array([self.middles_m[east], self.middles_m[north]]), float(smooth[east, north]) / mean
+
+
 class FlightOnMap:
     """Looks for the photos of one flight on the map that `search` knows."""
 
@@ -161,35 +191,16 @@ def _most_votes(pairs: _Pairs, px_m: float, settings: FlightOnMapSettings) -> tu
         _tried(min(most, settings.shift_px * px_m / rim_m), settings.step_px * px_m / rim_m)
         for most in (settings.most_scale, float(np.radians(settings.most_turn_deg)))
     )
+    raster = _Raster.of(px_m, settings)
     best, ratio = np.eye(3), 0.0
     for scale in scales:
         for turn in turns:
             linear = np.array([[1 + scale, -turn], [turn, 1 + scale]])
-            shift_m, own_ratio = _most_voted_shift(
-                pairs, pairs.map_m - middle_m - arms_m @ linear.T, px_m, settings
-            )
+            shift_m, own_ratio = raster.most_voted(pairs.map_m - middle_m - arms_m @ linear.T, pairs.votes)
             if own_ratio > ratio:
                 ratio, best = own_ratio, np.eye(3)
                 best[:2, :2], best[:2, 2] = linear, middle_m + shift_m - linear @ middle_m
     return best, ratio
-
-
-def _most_voted_shift(
-    pairs: _Pairs, apart_m: PointsM, px_m: float, settings: FlightOnMapSettings
-) -> tuple[Floats, float]:
-    """The shift (2,) that most of the pairs, (N, 2) apart, vote for, and how many times the mean one's votes it has."""
-    side = 2 * int(np.ceil(settings.reach_px / settings.cell_px))
-    cells = np.floor(apart_m / (settings.cell_px * px_m)).astype(np.int64) + side // 2
-    inside = ((cells >= 0) & (cells < side)).all(axis=1)
-    votes = np.bincount(cells[inside, 0] * side + cells[inside, 1], pairs.votes[inside], side * side)
-    smooth = cv2.GaussianBlur(
-        votes.reshape(side, side), (0, 0), settings.spread_px / settings.cell_px, borderType=cv2.BORDER_CONSTANT
-    )
-    middles_m = (np.arange(side) - side // 2 + 0.5) * settings.cell_px * px_m
-    is_within = np.hypot(*np.meshgrid(middles_m, middles_m)) < settings.shift_px * px_m
-    east, north = np.unravel_index(int(np.argmax(np.where(is_within, smooth, -1.0))), smooth.shape)
-    mean = max(float(smooth[is_within].mean()), 1e-9)
-    return np.array([middles_m[east], middles_m[north]]), float(smooth[east, north]) / mean
 
 
 def _tried(most: float, step: float) -> Floats:

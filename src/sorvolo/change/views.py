@@ -12,6 +12,7 @@ from sorvolo.change.areas.signs import leaning, level_of
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
+from sorvolo.change.map_search import MapSearch
 from sorvolo.change.pair.corroboration import CorroborationSettings, Difference, believed, is_whole, unwitnessed
 from sorvolo.change.pair.flight_tuning import FlightTuning, PairMeasures
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
@@ -22,6 +23,7 @@ from sorvolo.change.reference import ReferenceMap
 from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.registration.lens import Undistorter
 from sorvolo.survey.findings import ComparedView, ViewStatus
 from sorvolo.survey.flight import Frame, PosedFrame
@@ -39,6 +41,7 @@ class ViewSettings:
     further: int = 3  # pictures asked besides where those do not show all of it
     coarser: float = 1.25  # times the map's pixels: views less coarse than that have its pixels
     all_changed: float = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
+    turned_sigma_deg: float = 3.0  # of a camera's angles as it fits the map: tilt and place are seen together
     corroboration: CorroborationSettings = field(default_factory=CorroborationSettings)
 
 
@@ -227,6 +230,11 @@ class ViewMaker:
         return replace(outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found))
 
     @property
+    def search(self) -> MapSearch:
+        """What looks for the flight's frames on the map."""
+        return self._aligner.search
+
+    @property
     def undistorted_camera(self) -> Camera:
         """The camera of `undistorted` pictures."""
         return self._lens.camera
@@ -241,6 +249,16 @@ class ViewMaker:
             posed, self._flight.utc_ns(posed.frame.time_ns), outcome.site_from_image, outcome.reason,
             outcome.residual_px, map_sigma_m,
         )
+
+    def turned_as_found(self, posed: PosedFrame, outcome: ViewOutcome) -> PosedFrame:
+        """The frame with its camera turned as it fits the map, where it does: a compass may be off by any angle."""
+        if outcome.site_from_image is None:
+            return posed
+        pose = pose_from_homography(outcome.site_from_image, self._flight.full.undistorted())
+        if pose is None:
+            return posed
+        sigma_deg = np.full(3, self._settings.turned_sigma_deg)
+        return replace(posed, prior=replace(posed.prior, rotation=pose.rotation, attitude_sigma_deg=sigma_deg))
 
     def chosen(self) -> dict[str, Any]:
         """What the robust method's parameters set themselves to on this flight; nothing for method thesis."""

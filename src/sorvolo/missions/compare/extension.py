@@ -61,7 +61,7 @@ class MapExtension:
         self._last = posed.frame.index
         if self._run is None:
             self._run = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
-        taken = _taken_again(self._run, posed, earlier)
+        taken = _taken_again(self._run, self._views.turned_as_found(posed, outcome), earlier)
         if outcome.site_from_image is not None:
             self._run.note_found(posed.frame.index, outcome.site_from_image, outcome.residual_px)
         return taken

@@ -17,6 +17,7 @@ from sorvolo.change.alignment import FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import Again, CompareRun, Pending
+from sorvolo.missions.compare.whole_flight import WholeFlightSettings
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.frames_ahead import read_ahead
@@ -39,8 +40,6 @@ from sorvolo.survey.mosaic import FrameView
 
 _AHEAD = 2  # frames that are compared while the evidence of one is gathered: a thread for each
 _DECODED = 1  # frames of a video that wait to be compared
-_OVERLAP = 0.8  # of a video's frames that are laid on each other, as a first flight's are
-_MANY = 0.3  # share of these that is not found by itself, from which on the whole flight is looked for
 
 
 def compare_flights(
@@ -192,9 +191,9 @@ def _ended(
     """The frames as their comparisons end. What was not found on the map is tried again after the others, with the
     whole flight where that can be read again: each photo, and of a video, which shows the same ground again anyway,
     frames that overlap as photos do. Frames that come again are named until then."""
-    is_photos = source.kind == "photos"
+    whole, is_photos = WholeFlightSettings(), source.kind == "photos"
     can_whole = setup.track is not None and not isinstance(source, LiveSource)
-    overlapping = StretchSelection(_OVERLAP, keep_all=False)
+    overlapping = StretchSelection(whole.overlap, keep_all=False)
 
     def is_chosen(posed: PosedFrame) -> bool:
         if is_photos or not can_whole:
@@ -217,7 +216,7 @@ def _ended(
     if not again:
         return
     places: Mapping[int, FlightPlace] = {}
-    if can_whole and (is_photos or len(again) > _MANY * len(chosen)):
+    if can_whole and (is_photos or len(again) > whole.many * len(chosen)):
         frames = source.frames(lambda index, _: index in chosen)
         places = yield from run.places_with_flight(_posed(frames, setup, inside), len(chosen))
     yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead, places)

@@ -11,7 +11,6 @@ from typing import Any, Self
 from sorvolo.change.alignment import FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
-from sorvolo.change.map_search import MapSearch
 from sorvolo.change.map_update import paint_changes
 from sorvolo.change.pair.thesis import thesis_steps
 from sorvolo.change.reference import ReferenceMap
@@ -111,7 +110,7 @@ class CompareRun:
             journal=None if journal is None else journal.file,
         )
         self._journal = journal
-        self._views = _view_maker(setup, archive, settings, base_version)
+        self._views = view_maker(setup, archive, settings, base_version)
         self._changes = FlightChanges(
             source.name, self._views, archive.site(), settings, is_coarse=_is_coarse(setup, archive, settings)
         )
@@ -210,7 +209,7 @@ class CompareRun:
     ) -> Generator[Again, None, Mapping[int, FlightPlace]]:
         """Where so many photos of the flight lie, by index, laid on each other and found on the map as one; none where
         they are not. Yields each as it is laid."""
-        on_map = FlightOnMap(MapSearch(self._reference(), self._archive.site_grid()))
+        on_map = FlightOnMap(self._views.search)
         with WholeFlight(self._setup, self._archive, self._views, on_map, count) as whole:
             for each in photos:
                 with self._log.stage(Stage.REGISTER):
@@ -270,9 +269,6 @@ class CompareRun:
         )
 
     # ---- inside -----------------------------------------------------------------------------------------------
-
-    def _reference(self) -> ReferenceMap:
-        return ReferenceMap(self._archive.tiles(self._base_version), self._archive.site_grid().grid)
 
     def _keep(self, pending: Pending, taken: Taken | None) -> None:
         """Note a frame, and what the detector found meanwhile; nothing while those of a killed run are taken over."""
@@ -358,9 +354,10 @@ def _is_coarse(
     return is_of_photos and archive.site_grid().grid.m_per_px > sizes.fine_m_per_px
 
 
-def _view_maker(
+def view_maker(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, sizes: ViewSizes = ViewSizes(),
 ) -> ViewMaker:
+    """What compares a flight's frames with a version of the map of a site."""
     source, site_grid = setup.source, archive.site_grid()
     side_px = settings.side_px or (sizes.video_px if source.kind == "video" else sizes.photo_px)
     finer = 1.0

@@ -1,12 +1,14 @@
 """Photos that are not found on the map by themselves, placed there with all others of their flight (0087)."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
 from sorvolo.change.alignment import FlightPlace
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap, PhotoFeatures
 from sorvolo.change.views import ViewMaker
+from sorvolo.geometry.pose import Pose
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.painting import site_from_image
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
@@ -17,7 +19,14 @@ from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.flight import PosedFrame
 from sorvolo.survey.mosaic import Status
 
-_MOST_SOUGHT = 150  # photos that are looked for on the map, evenly spread over the flight
+
+@dataclass(frozen=True)
+class WholeFlightSettings:
+    """When a recorded flight is looked for as a whole, and by which of its frames; by choice, none measured alone."""
+
+    overlap: float = 0.8  # of a video's frames that are laid on each other, as a first flight's are
+    many: float = 0.3  # share of these that is not found by itself, from which on the whole flight is looked for
+    most_sought: int = 150  # photos that are looked for on the map, evenly spread over the flight
 
 
 class WholeFlight:
@@ -27,7 +36,8 @@ class WholeFlight:
     """
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, views: ViewMaker, on_map: FlightOnMap, count: int
+        self, setup: FlightSetup, archive: Archive, views: ViewMaker, on_map: FlightOnMap, count: int,
+        settings: WholeFlightSettings = WholeFlightSettings(),
     ) -> None:
         """`count` photos will be added."""
         model, track = setup.source.camera, setup.track
@@ -36,7 +46,7 @@ class WholeFlight:
         offset_sigma_m = None if track is None else track.altitude_offset_sigma_m
         graph = PoseGraphSettings.of_flight(model.focal_sigma, offset_sigma_m, joins_map=False)
         self._mapper = PlanarMapper(graph, shelf=self._spill)
-        self._step, self._added = max(1, -(-count // _MOST_SOUGHT)), 0
+        self._step, self._added = max(1, -(-count // settings.most_sought)), 0
         self._sought: dict[int, PhotoFeatures] = {}
         self.fit: FlightFit | None = None
         """Where the flight lies on the map, once `places` found it."""
@@ -60,17 +70,22 @@ class WholeFlight:
             self._sought[index] = self._on_map.features(image, camera)
         self._added += 1
 
-    def places(self) -> Mapping[int, FlightPlace]:
-        """Where the photos lie that others of the flight overlap, by index: none where it is not found on the map."""
-        camera = self._views.undistorted_camera
+    def sought(self) -> tuple[Mapping[int, PhotoFeatures], Mapping[int, Pose]]:
+        """The photos that are looked for on the map, and where the cameras of all that others of the flight overlap
+        are beside each other; by index."""
         self._mapper.settle()
         tied = [each for each in self._mapper.placed() if self._mapper.ending(each)[0] is Status.VISION]
         poses = {each: self._mapper.pose(each) for each in tied}
-        sought = {index: photo for index, photo in self._sought.items() if index in poses}
-        fit = self.fit = self._on_map.find(sought, poses)
+        return {index: photo for index, photo in self._sought.items() if index in poses}, poses
+
+    def places(self) -> Mapping[int, FlightPlace]:
+        """Where the photos lie that others of the flight overlap, by index: none where it is not found on the map."""
+        photos, poses = self.sought()
+        fit = self.fit = self._on_map.find(photos, poses)
         if fit is None:
             return {}
+        camera = self._views.undistorted_camera
         return {
             each: FlightPlace(fit.map_from_flight @ site_from_image(self._mapper, each, camera), fit.residual_m)
-            for each in tied if each not in fit.elsewhere
+            for each in poses if each not in fit.elsewhere
         }
