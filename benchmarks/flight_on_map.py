@@ -145,10 +145,10 @@ def over_own(name: str, options: argparse.Namespace, drawn: int) -> Iterator[dic
     photos, site = options.data / name, options.keep / f"map_{name}"
     make_map(site, photos, None)
     with laid_on_itself(site, photos, MOST_PHOTOS, None) as (laid, archive):
-        rows = {row.index: row for row in map_frames(site, archive.site())[photos.name]}
+        rows = {row.name: row for row in map_frames(site, archive.site())[photos.name]}
         yield from tries(
             {"ground": "own", "flight": name}, laid, drawn, options.aside,
-            {index: rows[index].outline_m for index in laid.photos},
+            {index: rows[laid.names[index]].outline_m for index in laid.photos},
         )
 
 

@@ -1,11 +1,12 @@
 """Two real dates of one building site: which views of the later date are placed right, which changes are found.
 
-python benchmarks/real_dates.py DATA [--pairs 2024-03-01/2024-03-12 ...] [--attitude none known] [--model default]
-  --keep FOLDER
+python benchmarks/real_dates.py DATA [--pairs 2024-03-01/2024-03-12 ...] [--attitude none known] [--taken video]
+  [--model default] --keep FOLDER
 
 DATA holds building_site/: five orthophotos of one site, 0.146 m a pixel. A camera is simulated over the earlier one and
 its photos are mapped (telemetry with attitude); another is simulated over the later one (about 45 photos of 960x540
-from 117 m, tilt of 2 degrees rms, GPS good to 1 m rms, with attitude or without) and compared with that map. What
+from 117 m, or a video of a shorter way, 5 frames/s; tilt of 2 degrees rms, GPS good to 1 m rms, with attitude or
+without) and compared with that map. What
 changed is real; the pictures hold no relief, for orthophotos are flat. Photos state the date, and the hour at which
 the sun stands at the simulated place where the orthophoto's shadows have it (by the edges of an office's shadow, to
 about 5 degrees; 2024-03-12 was overcast, its hour is a guess). Runs before decision 0056 stated other times, by which
@@ -68,7 +69,7 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.store.exports.flight_files import write_camera, write_photo
+from sorvolo.store.exports.flight_files import video_writer, write_camera, write_photo, write_telemetry
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.frame_rows import FrameRow
 
@@ -137,6 +138,7 @@ def main() -> None:
     parser.add_argument("--pairs", nargs="+", choices=PAIRS, default=HELD_OUT)
     parser.add_argument("--attitude", nargs="+", choices=("none", "known", "wrong"), default=("none", "known"),
                         help="of the later flight; wrong: the compass is 90 degrees off")
+    parser.add_argument("--taken", choices=("photos", "video"), default="photos", help="the later flight")
     parser.add_argument("--model", default="none", help="that looks for objects on both dates; none unless given")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, required=True,
@@ -147,8 +149,8 @@ def main() -> None:
     for name in options.pairs:
         pair = Pair.of(name, truth["pairs"])
         for attitude in options.attitude:
-            run = {"pair": name, "attitude": attitude, "seed": options.seed, "model": options.model,
-                   **score(pair, attitude, truth, options)}
+            run = {"pair": name, "attitude": attitude, "taken": options.taken, "seed": options.seed,
+                   "model": options.model, **score(pair, attitude, truth, options)}
             append(options.output, run)
             print(json.dumps({key: value for key, value in run.items() if not isinstance(value, list)}, indent=1))
 
@@ -167,16 +169,19 @@ def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Na
     earlier, later = pair.name.split("/")
     folder = options.keep / pair.name.replace("/", "_")
     first, size_px = fly(options.data, earlier, 2 * options.seed)
-    second, _ = fly(options.data, later, 2 * options.seed + 1)
+    second, _ = fly(options.data, later, 2 * options.seed + 1, options.taken)
     mapped = options.keep / f"photos_{earlier}_{2 * options.seed}_known"
-    flown = options.keep / f"photos_{later}_{2 * options.seed + 1}_{attitude}"
+    flown = options.keep / f"{options.taken}_{later}_{2 * options.seed + 1}_{attitude}"
     shown = write_photos(first, mapped, size_px, "known", begins_ns(earlier))
-    seen = write_photos(second, flown, size_px, attitude, begins_ns(later))
+    if options.taken == "photos":
+        seen = write_photos(second, flown, size_px, attitude, begins_ns(later))
+    else:
+        flown, seen = write_video(second, flown, size_px, attitude, begins_ns(later))
     base = options.keep / f"map_{earlier}_{2 * options.seed}_{options.model}"
     if not (base / "mosaic.tif").is_file():
         shutil.rmtree(base, ignore_errors=True)
         deque(map_flights([mapped], base, MapSettings(model=options.model), camera=options.keep / "camera.xml"), 0)
-    site = folder / f"{attitude}_{options.model}"
+    site = folder / f"{attitude}_{options.model}_{options.taken}"
     shutil.rmtree(site, ignore_errors=True)
     shutil.copytree(base, site)
     started, cpu = time.monotonic(), time.process_time()
@@ -186,15 +191,16 @@ def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Na
     with Archive.open(site, write=False) as archive:
         frame = archive.site().frame
         rows = map_frames(site, archive.site())
+    name = updates[0].flight
     map_from_true = map_error(first, shown, rows[mapped.name], frame)
-    views = placed_right(pair, second, seen, rows[flown.name], frame, map_from_true, size_px)
-    report = json.loads((site / "flights" / flown.name / "report.json").read_text())["comparison"]
+    views = placed_right(pair, second, seen, rows[name], frame, map_from_true, size_px)
+    report = json.loads((site / "flights" / name / "report.json").read_text())["comparison"]
     result = {**took, **views, "statuses": dict(Counter(each.status.value for each in updates if not each.comes_again)),
               "reasons": report["reasons"], "compared_m2": report["compared_area_m2"],
               "residual_px": report["residual_px"], "with_flight": report["with_flight"]}
     drawn_by_hand = drawn_of(truth, pair.name)
     if drawn_by_hand is not None:
-        events = site / "flights" / flown.name / "changes.geojson"
+        events = site / "flights" / name / "changes.geojson"
         result |= found(events, frame, map_from_true, drawn_by_hand, size_px)
     return result
 
@@ -204,17 +210,21 @@ def drawn_of(truth: dict[str, Any], name: str) -> dict[str, Any] | None:
     return truth if name == truth["changes_of"] else truth["others"].get(name)
 
 
-def fly(data: Path, date: str, seed: int) -> tuple[SimulatedFlight, tuple[int, int]]:
-    """A flight over one date's orthophoto, and the orthophoto's size; its middle is the site's origin."""
+def fly(data: Path, date: str, seed: int, taken: str = "photos") -> tuple[SimulatedFlight, tuple[int, int]]:
+    """A flight over one date's orthophoto, and the orthophoto's size; its middle is the site's origin. `taken` as
+    "video", it keeps its heading and its turns lie over the orthophoto."""
     picture = cv2.imread(str(data / "building_site" / f"{date}.jpg"), cv2.IMREAD_COLOR)
     if picture is None:
         raise SystemExit(f"{data}/building_site/{date}.jpg is missing")
     apron = cv2.copyMakeBorder(picture, *[_APRON_PX] * 4, cv2.BORDER_CONSTANT, value=(128, 128, 128))
+    path, output = (228.0, 3, 72.0, 0.0), OutputSettings(photos=True, photo_overlap=0.82)
+    if taken == "video":
+        path, output = (180.0, 3, 66.0, 0.0, False), OutputSettings(telemetry="srt")
     settings = SimulationSettings(
         seed=seed, flights=1, scene=SceneSettings("orthophoto", 0, 0, 0, has_scenery=False),
-        path=PathSettings(HEIGHT_M, 8.0, 228.0, 3, 72.0, 0.0),
+        path=PathSettings(HEIGHT_M, 8.0, *path),
         motion=MotionSettings(tilt_rms_deg=2.0, height_rms_m=1.0, drift_rms_m=1.0), imaging=ImagingSettings(fps=5),
-        sensor=SensorSettings(noise_m=(1.0, 1.0, 1.0)), output=OutputSettings(photos=True, photo_overlap=0.82),
+        sensor=SensorSettings(noise_m=(1.0, 1.0, 1.0)), output=output,
     )
     rgb = cv2.cvtColor(apron, cv2.COLOR_BGR2RGB)
     return simulate_flight(settings, orthophoto_ground(rgb, M_PER_PX)), (picture.shape[1], picture.shape[0])
@@ -253,6 +263,32 @@ def write_photos(
             (partial / name).write_bytes(written.replace(b"drone-dji:Gimbal", b"drone-dji:Absent"))
     partial.rename(folder)
     return chosen
+
+
+def write_video(
+    flight: SimulatedFlight, folder: Path, size_px: tuple[int, int], attitude: str, began_ns: int
+) -> tuple[Path, dict[str, int]]:
+    """Write the flight as a video with DJI's subtitles, of the older kind without attitude where none is known; the
+    file, and its frames' names and indices."""
+    limit_m = np.array(size_px) * M_PER_PX / 2
+    outlines_m = [footprint(flight.camera, pose) for pose in flight.true_poses]
+    assert all((np.abs(each) < limit_m).all() for each in outlines_m)
+    video, later_ns = folder / f"{folder.name}.mp4", began_ns - flight.started_ns
+    if not video.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_camera(folder.parent / "camera.xml", flight.camera)
+        telemetry = flight.telemetry("srt")
+        columns = dict(telemetry.columns)
+        if attitude == "wrong":
+            columns["camera_yaw_deg"] = (columns["camera_yaw_deg"] + 90) % 360
+        dialect = "srt-gps" if attitude == "none" else "srt"
+        stated = replace(telemetry, format=dialect, time_ns=telemetry.time_ns + later_ns, columns=columns)
+        write_telemetry(video.with_suffix(".srt"), stated)
+        size, fps = (flight.camera.width_px, flight.camera.height_px), flight.settings.imaging.fps
+        with video_writer(video, size, fps, began_ns, flight.settings.output.crf) as write:
+            for index in range(len(flight)):
+                write(flight.frame(index).image)
+    return video, {str(index): index for index in range(len(flight))}
 
 
 def metres(points_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
@@ -303,7 +339,7 @@ def placed_right(
         errors_m.append(float(np.median(np.linalg.norm(row.outline_m - expected_m, axis=1))))
         by_view.append([row.name, round(errors_m[-1], 2)])
     return {
-        "views": len(seen), "placed": len(errors_m), "right": sum(error < RIGHT_M for error in errors_m),
+        "views": len(by_view), "placed": len(errors_m), "right": sum(error < RIGHT_M for error in errors_m),
         "error_median_m": round(float(np.median(errors_m)), 2) if errors_m else None, "error_m": by_view,
     }
 

@@ -63,24 +63,35 @@ def test_where_hardly_anything_is_known_nothing_is_reported(ground):
     assert not learned_difference(ground, with_car(ground), known).any()
 
 
-def gathered(before: ImageRGB, after: ImageRGB, views: int, shade: int | np.ndarray = 0) -> GatheredThings:
-    things, rng = GatheredThings(), np.random.default_rng(3)
+def gathered(
+    before: ImageRGB, after: ImageRGB, views: int, shade: int | np.ndarray = 0, shrunk: int = 1
+) -> GatheredThings:
+    """What some views show together, each `shrunk` times smaller and looked at as much larger."""
+    things, rng = GatheredThings(float(shrunk)), np.random.default_rng(3)
+    size_px = VIEW_PX[0] // shrunk, VIEW_PX[1] // shrunk
+    small_from_view = np.array([[1 / shrunk, 0, 0.5 / shrunk - 0.5], [0, 1 / shrunk, 0.5 / shrunk - 0.5], [0, 0, 1]])
     for index in range(views):
         x, y = 32 * index, 24 * index
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
         noisy = np.clip(after[part] + rng.normal(0, 3, (*VIEW_PX[::-1], 3)), 0, 255).astype(np.uint8)
         site_from_image = np.array([[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]])
-        nothing = np.zeros(VIEW_PX[::-1], np.uint8)
+        nothing = np.zeros(size_px[::-1], np.uint8)
+        image, reference = (
+            np.asarray(cv2.resize(each, size_px, interpolation=cv2.INTER_AREA), np.uint8)
+            for each in (noisy, before[part])
+        )
         things.add(ComparedView(
-            index, f"{index}", index * 10**9, site_from_image, np.array([x * M_PER_PX, -y * M_PER_PX, 40.0]), noisy,
-            before[part].copy(), np.ones(VIEW_PX[::-1], bool), nothing, np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
-            nothing + np.broadcast_to(np.uint8(shade), before.shape[:2])[part],
+            index, f"{index}", index * 10**9, site_from_image @ np.linalg.inv(small_from_view),
+            np.array([x * M_PER_PX, -y * M_PER_PX, 40.0]), image, reference, nothing == 0, nothing,
+            np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
+            nothing + np.broadcast_to(np.uint8(shade), before.shape[:2])[part][::shrunk, ::shrunk],
         ))
     return things
 
 
-def test_a_thing_that_no_view_flags_is_reported_with_its_place_and_once(ground):
-    things = gathered(ground, with_car(ground), 4)
+@pytest.mark.parametrize("shrunk", [1, 2])
+def test_a_thing_that_no_view_flags_is_reported_with_its_place_and_once(ground, shrunk):
+    things = gathered(ground, with_car(ground), 4, shrunk=shrunk)
     (change,) = things.conclude("b", count(7), [])
     assert change.id == "b-7" and change.kind is ChangeKind.APPEARED and change.views == 4
     west, east, south, north = BOX_M

@@ -110,6 +110,14 @@ class ComparedView:
         return float(np.sqrt(abs(across))) or 1.0
 
 
+    @property
+    def outline_m(self) -> PointsM:
+        """(4, 2) the view's corners on the ground, site metres."""
+        height, width = self.changed.shape
+        corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
+        return apply_homography(self.site_from_image, corners_px)
+
+
 @dataclass(frozen=True, eq=False)
 class Patch:
     """A piece of ground on both dates, north up: pixel (column, row) is centred at east = `west_m` +

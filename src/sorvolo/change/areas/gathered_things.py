@@ -13,7 +13,7 @@ from sorvolo.change.pair.learned_difference import LearnedSettings, learned_diff
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import mask_of, measures, outline_of, overlap
 from sorvolo.change.shape.place_sigma import place_sigma_m
-from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
@@ -49,18 +49,21 @@ class GatherThingSettings:
 
 
 class GatheredThings:
-    """What a flight's views show together. Only `add` changes it."""
+    """What a flight's views show together. Only `add` changes it. Views are looked at `larger` times as large."""
 
-    def __init__(self, settings: GatherThingSettings = GatherThingSettings()) -> None:
-        self._settings = settings
+    def __init__(self, larger: float = 1.0, settings: GatherThingSettings = GatherThingSettings()) -> None:
+        self._larger, self._settings = larger, settings
         self._ground = GroundSums(_SUMS, settings.most_cells, settings.pictures)
 
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
         settings = self._settings
-        window = self._ground.window_of(view, settings.cell_px * view.m_per_px, view.m_per_px)
+        m_per_px = view.m_per_px / self._larger
+        window = self._ground.window_of(view, settings.cell_px * m_per_px, m_per_px)
         if window is None:
             return
+        if self._larger > 1:
+            view, leans = _enlarged(view, leans, self._larger)
         before, after = (np.ascontiguousarray(each[..., ::-1]) for each in (view.reference, view.image))
         apart = learned_difference(before, after, view.valid, settings.learned)
         if leans is not None:
@@ -214,6 +217,31 @@ class GatheredThings:
             "", kind_of(patch), score, outline_m, *self._ground.span_ns, max(round(views), 1), size.area_m2,
             size.length_m, sigma_m, patch,
         )
+
+
+def _enlarged(view: ComparedView, leans: Mask | None, times: float) -> tuple[ComparedView, Mask | None]:
+    """A view, and what leans in it, with more pixels."""
+    height, width = view.valid.shape
+    size = round(width * times), round(height * times)
+    x, y = size[0] / width, size[1] / height
+    view_from_large = np.array([[1 / x, 0, (1 - x) / (2 * x)], [0, 1 / y, (1 - y) / (2 * y)], [0, 0, 1.0]])
+
+    def picture(image: ImageRGB) -> ImageRGB:
+        return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
+
+    def mask(values: Mask) -> Mask:
+        return cv2.resize(values.view(np.uint8), size, interpolation=cv2.INTER_NEAREST).view(bool)
+
+    def levels(values: ImageGray) -> ImageGray:
+        return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+
+    large = replace(
+        view, site_from_image=view.site_from_image @ view_from_large, image=picture(view.image),
+        reference=picture(view.reference), valid=mask(view.valid), changed=levels(view.changed),
+        boxes=np.rint(view.boxes * np.array([x, y, x, y])).astype(view.boxes.dtype),
+        residual_px=view.residual_px * times, shade=levels(view.shade),
+    )
+    return large, None if leans is None else mask(leans)
 
 
 def _going_on(thing: Change, known: Change) -> Change:

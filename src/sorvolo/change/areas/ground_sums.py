@@ -50,9 +50,7 @@ class GroundSums:
         """
         if not self.cell_m:
             self.cell_m, self._pictures = cell_m, GroundPictures(picture_m, self._picture_settings)
-        height, width = view.valid.shape
-        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-        window = window_around(apply_homography(view.site_from_image, corners), self.cell_m)
+        window = window_around(view.outline_m, self.cell_m)
         return window if self._make_room(window) else None
 
     def add(

@@ -73,8 +73,7 @@ class GroundCoverage:
         self._planted.extend(planted)
         self._unknown.append(1.0 - float(view.valid.mean()))
         height, width = view.valid.shape
-        corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-        window = window_around(apply_homography(view.site_from_image, corners), self._settings.cell_m)
+        window = window_around(view.outline_m, self._settings.cell_m)
         cell_from_image = np.linalg.inv(window.site_from_cell(self._settings.cell_m)) @ view.site_from_image
         size = window.shape[::-1]
         marks = self._marks(view, is_dark=is_dark, doubted=doubted)

@@ -20,8 +20,7 @@ from sorvolo.change.motion.parallax import (
     shown_alone,
 )
 from sorvolo.errors import SettingsError
-from sorvolo.geometry.arrays import Floats, Labels, PointsM
-from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.arrays import Floats, Labels
 from sorvolo.survey.findings import ComparedView
 from sorvolo.survey.objects import Sighting
 from sorvolo.tracking.association import PairSettings
@@ -152,9 +151,11 @@ class BlobTracker:
         self._times_ns.append(now_ns)
         blobs = blobs_of(view, settings.blobs)
         colours = np.array([each.colour for each in blobs]).reshape(-1, 3) / settings.sightings.colour_levels
+        sees_horizon = not np.isfinite(view.outline_m).all()
         update = self._tracker.update(
             [_sighting(view, each, settings.sightings) for each in blobs], time_ns=now_ns,
-            footprint_m=_footprint_m(view), appearance=np.hstack([np.cos(colours), np.sin(colours)]),
+            footprint_m=None if sees_horizon else view.outline_m,
+            appearance=np.hstack([np.cos(colours), np.sin(colours)]),
         )
         self._join(update.merged)
         is_moving, held = np.zeros(len(view.boxes), bool), np.zeros(len(view.boxes), bool)
@@ -243,14 +244,6 @@ def _sighting(view: ComparedView, blob: Blob, settings: SightingSettings) -> Sig
         float(np.clip(blob.score, 0, 1)), np.array([x, y, x + w, y + h]), blob.place_m, sigma_m**2 * np.eye(2),
         np.array([blob.length_m, blob.area_m2 / max(blob.length_m, 1e-6)]),
     )
-
-
-def _footprint_m(view: ComparedView) -> PointsM | None:
-    """(4, 2) the ground that a view shows; None where it reaches beyond the horizon."""
-    height, width = view.valid.shape
-    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-    outline_m = apply_homography(view.site_from_image, corners)
-    return outline_m if np.isfinite(outline_m).all() else None
 
 
 def _is_plausible(points: Sequence[TrackPoint], move: Motion, length_m: float, settings: MovingSettings) -> bool:

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -14,24 +14,36 @@ from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.sun import slide_of
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.sunlight import sun_over
+from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView
 from sorvolo.survey.flight import Site
 from sorvolo.survey.map_objects import MapObject
 
 
+@dataclass(frozen=True)
+class Gathering:
+    """Which views learned differences are gathered of: all, or those that overlap by no more than `overlap`; they are
+    looked at `larger` times as large."""
+
+    overlap: float | None = None
+    larger: float = 1.0
+
+
 class FlightChanges:
     """The changes of a flight. `add` takes a view in, `conclude` follows the last one.
 
-    `is_coarse`: photos over a map whose things have few pixels, of which learned differences are gathered too.
+    `gathering`: over a map whose things have few pixels, learned differences are gathered too.
     """
 
     def __init__(
-        self, flight: str, views: ViewMaker, site: Site, settings: CompareSettings, *, is_coarse: bool
+        self, flight: str, views: ViewMaker, site: Site, settings: CompareSettings, gathering: Gathering | None
     ) -> None:
         self._flight, self._views, self._site, self._settings = flight, views, site, settings
         self._evidence: EvidenceMap | None = None
         self._areas = AreaMap()
-        self._gathered = GatheredThings() if is_coarse else None
+        self._gathered = None if gathering is None else GatheredThings(gathering.larger)
+        overlap = None if gathering is None else gathering.overlap
+        self._selection = StretchSelection(overlap or 0.0, keep_all=overlap is None)
         self._numbers = itertools.count(1)  # of the changes' ids that are still free, after `conclude`
 
     def add(self, view: ComparedView, leans: Mask | None) -> Sequence[Change]:
@@ -45,7 +57,7 @@ class FlightChanges:
         announced = self._evidence.add(view)
         if self._settings.method != "thesis":
             self._areas.add(view, leans)
-        if self._gathered is not None:
+        if self._gathered is not None and self._selection.take(view.outline_m):
             self._gathered.add(view, leans)
         return announced
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from sorvolo.capture.source import LiveSource
 from sorvolo.change.alignment import FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
@@ -24,7 +25,7 @@ from sorvolo.geometry.summary import median_of_known
 from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
-from sorvolo.missions.compare.flight_changes import FlightChanges
+from sorvolo.missions.compare.flight_changes import FlightChanges, Gathering
 from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal, KeptFrame
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import (
@@ -64,7 +65,8 @@ class ViewSizes:
 
     video_px: int = 1280  # longest side; a video's frames come faster than photos, and show a place more often
     photo_px: int = 1600  # photos are fewer and show more ground
-    photo_finer: float = 2.0  # times a photo's and the map's own pixels, at most: the robust method sees half of them
+    finer: float = 2.0  # times a photo's and the map's own pixels, at most: the robust method sees half of them
+    video_overlap: float = 0.8  # of a video's frames of which learned differences are gathered, as photos overlap
     fine_m_per_px: float = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses (decision 0022)
     cache_bytes: int = 128 * 2**20
 
@@ -112,7 +114,7 @@ class CompareRun:
         self._journal = journal
         self._views = view_maker(setup, archive, settings, base_version)
         self._changes = FlightChanges(
-            source.name, self._views, archive.site(), settings, is_coarse=_is_coarse(setup, archive, settings)
+            source.name, self._views, archive.site(), settings, _gathering(setup, archive, settings)
         )
         self._rejected = [
             KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
@@ -345,13 +347,23 @@ class CompareRun:
         }
 
 
-def _is_coarse(
+def _finer(archive: Archive, settings: CompareSettings, sizes: ViewSizes) -> float:
+    """How many times as fine as the map its ground is looked at: 1 where things have pixels enough, or by method
+    thesis. Over coarser maps learned features are compared as well."""
+    m_per_px = archive.site_grid().grid.m_per_px
+    return 1.0 if settings.method == "thesis" else min(max(m_per_px / sizes.fine_m_per_px, 1.0), sizes.finer)
+
+
+def _gathering(
     setup: FlightSetup, archive: Archive, settings: CompareSettings, sizes: ViewSizes = ViewSizes()
-) -> bool:
-    """Whether photos are compared with a map so coarse that its things have few pixels: then they are compared larger,
-    and by learned features as well."""
-    is_of_photos = setup.source.kind == "photos" and settings.method != "thesis"
-    return is_of_photos and archive.site_grid().grid.m_per_px > sizes.fine_m_per_px
+) -> Gathering | None:
+    """Of which views learned differences are gathered; a stream leaves no time for them."""
+    finer = _finer(archive, settings, sizes)
+    if finer <= 1.0:
+        return None
+    if setup.source.kind == "photos":
+        return Gathering()
+    return None if isinstance(setup.source, LiveSource) else Gathering(sizes.video_overlap, finer)
 
 
 def view_maker(
@@ -360,9 +372,7 @@ def view_maker(
     """What compares a flight's frames with a version of the map of a site."""
     source, site_grid = setup.source, archive.site_grid()
     side_px = settings.side_px or (sizes.video_px if source.kind == "video" else sizes.photo_px)
-    finer = 1.0
-    if _is_coarse(setup, archive, settings, sizes):
-        finer = min(sizes.photo_finer, site_grid.grid.m_per_px / sizes.fine_m_per_px)
+    finer = _finer(archive, settings, sizes) if source.kind == "photos" else 1.0
     flight = FlightCamera(source.camera.camera, setup.usual_height_m, side_px, setup.utc_ns, finer)
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
     if settings.method == "thesis":
