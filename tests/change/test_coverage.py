@@ -133,6 +133,35 @@ def test_the_smallest_size_is_that_of_four_in_five_and_grows_with_roughness():
     assert np.isnan(faint.smallest_px(np.array([0.1]))).all()  # nothing faint was planted
 
 
+def test_ground_that_differs_and_that_no_change_explains_is_not_compared(large_ground):
+    coverage = GroundCoverage()
+    changed = np.zeros(SIZE[::-1], np.uint8)
+    changed[100:300, 100:300] = 255  # 10 x 10 m
+    changed[400, 500] = 255  # noise
+    for index in range(3):
+        flags = changed if index else np.zeros_like(changed)  # two of three views
+        coverage.compare(replace(view_of(large_ground, index), changed=flags))
+    assert areas(coverage.parts())["unexplained"] == pytest.approx(100, abs=21)
+    square_m = np.array([[5.0, -5.0], [15, -5], [15, -15], [5, -15]])
+    assert "unexplained" not in areas(coverage.parts([square_m]))
+    assert areas(coverage.parts([square_m + np.array([40.0, 0.0])]))["unexplained"] == pytest.approx(100, abs=21)
+
+
+def test_too_few_planted_things_prove_nothing(large_ground):
+    coverage, few = GroundCoverage(), [each for each in plain_things(60) if each.contrast == 1.0][:30]
+    lost_faint = [replace(few[0], contrast=0.35, found=False)]
+    for index in range(2):
+        coverage.compare(view_of(large_ground, index), planted=tuple([*few, *lost_faint]) if index else ())
+    summary = coverage_summary(coverage.parts(), 0, coverage.planted)
+    assert summary["smallest_m"] is not None and summary["large_found"] is not None
+    assert not summary["faint_known"] and summary["faint_m"] is None
+    rare = GroundCoverage()
+    for index in range(2):
+        rare.compare(view_of(large_ground, index), planted=tuple(lost_faint))
+    assert set(areas(rare.parts())) == {"compared"}  # one thing missed makes no ground blind
+    assert coverage_summary(rare.parts(), 0, rare.planted)["large_found"] is None
+
+
 def test_where_nothing_planted_is_found_nothing_is_compared(large_ground):
     coverage = GroundCoverage()
     for index in range(3):

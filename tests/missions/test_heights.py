@@ -245,11 +245,13 @@ def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(wi
         heap = middle + 2.5 * np.column_stack([np.cos(around), np.sin(around)])
         area = replace(fake_change(1, kind=ChangeKind.AREA), outline_m=heap)
         with Archive.open(with_heights, write=False) as archive:
-            risen, thing = with_height_changes(archive, "other", [area, fake_change(2)])
+            beyond = replace(area, id="b-9", outline_m=heap + 1000)
+            (risen, thing, unseen), (notice,) = with_height_changes(archive, "other", [area, fake_change(2), beyond])
+            assert unseen.height_change is None and notice.count == 1 and "1 of 2 changed areas" in notice.text
             assert thing.height_change is None and risen.height_change is not None
             assert abs(risen.height_change.rise_m - 0.8) < 2 * risen.height_change.sigma_m
             assert risen.height_change.rise_m == pytest.approx(0.8, abs=0.1)
-            (unknown,) = with_height_changes(archive, "third", [area])
-            assert unknown.height_change is None
+            (unknown,), notices = with_height_changes(archive, "third", [area])
+            assert unknown.height_change is None and not notices
     finally:
         shutil.rmtree(other)

@@ -311,10 +311,12 @@ def _size_words(coverage: Mapping[str, Any]) -> str:
     """How small a thing is found in four of five pictures."""
     plain, faint, large = coverage["smallest_m"], coverage["faint_m"], coverage["large_found"]
     if large is None:
-        return "none: the smallest size that would be found is unknown"
+        return "too few: the smallest size that would be found is unknown"
     if plain is None:
         return f"only {large:.0%} of even the largest are found"
     faint_words = "faint ones are not found" if faint is None else f"faint ones from {faint:g} m"
+    if not coverage["faint_known"]:
+        faint_words = "of faint ones too few were drawn to know"
     return f"on half of the ground, plain ones are found from {plain:g} m; {faint_words}"
 
 

@@ -15,6 +15,7 @@ class Gap(StrEnum):
     LEANING = "leaning"  # earlier pictures contradict the map there: crowns and walls that lean
     BLURRED = "blurred"  # its views are blurred
     ONE_VIEW = "one-view"  # seen in one view only, too few to announce a change
+    UNEXPLAINED = "unexplained"  # most of its views differ from the map, and no change is reported there
     INSENSITIVE = "insensitive"  # test objects that were drawn there were not found
 
 
@@ -25,6 +26,7 @@ GAP_WORDS = {
     Gap.LEANING: "crowns or walls lean there: earlier pictures contradict the map",
     Gap.BLURRED: "its views are blurred",
     Gap.ONE_VIEW: "seen in one view only, too few to announce a change",
+    Gap.UNEXPLAINED: "it differs from the map, and none of the reported changes is why",
     Gap.INSENSITIVE: "test objects drawn into its views were not found",
 }
 """Each reason in words."""

@@ -32,7 +32,8 @@ class AreaSettings:
     touches: float = 0.02  # the same where both have one surface now ...
     gap: int = 3  # ... how near that is ...
     one_surface: float = 0.15  # ... whose colours are so many octaves apart at most
-    light: int = 71  # over which light, camera and season differ smoothly
+    light: int = 71  # over which light, camera and season differ smoothly: seen where ground is surely the same ...
+    least_same: float = 0.05  # ... in this share of a window; where less is, a wider window counts as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +57,9 @@ def segments(signs: GroundSigns, settings: AreaSettings) -> Iterator[tuple[Mask,
         return
     known = signs.known.astype(np.float32)
     same = signs.known & (signs.likeness > settings.same)
-    trust = np.where(same, signs.likeness, 0).astype(np.float32) + np.float32(1e-4) * known
+    trust = np.where(same, signs.likeness, 0).astype(np.float32) if same.any() else known
     signs_of = np.dstack([signs.colour, signs.detail]).astype(np.float32)
-    change = np.asarray((signs_of - _smooth(signs_of, trust, settings.light)) * known[..., None], np.float32)
+    change = np.asarray((signs_of - _light(signs_of, trust, settings)) * known[..., None], np.float32)
     core = np.zeros(known.shape, np.float32)
     for side in settings.scales:
         mean = _smooth(change, known, side) / _scale(_smooth(change, known, side), same, settings)
@@ -171,6 +172,20 @@ def _otherness(likeness: Cells, change: Cells, settings: AreaSettings) -> Cells:
     structure = (settings.other - likeness) / settings.other_range
     colour = (np.hypot(change[..., 0], change[..., 1]) - settings.seed) / settings.seed
     return np.asarray(np.clip(np.maximum(structure, colour), 0, 1), np.float32)
+
+
+def _light(values: Cells, trust: Cells, settings: AreaSettings) -> Cells:
+    """Values (rows, columns, n) of the ground around that is the same, by `trust` in it: over the usual window where
+    that holds enough, else over wider ones as well. A change of any width is not taken for light."""
+    light, missing, side = np.zeros_like(values), np.ones(trust.shape, np.float32), settings.light
+    while missing.any():
+        share = cv2.blur(trust, (side, side), borderType=cv2.BORDER_CONSTANT)
+        is_last = side > 2 * max(trust.shape)
+        enough = missing if is_last else missing * np.minimum(np.asarray(share, np.float32) / settings.least_same, 1)
+        light += enough[..., None] * _smooth(values, trust, side)
+        missing = missing - enough
+        side = 2 * side + 1
+    return light
 
 
 def _smooth(values: Cells, weights: Cells, side: int) -> Cells:

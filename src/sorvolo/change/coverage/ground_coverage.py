@@ -34,6 +34,8 @@ class CoverageSettings:
     black: float = 14.0  # mean grey level of ground in whose shadow nothing can be seen
     least_sharpness: float = 0.5  # of the flight's usual one: a view with less is blurred
     black_px: int = 15  # over how many pixels that mean is taken
+    differs: float = 0.5  # of the views that compared a cell flag it: it is changed, or not explained
+    widens: float = 1.0  # cells around a reported change that it explains: outlines are good to about one
     smooth_cells: int = 7  # over which the roughness of ground is averaged: what differs from cell to cell is luck
     steps_m: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # in which sizes are written
     planting: PlantingSettings = field(default_factory=PlantingSettings)
@@ -43,6 +45,7 @@ class _Chunk:
     def __init__(self) -> None:
         self.clean = np.zeros((_CHUNK, _CHUNK), np.uint16)
         self.gaps = {gap: np.zeros((_CHUNK, _CHUNK), np.uint16) for gap in _COUNTED}
+        self.differs = np.zeros((_CHUNK, _CHUNK), np.uint16)  # of the clean views
         self.rejected = np.zeros((_CHUNK, _CHUNK), np.uint8)  # which reason; 0 none
         self.texture = np.zeros((_CHUNK, _CHUNK), np.float32)  # summed over the clean views
         self.finest = np.full((_CHUNK, _CHUNK), np.inf, np.float32)  # m of a pixel
@@ -78,6 +81,7 @@ class GroundCoverage:
         size = window.shape[::-1]
         marks = self._marks(view, is_dark=is_dark, doubted=doubted)
         laid = cv2.warpPerspective(marks, cell_from_image, size, flags=cv2.INTER_NEAREST)
+        changed = cv2.warpPerspective(view.changed, cell_from_image, size, flags=cv2.INTER_NEAREST)
         rough = texture(view)
         image_from_rough = _resized(width / rough.shape[1], height / rough.shape[0])
         rough_laid = cv2.warpPerspective(
@@ -87,6 +91,7 @@ class GroundCoverage:
             mine = laid[part]
             is_clean = mine == _CLEAN
             chunk.clean[inside] += is_clean
+            chunk.differs[inside] += is_clean & (changed[part] > 0)
             chunk.texture[inside] += np.where(is_clean, rough_laid[part], 0)
             finest = chunk.finest[inside]
             np.minimum(finest, view.m_per_px, out=finest, where=is_clean)
@@ -120,13 +125,15 @@ class GroundCoverage:
         """Everything that was drawn into the views."""
         return self._planted
 
-    def parts(self) -> list[CoveredGround]:
-        """The ground in parts that were treated alike, compared ones first, each as large as it is."""
+    def parts(self, changes_m: Sequence[PointsM] = ()) -> list[CoveredGround]:
+        """The ground in parts that were treated alike, compared ones first, each as large as it is. `changes_m` are the
+        outlines, (N, 2) each, of what is reported: other ground that differs is not explained."""
         plain, faint = sensitivities(self._planted, self._settings.planting)[:2]
         runs: dict[tuple[int, int, int], list[tuple[float, float, float, float]]] = {}
         cell_m = self._settings.cell_m
         for (column, row), chunk in self._chunks.items():
-            labels = self._labels(chunk, plain, faint)
+            explained = self._explained(changes_m, column, row)
+            labels = self._labels(chunk, explained, plain, faint)
             for label, x0, x1, y in _runs(labels):
                 west, north = (column * _CHUNK + x0) * cell_m, -(row * _CHUNK + y) * cell_m
                 east = (column * _CHUNK + x1) * cell_m
@@ -146,9 +153,23 @@ class GroundCoverage:
         why = self._reasons[first - 1] if gap is Gap.REJECTED else ""
         return CoveredGround(polygons, area_m2, gap, why, np.nan, np.nan)
 
-    def _labels(self, chunk: _Chunk, plain: Sensitivity, faint: Sensitivity) -> NDArray[np.int32]:
+    def _explained(self, changes_m: Sequence[PointsM], column: int, row: int) -> Mask:
+        """(rows, columns) which cells of a chunk lie in a reported change, or beside it."""
+        cells = np.zeros((_CHUNK, _CHUNK), np.uint8)
+        wide = 1 + 2 * round(self._settings.widens)
+        for outline_m in changes_m:
+            at = outline_m * [1, -1] / self._settings.cell_m - [column * _CHUNK, row * _CHUNK] - 0.5
+            if (at.max(axis=0) > -wide).all() and (at.min(axis=0) < _CHUNK + wide).all():
+                corners = np.rint(at).astype(np.int32)
+                cv2.fillPoly(cells, [corners], 1)
+                cv2.polylines(cells, [corners], isClosed=True, color=1, thickness=wide)
+        return np.asarray(cells > 0)
+
+    def _labels(
+        self, chunk: _Chunk, explained: Mask, plain: Sensitivity, faint: Sensitivity
+    ) -> NDArray[np.int32]:
         """(rows, columns, 3): the class, and of compared ground the steps of both sizes, of rejected the reason."""
-        classes = self._classes(chunk)
+        classes = self._classes(chunk, explained)
         labels = np.zeros((*classes.shape, 3), np.int32)
         labels[..., 0] = classes
         labels[classes == list(Gap).index(Gap.REJECTED), 1] = chunk.rejected[
@@ -173,7 +194,7 @@ class GroundCoverage:
     def _step_m(self, number: int) -> float:
         return self._settings.steps_m[number - 1] if number else float("nan")
 
-    def _classes(self, chunk: _Chunk) -> NDArray[np.int32]:
+    def _classes(self, chunk: _Chunk, explained: Mask) -> NDArray[np.int32]:
         """(rows, columns): `_CLEAN`, the place of a gap among all, or -1 where no view was."""
         names = list(Gap)
         clean = chunk.clean.astype(np.int32)
@@ -185,7 +206,10 @@ class GroundCoverage:
         most = np.array([names.index(gap) for gap in (Gap.DARK, Gap.LEANING, Gap.BLURRED)])[hidden.argmax(axis=0)]
         classes = np.where(hidden.sum(axis=0) > 0, most, classes)
         is_compared = (clean >= self._settings.least_views) & (clean >= hidden.sum(axis=0))
-        return np.where(is_compared, _CLEAN, classes)
+        classes = np.where(is_compared, _CLEAN, classes)
+        differs = is_compared & ~explained & (chunk.differs >= self._settings.differs * clean)
+        whole = cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+        return np.where(whole, names.index(Gap.UNEXPLAINED), classes)
 
     def _marks(self, view: ComparedView, *, is_dark: bool, doubted: Mask | None) -> NDArray[np.uint8]:
         """A view's pixels, (h, w): 255 compared, else 1 + the place of what kept it from that; 0 where it sees nothing.
@@ -228,8 +252,10 @@ def coverage_summary(
 ) -> dict[str, Any]:
     """The areas as a report has them; `smallest_m` is what is found on half of the compared ground, `faint_m` too.
 
-    `large_found` is the share found of plain things of the largest size that was drawn, None where none was.
+    `large_found` is the share found of plain things of the largest size that was drawn, None where too few were drawn
+    to know; `faint_known` whether enough faint ones were.
     """
+    plain, faint = sensitivities(planted, PlantingSettings())[:2]
     compared = [each for each in parts if each.gap is None]
     gaps_m2 = _gaps_m2(parts)
     compared_m2, missing_m2 = sum(each.area_m2 for each in compared), sum(gaps_m2.values())
@@ -239,7 +265,7 @@ def coverage_summary(
         "gaps_m2": gaps_m2, "views_without_a_place": unplaced,
         "smallest_m": _middle([(each.smallest_m, each.area_m2) for each in compared]),
         "faint_m": _middle([(each.faint_m, each.area_m2) for each in compared]),
-        "large_found": _large_found(planted),
+        "large_found": _large_found(planted) if plain.is_known else None, "faint_known": faint.is_known,
         "is_enough": compared_m2 >= 0.5 * on_map_m2 and compared_m2 > 0,
     }
 

@@ -40,6 +40,7 @@ class PlantingSettings:
     shown: float = 0.25  # of a thing's pixels marked as changed: found
     wanted: float = 0.8  # of the things of a size found: that size is found
     drawn: DrawnThing = field(default_factory=DrawnThing)
+    least_planted: int = 10  # things of a contrast: fewer show nothing; by choice
     least: float = 0.5  # of the largest things found: on ground with less the comparison is blind
 
 
@@ -58,15 +59,18 @@ class Sensitivity:
     """How small a thing of one contrast is found, from all that were planted.
 
     A thing of s pixels on ground of texture t is found with the probability 1 / (1 + exp(-w . (1, log s, log t))).
-    `weights` (3,) are NaN where nothing was planted or nothing found.
+    `weights` (3,) are NaN where nothing was found; where too few were planted, nothing `is_known`.
     """
 
     contrast: float
+    is_known: bool
     weights: Floats
     settings: PlantingSettings
 
     def smallest_px(self, texture: Floats) -> Floats:
         """The size in pixels that is found in `wanted` of all cases on ground of these textures; NaN: none known."""
+        if not self.is_known:
+            return np.full(len(texture), np.nan)
         bias, by_size, by_texture = self.weights
         needed = np.log(self.settings.wanted / (1 - self.settings.wanted))
         size = np.exp((needed - bias - by_texture * np.log(texture)) / by_size)
@@ -74,6 +78,8 @@ class Sensitivity:
 
     def is_blind(self, texture: Floats) -> Mask:
         """Whether on ground of these textures most of the largest things are missed."""
+        if not self.is_known:
+            return np.zeros(len(texture), bool)
         logit = self.weights @ np.array([
             np.ones(len(texture)), np.full(len(texture), np.log(max(self.settings.sizes_px))), np.log(texture)
         ])
@@ -144,11 +150,10 @@ def texture(view: ComparedView) -> NDArray[np.float32]:
 
 def sensitivities(planted: Sequence[Planted], settings: PlantingSettings) -> tuple[Sensitivity, ...]:
     """What was found of everything planted, a record for each contrast."""
+    of_contrast = [[each for each in planted if each.contrast == contrast] for contrast in settings.contrasts]
     return tuple(
-        Sensitivity(
-            contrast, _weights([each for each in planted if each.contrast == contrast]), settings
-        )
-        for contrast in settings.contrasts
+        Sensitivity(contrast, len(own) >= settings.least_planted, _weights(own), settings)
+        for contrast, own in zip(settings.contrasts, of_contrast, strict=True)
     )
 
 

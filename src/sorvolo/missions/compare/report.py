@@ -19,6 +19,7 @@ from sorvolo.survey.wording import area_text, plural
 
 _DARK = 0.4  # times the map's brightness: less hides things
 _ALL_OVER = 0.1  # share of the compared ground: a day without changes has 0.01, other leaves 0.13, half snow 0.4
+_OTHER_GROUND = 0.5  # share of the compared ground that areas cover: more is no list of changes
 _COARSE = 3.0  # times the flight's pixels: a map with larger ones hides what the flight shows
 
 
@@ -98,6 +99,8 @@ def comparison_summary(
     person rejected them on an earlier flight."""
     kinds = Counter(each.kind for each in changes)
     coverage = coverage_summary(ground, counts.ground.unplaced, counts.ground.planted)
+    areas_m2 = sum(each.area_m2 for each in changes if each.kind is ChangeKind.AREA)
+    coverage["other_ground_m2"] = min(areas_m2, coverage["compared_m2"])
     return {
         "against_version": base_version,
         "method": settings.method,
@@ -138,14 +141,18 @@ def flight_notices(counts: ViewCounts, fit: FlightFit | None) -> list[Notice]:
 def comparison_headline(changes: int, coverage: Mapping[str, Any], *, is_local: bool) -> dict[str, str]:
     """The first line of a comparison: its `quality`, "compared" or "doubtful", and its `text`.
 
-    It is doubtful when most of the ground under the views that the map shows could not be compared: then the number of
-    changes proves nothing about the site. `coverage` is that of the report.
+    It is doubtful when most of the ground under the views that the map shows could not be compared, or is other ground
+    now: then the number of changes proves nothing about the site. `coverage` is that of the report.
     """
     compared, missing = (area_text(coverage[name], is_local=is_local) for name in ("compared_m2", "not_compared_m2"))
     found = f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"
-    if coverage["is_enough"]:
+    if not coverage["is_enough"]:
+        doubt = "most of the ground could not be compared"
+    elif coverage["other_ground_m2"] > _OTHER_GROUND * coverage["compared_m2"]:
+        doubt = "most of the ground is another one now (snow, water, ploughing?), and what stands on it may be missed"
+    else:
         return {"quality": "compared", "text": found}
-    return {"quality": "doubtful", "text": f"not to be relied on, most of the ground could not be compared: {found}"}
+    return {"quality": "doubtful", "text": f"not to be relied on, {doubt}: {found}"}
 
 
 def comparison_warnings(counts: ViewCounts, brightness: float, times_coarser: float) -> list[str]:

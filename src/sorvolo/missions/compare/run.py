@@ -257,11 +257,13 @@ class CompareRun:
                 paint_changes(changes, self._writer.tiles, self._archive.site_grid())
         with self._log.stage(Stage.DETECT):
             changes = self._objects.classified(changes, search)
-            changes = with_height_changes(self._archive, self._setup.source.name, changes)
+            changes, of_heights = with_height_changes(self._archive, self._setup.source.name, changes)
         with self._log.stage(Stage.REPORT):
             shown = picture(self._writer.tiles, 800)  # a day without change should cost little
-        ground = self._counts.ground.parts()
-        report = self._report(changes, suppressed, shown_as_well, placed, shown, notices, started_s, ground)
+        ground = self._counts.ground.parts([each.outline_m for each in changes])
+        report = self._report(
+            changes, suppressed, shown_as_well, placed, shown, [*notices, *of_heights], started_s, ground
+        )
         report["objects"] = self._objects.summary(search)
         page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
         site = self._archive.site()

@@ -167,7 +167,11 @@ def _headline(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str
     moving = sum(each.kind is ChangeKind.MOVING for each in changes)
     also = (f"; also {plural(moving, 'moving object')}" if moving else "") + missing
     is_dark = at(report, "comparison", "most_missed") is True
-    return _found_words(kinds, ground, also, is_dark=is_dark)
+    found = _found_words(kinds, ground, also, is_dark=is_dark)
+    if at(report, "comparison", "headline", "quality") != "doubtful":
+        return found
+    doubt = str(at(report, "comparison", "headline", "text")).partition(":")[0]
+    return f"{doubt.capitalize()}: {found[:1].lower()}{found[1:]}"
 
 
 def _found_words(kinds: Mapping[ChangeKind, int], ground: str, also: str, *, is_dark: bool) -> str:
