@@ -574,6 +574,7 @@ def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_groun
     assert ("too dark" in (site / "flights" / "flight2" / "changes.html").read_text().lower()) == is_night
     assert has_grown(site) != is_night
     if is_night:
+        assert report(site)["comparison"]["changes"]["area"] == 0
         compare(tmp_path / "dark", tmp_path / "thesis", replace(_COMPARE, method="thesis", views_per_second=1.0))
         assert not has_grown(tmp_path / "thesis")
 

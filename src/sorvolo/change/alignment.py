@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import cached_property, partial
 
 import cv2
@@ -87,16 +88,26 @@ class Aligned:
     with_flight: bool = False
 
 
+class Caution(Enum):
+    """When a frame is placed only by what is cheap and beyond doubt: what is not found so comes again later."""
+
+    NEVER = "never"
+    AT_FIRST = "at first"  # until a frame of the flight was found beyond doubt
+    ALWAYS = "always"
+
+
 @dataclass(frozen=True)
 class NotAligned:
     """A frame that fits the map nowhere, why, and the residual of the best try (NaN without any).
 
-    `is_outside`: it lies beyond the known ground, as far as is known.
+    `is_outside`: it lies beyond the known ground, as far as is known. `comes_again`: caution kept it from being looked
+    for by all means.
     """
 
     reason: str
     residual_px: float
     is_outside: bool = False
+    comes_again: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,16 +195,16 @@ class Aligner:
         """What looks for frames that no homography places."""
         self._count = 0
         self._misses = 0  # frames since the last fit
+        self._is_found = False  # whether a frame was found beyond doubt
         self.step = AlignStep(None, 0, ())
         """What the last frame left."""
 
     def align(
-        self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, place: FlightPlace | None = None, *,
-        comes_again: bool = False,
+        self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, place: FlightPlace | None = None,
+        caution: Caution = Caution.NEVER,
     ) -> Aligned | NotAligned:
         """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map. `place` is where its
-        flight has it, where that is known: only a local fit moves it then. A frame that `comes_again` if it is not
-        found is placed only by what is cheap and sure."""
+        flight has it, where that is known: only a local fit moves it then."""
         size, gray = self._small(image)
         scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
         small_camera = camera.resized(*size)
@@ -209,9 +220,10 @@ class Aligner:
 
         frame = _Frame(image, camera, gray, new, prior)
         placed: Place | NotAligned
+        is_cautious = caution is Caution.ALWAYS or (caution is Caution.AT_FIRST and not self._is_found)
         if place is not None:
             placed = _as_known(place, camera, small_camera)
-        elif comes_again:
+        elif is_cautious:
             placed = self._surely(new, prior, time_ns, telemetry_inside)
         else:
             placed = self._by_homographies(new, prior, time_ns, telemetry_inside)
@@ -221,7 +233,7 @@ class Aligner:
             is_outside = share.known < self._settings.least_known
             reason = self._beside() if is_outside else placed.reason
             self.step = AlignStep(None, self._misses, self._reference.windows)
-            return NotAligned(reason, placed.residual_px / scale, is_outside)
+            return NotAligned(reason, placed.residual_px / scale, is_outside, is_cautious and not is_outside)
         moved = self._settled(frame, placed)
         self._remember(time_ns, moved.place, prior, new)
         self.step = AlignStep(moved.place, self._misses, self._reference.windows)
@@ -416,6 +428,7 @@ class Aligner:
         )
         self._fits = [*self._fits[-1:], fit]
         self._misses = 0
+        self._is_found |= bool(np.isinf(placed.ratio))
         self.search.remember(new.gray, new.camera, prior, placed.pose, placed.site_from_image, placed.ratio)
 
     def _on_grid(self, site_from_image: Matrix3, camera: Camera) -> Matrix3 | None:

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from sorvolo.change.alignment import Aligned, Aligner, AlignStep, FlightPlace
+from sorvolo.change.alignment import Aligned, Aligner, AlignStep, Caution, FlightPlace
 from sorvolo.change.areas.signs import leaning, level_of
 from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
@@ -62,7 +62,7 @@ class ViewOutcome:
     as bright as the map the flight is so far, NaN where that is not known. `doubted` (h, w) is what surely differs from
     the map in a compared view and is contradicted by earlier pictures, `leans` (h, w) what leans another way in those,
     `planted` what is found of things drawn in. `local_m` is how far a local fit moved the frame on the map (median, m),
-    0 without any. `with_flight` is that of `Aligned`.
+    0 without any. `with_flight` is that of `Aligned`, `comes_again` that of `NotAligned`.
     """
 
     status: ViewStatus
@@ -77,6 +77,7 @@ class ViewOutcome:
     planted: tuple[Planted, ...] = ()
     local_m: float = 0.0
     with_flight: bool = False
+    comes_again: bool = False
     traces: ViewTraces | None = None
 
 
@@ -162,21 +163,21 @@ class ViewMaker:
         self._planting = Planting()
 
     def compare_with_map(
-        self, posed: PosedFrame, place: FlightPlace | None = None, *, comes_again: bool = False
+        self, posed: PosedFrame, place: FlightPlace | None = None, caution: Caution = Caution.NEVER
     ) -> ViewOutcome | OneSided:
-        """Align one frame and compare it with the map; a `ViewOutcome` if that ended it. `place` and `comes_again` are
+        """Align one frame and compare it with the map; a `ViewOutcome` if that ended it. `place` and `caution` are
         those of `Aligner.align`."""
         frame, small = posed.frame, self.pixels.small
         image = self.undistorted(posed)
         aligned = self._aligner.align(
-            image, self._lens.camera, posed.prior, frame.time_ns, place, comes_again=comes_again
+            image, self._lens.camera, posed.prior, frame.time_ns, place, caution
         )
         to_full = self._flight.full.width_px / small.width_px
         if not isinstance(aligned, Aligned):
             status = ViewStatus.OUTSIDE if aligned.is_outside else ViewStatus.NOT_ALIGNED
             return ViewOutcome(
                 status, aligned.reason, aligned.residual_px * to_full, 0.0, brightness=self.brightness,
-                traces=ViewTraces(self._aligner.step, None, None),
+                traces=ViewTraces(self._aligner.step, None, None), comes_again=aligned.comes_again,
             )
         residual_px = aligned.residual_px * to_full
         site_from_full = aligned.site_from_image @ self.pixels.small_from_full

@@ -227,4 +227,4 @@ class CompareUpdate:
     seconds: float
     view: FrameView | None = None  # None: not laid on the map
     is_resumed: bool = False  # compared by a run that was killed
-    comes_again: bool = False  # not the last update of this frame: it is looked for again, with all of its flight
+    comes_again: bool = False  # it is looked for again, with all of its flight, if that needs it

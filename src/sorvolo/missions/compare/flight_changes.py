@@ -12,6 +12,7 @@ from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
 from sorvolo.change.views import ViewMaker
 from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.sun import slide_of
+from sorvolo.missions.compare.extension import NIGHT
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.mosaic.selection import StretchSelection
@@ -68,7 +69,8 @@ class FlightChanges:
         evidence, gathered = self._evidence, self._gathered
         things = evidence.conclude() if gathered is None else evidence.conclude(gathered.shows_once)
         first = evidence.next_number
-        areas = self._areas.conclude(self._flight, first)
+        # in the dark the ground has neither its structure nor its colour
+        areas = () if self._views.brightness < NIGHT else self._areas.conclude(self._flight, first)
         if gathered is None:
             return with_areas(things, areas)
         found = with_areas(things, areas, lies_apart=gathered.lies_apart)

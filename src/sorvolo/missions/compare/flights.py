@@ -13,7 +13,7 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
-from sorvolo.change.alignment import FlightPlace
+from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import Again, CompareRun, Pending
@@ -52,7 +52,7 @@ def compare_flights(
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
 
     `inputs`, `telemetry`, `camera`, `area`, `detector`, `live` and `until` are those of `map_flights`. An update
-    carries the changes that its frame announced; after one that `comes_again` its frame has another. `steps` is a
+    carries the changes that its frame announced; after one that `comes_again` its frame may have another. `steps` is a
     folder for the intermediate pictures of method thesis (its Figure 3.14). The flights' findings and the new version
     of the map are part of the site when a flight's last update was yielded.
     A run that was killed continues when the same is asked for again.
@@ -190,10 +190,14 @@ def _ended(
 ) -> Iterator[Pending | LostFrame | Again]:
     """The frames as their comparisons end. What was not found on the map is tried again after the others, with the
     whole flight where that can be read again: each photo, and of a video, which shows the same ground again anyway,
-    frames that overlap as photos do. Frames that come again are named until then."""
+    frames that overlap as photos do. Until one of its frames was found beyond doubt all of a video wait: where none is,
+    single frames are found in wrong places. Frames that come again are named until then."""
     whole, is_photos = WholeFlightSettings(), source.kind == "photos"
     can_whole = setup.track is not None and not isinstance(source, LiveSource)
     overlapping = StretchSelection(whole.overlap, keep_all=False)
+    caution = Caution.NEVER
+    if can_whole:
+        caution = Caution.ALWAYS if is_photos else Caution.AT_FIRST
 
     def is_chosen(posed: PosedFrame) -> bool:
         if is_photos or not can_whole:
@@ -204,11 +208,13 @@ def _ended(
     chosen: set[int] = set()
     again: set[int] = set()
     yield from run.recalled()
-    for each in _begun(_frames(source, step_s), setup, inside, run, ahead, come_again=is_photos and can_whole):
-        if isinstance(each, Pending) and is_chosen(each.posed):
-            chosen.add(each.posed.frame.index)
-            if each.is_unplaced:
-                again.add(each.posed.frame.index)
+    for each in _begun(_frames(source, step_s), setup, inside, run, ahead, caution=caution):
+        if isinstance(each, Pending):
+            index, is_one = each.posed.frame.index, is_chosen(each.posed)
+            if is_one:
+                chosen.add(index)
+            if each.is_unplaced and (is_one or each.comes_again):
+                again.add(index)
                 run.put_off(each)
                 yield Again(each.posed, is_resumed=each.earlier is not None)
                 continue
@@ -216,9 +222,12 @@ def _ended(
     if not again:
         return
     places: Mapping[int, FlightPlace] = {}
-    if can_whole and (is_photos or len(again) > whole.many * len(chosen)):
+    if can_whole and (is_photos or len(again & chosen) > whole.many * len(chosen)):
         frames = source.frames(lambda index, _: index in chosen)
         places = yield from run.places_with_flight(_posed(frames, setup, inside), len(chosen))
+    if places and not is_photos:
+        run.leave_out(len(again - chosen))  # those that overlap show their ground
+        again &= chosen
     yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead, places)
 
 
@@ -243,8 +252,8 @@ def _frames(source: Source, step_s: float) -> Generator[Frame | LostFrame]:
 
 def _begun(
     frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
-    ahead: Callable[[], int], places: Mapping[int, FlightPlace] = MappingProxyType({}), *,
-    come_again: bool = False,
+    ahead: Callable[[], int], places: Mapping[int, FlightPlace] = MappingProxyType({}),
+    caution: Caution = Caution.NEVER,
 ) -> Iterator[Pending | LostFrame]:
     """The frames inside of the area in order, each with its comparison begun, and that of up to `ahead()` after it."""
     waiting: deque[Pending | LostFrame] = deque()
@@ -252,7 +261,7 @@ def _begun(
         if isinstance(each, LostFrame):
             waiting.append(each)
         elif inside(posed := PosedFrame(each, setup.prior(each, first=False))):
-            waiting.append(run.begin(posed, places.get(each.index), comes_again=come_again))
+            waiting.append(run.begin(posed, places.get(each.index), caution))
         while len(waiting) > ahead():
             yield waiting.popleft()
     yield from waiting

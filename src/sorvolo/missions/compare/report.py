@@ -34,6 +34,7 @@ class ViewCounts:
         self._differing: list[float] = []
         self._local_m: list[float] = []
         self.with_flight = 0
+        self.left_out = 0
 
     def end(self, status: ViewStatus, reason: str) -> None:
         """Count a frame that ended so."""
@@ -123,8 +124,10 @@ def flight_summary(counts: ViewCounts, fit: FlightFit | None) -> dict[str, Any]:
     """The report's part on photos that were placed with all others of their flight; `fit` is where that lies on the
     map, None where it was not looked for, or not found."""
     if fit is None:
-        return {"views": 0, "ratio": None, "residual_m": None}
-    return {"views": counts.with_flight, "ratio": fit.ratio, "residual_m": fit.residual_m}
+        return {"views": 0, "left_out": 0, "ratio": None, "residual_m": None}
+    return {
+        "views": counts.with_flight, "left_out": counts.left_out, "ratio": fit.ratio, "residual_m": fit.residual_m,
+    }
 
 
 def flight_notices(counts: ViewCounts, fit: FlightFit | None) -> list[Notice]:

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.capture.source import LiveSource
-from sorvolo.change.alignment import FlightPlace
+from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
 from sorvolo.change.map_update import paint_changes
@@ -83,6 +83,11 @@ class Pending:
     def is_unplaced(self) -> bool:
         """Whether the frame was not found on the map; waits for its comparison."""
         return self.outcome.result().status is ViewStatus.NOT_ALIGNED
+
+    @property
+    def comes_again(self) -> bool:
+        """Whether it was not looked for by all means; waits for its comparison."""
+        return self.outcome.result().comes_again
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +171,10 @@ class CompareRun:
         time_ns = self._setup.utc_ns(lost.time_ns)
         self._placed[lost.index] = PlacedFrame.rejected(lost.index, lost.name, time_ns, lost.reason, camera)
 
-    def begin(self, posed: PosedFrame, place: FlightPlace | None = None, *, comes_again: bool = False) -> Pending:
-        """Begin to compare a frame, in threads beside what `add` does with those before it. `place` and `comes_again`
+    def begin(
+        self, posed: PosedFrame, place: FlightPlace | None = None, caution: Caution = Caution.NEVER
+    ) -> Pending:
+        """Begin to compare a frame, in threads beside what `add` does with those before it. `place` and `caution`
         are those of `Aligner.align`."""
         earlier = None if self._journal is None else self._journal.next_frame(posed.frame.index)
         if earlier is not None:
@@ -176,7 +183,7 @@ class CompareRun:
                 lambda: self._views.recall(posed, self._views.undistorted(posed), record)
             )
             return Pending(posed, recalled, earlier)
-        compared = self._comparing.submit(self._views.compare_with_map, posed, place, comes_again=comes_again)
+        compared = self._comparing.submit(self._views.compare_with_map, posed, place, caution)
         return Pending(posed, self._corroborating.submit(lambda: self._views.corroborate(compared.result())))
 
     def recalled(self) -> Iterator[Pending]:
@@ -225,6 +232,10 @@ class CompareRun:
     def put_off(self, pending: Pending) -> None:
         """A frame that was not found on the map is tried again after the others."""
         self._keep(pending, None)
+
+    def leave_out(self, frames: int) -> None:
+        """So many frames were put off and are not tried again: others that overlap them show their ground."""
+        self._counts.left_out += frames
 
     def view(self, posed: PosedFrame) -> FrameView | None:
         """What a frame that was added shows; None where it was not laid on the map, or from an unknown place."""
