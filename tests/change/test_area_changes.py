@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sorvolo.change.areas.area_map import AreaMap, AreaMapSettings, with_areas
-from sorvolo.change.areas.connected_areas import AreaSettings
+from sorvolo.change.areas.connected_areas import AreaSettings, GroundSigns, segments
 from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
 from sorvolo.change.areas.signs import leaning, level_of
 from sorvolo.change.shape.outlines import overlap
@@ -68,6 +68,21 @@ def laid(ground: Rgb, other: Rgb, outline_m: np.ndarray) -> Rgb:
     cv2.fillPoly(inside, [np.rint(outline_m / M_PER_PX * [1, -1]).astype(np.int32)], 255)
     share = cv2.GaussianBlur(inside, (0, 0), 1.0)[..., None] / 255.0
     return np.rint(ground * (1 - share) + other * share).astype(np.uint8)
+
+
+@pytest.mark.parametrize("deep", [30, 120, 200])
+def test_an_area_keeps_its_inside_however_far_from_unchanged_ground(deep):
+    """A band of so many of 260 cells, flooded; light is looked for within 35 cells at first."""
+    rng, settings, shape = np.random.default_rng(1), AreaSettings(), (260, 260)
+    is_wet = np.arange(shape[0])[:, None] < np.full(shape[1], deep)
+    likeness = np.where(is_wet, 0.1, 0.85) + rng.normal(0, 0.03, shape)
+    colour = rng.normal(0, 0.02, (*shape, 2)) + np.array([0.5, -0.4]) * is_wet[..., None]
+    detail = rng.normal(0, 0.1, shape) - 2.0 * is_wet
+    signs = GroundSigns(
+        *(each.astype(np.float32) for each in (likeness, colour, detail, colour)), known=np.ones(shape, bool)
+    )
+    found = np.any([cells for cells, _ in segments(signs, settings)], axis=0)
+    assert found[is_wet].mean() > 0.97 and found[~is_wet].mean() < 0.05
 
 
 @pytest.mark.parametrize("kind", [GroundKind.URBAN, GroundKind.DIRT])

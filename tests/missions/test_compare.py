@@ -260,6 +260,7 @@ def test_a_view_that_fails_beside_the_rest_is_reported_and_leaves_the_site_as_it
     assert all(after[name] == content for name, content in before.items() if name.endswith((".tif", ".geojson")))
 
 
+@pytest.mark.long
 def test_the_pictures_of_changes_are_no_finer_than_the_views(flown, compared, tmp_path):
     fine = tmp_path / "fine"
     with Archive.open(compared[0], write=False) as archive:

@@ -215,7 +215,7 @@ def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
         report.unlink() if kept is None else report.write_bytes(kept)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_brighton_beach_has_heights(tmp_path: Path) -> None:
     photos = real_data("flights/brighton_beach")
     list(map_flights([photos], tmp_path / "site", MapSettings(model="none", m_per_px=0.2)))  # heights use the photos
