@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sorvolo.capture.sync import (
     Clock,
@@ -17,7 +18,7 @@ from sorvolo.capture.sync import (
 )
 from sorvolo.errors import InputError
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.geometry.pose import gimbal_angles_from_rotation
+from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_gimbal_rotation
 from sorvolo.survey.flight import Telemetry
 
 FRAME = LocalFrame(Geodetic(41.9, 12.6, 0.0))
@@ -315,6 +316,27 @@ def test_roll_turns_across_180_degrees_the_short_way():
     track, _ = track_of(straight([0.0, 1], camera_yaw_deg=yaw, camera_pitch_deg=-89.5, camera_roll_deg=roll))
     turned = track.prior(0.0).rotation.T @ track.prior(0.5).rotation
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) < 3.0
+
+
+def test_a_camera_that_sways_across_straight_down_is_not_turned_between_samples():
+    """Its yaw and its roll each jump by about half a turn; interpolated one by one, their sum made a full turn."""
+    sways_deg = np.random.default_rng(5).normal(0, 0.2, (21, 3)) * [0, 0, 1]
+    sways_deg[:, 0] = 0.4 * (-1.0) ** np.arange(21)
+    still = site_from_gimbal_rotation(90.0, -90.0, 0.0)
+    sways = Rotation.from_rotvec(np.radians(sways_deg)).as_matrix()
+    yaw, pitch, roll = np.array([gimbal_angles_from_rotation(each @ still) for each in sways]).T
+    track, _ = track_of(straight(ONE_HZ, camera_yaw_deg=yaw, camera_pitch_deg=pitch, camera_roll_deg=roll))
+    for time_s in np.arange(0, 20.01, 0.25):
+        turn = Rotation.from_matrix(track.prior(time_s).rotation @ still.T)
+        assert np.degrees(turn.magnitude()) < 1.0
+    assert np.allclose(track.prior(7.0).rotation, sways[7] @ still)
+
+
+def test_a_sample_without_angles_is_bridged_by_its_neighbours():
+    yaw_deg = 10.0 * ONE_HZ
+    yaw_deg[5] = np.nan
+    track, _ = track_of(straight(ONE_HZ, camera_yaw_deg=yaw_deg, camera_pitch_deg=-60.0))
+    assert np.allclose(gimbal_angles_from_rotation(track.prior(5.0).rotation)[0], 50.0, atol=0.5)
 
 
 def test_a_gimbal_is_asked_before_the_body():

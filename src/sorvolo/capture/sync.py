@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, PointsM, Vector3
+from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Vector3
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import fit_similarity
 from sorvolo.geometry.pose import site_from_body_nadir_rotation, site_from_gimbal_rotation
@@ -129,9 +130,7 @@ class Track:
     vertical_sigma_m: float
     altitude_offset_sigma_m: float
     height_words: str
-    yaw_deg: Floats  # unwrapped, as the roll is; of the camera if known, else the body
-    pitch_deg: Floats
-    roll_deg: Floats
+    angles_deg: Floats  # (N, 3) yaw, pitch, roll of the camera if known, else the body; NaN where not stated
     attitude: str  # "gimbal" | "body" | "none"
     stated_sigma_deg: tuple[float, float]  # of tilt and heading, NaN where the source states none
     interval_s: float
@@ -219,20 +218,35 @@ class Track:
 
     def _attitude(self, time_s: float, velocity_m_s: Vector3) -> tuple[Floats, Floats, str]:
         if self.attitude != "none" and self.sample_s[0] - 2 <= time_s <= self.sample_s[-1] + 2:
-            yaw, pitch, roll = (
-                float(np.interp(time_s, self.sample_s, column))
-                for column in (self.yaw_deg, self.pitch_deg, self.roll_deg)
-            )
             if self.attitude == "gimbal":
-                return site_from_gimbal_rotation(yaw, pitch, roll), self._sigma_deg(2.0, 4.0), "gimbal attitude"
+                return self._stated_rotation(time_s), self._sigma_deg(2.0, 4.0), "gimbal attitude"
             words = "body attitude, camera taken as fixed straight down"
-            return site_from_body_nadir_rotation(yaw, pitch, roll), self._sigma_deg(5.0, 8.0), words
+            return self._stated_rotation(time_s), self._sigma_deg(5.0, 8.0), words
         course_deg = 0.0
         words = "no attitude: camera taken as looking down"
         if np.isfinite(velocity_m_s[:2]).all() and np.hypot(*velocity_m_s[:2]) > 0.5:
             course_deg = float(np.degrees(np.arctan2(velocity_m_s[0], velocity_m_s[1])))
             words += ", image top taken as the course"
         return site_from_gimbal_rotation(course_deg, -90.0, 0.0), np.array([12.0, 12.0, np.inf]), words
+
+    def _stated_rotation(self, time_s: float) -> Matrix3:
+        """site_from_camera between the stated samples, by the shortest turn; beyond them that of the nearest.
+
+        Angles are not interpolated one by one: straight down, yaw and roll may both swing by half a turn where the
+        camera stands still.
+        """
+        known = np.flatnonzero(np.isfinite(self.angles_deg[:, 0]))
+        times = self.sample_s[known]
+        after = min(int(np.searchsorted(times, time_s)), len(known) - 1)
+        before = max(after - 1, 0)
+        turned = site_from_gimbal_rotation if self.attitude == "gimbal" else site_from_body_nadir_rotation
+        last = turned(*self.angles_deg[known[after]])
+        passed_s = times[after] - times[before]
+        share = float(np.clip((time_s - times[before]) / passed_s, 0.0, 1.0)) if passed_s > 0 else 1.0
+        if share == 1.0:
+            return last
+        first = turned(*self.angles_deg[known[before]])
+        return Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([first, last])))(share).as_matrix()
 
     def _sigma_deg(self, usual_tilt: float, usual_heading: float) -> Vector3:
         """Sigmas about the camera's x, y, z axes: as stated, else what such sources usually reach."""
@@ -271,7 +285,7 @@ def track_from_telemetry(
     if clock.is_per_photo:
         interval_s = 0.0
     track = Track(
-        clock.sample_s, east_north, up_m, sigma, vertical_sigma_m, offset_sigma_m, words, *angles, attitude,
+        clock.sample_s, east_north, up_m, sigma, vertical_sigma_m, offset_sigma_m, words, angles, attitude,
         (median_or_nan(telemetry["tilt_sigma_deg"]), median_or_nan(telemetry["heading_sigma_deg"])), interval_s, gap_s,
     )
     return track, notices
@@ -422,18 +436,13 @@ def _heights(
     return np.full(len(telemetry), 40.0), "none, found from the pictures", np.inf, np.inf, tuple(notices)
 
 
-def _angles(telemetry: Telemetry) -> tuple[str, tuple[Floats, Floats, Floats]]:
+def _angles(telemetry: Telemetry) -> tuple[str, Floats]:
+    """Whose angles are stated, and these: (N, 3) yaw, pitch, roll, deg; NaN where a sample states none."""
     for kind, prefix in (("gimbal", "camera"), ("body", "body")):
-        columns = [telemetry[f"{prefix}_{name}_deg"] for name in ("yaw", "pitch", "roll")]
-        known = np.isfinite(columns[0]) & np.isfinite(columns[1])
+        angles = np.column_stack([telemetry[f"{prefix}_{name}_deg"] for name in ("yaw", "pitch", "roll")])
+        known = np.isfinite(angles[:, :2]).all(axis=1)
         if len(telemetry) and known.mean() > 0.5:
-            columns[2] = np.where(np.isfinite(columns[2]), columns[2], 0.0)
-            index, where = np.arange(len(telemetry)), np.flatnonzero(known)
-            # a gimbal that looks straight down states a roll as wild as its yaw: both go the short way round
-            yaw, roll = (np.unwrap(columns[each][known], period=360.0) for each in (0, 2))
-            return kind, (
-                np.interp(index, where, yaw), np.interp(index, where, columns[1][known]),
-                np.interp(index, where, roll),
-            )
-    zeros = np.zeros(len(telemetry))
-    return "none", (zeros, zeros, zeros)
+            angles[:, 2] = np.where(np.isfinite(angles[:, 2]), angles[:, 2], 0.0)
+            angles[~known] = np.nan
+            return kind, angles
+    return "none", np.full((len(telemetry), 3), np.nan)
