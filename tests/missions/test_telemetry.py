@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import socket
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from small_flights import simulate_into, small_flight
-from sorvolo.capture.correction import telemetry_faults
+from sorvolo.capture.correction import fitted, path_fit, telemetry_faults
 from sorvolo.capture.live.klv_telemetry import read_klv_file
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
@@ -24,7 +25,7 @@ from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
 from sorvolo.missions.telemetry.words import fault_sentences
 from sorvolo.missions.watch.cot_sender import CotPlace
 from sorvolo.simulation.settings import OutputSettings
-from sorvolo.survey.corrected import Bias
+from sorvolo.survey.corrected import AS_THE_MAP, Bias
 from sorvolo.survey.flight import CameraPrior
 
 COMPASS_DEG, CLOCK_S, HEIGHT_M = 7.0, 0.4, 6.0
@@ -85,14 +86,125 @@ def test_frames_whose_angles_are_far_beside_the_others_are_named() -> None:
             np.ones(3),
         ) for k, pose in enumerate(poses)
     ]
-    faults = telemetry_faults(priors, poses, Bias(0.0, 0.01), Bias(1.0, 0.01), knows_height=True)
+    faults = telemetry_faults(priors, poses, Bias(0.0, 0.01), AS_THE_MAP, knows_height=True)
     assert faults.outlying == (4, 5, 6, 7) and faults.outlying_deg == pytest.approx(180, abs=5)
     assert faults.heading_deg.value == pytest.approx(3, abs=0.1)
     names = [f"{k}.jpg" for k in range(12)]
     (words,) = [each for each in fault_sentences(faults, names) if "far beside" in each]
     assert "4 frames of 12" in words and words.endswith("4.jpg, 5.jpg, 6.jpg, 7.jpg")
-    straight = telemetry_faults(priors[:4], poses[:4], Bias(0.0, 0.01), Bias(1.0, 0.01), knows_height=True)
+    straight = telemetry_faults(priors[:4], poses[:4], Bias(0.0, 0.01), AS_THE_MAP, knows_height=True)
     assert not straight.outlying and not any("far beside" in each for each in fault_sentences(straight, names))
+
+
+def _strips(clock_s: float = 0.0) -> tuple[list[Pose], list[CameraPrior]]:
+    """The true cameras of a flight in two strips of 60 m, 20 m apart, at 5 m/s; and its log, whose fixes scatter by
+    0.2 m, whose clock is off by `clock_s` and whose compass by 7 degrees."""
+    rng = np.random.default_rng(3)
+    poses, priors = [], []
+    for east_m, speed_m_s in ((0.0, 5.0), (20.0, -5.0)):
+        for north_m in np.arange(-30.0, 30.1, 5.0):
+            yaw_deg, velocity_m_s = (0.0 if speed_m_s > 0 else 180.0), np.array([0.0, speed_m_s, 0.0])
+            place_m = np.array([east_m, north_m, 30.0])
+            poses.append(Pose(site_from_gimbal_rotation(yaw_deg, -90.0, 0.0), place_m))
+            priors.append(CameraPrior(
+                place_m + clock_s * velocity_m_s + rng.normal(0, 0.2, 3) * [1, 1, 0], np.ones(3),
+                site_from_gimbal_rotation(yaw_deg + 7.0, -90.0, 0.0), np.ones(3), velocity_m_s,
+            ))
+    return poses, priors
+
+
+def test_a_map_that_the_compass_turned_does_not_hide_the_compass() -> None:
+    """Wrong heights made the map 1.3 times as large, the compass turned it by 2 degrees: its fixes show both."""
+    poses, priors = _strips()
+    turn = site_from_gimbal_rotation(2.0, -90.0, 0.0) @ site_from_gimbal_rotation(0.0, -90.0, 0.0).T
+    mapped = [Pose(turn @ each.rotation, 1.3 * turn @ each.translation_m) for each in poses]
+    path = path_fit(priors, mapped, 0.02)
+    assert path.scale.value == pytest.approx(1 / 1.3, abs=0.01)
+    assert path.turn_deg.value == pytest.approx(2.0, abs=3 * path.turn_deg.sigma) and path.turn_deg.sigma < 0.5
+    found = fitted(mapped, path)
+    for pose, truth in zip(found, poses):  # about the middle of the map, wherever that lies
+        apart_m = pose.translation_m - found[0].translation_m - truth.translation_m + poses[0].translation_m
+        assert np.linalg.norm(apart_m) < 0.8
+    faults = telemetry_faults(priors, found, Bias(0.0, 0.02), path, knows_height=True)
+    assert faults.heading_deg.value == pytest.approx(7.0, abs=3 * faults.heading_deg.sigma)
+    assert faults.heading_deg.sigma >= path.turn_deg.sigma
+    words = "; ".join(fault_sentences(faults, [""] * len(poses)))
+    assert "1.30 times as large as its GPS track and turned by" in words and "clockwise against it" in words
+    sound = telemetry_faults(priors, fitted(poses, path_fit(priors, poses, 0.02)), Bias(0.0, 0.02),
+                             path_fit(priors, poses, 0.02), knows_height=True)
+    assert "times as large" not in "; ".join(fault_sentences(sound, [""] * len(poses)))
+
+
+def test_a_turn_that_the_clock_explains_is_not_taken_for_one() -> None:
+    """0.2 s at 5 m/s shift two strips against each other, which looks like a turn."""
+    poses, priors = _strips(clock_s=0.2)
+    sure, unsure = (path_fit(priors, poses, sigma_s).turn_deg for sigma_s in (0.0, 0.2))
+    assert sure.value == unsure.value and abs(sure.value) > 0.5
+    assert np.sqrt(unsure.sigma**2 - sure.sigma**2) == pytest.approx(abs(sure.value), rel=0.5)
+
+
+@pytest.mark.parametrize("off_deg", [179.0, -179.5, 3.0])
+def test_a_compass_is_measured_all_round_the_circle(off_deg: float) -> None:
+    """A camera mounted the other way round is off by half a turn, on both sides of 180 degrees."""
+    poses = [Pose(site_from_gimbal_rotation(45.0, -90.0, 0.0), np.array([4.0 * k, 0.0, 30.0])) for k in range(12)]
+    priors = [
+        CameraPrior(pose.translation_m, np.ones(3), site_from_gimbal_rotation(45.0 + off_deg + k % 3, -90.0, 0.0),
+                    np.ones(3)) for k, pose in enumerate(poses)
+    ]
+    found = telemetry_faults(priors, poses, Bias(0.0, 0.01), AS_THE_MAP, knows_height=True).heading_deg
+    assert (found.value - off_deg - 1 + 180) % 360 - 180 == pytest.approx(0, abs=0.01)
+    assert found.scatter < 2 and found.sigma < 1
+
+
+def test_what_cannot_be_known_of_a_compass_is_not_called_right() -> None:
+    """Five photos where a strip turns, three of them half a turn off; and a hovering flight, whose track has no
+    direction."""
+    turned_deg = [2.0, 3.0, 179.0, -178.0, 177.0]
+    poses = [Pose(site_from_gimbal_rotation(0.0, -90.0, 0.0), np.array([30.0 * k, 0.0, 30.0])) for k in range(5)]
+    priors = [
+        CameraPrior(pose.translation_m, np.ones(3), site_from_gimbal_rotation(each, -90.0, 0.0), np.ones(3))
+        for pose, each in zip(poses, turned_deg)
+    ]
+    faults = telemetry_faults(priors, poses, Bias(0.0, 0.01), path_fit(priors, poses, 0.0), knows_height=True)
+    names = [f"{k}.jpg" for k in range(5)]
+    words = fault_sentences(faults, names)
+    assert "whether the compass was right cannot be known: the frames' angles disagree with each other" in words
+    assert any("3 frames of 5" in each and each.endswith("2.jpg, 3.jpg, 4.jpg") for each in words)
+    rng = np.random.default_rng(1)
+    near = [Pose(poses[0].rotation, rng.normal((0, 0, 30), 0.3)) for _ in range(8)]
+    fixes = [CameraPrior(each.translation_m + rng.normal(0, 1, 3), np.ones(3), each.rotation, np.ones(3))
+             for each in near]
+    hovering = telemetry_faults(fixes, near, Bias(0.0, 0.01), path_fit(fixes, near, 0.0), knows_height=True)
+    assert any("cannot be known: the GPS track is too short" in each for each in fault_sentences(hovering, names))
+    few = telemetry_faults(fixes[:3], near[:3], Bias(0.0, 0.01), path_fit(fixes[:3], near[:3], 0.0), knows_height=True)
+    assert any("cannot be known: too few frames have a fix" in each for each in fault_sentences(few, names))
+
+
+@pytest.mark.parametrize("quality", ["contradictory", "doubtful", "map"])
+def test_a_doubt_about_the_map_is_passed_on(
+    corrected: tuple[dict[str, Any], Path], tmp_path: Path, quality: str
+) -> None:
+    site = tmp_path / "site"
+    shutil.copytree(corrected[1] / "site", site)
+    path = site / "flights" / "flight1" / "report.json"
+    mapped = {**json.loads(path.read_text()), "headline": {"quality": quality, "text": "too large by half"}}
+    path.write_text(json.dumps(mapped))
+    report = correct_telemetry(site, tmp_path / "out")
+    assert ("too large by half" in report["warnings"]) == (quality != "map")
+
+
+def test_a_map_that_control_points_hold_is_not_bent_to_the_fixes(
+    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+) -> None:
+    site = tmp_path / "site"
+    shutil.copytree(corrected[1] / "site", site)
+    path = site / "flights" / "flight1" / "report.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), "control": {"points": [{"role": "control"}] * 3}}))
+    report = correct_telemetry(
+        site, tmp_path / "out", source=faulty / "flight1" / "flight1.mp4", camera=str(faulty / "camera.xml")
+    )
+    assert report["faults"]["path"]["turn_deg"] == {"value": 0.0, "sigma": 0.0, "scatter": None}
+    assert corrected[0]["faults"]["path"]["turn_deg"]["sigma"] > 0
 
 
 def test_corrected_cameras_lie_where_the_drone_flew(corrected: tuple[dict[str, Any], Path], faulty: Path) -> None:

@@ -1,74 +1,99 @@
 """Telemetry against the cameras that the pictures gave: how wrong it was, and the whole flight corrected by it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from math import inf
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from sorvolo.geometry.arrays import Floats, Mask
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
-from sorvolo.survey.corrected import Bias, TelemetryFaults
+from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
 from sorvolo.survey.flight import CameraPrior
 
 _FIXES_ALIKE = 1.5  # neighbouring fixes err alike: they are fewer than they look
-_LEAST_SCALE = 0.01  # a change of scale that matters: 30 cm in 30 m of height
+_LEAST_FIXES = 4  # a similarity has four unknowns; by choice
 _OUTLYING_DEG = 15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
+_MOST = 2 / 3  # of the frames whose angles must be off alike before a compass's error can be stated; by choice
+_MOST_ROUNDS = 20  # of moving to the middle of a group of angles
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
 
 
-def path_scale(priors: Sequence[CameraPrior], poses: Sequence[Pose]) -> Bias:
-    """By how much the fixes' path is larger than the solved one: 1 where heights and fixes agree.
+def path_fit(priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_sigma_s: float) -> PathFit:
+    """The similarity that takes the solved path to the fixes'.
 
-    The log's heights pull a map's scale when they are wrong, and the fixes' distances hold it: where the two contradict
-    each other over a long path, the distances are right. Fixes that most others contradict are left out.
+    The log's heights pull a map's scale when they are wrong, its compass the map's direction; the fixes' distances and
+    directions hold both: where the two contradict each other over a long path, the fixes are right. Fixes that most
+    others contradict are left out. What a clock that is off by `clock_sigma_s` does to the fit counts in its sigmas.
     """
     placed = [k for k, each in enumerate(priors) if each.knows_place]
-    if len(placed) < 4:
-        return _UNKNOWN
-    fixes, seen = (
+    if len(placed) < _LEAST_FIXES:
+        return PathFit(_UNKNOWN, _UNKNOWN)
+    fixes, seen, speeds = (
         np.array([each[k][:2] for k in placed]) @ np.array([1, 1j])
-        for each in ([prior.position_m for prior in priors], [pose.translation_m for pose in poses])
+        for each in (
+            [prior.position_m for prior in priors], [pose.translation_m for pose in poses],
+            [prior.velocity_m_s for prior in priors],
+        )
     )
     kept = np.ones(len(placed), bool)
-    scale, scatter = 1.0 + 0j, 0.0
+    factor, scatter, a = 1.0 + 0j, 0.0, seen
     for _ in range(3):
         a, b = seen - seen[kept].mean(), fixes - fixes[kept].mean()
-        scale = np.vdot(a[kept], b[kept]) / max(float(np.vdot(a[kept], a[kept]).real), 1e-9)
-        miss = np.abs(b - scale * a)
-        scatter = float(np.sqrt(np.mean(miss[kept] ** 2) / 2))
+        factor = np.vdot(a[kept], b[kept]) / _square(a[kept])
+        miss = np.abs(b - factor * a)
+        scatter = float(np.sqrt(np.sum(miss[kept] ** 2) / max(2 * int(kept.sum()) - 4, 1)))
         kept = miss <= 3 * max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(miss)), 1e-6)
-    reach = float(np.sqrt(np.sum(np.abs(seen[kept] - seen[kept].mean()) ** 2)))
-    return Bias(float(abs(scale)), _FIXES_ALIKE * scatter / max(reach, 1e-6), scatter)
+    size = float(abs(factor))
+    if size < 1e-6:
+        return PathFit(_UNKNOWN, _UNKNOWN)
+    by_chance = _FIXES_ALIKE * scatter / float(np.sqrt(_square(a[kept])))
+    by_clock = clock_sigma_s * np.vdot(a[kept], speeds[kept]) / _square(a[kept]) / factor
+    turn_sigma_deg = float(np.degrees(np.hypot(by_chance / size, by_clock.imag)))
+    return PathFit(
+        Bias(size, float(np.hypot(by_chance, size * by_clock.real)), scatter),
+        Bias(float(np.degrees(np.angle(factor))), turn_sigma_deg),
+    )
 
 
-def rescaled(poses: Sequence[Pose], scale: Bias) -> list[Pose]:
-    """The cameras with the fixes' scale, about the middle of their ground, where it is surely another than theirs."""
-    if not np.isfinite(scale.value) or abs(scale.value - 1) < max(3 * scale.sigma, _LEAST_SCALE):
-        return list(poses)
+def fitted(poses: Sequence[Pose], path: PathFit) -> list[Pose]:
+    """The cameras in the fixes' scale and direction, about the middle of their ground, where these surely differ."""
     middle_m = np.append(np.mean([each.translation_m[:2] for each in poses], axis=0), 0.0)
-    return [Pose(each.rotation, middle_m + scale.value * (each.translation_m - middle_m)) for each in poses]
+    turn = Rotation.from_euler("z", path.sure_turn_deg, degrees=True).as_matrix()
+    return [
+        Pose(turn @ each.rotation, middle_m + path.sure_scale * turn @ (each.translation_m - middle_m))
+        for each in poses
+    ]
 
 
 def telemetry_faults(
-    priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_s: Bias, scale: Bias, *, knows_height: bool
+    priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_s: Bias, path: PathFit, *, knows_height: bool
 ) -> TelemetryFaults:
     """How far telemetry's cameras, at the corrected clock, were off from the solved ones of the same frames.
 
-    `poses` have the fixes' scale (`rescaled`), whose uncertainty is that of the heights. `knows_height`: telemetry's
-    heights count from something that is taken for the ground; else they do not show it.
+    `poses` have the fixes' scale and direction (`fitted`); how well these are known counts in heights and headings.
+    The compass is measured against the direction of the fixes' path, since it may have turned the map itself.
+    `knows_height`: telemetry's heights count from something that is taken for the ground; else they do not show it.
     An error that all fixes share does not show in the pictures: `position_m` has the scatter alone.
     """
-    turned = np.array([_turn(prior.rotation, pose) for prior, pose in zip(priors, poses)]).reshape(-1, 3)
     knows_heading = np.array([np.isfinite(each.attitude_sigma_deg[2]) for each in priors], bool)
+    off_deg = np.array(
+        [_heading_and_tilt(prior.rotation, pose) for prior, pose in zip(priors, poses)]
+    ).reshape(-1, 3)[knows_heading]
     placed = np.array([each.knows_place for each in priors], bool)
     moved = np.array([prior.position_m - pose.translation_m for prior, pose in zip(priors, poses)]).reshape(-1, 3)
     scatter_m = _together([_bias(moved[placed, k]) for k in range(2)]).scatter / float(np.sqrt(2))
-    outlying, outlying_deg = _outlying(turned, knows_heading)
+    beside_deg = _beside_usual(off_deg)
+    near = beside_deg <= _OUTLYING_DEG
+    tilt_deg = _together([_bias(off_deg[near, k]) for k in (1, 2)])
     return TelemetryFaults(
-        clock_s, _bias(-turned[knows_heading, 2]), _together([_bias(turned[knows_heading, k]) for k in range(2)]),
-        _height(moved[placed, 2], poses, scale) if knows_height else _UNKNOWN,
-        Bias(0.0, float("nan"), scatter_m), outlying, outlying_deg,
+        clock_s, _heading(off_deg[:, 0], near, path), tilt_deg if _agree(near) else replace(tilt_deg, sigma=inf),
+        _height(moved[placed, 2], poses, path.scale) if knows_height else _UNKNOWN,
+        Bias(0.0, float("nan"), scatter_m), path, tuple(np.flatnonzero(knows_heading)[~near].tolist()),
+        float(np.median(beside_deg[~near])) if not near.all() else 0.0,
     )
 
 
@@ -81,14 +106,14 @@ def corrected_poses(
     `priors` are telemetry's cameras at `times_s`, `key_priors` those at the solved frames' times `key_s`; between two
     of these the correction changes evenly.
     """
-    turns = np.array([_turn(pose.rotation, Pose(prior.rotation, pose.translation_m))
-                      for prior, pose in zip(key_priors, key_poses)])
+    turns = Rotation.from_matrix([pose.rotation @ prior.rotation.T for prior, pose in zip(key_priors, key_poses)])
     shifts = np.array([pose.translation_m - prior.position_m for prior, pose in zip(key_priors, key_poses)])
+    within_s = np.clip(times_s, key_s[0], key_s[-1])
+    turned = Slerp(key_s, turns)(within_s).as_matrix() if len(key_s) > 1 else [turns[0].as_matrix()] * len(times_s)
     poses = []
-    for time_s, prior in zip(times_s, priors):
-        turn, shift = (np.array([np.interp(time_s, key_s, each[:, k]) for k in range(3)]) for each in (turns, shifts))
-        rotation = Rotation.from_rotvec(np.radians(turn)).as_matrix() @ prior.rotation
-        poses.append(Pose(_orthonormal(rotation), prior.position_m + shift))
+    for time_s, prior, turn in zip(times_s, priors, turned):
+        shift = np.array([np.interp(time_s, key_s, shifts[:, k]) for k in range(3)])
+        poses.append(Pose(_orthonormal(turn @ prior.rotation), prior.position_m + shift))
     return poses
 
 
@@ -97,23 +122,77 @@ def even_times_s(key_s: Sequence[float], step_s: float) -> list[float]:
     return [float(each) for each in np.arange(min(key_s), max(key_s) + step_s / 2, step_s)]
 
 
-def _turn(rotation: Floats, pose: Pose) -> Floats:
-    """(3,) the turn about east, north and up that takes the pose's rotation to this one, degrees."""
-    return np.degrees(Rotation.from_matrix(rotation @ pose.rotation.T).as_rotvec())
+def _square(numbers: NDArray[np.complex128]) -> float:
+    """The sum of the squares of these numbers' sizes, never 0."""
+    return max(float(np.vdot(numbers, numbers).real), 1e-9)
 
 
-def _outlying(turned_deg: Floats, knows_heading: Mask) -> tuple[tuple[int, ...], float]:
-    """Which frames' angles are far beside what the flight's usually are off, and by how much in the median, deg.
+def _heading_and_tilt(rotation: Floats, pose: Pose) -> Floats:
+    """(3,) how far a rotation is turned from the pose's: clockwise about the vertical, the rest about east and north,
+    degrees."""
+    turn = Rotation.from_matrix(rotation @ pose.rotation.T)
+    _, _, about_up, real = turn.as_quat()
+    about_up_rad = 2 * np.arctan2(about_up, real)
+    tilt_rad = (turn * Rotation.from_euler("z", -about_up_rad)).as_rotvec()
+    return np.degrees([-about_up_rad, *tilt_rad[:2]])
+
+
+def _beside_usual(off_deg: Floats) -> Floats:
+    """(N,) how far each frame's angles lie beside what the flight's usually are off, (N, 3), degrees.
 
     A compass that hangs, or a strip whose pictures are turned by half a turn, hides behind the flight's median.
     """
-    rows = np.flatnonzero(knows_heading)
-    if not len(rows):
-        return (), 0.0
-    beside_deg = np.linalg.norm(turned_deg[rows] - np.median(turned_deg[rows], axis=0), axis=1)
-    beside_deg = np.minimum(beside_deg, 360.0 - beside_deg)
-    far = beside_deg > _OUTLYING_DEG
-    return tuple(rows[far].tolist()), float(np.median(beside_deg[far])) if far.any() else 0.0
+    if not len(off_deg):
+        return np.zeros(0)
+    heading_deg = _wrapped(off_deg[:, 0] - _usual_angle(off_deg[:, 0]))
+    alike = np.abs(heading_deg) <= _OUTLYING_DEG
+    return np.hypot(heading_deg, np.linalg.norm(off_deg[:, 1:] - np.median(off_deg[alike, 1:], axis=0), axis=1))
+
+
+def _usual_angle(angles_deg: Floats) -> float:
+    """The median of those angles that most others are near, degrees; they may lie anywhere on the circle.
+
+    Of two groups that are nearly as large, the one nearer to 0: a small error is likelier than half a turn.
+    """
+    ordered_deg = np.sort(angles_deg % 360.0)
+    around_deg = np.concatenate([ordered_deg - 360.0, ordered_deg, ordered_deg + 360.0])
+    first, last = (
+        np.searchsorted(around_deg, ordered_deg + side * _OUTLYING_DEG, "left" if side < 0 else "right")
+        for side in (-1, 1)
+    )
+    large_deg = _wrapped(ordered_deg[2 * (last - first) >= np.max(last - first)])
+    usual_deg = float(large_deg[np.argmin(np.abs(large_deg))])
+    for _ in range(_MOST_ROUNDS):  # the first guess may lie at the edge of its group
+        beside_deg = _wrapped(angles_deg - usual_deg)
+        step_deg = float(np.median(beside_deg[np.abs(beside_deg) <= _OUTLYING_DEG]))
+        usual_deg += step_deg
+        if abs(step_deg) < 1e-9:
+            break
+    return usual_deg
+
+
+def _wrapped(angles_deg: Floats) -> Floats:
+    """The same angles from -180 to 180 degrees."""
+    return (angles_deg + 180.0) % 360.0 - 180.0
+
+
+def _agree(near: Mask) -> bool:
+    """Whether so many frames' angles are off alike that one error can be stated for all."""
+    return bool(len(near)) and float(near.mean()) >= _MOST
+
+
+def _heading(off_deg: Floats, near: Mask, path: PathFit) -> Bias:
+    """The compass's error by those frames that agree; its sigma is infinite where too few do, or fixes are too few."""
+    if not len(off_deg):
+        return _UNKNOWN
+    usual_deg = _usual_angle(off_deg)
+    found = _bias(_wrapped(off_deg[near] - usual_deg))
+    value_deg, sigma_deg = usual_deg + found.value, inf
+    if np.isfinite(path.turn_deg.value):
+        value_deg += path.turn_deg.value - path.sure_turn_deg
+        if _agree(near):
+            sigma_deg = float(np.hypot(found.sigma, path.turn_deg.sigma))
+    return Bias(float(_wrapped(np.asarray(value_deg))), sigma_deg, found.scatter)
 
 
 def _height(errors_m: Floats, poses: Sequence[Pose], scale: Bias) -> Bias:
@@ -131,7 +210,7 @@ def _together(parts: Sequence[Bias]) -> Bias:
 
 
 def _bias(values: Floats) -> Bias:
-    """The median, its uncertainty and the scatter about it; angles of a flight lie far from the turn of the circle."""
+    """The median, its uncertainty and the scatter about it."""
     if not len(values):
         return _UNKNOWN
     middle = float(np.median(values))

@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass
 
+_LEAST_SCALE = 0.01  # a change of scale that matters: 30 cm in 30 m of height
+_LEAST_TURN_DEG = 0.5  # a turn that matters: 45 cm at 50 m from the path's middle
+
 
 @dataclass(frozen=True)
 class CorrectedFrame:
@@ -44,16 +47,42 @@ class Bias:
 
 
 @dataclass(frozen=True)
+class PathFit:
+    """The fixes' path held against the one that the pictures gave: how many times as large it is, and by how much it is
+    turned, counter-clockwise as seen from above. NaN where there are too few fixes."""
+
+    scale: Bias
+    turn_deg: Bias
+
+    @property
+    def sure_scale(self) -> float:
+        """The scale where it is surely another than the map's, else 1."""
+        departure = abs(self.scale.value - 1)
+        return self.scale.value if departure > max(3 * self.scale.sigma, _LEAST_SCALE) else 1.0
+
+    @property
+    def sure_turn_deg(self) -> float:
+        """The turn where there surely is one, else 0."""
+        return self.turn_deg.value if abs(self.turn_deg.value) > max(3 * self.turn_deg.sigma, _LEAST_TURN_DEG) else 0.0
+
+
+AS_THE_MAP = PathFit(Bias(1.0, 0.0), Bias(0.0, 0.0))
+"""Of a map whose scale and direction are known from the ground, better than from the flight's fixes."""
+
+
+@dataclass(frozen=True)
 class TelemetryFaults:
     """What was wrong with a flight's telemetry. `clock_s` is telemetry's clock less the video's; `heading_deg` positive
-    where the compass read too far clockwise; `tilt_deg` how far the camera looked from its stated direction, sideways
-    and forward together; `height_m` positive where the log was too high above the ground. `outlying` are the rows of
-    compared frames whose stated angles are far beside what those of the others are off, `outlying_deg` their median."""
+    where the compass read too far clockwise, its sigma infinite where it cannot be known; `tilt_deg` how far the camera
+    looked from its stated direction, sideways and forward together; `height_m` positive where the log was too high
+    above the ground. `path` is the fixes' path held against the map. `outlying` are the rows of compared frames whose
+    stated angles are far beside what those of the others are off, `outlying_deg` their median."""
 
     clock_s: Bias
     heading_deg: Bias
     tilt_deg: Bias
     height_m: Bias
     position_m: Bias
+    path: PathFit
     outlying: tuple[int, ...] = ()
     outlying_deg: float = 0.0

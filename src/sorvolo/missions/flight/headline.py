@@ -23,6 +23,9 @@ class MapQuality(StrEnum):
     ONE_VIEW = "one-view"  # no map: the whole flight shows one piece of ground from one place
 
 
+_DOUBTED = (MapQuality.DOUBTFUL, MapQuality.CONTRADICTORY, MapQuality.ONE_VIEW)
+
+
 @dataclass(frozen=True)
 class Headline:
     """The first line of a flight's report."""
@@ -53,6 +56,14 @@ def contradicts_itself(report: Mapping[str, Any]) -> bool:
     """Whether the map of a flight, by its report, contradicts itself."""
     headline = report.get("headline")
     return isinstance(headline, dict) and headline.get("quality") == MapQuality.CONTRADICTORY
+
+
+def doubt_about(report: Mapping[str, Any]) -> str:
+    """The headline of a flight, by its report, where it doubts the map; else nothing."""
+    headline = report.get("headline")
+    if not isinstance(headline, dict) or headline.get("quality") not in _DOUBTED:
+        return ""
+    return str(headline.get("text"))
 
 
 def _one_view(figures: FlightFigures, seen: int) -> str:

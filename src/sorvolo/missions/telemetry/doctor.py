@@ -6,7 +6,7 @@ from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
-from sorvolo.capture.correction import corrected_poses, even_times_s, path_scale, rescaled, telemetry_faults
+from sorvolo.capture.correction import corrected_poses, even_times_s, fitted, path_fit, telemetry_faults
 from sorvolo.capture.flight_telemetry import FlightTelemetry
 from sorvolo.capture.live.klv_mux import mux_klv
 from sorvolo.capture.source import Source, opened_sources
@@ -14,6 +14,7 @@ from sorvolo.capture.video import VideoSource
 from sorvolo.errors import InputError
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation
+from sorvolo.missions.flight.headline import doubt_about
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.telemetry.words import fault_sentences
@@ -24,10 +25,12 @@ from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.exports.telemetry_files import cot_track, geo_txt, track_csv, track_gpx
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
-from sorvolo.survey.corrected import Bias, CorrectedFrame, TelemetryFaults
+from sorvolo.survey.control import ControlRole
+from sorvolo.survey.corrected import AS_THE_MAP, Bias, CorrectedFrame, TelemetryFaults
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
+_HOLDING = 2  # control points that hold a map's scale and direction
 _KLV_STEP_S = 0.2  # between samples, five a second; by choice
 
 
@@ -78,14 +81,15 @@ def correct_telemetry(
             raise InputError(f"{site_folder} was mapped without GPS: its cameras have no place on Earth to write down")
         if source is None:
             name = _flight(archive, flight)
-            return _written(site, name, folder, _solved(archive, name, 0), None, cot)
+            return _written(site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot)
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
             name = _flight(archive, flight or opened.name)
             setup = prepare(opened, MapSettings(), site, telemetry_named=telemetry is not None)
             solved = _solved(archive, name, _first_ns(setup))
-            solved, compared = _compared(setup, solved, archive.report(name))
-            return _written(site, name, folder, solved, compared, cot)
+            mapped = archive.report(name)
+            solved, compared = _compared(setup, solved, mapped)
+            return _written(site, name, folder, solved, compared, mapped, cot)
 
 
 def _flight(archive: Archive, wanted: str) -> str:
@@ -117,18 +121,26 @@ def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
 def _compared(
     setup: FlightSetup, solved: Sequence[_Solved], report: Mapping[str, Any]
 ) -> tuple[list[_Solved], _Compared]:
-    """The cameras in the fixes' own scale, and what was wrong with the telemetry by the frames that pictures placed."""
+    """The cameras in the fixes' own scale and direction, and what was wrong with the telemetry by the frames that
+    pictures placed."""
     track = setup.telemetry
     seen = [number for number, each in enumerate(solved) if each.stored.status is Status.VISION]
     if track is None or not seen:
         raise InputError("no frame of the flight was placed by its pictures: telemetry has nothing to be compared with")
     clock, applied_s = _clock(report)
     priors = track.priors([solved[k].seconds for k in seen], applied_s, setup.plan.smooth_s)
-    scale = path_scale(priors, [solved[k].pose for k in seen])
-    poses = rescaled([each.pose for each in solved], scale)
-    faults = telemetry_faults(priors, [poses[k] for k in seen], clock, scale, knows_height=track.knows_ground)
-    scaled = [replace(each, pose=pose) for each, pose in zip(solved, poses)]
-    return scaled, _Compared(setup, track, applied_s, faults, [solved[k].stored.name for k in seen])
+    sigma_s = clock.sigma if isfinite(clock.sigma) else track.clock.sigma_s
+    path = AS_THE_MAP if _is_tied(report) else path_fit(priors, [solved[k].pose for k in seen], sigma_s)
+    poses = fitted([each.pose for each in solved], path)
+    faults = telemetry_faults(priors, [poses[k] for k in seen], clock, path, knows_height=track.knows_ground)
+    moved = [replace(each, pose=pose) for each, pose in zip(solved, poses)]
+    return moved, _Compared(setup, track, applied_s, faults, [solved[k].stored.name for k in seen])
+
+
+def _is_tied(report: Mapping[str, Any]) -> bool:
+    """Whether a base map or control points hold the map's scale and direction."""
+    points = (report.get("control") or {}).get("points", [])
+    return bool(report.get("base")) or sum(each["role"] == ControlRole.CONTROL for each in points) >= _HOLDING
 
 
 def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
@@ -140,7 +152,7 @@ def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
 
 def _written(
     site: Site, name: str, folder: Path, solved: Sequence[_Solved], compared: _Compared | None,
-    cot: CotReceiver | None,
+    mapped: Mapping[str, Any], cot: CotReceiver | None,
 ) -> dict[str, Any]:
     frames = [_frame(each, site) for each in solved]
     with writing(folder):
@@ -163,7 +175,7 @@ def _written(
         "faults": None if compared is None else asdict(compared.faults),
         "sentences": [] if compared is None else fault_sentences(compared.faults, compared.names),
         "files": files,
-        "warnings": _warnings(site),
+        "warnings": _warnings(site, mapped),
     }))
     atomic_write_bytes(folder / "telemetry.json", json_bytes(report))
     sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
@@ -212,10 +224,12 @@ def _row(
     )
 
 
-def _warnings(site: Site) -> list[str]:
-    if site.height_reference in ("ellipsoidal", "orthometric"):
-        return []
-    return [
-        f"heights are {site.height_reference}: geo.txt, GPX and CSV hold them as such, and KLV and Cursor on Target "
-        "leave the height out, since both want it above the ellipsoid or the sea"
-    ]
+def _warnings(site: Site, mapped: Mapping[str, Any]) -> list[str]:
+    """Doubts about the map that all is measured by, and what the files leave out."""
+    warnings = [doubt] if (doubt := doubt_about(mapped)) else []
+    if site.height_reference not in ("ellipsoidal", "orthometric"):
+        warnings.append(
+            f"heights are {site.height_reference}: geo.txt, GPX and CSV hold them as such, and KLV and Cursor on "
+            "Target leave the height out, since both want it above the ellipsoid or the sea"
+        )
+    return warnings

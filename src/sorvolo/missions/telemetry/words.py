@@ -3,20 +3,21 @@
 from collections.abc import Sequence
 from math import isfinite
 
-from sorvolo.survey.corrected import Bias, TelemetryFaults
+from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
 from sorvolo.survey.wording import counted
 
 _LEAST = {"clock": 0.04, "heading": 0.5, "tilt": 0.5, "height": 0.3}  # s, deg, deg, m: smaller ones matter to nobody
 
 
 _MOST_NAMED = 6  # frames in a sentence
+_NOT_KNOWN_DEG = 10.0  # a compass that is right within more than this says nothing about it; by choice
 
 
 def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     """One sentence for each quantity that telemetry states; `names` are those of the compared frames."""
     return [
-        *_clock(faults.clock_s), *_heading(faults.heading_deg), *_outlying(faults, names), *_tilt(faults.tilt_deg),
-        *_height(faults.height_m),
+        *_clock(faults.clock_s), *_heading(faults.heading_deg, faults.path), *_outlying(faults, names),
+        *_tilt(faults.tilt_deg), *_height(faults.height_m), *_map(faults.path),
         f"fixes scatter by {faults.position_m.scatter:.2f} m about the path in the pictures (1 sigma per axis)",
     ]
 
@@ -25,21 +26,45 @@ def _clock(found: Bias) -> list[str]:
     if not isfinite(found.value):
         return ["the clocks cannot be compared: the motion does not show an offset"]
     if abs(found.value) < _LEAST["clock"] or not found.is_significant:
-        return [f"the clocks agree within {max(2 * found.sigma, 0.01):.2f} s"]
+        return [f"the clocks agree within {_within(found, 0.01):.2f} s"]
     side = "ahead of" if found.value > 0 else "behind"
     return [f"the telemetry's clock was {abs(found.value):.2f} s {side} the pictures (1 sigma {found.sigma:.2f} s)"]
 
 
-def _heading(found: Bias) -> list[str]:
+def _heading(found: Bias, path: PathFit) -> list[str]:
     if not isfinite(found.value):
         return ["telemetry has no heading to compare"]
+    if not 2 * found.sigma <= _NOT_KNOWN_DEG:
+        return [f"whether the compass was right cannot be known: {_why_unknown(path)}"]
     if abs(found.value) < _LEAST["heading"] or not found.is_significant:
-        return [f"the compass was right within {max(2 * found.sigma, 0.1):.1f} deg"]
+        return [f"the compass was right within {_within(found, 0.1):.1f} deg"]
     side = "clockwise" if found.value > 0 else "counter-clockwise"
     return [
         f"the compass was {abs(found.value):.1f} deg off, too far {side} (1 sigma {found.sigma:.1f} deg; scatter "
         f"{found.scatter:.1f} deg)"
     ]
+
+
+def _why_unknown(path: PathFit) -> str:
+    if not isfinite(path.turn_deg.value):
+        return "too few frames have a fix"
+    if 2 * path.turn_deg.sigma > _NOT_KNOWN_DEG:
+        return f"the GPS track is too short for its scatter (its direction: 1 sigma {path.turn_deg.sigma:.0f} deg)"
+    return "the frames' angles disagree with each other"
+
+
+def _map(path: PathFit) -> list[str]:
+    """What the corrected files were changed by against the map."""
+    found = []
+    if path.sure_scale != 1:
+        found.append(f"{1 / path.sure_scale:.2f} times as large as its GPS track")
+    if path.sure_turn_deg:
+        side = "clockwise" if path.sure_turn_deg > 0 else "counter-clockwise"
+        found.append(
+            f"turned by {abs(path.sure_turn_deg):.1f} deg {side} against {'it' if found else 'its GPS track'} (1 sigma "
+            f"{path.turn_deg.sigma:.1f} deg)"
+        )
+    return [f"the map is {' and '.join(found)}: the corrected cameras follow the track"] if found else []
 
 
 def _outlying(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
@@ -48,7 +73,7 @@ def _outlying(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     known = [names[row] for row in faults.outlying]
     more = f" and {len(known) - _MOST_NAMED} more" if len(known) > _MOST_NAMED else ""
     return [
-        f"the stated angles of {counted(len(known), 'frame')} of {len(names)} are far beside that, by "
+        f"the stated angles of {counted(len(known), 'frame')} of {len(names)} are far beside the others', by "
         f"{faults.outlying_deg:.0f} deg in the median, so that places by telemetry alone are wrong there: "
         f"{', '.join(known[:_MOST_NAMED])}{more}"
     ]
@@ -64,6 +89,11 @@ def _height(found: Bias) -> list[str]:
     if not isfinite(found.value):
         return ["telemetry has no height above the ground to compare"]
     if abs(found.value) < _LEAST["height"] or not found.is_significant:
-        return [f"heights above the ground were right within {max(2 * found.sigma, 0.1):.1f} m"]
+        return [f"heights above the ground were right within {_within(found, 0.1):.1f} m"]
     side = "too high" if found.value > 0 else "too low"
     return [f"heights above the ground were {abs(found.value):.1f} m {side} (1 sigma {found.sigma:.1f} m)"]
+
+
+def _within(found: Bias, least: float) -> float:
+    """What an error that is not significant hardly exceeds (2 sigma)."""
+    return max(abs(found.value) + 2 * found.sigma, least)
