@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sorvolo.capture.correction import headings_deg
 from sorvolo.capture.live.klv import ITEMS, UNIVERSAL_KEY, LocalSet, checksum, encode, local_sets
+from sorvolo.capture.live.klv_mux import packet_of
 from sorvolo.capture.live.klv_telemetry import (
     camera_of,
     columns_of,
@@ -17,7 +19,13 @@ from sorvolo.capture.live.klv_telemetry import (
     site_from_sensor_rotation,
 )
 from sorvolo.errors import InputError
-from sorvolo.geometry.pose import gimbal_angles_from_rotation
+from sorvolo.geometry.pose import (
+    Pose,
+    gimbal_angles_from_rotation,
+    rotation_from_vector,
+    site_from_gimbal_rotation,
+)
+from sorvolo.survey.corrected import Bias, CorrectedFrame
 
 _TIME_NS = 1_760_000_000_123_456_000
 
@@ -190,3 +198,46 @@ def test_the_lens_from_the_field_of_view() -> None:
     cut = camera_of(one(encode(0, both | {"sensor_vertical_fov_deg": 46.0})), 1000, 500)
     assert cut is not None and cut.camera.fy_px == cut.camera.fx_px
     assert camera_of(one(encode(0, {})), 1000, 500) is None
+
+
+# ---- corrected metadata ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 0.5, 20.0, 80.0])
+def test_the_aircrafts_heading_stays_and_the_camera_is_read_back_as_it_was(tilt_deg: float) -> None:
+    """A straight flight to the east whose camera sways about straight down, or about an oblique view to the south."""
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        sway = rotation_from_vector(np.radians(rng.normal(0, 0.5, 3)))
+        rotation = sway @ site_from_gimbal_rotation(180.0, tilt_deg - 90, 0.0)
+        yaw_deg, pitch_deg, roll_deg = gimbal_angles_from_rotation(rotation)
+        sample = CorrectedFrame(
+            "", 0, _TIME_NS, 0.0, 41.9, 12.6, 70.0, 40.0, yaw_deg, pitch_deg, roll_deg, nan, 60.0, 40.0, ""
+        )
+        found = one(packet_of(sample, 90.0, "ellipsoidal"))
+        assert found["platform_heading_deg"] == pytest.approx(90, abs=0.01)
+        columns = columns_of(found)
+        read = site_from_gimbal_rotation(*(columns[f"camera_{name}_deg"] for name in ("yaw", "pitch", "roll")))
+        assert np.abs(read - rotation).max() < 2e-4  # 0.01 deg
+
+
+def _flown(speed_m_s: float) -> tuple[np.ndarray, list[Pose]]:
+    """Five seconds to the east, then as many at a standstill, the pictures' top to the south."""
+    times_s = np.arange(0, 10, 0.2)
+    top_south = site_from_gimbal_rotation(180.0, -90.0, 0.0)
+    return times_s, [Pose(top_south, np.array([speed_m_s * min(each, 5.0), 0.0, 40.0])) for each in times_s]
+
+
+def test_the_aircrafts_heading_is_the_logs_less_the_compasss_error() -> None:
+    times_s, poses = _flown(5.0)
+    stated_deg = np.full(len(times_s), 3.0)
+    assert headings_deg(stated_deg, Bias(7.0, 0.2), times_s, poses) == pytest.approx([356.0] * len(times_s))
+    assert headings_deg(stated_deg, Bias(7.0, 4.0), times_s, poses) == pytest.approx([3.0] * len(times_s))
+
+
+def test_without_a_stated_heading_it_is_the_course_and_hovering_keeps_it() -> None:
+    unknown = np.full(50, nan)
+    times_s, poses = _flown(5.0)
+    assert headings_deg(unknown, Bias(7.0, 0.2), times_s, poses) == pytest.approx([90.0] * 50)
+    times_s, poses = _flown(0.0)
+    assert headings_deg(unknown, Bias(nan, nan), times_s, poses) == pytest.approx([180.0] * 50)

@@ -248,6 +248,30 @@ def test_the_video_gets_corrected_metadata_and_keeps_its_pictures(
     assert across_deg == pytest.approx(float(rows[0]["horizontal_fov_deg"]), abs=0.05)
 
 
+def test_the_metadata_has_the_aircrafts_heading(corrected: tuple[dict[str, Any], Path], faulty: Path) -> None:
+    """Tag 5 on the straight stretches is where the drone flew, without the 7 degrees that its compass was off; it swung
+    all round where the camera looked straight down."""
+    metadata = read_klv_file(corrected[1] / "out" / "flight1.ts")
+    assert metadata is not None
+    samples = metadata.telemetry
+    true = [
+        each["properties"] for each in json.loads((faulty / "truth" / "frames.geojson").read_text())["features"]
+        if each["properties"]["flight"] == "flight1"
+    ]
+    path_m = np.array([[each["camera_longitude_deg"] * np.cos(np.radians(41.9)), each["camera_latitude_deg"]]
+                       for each in true]) * 111_200
+    steps_m = np.diff(path_m, axis=0)
+    courses_deg = np.degrees(np.arctan2(steps_m[:, 0], steps_m[:, 1]))
+    off_deg = []
+    for row in range(len(samples)):
+        frame = round(float(samples.video_time_ns[row]) / 1e9 * 6)  # six frames a second
+        around_deg = courses_deg[max(frame - 4, 0): frame + 4]
+        if len(around_deg) and np.abs((around_deg - around_deg[0] + 180) % 360 - 180).max() < 3:
+            off_deg.append((samples["body_yaw_deg"][row] - around_deg[0] + 180) % 360 - 180)
+    assert len(off_deg) > 20
+    assert np.abs(off_deg).max() < 6 and abs(np.median(off_deg)) < 2
+
+
 def test_files_for_other_programs_hold_the_same_places(corrected: tuple[dict[str, Any], Path]) -> None:
     out = corrected[1] / "out"
     rows = list(csv.DictReader((out / "track.csv").read_text().splitlines()))

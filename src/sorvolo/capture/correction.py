@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, Rows
 from sorvolo.geometry.pose import Pose
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
@@ -18,6 +18,8 @@ _FIXES_ALIKE = 1.5  # neighbouring fixes err alike: they are fewer than they loo
 _LEAST_FIXES = 4  # a similarity has four unknowns; by choice
 _OUTLYING_DEG = 15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
 _MOST = 2 / 3  # of the frames whose angles must be off alike before a compass's error can be stated; by choice
+_COURSE_S = 1.0  # to both sides of a moment: over them a course is taken
+_HOVERING_M_S = 0.5  # below, a course is that of the gusts
 _MOST_ROUNDS = 20  # of moving to the middle of a group of angles
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
 
@@ -117,9 +119,47 @@ def corrected_poses(
     return poses
 
 
+def headings_deg(stated_deg: Floats, compass: Bias, times_s: Sequence[float], poses: Sequence[Pose]) -> list[float]:
+    """The aircraft's heading at these moments, clockwise from north: as stated, (N,), less what the compass was surely
+    off; NaN there: the course over ground, that of the nearest moment where it hovers.
+
+    A flight that hovers all along is given the direction of its pictures' top.
+    """
+    known = np.isfinite(stated_deg)
+    if known.any():
+        error_deg = compass.value if compass.is_significant else 0.0
+        pointing = np.exp(1j * np.radians(stated_deg[known] - error_deg))
+    else:
+        pointing, known = _courses(np.asarray(times_s), np.array([each.translation_m[:2] for each in poses]))
+    if not known.any():
+        known = np.ones(len(poses), bool)
+        pointing = np.array([-each.rotation[1, 1] - 1j * each.rotation[0, 1] for each in poses])
+    nearest = _nearest(np.flatnonzero(known), len(poses))
+    return [float(each) for each in np.degrees(np.angle(pointing))[nearest] % 360.0]
+
+
 def even_times_s(key_s: Sequence[float], step_s: float) -> list[float]:
     """Moments from the first solved frame to the last, so far apart."""
     return [float(each) for each in np.arange(min(key_s), max(key_s) + step_s / 2, step_s)]
+
+
+def _courses(times_s: Floats, path_m: PointsM) -> tuple[NDArray[np.complex128], Mask]:
+    """The velocity over ground, north and east as a complex number, m/s, at those moments of a path, (N, 2), where the
+    aircraft moves; and which these are, (N,)."""
+    before, after = (np.searchsorted(times_s, times_s + side * _COURSE_S) for side in (-1, 1))
+    after = np.minimum(after, len(times_s) - 1)
+    passed_s = np.maximum(times_s[after] - times_s[before], 1e-6)
+    velocity = (path_m[after] - path_m[before]) @ np.array([1j, 1]) / passed_s
+    moves = np.abs(velocity) >= _HOVERING_M_S
+    return velocity[moves], moves
+
+
+def _nearest(known: Rows, count: int) -> Rows:
+    """(count,) for each row the place in `known`, which is in order, of the row nearest to it."""
+    after = np.minimum(np.searchsorted(known, np.arange(count)), len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(known[before] - np.arange(count)) < np.abs(known[after] - np.arange(count))
+    return np.where(is_before, before, after)
 
 
 def _square(numbers: NDArray[np.complex128]) -> float:

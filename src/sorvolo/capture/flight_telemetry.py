@@ -124,6 +124,17 @@ class FlightTelemetry:
         moved = shifted(self._whole(), offset_s)
         return [moved.prior(each, smooth_s=smooth_s) for each in seconds]
 
+    def body_headings_deg(self, seconds: Sequence[float], offset_s: float) -> Floats:
+        """(N,) the aircraft's own heading as telemetry states it at N seconds of the video, under another clock offset,
+        clockwise from north; NaN where it largely states none."""
+        stated = self.samples["body_yaw_deg"]
+        known = np.isfinite(stated)
+        if known.mean() < _LARGELY:
+            return np.full(len(seconds), np.nan)
+        pointing = np.exp(1j * np.radians(stated[known]))
+        times_s = shifted(self.track, offset_s).sample_s[known]
+        return np.degrees(np.angle(np.interp(seconds, times_s, pointing))) % 360.0
+
     def ground_height(self, ground_up_m: float) -> tuple[float, str]:
         """The height of ground that lies at `ground_up_m` by the track's heights, in telemetry's reference; which that
         is. 0 "above ground" where telemetry has heights above take-off alone."""

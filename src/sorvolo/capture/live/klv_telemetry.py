@@ -66,6 +66,15 @@ def site_from_sensor_rotation(
     return site_from_gimbal_rotation(*platform_deg) @ _LEVEL_FROM_CAMERA.T @ site_from_gimbal_rotation(*relative_deg)
 
 
+def relative_angles(
+    platform_deg: tuple[float, float, float], site_from_camera_rotation: Matrix3
+) -> tuple[float, float, float]:
+    """Azimuth, elevation and roll relative to the platform, deg, of a camera that stands so: the inverse of
+    `site_from_sensor_rotation`."""
+    site_from_platform = site_from_gimbal_rotation(*platform_deg) @ _LEVEL_FROM_CAMERA.T
+    return gimbal_angles_from_rotation(site_from_platform.T @ site_from_camera_rotation)
+
+
 def ground_elevation_m(stated: LocalSet) -> float:
     """The ground's height at the frame's centre in the reference of the sensor's own height; NaN where unknown.
 

@@ -6,7 +6,14 @@ from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
-from sorvolo.capture.correction import corrected_poses, even_times_s, fitted, path_fit, telemetry_faults
+from sorvolo.capture.correction import (
+    corrected_poses,
+    even_times_s,
+    fitted,
+    headings_deg,
+    path_fit,
+    telemetry_faults,
+)
 from sorvolo.capture.flight_telemetry import FlightTelemetry
 from sorvolo.capture.live.klv_mux import mux_klv
 from sorvolo.capture.source import Source, opened_sources
@@ -168,7 +175,7 @@ def _written(
     video = None if compared is None else _video(compared.setup.source)
     if compared is not None and video is not None:
         with atomic_path(folder / f"{name}.ts") as temporary:
-            mux_klv(video, temporary, _samples(compared, solved, site), site.height_reference)
+            mux_klv(video, temporary, *_samples(compared, solved, site), site.height_reference)
         files.append(f"{name}.ts")
     report = dict(plain_json({
         "flight": name, "site": site.name, "frames": len(frames), "height_reference": site.height_reference,
@@ -187,8 +194,11 @@ def _video(source: Source) -> Path | None:
     return source.info.path if isinstance(source, VideoSource) else None
 
 
-def _samples(compared: _Compared, solved: Sequence[_Solved], site: Site) -> list[CorrectedFrame]:
-    """The corrected camera five times a second, by the telemetry between the solved frames."""
+def _samples(
+    compared: _Compared, solved: Sequence[_Solved], site: Site
+) -> tuple[list[CorrectedFrame], list[float]]:
+    """The corrected camera five times a second, by the telemetry between the solved frames; and the aircraft's
+    headings, deg."""
     smooth_s = compared.setup.plan.smooth_s
     key_s = [each.seconds for each in solved]
     times_s = even_times_s(key_s, _KLV_STEP_S)
@@ -196,10 +206,12 @@ def _samples(compared: _Compared, solved: Sequence[_Solved], site: Site) -> list
     priors = compared.track.priors(times_s, compared.applied_s, smooth_s)
     poses = corrected_poses(times_s, priors, key_s, key_priors, [each.pose for each in solved])
     stored, first_ns = solved[0].stored, _first_ns(compared.setup)
-    return [
+    stated_deg = compared.track.body_headings_deg(times_s, compared.applied_s)
+    rows = [
         _row("", number, first_ns + round(time_s * 1e9), time_s, pose, stored.camera, nan, "interpolated", site)
         for number, (time_s, pose) in enumerate(zip(times_s, poses))
     ]
+    return rows, headings_deg(stated_deg, compared.faults.heading_deg, times_s, poses)
 
 
 def _frame(each: _Solved, site: Site) -> CorrectedFrame:
