@@ -326,6 +326,27 @@ def test_a_sound_log_is_called_sound(filmed: Path, tmp_path: Path) -> None:
     assert (tmp_path / "alone" / "geo.txt").read_text() == (tmp_path / "out" / "geo.txt").read_text()
 
 
+def test_results_go_into_the_folder_of_their_flight(
+    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a map alone too; and such a run does not take the place of a diagnosis."""
+    site, results = tmp_path / "field", tmp_path / "field-telemetry"
+    shutil.copytree(corrected[1] / "site", site)
+    assert main(["telemetry", str(site)]) == 0
+    assert [each.name for each in results.iterdir()] == ["flight1"]
+    assert "no diagnosis was made" in capsys.readouterr().out
+    video = [str(faulty / "flight1" / "flight1.mp4"), "--camera", str(faulty / "camera.xml")]
+    assert main(["telemetry", *video, "--site", str(site)]) == 0
+    assert "no diagnosis" not in capsys.readouterr().out
+    diagnosed = {each.name: each.read_bytes() for each in (results / "flight1").iterdir()}
+    assert "flight1.ts" in diagnosed and [each.name for each in results.iterdir()] == ["flight1"]
+    assert main(["telemetry", str(site), "--flight", "flight1"]) == 1
+    assert "has the diagnosis of flight1" in capsys.readouterr().err
+    assert {each.name: each.read_bytes() for each in (results / "flight1").iterdir()} == diagnosed
+    assert main(["telemetry", str(site), "--out", str(tmp_path / "other")]) == 0
+    assert json.loads((tmp_path / "other" / "telemetry.json").read_text())["faults"] is None
+
+
 def test_what_is_missing_is_named(filmed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["telemetry", str(filmed / "flight1" / "flight1.mp4")]) == 1
     assert "--site" in capsys.readouterr().err

@@ -54,7 +54,7 @@ def telemetry_command(
 
     Example: sorvolo telemetry field --flight DJI_0042
     """
-    from sorvolo.missions.telemetry.doctor import correct_telemetry
+    from sorvolo.missions.telemetry.doctor import chosen_flight, correct_telemetry
     from sorvolo.missions.watch.cot_sender import CotTls
     from sorvolo.store.site.catalogue_place import is_site
 
@@ -63,18 +63,14 @@ def telemetry_command(
         raise SettingsError("give a flight and --site FOLDER, or the folder of a map alone")
     receiver = _receiver(cot, CotTls(cot_ca, cot_cert)) if cot else None
     with opened_site(site or source, writes=bool(site)) as place:
-        if site:
-            _map_if_new(Path(source), place, telemetry, camera)
-        target = out or _results(place, flight, source)
+        of_source = _map_if_new(Path(source), place, telemetry, camera) if site else ""
+        chosen = chosen_flight(place.folder, flight or of_source)
+        target = out or place.results("telemetry") / chosen
         report = correct_telemetry(
-            place.folder, target, flight=flight, source=None if from_site else Path(source),
+            place.folder, target, flight=chosen, source=None if from_site else Path(source),
             telemetry=telemetry or None, camera=camera or None, cot=receiver,
         )
     _print(report, target, as_json=as_json)
-
-
-def _results(place: OpenedSite, flight: str, source: str) -> Path:
-    return place.results("telemetry") / (flight or Path(source.rstrip("/")).stem)
 
 
 def _print(report: Mapping[str, Any], target: Path, *, as_json: bool) -> None:
@@ -108,17 +104,19 @@ def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
         show_path("written", target / name, console)
 
 
-def _map_if_new(source: Path, place: OpenedSite, telemetry: str, camera: str) -> None:
-    """Map the flight where the site does not have it yet."""
+def _map_if_new(source: Path, place: OpenedSite, telemetry: str, camera: str) -> str:
+    """Map the flight where the site does not have it yet; its name."""
     from sorvolo.capture.source import opened_sources
     from sorvolo.cli.map import map_and_read_reports
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.flight.setup import known_flights
 
     with opened_sources([source], telemetry or None, camera or None, known_flights(place.folder)) as sources:
-        is_known = sources[0].name in known_flights(place.folder)
+        name = sources[0].name
+        is_known = name in known_flights(place.folder)
     if not is_known:
         map_and_read_reports(
             [source], place.folder, MapSettings(model="none"), telemetry=telemetry or None, camera=camera or None,
             sent=place.sent,
         )
+    return name

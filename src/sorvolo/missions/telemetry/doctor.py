@@ -1,5 +1,6 @@
 """`sorvolo telemetry`: a mapped flight's telemetry corrected by its map, and what was wrong with it."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from math import isfinite, nan
@@ -38,6 +39,8 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
 _HOLDING = 2  # control points that hold a map's scale and direction
+_REPORT = "telemetry.json"
+_UNDIAGNOSED = "no diagnosis was made: it takes the flight's own video or photos, with --site"
 _KLV_STEP_S = 0.2  # between samples, five a second; by choice
 
 
@@ -80,7 +83,8 @@ def correct_telemetry(
     Without `flight` it is the site's only one, or that of `source`. With `source`, the flight's video or photos, its
     own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata.
     The events of cot.xml, with their own times, are sent to `cot`. Raises InputError for a site without GPS, a flight
-    that it has not, a source of another flight, and a receiver that takes nothing.
+    that it has not, a source of another flight, a receiver that takes nothing, and without `source` for a folder with
+    a diagnosis, which would be lost.
     """
     with Archive.open(site_folder, write=False) as archive:
         site = archive.site()
@@ -88,6 +92,7 @@ def correct_telemetry(
             raise InputError(f"{site_folder} was mapped without GPS: its cameras have no place on Earth to write down")
         if source is None:
             name = _flight(archive, flight)
+            _keep_diagnosis(folder)
             return _written(site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot)
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
@@ -99,6 +104,12 @@ def correct_telemetry(
             return _written(site, name, folder, solved, compared, mapped, cot)
 
 
+def chosen_flight(site_folder: Path, wanted: str = "") -> str:
+    """The site's flight of this name, without one its only flight. Raises InputError where there is no such one."""
+    with Archive.open(site_folder, write=False) as archive:
+        return _flight(archive, wanted)
+
+
 def _flight(archive: Archive, wanted: str) -> str:
     known = [each.id for each in archive.flights() if archive.keyframes(each.id)]
     if wanted and wanted not in known:
@@ -106,6 +117,19 @@ def _flight(archive: Archive, wanted: str) -> str:
     if not wanted and len(known) != 1:
         raise InputError(f"{archive.folder} has the flights {', '.join(known) or 'none'}; choose one with --flight")
     return wanted or known[0]
+
+
+def _keep_diagnosis(folder: Path) -> None:
+    """Raise InputError where the folder has files by a diagnosis: files of the map alone would take their place."""
+    try:
+        report = json.loads((folder / _REPORT).read_bytes())
+    except (OSError, ValueError):
+        return
+    if isinstance(report, dict) and report.get("faults"):
+        raise InputError(
+            f"{folder} has the diagnosis of {report.get('flight')} and files corrected by it, which files of the map "
+            "alone would replace: give the flight's video or photos with --site, or another folder with --out"
+        )
 
 
 def _first_ns(setup: FlightSetup) -> int:
@@ -180,11 +204,11 @@ def _written(
     report = dict(plain_json({
         "flight": name, "site": site.name, "frames": len(frames), "height_reference": site.height_reference,
         "faults": None if compared is None else asdict(compared.faults),
-        "sentences": [] if compared is None else fault_sentences(compared.faults, compared.names),
+        "sentences": [_UNDIAGNOSED] if compared is None else fault_sentences(compared.faults, compared.names),
         "files": files,
         "warnings": _warnings(site, mapped),
     }))
-    atomic_write_bytes(folder / "telemetry.json", json_bytes(report))
+    atomic_write_bytes(folder / _REPORT, json_bytes(report))
     sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
     return {**report, "cot_sent": sent}
 

@@ -10,7 +10,7 @@ _LEAST = {"clock": 0.04, "heading": 0.5, "tilt": 0.5, "height": 0.3}  # s, deg, 
 
 
 _MOST_NAMED = 6  # frames in a sentence
-_NOT_KNOWN_DEG = 10.0  # a compass that is right within more than this says nothing about it; by choice
+_NOT_KNOWN_DEG = 10.0  # right within more than this is no knowledge of a compass; by choice
 
 
 def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
