@@ -2,15 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from sorvolo.errors import InputError
-from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Vector3
+from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows, Vector3
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import fit_similarity
-from sorvolo.geometry.pose import site_from_body_nadir_rotation, site_from_gimbal_rotation
+from sorvolo.geometry.pose import rotation_between, site_from_body_nadir_rotation, site_from_gimbal_rotation
 from sorvolo.geometry.summary import median_or_nan
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
@@ -235,8 +235,7 @@ class Track:
         Angles are not interpolated one by one: straight down, yaw and roll may both swing by half a turn where the
         camera stands still.
         """
-        known = np.flatnonzero(np.isfinite(self.angles_deg[:, 0]))
-        times = self.sample_s[known]
+        known, times = self._stated
         after = min(int(np.searchsorted(times, time_s)), len(known) - 1)
         before = max(after - 1, 0)
         turned = site_from_gimbal_rotation if self.attitude == "gimbal" else site_from_body_nadir_rotation
@@ -245,8 +244,13 @@ class Track:
         share = float(np.clip((time_s - times[before]) / passed_s, 0.0, 1.0)) if passed_s > 0 else 1.0
         if share == 1.0:
             return last
-        first = turned(*self.angles_deg[known[before]])
-        return Slerp([0.0, 1.0], Rotation.from_matrix(np.stack([first, last])))(share).as_matrix()
+        return rotation_between(turned(*self.angles_deg[known[before]]), last, share)
+
+    @cached_property
+    def _stated(self) -> tuple[Rows, Floats]:
+        """The samples that state angles, and their times, s."""
+        known = np.flatnonzero(np.isfinite(self.angles_deg[:, 0]))
+        return known, self.sample_s[known]
 
     def _sigma_deg(self, usual_tilt: float, usual_heading: float) -> Vector3:
         """Sigmas about the camera's x, y, z axes: as stated, else what such sources usually reach."""

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from sorvolo.errors import GeometryError
@@ -56,6 +57,12 @@ def rotation_from_vector(rotation_vector_rad: Floats) -> Floats:
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vector.shape[:-1], 3, 3)
     turned = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
     return np.where(small, np.eye(3), turned)
+
+
+def rotation_between(first: Matrix3, last: Matrix3, share: float) -> Matrix3:
+    """The rotation so far, from 0 to 1, on the shortest turn from one, (3, 3), to another."""
+    turn, _ = cv2.Rodrigues(first.T @ last)
+    return np.asarray(first @ cv2.Rodrigues(share * turn)[0], np.float64)
 
 
 def site_from_gimbal_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix3:
