@@ -68,9 +68,21 @@ def test_flights_together_miss_what_each_misses() -> None:
 def test_figures_count_unseen_ground_as_nought() -> None:
     mean = np.array([0.8, 0.8, np.nan, 0.8])
     chances = Chances(mean, mean - 0.1, mean + 0.1)
-    found = figures(chances, np.array([True, True, True, False]), 10.0, 20.0)
+    found = figures([chances], np.array([True, True, True, False]), 10.0, 20.0)
     assert found.area_m2 == 300 and found.seen_m2 == 200
     assert found.pod == pytest.approx(1.6 / 3) and found.swept_m2 == pytest.approx(160)
     assert found.sweep_width_m == pytest.approx(8.0) and found.random_pod == pytest.approx(1 - np.exp(-1.6 / 3))
     north = segment("north", 0.6, chances, np.array([True, True, False, False]), 10.0, 400.0)
     assert north.pod == pytest.approx(0.4) and north.pos == pytest.approx(0.24) and north.left == pytest.approx(0.36)
+
+
+def test_the_effort_of_two_flights_adds_up_and_their_sweep_width_stays() -> None:
+    """The same flight twice: twice the coverage, the same sweep width, a probability below 1."""
+    mean = np.array([0.7, 0.7, np.nan])
+    chances, wanted = Chances(mean, mean - 0.1, mean + 0.1), np.ones(3, bool)
+    once, twice = (figures([chances] * count, wanted, 10.0, 20.0 * count) for count in (1, 2))
+    assert once.coverage == pytest.approx(1.4 / 3) and twice.coverage == pytest.approx(2.8 / 3)
+    assert twice.swept_m2 == pytest.approx(2 * once.swept_m2)
+    assert twice.sweep_width_m == pytest.approx(once.sweep_width_m)
+    assert twice.random_pod == pytest.approx(1 - np.exp(-2.8 / 3))
+    assert twice.pod == pytest.approx(2 / 3 * (1 - 0.3**2)) and twice.seen_m2 == once.seen_m2

@@ -16,9 +16,10 @@ from sorvolo.search.recall import Chances
 class SearchFigures:
     """Of one class over the wanted ground. Chances count unseen ground as 0.
 
-    `pod` with its interval is the chance that one who lay anywhere in the area was found. `swept_m2` is the ground
-    times its chance, `sweep_width_m` that over the flown path, `coverage` that over the area; `random_pod` is what
-    Koopman's formula of random search, 1 - exp(-coverage), makes of it.
+    `pod` with its interval is the chance that one who lay anywhere in the area was found, by all flights together.
+    `swept_m2` is the ground times its chance, summed over the flights: effort adds up, even over the same ground.
+    `sweep_width_m` is that over the path of all flights, `coverage` that over the area, so it may exceed 1.
+    `random_pod` is what Koopman's formula of random search, 1 - exp(-coverage), makes of it.
     """
 
     area_m2: float
@@ -61,17 +62,18 @@ def together(flights: Sequence[Chances]) -> Chances:
     return Chances(mean, low, high)
 
 
-def figures(chances: Chances, wanted: Mask, cell_m: float, path_m: float) -> SearchFigures:
-    """The figures of the wanted cells, (N,); `path_m` is how far the camera flew."""
+def figures(flights: Sequence[Chances], wanted: Mask, cell_m: float, path_m: float) -> SearchFigures:
+    """The figures of the wanted cells, (N,), of one or more flights; `path_m` is how far their cameras flew in all."""
     cell_m2 = cell_m**2
     inside = np.asarray(wanted, bool)
     area_m2 = float(inside.sum()) * cell_m2
-    mean, low, high = (np.nan_to_num(each[inside]) for each in (chances.mean, chances.low, chances.high))
-    swept_m2 = float(mean.sum()) * cell_m2
+    total = together(flights)
+    mean, low, high = (np.nan_to_num(each[inside]) for each in (total.mean, total.low, total.high))
+    swept_m2 = sum(float(np.nansum(each.mean[inside])) for each in flights) * cell_m2
     coverage = swept_m2 / area_m2 if area_m2 else 0.0
     pod, pod_low, pod_high = (float(each.mean()) if len(each) else 0.0 for each in (mean, low, high))
     return SearchFigures(
-        area_m2, float(np.isfinite(chances.mean[inside]).sum()) * cell_m2, pod, pod_low, pod_high, swept_m2,
+        area_m2, float(np.isfinite(total.mean[inside]).sum()) * cell_m2, pod, pod_low, pod_high, swept_m2,
         swept_m2 / path_m if path_m > 0 else float("nan"), coverage, float(1 - np.exp(-coverage)),
     )
 

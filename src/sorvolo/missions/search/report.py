@@ -122,7 +122,8 @@ def build_search_report(
 
 def _class_row(searched: Searched, label: str, settings: SearchSettings, info: ModelInfo) -> dict[str, Any]:
     cells = searched.cells
-    found = figures(total_of(searched, label), cells.wanted, cells.cell_m, searched.path_m)
+    chances = [each.chances for each in searched.of_class(label)]
+    found = figures(chances, cells.wanted, cells.cell_m, searched.path_m)
     numbers = hole_numbers(searched, label, settings, info)
     return {**asdict(found), "holes_m2": hole_areas_m2(numbers, cells.cell_m)}
 

@@ -33,7 +33,7 @@ def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ("probability of detection (POD)", f"{row['pod']:.2f}", interval),
         ("area", area_words(row["area_m2"]), f"of it seen: {area_words(row['seen_m2'])}"),
         ("effective sweep width", with_unit("{:.1f} m", row["sweep_width_m"]) or "unknown",
-         "ground times its probability, over the flown path"),
+         "ground times its probability, over the path of all flights"),
         ("coverage", f"{row['coverage']:.2f}", f"a random search of that effort has POD {row['random_pod']:.2f}"),
     ]
 
