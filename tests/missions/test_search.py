@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import rasterio
 from sorvolo.capture.areas import read_segments
 from sorvolo.cli.main import main
 from sorvolo.detection.contract import ModelInfo
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
@@ -152,6 +153,52 @@ def test_the_command_refuses_what_it_cannot_use(tmp_path: Path, capsys: pytest.C
     assert "--plants" in capsys.readouterr().err
     assert main(["search", str(tmp_path), "--sun", "south"]) == 1
     assert "--sun" in capsys.readouterr().err
+
+
+def test_classes_that_cannot_be_measured_are_refused(site: Path, tmp_path: Path) -> None:
+    """An unknown class, a known one of which nothing can be drawn, and a model that knows nothing that can."""
+    detector, outputs = Comparing(site), SearchOutputs(tmp_path / "out")
+    with pytest.raises(SettingsError, match="'giraffe'; it knows person, car, small object"):
+        next(search_site(site, SearchSettings(classes=("giraffe",)), outputs, detector))
+    detector.classes = ("truck", "bus")
+    detector.info = replace(
+        detector.info, classes=("truck", "bus"), thresholds={"truck": 0.3, "bus": 0.3},
+        best_px={"truck": (4.0, 400.0), "bus": (4.0, 400.0)},
+    )
+    with pytest.raises(SettingsError, match="no 'truck' can be drawn"):
+        next(search_site(site, SearchSettings(classes=("truck",)), outputs, detector))
+    with pytest.raises(SettingsError, match="reports truck, bus"):
+        next(search_site(site, SearchSettings(), outputs, detector))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"refly": "holes.txt"}, "not as '.txt'"), ({"refly": "nowhere/holes.kml"}, "there is no folder"),
+        ({"refly": "holes.kmz", "dji-drone": "paper"}, "--dji-drone paper"), ({"area": "missing.geojson"}, "missing"),
+        ({"poa": "missing.geojson"}, "missing"), ({"classes": "giraffe"}, "giraffe"), ({"model": "none"}, "nothing"),
+        ({"out": "camera.xml"}, "is a file"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_before_a_flight_is_mapped(
+    photographed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    options: dict[str, str], words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "camera.xml").write_bytes((photographed / "camera.xml").read_bytes())
+    wishes = [part for name, value in options.items() for part in (f"--{name}", value)]
+    photos = str(photographed / "flight1" / "photos")
+    assert main(["search", photos, "--site", "site", "--camera", "camera.xml", *wishes]) == 1
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "site" / "site.db").exists()
+
+
+def test_waypoints_of_an_unknown_format_are_refused_before_the_search(site: Path, tmp_path: Path) -> None:
+    outputs = SearchOutputs(tmp_path / "out", refly=(tmp_path / "holes.txt",))
+    with pytest.raises(SettingsError, match="flight plans are written as"):
+        next(search_site(site, SearchSettings(), outputs, Comparing(site)))
+    assert not (tmp_path / "out").exists()
 
 
 def test_segments_need_probabilities_that_add_up(tmp_path: Path) -> None:

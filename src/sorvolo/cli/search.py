@@ -87,18 +87,19 @@ def search_command(
     """
     from sorvolo.cli.map import map_and_read_reports
     from sorvolo.missions.flight.settings import MapSettings
-    from sorvolo.missions.search.flights import SearchOutputs
+    from sorvolo.missions.search.flights import SearchOutputs, prepare_search
     from sorvolo.missions.search.settings import SearchSettings
 
     settings = SearchSettings(plants, names(classes), model, enough, through_crowns, _sun(sun), seed)
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
-        if site:
-            map_and_read_reports(
-                list(inputs), place.folder, MapSettings(model=model), camera=camera or None, sent=place.sent
-            )
         outputs = SearchOutputs(
             out or place.results("search"), area, poa, tuple(flight or ()), tuple(refly or ()), dji_drone
         )
+        if site:
+            prepare_search(settings, outputs)  # mapping takes long: what cannot be used is refused before
+            map_and_read_reports(
+                list(inputs), place.folder, MapSettings(model=model), camera=camera or None, sent=place.sent
+            )
         report = _measured(place.folder, settings, outputs)
     if as_json:
         typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1))

@@ -6,13 +6,19 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.capture.areas import read_area, read_segments
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
 from sorvolo.missions.search.frames import flights_to_search, search_frames
-from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, SearchProgress, measure_flight
+from sorvolo.missions.search.measure import (
+    MeasuredFlight,
+    SearchFrame,
+    SearchProgress,
+    measure_flight,
+    planted_classes,
+)
 from sorvolo.missions.search.refly import write_refly
 from sorvolo.missions.search.report import Searched, build_search_report, hole_numbers, total_of
 from sorvolo.missions.search.settings import SearchSettings
@@ -22,8 +28,10 @@ from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes
 from sorvolo.store.exports.pod_files import CellGrid, Region, pod_picture, region_features, regions_of, write_pod_tif
+from sorvolo.store.exports.waypoints import check_waypoint_file
 from sorvolo.store.pages.search import search_page
 from sorvolo.store.site.archive import Archive
+from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Site
 
 
@@ -44,6 +52,39 @@ class SearchOutputs:
     dji_drone: str = "fly"
 
 
+@dataclass(frozen=True, eq=False)
+class PreparedSearch:
+    """What a search needs beside a site, read and checked: the area, the segments with their probabilities, a
+    detector."""
+
+    area: Area | None
+    segments: Sequence[tuple[str, Area, float]]
+    detector: ObjectDetector
+
+
+def prepare_search(
+    settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector | None = None
+) -> PreparedSearch:
+    """Read and check all that a search needs beside a site, before it takes any time.
+
+    Raises InputError for a broken area or file of segments and for a model that is not there, SettingsError for classes
+    that cannot be measured, and for a folder or a file of waypoints that cannot be written.
+    """
+    if outputs.folder.exists() and not outputs.folder.is_dir():
+        raise SettingsError(f"--out {outputs.folder} is a file, a folder was needed")
+    for path in outputs.refly:
+        check_waypoint_file(path, outputs.dji_drone)
+        if not path.parent.is_dir() and path.parent.resolve() != outputs.folder.resolve():
+            raise SettingsError(f"--refly {path}: there is no folder {path.parent}")
+    area = None if outputs.area is None else read_area(outputs.area)
+    segments = [] if outputs.poa is None else read_segments(outputs.poa)
+    looks = open_detector(settings.model) if detector is None else detector
+    if looks is None:
+        raise InputError(f"nothing to measure: {why_not_searched(settings.model)}")
+    planted_classes(looks, settings)
+    return PreparedSearch(area, segments, looks)
+
+
 def search_site(
     site_folder: Path, settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector | None = None
 ) -> Generator[SearchProgress | dict[str, Any]]:
@@ -51,13 +92,10 @@ def search_site(
 
     The probability that a person, or a car, who lay anywhere in the area would have been reported is learnt from ones
     drawn into the flights' own frames. Raises InputError for a site without metres or flights, and for a model that is
-    not installed.
+    not installed; what `prepare_search` refuses is refused before any work.
     """
-    area = None if outputs.area is None else read_area(outputs.area)
-    segments = [] if outputs.poa is None else read_segments(outputs.poa)
-    looks = open_detector(settings.model) if detector is None else detector
-    if looks is None:
-        raise InputError(f"nothing to measure: {why_not_searched(settings.model)}")
+    prepared = prepare_search(settings, outputs, detector)
+    area, looks = prepared.area, prepared.detector
     with Archive.open(site_folder, write=False) as archive:
         site = _site_with_metres(archive)
         names = flights_to_search(archive, outputs.flights)
@@ -66,7 +104,9 @@ def search_site(
             raise InputError(f"{site_folder} has no mapped flight: sorvolo map INPUT --site {site_folder} makes one")
         cells = _cells(site, frames, None if area is None else area.polygons_m(site.frame))
         measured = yield from _measured(frames, cells, archive, looks, settings)
-        searched = Searched(site, cells, tuple(measured), {name: tuple(own) for name, own in frames.items()}, segments)
+        searched = Searched(
+            site, cells, tuple(measured), {name: tuple(own) for name, own in frames.items()}, prepared.segments
+        )
         yield _write(searched, archive, settings, outputs, looks)
 
 

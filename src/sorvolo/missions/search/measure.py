@@ -5,9 +5,11 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from sorvolo.detection.turning import is_from_above
+from sorvolo.errors import SettingsError
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Mask, Vector3
 from sorvolo.geometry.sun import direction_from_angles
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.map_objects import check_classes
 from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
@@ -20,7 +22,7 @@ from sorvolo.simulation.objects import Thing
 from sorvolo.simulation.planted import new_plant, plant
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
-from sorvolo.survey.objects import TYPICAL_SIZE_M
+from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
 from sorvolo.tracking.planted import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
@@ -80,10 +82,11 @@ def measure_flight(
 ) -> Iterator[SearchProgress | MeasuredFlight]:
     """Measure one flight over a site with metres; yields progress and, at last, what was measured.
 
-    `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it.
+    `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it. Raises
+    SettingsError as `planted_classes` does.
     """
     started_s = time.monotonic()
-    wanted = settings.classes or every_label(detector.info.usual_classes)
+    wanted = planted_classes(detector, settings)
     lights, looks = _looks(frames)
     seen = {label: gather(looks, cells.centres_m, reach_m(label)) for label in wanted}
     usable = _usable(seen[wanted[0]], cells, settings)
@@ -107,6 +110,25 @@ def measure_flight(
         name, len(frames), looked, len(rounds), time.monotonic() - started_s, sun is not None,
         any(each.is_thermal for each in lights), max((each.blur_px for each in lights), default=0.0), measured,
     )
+
+
+def planted_classes(detector: ObjectDetector, settings: SearchSettings) -> tuple[str, ...]:
+    """The classes that are planted and searched for: those asked for, else what the detector usually reports.
+
+    Raises SettingsError for a class that the detector does not know or of which nothing can be drawn, and for a
+    detector that knows none that can be drawn.
+    """
+    check_classes(detector, settings.classes)
+    usual = detector.info.usual_classes
+    wanted = tuple(dict.fromkeys(settings.classes)) or every_label(usual)
+    if undrawn := sorted(set(wanted) - set(CLASSES)):
+        raise SettingsError(f"no {undrawn[0]!r} can be drawn into pictures; a search measures {', '.join(CLASSES)}")
+    if not wanted:
+        raise SettingsError(
+            f"a search measures {', '.join(CLASSES)}, and the model {detector.info.name} reports "
+            f"{', '.join(usual) or 'nothing'}; give another --model"
+        )
+    return wanted
 
 
 def reach_m(label: str) -> float:

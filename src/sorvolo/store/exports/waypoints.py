@@ -16,13 +16,15 @@ from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.planning import FlightPlan
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.placemarks import kml_from_one
-from sorvolo.store.exports.wpml import wpml_kmz
+from sorvolo.store.exports.wpml import check_drone, wpml_kmz
 
 _TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _MOUNT_CONTROL, _TRIGGER_DISTANCE = 22, 16, 20, 178, 205, 206  # MAV_CMD
 _MOUNT_BY_MAVLINK = 2  # MAV_MOUNT_MODE: to the angles given
 _FRAME_RELATIVE_HEIGHT, _FRAME_MISSION = 3, 2  # MAV_FRAME
 _HEIGHT_RELATIVE = 1  # QGroundControl's AltitudeMode
 _AUTOPILOT_PX4, _VEHICLE_QUADROTOR = 12, 2  # MAV_AUTOPILOT, MAV_TYPE
+
+_ENDINGS = (".plan", ".kmz", ".geojson", ".json", ".kml")
 
 _Item: TypeAlias = dict[str, Any]
 _LonLat: TypeAlias = list[list[float]]
@@ -33,20 +35,27 @@ def write_waypoints(
 ) -> None:
     """Write the plan, whose metres are those of `frame`, in the format that the path's ending names.
 
-    `dji_drone`, one of `DJI_DRONES`, is what a .kmz is for. Raises SettingsError for an ending other than .plan, .kmz,
-    .geojson, .json or .kml and for an unknown drone, StoreError when the file cannot be written.
+    `dji_drone`, one of `DJI_DRONES`, is what a .kmz is for. Raises SettingsError as `check_waypoint_file` does,
+    StoreError when the file cannot be written.
     """
+    check_waypoint_file(path, dji_drone)
     writers: Mapping[str, Callable[[FlightPlan, _LonLat, str], str | bytes]] = {
         ".plan": _qgroundcontrol, ".kmz": lambda plan, lonlat, _: wpml_kmz(plan, lonlat, dji_drone),
         ".geojson": _geojson, ".json": _geojson, ".kml": _kml,
     }
-    writer = writers.get(path.suffix.lower())
-    if writer is None:
-        raise SettingsError(f"{path}: flight plans are written as {', '.join(writers)}, not as {path.suffix!r}")
+    writer = writers[path.suffix.lower()]
     latitude_deg, longitude_deg, _ = frame.wgs84_from_site(plan.waypoints_m)
     lonlat = [[round(float(lon), 9), round(float(lat), 9)] for lon, lat in zip(longitude_deg, latitude_deg)]
     content = writer(plan, lonlat, name)
     atomic_write_bytes(path, content.encode() if isinstance(content, str) else content)
+
+
+def check_waypoint_file(path: Path, dji_drone: str = "fly") -> None:
+    """Raise SettingsError for an ending other than .plan, .kmz, .geojson, .json or .kml, and for an unknown drone."""
+    if path.suffix.lower() not in _ENDINGS:
+        raise SettingsError(f"{path}: flight plans are written as {', '.join(_ENDINGS)}, not as {path.suffix!r}")
+    if path.suffix.lower() == ".kmz":
+        check_drone(dji_drone)
 
 
 def _geojson(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:

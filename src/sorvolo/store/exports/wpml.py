@@ -38,13 +38,18 @@ DJI_DRONES = {
 """Drones by the name to give; the numbers are those of DJI's table of supported products."""
 
 
+def check_drone(drone: str) -> None:
+    """Raise SettingsError for a drone that is none of `DJI_DRONES`."""
+    if drone not in DJI_DRONES:
+        raise SettingsError(f"--dji-drone {drone}: choose one of {', '.join(DJI_DRONES)}")
+
+
 def wpml_kmz(plan: FlightPlan, lonlat: Sequence[Sequence[float]], drone: str) -> bytes:
     """The .kmz of a plan for a drone of `DJI_DRONES`; `lonlat` are its waypoints, [longitude_deg, latitude_deg] each.
 
     Raises SettingsError for another drone's name.
     """
-    if drone not in DJI_DRONES:
-        raise SettingsError(f"--dji-drone {drone}: choose one of {', '.join(DJI_DRONES)}")
+    check_drone(drone)
     register_namespace("", _KML)
     register_namespace("wpml", _WPML)
     made = io.BytesIO()
