@@ -29,6 +29,7 @@ from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.sun import direction_from_angles
 from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, measure_flight, reach_m
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import cell_side_m, cells_over
@@ -168,7 +169,9 @@ def rows_of(
     empty = without_targets(flight)
     bare = [taken(empty, index, measured.is_thermal) for index in range(len(images))]
     looks = [
-        look_at(image, each.placed.camera, flight.true_poses[k], frame_light(image).blur_px)
+        look_at(
+            image, each.placed.camera, flight.true_poses[k], frame_light(image).blur_px, direction_from_angles(*SUN_DEG)
+        )
         for k, (each, image) in enumerate(zip(frames, bare))
     ]
     rows = []

@@ -71,6 +71,13 @@ def standing(surface: HeightField, ground: HeightField) -> tuple[Floats32, Matri
     return np.where(stands, above_m, 0).astype(np.float32), cells_from_site
 
 
+def above_ground(surface: HeightField, ground: HeightField, points_m: PointsM) -> tuple[Floats, Floats]:
+    """(N,) how high the surface lies above the bare ground at site points, (N, 2), m, and its sigma; NaN in holes."""
+    up_m, sigma_m = surface.at(points_m)
+    bare_m, _ = ground.at(points_m)
+    return up_m - bare_m, sigma_m
+
+
 def along(points_m: PointsM, step_m: float) -> tuple[PointsM, Floats]:
     """(M, 2) points every `step_m` along a line through `points_m`, (N, 2), and their way from its start, (M,), m.
 

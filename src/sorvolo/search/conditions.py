@@ -1,20 +1,28 @@
 """Under which conditions ground was seen: how finely, how often, how sharp, in which light, on what ground."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsM, frozen
+from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
+from sorvolo.search.crowns import crowns_in, plants_in
 
 CONDITIONS = ("resolution", "views", "single view", "blur", "texture", "light", "slant", "trees")
 """What a probability of detection is explained by: the columns of `Conditions.columns`."""
 
 _CROWN_SHARE = 0.5  # of the views of a cell: crowns lean apart, ground does not
+_RAISED_M = 2.0  # above the ground: higher than people and cars
+_LOW_M = 1.0  # what stands lower hides nobody, but for bushes around one who lies
+_LEAST_SUN = 0.1  # sine of the sun's height: lower, shadows are longer than pictures; or its way along the ground
 _FARTHEST = 3.0  # tangent of the angle from straight down: beyond it nothing is measured
+
+AboveGround: TypeAlias = Callable[[PointsM], tuple[Floats, Floats]]
+"""How high the surface lies above the bare ground at places (N, 2), m, and its sigma, m; NaN where unknown."""
 
 
 @dataclass(frozen=True)
@@ -23,12 +31,6 @@ class LookSettings:
 
     look_m: float = 0.25  # along its pixels
     window: int = 5  # of them: 1.25 m, about a person and what is around
-    green: float = 0.05  # excess green, (2 g - r - b) / (r + g + b), of plants ...
-    plants: float = 0.6  # ... in this share of what is around
-    rough: float = 0.2  # rms of lightness over its mean within 1.25 m: crowns are rough, lawns are not
-    crown_m: float = 1.5  # over which a crown must be so
-    gap_m: float = 6.0  # a gap among crowns that is no wider is forest: smooth or dark crowns, and their shade ...
-    stand_m: float = 2.5  # ... where the crowns themselves are so wide: shrubs on a lawn and rims of things are none
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +38,7 @@ class FrameLook:
     """One frame as the ground under it is judged: small maps of it, `scale` of its pixels each.
 
     `lightness` is in grey levels, 0 to 255; `texture` is the rms of lightness within 1.25 m over its mean there (no
-    unit); `crowns` is whether trees or bushes show.
+    unit); `plants` is where it is green, `crowns` whether trees or bushes show.
     """
 
     camera: Camera
@@ -45,6 +47,7 @@ class FrameLook:
     scale: float
     lightness: Floats
     texture: Floats
+    plants: Mask
     crowns: Mask
 
 
@@ -54,16 +57,19 @@ class Conditions:
 
     They are logarithm of metres a pixel, logarithm of views, whether one view only, logarithm of the blur in metres,
     texture over lightness, lightness, tangent of the angle from straight down: means over the views; and `crowns` (N,),
-    the share of the views in which trees or bushes stand there.
+    the share of the views in which trees or bushes stand there. `roofs` (N,) is where something without leaves, and
+    higher than people and cars, stands by the heights of the flight.
     """
 
     views: Floats
     columns: Floats
     crowns: Floats
+    roofs: Mask
 
     def __post_init__(self) -> None:
         for name in ("views", "columns", "crowns"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+        object.__setattr__(self, "roofs", frozen(self.roofs, np.bool_))
 
     @property
     def seen(self) -> Mask:
@@ -86,43 +92,45 @@ class Conditions:
 
 
 def look_at(
-    image: ImageRGB, camera: Camera, site_from_camera: Pose, blur_px: float, settings: LookSettings = LookSettings()
+    image: ImageRGB, camera: Camera, site_from_camera: Pose, blur_px: float, sun: Vector3 | None = None,
+    settings: LookSettings = LookSettings(),
 ) -> FrameLook:
-    """The small maps of a frame (H, W, 3)."""
+    """The small maps of a frame (H, W, 3); `sun` (3,) is the direction to the sun in the site, None: not known."""
     m_per_px = max(float(site_from_camera.translation_m[2]), 1.0) / camera.fx_px
-    look_m = settings.look_m
-    scale = max(1.0, look_m / m_per_px)
+    scale = max(1.0, settings.look_m / m_per_px)
+    small_m = max(m_per_px, settings.look_m)
     size = max(8, round(camera.width_px / scale)), max(8, round(camera.height_px / scale))
     small = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32)
     lightness = small.mean(axis=2)
-    around = max(3, 2 * round(settings.window * look_m / max(m_per_px, look_m) / 2) + 1)
+    around = max(3, 2 * round(settings.window * settings.look_m / small_m / 2) + 1)
     mean = cv2.blur(lightness, (around, around))
     texture = np.sqrt(np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0)) / np.maximum(mean, 8)
-    green = (2 * small[..., 1] - small[..., 0] - small[..., 2]) / np.maximum(small.sum(axis=2), 1)
-    wide = max(3, 2 * round(settings.crown_m / max(m_per_px, look_m) / 2) + 1)
-    is_plant = cv2.blur((green > settings.green).astype(np.float32), (wide, wide)) > settings.plants
-    is_rough = cv2.blur(texture, (wide, wide)) > settings.rough
+    crowns = crowns_in(image, small, m_per_px, small_m, _sunward(site_from_camera, sun))
     return FrameLook(
-        camera, site_from_camera, blur_px, camera.width_px / size[0], lightness, texture,
-        _closed(is_plant & is_rough, settings, max(m_per_px, look_m)),
+        camera, site_from_camera, blur_px, camera.width_px / size[0], lightness, texture, plants_in(small, small_m),
+        crowns,
     )
 
 
-def _closed(crowns: Mask, settings: LookSettings, m_per_px: float) -> Mask:
-    """The crowns (H, W) with the narrow gaps between them, where they are those of a stand of trees."""
-    gap_px, stand_px = (max(3, round(each / m_per_px)) for each in (settings.gap_m, settings.stand_m))
-    gap, stand = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (each, each)) for each in (gap_px, stand_px))
-    # beyond the picture the forest may go on: what lies at its edge is judged by what the picture shows
-    wide = cv2.copyMakeBorder(crowns.astype(np.uint8), gap_px, gap_px, gap_px, gap_px, cv2.BORDER_REFLECT)
-    closed = cv2.morphologyEx(cv2.morphologyEx(wide, cv2.MORPH_OPEN, stand), cv2.MORPH_CLOSE, gap)
-    return np.asarray(crowns | (closed[gap_px:-gap_px, gap_px:-gap_px] > 0), bool)
+def _sunward(site_from_camera: Pose, sun: Vector3 | None) -> Floats | None:
+    """(2,) the direction to the sun in a picture, of length 1; None where there is none."""
+    if sun is None or sun[2] < _LEAST_SUN:
+        return None
+    direction = (site_from_camera.rotation.T @ np.array([sun[0], sun[1], 0.0]))[:2]
+    length = float(np.hypot(*direction))
+    return None if length < _LEAST_SUN else direction / length
 
 
-def gather(looks: Sequence[FrameLook], places_m: PointsM | Sequence[Floats], reach_m: float) -> Conditions:
-    """The conditions of places (N, 2); a frame counts that shows what reaches `reach_m` about a place whole."""
+def gather(
+    looks: Sequence[FrameLook], places_m: PointsM | Sequence[Floats], reach_m: float, above: AboveGround | None = None
+) -> Conditions:
+    """The conditions of places (N, 2); a frame counts that shows what reaches `reach_m` about a place whole.
+
+    Where `above` knows how high something stands it decides what is under crowns and roofs; elsewhere, pictures do.
+    """
     places_m = np.reshape(np.asarray(places_m, np.float64), (-1, 2))
     count = len(places_m)
-    views, sums, crowns = np.zeros(count), np.zeros((count, 5)), np.zeros(count)
+    views, sums, crowns, plants = np.zeros(count), np.zeros((count, 5)), np.zeros(count), np.zeros(count)
     for look in looks:
         shown, pixels, m_per_px, slant = _projected(look, places_m, reach_m)
         if not shown.any():
@@ -134,15 +142,28 @@ def gather(looks: Sequence[FrameLook], places_m: PointsM | Sequence[Floats], rea
             np.log(near_m), np.log(look.blur_px * near_m), look.texture[y, x], look.lightness[y, x], slant[shown],
         ])
         crowns[shown] += look.crowns[y, x]
+        plants[shown] += look.plants[y, x]
         views[shown] += 1
     with np.errstate(invalid="ignore", divide="ignore"):
-        means, share = sums / views[:, None], crowns / views
+        means, share, green = sums / views[:, None], crowns / views, plants / views
         log_views = np.where(views > 0, np.log(views), np.nan)
+    roofs = np.zeros(count, bool)
+    if above is not None and count:
+        raised, low = _by_height(*above(places_m))
+        roofs = raised & (green <= _CROWN_SHARE)
+        share = np.where(raised & ~roofs, 1.0, np.where(low | roofs, 0.0, share)) + 0 * share
     columns = np.column_stack([
         means[:, 0], log_views, np.where(views > 0, views == 1, np.nan), means[:, 1], means[:, 2], means[:, 3],
         means[:, 4], share,
     ])
-    return Conditions(views, columns, np.nan_to_num(share))
+    return Conditions(views, columns, np.nan_to_num(share), roofs)
+
+
+def _by_height(above_m: Floats, sigma_m: Floats) -> tuple[Mask, Mask]:
+    """(N,) where something stands that hides who is under it, and where surely nothing does."""
+    with np.errstate(invalid="ignore"):
+        raised = (above_m > _RAISED_M) & (above_m > 2 * sigma_m)
+        return np.asarray(raised, bool), np.asarray((above_m < _LOW_M) & (sigma_m < _LOW_M / 2), bool)
 
 
 def _projected(look: FrameLook, places_m: PointsM, reach_m: float) -> tuple[Mask, Floats, Floats, Floats]:

@@ -41,11 +41,12 @@ class Reason(StrEnum):
     FEW_VIEWS = "too few views"
     SLANT = "seen aslant"
     DETECTOR = "rarely found anywhere"
+    ROOF = "under a roof"
 
     @property
     def can_be_flown_again(self) -> bool:
         """Whether another flight may see what this one did not."""
-        return self not in (Reason.NONE, Reason.TREES, Reason.DETECTOR)
+        return self not in (Reason.NONE, Reason.TREES, Reason.ROOF, Reason.DETECTOR)
 
 
 REASONS = tuple(Reason)
@@ -72,7 +73,7 @@ def hole_reasons(
     light = seen.columns[:, CONDITIONS.index("light")]
     with np.errstate(invalid="ignore"):
         rules: list[tuple[Reason, Mask]] = [
-            (Reason.NOT_SEEN, ~seen.seen), (Reason.TREES, seen.under_trees),
+            (Reason.NOT_SEEN, ~seen.seen), (Reason.ROOF, seen.roofs), (Reason.TREES, seen.under_trees),
             (Reason.COARSE, seen.m_per_px() > needed_m_per_px),
             (Reason.BLUR, blur_m > settings.blurred_share * length_m), (Reason.DARK, light < settings.dark),
         ]

@@ -11,7 +11,7 @@ from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
-from sorvolo.missions.search.frames import flights_to_search, search_frames
+from sorvolo.missions.search.frames import flights_to_search, heights_for, search_frames
 from sorvolo.missions.search.measure import (
     MeasuredFlight,
     SearchFrame,
@@ -117,7 +117,9 @@ def _measured(
     """Each flight measured, one after the other."""
     site, known_m, measured = archive.site(), _known_places(archive), []
     for name, own in frames.items():
-        for each in measure_flight(name, own, cells, site, detector, settings, known_m):
+        for each in measure_flight(
+            name, own, cells, site, detector, settings, known_m, heights_for(archive, name)
+        ):
             if isinstance(each, MeasuredFlight):
                 measured.append(each)
             else:

@@ -1,13 +1,18 @@
-"""A site's flights as they are searched: their kept frames on their final places."""
+"""A site's flights as they are searched: their kept frames on their final places, and the heights of the ground."""
 
 from collections.abc import Sequence
+from functools import partial
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.geometry.level_ground import footprint, is_on_ground
+from sorvolo.heights.field import above_ground
+from sorvolo.missions.heights.measure import flight_with_heights, read_field
 from sorvolo.missions.search.measure import SearchFrame
+from sorvolo.search.conditions import AboveGround
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
@@ -33,6 +38,21 @@ def search_frames(archive: Archive, flight_id: str) -> list[SearchFrame]:
     if not frames:
         raise InputError(f"no frame of the flight {flight_id} has a place on the ground; map it again")
     return frames
+
+
+def heights_for(archive: Archive, flight_id: str) -> AboveGround | None:
+    """How high things stand on the ground of a flight: by its own heights, else by the newest of the site.
+
+    None where the site has no heights of a present map that can be read.
+    """
+    for each in (flight_id, flight_with_heights(archive, "")):
+        try:
+            if each is not None and archive.height_path(each, HeightFile.REPORT).exists():
+                surface, ground = (read_field(archive, each, file) for file in (HeightFile.SURFACE, HeightFile.GROUND))
+                return partial(above_ground, surface, ground)
+        except InputError:
+            continue  # of an earlier map, or damaged: a search can do without
+    return None
 
 
 def _placed(stored: StoredKeyframe) -> PlacedFrame | None:

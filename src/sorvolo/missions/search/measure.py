@@ -3,6 +3,8 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
 
 from sorvolo.detection.turning import is_from_above
 from sorvolo.errors import SettingsError
@@ -13,7 +15,7 @@ from sorvolo.missions.flight.map_objects import check_classes
 from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
-from sorvolo.search.conditions import Conditions, FrameLook, gather, look_at
+from sorvolo.search.conditions import AboveGround, Conditions, FrameLook, gather, look_at
 from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows
 from sorvolo.search.plant_places import PlantPlace, plant_places, seeded
 from sorvolo.search.recall import Chances, Recall, fit_recall, map_chances
@@ -26,6 +28,8 @@ from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
 from sorvolo.tracking.planted import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
+
+_ConditionsAt: TypeAlias = Callable[[Sequence[Floats], float], Conditions]
 
 _KEEP_OFF_M = 4.0  # plants from what a map shows already
 _MOST_DETECTIONS = 60  # of one frame, as maps take them
@@ -60,6 +64,7 @@ class MeasuredFlight:
     rounds: int
     seconds: float
     has_shadows: bool
+    has_heights: bool
     is_thermal: bool
     blur_px: float
     classes: tuple[MeasuredClass, ...]
@@ -78,37 +83,39 @@ class SearchProgress:
 
 def measure_flight(
     name: str, frames: Sequence[SearchFrame], cells: Cells, site: Site, detector: ObjectDetector,
-    settings: SearchSettings, keep_off_m: Sequence[Floats],
+    settings: SearchSettings, keep_off_m: Sequence[Floats], above: AboveGround | None = None,
 ) -> Iterator[SearchProgress | MeasuredFlight]:
     """Measure one flight over a site with metres; yields progress and, at last, what was measured.
 
-    `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it. Raises
-    SettingsError as `planted_classes` does.
+    `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it.
+    `above` has how high things stand, where the flight has heights. Raises SettingsError as `planted_classes` does.
     """
     started_s = time.monotonic()
     wanted = planted_classes(detector, settings)
-    lights, looks = _looks(frames)
-    seen = {label: gather(looks, cells.centres_m, reach_m(label)) for label in wanted}
+    sun = _sun(frames, site, settings)
+    lights, looks = _looks(frames, sun)
+    conditions_at = partial(gather, looks, above=above)
+    seen = {label: conditions_at(cells.centres_m, reach_m(label)) for label in wanted}
     usable = _usable(seen[wanted[0]], cells, settings)
     rounds = plant_places(
         cells, seen[wanted[0]], wanted, settings.plants, keep_off_m=keep_off_m, free_m=_KEEP_OFF_M,
         rng=seeded(settings.seed), usable=usable,
     )
-    sun = _sun(frames, site, settings)
     gathered: list[tuple[PlantPlace, bool]] = []
     number = looked = 0
     for place_round in rounds:
         things = [new_plant(number + k, each.label, each.place_m, settings.seed) for k, each in enumerate(place_round)]
         number += len(things)
-        run = _Round(frames, lights, looks, things, sun, settings)
+        run = _Round(frames, lights, conditions_at, things, sun, settings)
         yield from run.search(name, detector, wanted, looked, len(rounds) * len(frames), gathered)
         looked += run.looked
         reported = run.reported()
         gathered += [(place, k in reported) for k, place in enumerate(place_round)]
-    measured = tuple(_measured(label, seen[label], looks, gathered, settings) for label in wanted)
+    measured = tuple(_measured(label, seen[label], conditions_at, gathered, settings) for label in wanted)
     yield MeasuredFlight(
         name, len(frames), looked, len(rounds), time.monotonic() - started_s, sun is not None,
-        any(each.is_thermal for each in lights), max((each.blur_px for each in lights), default=0.0), measured,
+        above is not None, any(each.is_thermal for each in lights), max((each.blur_px for each in lights), default=0.0),
+        measured,
     )
 
 
@@ -140,11 +147,11 @@ class _Round:
     """Plants that stand at once, in all frames that show them."""
 
     def __init__(
-        self, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], looks: Sequence[FrameLook],
+        self, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], conditions_at: _ConditionsAt,
         things: Sequence[Thing], sun: Vector3 | None, settings: SearchSettings,
     ) -> None:
         self._frames, self._lights, self._things, self._sun, self._settings = frames, lights, things, sun, settings
-        under = gather(looks, [each.place_m(0)[:2] for each in things], 0.5).under_trees
+        under = conditions_at([each.place_m(0)[:2] for each in things], 0.5).under_trees
         self._shown = [settings.through_crowns if hidden else 1.0 for hidden in under]
         self._laid: list[LaidSighting] = []
         self._boxes_px: dict[int, BoxesPx] = {}
@@ -184,20 +191,20 @@ class _Round:
         return reported_plants(self._laid, placed, self._boxes_px, labels, self._least)
 
 
-def _looks(frames: Sequence[SearchFrame]) -> tuple[list[FrameLight], list[FrameLook]]:
+def _looks(frames: Sequence[SearchFrame], sun: Vector3 | None) -> tuple[list[FrameLight], list[FrameLook]]:
     lights, looks = [], []
     for each in frames:
         image, pose = each.image(), pose_of(each.placed)
         assert pose is not None
         light = frame_light(image)
         lights.append(light)
-        looks.append(look_at(image, each.placed.camera, pose, light.blur_px))
+        looks.append(look_at(image, each.placed.camera, pose, light.blur_px, sun))
     return lights, looks
 
 
 def _usable(seen: Conditions, cells: Cells, settings: SearchSettings) -> Mask:
     """Where plants may stand: wanted ground that was seen, under trees only where some of them would show."""
-    usable = cells.wanted & seen.seen
+    usable = cells.wanted & seen.seen & ~seen.roofs
     return usable if settings.through_crowns > 0 else usable & ~seen.beside_trees
 
 
@@ -209,12 +216,12 @@ def _sun(frames: Sequence[SearchFrame], site: Site, settings: SearchSettings) ->
 
 
 def _measured(
-    label: str, seen: Conditions, looks: Sequence[FrameLook], gathered: Sequence[tuple[PlantPlace, bool]],
+    label: str, seen: Conditions, conditions_at: _ConditionsAt, gathered: Sequence[tuple[PlantPlace, bool]],
     settings: SearchSettings,
 ) -> MeasuredClass:
     places_m: list[Floats] = [place.place_m for place, _ in gathered if place.label == label]
     hits = [hit for place, hit in gathered if place.label == label]
-    outcomes = found_rows(places_m, gather(looks, places_m, reach_m(label)), hits)
+    outcomes = found_rows(places_m, conditions_at(places_m, reach_m(label)), hits)
     recall = fit_recall(outcomes.columns, outcomes.found) if len(outcomes) else None
-    hidden = seen.under_trees if settings.through_crowns == 0 else seen.under_trees & False
+    hidden = seen.roofs | seen.under_trees if settings.through_crowns == 0 else seen.roofs
     return MeasuredClass(label, seen, outcomes, recall, map_chances(recall, seen.columns, hidden))

@@ -139,8 +139,9 @@ def _flight_row(flight: MeasuredFlight) -> dict[str, Any]:
         }
     return {
         "name": flight.name, "frames": flight.frames, "searched_pictures": flight.looked, "rounds": flight.rounds,
-        "seconds": round(flight.seconds, 1), "shadows": flight.has_shadows, "thermal": flight.is_thermal,
-        "blur_px": round(flight.blur_px, 2), "classes": classes,
+        "seconds": round(flight.seconds, 1), "shadows": flight.has_shadows,
+        "heights": flight.has_heights, "thermal": flight.is_thermal, "blur_px": round(flight.blur_px, 2),
+        "classes": classes,
     }
 
 
@@ -181,6 +182,11 @@ def _warnings(searched: Searched, settings: SearchSettings) -> list[str]:
             warnings.append(
                 f"{flight.name}: its clock has no date, so the sun is unknown and plants throw no shadow; give --sun"
             )
+    if any(not each.has_heights and not each.is_thermal for each in searched.flights):
+        warnings.append(
+            "trees were recognised in the pictures, which miss some that stand alone, and roofs count as ground: "
+            "`sorvolo heights` measures both, for the next search"
+        )
     if settings.through_crowns == 0:
         warnings.append("ground under trees counts as not found at all; --through-crowns assumes gaps in crowns")
     if "person" in searched.labels:
