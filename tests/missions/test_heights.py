@@ -27,6 +27,7 @@ from sorvolo.missions.heights.measure import (
 )
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.search.frames import heights_for
 from sorvolo.simulation.settings import (
     ImagingSettings,
     OutputSettings,
@@ -192,6 +193,31 @@ def test_heights_of_an_earlier_map_of_the_flight_are_refused(with_heights: Path,
             write_contours(with_heights, tmp_path / "lines.geojson", 1.0)
     finally:
         report.write_text(kept)
+
+
+def test_a_search_knows_what_stands_high_where_the_site_has_heights(
+    with_heights: Path, mapped: Path, tmp_path: Path
+) -> None:
+    """By the flight's own heights or by another's of the site; without any that can be read it goes by pictures."""
+    truth = json.loads((with_heights.parent / "made" / "truth" / "objects.geojson").read_text())["features"]
+    rings = [each["geometry"]["coordinates"][0] for each in truth if each["properties"]["height_m"] > 2.5]
+    with Archive.open(with_heights, write=False) as archive:
+        above = heights_for(archive, archive.flights()[0].id)
+        other = heights_for(archive, "another")
+        frame = archive.site().frame
+    assert above is not None and other is not None
+    places_m = frame.ground_from_lonlat([np.mean(ring[:-1], axis=0) for ring in rings])
+    above_m, sigma_m = above(places_m)
+    known = np.isfinite(above_m)
+    assert known.any() and (above_m[known] > 1.0).mean() >= 0.5 and (sigma_m[known] > 0).all(), above_m
+    np.testing.assert_array_equal(other(places_m)[0], above_m)
+    with Archive.open(mapped, write=False) as archive:
+        assert heights_for(archive, archive.flights()[0].id) is None
+    damaged = Path(shutil.copytree(with_heights, tmp_path / "site"))
+    (report,) = damaged.glob("flights/*/heights.json")
+    report.write_text("{")
+    with Archive.open(damaged, write=False) as archive:
+        assert heights_for(archive, archive.flights()[0].id) is None
 
 
 @pytest.mark.parametrize("content", [b"{}", b"[]", b"\xff", b'{"run": 1, "cell_m": 0}', b'{"run": 1, "cell_m": 1e999}'])

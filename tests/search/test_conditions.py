@@ -78,21 +78,22 @@ def test_nothing_is_found_on_the_side_of_a_shadow_that_is_away_from_the_sun() ->
     assert crowns_of_picture(image, np.array([0.7, 0.0, 0.7]))[crown].mean() < 0.1
 
 
-def test_heights_decide_what_is_under_crowns_and_roofs_where_they_are_known() -> None:
-    """A raised lawn-coloured place is a crown, a raised grey one a roof, a rough low one neither."""
+def test_what_stands_high_hides_the_ground_as_a_crown_or_a_roof() -> None:
+    """A raised green place is a crown, a raised grey one a roof; what the pictures show to be crowns stays so."""
     rough = cv2.resize(np.random.default_rng(4).normal(1.0, 0.45, (100, 100)), (SIDE_PX, SIDE_PX)).clip(0.1, 2.0)
     image = np.uint8(np.clip(np.array([60.0, 110.0, 45.0]) * rough[..., None], 0, 255))
     image[:, :200] = (90, 90, 90)
+    image[:130, 200:] = (60, 110, 45)
     camera, pose = straight_down()
     look = look_at(image, camera, pose, 0.5)
-    places_m = np.array([[-10.0, 0.0], [10.0, 0.0], [10.0, 10.0], [10.0, -10.0], [500.0, 0.0]])
+    places_m = np.array([[-10.0, 0.0], [10.0, 15.0], [10.0, -5.0], [10.0, -10.0], [500.0, 0.0]])
 
     def above(places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.array([4.0, 4.0, 0.1, np.nan, 4.0]), np.array([0.2, 0.2, 0.2, np.nan, 0.2])
 
     alone, known = gather([look], places_m, 0.5), gather([look], places_m, 0.5, above)
-    assert alone.under_trees.tolist() == [False, True, True, True, False] and not alone.roofs.any()
-    assert known.under_trees.tolist() == [False, True, False, True, False]
+    assert alone.under_trees.tolist() == [False, False, True, True, False] and not alone.roofs.any()
+    assert known.under_trees.tolist() == [False, True, True, True, False]
     assert known.roofs.tolist() == [True, False, False, False, False]
     assert np.isnan(known.columns[4]).all()
 

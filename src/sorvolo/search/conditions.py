@@ -17,7 +17,6 @@ CONDITIONS = ("resolution", "views", "single view", "blur", "texture", "light", 
 
 _CROWN_SHARE = 0.5  # of the views of a cell: crowns lean apart, ground does not
 _RAISED_M = 2.0  # above the ground: higher than people and cars
-_LOW_M = 1.0  # what stands lower hides nobody, but for bushes around one who lies
 _LEAST_SUN = 0.1  # sine of the sun's height: lower, shadows are longer than pictures; or its way along the ground
 _FARTHEST = 3.0  # tangent of the angle from straight down: beyond it nothing is measured
 
@@ -126,7 +125,7 @@ def gather(
 ) -> Conditions:
     """The conditions of places (N, 2); a frame counts that shows what reaches `reach_m` about a place whole.
 
-    Where `above` knows how high something stands it decides what is under crowns and roofs; elsewhere, pictures do.
+    What stands higher than people and cars by `above` hides the ground as well as the crowns that the pictures show.
     """
     places_m = np.reshape(np.asarray(places_m, np.float64), (-1, 2))
     count = len(places_m)
@@ -149,9 +148,9 @@ def gather(
         log_views = np.where(views > 0, np.log(views), np.nan)
     roofs = np.zeros(count, bool)
     if above is not None and count:
-        raised, low = _by_height(*above(places_m))
+        raised = _raised(*above(places_m)) & (views > 0)
         roofs = raised & (green <= _CROWN_SHARE)
-        share = np.where(raised & ~roofs, 1.0, np.where(low | roofs, 0.0, share)) + 0 * share
+        share = np.where(roofs, 0.0, np.where(raised, 1.0, share))
     columns = np.column_stack([
         means[:, 0], log_views, np.where(views > 0, views == 1, np.nan), means[:, 1], means[:, 2], means[:, 3],
         means[:, 4], share,
@@ -159,11 +158,13 @@ def gather(
     return Conditions(views, columns, np.nan_to_num(share), roofs)
 
 
-def _by_height(above_m: Floats, sigma_m: Floats) -> tuple[Mask, Mask]:
-    """(N,) where something stands that hides who is under it, and where surely nothing does."""
+def _raised(above_m: Floats, sigma_m: Floats) -> Mask:
+    """(N,) where something stands that hides who is under it.
+
+    The opposite does not follow: under closed crowns nothing of the ground shows, and crowns may pass for it.
+    """
     with np.errstate(invalid="ignore"):
-        raised = (above_m > _RAISED_M) & (above_m > 2 * sigma_m)
-        return np.asarray(raised, bool), np.asarray((above_m < _LOW_M) & (sigma_m < _LOW_M / 2), bool)
+        return np.asarray((above_m > _RAISED_M) & (above_m > 2 * sigma_m), bool)
 
 
 def _projected(look: FrameLook, places_m: PointsM, reach_m: float) -> tuple[Mask, Floats, Floats, Floats]:
