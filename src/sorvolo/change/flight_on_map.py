@@ -34,8 +34,8 @@ class FlightOnMapSettings:
     ground_px: float = 28.0  # side of the squares of ground that vote once for a shift
     cell_px: float = 1.2  # of the raster of shifts on which pairs vote
     spread_px: float = 2.5  # one sigma of what right pairs scatter: another light, and maps are distorted
-    least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 6.8
-    least_agree: int = 100  # pairs within the band: few pairs in all stand out by chance
+    least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 7.2, ...
+    least_agree: int = 100  # ... of 40 pairs within the band: few in all stand out by chance
     own_share: float = 0.25  # of a photo's pairs on another place, and twice those on the flight's: it lies elsewhere
     least_spread: float = 1.4  # times the squares that chance would leave; other ground has about one
     rounds: int = 10  # of the least squares that follow, over the pairs within ...
