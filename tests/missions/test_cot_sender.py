@@ -12,7 +12,7 @@ import pytest
 from live_sender import free_port
 
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.watch.cot_sender import CotPlace, CotSender, CotTls, cot_place
+from sorvolo.missions.watch.cot_sender import CotPlace, CotSender, CotTls, cot_place, send_all
 from sorvolo.missions.watch.settings import WatchOutputs
 
 
@@ -141,6 +141,68 @@ def test_tls_with_certificates_on_both_sides(certificates: dict[str, Path]) -> N
         thread.join(5)
         sender.close()
     assert received == [b"<event n='1'/>", b"<event n='2'/>"]
+
+
+def _serve_all(certificates: dict[str, Path], server: socket.socket, received: list[bytes], tickets: int) -> None:
+    """Take connections one after the other, each to its end; of a client without the right certificate nothing."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificates["server"])
+    context.load_verify_locations(certificates["client"])
+    context.verify_mode, context.num_tickets = ssl.CERT_REQUIRED, tickets
+    while True:
+        try:
+            plain, _ = server.accept()
+        except OSError:
+            return
+        plain.settimeout(5)
+        try:
+            with context.wrap_socket(plain, server_side=True) as stream:
+                while part := stream.recv(1000):
+                    received.append(part)
+        except OSError:
+            plain.close()
+
+
+@pytest.mark.parametrize("tickets", [0, 2])
+def test_a_client_that_the_server_refuses_has_sent_nothing(certificates: dict[str, Path], tickets: int) -> None:
+    received: list[bytes] = []
+    events = [b"<event n='%d'/>" % number for number in range(25)]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        thread = threading.Thread(target=_serve_all, args=(certificates, server, received, tickets), daemon=True)
+        thread.start()
+        place = CotPlace("tls", "127.0.0.1", server.getsockname()[1])
+        with pytest.raises(InputError, match=r"nothing could be sent.*certificate required.*give --cot-cert"):
+            send_all(events, place, CotTls(certificates["server"]))
+        with pytest.raises(InputError, match=r"nothing could be sent.*check that it knows .*--cot-cert"):
+            send_all(events, place, CotTls(certificates["server"], certificates["server"]))
+        assert not received
+        assert send_all(events, place, CotTls(certificates["server"], certificates["client"])) == 25
+        assert b"".join(received) == b"".join(events)  # `send_all` returns when the server has taken them
+        with pytest.raises(ConnectionRefusedError, match="--cot-cert"):
+            CotSender(place, CotTls(certificates["server"])).send(events[0])
+    thread.join(6)
+
+
+def test_a_receiver_that_breaks_the_connection_is_no_receiver() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        sender = CotSender(CotPlace("tcp", "127.0.0.1", server.getsockname()[1]))
+        sender.send(b"<event/>")
+        taken, _ = server.accept()
+        time.sleep(0.05)
+        taken.close()  # with the event unread
+        time.sleep(0.05)
+        with pytest.raises(ConnectionResetError):
+            sender.finish()
+        sender.send(b"<event n='2'/>")
+        taken, _ = server.accept()
+        assert taken.recv(100) == b"<event n='2'/>"
+        began_s = time.monotonic()
+        sender.finish()  # a server that holds its half open is not waited for without end
+        assert time.monotonic() - began_s < 3
+        assert taken.recv(100) == b""
+        taken.close()
 
 
 def test_an_unknown_server_is_refused(certificates: dict[str, Path]) -> None:

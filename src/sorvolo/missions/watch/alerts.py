@@ -62,8 +62,11 @@ class Outbox(Generic[_Item]):
             self._waiting.append(item)
             self._changed.notify()
 
-    def close(self, timeout_s: float) -> None:
-        """Wait until all is sent, at most so long; what then still waits is dropped and counted."""
+    def close(self, timeout_s: float) -> bool:
+        """Wait until all is sent, at most so long; what then still waits is dropped and counted.
+
+        Whether nothing is being sent any more.
+        """
         with self._changed:
             self._is_closing = True
             self._changed.notify()
@@ -71,6 +74,7 @@ class Outbox(Generic[_Item]):
         with self._changed:
             self._dropped += len(self._waiting)
             self._waiting.clear()
+        return not self._thread.is_alive()
 
     def notices(self) -> tuple[Notice, ...]:
         """What failed so far."""

@@ -1,7 +1,9 @@
 """The way of Cursor on Target events to a TAK server or a team's phones: UDP datagrams, a TCP stream or TLS."""
 
+import selectors
 import socket
 import ssl
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from ipaddress import ip_address
@@ -10,11 +12,14 @@ from typing import Literal
 from urllib.parse import urlsplit
 
 from sorvolo.errors import InputError, SettingsError
+from sorvolo.survey.wording import counted
 
 Transport = Literal["udp", "tcp", "tls"]
 
 _DEFAULT_PORTS: dict[Transport, int] = {"udp": 6969, "tcp": 8087, "tls": 8089}
 _TIMEOUT_S = 3.0  # for a connection and a message, which wait meanwhile; by choice
+_VERDICT_S = 1.0  # for a server's answer to one's certificate: a satellite's way and back; by choice
+_END_S = 1.0  # for the other side to end its half of a stream; by choice
 
 
 @dataclass(frozen=True)
@@ -84,7 +89,7 @@ def check_host(place: CotPlace) -> None:
 def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -> int:
     """Send recorded events one after the other; how many arrived as far as the sender can know.
 
-    Raises InputError where nothing can be sent at all.
+    Raises InputError where nothing can be sent at all, and where the receiver breaks the connection at the end.
     """
     sender, sent, last = CotSender(place, tls), 0, ""
     try:
@@ -94,6 +99,14 @@ def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -
                 sent += 1
             except OSError as error:
                 last = str(error)
+                if not sent and isinstance(error, ConnectionRefusedError):
+                    break
+        sender.finish()
+    except OSError as error:
+        raise InputError(
+            f"--cot {place}: the receiver broke the connection at the end ({error}), so that how many of "
+            f"{counted(len(events), 'event')} arrived is not known; check the receiver, and send them again"
+        ) from error
     finally:
         sender.close()
     if events and not sent:
@@ -107,12 +120,17 @@ class CotSender:
     def __init__(self, place: CotPlace, tls: CotTls = CotTls()) -> None:
         self._place = place
         self._tls = tls.context() if place.transport == "tls" else None
+        self._advice = (
+            "it may ask clients for a certificate: give --cot-cert" if tls.certificate is None
+            else "check that it knows the certificate of --cot-cert"
+        )
         self._socket: socket.socket | None = None
 
     def send(self, event: bytes) -> None:
         """Send one event: a datagram, or a piece of the stream.
 
-        Raises OSError when that fails, or when an earlier datagram was refused (this one is then sent all the same).
+        Raises OSError when that fails, or when an earlier datagram was refused (this one is then sent all the same);
+        ConnectionRefusedError where a TLS server refuses this client.
         """
         try:
             if self._socket is not None and self._place.transport != "udp" and not _is_open(self._socket):
@@ -120,18 +138,46 @@ class CotSender:
             if self._socket is None:
                 self._socket = _connected(self._place, self._tls)
             self._socket.sendall(event)
-        except OSError:
+        except OSError as error:
             self.close()
             if self._place.transport == "udp":
                 with _connected(self._place) as once_more:
                     once_more.send(event)
+            self._raise_refusal(error)
             raise
 
+    def finish(self) -> None:
+        """End the connection once the other side has taken what was sent, or has had a second for it.
+
+        Raises OSError where the other side breaks the connection instead.
+        """
+        if self._socket is not None and self._place.transport != "udp":
+            try:
+                _end(self._socket)
+            except OSError as error:
+                self._raise_refusal(error)
+                raise
+            finally:
+                self.close()
+        self.close()
+
     def close(self) -> None:
-        """End the connection, if there is one."""
+        """End the connection at once, if there is one."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+    def _raise_refusal(self, error: OSError) -> None:
+        """Raise ConnectionRefusedError, which names --cot-cert, for an error by which a TLS server refuses a client."""
+        if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
+            words = (error.reason or "").lower().replace("_", " ")
+            raise ConnectionRefusedError(f"the server refuses this client ({words}); {self._advice}") from error
+        if isinstance(error, _ClosedAtOnceError):
+            raise ConnectionRefusedError(f"the server closed the connection at once; {self._advice}") from error
+
+
+class _ClosedAtOnceError(ConnectionError):
+    """A TLS server ended a connection before anything was sent."""
 
 
 def _is_open(stream: socket.socket) -> bool:
@@ -147,16 +193,45 @@ def _is_open(stream: socket.socket) -> bool:
         stream.settimeout(_TIMEOUT_S)
 
 
+def _end(stream: socket.socket) -> None:
+    """End one's own half and wait for the other's, at most `_END_S`. Raises OSError where that is broken off.
+
+    A stream that is closed while bytes of the other side wait unread is reset, and may lose what was sent.
+    """
+    if not _is_open(stream):
+        return
+    stream.settimeout(_END_S)
+    until_s = time.monotonic() + _END_S
+    try:
+        if isinstance(stream, ssl.SSLSocket):
+            stream.unwrap()
+            return
+        stream.shutdown(socket.SHUT_WR)
+        while time.monotonic() < until_s and stream.recv(65_536):
+            pass
+    except TimeoutError:  # the other side holds its half open
+        return
+    except ssl.SSLError as error:
+        if "ALERT" in (error.reason or ""):
+            raise  # others are of servers that end without TLS's own farewell, or still send
+
+
 def _connected(place: CotPlace, tls: ssl.SSLContext | None = None) -> socket.socket:
     if place.transport != "udp":
         plain = socket.create_connection((place.host, place.port), timeout=_TIMEOUT_S)
         if tls is None:
             return plain
         try:
-            return tls.wrap_socket(plain, server_hostname=place.host)
+            stream = tls.wrap_socket(plain, server_hostname=place.host)
         except OSError:
             plain.close()
             raise
+        try:
+            _await_verdict(stream)
+        except OSError:
+            stream.close()
+            raise
+        return stream
     family, kind, protocol, _, address = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_DGRAM)[0]
     made = socket.socket(family, kind, protocol)
     try:
@@ -168,3 +243,18 @@ def _connected(place: CotPlace, tls: ssl.SSLContext | None = None) -> socket.soc
         made.close()
         raise
     return made
+
+
+def _await_verdict(stream: ssl.SSLSocket) -> None:
+    """Wait until a server has judged the client's certificate. Raises OSError where it refuses the client.
+
+    In TLS 1.3 the handshake ends for the client before that. A server that takes the client mostly sends session
+    tickets at once; of one that sends nothing in `_VERDICT_S` no refusal is expected.
+    """
+    if stream.version() != "TLSv1.3":
+        return
+    with selectors.DefaultSelector() as waiting:
+        waiting.register(stream, selectors.EVENT_READ)
+        has_answered = bool(waiting.select(_VERDICT_S))
+    if has_answered and not _is_open(stream):
+        raise _ClosedAtOnceError("the server closed the connection at once")

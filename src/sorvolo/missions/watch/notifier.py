@@ -34,6 +34,7 @@ class Notifier:
         self._caught_up: dict[int, Track] = {}  # tracks of frames that a killed watch searched
         self._cot: Outbox[bytes] | None = None
         self._sender: CotSender | None = None
+        self._broken_end: tuple[Notice, ...] = ()
         self._alerts: dict[str, Outbox[Mapping[str, Any]]] = {}
         if outputs.cot and not site.is_local:
             self._sender = CotSender(cot_place(outputs.cot), outputs.cot_tls)
@@ -87,7 +88,8 @@ class Notifier:
         for outbox in self._alerts.values():
             outbox.close(alerts_s)
         if self._cot is not None and self._sender is not None:
-            self._cot.close(events_s)
+            if self._cot.close(events_s):
+                self._finish(self._sender)
             self._sender.close()
 
     def notices(self) -> tuple[Notice, ...]:
@@ -98,7 +100,15 @@ class Notifier:
             found.append(Notice("cot_without_place", 1, text))
         for outbox in self._alerts.values():
             found += outbox.notices()
-        return (*found, *(self._cot.notices() if self._cot is not None else ()))
+        return (*found, *(self._cot.notices() if self._cot is not None else ()), *self._broken_end)
+
+    def _finish(self, sender: CotSender) -> None:
+        """End the TAK server's connection; one that it breaks is a notice."""
+        try:
+            sender.finish()
+        except OSError as error:
+            text = f"{self._outputs.cot} broke the connection at the end: {error}"
+            self._broken_end = (Notice("cot_broken_end", 1, text),)
 
     def _alert(self, track: Track, crop: str | None, segment: int) -> None:
         """Send the alert of a track to those who have not got it."""
