@@ -98,11 +98,26 @@ def main() -> None:
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size, "export": check,
         "calibration": learnt, "fails": list(FAILS),
     }
+    if alone := aerial_alone(wishes.aerial):
+        card["aerial_alone"] = alone
     if wishes.measured is not None:
         card["measured"] = measured(json.loads(wishes.measured.read_text()))
     if wishes.alarms is not None:
         card["false_alarms"] = json.loads(wishes.alarms.read_text())["models"]["default"]
     (wishes.out / "default.json").write_text(json.dumps(card, indent=1) + "\n")
+
+
+def aerial_alone(name: str) -> dict[str, Any]:
+    """Of a card: from which scores the aerial network by itself reports, and what it was measured to find.
+
+    `name` is a model file's or an installed model's, of the aerial network alone or of one that has it as a part; what
+    stands in the card of the latter is taken on. `sorvolo train --weights` goes by it.
+    """
+    place = find_model(name).with_suffix(".json")
+    card = json.loads(place.read_text()) if place.is_file() else {}
+    if "aerial_alone" in card or "thresholds" not in card:
+        return card.get("aerial_alone", {})
+    return {"thresholds": card["thresholds"], "measured": card.get("measured") or {}}
 
 
 def model_and_probabilities(wishes: argparse.Namespace) -> tuple[Daylight, dict[str, Any]]:

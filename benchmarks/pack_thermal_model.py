@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from detection_data import hituav, in_order
-from pack_daylight_model import SAME_BOX_PX, SAME_SCORE, differences, half_stored
+from pack_daylight_model import SAME_BOX_PX, SAME_SCORE, aerial_alone, differences, half_stored
 from pack_default_model import BEST_PX, HOME, VALIDATION_PICTURES, VALIDATION_SEED, best_thresholds, measured
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
@@ -97,7 +97,8 @@ def main() -> None:
     card = {
         **info, "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in TRAINED_ON],
         "sha256": hashlib.sha256(exported).hexdigest(), "bytes": len(exported), "training": TRAINING, "export": check,
-        "fails": FAILS, "measured": {each: figures[each] for each in figures if each in THERMAL_SETS} or None,
+        "fails": FAILS, "aerial_alone": {} if wishes.aerial.endswith(".pt") else aerial_alone(wishes.aerial),
+        "measured": {each: figures[each] for each in figures if each in THERMAL_SETS} or None,
     }
     wishes.out.mkdir(parents=True, exist_ok=True)
     (wishes.out / "thermal.onnx").write_bytes(exported)

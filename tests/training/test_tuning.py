@@ -14,6 +14,8 @@ from square_pictures import labelled_squares  # noqa: E402
 from sorvolo.cli.main import main  # noqa: E402
 from sorvolo.detection.detector import Detector  # noqa: E402
 from sorvolo.detection.models import find_model  # noqa: E402
+from sorvolo.missions.train.start import load_start, part_notices, threshold_notices  # noqa: E402
+from sorvolo.training.exported import ExportedModel  # noqa: E402
 
 _BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu")
 
@@ -91,7 +93,31 @@ def test_new_classes_are_learnt_from_the_beginning_and_reported(
     assert "note the model default knows person, small object, which nothing here labels" in printed
     notices = json.loads((out / "training.json").read_text())["notices"]
     assert any("does not know boat" in each for each in notices)
-    assert Detector.load(out / "model.onnx").classes == ("car", "boat")
+    info = Detector.load(out / "model.onnx").info
+    assert info.classes == ("car", "boat")
+
+    # the packaged model joins networks: what a training does not carry on, and from which scores its part reports
+    card = json.loads(find_model("default").with_suffix(".json").read_text())
+    assert info.thresholds["car"] == card["aerial_alone"]["thresholds"]["car"] != card["thresholds"]["car"]
+    not_carried_on = "only the aerial network of the model default is learnt on from. Not carried on: NanoDet's network"
+    assert not_carried_on in printed
+    assert any(not_carried_on in each and "person on semantic_drone 15.7 alone" in each for each in notices)
+    assert any("car kept those of the model's aerial network by itself" in each for each in notices)
+    assert "the judge of cars" in json.loads((out / "training.json").read_text())["not_carried_on"]
+
+
+def test_a_model_of_several_networks_without_its_card_keeps_no_thresholds(tmp_path: Path) -> None:
+    own = tmp_path / "own.onnx"
+    shutil.copy(find_model("thermal"), own)
+    start = load_start(str(own), "fast")
+    assert isinstance(start, ExportedModel)
+    assert not start.thresholds
+    assert "NanoDet's network" in part_notices(start)[0]
+    (notice,) = threshold_notices(start, ("car", "boat"))
+    assert "the scores from which car are reported are not calibrated" in notice
+    packaged = load_start("thermal", "fast")
+    assert isinstance(packaged, ExportedModel)
+    assert set(packaged.thresholds) == set(packaged.classes)
 
 
 @pytest.mark.long

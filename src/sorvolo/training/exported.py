@@ -17,12 +17,17 @@ from sorvolo.training.faster_rcnn import FasterRCNN
 
 _WEIGHTED = ("Conv", "Gemm")
 _AERIAL = "/aerial/"  # of a model of two networks, such as the packaged one, the part that can be learnt on from
+_OTHER_PARTS = {"backbone": "NanoDet's network", "coco": "NanoDet's network", "judge": "the judge of cars"}
 _OF_CLASSES = "head.scores"  # the one layer with a row for each class; the background's comes last
 
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
-    """A model file of ours to learn on from, and what it states about itself; `origin` names it in words."""
+    """A model file of ours to learn on from, and what it states about itself; `origin` names it in words.
+
+    `thresholds` are those of the network that is learnt on from. `left` names in words what else the file joins with it
+    and a training does not carry on, `cost` what that costs, by the model's card.
+    """
 
     content: bytes
     classes: tuple[str, ...]
@@ -31,6 +36,8 @@ class ExportedModel:
     licence: str
     trained_on: str
     thresholds: Mapping[str, float] = field(default_factory=dict)
+    left: tuple[str, ...] = ()
+    cost: tuple[str, ...] = ()
 
 
 def load_exported(
@@ -59,6 +66,18 @@ def load_exported(
         _demand_fitting(name, layer, found)
         _fill(name, layer, norms.get(name), *found)
     _settle(model, list(norms.values()), pictures)
+
+
+def other_networks(exported: bytes) -> tuple[str, ...]:
+    """What a file joins with its aerial network, in words; nothing for a file of one network.
+
+    Raises InputError where the file is damaged.
+    """
+    names = [node.name for node in _read(exported)[0].node]
+    if not any(name.startswith(_AERIAL) for name in names):
+        return ()
+    found = (words for part, words in _OTHER_PARTS.items() if any(name.startswith(f"/{part}/") for name in names))
+    return tuple(dict.fromkeys(found))
 
 
 def _read(exported: bytes) -> tuple[Any, tuple[str, ...]]:

@@ -19,7 +19,7 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.train.checks import check_model, check_of
 from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
 from sorvolo.missions.train.settings import TrainSettings
-from sorvolo.missions.train.start import class_notices, load_start
+from sorvolo.missions.train.start import class_notices, load_start, part_notices, threshold_notices
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.pages.training import training_page
@@ -124,7 +124,7 @@ def _train(
     sets = training_sets(labels, synthetic=settings.synthetic, simulated=out / SIMULATED)
     notices = sets.notices
     if isinstance(start, ExportedModel):
-        notices += tuple(class_notices(start, sets.classes))
+        notices += (*part_notices(start), *class_notices(start, sets.classes))
     yield TrainingUpdate(0, steps, f"preparing the network ({settings.preset})", notices=notices)
     reader = _Reader(sets)
     with without_denormals():
@@ -274,8 +274,9 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
     check = check_of(checked, run.learner.step if best is None else best.step) if run.sets.held_out else None
-    kept = [name for name in checked.too_few(classes) if name in before]
-    notices = (*_closing_notices(run, agreement, check), *_kept_notices(kept))
+    notices = _closing_notices(run, agreement, check)
+    if isinstance(run.start, ExportedModel):
+        notices += tuple(threshold_notices(run.start, checked.too_few(classes)))
     report = _report(run, info, agreement, len(exported), check, notices) | {
         "reported": {name: asdict(each) for name, each in thresholds.items()},
         "found_px": found_sizes_px(checked, scores, classes),
@@ -346,13 +347,6 @@ def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> 
     return tuple(notices)
 
 
-def _kept_notices(kept: Sequence[str]) -> list[str]:
-    """Which scores to report from are those of the model before."""
-    if not kept:
-        return []
-    return [f"too few objects were held out to choose the score to report from: {', '.join(kept)} kept the model's own"]
-
-
 def _report(
     run: _Run, info: Mapping[str, Any], agreement: ExportCheck, size_bytes: int, check: Check | None,
     closing_notices: Sequence[str],
@@ -362,6 +356,7 @@ def _report(
     return {
         "made_by": "sorvolo train", "format": 1, "model": dict(info), "settings": asdict(run.settings),
         "device": run.device, "weights": "none" if run.start is None else run.start.origin,
+        "not_carried_on": list(run.start.left) if isinstance(run.start, ExportedModel) else [],
         "sets": run.sets.described(), "notices": [*run.notices, *closing_notices],
         "step": step, "steps": steps, "stopped_early": step < steps, "seconds": history.seconds,
         "losses": [asdict(row) for row in history.rows], "checks": [asdict(each) for each in history.checks],

@@ -1,19 +1,24 @@
 """What a training begins with: ImageNet weights of the backbone, or a model of ours that is tuned to other pictures."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
-from sorvolo.detection.models import file_sha256, find_model, installed_models
+from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.models import HASH_KEY, InstalledModel, file_sha256, find_model, installed_models, read_card
 from sorvolo.detection.session import read_info, read_model
 from sorvolo.errors import InputError
 from sorvolo.missions.fetched_files import copy_by_hash
 from sorvolo.store.atomic import atomic_path, writing
-from sorvolo.training.exported import ExportedModel
+from sorvolo.training.exported import ExportedModel, other_networks
 from sorvolo.training.presets import NETS, Preset
 from sorvolo.training.weights import SOURCES, WAYS, ImageNetWeights, Net, read_weights
+
+_FEW_LABELS = 50  # of a class in a measured set: with fewer, two AP50 may differ by chance
+_CLEARLY = 0.03  # so much higher an AP50 is worth a word; by choice
 
 
 def load_start(choice: str, preset: Preset) -> ImageNetWeights | ExportedModel | None:
@@ -62,6 +67,36 @@ def fetch_weights(net: Net) -> Path:
     return place
 
 
+def part_notices(start: ExportedModel) -> list[str]:
+    """What of the model a training does not carry on, and what that costs by its card."""
+    if not start.left:
+        return []
+    text = (
+        f"only the aerial network of {start.origin} is learnt on from. Not carried on: {', '.join(start.left)}; the "
+        "new model begins with less than that model knows"
+    )
+    if start.cost:
+        text += f" (by its card, AP50 in %: {'; '.join(start.cost)})"
+    return [text]
+
+
+def threshold_notices(start: ExportedModel, too_few: Sequence[str]) -> list[str]:
+    """From which scores the new model reports the classes of which too few objects were held out to choose one."""
+    why = "too few objects were held out to choose the score to report from"
+    own = "those of the model's aerial network by itself" if start.left else "the model's own"
+    kept = [name for name in too_few if name in start.thresholds]
+    unknown = [name for name in too_few if name in start.classes and name not in start.thresholds]
+    notices = []
+    if kept:
+        notices.append(f"{why}: {', '.join(kept)} kept {own}")
+    if unknown:
+        notices.append(
+            f"{why}, and nothing states those of the model's aerial network by itself: the scores from which "
+            f"{', '.join(unknown)} are reported are not calibrated; hold more out (--val)"
+        )
+    return notices
+
+
 def class_notices(start: ExportedModel, classes: Sequence[str]) -> list[str]:
     """What becomes of the model's classes in a training of `classes`, where they are not the same."""
     new = [name for name in classes if name not in start.classes]
@@ -83,7 +118,31 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
         )
     if info.preset and info.preset != preset:
         raise InputError(f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}")
-    return ExportedModel(
-        content, info.classes, f"the model {info.name}", file_sha256(path), info.licence, info.trained_on,
-        info.thresholds,
+    sha256 = file_sha256(path)
+    start = ExportedModel(
+        content, info.classes, f"the model {info.name}", sha256, info.licence, info.trained_on, info.thresholds
     )
+    return _aerial(start, info, path) if other_networks(content) else start
+
+
+def _aerial(start: ExportedModel, info: ModelInfo, path: Path) -> ExportedModel:
+    """Of a file of several networks the aerial one: its own thresholds, by the card, and what the others gave."""
+    card = read_card(InstalledModel(path.stem, path, is_packaged=False))
+    is_of_file = str(card.get(HASH_KEY, "")).lower() == start.sha256
+    alone = card.get("aerial_alone", {}) if is_of_file else {}
+    left = [*other_networks(start.content)]
+    left += [f"the second look at reports ({', '.join(info.second_look)})"] if info.second_look else []
+    left += ["the search in several sizes"] if info.pyramid else []
+    cost = tuple(_lost(alone.get("measured") or {}, card.get("measured") or {})) if alone else ()
+    return replace(start, thresholds=alone.get("thresholds", {}), left=tuple(left), cost=cost)
+
+
+def _lost(alone: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterator[str]:
+    """Of each class that the whole model finds clearly better on a set, both AP50."""
+    for name in (each for each in whole if each in alone):
+        for label, figures in whole[name].items():
+            if label not in alone[name] or figures["labels"] < _FEW_LABELS:
+                continue
+            before, after = (each["AP50"]["value"] for each in (figures, alone[name][label]))
+            if before - after > _CLEARLY:
+                yield f"{label} on {name} {100 * after:.1f} alone, {100 * before:.1f} as a whole"
