@@ -12,8 +12,10 @@ linked to objects by what each moves against the ground; at which rate they were
 second is assumed.
 
 An object counts as seen when enough frames show more than half of it (five of a patrol, three of a real video); one
-that fewer showed is neither right nor wrong. A track is of the object of its class that most of its boxes lie on (IoU
-0.2 or more), if half of them do; the object's other tracks count it again (`twice`), and tracks of nothing are `false`.
+that fewer showed is neither right nor wrong. A track is of an object of its class where half of its boxes lie on labelled
+ones (IoU 0.2 or more); else it is `false`. Tracks and objects are paired so that most boxes agree, a quarter of a track's
+at least: in a crowd a track may change from one person to the next, and the count is right all the same. Tracks of
+objects that are left without a partner count one again (`twice`).
 Without telemetry nothing says where on the ground a thing lies, so that one that comes into view again on the next
 strip is likely to count again: `appearances` is how often the objects came into view.
 """
@@ -93,7 +95,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     seeds = seeds_or_drawn("watch_counts_detector", options.seeds, options.patrols) if options.patrols else []
-    scoring = note_scoring(f"watch_counts_detector, seeds {' '.join(map(str, seeds))}")
+    scoring = note_scoring(f"watch_counts_detector, seeds {' '.join(map(str, seeds))}") if seeds else {}
     detector = Detector.load(options.model)
     result: dict[str, Any] = {
         "benchmark": "watch_counts_detector", "machine": machine(), "commit": commit(),
@@ -202,26 +204,27 @@ def compared(
         if row["track"] is not None:
             boxes[row["track"]].append((int(row["frame"]), np.array(row["box_px"])))
     seen = {each for each, frames in truth.clear.items() if len(frames) >= truth.least}
-    of_object: dict[int, list[int]] = defaultdict(list)
+    votes_of: dict[int, Counter[int]] = {}
     false: Counter[str] = Counter()
     for track in tracks:
         views = boxes[track["id"]]
         votes = Counter(
             best for frame, box in views if (best := _object_at(frame, box, truth, track["class"])) is not None
         )
-        best, count = votes.most_common(1)[0] if votes else (None, 0)
         ignored = sum(bool(np.any(_overlaps(truth.ignored.get(frame, np.zeros((0, 4))), box))) for frame, box in views)
-        if best is not None and count >= len(views) / 2:
-            of_object[best].append(track["id"])
+        if votes and votes.total() >= len(views) / 2:
+            votes_of[track["id"]] = votes
         elif ignored < len(views) / 2:
             false[track["class"]] += 1
+    partners = _paired(votes_of, {each: len(boxes[each]) for each in votes_of})
+    found = set(partners.values())
+    again = [votes.most_common(1)[0][0] for track, votes in votes_of.items() if track not in partners]
     groups = {name: [each for each in seen if truth.labels[each] == name] for name in COUNTED}
     groups["moving car"] = [each for each in groups["car"] if truth.moving[each]]
     figures = {
         name: {
-            "true": len(members), "found": sum(bool(of_object[each]) for each in members),
-            "missed": sum(not of_object[each] for each in members),
-            "twice": sum(max(0, len(of_object[each]) - 1) for each in members),
+            "true": len(members), "found": len(found.intersection(members)),
+            "missed": len(set(members) - found), "twice": sum(each in members for each in again),
             "appearances": sum(_appearances(truth.clear[each]) for each in members),
             **({"false": false[name]} if name in COUNTED else {}),
         }
@@ -230,6 +233,18 @@ def compared(
     for name in COUNTED:
         figures[name]["counted"] = sum(figures[name][key] for key in ("found", "twice", "false"))
     return figures
+
+
+def _paired(votes_of: Mapping[int, Counter[int]], views: Mapping[int, int]) -> dict[int, int]:
+    """The object of each track that has one for itself: so that most boxes lie on their track's object."""
+    tracks, objects = list(votes_of), sorted({each for votes in votes_of.values() for each in votes})
+    votes = np.array([[votes_of[track][each] for each in objects] for track in tracks]).reshape(-1, len(objects))
+    if not votes.size:
+        return {}
+    return {
+        tracks[row]: objects[column] for row, column in zip(*linear_sum_assignment(votes, maximize=True))
+        if votes[row, column] >= max(1, views[tracks[row]] / 4)
+    }
 
 
 def _summed(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

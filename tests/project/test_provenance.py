@@ -73,7 +73,7 @@ def test_each_scoring_of_a_held_out_set_counts(provenance: ModuleType, tmp_path:
     assert json.loads(ledger.read_text()) == {"a set": 2, "another": 1}
 
 
-@pytest.mark.parametrize("name", ["change_events", "change_methods", "watch_counts"])
+@pytest.mark.parametrize("name", ["change_events", "change_methods", "watch_counts", "watch_counts_detector"])
 def test_published_scores_state_how_often_their_set_was_scored(name: str) -> None:
     result = json.loads((BENCHMARKS / "results" / f"{name}.json").read_text())
     ledger = json.loads((BENCHMARKS / "results" / "scored.json").read_text())

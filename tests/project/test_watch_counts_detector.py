@@ -36,4 +36,11 @@ def test_tracks_are_of_the_object_that_most_of_their_boxes_lie_on(monkeypatch: p
         "true": 2, "found": 1, "missed": 1, "twice": 1, "appearances": 3, "false": 1, "counted": 3
     }
     assert found["car"] == {"true": 1, "found": 1, "missed": 0, "twice": 0, "appearances": 1, "false": 1, "counted": 2}
+    # two who cross, and their tracks change: the count is right
+    rows = [
+        {"track": 1 + number, "frame": str(frame), "box_px": list(places[1 + (number + (frame > 8)) % 2])}
+        for number in range(2) for frame in frames
+    ]
+    crossed = benchmark.compared([{"id": 1, "class": "person"}, {"id": 2, "class": "person"}], rows, truth)
+    assert [crossed["person"][key] for key in ("true", "found", "twice", "false")] == [2, 2, 0, 0]
     assert found["moving car"] == {"true": 1, "found": 1, "missed": 0, "twice": 0, "appearances": 1}
