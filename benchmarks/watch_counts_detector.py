@@ -12,10 +12,10 @@ linked to objects by what each moves against the ground; at which rate they were
 second is assumed.
 
 An object counts as seen when enough frames show more than half of it (five of a patrol, three of a real video); one
-that fewer showed is neither right nor wrong. A track is of an object of its class where half of its boxes lie on labelled
-ones (IoU 0.2 or more); else it is `false`. Tracks and objects are paired so that most boxes agree, a quarter of a track's
-at least: in a crowd a track may change from one person to the next, and the count is right all the same. Tracks of
-objects that are left without a partner count one again (`twice`).
+that fewer showed is neither right nor wrong. A track is of an object of its class where half of its boxes lie on
+labelled ones (IoU 0.2 or more); else it is `false`. Tracks and objects are paired so that most boxes agree, a quarter
+of a track's at least: in a crowd a track may change from one person to the next, and the count is right all the same.
+Tracks of objects that are left without a partner count one again (`twice`).
 Without telemetry nothing says where on the ground a thing lies, so that one that comes into view again on the next
 strip is likely to count again: `appearances` is how often the objects came into view.
 """
