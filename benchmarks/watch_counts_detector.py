@@ -16,7 +16,7 @@ that fewer showed is neither right nor wrong. A track is of an object of its cla
 labelled ones (IoU 0.2 or more); else it is `false`. Tracks and objects are paired so that most boxes agree, a quarter
 of a track's at least: in a crowd a track may change from one person to the next, and the count is right all the same.
 Tracks of objects that are left without a partner count one again (`twice`).
-Without telemetry nothing says where on the ground a thing lies, so that one that comes into view again on the next
+Without telemetry nothing states where on the ground a thing lies, so that one that comes into view again on the next
 strip is likely to count again: `appearances` is how often the objects came into view.
 """
 
