@@ -231,6 +231,7 @@ def test_a_broken_calibration(
 @pytest.mark.parametrize(("option", "value", "words"), [
     ("--crs", "EPSG:99999", "EPSG:32633"), ("--crs", "EPSG:4978", "projected"), ("--gsd", "0", "sampling distance"),
     ("--gsd", "nan", "sampling distance"), ("--overlap", "1.5", "between 0 and 1"), ("--offset", "nan", "seconds"),
+    ("--refly", "holes.txt", "not as '.txt'"), ("--refly", "nowhere/holes.kml", "there is no folder"),
 ])
 def test_impossible_options_are_refused_before_the_work(
     film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, value: str, words: str
