@@ -206,8 +206,8 @@ def test_commands_take_a_place_in_a_store(
     assert main(["evaluate", "mosaic", address, "--json"]) == 0
     assert [each["flight"] for each in json.loads(capsys.readouterr().out)["flights"]] == ["one"]
     assert main(["telemetry", address, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["folder"] == "commands-telemetry/commands"
-    assert (tmp_path / "commands-telemetry" / "commands" / "geo.txt").is_file()
+    assert json.loads(capsys.readouterr().out)["folder"] == "commands-telemetry/one"
+    assert (tmp_path / "commands-telemetry" / "one" / "geo.txt").is_file()
     for command, fault in (
         (["measure", "contours", address, "--out", "contours.geojson"], "flight one of .* has no heights"),
         (["search", address, "--model", "default", "--flight", "nine"], "nine"),
