@@ -66,6 +66,7 @@ def test_wind_makes_a_wing_faster_downwind_and_turns_its_nose_and_turns_bank_it(
         MotionSettings(wind_m_s=3.0)
 
 
+@pytest.mark.long
 def test_a_real_survey_is_one_map_within_what_its_receiver_errs(tmp_path: Path) -> None:
     photos = real_data("flights/fixed_wing")
     coarse = ["--gsd", "0.4", "--model", "none"]  # how finely it is painted has nothing to do with where it lies

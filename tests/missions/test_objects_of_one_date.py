@@ -27,6 +27,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate_into(tmp_path_factory.mktemp("photos"), replace(settings, flights=2))
 
 
+@pytest.mark.long
 def test_objects_of_one_date_are_changes_where_the_ground_differs_as_well(
     simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
