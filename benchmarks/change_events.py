@@ -21,6 +21,7 @@ import tempfile
 import time
 from collections import deque
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from statistics import median
 
@@ -100,7 +101,7 @@ def save(runs: list[dict], presets: list[str], options: argparse.Namespace) -> N
     output.write_text(json.dumps({
         "benchmark": "change_events", "presets": list(presets), "length_m": options.length, "fps": options.fps,
         "seeds": options.seeds, **options.scoring,
-        "least_px": LEAST_PX, "machine": machine(), "commit": commit(),
+        "least_px": LEAST_PX, "machine": machine(), "commit": commit(), "date": f"{datetime.now(UTC):%Y-%m-%d}",
         "summary": summarised(runs, presets, options.methods), "runs": runs,
     }, indent=1) + "\n")
 
