@@ -38,7 +38,7 @@ from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import SelectionSettings, select_keyframes
-from sorvolo.store.exports.waypoints import check_waypoint_file
+from sorvolo.store.exports.waypoints import check_waypoint_files
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.survey.area import Area
@@ -69,10 +69,7 @@ def map_flights(
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
-    for path in refly:
-        check_waypoint_file(path)
-        if not path.parent.is_dir() and path.parent.resolve() != site.resolve():
-            raise SettingsError(f"--refly {path}: there is no folder {path.parent}")
+    check_waypoint_files(refly, site)
     wanted = None if area is None else read_area(area)
     is_live = any(is_live_address(str(each)) for each in inputs)
     looks = open_detector(settings.model, is_live=is_live) if detector is None else detector

@@ -28,7 +28,7 @@ from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes
 from sorvolo.store.exports.pod_files import CellGrid, Region, pod_picture, region_features, regions_of, write_pod_tif
-from sorvolo.store.exports.waypoints import check_waypoint_file
+from sorvolo.store.exports.waypoints import check_waypoint_files
 from sorvolo.store.pages.search import search_page
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
@@ -72,10 +72,7 @@ def prepare_search(
     """
     if outputs.folder.exists() and not outputs.folder.is_dir():
         raise SettingsError(f"--out {outputs.folder} is a file, a folder was needed")
-    for path in outputs.refly:
-        check_waypoint_file(path, outputs.dji_drone)
-        if not path.parent.is_dir() and path.parent.resolve() != outputs.folder.resolve():
-            raise SettingsError(f"--refly {path}: there is no folder {path.parent}")
+    check_waypoint_files(outputs.refly, outputs.folder, outputs.dji_drone)
     area = None if outputs.area is None else read_area(outputs.area)
     segments = [] if outputs.poa is None else read_segments(outputs.poa)
     looks = open_detector(settings.model) if detector is None else detector

@@ -5,7 +5,7 @@ speed, the gimbal straight down, every pass with the camera triggered by distanc
 """
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -56,6 +56,15 @@ def check_waypoint_file(path: Path, dji_drone: str = "fly") -> None:
         raise SettingsError(f"{path}: flight plans are written as {', '.join(_ENDINGS)}, not as {path.suffix!r}")
     if path.suffix.lower() == ".kmz":
         check_drone(dji_drone)
+
+
+def check_waypoint_files(paths: Sequence[Path], made: Path, dji_drone: str = "fly") -> None:
+    """As `check_waypoint_file` for files to be written after long work; a folder that is not there is refused as well,
+    but for the one that the work has `made` by then."""
+    for path in paths:
+        check_waypoint_file(path, dji_drone)
+        if not path.parent.is_dir() and path.parent.resolve() != made.resolve():
+            raise SettingsError(f"--refly {path}: there is no folder {path.parent}")
 
 
 def _geojson(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
