@@ -1,69 +1,23 @@
 """Searches through whole missions: a small flight mapped, things planted into its frames, what a map would report."""
 
 import json
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import rasterio
+from comparing_detector import Comparing
 
 from sorvolo.capture.areas import read_segments
 from sorvolo.cli.main import main
-from sorvolo.detection.contract import ModelInfo
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.search.flights import SearchOutputs, search_site
-from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.missions.search.flights import search_site
+from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
-from sorvolo.survey.objects import CLASSES, Detections
-
-
-class Comparing:
-    """Detects what a picture has that the site's own frames have not, or nothing at all."""
-
-    classes = CLASSES
-    provider = "comparison"
-    notices = ()
-    info = ModelInfo(
-        "comparing", CLASSES, dict.fromkeys(CLASSES, 0.3), dict.fromkeys(CLASSES, (4.0, 400.0)), version="1",
-        licence="CC0-1.0", trained_on="nothing",
-    )
-
-    def __init__(self, site: Path, *, sees: bool = True) -> None:
-        with Archive.open(site, write=False) as archive:
-            self._frames = [archive.image(each) for each in archive.keyframes()]
-        self._sees = sees
-
-    def rest(self) -> None:
-        """There is nothing to give back."""
-
-    def thresholds_for(
-        self, picture: ImageRGB, *, from_above: bool = False, m_per_px: float | None = None,
-    ) -> Mapping[str, float]:
-        """The same for all pictures."""
-        return self.info.thresholds
-
-    def detect(
-        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False,
-    ) -> Detections:
-        """Boxes around what differs from the frame that is most like the picture; cars are the large ones."""
-        apart = [int(cv2.norm(each, image, cv2.NORM_L1)) for each in self._frames]
-        same = self._frames[int(np.argmin(apart))]
-        grey = np.abs(image.astype(np.int16) - same).max(axis=2)
-        mask = cv2.dilate((grey > 25).astype(np.uint8), np.ones((5, 5), np.uint8))
-        _, _, stats, _ = cv2.connectedComponentsWithStats(mask)
-        boxes = [row[:4] for row in stats[1:] if row[4] > 12] if self._sees else []
-        rows = np.array([[x, y, x + w, y + h] for x, y, w, h in boxes], np.float32).reshape(-1, 4)
-        large = (rows[:, 2:] - rows[:, :2]).max(axis=1, initial=0) * (m_per_px or 0) > 3.0
-        return Detections(rows, np.full(len(rows), 0.95), np.where(large, 1, 0), CLASSES)
 
 
 @pytest.fixture(scope="module")

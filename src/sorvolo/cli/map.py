@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.flight.request import AlreadyDone
     from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.search.while_flying import SearchWhileFlying
     from sorvolo.store.site.catalogue_place import Catalogues
     from sorvolo.survey.mosaic import MosaicUpdate
 
@@ -222,10 +223,11 @@ def map_and_read_reports(
     camera: str | None = None, area: Path | None = None,
     live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None, again: bool = False,
     sent: Passing = not_sent, refly: Sequence[Path] = (), catalogues: "Catalogues | None" = None,
+    search: "SearchWhileFlying | None" = None,
 ) -> list[dict[str, Any]]:
     """Map with progress on stderr; the reports of the flights, in order, and of those that were mapped already.
 
-    `sent` sees the mission's updates and may send what a flight added. `catalogues`: as `map_flights`.
+    `sent` sees the mission's updates and may send what a flight added. `search`, `catalogues`: as `map_flights`.
     """
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.missions.map.flights import map_flights
@@ -236,7 +238,7 @@ def map_and_read_reports(
         mapping = sent(map_flights(
             inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
             live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base, again=again,
-            refly=refly, catalogues=catalogues,
+            refly=refly, catalogues=catalogues, search=search,
         ))
         known: list[AlreadyDone] = []
 

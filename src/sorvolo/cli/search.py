@@ -12,21 +12,22 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.exit_codes import TO_CHECK
-from sorvolo.cli.options import AsJson, Camera, names
+from sorvolo.cli.options import AsJson, Camera, GiveUp, LiveTelemetry, names
 from sorvolo.cli.places_of_sites import opened_site
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import show_notices_and_warnings, show_path
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:
-    from sorvolo.missions.search.flights import SearchOutputs
-    from sorvolo.missions.search.settings import SearchSettings
+    from sorvolo.cli.places_of_sites import OpenedSite
+    from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+    from sorvolo.missions.search.while_flying import SearchWhileFlying
 
 
 Inputs = Annotated[
     list[str],
     typer.Argument(
-        help="The folder of a map, or s3://BUCKET/NAME; or flights (videos, folders of photos) to map into --site."
+        help="The folder of a map, or s3://BUCKET/NAME; or flights (videos, photos, a live source) to map into --site."
     ),
 ]
 SiteFolder = Annotated[str, typer.Option(help="Folder of the map that flights go into, or s3://BUCKET/NAME.")]
@@ -71,7 +72,9 @@ def search_command(
     refly: ReflyFiles = None,
     dji_drone: DjiDrone = "fly",
     out: ResultsFolder = None,
+    telemetry: LiveTelemetry = None,
     camera: Camera = "",
+    give_up: GiveUp = 30.0,
     seed: Seed = 1,
     as_json: AsJson = False,
 ) -> None:
@@ -79,34 +82,57 @@ def search_command(
 
     People and cars are drawn into the flight's own frames, the detector searches them, and the share that a map would
     report becomes a map of the probability of detection. Ends with exit code 3 where part of the area was not seen well
-    enough; the first line states why.
+    enough; the first line states why. A live source is measured while it flies: the page, the files and the waypoints
+    show what would have been found so far, and where it has yet to look.
 
     Example: sorvolo search field --area search-area.kml --refly holes.kml
 
     Example: sorvolo search DJI_0042.MP4 --site field --poa segments.geojson
+
+    Example: sorvolo search rtsp://192.168.1.10/live --site field --area search-area.kml --refly holes.kml
     """
-    from sorvolo.cli.map import map_and_read_reports
-    from sorvolo.missions.flight.settings import MapSettings
-    from sorvolo.missions.search.flights import SearchOutputs, prepare_search
-    from sorvolo.missions.search.settings import SearchSettings
+    from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 
     settings = SearchSettings(plants, names(classes), model, enough, through_crowns, _sun(sun), seed)
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
         outputs = SearchOutputs(
             out or place.results("search"), area, poa, tuple(flight or ()), tuple(refly or ()), dji_drone
         )
-        if site:
-            prepare_search(settings, outputs)  # mapping takes long: what cannot be used is refused before
-            map_and_read_reports(
-                list(inputs), place.folder, MapSettings(model=model), camera=camera or None, sent=place.sent
-            )
+        flying = _mapped(inputs, place, settings, outputs, telemetry, camera, give_up) if site else None
         report = _measured(place.folder, settings, outputs)
+        if flying is not None and report["refly"] is None:
+            flying.take_back()
     if as_json:
         typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1))
     else:
         _show(report, outputs.folder, outputs.refly, Console())
     if not report["headline"]["complete"]:
         raise typer.Exit(TO_CHECK)
+
+
+def _mapped(
+    inputs: Sequence[str], place: "OpenedSite", settings: "SearchSettings", outputs: "SearchOutputs",
+    telemetry: str | None, camera: str, give_up_s: float,
+) -> "SearchWhileFlying | None":
+    """Map the flights; what measured a live one meanwhile."""
+    from sorvolo.capture.live.addresses import is_live_address
+    from sorvolo.capture.live.reconnect import LiveSettings
+    from sorvolo.cli.map import map_and_read_reports
+    from sorvolo.missions.flight.settings import MapSettings
+    from sorvolo.missions.search.prepare import prepare_search
+    from sorvolo.missions.search.while_flying import SearchWhileFlying
+
+    flying = None
+    if any(is_live_address(each) for each in inputs):
+        flying = SearchWhileFlying(settings, outputs)
+        show_path("page, kept up to date", outputs.folder / "search.html", Console(stderr=True))
+    else:
+        prepare_search(settings, outputs)  # mapping takes long: what cannot be used is refused before
+    map_and_read_reports(
+        list(inputs), place.folder, MapSettings(model=settings.model), telemetry=telemetry, camera=camera or None,
+        live=LiveSettings(keeps_all=True, give_up_s=give_up_s), sent=place.sent, search=flying,
+    )
+    return flying
 
 
 def _map_of(inputs: Sequence[str]) -> str:

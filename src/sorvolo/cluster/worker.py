@@ -199,8 +199,8 @@ def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -
 
 def _search(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
     """Map the flight if the site has it not yet; measure what a search of it would have found."""
-    from sorvolo.missions.search.flights import SearchOutputs, search_site
-    from sorvolo.missions.search.settings import SearchSettings
+    from sorvolo.missions.search.flights import search_site
+    from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 
     flight, words, is_good = _map(order, alive, until)
     if not is_good:

@@ -13,6 +13,7 @@ from sorvolo.geometry.arrays import Mask, PointsM, frozen
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.polygons import points_inside
+from sorvolo.survey.flight import Site
 
 _Number = TypeVar("_Number", np.uint8, np.float64)
 
@@ -72,6 +73,12 @@ def cell_side_m(outlines_m: Sequence[PointsM], settings: CellSettings = CellSett
     least_m = max(settings.least_m, (wide_m / settings.most) ** 0.5)
     power = 10.0 ** np.floor(np.log10(least_m))
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= least_m - 1e-9))
+
+
+def cells_of(outlines_m: Sequence[PointsM], site: Site, area_m: Sequence[Sequence[PointsM]] | None) -> Cells:
+    """`cells_over` of a site, of a side that bounds their number."""
+    side_m = cell_side_m([*outlines_m, *(ring for rings in area_m or () for ring in rings)])
+    return cells_over(outlines_m, SiteGrid.at(site.origin, side_m, site.crs), area_m)
 
 
 def cells_over(

@@ -42,11 +42,12 @@ class Reason(StrEnum):
     SLANT = "seen aslant"
     DETECTOR = "rarely found anywhere"
     ROOF = "under a roof"
+    UNMEASURED = "not measured"
 
     @property
     def can_be_flown_again(self) -> bool:
         """Whether another flight may see what this one did not."""
-        return self not in (Reason.NONE, Reason.TREES, Reason.ROOF, Reason.DETECTOR)
+        return self not in (Reason.NONE, Reason.TREES, Reason.ROOF, Reason.DETECTOR, Reason.UNMEASURED)
 
 
 REASONS = tuple(Reason)
@@ -65,7 +66,8 @@ def hole_reasons(
     """(N,) the number in REASONS of why each wanted cell has less than `enough` of a chance; 0 where it has it.
 
     Pixels coarser than `needed_m_per_px`, blur over a quarter of `length_m` and darkness are reasons by themselves;
-    else it is the condition that lowers the fitted chance most, or the detector where none does by much.
+    else it is the condition that lowers the fitted chance most, or the detector where none does by much. Without a
+    regression, since no plant of the class found room, nothing was measured.
     """
     numbers = np.zeros(len(cells), np.uint8)
     poor = cells.wanted & ~(np.nan_to_num(chances.mean, nan=-1.0) >= enough)
@@ -89,7 +91,7 @@ def _worst_condition(
     """The condition that lowers the chance of each cell most, by reasons; the detector where none does."""
     everything = np.ones(len(columns), bool)
     if recall is None:
-        return [(Reason.DETECTOR, everything)]
+        return [(Reason.UNMEASURED, everything)]
     pulls = np.nan_to_num(recall.pulls(columns))
     is_lowest = pulls.argmin(axis=1)
     is_strong = pulls.min(axis=1) < -least_pull

@@ -45,3 +45,10 @@ def any_of(boxes_px: BoxesPx) -> bool:
 def every_label(names: Sequence[str]) -> tuple[str, ...]:
     """Those classes that can be planted, people first."""
     return tuple(name for name in CLASSES if name in names)
+
+
+def rows_of(boxes_px: BoxesPx, numbers: Sequence[int], count: int) -> BoxesPx:
+    """(count, 4): the boxes (N, 4) in the rows of these numbers, NaN in all others."""
+    rows = np.full((count, 4), np.nan, np.float32)
+    rows[list(numbers)] = boxes_px
+    return rows

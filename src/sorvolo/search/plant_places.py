@@ -1,4 +1,5 @@
-"""Where people and things are planted: all over the ground that was seen, far enough apart not to meddle."""
+"""Where people and things are planted: all over the ground that was seen, far enough apart not to meddle; or, while a
+flight goes on, all over the ground that it may come to see."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,6 +57,68 @@ def plant_places(
             break
         rounds.append(placed)
     return rounds
+
+
+@dataclass(frozen=True)
+class FieldSettings:
+    """How dense a field of plants is; all by choice."""
+
+    square_m: float = 7.0  # the side of the square that holds one plant, at least
+    free: float = 0.5  # of the side: plants stand in the middle of their square, so far from those of the next
+    most_in_view: float = 80.0  # squares that a picture shows: from high up they are larger
+
+
+class PlantField:
+    """Places of plants all over endless ground, one in each square of it, whether anybody has seen it yet or not.
+
+    So a frame that comes later shows the plants that stand where an earlier one looked. What needs more room than a
+    square gives, as cars do, stands in every fourth square, the other classes of `labels` in the others. Nothing stands
+    within `free_m` of `keep_off_m`. The squares fit `outline_m` (4, 2), the ground of a usual frame.
+    """
+
+    def __init__(
+        self, labels: Sequence[str], outline_m: PointsM, *, keep_off_m: Sequence[Floats], free_m: float, seed: int,
+        settings: FieldSettings = FieldSettings(),
+    ) -> None:
+        self._seed, self._free = seed, settings.free
+        self._keep_off_m, self._free_m = np.reshape(keep_off_m, (-1, 2)), free_m
+        wide_m2 = float(np.prod(np.ptp(outline_m, axis=0)))
+        self._side_m = max(settings.square_m, (wide_m2 / settings.most_in_view) ** 0.5)
+        self._wide = tuple(each for each in labels if _room_m(each) > self._side_m)
+        self._others = tuple(each for each in labels if each not in self._wide)
+        self._numbers: dict[tuple[int, int], int | None] = {}  # by square; None: nothing stands there
+        self.places: list[PlantPlace] = []
+        """All that any frame came near, in the order of their numbers."""
+
+    def near(self, outline_m: PointsM, reach_m: float) -> list[int]:
+        """The numbers of the plants of all squares that lie within `reach_m` of the box around this ground (N, 2)."""
+        low = np.floor((np.min(outline_m, axis=0) - reach_m) / self._side_m).astype(int)
+        high = np.floor((np.max(outline_m, axis=0) + reach_m) / self._side_m).astype(int)
+        numbers = [
+            self._number(column, row) for row in range(low[1], high[1] + 1) for column in range(low[0], high[0] + 1)
+        ]
+        return [each for each in numbers if each is not None]
+
+    def _number(self, column: int, row: int) -> int | None:
+        if (column, row) not in self._numbers:
+            place = self._sown(column, row)
+            self._numbers[column, row] = None if place is None else len(self.places)
+            if place is not None:
+                self.places.append(place)
+        return self._numbers[column, row]
+
+    def _sown(self, column: int, row: int) -> PlantPlace | None:
+        """What stands in a square."""
+        labels = self._wide if self._wide and column % 2 == row % 2 == 0 else self._others
+        if not labels:
+            return None
+        rng = np.random.default_rng([self._seed, 43, column & 0xFFFFFFFF, row & 0xFFFFFFFF])
+        place_m = (np.array([column, row]) + 0.5 + self._free * rng.uniform(-0.5, 0.5, 2)) * self._side_m
+        label = labels[int(rng.integers(len(labels)))]
+        least_m = max(self._free_m, _room_m(label) / 2 + 1.0)
+        if len(self._keep_off_m) and np.hypot(*(self._keep_off_m - place_m).T).min() < least_m:
+            return None
+        return PlantPlace(label, place_m)
 
 
 def seeded(seed: int) -> np.random.Generator:

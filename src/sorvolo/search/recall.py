@@ -104,10 +104,8 @@ def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSe
 
 def map_chances(recall: Recall | None, columns: Floats, hidden: Mask) -> Chances:
     """The chances of cells under conditions (N, K): 0 where crowns hide the ground, unknown without a regression."""
-    if recall is None:
-        nothing = np.full(len(columns), np.nan)
-        return Chances(nothing, nothing, nothing)
-    open_ground = recall.of(columns)
+    unknown = np.full(len(columns), np.nan)
+    open_ground = Chances(unknown, unknown, unknown) if recall is None else recall.of(columns)
     return Chances(*(np.where(hidden, 0.0, each) for each in (open_ground.mean, open_ground.low, open_ground.high)))
 
 

@@ -250,8 +250,8 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
 
 
 def _search(order: Order, journal: Journal, _: threading.Event) -> str:
-    from sorvolo.missions.search.flights import SearchOutputs, search_site
-    from sorvolo.missions.search.settings import SearchSettings
+    from sorvolo.missions.search.flights import search_site
+    from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 
     wish = order.choices
     settings = SearchSettings(plants=wish.plants, classes=tuple(wish.classes), model=wish.model or "default")

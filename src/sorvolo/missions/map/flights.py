@@ -4,6 +4,7 @@ import threading
 import time
 import warnings
 from collections.abc import Generator, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,6 +37,7 @@ from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.reader import FrameReader
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
+from sorvolo.missions.search.while_flying import SearchWhileFlying
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import SelectionSettings, select_keyframes
 from sorvolo.store.exports.waypoints import check_waypoint_files
@@ -52,6 +54,7 @@ def map_flights(
     detector: ObjectDetector | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
     base: Path | None = None, again: bool = False, refly: Sequence[Path] = (), catalogues: Catalogues | None = None,
+    search: SearchWhileFlying | None = None,
 ) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
@@ -66,6 +69,7 @@ def map_flights(
     the same files, settings and version of the program, is left out and returned, unless `again` is given.
     `catalogues` is where a new site's catalogue goes; None: where the environment has it.
     `refly` are files for waypoints over ground that the pictures leave out, kept up to date while the flight goes on.
+    `search` measures a live flight's probability of detection meanwhile.
     Raises InputError, SettingsError or StoreError with what to do; the site then stays as it was. Close the generator
     to stop early: the flight that is being mapped is left out, those before it are in.
     """
@@ -92,7 +96,7 @@ def map_flights(
             coverage = FlightCoverage(setup, archive, wanted, refly, settings.live_s)
             yield from _map_one(
                 setup, archive, settings, wanted, looks, request, coverage, anew=again and mapped is None,
-                samples=samples,
+                samples=samples, search=search if isinstance(source, LiveSource) else None,
             )
         return tuple(known)
 
@@ -123,7 +127,7 @@ def _refuse_ties(flights: int, settings: MapSettings) -> None:
 
 def _map_one(
     setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: ObjectDetector | None,
-    request: str, coverage: FlightCoverage, *, anew: bool, samples: int,
+    request: str, coverage: FlightCoverage, *, anew: bool, samples: int, search: SearchWhileFlying | None,
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
@@ -135,10 +139,13 @@ def _map_one(
     finder = None if detector is None else ObjectFinder(
         detector, source.camera.camera, settings.classes, live_folder=live_folder
     )
-    with _begun(setup, archive, settings, finder, request, coverage, anew=anew, samples=samples) as run:
+    begun = _begun(setup, archive, settings, finder, request, coverage, anew=anew, samples=samples)
+    with begun as run, nullcontext() if search is None else search:
 
         def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
             view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
+            if search is not None and ended[0] is not Status.REJECTED:
+                search.take(run, archive, frame.index)
             return MosaicUpdate(
                 source.name, frame.name, ended[0], ended[1], read, source.frame_count, run.selected,
                 max(setup.plan.expected, run.selected), run.by_vision, ended[2], time.monotonic() - started_s, view,
@@ -162,6 +169,8 @@ def _map_one(
             room.look(run.selected)
             coverage.show(run.pictures_on_ground)
             yield update(each if isinstance(each, LostFrame) else each.posed.frame, ended, reader.read)
+        if search is not None:
+            search.land()
         run.finish(source.notices(), started_s)
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -37,6 +38,7 @@ from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.images import image_from_jpeg, jpeg_from_image
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
+from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.control import ControlReport
 from sorvolo.survey.flight import Frame, Notice, PosedFrame
@@ -161,6 +163,13 @@ class PlanarRun(FlightRun):
             PictureOnGround(outline_m, float(pose.translation_m[2]) / camera.fx_px)
             for pose, outline_m in outlines_m if is_on_ground(outline_m)
         ]
+
+    def stored_frame(self, index: int) -> StoredKeyframe | None:
+        """See `FlightRun.stored_frame`."""
+        if self._known.count + index not in self._times_ns or index not in self.images:
+            return None
+        frame = self._on_ground(self._log.endings[index], self._refined(self._setup.source.camera.camera))
+        return None if frame is None else self.begin().keyframe(frame, self.images[index])
 
     def note_found(self, index: int, site_from_image: Matrix3, residual_px: float) -> None:
         """Where the site's map shows a frame's ground: (3, 3) of its full undistorted picture, and how well that fits.
@@ -338,20 +347,30 @@ class PlanarRun(FlightRun):
             if keyframe_id not in self._times_ns:
                 result.append(self._rejected(ending, ending.reason, camera))
                 continue
-            pose = self._mapper.pose(keyframe_id)
-            outline_m = footprint(camera, pose)
-            if not is_on_ground(outline_m):
+            status, reason = self._mapper.ending(keyframe_id)
+            frame = self._on_ground(replace(ending, status=status, reason=reason), camera)
+            if frame is None:
                 result.append(self._rejected(ending, HORIZON, camera))
                 continue
-            status, reason = self._mapper.ending(keyframe_id)
             self._log.end(ending.index, ending.name, ending.time_ns, status, reason)
-            result.append(PlacedFrame(
-                ending.name, ending.index, self._setup.utc_ns(ending.time_ns), status, reason, camera, pose,
-                site_from_image(self._mapper, keyframe_id, self._lens.camera), outline_m,
-                residuals.get(keyframe_id, float("nan")), sigmas[keyframe_id], self._exposure.gains_of(keyframe_id),
-                gps[keyframe_id], self._exposure.vignette_of(0),
+            result.append(replace(
+                frame, residual_px=residuals.get(keyframe_id, frame.residual_px), sigma_m=sigmas[keyframe_id],
+                gps_residual_m=gps[keyframe_id],
             ))
         return result
+
+    def _on_ground(self, ending: Ending, camera: Camera) -> PlacedFrame | None:
+        """A frame as it lies by now, how well being unknown; None where it shows more than the ground."""
+        keyframe_id, unknown = self._known.count + ending.index, float("nan")
+        pose = self._mapper.pose(keyframe_id)
+        outline_m = footprint(camera, pose)
+        if not is_on_ground(outline_m):
+            return None
+        return PlacedFrame(
+            ending.name, ending.index, self._setup.utc_ns(ending.time_ns), ending.status, ending.reason, camera, pose,
+            site_from_image(self._mapper, keyframe_id, self._lens.camera), outline_m, unknown, unknown,
+            self._exposure.gains_of(keyframe_id), vignette=self._exposure.vignette_of(0),
+        )
 
     def _rejected(self, ending: Ending, reason: str, camera: Camera) -> PlacedFrame:
         """The record of a frame that came to nothing."""

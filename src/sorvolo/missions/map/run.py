@@ -15,6 +15,7 @@ from sorvolo.missions.map.journal import MapJournal, Step, Taken
 from sorvolo.mosaic.seen_ground import PictureOnGround
 from sorvolo.mosaic.selection import Selected
 from sorvolo.store.site.archive import Archive, FlightWriter
+from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.map_objects import ObjectSearch
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
@@ -129,6 +130,13 @@ class FlightRun(ABC):
 
     def view(self, index: int, time_ns: int) -> FrameView | None:
         """What the frame of this index and time shows, as it lies now; None where the camera's place is not known."""
+        return None
+
+    def stored_frame(self, index: int) -> StoredKeyframe | None:
+        """The frame of this index as it lies now, with the picture that the site keeps of it.
+
+        None where it has no place, or where no picture is stored yet: it may be asked for later.
+        """
         return None
 
     @abstractmethod

@@ -32,12 +32,17 @@ def _mapped(archive: Archive) -> list[str]:
 def search_frames(archive: Archive, flight_id: str) -> list[SearchFrame]:
     """The frames of a flight that have a place. Raises InputError where none has."""
     frames = [
-        SearchFrame(placed, lambda stored=stored: archive.image(stored))  # type: ignore[misc]
-        for stored in archive.keyframes(flight_id) if (placed := _placed(stored)) is not None
+        frame for stored in archive.keyframes(flight_id) if (frame := search_frame(archive, stored)) is not None
     ]
     if not frames:
         raise InputError(f"no frame of the flight {flight_id} has a place on the ground; map it again")
     return frames
+
+
+def search_frame(archive: Archive, stored: StoredKeyframe) -> SearchFrame | None:
+    """A stored frame as it is searched; None where it has no place on the ground."""
+    placed = _placed(stored)
+    return None if placed is None else SearchFrame(placed, partial(archive.image, stored))
 
 
 def heights_for(archive: Archive, flight_id: str) -> AboveGround | None:

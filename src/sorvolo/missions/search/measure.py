@@ -1,7 +1,7 @@
 """One flight measured: plants into its own frames, the detector over them, and what a map would have reported."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
@@ -29,9 +29,10 @@ from sorvolo.tracking.laying import LaidSighting, lay_on_ground, pose_of
 from sorvolo.tracking.planted import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
 
-_ConditionsAt: TypeAlias = Callable[[Sequence[Floats], float], Conditions]
+ConditionsAt: TypeAlias = Callable[[Sequence[Floats], float], Conditions]
+"""The conditions of places, (2,) each, that reach so far, m."""
 
-_KEEP_OFF_M = 4.0  # plants from what a map shows already
+KEEP_OFF_M = 4.0  # plants from what a map shows already
 _MOST_DETECTIONS = 60  # of one frame, as maps take them
 
 
@@ -92,13 +93,13 @@ def measure_flight(
     """
     started_s = time.monotonic()
     wanted = planted_classes(detector, settings)
-    sun = _sun(frames, site, settings)
+    sun = sun_at(frames[len(frames) // 2], site, settings)
     lights, looks = _looks(frames, sun)
     conditions_at = partial(gather, looks, above=above)
     seen = {label: conditions_at(cells.centres_m, reach_m(label)) for label in wanted}
     usable = _usable(seen[wanted[0]], cells, settings)
     rounds = plant_places(
-        cells, seen[wanted[0]], wanted, settings.plants, keep_off_m=keep_off_m, free_m=_KEEP_OFF_M,
+        cells, seen[wanted[0]], wanted, settings.plants, keep_off_m=keep_off_m, free_m=KEEP_OFF_M,
         rng=seeded(settings.seed), usable=usable,
     )
     gathered: list[tuple[PlantPlace, bool]] = []
@@ -111,7 +112,7 @@ def measure_flight(
         looked += run.looked
         reported = run.reported()
         gathered += [(place, k in reported) for k, place in enumerate(place_round)]
-    measured = tuple(_measured(label, seen[label], conditions_at, gathered, settings) for label in wanted)
+    measured = tuple(measured_class(label, seen[label], conditions_at, gathered, settings) for label in wanted)
     yield MeasuredFlight(
         name, len(frames), looked, len(rounds), time.monotonic() - started_s, sun is not None,
         above is not None, any(each.is_thermal for each in lights), max((each.blur_px for each in lights), default=0.0),
@@ -143,11 +144,50 @@ def reach_m(label: str) -> float:
     return max(TYPICAL_SIZE_M[label][:2]) / 2 if label in TYPICAL_SIZE_M else 0.5
 
 
+@dataclass(frozen=True, eq=False)
+class SearchedPicture:
+    """A planted picture that a detector searched: each plant's box (N, 4), NaN out of sight; the sightings on the
+    ground; from which score on each class is reported."""
+
+    boxes_px: BoxesPx
+    laid: Sequence[LaidSighting]
+    least: Mapping[str, float]
+
+
+def search_planted(
+    frame: SearchFrame, image: ImageRGB, light: FrameLight, things: Sequence[Thing], sun: Vector3 | None,
+    shown: Sequence[float], seed: int, detector: ObjectDetector, wanted: Sequence[str],
+) -> SearchedPicture | None:
+    """Plant things into a frame's picture and have it searched as a map's is; None where it shows none of them.
+
+    `light` is the picture's; `sun`, `shown` and `seed` as `plant` takes them.
+    """
+    pose = pose_of(frame.placed)
+    assert pose is not None  # frames without a place are none of these
+    camera = frame.placed.camera
+    planted = plant(image, camera, pose, things, light, sun, shown, seed)
+    if not any_of(planted.boxes_px):
+        return None
+    from_above = is_from_above(pose.rotation)
+    least = detector.thresholds_for(planted.image, from_above=from_above)
+    found = detector.detect(
+        planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / camera.fx_px, classes=wanted,
+        from_above=from_above, least_score=least_seen(least),
+    ).surest(_MOST_DETECTIONS)
+    laid = [each for each in lay_on_ground(found, frame.placed) if each is not None]
+    return SearchedPicture(planted.boxes_px, laid, least)
+
+
+def strictest(one: Mapping[str, float], other: Mapping[str, float]) -> dict[str, float]:
+    """The higher of the two thresholds of each class: what frames of two lights are reported by."""
+    return {name: max(score, one.get(name, 0.0)) for name, score in other.items()}
+
+
 class _Round:
     """Plants that stand at once, in all frames that show them."""
 
     def __init__(
-        self, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], conditions_at: _ConditionsAt,
+        self, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], conditions_at: ConditionsAt,
         things: Sequence[Thing], sun: Vector3 | None, settings: SearchSettings,
     ) -> None:
         self._frames, self._lights, self._things, self._sun, self._settings = frames, lights, things, sun, settings
@@ -164,22 +204,14 @@ class _Round:
     ) -> Iterator[SearchProgress]:
         """Plant into one frame after the other and search it; those that show no plant are left out."""
         for number, (each, light) in enumerate(zip(self._frames, self._lights)):
-            pose = pose_of(each.placed)
-            assert pose is not None  # frames without a place are none of these
-            planted = plant(
-                each.image(), each.placed.camera, pose, self._things, light, self._sun, self._shown,
-                self._settings.seed + number,
+            seen = search_planted(
+                each, each.image(), light, self._things, self._sun, self._shown, self._settings.seed + number, detector,
+                wanted,
             )
-            if any_of(planted.boxes_px):
-                from_above = is_from_above(pose.rotation)
-                least = detector.thresholds_for(planted.image, from_above=from_above)
-                self._least = {name: max(score, self._least.get(name, 0.0)) for name, score in least.items()}
-                found = detector.detect(
-                    planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / each.placed.camera.fx_px,
-                    classes=wanted, from_above=from_above, least_score=least_seen(least),
-                ).surest(_MOST_DETECTIONS)
-                self._boxes_px[each.placed.index] = planted.boxes_px
-                self._laid += [laid for laid in lay_on_ground(found, each.placed) if laid is not None]
+            if seen is not None:
+                self._least = strictest(self._least, seen.least)
+                self._boxes_px[each.placed.index] = seen.boxes_px
+                self._laid += seen.laid
                 self.looked += 1
             hits = sum(hit for _, hit in gathered)
             yield SearchProgress(name, before + self.looked, total, hits, len(gathered))
@@ -208,17 +240,18 @@ def _usable(seen: Conditions, cells: Cells, settings: SearchSettings) -> Mask:
     return usable if settings.through_crowns > 0 else usable & ~seen.beside_trees
 
 
-def _sun(frames: Sequence[SearchFrame], site: Site, settings: SearchSettings) -> Vector3 | None:
-    """The direction to the sun; None where no clock knows the date."""
+def sun_at(frame: SearchFrame, site: Site, settings: SearchSettings) -> Vector3 | None:
+    """The direction to the sun as a frame was taken; None where no clock knows the date."""
     if settings.sun_deg is not None:
         return direction_from_angles(*settings.sun_deg)
-    return sun_over(site, frames[len(frames) // 2].placed.time_ns)
+    return sun_over(site, frame.placed.time_ns)
 
 
-def _measured(
-    label: str, seen: Conditions, conditions_at: _ConditionsAt, gathered: Sequence[tuple[PlantPlace, bool]],
+def measured_class(
+    label: str, seen: Conditions, conditions_at: ConditionsAt, gathered: Sequence[tuple[PlantPlace, bool]],
     settings: SearchSettings,
 ) -> MeasuredClass:
+    """What plants of a class, found or not, state of all cells, which were `seen` under their conditions."""
     places_m: list[Floats] = [place.place_m for place, _ in gathered if place.label == label]
     hits = [hit for place, hit in gathered if place.label == label]
     outcomes = found_rows(places_m, conditions_at(places_m, reach_m(label)), hits)

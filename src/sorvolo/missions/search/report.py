@@ -30,6 +30,14 @@ _FEW_PLANTS = 25  # fewer outcomes of a class leave its probability a guess
 _MOST_HOLES = 0.01  # of the area: more is reported in the headline and the exit code
 
 
+@dataclass(frozen=True)
+class SoFar:
+    """A flight that goes on: how many pictures were measured of those that have a place."""
+
+    measured: int
+    placed: int
+
+
 @dataclass(frozen=True, eq=False)
 class Searched:
     """All that was measured of a site; `segments` are names, areas and the probability that the missing is in each."""
@@ -105,14 +113,16 @@ def is_coarse(searched: Searched, settings: SearchSettings, info: ModelInfo) -> 
 
 
 def build_search_report(
-    searched: Searched, settings: SearchSettings, detector: ObjectDetector, refly: "Refly | None"
+    searched: Searched, settings: SearchSettings, detector: ObjectDetector, refly: "Refly | None",
+    so_far: SoFar | None = None,
 ) -> dict[str, Any]:
-    """search.json (docs/formats.md)."""
+    """search.json (docs/formats.md); `so_far` is given while the flight goes on."""
     rows = {label: _class_row(searched, label, settings, detector.info) for label in searched.labels}
     first = searched.labels[0]
     report = {
         "site": searched.site.name, "model": detector.info.name, "settings": asdict(settings),
-        "cell_m": searched.cells.cell_m, "headline": _headline(first, rows[first], settings),
+        "cell_m": searched.cells.cell_m, "headline": _headline(first, rows[first], settings, so_far),
+        "so_far": None if so_far is None else asdict(so_far),
         "classes": rows, "flights": [_flight_row(each) for each in searched.flights],
         "segments": _segment_rows(searched, first), "refly": None if refly is None else asdict(refly),
         "notices": [asdict(each) for each in detector.notices], "warnings": _warnings(searched, settings),
@@ -155,13 +165,16 @@ def _segment_rows(searched: Searched, label: str) -> list[dict[str, Any]]:
     ]
 
 
-def _headline(label: str, row: Mapping[str, Any], settings: SearchSettings) -> dict[str, Any]:
+def _headline(
+    label: str, row: Mapping[str, Any], settings: SearchSettings, so_far: SoFar | None
+) -> dict[str, Any]:
     """The search in one line, and whether all of the area was searched well enough."""
     area_m2 = row["area_m2"]
     shares = {reason: holes_m2 / area_m2 for reason, holes_m2 in row["holes_m2"].items()} if area_m2 else {}
     holes = ", ".join(f"{share:.0%} {reason}" for reason, share in shares.items() if share >= 0.005)
     chance = f"{row['pod']:.2f} (90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f})"
-    text = f"probability of detection of a {label} anywhere in the area: {chance}"
+    by = "" if so_far is None else f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')}: "
+    text = f"{by}probability of detection of a {label} anywhere in the area: {chance}"
     total = sum(shares.values())
     is_complete = total <= _MOST_HOLES
     text += "; no holes" if is_complete else (

@@ -1,6 +1,7 @@
-"""What a person may choose for measuring a search."""
+"""What a person may choose for measuring a search, and where its results go."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from sorvolo.errors import SettingsError
 
@@ -30,3 +31,20 @@ class SearchSettings:
                 raise SettingsError(f"{name} must lie in 0 to 1, got {value}")
         if self.sun_deg is not None and not (0 <= self.sun_deg[0] <= 360 and -90 <= self.sun_deg[1] <= 90):
             raise SettingsError(f"--sun: azimuth in 0 to 360 and elevation in -90 to 90 degrees, got {self.sun_deg}")
+
+
+@dataclass(frozen=True)
+class SearchOutputs:
+    """Where results go and what they are counted over.
+
+    `area` is what was to be searched (None: what the frames show and enclose), `poa` a file of segments with the
+    probability that the missing is in each, `flights` those that are measured (none: all of the site's), `refly` files
+    for waypoints over the holes; a .kmz is for `dji_drone`.
+    """
+
+    folder: Path
+    area: Path | None = None
+    poa: Path | None = None
+    flights: tuple[str, ...] = ()
+    refly: tuple[Path, ...] = ()
+    dji_drone: str = "fly"

@@ -119,6 +119,22 @@ class FlightWriter:
         """Size (width, height) and SHA-256 of a picture that this run has stored."""
         return self._sizes[self._image_path(index)], self._sha256[index]
 
+    def keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
+        """The record of a frame whose picture was saved at this path; raises StoreError where none was."""
+        if image_path not in self._sizes:
+            raise StoreError(f"the image {image_path} of frame {frame.name} was never saved; save it first")
+        width_px, height_px = self._sizes[image_path]
+        camera = frame.camera.undistorted()
+        sx, sy = camera.width_px / width_px, camera.height_px / height_px
+        # centres of pixels lie half a pixel inside: frame = (stored + 1/2) s - 1/2
+        frame_from_stored = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
+        return StoredKeyframe(
+            self._flight_id, frame.index, frame.name, frame.time_ns, frame.status, image_path,
+            camera.resized(width_px, height_px), frame.site_from_image @ frame_from_stored,
+            frame.site_from_camera, np.asarray(frame.gains), frame.sigma_m, frame.residual_px,
+            np.asarray(frame.vignette),
+        )
+
     def keep_original(self, index: int) -> None:
         """Keep a stored picture as it is until the commit, so that a run that goes on after a kill finds it."""
         data = read_below(self._files.folder, self._image_path(index))
@@ -286,25 +302,10 @@ class FlightWriter:
     def _keyframes(self, placed: Sequence[PlacedFrame], image_paths: Mapping[int, str]) -> list[StoredKeyframe]:
         """The frames with a saved picture that the map did not reject."""
         return [
-            self._keyframe(frame, image_paths[frame.index])
+            self.keyframe(frame, image_paths[frame.index])
             for frame in placed
             if frame.index in image_paths and frame.status is not Status.REJECTED
         ]
-
-    def _keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
-        if image_path not in self._sizes:
-            raise StoreError(f"the image {image_path} of frame {frame.name} was never saved; save it first")
-        width_px, height_px = self._sizes[image_path]
-        camera = frame.camera.undistorted()
-        sx, sy = camera.width_px / width_px, camera.height_px / height_px
-        # centres of pixels lie half a pixel inside: frame = (stored + 1/2) s - 1/2
-        frame_from_stored = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
-        return StoredKeyframe(
-            self._flight_id, frame.index, frame.name, frame.time_ns, frame.status, image_path,
-            camera.resized(width_px, height_px), frame.site_from_image @ frame_from_stored,
-            frame.site_from_camera, np.asarray(frame.gains), frame.sigma_m, frame.residual_px,
-            np.asarray(frame.vignette),
-        )
 
 
 def _flown_ns(placed: Sequence[PlacedFrame]) -> tuple[int, int] | None:

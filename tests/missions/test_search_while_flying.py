@@ -1,0 +1,216 @@
+"""A search measured while the flight goes on: frame by frame, in a thread beside the map, into the same files."""
+
+import json
+import shutil
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from comparing_detector import Comparing
+
+from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.errors import SettingsError, StoreError
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.missions.search import while_flying
+from sorvolo.missions.search.frames import flights_to_search, search_frames
+from sorvolo.missions.search.growing import GrowingMeasure
+from sorvolo.missions.search.measure import MeasuredFlight, measure_flight
+from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.missions.search.while_flying import Pace, SearchWhileFlying
+from sorvolo.search.cells import cells_of
+from sorvolo.search.plant_places import PlantField
+from sorvolo.store.site.archive import Archive
+
+_SETTINGS = SearchSettings(plants=30, classes=("car", "person"), sun_deg=(215, 48))
+_LIVE = LiveSettings(keeps_all=True, give_up_s=60.0, first_s=20.0)
+
+
+@pytest.fixture(scope="module")
+def site(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The photos mapped after the flight."""
+    folder = tmp_path_factory.mktemp("flying") / "site"
+    for _ in map_flights(
+        [photographed / "flight1" / "photos"], folder, MapSettings(model="none"), camera=photographed / "camera.xml"
+    ):
+        pass
+    return folder
+
+
+def _chance(flight: MeasuredFlight, label: str) -> float:
+    """Its mean over the ground that was seen."""
+    (own,) = (each for each in flight.classes if each.label == label)
+    return float(np.nanmean(own.chances.mean))
+
+
+def test_frame_by_frame_comes_to_what_the_whole_flight_comes_to(site: Path) -> None:
+    with Archive.open(site, write=False) as archive:
+        (name,) = flights_to_search(archive, ())
+        frames, place = search_frames(archive, name), archive.site()
+        growing = GrowingMeasure(
+            name, place, Comparing(site), _SETTINGS, area_m=None, keep_off_m=[], above=None
+        )
+        planted = []
+        for number, frame in enumerate(frames):
+            growing.add(frame)
+            if number % 6 == 0 or frame is frames[-1]:
+                cells, flight = growing.measured()
+                planted.append([len(each.outcomes) for each in flight.classes])
+                assert len(flight.classes[0].chances.mean) == len(cells)
+        whole = cells_of([each.placed.outline_m for each in frames], place, None)
+        *_, at_once = measure_flight(name, frames, whole, place, Comparing(site), _SETTINGS, [])
+    assert isinstance(at_once, MeasuredFlight)
+    assert (np.diff(planted, axis=0) >= 0).all()
+    assert planted[-1][0] >= 4 and planted[-1][1] >= 2 * planted[0][1] > 8
+    for label in ("car", "person"):
+        assert _chance(flight, label) == pytest.approx(_chance(at_once, label), abs=0.15)
+
+
+def test_a_blind_detector_is_known_as_such_while_it_flies(site: Path) -> None:
+    with Archive.open(site, write=False) as archive:
+        (name,) = flights_to_search(archive, ())
+        growing = GrowingMeasure(
+            name, archive.site(), Comparing(site, sees=False), _SETTINGS, area_m=None, keep_off_m=[], above=None
+        )
+        for frame in search_frames(archive, name)[:4]:
+            growing.add(frame)
+        _, flight = growing.measured()
+    assert all(not each.outcomes.found.any() for each in flight.classes) and _chance(flight, "person") < 0.25
+
+
+def test_a_field_is_the_same_from_wherever_it_is_come_to() -> None:
+    ground = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 40.0], [0.0, 40.0]])
+
+    def sown(*corners_m: tuple[float, float]) -> dict[tuple[float, float], str]:
+        field = PlantField(("person", "car"), ground, keep_off_m=[np.array([30.0, 20.0])], free_m=4.0, seed=5)
+        for corner_m in corners_m:
+            field.near(ground + corner_m, 5.0)
+        return {tuple(each.place_m): each.label for each in field.places}  # type: ignore[misc]
+
+    one, other = sown((0, 0), (-50, 30)), sown((-50, 30), (0, 0))
+    assert one == other and {*one.values()} == {"person", "car"}
+    places_m = np.array([*one])
+    apart_m = np.linalg.norm(places_m[:, None] - places_m, axis=2) + 1e9 * np.eye(len(places_m))
+    assert apart_m.min() >= 4.0 and np.linalg.norm(places_m - (30, 20), axis=1).min() >= 3.0
+    cars_m = places_m[[label == "car" for label in one.values()]]
+    assert len(cars_m) > 5
+    assert (np.linalg.norm(cars_m[:, None] - cars_m, axis=2) + 1e9 * np.eye(len(cars_m))).min() >= 10.0
+
+
+class Arriving:
+    """Photos that come into a folder, the next as soon as the search has seen to the last."""
+
+    def __init__(self, photos: Path, folder: Path) -> None:
+        self._photos, self._folder = sorted(photos.iterdir()), folder
+        folder.mkdir()
+        for each in self._photos[:2]:
+            self._bring(each)
+        self.landed = threading.Event()
+        self.reports: list[Mapping[str, Any]] = []
+
+    def fly(self, flying: SearchWhileFlying, report: Path) -> threading.Thread:
+        """Bring the others in a thread, and keep each report that the search writes meanwhile."""
+        def bring() -> None:
+            for each in [*self._photos[2:], None]:
+                _wait(lambda: flying.written > len(self.reports), 20.0 if self.reports else 0.2)
+                if flying.written > len(self.reports):
+                    self.reports.append(json.loads(report.read_bytes()))
+                if each is not None:
+                    self._bring(each)
+            self.landed.set()
+
+        thread = threading.Thread(target=bring)
+        thread.start()
+        return thread
+
+    def _bring(self, photo: Path) -> None:
+        part = self._folder / f".{photo.name}"
+        shutil.copy(photo, part)
+        part.rename(self._folder / photo.name)
+
+
+def _wait(holds: Any, most_s: float) -> None:
+    pause = threading.Event()
+    for _ in range(int(most_s / 0.05)):
+        if holds():
+            return
+        pause.wait(0.05)
+
+
+def _flown(photos: Path, camera: Path, folder: Path, flying: SearchWhileFlying) -> Sequence[Mapping[str, Any]]:
+    arriving = Arriving(photos, folder / "in")
+    thread = arriving.fly(flying, folder / "out" / "search.json")
+    for _ in map_flights(
+        [f"follow:{folder / 'in'}"], folder / "site", MapSettings(model="none", live_s=0.2), camera=camera, live=_LIVE,
+        until=arriving.landed, search=flying,
+    ):
+        pass
+    thread.join()
+    return arriving.reports
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    """No thread of a search outlives its flight."""
+    yield
+    assert not [each for each in threading.enumerate() if each.name == "search"]
+
+
+@pytest.mark.usefixtures("threads")
+def test_files_and_waypoints_follow_the_flight(photographed: Path, site: Path, tmp_path: Path) -> None:
+    refly = tmp_path / "holes.kml"
+    outputs = SearchOutputs(tmp_path / "out", area=_area(site, tmp_path), refly=(refly,))
+    flying = SearchWhileFlying(_SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02))
+    reports = _flown(photographed / "flight1" / "photos", photographed / "camera.xml", tmp_path, flying)
+    assert len(reports) >= 2
+    for each in reports:
+        assert 1 <= each["so_far"]["measured"] <= each["so_far"]["placed"]
+        assert each["headline"]["text"].startswith(f"so far, by {each['so_far']['measured']} of ")
+        assert not each["headline"]["complete"] and "not seen" in each["headline"]["text"]
+    seen_m2 = [each["classes"]["car"]["seen_m2"] for each in reports]
+    assert seen_m2 == sorted(seen_m2) and seen_m2[-1] > seen_m2[0] > 0
+    page = (tmp_path / "out" / "search.html").read_text()
+    assert "The flight goes on" in page and 'http-equiv="refresh"' in page
+    assert refly.is_file() and (tmp_path / "out" / "pod.tif").is_file()
+    flying.take_back()
+    assert not refly.exists()
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_fault_of_the_measure_does_not_end_the_map(
+    photographed: Path, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise StoreError("disk full")
+
+    monkeypatch.setattr(while_flying, "write_search", full)
+    outputs = SearchOutputs(tmp_path / "out")
+    flying = SearchWhileFlying(_SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02))
+    with pytest.warns(match="not measured while the flight goes on: disk full"):
+        _flown(photographed / "flight1" / "photos", photographed / "camera.xml", tmp_path, flying)
+    assert flying.written == 0
+    with Archive.open(tmp_path / "site", write=False) as archive:
+        assert archive.keyframes()
+
+
+def test_what_cannot_be_used_is_refused_before_the_flight(site: Path, tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="giraffe"):
+        SearchWhileFlying(SearchSettings(classes=("giraffe",)), SearchOutputs(tmp_path / "out"), Comparing(site))
+
+
+def _area(site: Path, folder: Path) -> Path:
+    """An area twice as long as what is flown."""
+    with Archive.open(site, write=False) as archive:
+        frame = archive.site().frame
+        (name,) = flights_to_search(archive, ())
+        outlines_m = np.concatenate([each.placed.outline_m for each in search_frames(archive, name)])
+    (west, south), (east, north) = outlines_m.min(axis=0), outlines_m.max(axis=0)
+    ring_m = [(west, south), (2 * east - west, south), (2 * east - west, north), (west, north), (west, south)]
+    latitudes_deg, longitudes_deg, _ = frame.wgs84_from_site(np.array([(x, y, 0.0) for x, y in ring_m]))
+    ring = np.column_stack([longitudes_deg, latitudes_deg]).tolist()
+    path = folder / "area.geojson"
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    return path
