@@ -1,4 +1,7 @@
-"""The packaged model from trained weights: benchmarks/pack_default_model.py WEIGHTS DATA (the end of `make model`).
+"""A model file from trained weights: benchmarks/pack_default_model.py WEIGHTS DATA (`make model`, `make long-model`).
+
+WEIGHTS is what train_default_model.py left; run.json beside it states the preset. `fast` becomes the model `default`,
+in the package unless --out names another folder, `accurate` becomes accurate.onnx, beside its weights.
 
 Reporting thresholds come from validation pictures, which neither train nor measure: blocks of HIT-UAV, videos of
 TinyPerson, simulated pictures of a seed of their own. The graph is checked against torch. With --measured FILE, the
@@ -27,31 +30,35 @@ from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 from sorvolo.training.onnx_export import check_export, export_onnx
-from sorvolo.training.presets import fast
-from train_default_model import SIMULATED_PICTURES, SIMULATED_SEED, reader
+from sorvolo.training.weights import SOURCES
+from train_default_model import RUN, network_of, reader
+from training_shares import SIMULATED_PICTURES, SIMULATED_SEED
 
 HOME = Path(__file__).parents[1] / "src" / "sorvolo" / "detection" / "data"
 VALIDATION_SEED, VALIDATION_PICTURES = 2, 60
 BEST_PX = {"person": [12, 130], "car": [14, 110], "small object": [10, 130]}  # what training shows it, and finds well
-TRAINED_ON = (
+LABELLED = (
     ("HIT-UAV, thermal, blocks of ids", "CC BY 4.0", "Suo et al., HIT-UAV, Scientific Data 2023"),
     ("TinyPerson, videos", "CC BY 4.0", "Yu et al., Scale Match for Tiny Person Detection, 2020"),
     ("a dummy on a pond, one video", "CC BY 4.0", "as published under that licence"),
     ("aerial cars, flights", "CC BY-SA", "Yauhen Kharuzhy and the Minsk OpenStreetMap community"),
     (f"simulated pictures, seed {SIMULATED_SEED}, {SIMULATED_PICTURES} of them", "Apache-2.0", "sorvolo simulate"),
     ("ground of two flights of photos, with composed small objects", "BSD-2-Clause, CC0", "brighton_beach, caliterra"),
-    ("ImageNet weights of EfficientNet-Lite0", "Apache-2.0", "Tan and Le 2019"),
 )
+TRAINED_ON = (*LABELLED, ("ImageNet weights of EfficientNet-Lite0", "Apache-2.0", "Tan and Le 2019"))
 TRAINING = (
     "6,500 steps of four crops of 384 px from ImageNet, the layers up to stride 8 frozen; 5,600 steps from there; then "
     "7,000 with those layers learning too, from the 1,750th on without turning pictures from aslant; then 12,000 with "
     "thermal frames shown larger, from the 2,550th on with simulated people drawn limb by limb"
 )
-FAILS = (
-    "people below 10 px: most are missed; crowds more so",
+NOT_LEARNT = (
     "small objects were never seen in real labelled pictures, only composed and simulated",
     "daylight people come from beaches, one pond and simulation: other clothing, poses and ground are not known",
     "trucks and buses count as nothing in particular; bicycles and their riders likewise",
+)
+FAILS = (
+    "people below 10 px: most are missed; crowds more so",
+    *NOT_LEARNT,
     "windows and hatches on roofs are reported as small objects, cones and birds as people",
     "false-colour thermal palettes look like daylight to it",
     "thermal frames are seen by the model `thermal` (thermal_by): the figures of hituav and pictures_thermal are its",
@@ -76,23 +83,51 @@ class Recipe:
 
 def main() -> None:
     """Choose thresholds, export, check, write the model and its card."""
-    info = {"name": "default", "version": "3", "thermal": True, "thermal_by": "thermal"}
-    pack(Recipe(info, TRAINED_ON, TRAINING, FAILS, validation), str(__doc__))
-
-
-def pack(recipe: Recipe, words: str) -> None:
-    """Do as the command line, described by `words`, asks."""
-    parser = argparse.ArgumentParser(description=words)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("weights", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--steps", type=int, required=True, help="that the weights were trained for")
+    parser.add_argument("--steps", type=int, help="that the weights were trained for; else run.json's")
     parser.add_argument("--measured", type=Path, help="detector_accuracy.json")
-    parser.add_argument("--out", type=Path, default=HOME)
+    parser.add_argument("--out", type=Path, help="folder for the model and its card")
     wishes = parser.parse_args()
-    model = fast(CLASSES)
+    stated = wishes.weights.parent / RUN
+    run = json.loads(stated.read_text()) if stated.is_file() else {"preset": "fast", "step": wishes.steps}
+    if wishes.steps is None and run["step"] is None:
+        parser.error(f"there is no {stated}; give --steps")
+    wishes.steps = wishes.steps or run["step"]
+    is_default = run["preset"] == "fast"
+    wishes.out = wishes.out or (HOME if is_default else wishes.weights.parent)
+    pack(default_recipe(run) if is_default else accurate_recipe(run), run, wishes)
+
+
+def default_recipe(run: Mapping[str, Any]) -> Recipe:
+    """The aerial network of `default`; the packaged one, where there is no run.json."""
+    info = {"name": "default", "version": "3", "thermal": True, "thermal_by": "thermal"}
+    return Recipe(info, TRAINED_ON, described(run) if "steps" in run else TRAINING, FAILS, validation)
+
+
+def accurate_recipe(run: Mapping[str, Any]) -> Recipe:
+    """The network for GPUs. How well it finds anything, and what it reports wrongly, is not known before it is run."""
+    source, known = SOURCES["resnet50"], SOURCES["resnet50"].name in run["begun"]
+    weights = ("ImageNet weights of ResNet-50", source.licence if known else "as their source states", run["begun"])
+    info = {"name": "accurate", "version": "1", "thermal": True}
+    return Recipe(info, (*LABELLED, weights), described(run), NOT_LEARNT, validation)
+
+
+def described(run: Mapping[str, Any]) -> str:
+    """How long it learnt, from what."""
+    return (
+        f"{run['step']} of {run['steps']} steps of {run['batch']} crops of {run['side_px']} px, preset "
+        f"{run['preset']}, from {run['begun']}"
+    )
+
+
+def pack(recipe: Recipe, run: Mapping[str, Any], wishes: argparse.Namespace) -> None:
+    """Do as the command line asks."""
+    model = network_of(run)
     model.load_state_dict(torch.load(wishes.weights, weights_only=True))
     info: dict[str, Any] = {
-        **recipe.info, "preset": "fast", "classes": list(CLASSES),
+        **recipe.info, "preset": run["preset"], "classes": list(CLASSES),
         "thresholds": dict.fromkeys(CLASSES, 0.5), "best_px": BEST_PX, "licence": "CC-BY-SA-4.0",
         "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in recipe.trained_on),
         "created": f"{datetime.now(UTC):%Y-%m-%d}",

@@ -24,7 +24,8 @@ from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from train_default_model import SIMULATED_SEED, reader
+from train_default_model import reader
+from training_shares import SIMULATED_SEED
 
 MOST_LOST = 0.005  # of AP in a class of a set, beyond which nothing is written
 # 64 channels wide, and the first layers, a few channels of large values: in eight bits they lose most of what is lost

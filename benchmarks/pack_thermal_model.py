@@ -32,8 +32,9 @@ from sorvolo.training.faster_rcnn import FasterRCNN
 from sorvolo.training.onnx_export import onnx_from_module
 from sorvolo.training.presets import fast
 from sorvolo.training.together import Together
-from train_default_model import SIMULATED_PICTURES, SIMULATED_SEED, reader
+from train_default_model import reader
 from train_thermal import trained
+from training_shares import SIMULATED_PICTURES, SIMULATED_SEED
 
 VERSION = "3"
 SIZES_PX = {**BEST_PX, "car": [14, 220]}  # as of version 1

@@ -42,7 +42,7 @@ from sorvolo.training.nanodet import (
 )
 from sorvolo.training.samples import Share, boxes_in_crop
 from sorvolo.training.tfjs_graph import read_graph
-from train_default_model import frames_of_heat
+from training_shares import frames_of_heat
 
 COCO_ROWS = (0, 2, 32)  # person, car, sports ball: where each of our classes starts
 SIMULATED_SEED, SIMULATED_PICTURES, SIMULATED_WEIGHT, SIMULATED_SCALES = 77001, 360, 0.7, (0.8, 1.8)
