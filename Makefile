@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 TRAINS := $(VENV)/.trains
 
-.PHONY: demo test test-long check bench model page-vendor wheel docs
+.PHONY: demo test test-long check bench model training-data long-training long-model page-vendor wheel docs
 
 demo: $(READY)
 	$(BIN)/sorvolo demo demo-site
@@ -71,6 +71,21 @@ model: $(TRAINS)
 	$(BIN)/python benchmarks/fit_second_look.py $(DATA) $(PEOPLE)/fit --scenes $(PEOPLE)/other --things $(PEOPLE)/other
 	$(BIN)/python benchmarks/pack_int8_model.py $(DATA)
 	$(BIN)/python benchmarks/pack_second_look.py $(PEOPLE)/fit/second_look.json
+
+# A long training of PRESET=fast or accurate on a machine with a GPU (docs/detector.md). Here: make training-data DATA=FOLDER
+# makes one file of all that it needs. There, with that file and without a network: make long-training PYTHON=PYTHON, by a
+# Python with torch for the card; the same again goes on after a stop. Here: make long-model DATA=FOLDER, of its weights.
+PRESET ?= fast
+PACKED ?= build/long/training-data.zip
+LONG := build/long/$(PRESET)
+training-data: $(TRAINS)
+	$(BIN)/python benchmarks/pack_training_data.py $(DATA) $(PACKED)
+
+long-training:
+	PYTHONPATH=src $(PYTHON) benchmarks/train_default_model.py $(PACKED) $(LONG) --preset $(PRESET) --steps $(STEPS)
+
+long-model: $(TRAINS)
+	$(BIN)/python benchmarks/pack_default_model.py $(LONG)/weights.pt $(DATA) --out $(LONG)/model
 
 # The libraries of the station's page, from npm, with their hashes and licences (needs npm; an install does not).
 page-vendor:
