@@ -61,6 +61,12 @@ def test_udp_arrives_and_a_dead_receiver_is_an_error_that_passes() -> None:
     sender.close()
 
 
+def test_datagrams_that_a_host_refuses_are_not_counted_as_sent() -> None:
+    """Each other one was: a refusal is only known when the next one is sent."""
+    with pytest.raises(InputError, match=r"nothing listens there .*start the receiver, and send them again"):
+        send_all([b"<event/>"] * 16, CotPlace("udp", "127.0.0.1", free_port()))
+
+
 def test_tcp_is_connected_again_after_the_server_went_away() -> None:
     port = free_port(socket.SOCK_STREAM)
     with socket.create_server(("127.0.0.1", port)) as server:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 import socket
 from dataclasses import replace
@@ -21,7 +22,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
+from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry, mapped_flights
 from sorvolo.missions.telemetry.words import fault_sentences
 from sorvolo.missions.watch.cot_sender import CotPlace
 from sorvolo.simulation.settings import OutputSettings
@@ -342,9 +343,69 @@ def test_results_go_into_the_folder_of_their_flight(
     assert "flight1.ts" in diagnosed and [each.name for each in results.iterdir()] == ["flight1"]
     assert main(["telemetry", str(site), "--flight", "flight1"]) == 1
     assert "has the diagnosis of flight1" in capsys.readouterr().err
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:  # the corrected track can be sent
+        receiver.bind(("127.0.0.1", 0))
+        receiver.settimeout(5)
+        assert main(["telemetry", str(site), "--cot", f"udp://127.0.0.1:{receiver.getsockname()[1]}"]) == 0
+        events = diagnosed["cot.xml"].splitlines()
+        assert [receiver.recv(10_000) for _ in events] == events
+    printed = capsys.readouterr().out
+    assert f"{len(events)} of {len(events)} Cursor on Target events sent" in printed and "written" not in printed
     assert {each.name: each.read_bytes() for each in (results / "flight1").iterdir()} == diagnosed
     assert main(["telemetry", str(site), "--out", str(tmp_path / "other")]) == 0
     assert json.loads((tmp_path / "other" / "telemetry.json").read_text())["faults"] is None
+
+
+def test_a_flight_is_recognised_under_any_name_and_another_one_refused(
+    corrected: tuple[dict[str, Any], Path], faulty: Path, filmed: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A video of another flight was mapped, compared with the flight of --flight all the same, and its figures, which
+    were no numbers, took the place of the right ones."""
+    site, out = tmp_path / "field", tmp_path / "out"
+    shutil.copytree(corrected[1] / "site", site)
+    for suffix in (".mp4", ".csv"):
+        shutil.copy(faulty / "flight1" / f"flight1{suffix}", tmp_path / f"DJI_7{suffix}")
+    command = ["--site", str(site), "--out", str(out)]
+    assert main(["telemetry", str(tmp_path / "DJI_7.mp4"), *command, "--camera", str(faulty / "camera.xml")]) == 0
+    assert "Telemetry of flight1" in capsys.readouterr().out and len(mapped_flights(site)) == 1
+    right = (out / "telemetry.json").read_bytes()
+    other = str(filmed / "flight1" / "flight1.mp4")
+    assert main(["telemetry", other, *command, "--flight", "flight1"]) == 1
+    assert "flight1.mp4 is of another flight: flight1 of" in capsys.readouterr().err
+    assert main(["telemetry", other, *command, "--flight", "DJI_8"]) == 1
+    assert "has no flight 'DJI_8', only flight1: leave --flight out" in capsys.readouterr().err
+    assert len(mapped_flights(site)) == 1 and (out / "telemetry.json").read_bytes() == right
+
+    log, text = tmp_path / "earlier.gpx", next((filmed / "flight1").rglob("*.gpx")).read_text()
+    log.write_text(re.sub(r"T\d\d:", "T07:", text))
+    with pytest.raises(InputError, match=r"at none of the .* its telemetry has a position"):
+        correct_telemetry(site, out, source=faulty / "flight1" / "flight1.mp4", telemetry=str(log))
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["{video}"], "flight1.mp4 is no map: give the map that this flight is in"),
+    (["nowhere"], "no such file or folder: nowhere; give a flight's video"),
+    (["{site}", "--site", "{site}"], "is a map, and so is --site"),
+    (["{site}", "--camera", "{camera}"], "--telemetry and --camera belong to a flight"),
+    (["{site}", "--cot-ca", "x.pem"], "--cot-ca and --cot-cert are for --cot tls://host:port"),
+    (["rtsp://camera/live", "--site", "{site}"], "rtsp:// is the address of a live stream"),
+    (["{lonely}", "--site", "new"], "no telemetry with positions was found in it or beside it"),
+])
+def test_what_was_given_wrongly_is_named_before_the_work(
+    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    lonely = tmp_path / "lonely.mp4"
+    shutil.copy(faulty / "flight1" / "flight1.mp4", lonely)
+    places = {
+        "video": faulty / "flight1" / "flight1.mp4", "site": corrected[1] / "site", "camera": faulty / "camera.xml",
+        "lonely": lonely,
+    }
+    assert main(["telemetry", *(each.format(**places) for each in arguments)]) == 1
+    assert words in capsys.readouterr().err
+    assert [each.name for each in tmp_path.iterdir()] == ["lonely.mp4"]
 
 
 def test_what_is_missing_is_named(filmed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

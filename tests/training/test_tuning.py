@@ -14,7 +14,13 @@ from square_pictures import labelled_squares  # noqa: E402
 from sorvolo.cli.main import main  # noqa: E402
 from sorvolo.detection.detector import Detector  # noqa: E402
 from sorvolo.detection.models import find_model  # noqa: E402
-from sorvolo.missions.train.start import load_start, part_notices, threshold_notices  # noqa: E402
+from sorvolo.missions.train.start import (  # noqa: E402
+    kept_on_request,
+    kept_thermal_by,
+    load_start,
+    part_notices,
+    threshold_notices,
+)
 from sorvolo.training.exported import ExportedModel  # noqa: E402
 
 _BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu")
@@ -118,6 +124,40 @@ def test_a_model_of_several_networks_without_its_card_keeps_no_thresholds(tmp_pa
     packaged = load_start("thermal", "fast")
     assert isinstance(packaged, ExportedModel)
     assert set(packaged.thresholds) == set(packaged.classes)
+
+
+def test_a_tuned_model_is_used_as_the_one_before_where_nothing_new_was_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = labelled_squares(tmp_path / "both", 2, 3, names=("car", "small object"))
+    command = ["train", str(data), "--steps", "1", *_BRIEFLY]
+    assert main([*command, "--out", str(tmp_path / "first"), "--weights", "none"]) == 0
+    before = onnx.load(tmp_path / "first" / "model.onnx")
+    (entry,) = [each for each in before.metadata_props if each.key == "sorvolo"]
+    entry.value = json.dumps(
+        json.loads(entry.value) | {"on_request": ["small object"], "thermal_by": "thermal"}
+    )
+    onnx.save(before, tmp_path / "before.onnx")
+    capsys.readouterr()
+
+    assert main([*command, "--out", str(tmp_path / "tuned"), "--weights", str(tmp_path / "before.onnx")]) == 0
+    info = Detector.load(tmp_path / "tuned" / "model.onnx").info
+    assert (info.classes, info.usual_classes, info.thermal_by) == (("car", "small object"), ("car",), "thermal")
+    assert "small object: reported only where asked for (--classes)" in " ".join(capsys.readouterr().out.split())
+
+
+def test_what_of_the_use_of_a_model_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path))
+    start = load_start("default", "fast")
+    assert isinstance(start, ExportedModel)
+    classes = ("person", "small object")
+    assert kept_on_request(start, classes, classes) == ("small object",)
+    assert kept_on_request(start, classes, ("person",)) == ()  # enough held-out ones chose its score
+    assert kept_on_request(start, ("person",), ("person",)) == ()
+    assert kept_on_request(start, ("small object",), ("small object",)) == ()  # it was made for nothing else
+    assert kept_thermal_by(start, classes, thermal=False) == "thermal"
+    assert kept_thermal_by(start, classes, thermal=True) == ""
+    assert kept_thermal_by(start, ("boat",), thermal=False) == ""  # any other that knows boats may look
 
 
 @pytest.mark.long

@@ -1,7 +1,7 @@
 """Telemetry against the cameras that the pictures gave: how wrong it was, and the whole flight corrected by it."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import inf
 
 import numpy as np
@@ -16,12 +16,24 @@ from sorvolo.survey.flight import CameraPrior
 
 _FIXES_ALIKE = 1.5  # neighbouring fixes err alike: they are fewer than they look
 _LEAST_FIXES = 4  # a similarity has four unknowns; by choice
-_OUTLYING_DEG = 15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
-_MOST = 2 / 3  # of the frames whose angles must be off alike before a compass's error can be stated; by choice
-_COURSE_S = 1.0  # to both sides of a moment: over them a course is taken
-_HOVERING_M_S = 0.5  # below, a course is that of the gusts
 _MOST_ROUNDS = 20  # of moving to the middle of a group of angles
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class CompassSettings:
+    """Which frames' angles are off alike, and how many must be before a compass's error can be stated."""
+
+    outlying_deg: float = 15.0  # beside the flight's usual error: a map does not use angles that are so far off, either
+    agreeing: float = 2 / 3  # share of the frames that must be off alike; by choice
+
+
+@dataclass(frozen=True)
+class CourseSettings:
+    """How a course over ground is taken from a path; both by choice."""
+
+    around_s: float = 1.0  # to both sides of a moment: over them a course is taken
+    hovering_m_s: float = 0.5  # below, a course is that of the gusts
 
 
 def path_fit(priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_sigma_s: float) -> PathFit:
@@ -72,7 +84,8 @@ def fitted(poses: Sequence[Pose], path: PathFit) -> list[Pose]:
 
 
 def telemetry_faults(
-    priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_s: Bias, path: PathFit, *, knows_height: bool
+    priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_s: Bias, path: PathFit, *, knows_height: bool,
+    settings: CompassSettings = CompassSettings(),
 ) -> TelemetryFaults:
     """How far telemetry's cameras, at the corrected clock, were off from the solved ones of the same frames.
 
@@ -88,11 +101,12 @@ def telemetry_faults(
     placed = np.array([each.knows_place for each in priors], bool)
     moved = np.array([prior.position_m - pose.translation_m for prior, pose in zip(priors, poses)]).reshape(-1, 3)
     scatter_m = _together([_bias(moved[placed, k]) for k in range(2)]).scatter / float(np.sqrt(2))
-    beside_deg = _beside_usual(off_deg)
-    near = beside_deg <= _OUTLYING_DEG
+    beside_deg = _beside_usual(off_deg, settings.outlying_deg)
+    near = beside_deg <= settings.outlying_deg
     tilt_deg = _together([_bias(off_deg[near, k]) for k in (1, 2)])
     return TelemetryFaults(
-        clock_s, _heading(off_deg[:, 0], near, path), tilt_deg if _agree(near) else replace(tilt_deg, sigma=inf),
+        clock_s, _heading(off_deg[:, 0], near, path, settings),
+        tilt_deg if _agree(near, settings) else replace(tilt_deg, sigma=inf),
         _height(moved[placed, 2], poses, path.scale) if knows_height else _UNKNOWN,
         Bias(0.0, float("nan"), scatter_m), path, tuple(np.flatnonzero(knows_heading)[~near].tolist()),
         float(np.median(beside_deg[~near])) if not near.all() else 0.0,
@@ -119,7 +133,10 @@ def corrected_poses(
     return poses
 
 
-def headings_deg(stated_deg: Floats, compass: Bias, times_s: Sequence[float], poses: Sequence[Pose]) -> list[float]:
+def headings_deg(
+    stated_deg: Floats, compass: Bias, times_s: Sequence[float], poses: Sequence[Pose],
+    settings: CourseSettings = CourseSettings(),
+) -> list[float]:
     """The aircraft's heading at these moments, clockwise from north: as stated, (N,), less what the compass was surely
     off; NaN there: the course over ground, that of the nearest moment where it hovers.
 
@@ -130,7 +147,8 @@ def headings_deg(stated_deg: Floats, compass: Bias, times_s: Sequence[float], po
         error_deg = compass.value if compass.is_significant else 0.0
         pointing = np.exp(1j * np.radians(stated_deg[known] - error_deg))
     else:
-        pointing, known = _courses(np.asarray(times_s), np.array([each.translation_m[:2] for each in poses]))
+        path_m = np.array([each.translation_m[:2] for each in poses])
+        pointing, known = _courses(np.asarray(times_s), path_m, settings)
     if not known.any():
         known = np.ones(len(poses), bool)
         pointing = np.array([-each.rotation[1, 1] - 1j * each.rotation[0, 1] for each in poses])
@@ -143,14 +161,16 @@ def even_times_s(key_s: Sequence[float], step_s: float) -> list[float]:
     return [float(each) for each in np.arange(min(key_s), max(key_s) + step_s / 2, step_s)]
 
 
-def _courses(times_s: Floats, path_m: PointsM) -> tuple[NDArray[np.complex128], Mask]:
+def _courses(
+    times_s: Floats, path_m: PointsM, settings: CourseSettings
+) -> tuple[NDArray[np.complex128], Mask]:
     """The velocity over ground, north and east as a complex number, m/s, at those moments of a path, (N, 2), where the
     aircraft moves; and which these are, (N,)."""
-    before, after = (np.searchsorted(times_s, times_s + side * _COURSE_S) for side in (-1, 1))
+    before, after = (np.searchsorted(times_s, times_s + side * settings.around_s) for side in (-1, 1))
     after = np.minimum(after, len(times_s) - 1)
     passed_s = np.maximum(times_s[after] - times_s[before], 1e-6)
     velocity = (path_m[after] - path_m[before]) @ np.array([1j, 1]) / passed_s
-    moves = np.abs(velocity) >= _HOVERING_M_S
+    moves = np.abs(velocity) >= settings.hovering_m_s
     return velocity[moves], moves
 
 
@@ -177,19 +197,19 @@ def _heading_and_tilt(rotation: Floats, pose: Pose) -> Floats:
     return np.degrees([-about_up_rad, *tilt_rad[:2]])
 
 
-def _beside_usual(off_deg: Floats) -> Floats:
+def _beside_usual(off_deg: Floats, outlying_deg: float) -> Floats:
     """(N,) how far each frame's angles lie beside what the flight's usually are off, (N, 3), degrees.
 
     A compass that hangs, or a strip whose pictures are turned by half a turn, hides behind the flight's median.
     """
     if not len(off_deg):
         return np.zeros(0)
-    heading_deg = _wrapped(off_deg[:, 0] - _usual_angle(off_deg[:, 0]))
-    alike = np.abs(heading_deg) <= _OUTLYING_DEG
+    heading_deg = _wrapped(off_deg[:, 0] - _usual_angle(off_deg[:, 0], outlying_deg))
+    alike = np.abs(heading_deg) <= outlying_deg
     return np.hypot(heading_deg, np.linalg.norm(off_deg[:, 1:] - np.median(off_deg[alike, 1:], axis=0), axis=1))
 
 
-def _usual_angle(angles_deg: Floats) -> float:
+def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
     """The median of those angles that most others are near, degrees; they may lie anywhere on the circle.
 
     Of two groups that are nearly as large, the one nearer to 0: a small error is likelier than half a turn.
@@ -197,14 +217,14 @@ def _usual_angle(angles_deg: Floats) -> float:
     ordered_deg = np.sort(angles_deg % 360.0)
     around_deg = np.concatenate([ordered_deg - 360.0, ordered_deg, ordered_deg + 360.0])
     first, last = (
-        np.searchsorted(around_deg, ordered_deg + side * _OUTLYING_DEG, "left" if side < 0 else "right")
+        np.searchsorted(around_deg, ordered_deg + side * outlying_deg, "left" if side < 0 else "right")
         for side in (-1, 1)
     )
     large_deg = _wrapped(ordered_deg[2 * (last - first) >= np.max(last - first)])
     usual_deg = float(large_deg[np.argmin(np.abs(large_deg))])
     for _ in range(_MOST_ROUNDS):  # the first guess may lie at the edge of its group
         beside_deg = _wrapped(angles_deg - usual_deg)
-        step_deg = float(np.median(beside_deg[np.abs(beside_deg) <= _OUTLYING_DEG]))
+        step_deg = float(np.median(beside_deg[np.abs(beside_deg) <= outlying_deg]))
         usual_deg += step_deg
         if abs(step_deg) < 1e-9:
             break
@@ -216,21 +236,21 @@ def _wrapped(angles_deg: Floats) -> Floats:
     return (angles_deg + 180.0) % 360.0 - 180.0
 
 
-def _agree(near: Mask) -> bool:
+def _agree(near: Mask, settings: CompassSettings) -> bool:
     """Whether so many frames' angles are off alike that one error can be stated for all."""
-    return bool(len(near)) and float(near.mean()) >= _MOST
+    return bool(len(near)) and float(near.mean()) >= settings.agreeing
 
 
-def _heading(off_deg: Floats, near: Mask, path: PathFit) -> Bias:
+def _heading(off_deg: Floats, near: Mask, path: PathFit, settings: CompassSettings) -> Bias:
     """The compass's error by those frames that agree; its sigma is infinite where too few do, or fixes are too few."""
     if not len(off_deg):
         return _UNKNOWN
-    usual_deg = _usual_angle(off_deg)
+    usual_deg = _usual_angle(off_deg, settings.outlying_deg)
     found = _bias(_wrapped(off_deg[near] - usual_deg))
     value_deg, sigma_deg = usual_deg + found.value, inf
     if np.isfinite(path.turn_deg.value):
         value_deg += path.turn_deg.value - path.sure_turn_deg
-        if _agree(near):
+        if _agree(near, settings):
             sigma_deg = float(np.hypot(found.sigma, path.turn_deg.sigma))
     return Bias(float(_wrapped(np.asarray(value_deg))), sigma_deg, found.scatter)
 

@@ -42,6 +42,11 @@ class FramePixels:
             return None
         return outline_m if np.isfinite(outline_m).all() else None
 
+    def pose(self, site_from_image: Matrix3 | None) -> Pose | None:
+        """The camera over level ground that sees a frame there, by undistorted pixels of the full size; None where it
+        lies nowhere or no camera sees it so."""
+        return None if site_from_image is None else pose_from_homography(site_from_image, self.full.undistorted())
+
     def masks(self, view: ComparedView) -> tuple[ImageGray, Mask]:
         """The change mask and the valid mask in the frame's own pixels, with the lens's distortion."""
         if self._maps is None:
@@ -79,7 +84,7 @@ class FramePixels:
         frame = posed.frame
         if site_from_image is None:
             return PlacedFrame.rejected(frame.index, frame.name, time_ns, reason, self.full, residual_px)
-        pose = pose_from_homography(site_from_image, self.full.undistorted())
+        pose = self.pose(site_from_image)
         outline_m = self.outline_m(site_from_image)
         if pose is None or not np.isfinite(outline_m).all():
             return PlacedFrame.rejected(frame.index, frame.name, time_ns, "the camera looks at the horizon", self.full)

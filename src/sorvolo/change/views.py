@@ -23,7 +23,6 @@ from sorvolo.change.reference import ReferenceMap
 from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.geometry.homography import pose_from_homography
 from sorvolo.registration.lens import Undistorter
 from sorvolo.survey.findings import ComparedView, ViewStatus
 from sorvolo.survey.flight import Frame, PosedFrame
@@ -253,9 +252,7 @@ class ViewMaker:
 
     def turned_as_found(self, posed: PosedFrame, outcome: ViewOutcome) -> PosedFrame:
         """The frame with its camera turned as it fits the map, where it does: a compass may be off by any angle."""
-        if outcome.site_from_image is None:
-            return posed
-        pose = pose_from_homography(outcome.site_from_image, self._flight.full.undistorted())
+        pose = self.pixels.pose(outcome.site_from_image)
         if pose is None:
             return posed
         sigma_deg = np.full(3, self._settings.turned_sigma_deg)

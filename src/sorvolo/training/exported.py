@@ -26,7 +26,8 @@ class ExportedModel:
     """A model file of ours to learn on from, and what it states about itself; `origin` names it in words.
 
     `thresholds` are those of the network that is learnt on from. `left` names in words what else the file joins with it
-    and a training does not carry on, `cost` what that costs, by the model's card.
+    and a training does not carry on, `cost` what that costs, by the model's card. `on_request` and `thermal_by` are
+    those of `detection.contract.ModelInfo`.
     """
 
     content: bytes
@@ -38,6 +39,8 @@ class ExportedModel:
     thresholds: Mapping[str, float] = field(default_factory=dict)
     left: tuple[str, ...] = ()
     cost: tuple[str, ...] = ()
+    on_request: tuple[str, ...] = ()
+    thermal_by: str = ""
 
 
 def load_exported(

@@ -12,7 +12,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.coverage.planting import Planted, PlantingSettings, Sensitivity, sensitivities, texture
+from sorvolo.change.coverage.planting import (
+    Planted,
+    PlantingSettings,
+    Sensitivity,
+    are_enough,
+    sensitivities,
+    texture,
+)
 from sorvolo.change.evidence.cells import CellWindow, window_around
 from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsM
 from sorvolo.geometry.homography import apply_homography
@@ -255,7 +262,7 @@ def coverage_summary(
     `large_found` is the share found of plain things of the largest size that was drawn, None where too few were drawn
     to know; `faint_known` whether enough faint ones were.
     """
-    plain, faint = sensitivities(planted, PlantingSettings())[:2]
+    plain_known, faint_known = (are_enough(planted, contrast) for contrast in PlantingSettings().contrasts[:2])
     compared = [each for each in parts if each.gap is None]
     gaps_m2 = _gaps_m2(parts)
     compared_m2, missing_m2 = sum(each.area_m2 for each in compared), sum(gaps_m2.values())
@@ -265,7 +272,7 @@ def coverage_summary(
         "gaps_m2": gaps_m2, "views_without_a_place": unplaced,
         "smallest_m": _middle([(each.smallest_m, each.area_m2) for each in compared]),
         "faint_m": _middle([(each.faint_m, each.area_m2) for each in compared]),
-        "large_found": _large_found(planted) if plain.is_known else None, "faint_known": faint.is_known,
+        "large_found": _large_found(planted) if plain_known else None, "faint_known": faint_known,
         "is_enough": compared_m2 >= 0.5 * on_map_m2 and compared_m2 > 0,
     }
 

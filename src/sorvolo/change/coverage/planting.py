@@ -148,11 +148,16 @@ def texture(view: ComparedView) -> NDArray[np.float32]:
     return np.asarray(np.maximum(coarse, 2e-3), np.float32)
 
 
+def are_enough(planted: Sequence[Planted], contrast: float, settings: PlantingSettings = PlantingSettings()) -> bool:
+    """Whether so many things of this contrast were planted that they show how small a thing is found."""
+    return sum(each.contrast == contrast for each in planted) >= settings.least_planted
+
+
 def sensitivities(planted: Sequence[Planted], settings: PlantingSettings) -> tuple[Sensitivity, ...]:
     """What was found of everything planted, a record for each contrast."""
     of_contrast = [[each for each in planted if each.contrast == contrast] for contrast in settings.contrasts]
     return tuple(
-        Sensitivity(contrast, len(own) >= settings.least_planted, _weights(own), settings)
+        Sensitivity(contrast, are_enough(planted, contrast, settings), _weights(own), settings)
         for contrast, own in zip(settings.contrasts, of_contrast, strict=True)
     )
 

@@ -33,10 +33,12 @@ from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.exports.telemetry_files import cot_track, geo_txt, track_csv, track_gpx
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.control import ControlRole
 from sorvolo.survey.corrected import AS_THE_MAP, Bias, CorrectedFrame, TelemetryFaults
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
+from sorvolo.survey.wording import counted
 
 _HOLDING = 2  # control points that hold a map's scale and direction
 _REPORT = "telemetry.json"
@@ -82,26 +84,40 @@ def correct_telemetry(
 
     Without `flight` it is the site's only one, or that of `source`. With `source`, the flight's video or photos, its
     own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata.
-    The events of cot.xml, with their own times, are sent to `cot`. Raises InputError for a site without GPS, a flight
-    that it has not, a source of another flight, a receiver that takes nothing, and without `source` for a folder with
-    a diagnosis, which would be lost.
+    The events of cot.xml, with their own times, are sent to `cot`. Without `source` a folder with a diagnosis is left
+    as it is: its events are sent, and `diagnosed_before` is true in the report. Raises InputError for a site without
+    GPS, a flight that it has not, a source of another flight or without a fix at any of its frames, a receiver that
+    takes nothing, and without `source` for a folder with a diagnosis, which would be lost, if there is nothing to send.
     """
     with Archive.open(site_folder, write=False) as archive:
         site = archive.site()
         if site.is_local:
-            raise InputError(f"{site_folder} was mapped without GPS: its cameras have no place on Earth to write down")
+            raise InputError(
+                f"{site_folder} was mapped without GPS: its cameras have no place on Earth to write down; map the "
+                "flight into another folder with its log (`sorvolo map --telemetry FILE`)"
+            )
         if source is None:
             name = _flight(archive, flight)
-            _keep_diagnosis(folder)
+            if (earlier := _diagnosis(folder)) is not None:
+                return _sent_again(earlier, name, folder, cot)
             return _written(site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot)
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
             name = _flight(archive, flight or opened.name)
+            _check_same(archive, name, opened)
             setup = prepare(opened, MapSettings(), site, telemetry_named=telemetry is not None)
             solved = _solved(archive, name, _first_ns(setup))
             mapped = archive.report(name)
             solved, compared = _compared(setup, solved, mapped)
             return _written(site, name, folder, solved, compared, mapped, cot)
+
+
+def mapped_flights(site_folder: Path) -> dict[str, str]:
+    """The fingerprint of each flight that the site has frames of, by name; none where there is no site yet."""
+    if not is_site(site_folder):
+        return {}
+    with Archive.open(site_folder, write=False) as archive:
+        return _mapped(archive)
 
 
 def chosen_flight(site_folder: Path, wanted: str = "") -> str:
@@ -110,26 +126,58 @@ def chosen_flight(site_folder: Path, wanted: str = "") -> str:
         return _flight(archive, wanted)
 
 
+def _mapped(archive: Archive) -> dict[str, str]:
+    return {each.id: each.fingerprint for each in archive.flights() if archive.keyframes(each.id)}
+
+
 def _flight(archive: Archive, wanted: str) -> str:
-    known = [each.id for each in archive.flights() if archive.keyframes(each.id)]
+    known = [*_mapped(archive)]
+    if not known:
+        raise InputError(f"{archive.folder} has no mapped flight: map one first, or give its video with --site")
     if wanted and wanted not in known:
-        raise InputError(f"{archive.folder} has no flight {wanted!r}, only {', '.join(known) or 'none'}: map it first")
+        raise InputError(
+            f"{archive.folder} has no flight {wanted!r}, only {', '.join(known)}: choose one of these, or map it first"
+        )
     if not wanted and len(known) != 1:
-        raise InputError(f"{archive.folder} has the flights {', '.join(known) or 'none'}; choose one with --flight")
+        raise InputError(f"{archive.folder} has the flights {', '.join(known)}; choose one with --flight")
     return wanted or known[0]
 
 
-def _keep_diagnosis(folder: Path) -> None:
-    """Raise InputError where the folder has files by a diagnosis: files of the map alone would take their place."""
+def _check_same(archive: Archive, name: str, source: Source) -> None:
+    """Raise InputError for the source of another flight. A live one has no file that it could be recognised by."""
+    report = archive.report(name)
+    if _mapped(archive)[name] != source.fingerprint and not report.get("delay_s"):
+        first = next(iter(report.get("inputs") or ()), "another file")
+        raise InputError(
+            f"{source.inputs[0]} is of another flight: {name} of {archive.folder} was mapped from {first}. Give that, "
+            "or leave --flight out for a flight of its own"
+        )
+
+
+def _diagnosis(folder: Path) -> dict[str, Any] | None:
+    """The report of the diagnosis whose files the folder has; None where it has none."""
     try:
         report = json.loads((folder / _REPORT).read_bytes())
     except (OSError, ValueError):
-        return
-    if isinstance(report, dict) and report.get("faults"):
+        return None
+    return report if isinstance(report, dict) and report.get("faults") else None
+
+
+def _sent_again(earlier: dict[str, Any], name: str, folder: Path, cot: CotReceiver | None) -> dict[str, Any]:
+    """Send the events of the diagnosis that a folder has; its report.
+
+    Raises InputError where there is nobody to send them to, or they are another flight's: files of the map alone would
+    take the diagnosis's place.
+    """
+    events = folder / "cot.xml"
+    if cot is None or earlier.get("flight") != name or not events.is_file():
         raise InputError(
-            f"{folder} has the diagnosis of {report.get('flight')} and files corrected by it, which files of the map "
-            "alone would replace: give the flight's video or photos with --site, or another folder with --out"
+            f"{folder} has the diagnosis of {earlier.get('flight')} and files corrected by it, which files of the map "
+            "alone would replace: use those, give the flight's video or photos with --site for new ones, or another "
+            "folder with --out"
         )
+    sent = send_all(events.read_bytes().splitlines(), cot.place, cot.tls)
+    return {**earlier, "cot_sent": sent, "diagnosed_before": True}
 
 
 def _first_ns(setup: FlightSetup) -> int:
@@ -156,10 +204,21 @@ def _compared(
     pictures placed."""
     track = setup.telemetry
     seen = [number for number, each in enumerate(solved) if each.stored.status is Status.VISION]
-    if track is None or not seen:
-        raise InputError("no frame of the flight was placed by its pictures: telemetry has nothing to be compared with")
+    if not seen:
+        raise InputError(
+            "no frame of the flight was placed by its pictures, so that telemetry has nothing to be compared with: "
+            "leave the video out, and files are written by the map alone"
+        )
+    first = setup.source.inputs[0]
+    if track is None:
+        raise InputError(f"{first}: no telemetry with positions was found in it or beside it; give it as --telemetry")
     clock, applied_s = _clock(report)
     priors = track.priors([solved[k].seconds for k in seen], applied_s, setup.plan.smooth_s)
+    if not any(each.knows_place for each in priors):
+        raise InputError(
+            f"{first}: at none of the {counted(len(seen), 'frame')} that their pictures placed its telemetry has a "
+            "position: check that the log is of this flight, or give another one with --telemetry"
+        )
     sigma_s = clock.sigma if isfinite(clock.sigma) else track.clock.sigma_s
     path = AS_THE_MAP if _is_tied(report) else path_fit(priors, [solved[k].pose for k in seen], sigma_s)
     poses = fitted([each.pose for each in solved], path)
@@ -210,7 +269,7 @@ def _written(
     }))
     atomic_write_bytes(folder / _REPORT, json_bytes(report))
     sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
-    return {**report, "cot_sent": sent}
+    return {**report, "cot_sent": sent, "diagnosed_before": False}
 
 
 def _video(source: Source) -> Path | None:

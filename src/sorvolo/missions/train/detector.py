@@ -19,7 +19,15 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.train.checks import check_model, check_of
 from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
 from sorvolo.missions.train.settings import TrainSettings
-from sorvolo.missions.train.start import class_notices, load_start, part_notices, threshold_notices
+from sorvolo.missions.train.start import (
+    class_notices,
+    kept_on_request,
+    kept_thermal_by,
+    load_start,
+    part_notices,
+    request_notices,
+    threshold_notices,
+)
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
 from sorvolo.store.exports.plain import json_bytes, plain_json
 from sorvolo.store.pages.training import training_page
@@ -277,6 +285,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     notices = _closing_notices(run, agreement, check)
     if isinstance(run.start, ExportedModel):
         notices += tuple(threshold_notices(run.start, checked.too_few(classes)))
+        notices += tuple(request_notices(run.start, info["on_request"]))
     report = _report(run, info, agreement, len(exported), check, notices) | {
         "reported": {name: asdict(each) for name, each in thresholds.items()},
         "found_px": found_sizes_px(checked, scores, classes),
@@ -295,8 +304,19 @@ def _info(run: _Run, checked: Checked, thresholds: dict[str, float]) -> dict[str
         "classes": list(classes), "thresholds": thresholds,
         "best_px": best_sizes_px(checked, thresholds, learnt, classes),
         **_descent(run, ", ".join(each.name for each in learnt)),
-        "thermal": thermal, "daylight": by_day,
+        "thermal": thermal, "daylight": by_day, **_kept(run, checked, thermal=thermal),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _kept(run: _Run, checked: Checked, *, thermal: bool) -> dict[str, Any]:
+    """What a tuned model keeps of how the one before is used; nothing of one that begins otherwise."""
+    if not isinstance(run.start, ExportedModel):
+        return {}
+    classes = run.sets.classes
+    return {
+        "on_request": list(kept_on_request(run.start, classes, checked.too_few(classes))),
+        "thermal_by": kept_thermal_by(run.start, classes, thermal=thermal),
     }
 
 

@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from sorvolo.detection.contract import ModelInfo
-from sorvolo.detection.models import HASH_KEY, InstalledModel, file_sha256, find_model, installed_models, read_card
+from sorvolo.detection.models import (
+    HASH_KEY,
+    InstalledModel,
+    file_sha256,
+    find_model,
+    installed_models,
+    read_card,
+    thermal_model,
+)
 from sorvolo.detection.session import read_info, read_model
 from sorvolo.errors import InputError
 from sorvolo.missions.fetched_files import copy_by_hash
@@ -97,6 +105,32 @@ def threshold_notices(start: ExportedModel, too_few: Sequence[str]) -> list[str]
     return notices
 
 
+def kept_on_request(start: ExportedModel, classes: Sequence[str], too_few: Sequence[str]) -> tuple[str, ...]:
+    """Which of the new model's classes are reported on request alone: those of the model before that are `too_few`
+    among the held-out objects, since nothing shows that they became surer. None where no other class would be left."""
+    kept = tuple(name for name in classes if name in start.on_request and name in too_few)
+    return kept if len(kept) < len(classes) else ()
+
+
+def request_notices(start: ExportedModel, kept: Sequence[str]) -> list[str]:
+    """Which classes `kept_on_request` leaves unreported unless a person asks for them."""
+    if not kept:
+        return []
+    names = ", ".join(kept)
+    return [
+        f"{names}: reported only where asked for (--classes), as by {start.origin}; too few objects were held out to "
+        "show that the new model finds them more surely"
+    ]
+
+
+def kept_thermal_by(start: ExportedModel, classes: Sequence[str], *, thermal: bool) -> str:
+    """The installed model that goes on looking at thermal frames in the new one's place: that of the model before,
+    unless the new one learnt from thermal frames itself or they share no class; "" for none."""
+    if thermal or not start.thermal_by or thermal_model(classes, start.thermal_by) is None:
+        return ""
+    return start.thermal_by
+
+
 def class_notices(start: ExportedModel, classes: Sequence[str]) -> list[str]:
     """What becomes of the model's classes in a training of `classes`, where they are not the same."""
     new = [name for name in classes if name not in start.classes]
@@ -120,7 +154,8 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
         raise InputError(f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}")
     sha256 = file_sha256(path)
     start = ExportedModel(
-        content, info.classes, f"the model {info.name}", sha256, info.licence, info.trained_on, info.thresholds
+        content, info.classes, f"the model {info.name}", sha256, info.licence, info.trained_on, info.thresholds,
+        on_request=info.on_request, thermal_by=info.thermal_by,
     )
     return _aerial(start, info, path) if other_networks(content) else start
 

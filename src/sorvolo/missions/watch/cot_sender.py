@@ -89,9 +89,10 @@ def check_host(place: CotPlace) -> None:
 def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -> int:
     """Send recorded events one after the other; how many arrived as far as the sender can know.
 
-    Raises InputError where nothing can be sent at all, and where the receiver breaks the connection at the end.
+    Raises InputError where nothing can be sent at all, where a host refuses datagrams because nothing listens there,
+    and where the receiver breaks the connection at the end.
     """
-    sender, sent, last = CotSender(place, tls), 0, ""
+    sender, sent, is_refused, last = CotSender(place, tls), 0, False, ""
     try:
         for event in events:
             try:
@@ -99,7 +100,8 @@ def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -
                 sent += 1
             except OSError as error:
                 last = str(error)
-                if not sent and isinstance(error, ConnectionRefusedError):
+                is_refused = isinstance(error, ConnectionRefusedError)
+                if is_refused and (not sent or place.transport == "udp"):
                     break
         sender.finish()
     except OSError as error:
@@ -109,6 +111,11 @@ def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -
         ) from error
     finally:
         sender.close()
+    if is_refused and place.transport == "udp":
+        raise InputError(
+            f"--cot {place}: nothing listens there ({last}), so that how many of {counted(len(events), 'event')} "
+            "arrived is not known; check the address and the port, start the receiver, and send them again"
+        )
     if events and not sent:
         raise InputError(f"--cot {place}: nothing could be sent ({last}); check the address, the port and the network")
     return sent
