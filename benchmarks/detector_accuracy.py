@@ -20,6 +20,7 @@ import numpy as np
 import detection_data
 from mosaic_methods import commit, machine
 from provenance import note_scoring
+from sorvolo.detection.scores import score_set
 from sorvolo.missions.evaluate.detector import EvaluationSettings, evaluate_detector, write_evaluation
 from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.flight import simulate_flight
@@ -66,6 +67,7 @@ def main() -> None:
         runs[name] = figures(measured.sets[0]) | {
             "seconds_per_picture": measured.found.seconds_per_picture,
             "people_by_centre": people_by_centre(labelled, measured.found.sets[labelled.name], measured.found.classes),
+            "people_from_8_px": people_from(8.0, labelled, measured.found.sets[labelled.name], measured.found.classes),
         }
         print(name, json.dumps(plain_json(runs[name]["classes"])), flush=True)
         if options.out is not None:
@@ -176,6 +178,29 @@ def people_by_centre(
     if not labels:
         return None
     return {"labels": labels, "reported": boxes, "found": hits / labels, "right": right / max(boxes, 1)}
+
+
+def people_from(
+    least_px: float, labelled: LabelledSet, found: FoundSet, classes: tuple[str, ...]
+) -> dict[str, object] | None:
+    """AP50 and what is reported of people whose longer side has `least_px` or more, smaller ones being ignored.
+
+    None where no person is that large.
+    """
+    own = labelled.classes.index("person")
+    pictures = []
+    for each in labelled.pictures:
+        sides = np.max(each.boxes_px[:, 2:] - each.boxes_px[:, :2], axis=1, initial=0)
+        small = (each.labels == own) & (sides < least_px)
+        pictures.append(replace(
+            each, boxes_px=each.boxes_px[~small], labels=each.labels[~small],
+            ignored_px=np.vstack([each.ignored_px, each.boxes_px[small]]),
+        ))
+    scores = score_set(labelled.only(pictures), found.detections, classes, found.thresholds)
+    rows = [row for row in scores.classes if row.label == "person" and row.labels]
+    return {
+        "labels": rows[0].labels, "AP50": asdict(scores.intervals["AP50 person"]), "reported": asdict(rows[0].reported),
+    } if rows else None
 
 
 def _holds(boxes_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:

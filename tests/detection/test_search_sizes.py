@@ -11,7 +11,7 @@ from toy_models import draw, rectangle_model
 
 from sorvolo.detection.contract import Pyramid
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.pyramid import PyramidSettings, agreed_in_sizes, trust
+from sorvolo.detection.pyramid import PyramidSettings, agreed_in_sizes, closer_for, trust
 from sorvolo.detection.session import Seen, Session
 from sorvolo.errors import InputError
 
@@ -81,6 +81,31 @@ def test_only_a_picture_by_itself_of_unknown_scale_is_searched_in_several_sizes(
     np.testing.assert_allclose(found.boxes_px[found.names.index("car")], _BOXES[1])
 
 
+@pytest.mark.parametrize(("side_px", "label", "score", "closer"), [
+    (8, 0, 0.8, {4.0: ("person",)}), (14, 0, 0.8, {}), (8, 0, 0.2, {}), (8, 1, 0.8, {}),
+])
+def test_a_closer_look_is_taken_where_a_class_of_it_is_surely_seen_and_small(
+    tmp_path: Path, side_px: int, label: int, score: float, closer: dict[float, tuple[str, ...]]
+) -> None:
+    """Twice and four times as large are as good for 11.3 px, the one for what is larger, the other for what is not."""
+    sizes = {"person": _SIZES | {"closer": [4]}, "car": _SIZES}
+    info = Detector.load(rectangle_model(tmp_path / "toy.onnx", pyramid=sizes), provider="cpu", threads=1).info
+    seen = _seen(((10.0, 10.0, 10.0 + side_px, 10.0 + side_px), score, label))
+    looks, times = [_seen(), _seen(), seen], (1.0, 0.5, 2.0)
+    assert closer_for((120, 200), info, info.classes, "auto", math.nan, looks, times) == closer
+    assert not closer_for((120, 200), info, info.classes, "auto", 0.1, looks, times)
+    assert not closer_for((3000, 4000), info, info.classes, "auto", math.nan, looks, times)
+
+
+def test_a_picture_with_small_people_is_shown_once_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = _shown_sizes(monkeypatch)
+    sizes = {"person": _SIZES | {"closer": [4]}}
+    detector = Detector.load(rectangle_model(tmp_path / "toy.onnx", pyramid=sizes), provider="cpu", threads=1)
+    small, car = (60, 40, 68, 48), _BOXES[1]
+    detector.detect(draw((120, 200), [small, car], labels=[0, 1], scores=[200, 200]), tiles="auto")
+    assert shown == [1.0, 0.5, 2.0, 4.0]
+
+
 def test_a_known_scale_needs_no_other_sizes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = _shown_sizes(monkeypatch)
     detector = Detector.load(
@@ -126,7 +151,7 @@ def test_a_class_of_which_no_other_size_is_left_keeps_its_scores(tmp_path: Path)
 
 @pytest.mark.parametrize("wrong", [
     {"times": []}, {"times": [9]}, {"times": [-1]}, {"times": [1]}, {"known_px": 0}, {"octaves": math.inf},
-    {"shift": math.nan},
+    {"shift": math.nan}, {"closer": [2]}, {"closer": [5]}, {"closer": [0.5]},
 ])
 def test_a_pyramid_that_cannot_be_is_an_error(tmp_path: Path, wrong: dict[str, object]) -> None:
     with pytest.raises(InputError, match="its pyramid must"):

@@ -22,6 +22,9 @@ _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on
 MOST_LARGER = 3.0
 """So many times as large as it is a picture is shown at most: magnified further, it is only blurred more."""
 
+MOST_CLOSER = 4.0
+"""The same of a picture in which small things were seen already: their boxes gain."""
+
 POSITIONS = ((0, False), (1, False), (2, True), (3, True))
 """In which a second look may show a report: turned by so many quarters counter-clockwise, and then mirrored or not."""
 
@@ -59,13 +62,15 @@ class Pyramid:
     `times`: so many times as large as it is, besides as it is. `known_px`: the side (the root of a box's area) at which
     the model knows the class best; `octaves`: the standard deviation, in powers of two, of the normal curve by which a
     look's opinion counts less where it shows an object larger or smaller. `shift`: added to the mean log-odds, so that
-    thresholds hold that were chosen for one look: what looks of all sizes show is right more often.
+    thresholds hold that were chosen for one look: what looks of all sizes show is right more often. `closer`: so many
+    times as large a picture is shown only where the other looks show something that is known best at that size.
     """
 
     times: tuple[float, ...]
     known_px: float
     octaves: float
     shift: float
+    closer: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -181,11 +186,14 @@ def _pyramid(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Pyr
         known_px, octaves, shift = (float(each[key]) for key in ("known_px", "octaves", "shift"))
         if name not in classes or not times or not all(0 < one <= MOST_LARGER and one != 1 for one in times):
             raise ValueError(f"its pyramid must name classes and times up to {MOST_LARGER}, not {name} {list(times)}")
+        closer = tuple(float(one) for one in each.get("closer", ()))
+        if not all(1 < one <= MOST_CLOSER and one not in times for one in closer):
+            raise ValueError(f"its pyramid must look closer at other times above 1, up to {MOST_CLOSER}, not {list(closer)}")
         if not (0 < known_px < math.inf and 0 < octaves < math.inf and math.isfinite(shift)):
             raise ValueError(
                 f"its pyramid must have a size and octaves above 0 and a shift, not {known_px}, {octaves} and {shift}"
             )
-        found[name] = Pyramid(times, known_px, octaves, shift)
+        found[name] = Pyramid(times, known_px, octaves, shift, closer)
     return found
 
 

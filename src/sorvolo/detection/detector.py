@@ -13,7 +13,7 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
 from sorvolo.detection.models import find_model, thermal_model
-from sorvolo.detection.pyramid import agreed_in_sizes, sizes_for
+from sorvolo.detection.pyramid import agreed_in_sizes, closer_for, sizes_for
 from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
 from sorvolo.detection.suppression import SeenTile, merge_tiles
@@ -217,7 +217,12 @@ class Detector:
             whole_px = shown.shape[0], shown.shape[1]
             sizes = {} if overlapping else sizes_for(whole_px, session.info, names, tiles, m_per_px)
             looks = [look(shown, names), *(look(shown, of, times) for times, of in sizes.items())]
-            return _in_sizes(looks, names, session.info) if sizes else looks[0].seen
+            if not sizes:
+                return looks[0].seen
+            seen, scales = [each.seen for each in looks], [each.scale for each in looks]
+            closer = closer_for(whole_px, session.info, names, tiles, m_per_px, seen, scales)
+            looks += [look(shown, of, times) for times, of in closer.items()]
+            return _in_sizes(looks, names, session.info)
 
         def look(shown: ImageRGB, names: Sequence[str], times: float = 1.0) -> _SizedLook:
             size_px = shown.shape[0], shown.shape[1]

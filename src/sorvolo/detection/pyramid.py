@@ -5,7 +5,7 @@ is shown at the right size (`tiling`); where it is not, nothing but the boxes th
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +27,7 @@ class PyramidSettings:
     unseen_odds: float = -4.5  # log-odds of what a look does not show: models report from -3.9 on
     least_sure: float = 1e-4  # no score counts for less, nor for more than 1 less this
     least_trust: float = 1e-6  # of a look, beside the best one: it stays above zero, and its logarithm finite
+    least_small: float = 0.3  # a score from which on something small is worth a closer look: as of the second look
 
 
 def sizes_for(
@@ -37,10 +38,41 @@ def sizes_for(
 
     Where "auto" does not know its scale, those of the model's `pyramid` at which it has `most_px` or less.
     """
+    asked = {name: each.times for name, each in _asked(info, wanted, tiles, m_per_px).items()}
+    return _within(size_px, asked, settings)
+
+
+def closer_for(
+    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], tiles: Tiles, m_per_px: float,
+    looks: Sequence[Seen], times: Sequence[float], settings: PyramidSettings = PyramidSettings(),
+) -> dict[float, tuple[str, ...]]:
+    """The same of closer looks: for the classes of which the `looks` so far, `times` as large (the first of the picture
+    as it is), show something small.
+
+    Small is what the model knows better as large as it is shown there than in any look so far.
+    """
+    asked = {}
+    for name, pyramid in _asked(info, wanted, tiles, m_per_px).items():
+        label = info.classes.index(name)
+        boxes = [look.boxes_px[(look.labels == label) & (look.scores >= settings.least_small)] for look in looks]
+        shown = np.array([*times, *(times[0] * each for each in pyramid.closer)])
+        best = trust(np.concatenate(boxes), shown, pyramid, settings).argmax(axis=1)
+        asked[name] = tuple(each for k, each in enumerate(pyramid.closer, len(times)) if (best == k).any())
+    return _within(size_px, asked, settings)
+
+
+def _asked(info: ModelInfo, wanted: Sequence[str], tiles: Tiles, m_per_px: float) -> dict[str, Pyramid]:
+    """The classes that are looked for in several sizes."""
     if tiles != "auto" or not math.isnan(m_per_px):
         return {}
+    return {name: info.pyramid[name] for name in wanted if name in info.pyramid}
+
+
+def _within(
+    size_px: tuple[int, int], asked: Mapping[str, Sequence[float]], settings: PyramidSettings
+) -> dict[float, tuple[str, ...]]:
+    """The sizes at which a picture has not too many pixels, each with its classes."""
     area_px = size_px[0] * size_px[1]
-    asked = {name: info.pyramid[name].times for name in wanted if name in info.pyramid}
     return {
         each: tuple(name for name, times in asked.items() if each in times)
         for each in sorted({each for times in asked.values() for each in times})
