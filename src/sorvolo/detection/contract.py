@@ -188,7 +188,9 @@ def _pyramid(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Pyr
             raise ValueError(f"its pyramid must name classes and times up to {MOST_LARGER}, not {name} {list(times)}")
         closer = tuple(float(one) for one in each.get("closer", ()))
         if not all(1 < one <= MOST_CLOSER and one not in times for one in closer):
-            raise ValueError(f"its pyramid must look closer at other times above 1, up to {MOST_CLOSER}, not {list(closer)}")
+            raise ValueError(
+                f"its pyramid must look closer at other times above 1, up to {MOST_CLOSER}, not {list(closer)}"
+            )
         if not (0 < known_px < math.inf and 0 < octaves < math.inf and math.isfinite(shift)):
             raise ValueError(
                 f"its pyramid must have a size and octaves above 0 and a shift, not {known_px}, {octaves} and {shift}"
