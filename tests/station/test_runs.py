@@ -293,6 +293,22 @@ def test_a_line_of_a_mission_is_taken_in_when_it_comes(tmp_path: Path, monkeypat
         runs._processes[run.id].kill()
 
 
+def test_a_search_maps_the_flight_that_it_is_given_and_measures_it(
+    open_station: Callable[[], TestClient], tmp_path: Path
+) -> None:
+    """It writes into its site as a map does; a search of the site's own flights does not."""
+    client = open_station()
+    run = client.post("/api/runs", json=wish(client, "search", model="default", classes=["car"], plants=10)).json()
+    second = client.post("/api/runs", json=wish(client, "map"))
+    assert second.status_code == 409 and "search" in second.json()["detail"]
+    state = ended(client, run["id"])
+    assert state["state"] == "finished", state
+    assert state["headline"].startswith("probability of detection of a car")
+    report = json.loads((tmp_path / "root" / "new" / "search" / "search.json").read_bytes())
+    assert report["so_far"] is None and report["flights"][0]["name"] == "flight1"
+    assert client.get("/api/sites/new").json()["versions"]
+
+
 def test_the_missions_of_a_site_are_not_cut_off_by_those_of_others(tmp_path: Path) -> None:
     """The limit counts what was asked for."""
     with TestClient(station_app(StationSettings(tmp_path)), base_url=HOST) as client:
@@ -311,7 +327,7 @@ WRONG: list[tuple[dict[str, Any], int]] = [
     ({"input": {"path": "/etc/passwd"}}, 422), ({"input": {"input": "a", "upload": "b"}}, 422),
     ({"options": {"camera": "/etc/passwd"}}, 422), ({"options": {"model": "../model"}}, 422),
     ({"options": {"alert_command": "rm"}}, 422), ({"options": {"overlap": 2}}, 422),
-    ({"mission": "compare", "site": "nowhere"}, 404), ({"mission": "search"}, 422),
+    ({"mission": "compare", "site": "nowhere"}, 404), ({"mission": "search", "site": "nowhere", "input": None}, 404),
     ({"input": {"stream_url": "rtsp://127.0.0.1/live"}}, 400), ({"input": {"stream": "../x"}}, 400),
     ({"input": {"stream": "nobody"}}, 404),
 ]

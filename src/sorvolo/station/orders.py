@@ -29,8 +29,11 @@ TO_CHECK = 3
 """The exit code of a mission whose flight is incomplete, as of commands whose result has to be checked."""
 
 Mission = Literal["map", "compare", "watch", "search"]
-WRITES: frozenset[str] = frozenset({"map", "compare"})
-"""The missions that write into their site: one at a time."""
+
+
+def writes(mission: str, *, has_input: bool) -> bool:
+    """Whether a mission writes into its site, as one at a time may; a search does of a flight that it maps first."""
+    return mission in ("map", "compare") or (mission == "search" and has_input)
 
 
 _CAMERA = r"^(aov=[0-9.]{1,8}|focal_px=[0-9.]{1,10}|[A-Za-z0-9 .+-]+)$"  # a preset's name: no path
@@ -89,8 +92,8 @@ class RunWish(BaseModel):
 
     @model_validator(mode="after")
     def _input_where_needed(self) -> "RunWish":
-        if (self.input is None) != (self.mission == "search"):
-            raise ValueError("map, compare and watch need an input; search has none: it measures the site's flights")
+        if self.input is None and self.mission != "search":
+            raise ValueError("map, compare and watch need an input; search without one measures the site's flights")
         return self
 
 

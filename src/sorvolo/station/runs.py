@@ -35,9 +35,9 @@ from sorvolo.station.orders import (
     ORDER_FILE,
     SOURCE_VARIABLE,
     TO_CHECK,
-    WRITES,
     Order,
     RunWish,
+    writes,
 )
 from sorvolo.station.problems import Problem
 from sorvolo.station.settings import RESERVE_FILE, RUNS_FOLDER, STREAMS_FOLDER, StationSettings
@@ -143,7 +143,8 @@ class Runs:
         self._demand_room()
         with self._lock:
             self._demand_turn(wish)
-            find = self._shelf.new_folder if wish.mission in ("map", "watch") else self._shelf.folder
+            makes_site = wish.mission in ("map", "watch") or (wish.mission == "search" and wish.input is not None)
+            find = self._shelf.new_folder if makes_site else self._shelf.folder
             site = find(wish.site)
             run_id = secrets.token_hex(8)
             folder = self._folder / run_id
@@ -395,8 +396,8 @@ class Runs:
         running = [each for each, _ in self._running()]
         if len(running) >= self._settings.limits.most_missions:
             raise Problem(409, f"{len(running)} missions run already; wait until one ends, or stop one")
-        for each in running:
-            if each.site == wish.site and each.mission in WRITES and wish.mission in WRITES:
+        for each in running if writes(wish.mission, has_input=wish.input is not None) else ():
+            if each.site == wish.site and writes(each.mission, has_input=each.input is not None):
                 raise Problem(
                     409, f"the site {wish.site!r} is being written by a {each.mission} that {each.who} started; wait "
                          "until it ends, or stop it", run=each.id,

@@ -41,6 +41,7 @@ from sorvolo.survey.mosaic import FrameView, MosaicUpdate
 from sorvolo.survey.wording import counted_list
 
 if TYPE_CHECKING:
+    from sorvolo.missions.search.while_flying import SearchWhileFlying
     from sorvolo.missions.watch.run import EarlyFound, WatchUpdate
     from sorvolo.tracking.picture_steps import PictureStep
 
@@ -168,7 +169,7 @@ def _flown(order: Order, folder: Path, journal: Journal, until: threading.Event)
     return headline, "; ".join(filter(None, (why, unsent(camera.left()))))
 
 
-def _map(order: Order, journal: Journal, until: threading.Event) -> str:
+def _map(order: Order, journal: Journal, until: threading.Event, search: "SearchWhileFlying | None" = None) -> str:
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
 
@@ -180,7 +181,7 @@ def _map(order: Order, journal: Journal, until: threading.Event) -> str:
     before = _newest(site)
     updates = map_flights(
         [order.source], site, settings, telemetry=order.telemetry or None, camera=order.camera or None,
-        live=_live(order, keeps_all=True), until=until,
+        live=_live(order, keeps_all=True), until=until, search=search,
     )
     with closing(updates):
         for update in updates:
@@ -249,14 +250,18 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
     return f"{counted_list(counts)} found"
 
 
-def _search(order: Order, journal: Journal, _: threading.Event) -> str:
+def _search(order: Order, journal: Journal, until: threading.Event) -> str:
     from sorvolo.missions.search.flights import search_site
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+    from sorvolo.missions.search.while_flying import SearchWhileFlying
 
     wish = order.choices
     settings = SearchSettings(plants=wish.plants, classes=tuple(wish.classes), model=wish.model or "default")
+    outputs = SearchOutputs(Path(order.folder))
+    if order.source:  # a flight to map first; one in the air is measured meanwhile
+        _map(order, journal, until, SearchWhileFlying(settings, outputs))
     report: Mapping[str, Any] = {}
-    with closing(search_site(Path(order.site), settings, SearchOutputs(Path(order.folder)))) as measuring:
+    with closing(search_site(Path(order.site), settings, outputs)) as measuring:
         for each in measuring:
             if isinstance(each, dict):
                 report = each

@@ -8,7 +8,7 @@ import { zipOfFiles } from "./zip.js";
 
 const KINDS = {
   map: ["Map", "A first map, or more of it, from a flight."], compare: ["Compare", "A later flight over the same ground: what changed."],
-  watch: ["Watch", "People, cars and small objects in a video, counted and placed."], search: ["Search", "How probable it is that somebody would have been found."],
+  watch: ["Watch", "People, cars and small objects in a video, counted and placed."], search: ["Search", "How probable it is that somebody would have been found: on this site's flights, or on one that is mapped now, measured while it flies."],
 };
 const MOST_ZIP_BYTES = 4e9;
 
@@ -40,18 +40,21 @@ class Missions {
 
   form() {
     this.mission = this.screen.data.detail.versions?.length ? "compare" : "map";
-    this.from = "upload";
+    this.from = this.flown = "upload";
     const note = el("p", { class: "note" }, KINDS[this.mission][1]);
     const files = el("input", { type: "file", multiple: true, "aria-label": "Files of the flight" });
     const url = el("input", { type: "text", inputmode: "url", placeholder: "rtsp://…, udp://…", autocomplete: "off" });
     const camera = el("input", { type: "text", maxlength: 80, placeholder: "found by itself", pattern: "(aov=[0-9.]+|focal_px=[0-9.]+|[A-Za-z0-9 .+\\-]+)" });
     const ready = el("div", {});
     const input = el("div", {});
-    const from = field("From", choice([["upload", "Files of this device"], ["stream", "A stream's address"], ["ready", "What the station has"]], this.from, (value) => { this.from = value; show(); }));
+    const from = el("div", {});
+    const origins = [["upload", "Files of this device"], ["stream", "A stream's address"], ["ready", "What the station has"]];
     const show = () => {
-      from.hidden = input.hidden = this.mission === "search";
+      this.from = this.mission === "search" ? this.searched ?? "site" : this.flown;
+      const take = (value) => { this[this.mission === "search" ? "searched" : "flown"] = value; show(); };
+      fill(from, field("From", choice(this.mission === "search" ? [["site", "The flights of this site"], ...origins] : origins, this.from, take)));
       fill(input, { upload: field("Files of the flight", files, "The video, and its telemetry (SRT, CSV, GPX …) if it is not inside; or all photos."),
-        stream: field("Stream's address", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows. The station opens the camera once; its video appears over the map."), ready }[this.from]);
+        stream: field("Stream's address", url, "RTSP, RTMP or MPEG-TS over UDP, from networks that the station allows. The station opens the camera once; its video appears over the map."), ready, site: null }[this.from]);
     };
     const start = el("button", { class: "main" }, "Start");
     const form = el("form", { class: "stack start", on: { submit: async (event) => {
@@ -83,7 +86,7 @@ class Missions {
 
   async start(wish) {
     const options = wish.camera ? { camera: wish.camera } : {};
-    const input = this.mission === "search" ? null : await this.input(wish, options);
+    const input = this.from === "site" ? null : await this.input(wish, options);
     if (input === undefined) return undefined;
     await post("/api/runs", { mission: this.mission, site: this.screen.data.id, options, ...(input && { input }) });
     message(`${KINDS[this.mission][0]} started`);
