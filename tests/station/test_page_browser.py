@@ -977,6 +977,22 @@ def test_how_far_the_picture_moved_between_two_of_its_times(served: Served, open
     }
 
 
+def test_a_search_is_of_the_site_s_flights_or_of_one_that_is_given(served: Served, opened: Watched) -> None:
+    page = opened.page
+    show(opened, served, "missions")
+    mission, origin = (page.get_by_role("combobox", name=name, exact=True) for name in ("Mission", "From"))
+    mission.select_option("search")
+    expect(origin).to_have_value("site")
+    expect(page.get_by_label("Files of the flight")).to_have_count(0)
+    origin.select_option("stream")
+    expect(page.get_by_label("Stream's address")).to_be_visible()
+    mission.select_option("map")
+    expect(origin).to_have_value("upload")
+    expect(origin.locator("option")).to_have_count(3)
+    mission.select_option("search")
+    expect(origin).to_have_value("stream")
+
+
 def test_a_camera_s_address_shows_its_video(served: Served, opened: Watched) -> None:
     """A watch that is started on the page, on a camera that sends MPEG-TS: its pictures, and then its boxes."""
     page, port = opened.page, free_port()
