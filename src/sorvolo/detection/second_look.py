@@ -35,8 +35,6 @@ class SheetSettings:
     surest: float = 0.98  # no first score counts for more, so that the second look can overrule it (decision 0075)
     least_sure: float = 1e-3  # no score counts for less, nor for more than 1 less this: log-odds stay within 7
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
-    unlooked: float = 0.65  # of its score has what is too weak to be looked at: 0.3 falls below 0.2, where views begin
-    # to be evidence (decision 0089)
     filling: int = 114  # beyond the picture's edge, as in training
 
 
@@ -56,17 +54,19 @@ def looked_again(
 ) -> Seen:
     """What was `seen` in a picture (H, W, 3), with the scores that a second look leaves, best first.
 
-    `hows` names for labels how their reports are looked at again; others keep their score, and so do those for which
-    there is no room. Reports below `least` are not looked at, and count for less (`unlooked`).
+    `hows` names for labels how their reports are looked at again; others keep their score. Reports below `least` are
+    not looked at and count as not seen again, so that they stay behind those that were not.
     """
-    scores = seen.scores.copy()
-    for row, again in opinions(seen, picture, sees, hows, settings).items():
-        how = hows[int(seen.labels[row])]
-        own_odds = log_odds(min(scores[row], settings.surest), settings.least_sure)
-        odds = how.shift + how.own * own_odds + how.again * log_odds(again, settings.least_sure).mean()
-        scores[row] = 1 / (1 + np.exp(-odds))
+    scores, again_odds = seen.scores.copy(), np.full(len(seen.scores), log_odds(settings.unseen, settings.least_sure))
+    looked_at = opinions(seen, picture, sees, hows, settings)
+    for row, again in looked_at.items():
+        again_odds[row] = log_odds(again, settings.least_sure).mean()
     for label, how in hows.items():
-        scores[(seen.labels == label) & (seen.scores < how.least)] *= settings.unlooked
+        rows = (seen.labels == label) & (seen.scores < how.least)
+        rows[[row for row in looked_at if seen.labels[row] == label]] = True
+        own_odds = log_odds(np.minimum(scores[rows], settings.surest), settings.least_sure)
+        odds = how.shift + how.own * own_odds + how.again * again_odds[rows]
+        scores[rows] = 1 / (1 + np.exp(-odds))
     order = np.argsort(-scores, kind="stable")
     return Seen(seen.boxes_px[order], scores[order], seen.labels[order])
 

@@ -27,8 +27,9 @@ from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections, no_detections
 from sorvolo.survey.wording import counted
 
-LEAST_SCORE = 0.01
-"""Candidates from this score on are measured, all that packaged models give: average precision needs doubtful ones."""
+LEAST_SCORE = 1e-4
+"""Candidates from this score on are measured: average precision needs the doubtful ones, and packaged models give those
+that a second look has no room for scores down to 0.0002."""
 
 PAGE, NUMBERS, FOUND = "detector.html", "detector.json", "detections.json"
 
