@@ -173,7 +173,7 @@ def test_files_and_waypoints_follow_the_flight(photographed: Path, site: Path, t
     seen_m2 = [each["classes"]["car"]["seen_m2"] for each in reports]
     assert seen_m2 == sorted(seen_m2) and seen_m2[-1] > seen_m2[0] > 0
     page = (tmp_path / "out" / "search.html").read_text()
-    assert "The flight goes on" in page and 'http-equiv="refresh"' in page
+    assert "The flight goes on" in page and f"As of {reports[-1]['so_far']['as_of'][:13]}" in page and 'http-equiv="refresh"' in page
     assert refly.is_file() and (tmp_path / "out" / "pod.tif").is_file()
     flying.take_back()
     assert not refly.exists()

@@ -32,10 +32,11 @@ _MOST_HOLES = 0.01  # of the area: more is reported in the headline and the exit
 
 @dataclass(frozen=True)
 class SoFar:
-    """A flight that goes on: how many pictures were measured of those that have a place."""
+    """A flight that goes on: how many pictures were measured of those that have a place, by when (ISO 8601, UTC)."""
 
     measured: int
     placed: int
+    as_of: str
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,7 @@ from sorvolo.missions.search.prepare import PreparedSearch, known_places, prepar
 from sorvolo.missions.search.report import Searched, SoFar
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
-from sorvolo.store.site.catalogue import StoredKeyframe
+from sorvolo.store.site.catalogue import StoredKeyframe, utc_now
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class SearchWhileFlying:
         searched = Searched(archive.site(), cells, (flight,), frames, self._prepared.segments)
         report: dict[str, Any] = write_search(
             searched, tiles, archive.site_grid(), self._settings, self._outputs, self._prepared.detector,
-            SoFar(len(measure.frames), self._placed),
+            SoFar(len(measure.frames), self._placed, utc_now()),
         )
         if report["refly"] is None:
             self.take_back()

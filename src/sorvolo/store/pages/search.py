@@ -18,7 +18,7 @@ def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) ->
         maps=[(label, picture_uri(picture)) for label, picture in pictures.items()],
         figures=_figures(report["classes"][first]), holes=_holes(report["classes"]), segments=_segments(report),
         refly=_refly(report.get("refly")), plants=_plants(report), calibration=_calibration(report),
-        cell=with_unit("{:g} m", report["cell_m"]), so_far=report["so_far"] is not None,
+        cell=with_unit("{:g} m", report["cell_m"]), as_of=at(report, "so_far", "as_of") or "",
     )
     return str(page)
 
