@@ -148,6 +148,19 @@ def test_what_cannot_be_used_is_refused_before_a_flight_is_mapped(
     assert not (tmp_path / "site" / "site.db").exists()
 
 
+@pytest.mark.parametrize(("inputs", "wishes", "words"), [
+    (["photos"], ["--flight", "flight1"], "flights that the map has"), (["photos"], ["--seed", "-1"], "--seed"),
+    (["follow:a", "follow:b"], [], "one live flight"),
+])
+def test_what_makes_no_sense_of_a_flight_to_map_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], inputs: list[str],
+    wishes: list[str], words: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["search", *inputs, "--site", "site", *wishes]) == 1
+    assert words in capsys.readouterr().err
+
+
 def test_waypoints_of_an_unknown_format_are_refused_before_the_search(site: Path, tmp_path: Path) -> None:
     outputs = SearchOutputs(tmp_path / "out", refly=(tmp_path / "holes.txt",))
     with pytest.raises(SettingsError, match="flight plans are written as"):

@@ -22,7 +22,7 @@ from sorvolo.missions.search.measure import MeasuredFlight, measure_flight
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.missions.search.while_flying import Pace, SearchWhileFlying
 from sorvolo.search.cells import cells_of
-from sorvolo.search.plant_places import PlantField
+from sorvolo.search.plant_places import FieldSettings, PlantField
 from sorvolo.store.site.archive import Archive
 
 _SETTINGS = SearchSettings(plants=30, classes=("car", "person"), sun_deg=(215, 48))
@@ -99,6 +99,26 @@ def test_a_field_is_the_same_from_wherever_it_is_come_to() -> None:
     cars_m = places_m[[label == "car" for label in one.values()]]
     assert len(cars_m) > 5
     assert (np.linalg.norm(cars_m[:, None] - cars_m, axis=2) + 1e9 * np.eye(len(cars_m))).min() >= 10.0
+
+
+def test_a_flight_that_climbs_is_sown_anew(site: Path) -> None:
+    """What was measured from below would crowd the pictures from above."""
+    with Archive.open(site, write=False) as archive:
+        (name,) = flights_to_search(archive, ())
+        frames, place = search_frames(archive, name)[:3], archive.site()
+    growing = GrowingMeasure(name, place, Comparing(site), _SETTINGS, area_m=None, keep_off_m=[], above=None)
+    field = PlantField(("person", "car"), frames[0].placed.outline_m / 10, keep_off_m=[], free_m=4.0, seed=1)
+    small = PlantField(
+        ("person", "car"), frames[0].placed.outline_m / 10, keep_off_m=[], free_m=4.0, seed=1,
+        settings=FieldSettings(square_m=0.5),
+    )
+    assert field.fits(frames[0].placed.outline_m) and not small.fits(frames[0].placed.outline_m)
+    growing.add(frames[0])
+    growing._field = small
+    growing.add(frames[1])
+    growing.add(frames[2])
+    _, flight = growing.measured()
+    assert flight.frames == 2 and growing.frames == frames[1:]
 
 
 class Arriving:
@@ -179,15 +199,41 @@ def test_files_and_waypoints_follow_the_flight(photographed: Path, site: Path, t
     for each in reports:
         assert 1 <= each["so_far"]["measured"] <= each["so_far"]["placed"]
         assert each["headline"]["text"].startswith(f"so far, by {each['so_far']['measured']} of ")
+        assert "of the flight in alone" in each["headline"]["text"] and each["so_far"]["state"] == "flying"
         assert not each["headline"]["complete"] and "not seen" in each["headline"]["text"]
     seen_m2 = [each["classes"]["car"]["seen_m2"] for each in reports]
     assert seen_m2 == sorted(seen_m2) and seen_m2[-1] > seen_m2[0] > 0
     page = (tmp_path / "out" / "search.html").read_text()
-    assert "The flight goes on" in page and 'http-equiv="refresh"' in page
+    assert "The flight has landed" in page and 'http-equiv="refresh"' in page
     assert f"As of {reports[-1]['so_far']['as_of'][:10]}" in page
     assert refly.is_file() and (tmp_path / "out" / "pod.tif").is_file()
-    flying.take_back()
-    assert not refly.exists()
+
+
+@pytest.mark.usefixtures("threads")
+def test_a_flight_that_is_stopped_leaves_no_waypoints(photographed: Path, site: Path, tmp_path: Path) -> None:
+    """And a page that states it, not one that is loaded anew for ever."""
+    refly = tmp_path / "holes.kml"
+    outputs = SearchOutputs(tmp_path / "out", area=_area(site, tmp_path), refly=(refly,))
+    flying = SearchWhileFlying(_SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02))
+    photos = Arriving(photographed / "flight1" / "photos", tmp_path / "in", 0.0)
+    over = threading.Event()
+    thread = photos.fly(flying, tmp_path / "out" / "search.json", over)
+    updates = map_flights(
+        [f"follow:{tmp_path / 'in'}"], tmp_path / "site", MapSettings(model="none", live_s=0.2),
+        camera=photographed / "camera.xml", live=_LIVE, until=photos.landed, search=flying,
+    )
+    next(updates)
+    assert "Waiting for the first pictures" in (tmp_path / "out" / "search.html").read_text()
+    for _ in updates:
+        _wait(lambda: flying.written > 0, 3.0 if flying.placed else 0.0)
+        if flying.written:
+            assert refly.is_file()
+            break
+    updates.close()
+    over.set()
+    thread.join()
+    page = (tmp_path / "out" / "search.html").read_text()
+    assert "when the flight was stopped" in page and "refresh" not in page and not refly.exists()
 
 
 @pytest.mark.usefixtures("threads")
@@ -203,7 +249,7 @@ def test_a_fault_of_the_measure_does_not_end_the_map(
     monkeypatch.setattr(while_flying, "write_search", full)
     outputs = SearchOutputs(tmp_path / "out")
     flying = SearchWhileFlying(_SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02))
-    with pytest.warns(match="not measured while the flight goes on: disk full"):
+    with pytest.warns(match="not measured whole while the flight goes on: disk full"):
         _flown(photographed / "flight1" / "photos", photographed / "camera.xml", tmp_path, flying, 0.0, failed)
     assert flying.written == 0
     with Archive.open(tmp_path / "site", write=False) as archive:

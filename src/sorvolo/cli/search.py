@@ -21,7 +21,6 @@ from sorvolo.errors import SettingsError
 if TYPE_CHECKING:
     from sorvolo.cli.places_of_sites import OpenedSite
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
-    from sorvolo.missions.search.while_flying import SearchWhileFlying
 
 
 Inputs = Annotated[
@@ -98,10 +97,11 @@ def search_command(
         outputs = SearchOutputs(
             out or place.results("search"), area, poa, tuple(flight or ()), tuple(refly or ()), dji_drone
         )
-        flying = _mapped(inputs, place, settings, outputs, telemetry, camera, give_up) if site else None
+        if site:
+            if flight:
+                raise SettingsError("--flight names flights that the map has; flights that are mapped now are measured")
+            _map_all(inputs, place, settings, outputs, telemetry, camera, give_up)
         report = _measured(place.folder, settings, outputs)
-        if flying is not None and report["refly"] is None:
-            flying.take_back()
     if as_json:
         typer.echo(json.dumps({"folder": str(outputs.folder), **report}, indent=1))
     else:
@@ -110,11 +110,11 @@ def search_command(
         raise typer.Exit(TO_CHECK)
 
 
-def _mapped(
+def _map_all(
     inputs: Sequence[str], place: "OpenedSite", settings: "SearchSettings", outputs: "SearchOutputs",
     telemetry: str | None, camera: str, give_up_s: float,
-) -> "SearchWhileFlying | None":
-    """Map the flights; what measured a live one meanwhile."""
+) -> None:
+    """Map the flights; a live one is measured meanwhile."""
     from sorvolo.capture.live.addresses import is_live_address
     from sorvolo.capture.live.reconnect import LiveSettings
     from sorvolo.cli.map import map_and_read_reports
@@ -123,16 +123,17 @@ def _mapped(
     from sorvolo.missions.search.while_flying import SearchWhileFlying
 
     flying = None
-    if any(is_live_address(each) for each in inputs):
+    if live := sum(is_live_address(each) for each in inputs):
+        if live > 1:
+            raise SettingsError(f"one live flight is measured while it is on, not {live}; search them one by one")
         flying = SearchWhileFlying(settings, outputs)
-        show_path("page, kept up to date", outputs.folder / "search.html", Console(stderr=True))
+        show_path("page, once the flight is on", outputs.folder / "search.html", Console(stderr=True))
     else:
         prepare_search(settings, outputs)  # mapping takes long: what cannot be used is refused before
     map_and_read_reports(
         list(inputs), place.folder, MapSettings(model=settings.model), telemetry=telemetry, camera=camera or None,
         live=LiveSettings(keeps_all=True, give_up_s=give_up_s), sent=place.sent, search=flying,
     )
-    return flying
 
 
 def _map_of(inputs: Sequence[str]) -> str:

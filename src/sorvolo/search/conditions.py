@@ -9,6 +9,7 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
 from sorvolo.search.crowns import crowns_in, plants_in
 
@@ -18,6 +19,7 @@ CONDITIONS = ("resolution", "views", "single view", "blur", "texture", "light", 
 _CROWN_SHARE = 0.5  # of the views of a cell: crowns lean apart, ground does not
 _RAISED_M = 2.0  # above the ground: higher than people and cars
 _LEAST_SUN = 0.1  # sine of the sun's height: lower, shadows are longer than pictures; or its way along the ground
+_SPARE = 0.3  # of a frame's ground, beside it: its edges bend where the lens does
 _FARTHEST = 3.0  # tangent of the angle from straight down: beyond it nothing is measured
 
 AboveGround: TypeAlias = Callable[[PointsM], tuple[Floats, Floats]]
@@ -131,18 +133,22 @@ def gather(
     count = len(places_m)
     views, sums, crowns, plants = np.zeros(count), np.zeros((count, 5)), np.zeros(count), np.zeros(count)
     for look in looks:
-        shown, pixels, m_per_px, slant = _projected(look, places_m, reach_m)
+        about = np.flatnonzero(_about(look, places_m))
+        if not len(about):
+            continue
+        shown, pixels, m_per_px, slant = _projected(look, places_m[about], reach_m)
         if not shown.any():
             continue
+        at = about[shown]
         rows, columns = look.lightness.shape
         x, y = (pixels[shown] / look.scale).astype(int).clip(0, [columns - 1, rows - 1]).T
         near_m = m_per_px[shown]
-        sums[shown] += np.column_stack([
+        sums[at] += np.column_stack([
             np.log(near_m), np.log(look.blur_px * near_m), look.texture[y, x], look.lightness[y, x], slant[shown],
         ])
-        crowns[shown] += look.crowns[y, x]
-        plants[shown] += look.plants[y, x]
-        views[shown] += 1
+        crowns[at] += look.crowns[y, x]
+        plants[at] += look.plants[y, x]
+        views[at] += 1
     with np.errstate(invalid="ignore", divide="ignore"):
         means, share, green = sums / views[:, None], crowns / views, plants / views
         log_views = np.where(views > 0, np.log(views), np.nan)
@@ -165,6 +171,16 @@ def _raised(above_m: Floats, sigma_m: Floats) -> Mask:
     """
     with np.errstate(invalid="ignore"):
         return np.asarray((above_m > _RAISED_M) & (above_m > 2 * sigma_m), bool)
+
+
+def _about(look: FrameLook, places_m: PointsM) -> Mask:
+    """Which places (N, 2) lie in the box around a frame's ground, a little wider: none that it shows is left out."""
+    outline_m = footprint(look.camera, look.site_from_camera)
+    if not is_on_ground(outline_m):
+        return np.ones(len(places_m), bool)
+    low, high = outline_m.min(axis=0), outline_m.max(axis=0)
+    spare = _SPARE * (high - low)
+    return np.asarray(((places_m >= low - spare) & (places_m <= high + spare)).all(axis=1), bool)
 
 
 def _projected(look: FrameLook, places_m: PointsM, reach_m: float) -> tuple[Mask, Floats, Floats, Floats]:

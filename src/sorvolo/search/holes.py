@@ -7,7 +7,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, Mask
+from sorvolo.geometry.arrays import Floats, Mask, PointsM
+from sorvolo.geometry.polygons import points_inside
 from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import CONDITIONS, Conditions
 from sorvolo.search.recall import Chances, Recall
@@ -122,6 +123,14 @@ def flyable(numbers: Holes) -> Holes:
     """(N,) 1 where another flight may see what these did not."""
     again = [k for k, reason in enumerate(REASONS) if reason.can_be_flown_again]
     return np.isin(numbers, again).astype(np.uint8)
+
+
+def without_seen(numbers: Holes, cells: Cells, outlines_m: Sequence[PointsM]) -> Holes:
+    """(N,) the holes but for those that frames of these outlines, (4, 2) site metres each, show."""
+    seen = np.zeros(len(cells), bool)
+    for outline_m in outlines_m:
+        seen |= points_inside([outline_m], cells.centres_m)
+    return np.where(seen, 0, numbers).astype(np.uint8)
 
 
 def pod_classes(chances: Chances, wanted: Mask) -> Holes:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sorvolo.geometry.arrays import BoxesPx, Floats, Mask, PointsM, frozen
 from sorvolo.search.conditions import Conditions
@@ -47,8 +48,19 @@ def every_label(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in CLASSES if name in names)
 
 
-def rows_of(boxes_px: BoxesPx, numbers: Sequence[int], count: int) -> BoxesPx:
-    """(count, 4): the boxes (N, 4) in the rows of these numbers, NaN in all others."""
-    rows = np.full((count, 4), np.nan, np.float32)
-    rows[list(numbers)] = boxes_px
+def rows_of(boxes_px: BoxesPx, numbers: Sequence[int], wanted: Sequence[int]) -> BoxesPx:
+    """(W, 4): of the boxes (N, 4) of these numbers those of the `wanted` ones, in their order; NaN where none is."""
+    row_of = {number: row for row, number in enumerate(wanted)}
+    rows = np.full((len(wanted), 4), np.nan, np.float32)
+    for number, box_px in zip(numbers, boxes_px):
+        if number in row_of:
+            rows[row_of[number]] = box_px
     return rows
+
+
+def near_any(places_m: Sequence[Floats], others_m: Sequence[Floats], reach_m: float) -> list[int]:
+    """Which of the places, (2,) each, lie within `reach_m` of any of the others: their numbers, in order."""
+    if not len(places_m) or not len(others_m):
+        return []
+    distances_m, _ = cKDTree(np.reshape(others_m, (-1, 2))).query(np.reshape(places_m, (-1, 2)))
+    return np.flatnonzero(distances_m <= reach_m).tolist()

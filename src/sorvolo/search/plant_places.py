@@ -80,15 +80,18 @@ class PlantField:
         self, labels: Sequence[str], outline_m: PointsM, *, keep_off_m: Sequence[Floats], free_m: float, seed: int,
         settings: FieldSettings = FieldSettings(),
     ) -> None:
-        self._seed, self._free = seed, settings.free
+        self._seed, self._settings = seed, settings
         self._keep_off_m, self._free_m = np.reshape(keep_off_m, (-1, 2)), free_m
-        wide_m2 = float(np.prod(np.ptp(outline_m, axis=0)))
-        self._side_m = max(settings.square_m, (wide_m2 / settings.most_in_view) ** 0.5)
+        self._side_m = _side_m(outline_m, settings)
         self._wide = tuple(each for each in labels if _room_m(each) > self._side_m)
         self._others = tuple(each for each in labels if each not in self._wide)
         self._numbers: dict[tuple[int, int], int | None] = {}  # by square; None: nothing stands there
         self.places: list[PlantPlace] = []
         """All that any frame came near, in the order of their numbers."""
+
+    def fits(self, outline_m: PointsM) -> bool:
+        """Whether a frame of this outline shows no more than twice as many plants as it should."""
+        return _side_m(outline_m, self._settings) <= 2**0.5 * self._side_m
 
     def near(self, outline_m: PointsM, reach_m: float) -> list[int]:
         """The numbers of the plants of all squares that lie within `reach_m` of the box around this ground (N, 2)."""
@@ -113,12 +116,18 @@ class PlantField:
         if not labels:
             return None
         rng = np.random.default_rng([self._seed, 43, column & 0xFFFFFFFF, row & 0xFFFFFFFF])
-        place_m = (np.array([column, row]) + 0.5 + self._free * rng.uniform(-0.5, 0.5, 2)) * self._side_m
+        place_m = (np.array([column, row]) + 0.5 + self._settings.free * rng.uniform(-0.5, 0.5, 2)) * self._side_m
         label = labels[int(rng.integers(len(labels)))]
         least_m = max(self._free_m, _room_m(label) / 2 + 1.0)
         if len(self._keep_off_m) and np.hypot(*(self._keep_off_m - place_m).T).min() < least_m:
             return None
         return PlantPlace(label, place_m)
+
+
+def _side_m(outline_m: PointsM, settings: FieldSettings) -> float:
+    """The side of squares of which a frame shows as many as it should."""
+    wide_m2 = float(np.prod(np.ptp(outline_m, axis=0)))
+    return max(settings.square_m, (wide_m2 / settings.most_in_view) ** 0.5)
 
 
 def seeded(seed: int) -> np.random.Generator:

@@ -3,13 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.geometry.arrays import ImageRGBA, PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.refly import write_refly
-from sorvolo.missions.search.report import Searched, SoFar, build_search_report, hole_numbers, total_of
+from sorvolo.missions.search.report import Searched, SoFar, State, build_search_report, hole_numbers, total_of
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
-from sorvolo.search.holes import POD_EDGES, REASONS, flyable, pod_classes
+from sorvolo.search.holes import POD_EDGES, REASONS, flyable, pod_classes, without_seen
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes
@@ -20,10 +20,13 @@ from sorvolo.store.pages.search import search_page
 def write_search(
     searched: Searched, tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, settings: SearchSettings,
     outputs: SearchOutputs, detector: ObjectDetector, so_far: SoFar | None = None,
+    seen_before_m: Sequence[PointsM] = (),
 ) -> dict[str, Any]:
     """Write all files of a measured search over the map of these `tiles`, and return its report.
 
-    `so_far` is given while the flight goes on. Raises StoreError where the disk is full.
+    `so_far` is given of a flight that is not mapped whole; what earlier flights' frames of these outlines, (4, 2) site
+    metres each, show need not be flown again by it. Files of waypoints are taken away where nothing has to be flown, or
+    the flight was stopped. Raises StoreError where the disk is full.
     """
     site, cells = searched.site, searched.cells
     grid = CellGrid(cells.outer_corner_m(), cells.cell_m, site.crs, site.origin.longitude_deg)
@@ -40,11 +43,16 @@ def write_search(
         features += _features(label, regions_of(classes, grid), regions_of(hole_grid, grid))
         pictures[label] = pod_picture(shown, site_grid, classes, hole_grid > 0, grid)
         if label == searched.labels[0]:
-            again = regions_of(cells.as_grid(flyable(holes)), grid)
+            again = regions_of(cells.as_grid(flyable(without_seen(holes, cells, seen_before_m))), grid)
     write_pod_tif(outputs.folder / "pod.tif", bands, grid, {"sorvolo": "probability of detection; docs/search.md"})
     collection = feature_collection("pod", features, is_local=False)
     atomic_write_bytes(outputs.folder / "pod.geojson", geojson_bytes(collection))
-    refly = write_refly(again, grid, searched, settings, detector.info, outputs.refly, dji_drone=outputs.dji_drone)
+    was_stopped = so_far is not None and so_far.state is State.STOPPED
+    refly = None if was_stopped else write_refly(
+        again, grid, searched, settings, detector.info, outputs.refly, dji_drone=outputs.dji_drone
+    )
+    for path in outputs.refly if refly is None else ():
+        path.unlink(missing_ok=True)  # an earlier search's, or of this flight when it had less
     report = build_search_report(searched, settings, detector, refly, so_far)
     atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
     atomic_write_bytes(outputs.folder / "search.html", search_page(report, pictures).encode())

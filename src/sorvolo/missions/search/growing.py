@@ -21,15 +21,17 @@ from sorvolo.missions.search.measure import (
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells, cells_of
 from sorvolo.search.conditions import AboveGround, FrameLook, gather, look_at
-from sorvolo.search.outcomes import rows_of
-from sorvolo.search.plant_places import PlantField
+from sorvolo.search.outcomes import near_any, rows_of
+from sorvolo.search.plant_places import PlantField, PlantPlace
 from sorvolo.simulation.frame_light import frame_light
 from sorvolo.simulation.objects import Thing
 from sorvolo.simulation.planted import new_plant
 from sorvolo.survey.flight import Site
+from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.tracking.laying import pose_of
 from sorvolo.tracking.planted import reported_plants
 
+_AROUND_M = 6.0  # of a plant: sightings farther away are of other things; more than its own length
 _REACH_M = 5.0  # beside a frame's ground: what stands there leans or throws its shadow in
 
 
@@ -40,7 +42,8 @@ class GrowingMeasure:
     was sown before anybody saw it (`PlantField`), so that all frames of a place show the same; a frame is planted on
     the place that it has when it is added, and its sightings are laid by that. What turns out to be under trees or
     roofs does not count as planted, but where `through_crowns` is given. `keep_off_m` and `above` as `measure_flight`
-    takes them.
+    takes them. A flight that climbs shows too many plants at once: a wider field is sown then, and what was measured
+    from below is forgotten.
     """
 
     def __init__(
@@ -53,7 +56,9 @@ class GrowingMeasure:
         self._field: PlantField | None = None
         self._things: list[Thing] = []
         self._looks: list[FrameLook] = []
-        self._pictures: dict[int, tuple[Sequence[int], SearchedPicture]] = {}
+        self._pictures: dict[int, tuple[PlacedFrame, Sequence[int], SearchedPicture]] = {}
+        self._fresh: set[int] = set()  # plants that were shown since it was last asked which are reported
+        self._reported: set[int] = set()
         self._least: dict[str, float] = {}
         self._has_shadows = self._is_thermal = False
         self._blur_px = self._seconds = 0.0
@@ -63,7 +68,8 @@ class GrowingMeasure:
     def add(self, frame: SearchFrame) -> None:
         """Plant into a frame and search it."""
         started_s, outline_m = time.monotonic(), frame.placed.outline_m
-        if self._field is None:
+        if self._field is None or not self._field.fits(outline_m):
+            self._forget()
             self._field = PlantField(
                 self._wanted, outline_m, keep_off_m=self._keep_off_m, free_m=KEEP_OFF_M, seed=self._settings.seed
             )
@@ -79,7 +85,8 @@ class GrowingMeasure:
         seed = self._settings.seed + frame.placed.index
         seen = search_planted(frame, image, light, things, sun, shown, seed, self._detector, self._wanted)
         if seen is not None:
-            self._pictures[frame.placed.index] = numbers, seen
+            self._pictures[frame.placed.index] = frame.placed, numbers, seen
+            self._fresh.update(numbers)
             self._least = strictest(self._least, seen.least)
         self._looks.append(look)
         self.frames.append(frame)
@@ -93,16 +100,12 @@ class GrowingMeasure:
         placed = [each.placed for each in self.frames]
         cells = cells_of([each.outline_m for each in placed], self._site, self._area_m)
         places = [] if self._field is None else self._field.places
-        laid = [each for _, seen in self._pictures.values() for each in seen.laid]
-        boxes = {
-            index: rows_of(seen.boxes_px, numbers, len(places)) for index, (numbers, seen) in self._pictures.items()
-        }
-        reported = reported_plants(laid, placed, boxes, [each.label for each in places], self._least)
+        self._judge_fresh(places)
         conditions_at = partial(gather, self._looks, above=self._above)
         at = conditions_at([each.place_m for each in places], 0.5)
         hides = at.roofs if self._settings.through_crowns > 0 else at.roofs | at.beside_trees
         gathered = [
-            (place, number in reported) for number, (place, hidden) in enumerate(zip(places, hides)) if not hidden
+            (place, number in self._reported) for number, (place, hidden) in enumerate(zip(places, hides)) if not hidden
         ]
         classes = tuple(
             measured_class(
@@ -113,6 +116,35 @@ class GrowingMeasure:
             self._name, len(self.frames), len(self._pictures), 1, self._seconds, self._has_shadows,
             self._above is not None, self._is_thermal, self._blur_px, classes,
         )
+
+    def _judge_fresh(self, places: Sequence[PlantPlace]) -> None:
+        """Find out anew which plants are reported, of those that were shown since: what is far from them stays."""
+        if not self._fresh:
+            return
+        fresh_m = [places[each].place_m for each in self._fresh]
+        known = near_any([each.place_m for each in places], fresh_m, 2 * _AROUND_M)
+        wanted, laid = set(known), []
+        frames, boxes = {}, {}
+        for index, (placed, numbers, seen) in self._pictures.items():
+            if wanted.isdisjoint(numbers):
+                continue
+            near = near_any([each.sighting.position_m[:2] for each in seen.laid], fresh_m, _AROUND_M)
+            laid += [seen.laid[each] for each in near]
+            frames[index], boxes[index] = placed, rows_of(seen.boxes_px, numbers, known)
+        labels = [places[each].label for each in known]
+        reported = reported_plants(laid, list(frames.values()), boxes, labels, self._least)
+        self._reported -= self._fresh
+        self._reported |= {known[row] for row in reported} & self._fresh
+        self._fresh.clear()
+
+    def _forget(self) -> None:
+        """Begin anew with another field: the flight has climbed, and its first pictures show little."""
+        self._things.clear()
+        self._looks.clear()
+        self._pictures.clear()
+        self._fresh.clear()
+        self._reported.clear()
+        self.frames.clear()
 
     def _grow(self, field: PlantField) -> None:
         """Make the things that stand at the field's new places."""

@@ -33,7 +33,7 @@ ConditionsAt: TypeAlias = Callable[[Sequence[Floats], float], Conditions]
 """The conditions of places, (2,) each, that reach so far, m."""
 
 KEEP_OFF_M = 4.0  # plants from what a map shows already
-_MOST_DETECTIONS = 60  # of one frame, as maps take them
+_MOST_DETECTIONS = 60  # of one frame beside its plants, as maps take them
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ def search_planted(
     found = detector.detect(
         planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / camera.fx_px, classes=wanted,
         from_above=from_above, least_score=least_seen(least),
-    ).surest(_MOST_DETECTIONS)
+    ).surest(_MOST_DETECTIONS + len(things))
     laid = [each for each in lay_on_ground(found, frame.placed) if each is not None]
     return SearchedPicture(planted.boxes_px, laid, least)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from sorvolo.detection.contract import ModelInfo
@@ -30,13 +31,24 @@ _FEW_PLANTS = 25  # fewer outcomes of a class leave its probability a guess
 _MOST_HOLES = 0.01  # of the area: more is reported in the headline and the exit code
 
 
+class State(StrEnum):
+    """What a flight does that is measured before it is mapped whole."""
+
+    FLYING = "flying"
+    LANDED = "landed"
+    STOPPED = "stopped"
+
+
 @dataclass(frozen=True)
 class SoFar:
-    """A flight that goes on: how many pictures were measured of those that have a place, by when (ISO 8601, UTC)."""
+    """A flight that is not mapped whole: how many pictures were measured of those that have a place, by when (ISO 8601,
+    UTC), and what it does."""
 
+    flight: str
     measured: int
     placed: int
     as_of: str
+    state: State
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +138,8 @@ def build_search_report(
         "so_far": None if so_far is None else asdict(so_far),
         "classes": rows, "flights": [_flight_row(each) for each in searched.flights],
         "segments": _segment_rows(searched, first), "refly": None if refly is None else asdict(refly),
-        "notices": [asdict(each) for each in detector.notices], "warnings": _warnings(searched, settings),
+        "notices": [asdict(each) for each in detector.notices],
+        "warnings": _warnings(searched, settings, is_over=so_far is None),
     }
     return dict(plain_json(report))
 
@@ -174,7 +187,9 @@ def _headline(
     shares = {reason: holes_m2 / area_m2 for reason, holes_m2 in row["holes_m2"].items()} if area_m2 else {}
     holes = ", ".join(f"{share:.0%} {reason}" for reason, share in shares.items() if share >= 0.005)
     chance = f"{row['pod']:.2f} (90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f})"
-    by = "" if so_far is None else f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')}: "
+    by = "" if so_far is None else (
+        f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')} of the flight {so_far.flight} alone: "
+    )
     text = f"{by}probability of detection of a {label} anywhere in the area: {chance}"
     total = sum(shares.values())
     is_complete = total <= _MOST_HOLES
@@ -184,13 +199,13 @@ def _headline(
     return {"text": text, "complete": is_complete, "hole_share": total}
 
 
-def _warnings(searched: Searched, settings: SearchSettings) -> list[str]:
-    warnings = []
+def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) -> list[str]:
+    warnings, how = [], " (--plants, and room on open ground)" if is_over else ""
     for flight in searched.flights:
         few = [each for each in flight.classes if len(each.outcomes) < _FEW_PLANTS]
         warnings += [
-            f"{flight.name}: only {counted(len(each.outcomes), 'plant')} of the class {each.label} (--plants, and room "
-            "on open ground); its probability is a guess, as its interval shows" for each in few
+            f"{flight.name}: only {counted(len(each.outcomes), 'plant')} of the class {each.label}{how}; its "
+            "probability is a guess, as its interval shows" for each in few
         ]
         if not flight.has_shadows and not flight.is_thermal:
             warnings.append(

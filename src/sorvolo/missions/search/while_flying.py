@@ -4,20 +4,25 @@ import threading
 import time
 import warnings
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 from sorvolo.errors import SorvoloError, SorvoloWarning
+from sorvolo.geometry.arrays import PointsM
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.priority import lower_priority
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.search.files import write_search
-from sorvolo.missions.search.frames import heights_for, search_frame
+from sorvolo.missions.search.frames import flights_to_search, heights_for, search_frame, search_frames
 from sorvolo.missions.search.growing import GrowingMeasure
 from sorvolo.missions.search.prepare import PreparedSearch, known_places, prepare_search, site_with_metres
-from sorvolo.missions.search.report import Searched, SoFar
+from sorvolo.missions.search.report import Searched, SoFar, State
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.pages.search import waiting_page
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe, utc_now
 
@@ -30,6 +35,7 @@ class Pace:
     rest: float = 4.0  # times as long as the last writing took: most of the time is the measure's
     look_s: float = 0.2  # until it is asked again whether there is a frame
     most_behind: int = 8  # frames that wait: of more every second is put off, so that new ground is measured soon
+    land_s: float = 20.0  # for the frame that is being searched as the flight lands; a report that takes longer is lost
 
 
 class SearchWhileFlying:
@@ -54,20 +60,31 @@ class SearchWhileFlying:
         self._placed = 0
         self._landed = threading.Event()
         self._thread: threading.Thread | None = None
-        self._planned = False
+        self._shown: Callable[[SoFar], None] | None = None  # writes the last report again, in another state
+        self._last: SoFar | None = None
+        self._has_warned = False
         self.written = 0
         """How often the files were written."""
+
+    @property
+    def placed(self) -> int:
+        """How many pictures have a place so far."""
+        return self._placed
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
-        self.land()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.land(State.LANDED if kind is None else State.STOPPED)
 
     def take(self, run: FlightRun, archive: Archive, index: int) -> None:
         """Have the frame of this index measured as soon as its picture is stored; called where the map is made."""
         if self._landed.is_set():
             return
+        if not self._placed and not self._unplaced:
+            self._write_waiting()
         self._unplaced.append(index)
         later = []
         for each in self._unplaced:
@@ -82,24 +99,44 @@ class SearchWhileFlying:
             self._thread = threading.Thread(target=self._measure, args=(archive,), name="search", daemon=True)
             self._thread.start()
 
-    def land(self) -> None:
-        """The flight is over: what waits is not measured any more, for its pictures are about to be put straight."""
+    def land(self, state: State = State.LANDED) -> None:
+        """The flight is over: what waits is not measured any more, for its pictures are about to be put straight.
+
+        The page then states that the flight has landed, or was stopped.
+        """
         self._landed.set()
         if self._thread is not None:
-            self._thread.join()
+            self._thread.join(self._pace.land_s)
+        if self._shown is None or self._last is None:
+            if state is State.STOPPED:
+                self._write_waiting(is_over=True)
+        elif self._last.state is not state:
+            self._last = replace(self._last, state=state)
+            with self._warning():
+                self._shown(self._last)
 
-    def take_back(self) -> None:
-        """Remove the waypoints that were planned while the flight went on: nothing is left to fly."""
-        for path in self._outputs.refly if self._planned else ():
-            path.unlink(missing_ok=True)
-        self._planned = False
+    def _write_waiting(self, *, is_over: bool = False) -> None:
+        """A page that waits for the first figures, in the place of an earlier search's; or waits no more."""
+        with self._warning(), writing(self._outputs.folder):
+            self._outputs.folder.mkdir(parents=True, exist_ok=True)
+            atomic_write_bytes(self._outputs.folder / "search.html", waiting_page(is_over=is_over).encode(), durable=False)
+
+    @contextmanager
+    def _warning(self) -> Iterator[None]:
+        """Turn a fault of the measure into a warning, the first one alone: the map goes on."""
+        try:
+            yield
+        except Exception as error:
+            if not self._has_warned and not self._landed.is_set():
+                words = str(error) if isinstance(error, SorvoloError) else f"{type(error).__name__}: {error}"
+                text = f"the search is not measured whole while the flight goes on: {words}"
+                warnings.warn(text, SorvoloWarning, stacklevel=3)
+                self._has_warned = True
 
     def _measure(self, archive: Archive) -> None:
         lower_priority()
-        try:
+        with self._warning():
             self._measure_all(archive)
-        except SorvoloError as error:
-            warnings.warn(f"the search is not measured while the flight goes on: {error}", SorvoloWarning, stacklevel=1)
 
     def _measure_all(self, archive: Archive) -> None:
         site = site_with_metres(archive)
@@ -109,20 +146,27 @@ class SearchWhileFlying:
             area_m=None if area is None else area.polygons_m(site.frame), keep_off_m=known_places(archive),
             above=heights_for(archive, flight_id),
         )
-        unwritten, again_s = 0, 0.0
+        seen_before_m = [
+            each.placed.outline_m for name in flights_to_search(archive, ()) if name != flight_id
+            for each in search_frames(archive, name)
+        ]
+        unwritten, again_s = 0, time.monotonic() + self._pace.again_s
         while not self._landed.is_set():
             stored = self._next()
             if stored is not None:
-                frame = search_frame(archive, stored)
-                if frame is not None:
-                    measure.add(frame)
-                    unwritten += 1
+                with self._warning():
+                    frame = search_frame(archive, stored)
+                    if frame is None:
+                        self._placed -= 1
+                    else:
+                        measure.add(frame)
+                        unwritten += 1
             elif not unwritten or time.monotonic() < again_s:
                 self._landed.wait(self._pace.look_s)
             if unwritten and time.monotonic() >= again_s:
                 started_s = time.monotonic()
-                if self._write(measure, archive):
-                    unwritten = 0
+                with self._warning():
+                    unwritten = 0 if self._write(measure, archive, seen_before_m) else unwritten
                 took_s = time.monotonic() - started_s
                 again_s = time.monotonic() + max(self._pace.again_s, self._pace.rest * took_s)
 
@@ -137,20 +181,26 @@ class SearchWhileFlying:
                 return queue.popleft()
         return None
 
-    def _write(self, measure: GrowingMeasure, archive: Archive) -> bool:
+    def _write(self, measure: GrowingMeasure, archive: Archive, seen_before_m: Sequence[PointsM]) -> bool:
         """Write what is known by now; whether there is a map yet to show it on."""
-        tiles = archive.live_tiles()
+        tiles, placed = archive.live_tiles(), self._placed
         if not tiles:
             return False
         cells, flight = measure.measured()
-        frames = {flight.name: tuple(measure.frames)}
-        searched = Searched(archive.site(), cells, (flight,), frames, self._prepared.segments)
-        report: dict[str, Any] = write_search(
-            searched, tiles, archive.site_grid(), self._settings, self._outputs, self._prepared.detector,
-            SoFar(len(measure.frames), self._placed, utc_now()),
+        searched = Searched(
+            archive.site(), cells, (flight,), {flight.name: tuple(measure.frames)}, self._prepared.segments
         )
-        if report["refly"] is None:
-            self.take_back()
-        self._planned = bool(report["refly"]) and bool(self._outputs.refly)
+
+        def show(so_far: SoFar) -> None:
+            write_search(
+                searched, tiles, archive.site_grid(), self._settings, self._outputs, self._prepared.detector, so_far,
+                seen_before_m,
+            )
+
+        if self._landed.is_set():
+            return False
+        self._last = SoFar(flight.name, len(measure.frames), placed, utc_now(), State.FLYING)
+        show(self._last)
+        self._shown = show
         self.written += 1
         return True

@@ -18,9 +18,14 @@ def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) ->
         maps=[(label, picture_uri(picture)) for label, picture in pictures.items()],
         figures=_figures(report["classes"][first]), holes=_holes(report["classes"]), segments=_segments(report),
         refly=_refly(report.get("refly")), plants=_plants(report), calibration=_calibration(report),
-        cell=with_unit("{:g} m", report["cell_m"]), as_of=at(report, "so_far", "as_of") or "",
+        cell=with_unit("{:g} m", report["cell_m"]), so_far=report["so_far"],
     )
     return str(page)
+
+
+def waiting_page(*, is_over: bool) -> str:
+    """search.html of a flight of which nothing was measured yet: it loads itself anew, until the flight is over."""
+    return str(render("search_waiting.html", title="What a search would have found", is_over=is_over))
 
 
 def _sentence(text: str) -> str:
