@@ -119,7 +119,8 @@ class SearchWhileFlying:
         """A page that waits for the first figures, in the place of an earlier search's; or waits no more."""
         with self._warning(), writing(self._outputs.folder):
             self._outputs.folder.mkdir(parents=True, exist_ok=True)
-            atomic_write_bytes(self._outputs.folder / "search.html", waiting_page(is_over=is_over).encode(), durable=False)
+            page = waiting_page(is_over=is_over).encode()
+            atomic_write_bytes(self._outputs.folder / "search.html", page, durable=False)
 
     @contextmanager
     def _warning(self) -> Iterator[None]:
