@@ -81,6 +81,15 @@ def test_only_a_picture_by_itself_of_unknown_scale_is_searched_in_several_sizes(
     np.testing.assert_allclose(found.boxes_px[found.names.index("car")], _BOXES[1])
 
 
+def test_a_closer_look_counts_only_for_what_it_knows_best() -> None:
+    pyramid = Pyramid((2.0,), 32.0, 1.0, 0.0, closer=(4.0,))
+    boxes, times = np.array([[0, 0, 9, 9], [0, 0, 14, 14]], np.float32), np.array([1.0, 2.0, 4.0])
+    small, large = trust(boxes, times, pyramid)
+    assert small.argmax() == 2 and small[1] > 0.3
+    assert large[2] < 1e-5
+    np.testing.assert_allclose(large[:2], trust(boxes, times[:2], pyramid)[1], rtol=1e-4)
+
+
 @pytest.mark.parametrize(("side_px", "label", "score", "closer"), [
     (8, 0, 0.8, {4.0: ("person",)}), (14, 0, 0.8, {}), (8, 0, 0.2, {}), (8, 1, 0.8, {}),
 ])

@@ -116,8 +116,13 @@ def agreed_in_sizes(
 def trust(
     boxes_px: BoxesPx, times: Floats, pyramid: Pyramid, settings: PyramidSettings = PyramidSettings()
 ) -> Floats:
-    """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large."""
+    """(N, looks) shares of the opinion on boxes (N, 4) in looks that show the picture `times` as large.
+
+    The first look shows it as it is. A closer look is asked about what it knows best alone: larger things lose by it.
+    """
     area_px = (boxes_px[:, 2] - boxes_px[:, 0]) * (boxes_px[:, 3] - boxes_px[:, 1])
     off = np.log2(np.sqrt(np.maximum(area_px, 1.0))[:, None] * times / pyramid.known_px) / pyramid.octaves
     curve = np.exp(-0.5 * (off**2 - (off**2).min(axis=1, keepdims=True))) + settings.least_trust
+    is_closer = np.isin(times, times[0] * np.array(pyramid.closer))
+    curve[~is_closer[curve.argmax(axis=1)][:, None] & is_closer] = settings.least_trust
     return np.asarray(curve / curve.sum(axis=1, keepdims=True))
