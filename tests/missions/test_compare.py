@@ -560,7 +560,8 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
 
 
 @pytest.mark.parametrize(("brightness", "printed"), [
-    pytest.param(0.4, "dark or of the ground's colour", marks=pytest.mark.long), (0.06, "means little"),
+    pytest.param(0.4, "dark or of the ground's colour", marks=pytest.mark.long),
+    pytest.param(0.06, "means little", marks=pytest.mark.long),  # benchmarks/change_unfit.py has nights, too
 ])
 def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_ground(site, tmp_path, brightness, printed):
     weather = replace(_PAIR.later.weather, brightness=brightness)
