@@ -9,6 +9,8 @@ import pytest
 from truth_detector import TruthDetector
 
 from small_flights import simulate_into, small_flight
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
 from sorvolo.simulation.settings import OutputSettings
 
 _SMALL = small_flight(
@@ -28,6 +30,17 @@ def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same flight as geo-tagged photos with the gimbal's angles, and the truth."""
     folder = tmp_path_factory.mktemp("flights") / "photographed"
     return simulate_into(folder, replace(_SMALL, output=OutputSettings(photos=True)))
+
+
+@pytest.fixture(scope="session")
+def photo_map(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site of these photos, which nobody writes to."""
+    folder = tmp_path_factory.mktemp("flights") / "site"
+    for _ in map_flights(
+        [photographed / "flight1" / "photos"], folder, MapSettings(model="none"), camera=photographed / "camera.xml"
+    ):
+        pass
+    return folder
 
 
 @pytest.fixture(scope="session")

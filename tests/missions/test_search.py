@@ -20,15 +20,10 @@ from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
 
 
-@pytest.fixture(scope="module")
-def site(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The photos mapped."""
-    folder = tmp_path_factory.mktemp("search") / "site"
-    for _ in map_flights(
-        [photographed / "flight1" / "photos"], folder, MapSettings(model="none"), camera=photographed / "camera.xml"
-    ):
-        pass
-    return folder
+@pytest.fixture
+def site(photo_map: Path) -> Path:
+    """The photos mapped after their flight."""
+    return photo_map
 
 
 def _report(site: Path, folder: Path, detector: Any, settings: SearchSettings, **outputs: Any) -> dict[str, Any]:

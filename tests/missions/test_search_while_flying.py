@@ -30,15 +30,10 @@ _AT_ONCE = 14  # photos: from 12 on a flight has its height above the ground, an
 _LIVE = LiveSettings(keeps_all=True, give_up_s=60.0, first_s=20.0)
 
 
-@pytest.fixture(scope="module")
-def site(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The photos mapped after the flight."""
-    folder = tmp_path_factory.mktemp("flying") / "site"
-    for _ in map_flights(
-        [photographed / "flight1" / "photos"], folder, MapSettings(model="none"), camera=photographed / "camera.xml"
-    ):
-        pass
-    return folder
+@pytest.fixture
+def site(photo_map: Path) -> Path:
+    """The photos mapped after their flight."""
+    return photo_map
 
 
 def _chance(flight: MeasuredFlight, label: str) -> float:

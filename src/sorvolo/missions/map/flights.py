@@ -7,6 +7,7 @@ from collections.abc import Generator, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.addresses import is_live_address
@@ -37,7 +38,6 @@ from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.map.reader import FrameReader
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
-from sorvolo.missions.search.while_flying import SearchWhileFlying
 from sorvolo.mosaic.control import ControlSettings
 from sorvolo.mosaic.selection import SelectionSettings, select_keyframes
 from sorvolo.store.exports.waypoints import check_waypoint_files
@@ -47,6 +47,9 @@ from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Frame, LostFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
 
+if TYPE_CHECKING:  # `map` alone has no use for what plants and searches
+    from sorvolo.missions.search.while_flying import SearchWhileFlying
+
 
 def map_flights(
     inputs: Sequence[Path | str], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
@@ -54,7 +57,7 @@ def map_flights(
     detector: ObjectDetector | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
     until: threading.Event | None = None, control: Path | None = None,
     base: Path | None = None, again: bool = False, refly: Sequence[Path] = (), catalogues: Catalogues | None = None,
-    search: SearchWhileFlying | None = None,
+    search: "SearchWhileFlying | None" = None,
 ) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
 
@@ -127,7 +130,7 @@ def _refuse_ties(flights: int, settings: MapSettings) -> None:
 
 def _map_one(
     setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: ObjectDetector | None,
-    request: str, coverage: FlightCoverage, *, anew: bool, samples: int, search: SearchWhileFlying | None,
+    request: str, coverage: FlightCoverage, *, anew: bool, samples: int, search: "SearchWhileFlying | None",
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)

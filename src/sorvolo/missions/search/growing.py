@@ -123,16 +123,14 @@ class GrowingMeasure:
             return
         fresh_m = [places[each].place_m for each in self._fresh]
         known = near_any([each.place_m for each in places], fresh_m, 2 * _AROUND_M)
-        wanted, laid = set(known), []
-        frames, boxes = {}, {}
-        for index, (placed, numbers, seen) in self._pictures.items():
-            if wanted.isdisjoint(numbers):
-                continue
-            near = near_any([each.sighting.position_m[:2] for each in seen.laid], fresh_m, _AROUND_M)
-            laid += [seen.laid[each] for each in near]
-            frames[index], boxes[index] = placed, rows_of(seen.boxes_px, numbers, known)
+        wanted = set(known)
+        pictures = [each for each in self._pictures.values() if not wanted.isdisjoint(each[1])]
+        boxes = {placed.index: rows_of(seen.boxes_px, numbers, known) for placed, numbers, seen in pictures}
+        laid = [each for _, _, seen in pictures for each in seen.laid]
+        near = near_any([each.sighting.position_m for each in laid], fresh_m, _AROUND_M)
         labels = [places[each].label for each in known]
-        reported = reported_plants(laid, list(frames.values()), boxes, labels, self._least)
+        frames = [placed for placed, _, _ in pictures]
+        reported = reported_plants([laid[each] for each in near], frames, boxes, labels, self._least)
         self._reported -= self._fresh
         self._reported |= {known[row] for row in reported} & self._fresh
         self._fresh.clear()
