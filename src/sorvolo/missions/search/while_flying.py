@@ -57,7 +57,6 @@ class SearchWhileFlying:
         self._unplaced: list[int] = []  # frames that the map took, whose pictures it has not stored yet
         self._waiting: deque[StoredKeyframe] = deque()
         self._put_off: deque[StoredKeyframe] = deque()
-        self._placed = 0
         self._landed = threading.Event()
         self._thread: threading.Thread | None = None
         self._shown: Callable[[SoFar], None] | None = None  # writes the last report again, in another state
@@ -65,11 +64,8 @@ class SearchWhileFlying:
         self._has_warned = False
         self.written = 0
         """How often the files were written."""
-
-    @property
-    def placed(self) -> int:
+        self.placed = 0
         """How many pictures have a place so far."""
-        return self._placed
 
     def __enter__(self) -> Self:
         return self
@@ -83,7 +79,7 @@ class SearchWhileFlying:
         """Have the frame of this index measured as soon as its picture is stored; called where the map is made."""
         if self._landed.is_set():
             return
-        if not self._placed and not self._unplaced:
+        if not self.placed and not self._unplaced:
             self._write_waiting()
         self._unplaced.append(index)
         later = []
@@ -93,7 +89,7 @@ class SearchWhileFlying:
                 later.append(each)
             else:
                 self._waiting.append(stored)
-                self._placed += 1
+                self.placed += 1
         self._unplaced = later
         if self._thread is None and self._waiting:
             self._thread = threading.Thread(target=self._measure, args=(archive,), name="search", daemon=True)
@@ -108,7 +104,7 @@ class SearchWhileFlying:
         if self._thread is not None:
             self._thread.join(self._pace.land_s)
         if self._shown is None or self._last is None:
-            if state is State.STOPPED:
+            if state is State.STOPPED and (self.placed or self._unplaced):  # else an earlier search's page stands
                 self._write_waiting(is_over=True)
         elif self._last.state is not state:
             self._last = replace(self._last, state=state)
@@ -158,7 +154,7 @@ class SearchWhileFlying:
                 with self._warning():
                     frame = search_frame(archive, stored)
                     if frame is None:
-                        self._placed -= 1
+                        self.placed -= 1
                     else:
                         measure.add(frame)
                         unwritten += 1
@@ -184,7 +180,7 @@ class SearchWhileFlying:
 
     def _write(self, measure: GrowingMeasure, archive: Archive, seen_before_m: Sequence[PointsM]) -> bool:
         """Write what is known by now; whether there is a map yet to show it on."""
-        tiles, placed = archive.live_tiles(), self._placed
+        tiles, placed = archive.live_tiles(), self.placed
         if not tiles:
             return False
         cells, flight = measure.measured()
