@@ -60,6 +60,20 @@ def test_a_blind_detector_finds_nothing_and_the_headline_reports_it(site: Path, 
     assert sum(report["classes"]["car"]["holes_m2"].values()) == pytest.approx(report["classes"]["car"]["area_m2"])
 
 
+def test_an_area_elsewhere_is_asked_about(site: Path, tmp_path: Path) -> None:
+    """A file of another search, some 30 km away."""
+    with Archive.open(site, write=False) as archive:
+        origin = archive.site().origin
+    south, west = origin.latitude_deg + 0.27, origin.longitude_deg
+    ring = [[west, south], [west + 0.002, south], [west + 0.002, south + 0.002], [west, south]]
+    area = tmp_path / "area.geojson"
+    area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    settings = SearchSettings(plants=10, classes=("car",), sun_deg=(215, 48))
+    report = _report(site, tmp_path / "out", Comparing(site), settings, area=area)
+    assert any("begins 30.0 km" in each and "is it the right --area" in each for each in report["warnings"])
+    assert report["headline"]["hole_share"] == pytest.approx(1) and report["classes"]["car"]["pod"] == 0
+
+
 def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(site: Path, tmp_path: Path) -> None:
     with Archive.open(site, write=False) as archive:
         origin = archive.site().origin

@@ -8,8 +8,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
+from scipy.spatial import KDTree
 
-from sorvolo.geometry.arrays import Mask, PointsM, frozen
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.polygons import points_inside
@@ -60,6 +61,11 @@ class Cells:
         """(N,) values laid out as (rows, columns), north up."""
         return values.reshape(self.rows, self.columns)
 
+    def wanted_from_m(self, places_m: Sequence[Floats]) -> float:
+        """How far the wanted ground is from the nearest of places, (2,) each, m; 0 where nothing is wanted."""
+        wanted_m = self.centres_m[self.wanted]
+        return float(KDTree(np.array(places_m)).query(wanted_m)[0].min()) if len(wanted_m) else 0.0
+
     def outer_corner_m(self) -> tuple[float, float]:
         """Easting and northing of the grid's north-west corner, in the grid's own projection."""
         corner = self.site_grid.grid.projected_from_grid(np.array([[self.left - 0.5, self.top - 0.5]]))[0]
@@ -77,7 +83,7 @@ def cell_side_m(outlines_m: Sequence[PointsM], settings: CellSettings = CellSett
 
 def cells_of(outlines_m: Sequence[PointsM], site: Site, area_m: Sequence[Sequence[PointsM]] | None) -> Cells:
     """`cells_over` of a site, of a side that bounds their number."""
-    side_m = cell_side_m([*outlines_m, *(ring for rings in area_m or () for ring in rings)])
+    side_m = cell_side_m(_rings_to_cover(outlines_m, area_m))
     return cells_over(outlines_m, SiteGrid.at(site.origin, side_m, site.crs), area_m)
 
 
@@ -86,10 +92,10 @@ def cells_over(
 ) -> Cells:
     """Cells over frames' outlines, (4, 2) site metres each, and over the area (polygons of rings) to be searched.
 
+    At least one cell of the area is wanted; where the frames are elsewhere there are cells over the area alone.
     Without an area, what is wanted is what the frames show and the gaps that they enclose.
     """
-    area_rings = [] if area_m is None else [ring for rings in area_m for ring in rings]
-    corners_px = site_grid.grid_from_site(np.concatenate([*map(np.asarray, outlines_m), *map(np.asarray, area_rings)]))
+    corners_px = site_grid.grid_from_site(np.concatenate(_rings_to_cover(outlines_m, area_m)))
     left, top = (int(each) for each in np.floor(corners_px.min(axis=0)))
     right, bottom = (int(each) + 1 for each in np.ceil(corners_px.max(axis=0)))
     columns, rows = right - left, bottom - top
@@ -98,7 +104,21 @@ def cells_over(
         wanted = _with_enclosed(_inside_any([[each] for each in outlines_m], centres_m).reshape(rows, columns)).ravel()
     else:
         wanted = _inside_any(area_m, centres_m)
+        if not wanted.any():  # narrower than a cell
+            x, y = np.floor(corners_px + 0.5).astype(int).T
+            wanted[(y - top) * columns + x - left] = True
     return Cells(site_grid, left, top, columns, rows, wanted)
+
+
+def _rings_to_cover(outlines_m: Sequence[PointsM], area_m: Sequence[Sequence[PointsM]] | None) -> list[PointsM]:
+    """What cells have to cover: frames' outlines and the area's rings, or these alone where both are far apart."""
+    own = [np.asarray(each) for each in outlines_m]
+    wanted = [np.asarray(ring) for rings in area_m or () for ring in rings]
+    if area_m is None:
+        return own
+    shown, asked = np.concatenate(own), np.concatenate(wanted)
+    apart_m = np.maximum(shown.min(axis=0) - asked.max(axis=0), asked.min(axis=0) - shown.max(axis=0))
+    return wanted if (apart_m > np.ptp(asked, axis=0) + np.ptp(shown, axis=0)).any() else own + wanted
 
 
 def _centres_m(site_grid: SiteGrid, left: int, top: int, columns: int, rows: int) -> PointsM:

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import Floats, ImageRGB, Mask, PointsM, Vector3, frozen
+from sorvolo.geometry.arrays import Floats, Floats16, ImageRGB, Mask, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint, is_on_ground
 from sorvolo.geometry.pose import Pose
@@ -39,15 +39,15 @@ class FrameLook:
     """One frame as the ground under it is judged: small maps of it, `scale` of its pixels each.
 
     `lightness` is in grey levels, 0 to 255; `texture` is the rms of lightness within 1.25 m over its mean there (no
-    unit); `plants` is where it is green, `crowns` whether trees or bushes show.
+    unit), both in half precision, for memory; `plants` is where it is green, `crowns` whether trees or bushes show.
     """
 
     camera: Camera
     site_from_camera: Pose
     blur_px: float
     scale: float
-    lightness: Floats
-    texture: Floats
+    lightness: Floats16
+    texture: Floats16
     plants: Mask
     crowns: Mask
 
@@ -108,8 +108,8 @@ def look_at(
     texture = np.sqrt(np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0)) / np.maximum(mean, 8)
     crowns = crowns_in(image, small, m_per_px, small_m, _sunward(site_from_camera, sun))
     return FrameLook(
-        camera, site_from_camera, blur_px, camera.width_px / size[0], lightness, texture, plants_in(small, small_m),
-        crowns,
+        camera, site_from_camera, blur_px, camera.width_px / size[0], lightness.astype(np.float16),
+        texture.astype(np.float16), plants_in(small, small_m), crowns,
     )
 
 

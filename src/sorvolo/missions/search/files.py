@@ -13,7 +13,15 @@ from sorvolo.search.holes import POD_EDGES, REASONS, flyable, pod_classes, witho
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, json_bytes
-from sorvolo.store.exports.pod_files import CellGrid, Region, pod_picture, region_features, regions_of, write_pod_tif
+from sorvolo.store.exports.pod_files import (
+    PICTURE_PX,
+    CellGrid,
+    Region,
+    pod_picture,
+    region_features,
+    regions_of,
+    write_pod_tif,
+)
 from sorvolo.store.pages.search import search_page
 
 
@@ -33,7 +41,7 @@ def write_search(
     with writing(outputs.folder):
         outputs.folder.mkdir(parents=True, exist_ok=True)
     bands, features, pictures = {}, [], {}
-    shown = picture(tiles, 1200)
+    shown = picture(tiles, PICTURE_PX)
     for label in searched.labels:
         total, holes = total_of(searched, label), hole_numbers(searched, label, settings, detector.info)
         classes = cells.as_grid(pod_classes(total, cells.wanted))

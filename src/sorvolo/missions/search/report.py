@@ -84,6 +84,15 @@ class Searched:
             for own in self.frames.values()
         )
 
+    @property
+    def unseen_from_m(self) -> float | None:
+        """How far the area is from the ground that was seen, where none of the area was seen; else None."""
+        cells = self.cells
+        if any((each.seen.seen & cells.wanted).any() for flight in self.flights for each in flight.classes):
+            return None
+        places_m = [corner_m for own in self.frames.values() for each in own for corner_m in each.placed.outline_m]
+        return cells.wanted_from_m(places_m)
+
     def of_class(self, label: str) -> list[MeasuredClass]:
         """What each flight measured of a class."""
         return [each for flight in self.flights for each in flight.classes if each.label == label]
@@ -201,11 +210,17 @@ def _headline(
 
 def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) -> list[str]:
     warnings, how = [], " (--plants, and room on open ground)" if is_over else ""
+    if (away_m := searched.unseen_from_m) is not None:
+        distance = f"{away_m / 1000:.1f} km" if away_m >= 1000 else f"{away_m:.0f} m"
+        warnings.append(
+            f"no picture{'' if is_over else ' so far'} shows any of the area, which begins {distance} "
+            "from what they show: is it the right --area?"
+        )
     for flight in searched.flights:
         few = [each for each in flight.classes if len(each.outcomes) < _FEW_PLANTS]
         warnings += [
-            f"{flight.name}: only {counted(len(each.outcomes), 'plant')} of the class {each.label}{how}; its "
-            "probability is a guess, as its interval shows" for each in few
+            f"{flight.name}: {'only ' * bool(len(each.outcomes))}{counted(len(each.outcomes), 'plant')} of the class "
+            f"{each.label}{how}; its probability is a guess, as its interval shows" for each in few
         ]
         if not flight.has_shadows and not flight.is_thermal:
             warnings.append(

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.geometry.arrays import ImageRGBA, PointsPx
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes
@@ -127,6 +127,23 @@ def picture(tiles: Mapping[TileIndex, ImageRGBA], max_px: int) -> Picture:
     Reads one tile at a time, so that memory depends on `max_px` only.
     """
     return pictures([tiles], max_px)[0]
+
+
+def with_room(shown: Picture, corners_px: PointsPx, max_px: int) -> Picture:
+    """The map with empty room up to grid pixels (N, 2) beyond it, made smaller until no side exceeds `max_px`."""
+    step, corner_px = shown.step_px, np.array(shown.corner_px)
+    height, width = shown.rgba.shape[:2]
+    low = np.minimum(corner_px, np.floor(corners_px.min(axis=0)))
+    high = np.maximum(corner_px + step * np.array([width, height]), corners_px.max(axis=0))
+    times = max(1, int(np.ceil((high - low).max() / (step * max_px))))
+    wider = step * times
+    before = np.ceil((corner_px - low) / wider).astype(int)  # pixels of the wider picture
+    own = -(-np.array([width, height]) // times)
+    after = np.maximum(np.ceil((high - corner_px) / wider).astype(int) - own, 0)
+    padded = np.pad(shown.rgba, [(0, own[1] * times - height), (0, own[0] * times - width), (0, 0)])
+    rgba = np.pad(shrink(padded, own[0], own[1]), [(before[1], after[1]), (before[0], after[0]), (0, 0)])
+    corner = corner_px - before * wider
+    return Picture(rgba, (float(corner[0]), float(corner[1])), wider, shown.shown_px)
 
 
 def pictures(

@@ -16,14 +16,18 @@ from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.polygons import swollen
 from sorvolo.store.atomic import atomic_path
-from sorvolo.store.exports.map_pictures import Picture
+from sorvolo.store.exports.map_pictures import Picture, with_room
 from sorvolo.store.exports.places import near_longitudes
 from sorvolo.store.rasters.gdal import crs_of_epsg, quiet_gdal
+
+PICTURE_PX = 1200
+"""The longer side of a picture, at most."""
 
 _COLOURS = np.array([
     [196, 48, 43], [232, 126, 60], [243, 205, 90], [150, 200, 105], [26, 130, 92],
 ], np.float64)  # of the classes of probability, from the lowest
 _HOLE = np.array([70.0, 70, 78])
+_PAPER = (255, 255, 255)
 _STRENGTH = 0.55  # opacity of the colours over the map
 
 
@@ -102,7 +106,11 @@ def region_features(regions: Sequence[Region], properties: Sequence[Mapping[str,
 def pod_picture(
     shown: Picture, site_grid: SiteGrid, classes: NDArray[np.uint8], is_hole: NDArray[np.bool_], grid: CellGrid
 ) -> ImageRGBA:
-    """The map with the classes of probability, (rows, columns) from 1, laid over it, and holes grey."""
+    """The map with the classes of probability, (rows, columns) from 1, laid over it, and holes grey.
+
+    It has room for all of them, beyond the map too; where nothing was mapped there is paper under the colours.
+    """
+    shown = _with_all(shown, site_grid, (classes > 0) | is_hole, grid)
     height, width = shown.rgba.shape[:2]
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     on_grid = np.column_stack([x.ravel(), y.ravel()]) * shown.step_px + np.array(shown.corner_px) - 0.5
@@ -114,10 +122,21 @@ def pod_picture(
     numbers[inside], holes[inside] = classes[rows[inside], columns[inside]], is_hole[rows[inside], columns[inside]]
     colours = np.where((numbers > 0)[:, None], _COLOURS[np.maximum(numbers, 1) - 1], _HOLE)
     share = np.where((numbers > 0) | holes, _STRENGTH, 0.0).reshape(height, width, 1)
-    rgba = shown.rgba.astype(np.float64)
+    rgba = np.where(shown.rgba[..., 3:] > 0, shown.rgba, [*_PAPER, 0]).astype(np.float64)
     rgba[..., :3] += share * (colours.reshape(height, width, 3) - rgba[..., :3])
     rgba[..., 3] = np.maximum(rgba[..., 3], 255 * (share[..., 0] > 0))
     return np.round(rgba).astype(np.uint8)
+
+
+def _with_all(shown: Picture, site_grid: SiteGrid, marked: NDArray[np.bool_], grid: CellGrid) -> Picture:
+    """The map with room for all marked cells, (rows, columns)."""
+    rows, columns = np.nonzero(marked)
+    if not len(rows):
+        return shown
+    low, high = (columns.min(), rows.min()), (columns.max() + 1, rows.max() + 1)
+    x, y = np.array([(low[0], low[1]), (high[0], low[1]), (low[0], high[1]), high]).T * grid.cell_m
+    corners_m = np.column_stack([grid.corner_m[0] + x, grid.corner_m[1] - y])
+    return with_room(shown, site_grid.grid.grid_from_projected(corners_m), PICTURE_PX)
 
 
 def _lonlat(ring_m: PointsM, grid: CellGrid) -> Floats:
