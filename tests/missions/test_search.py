@@ -1,7 +1,7 @@
 """Searches through whole missions: a small flight mapped, things planted into its frames, what a map would report."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.search.flights import search_site
+from sorvolo.missions.search.measured_before import Basis
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.site.archive import Archive
 
@@ -98,6 +99,56 @@ def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(site: Pa
     assert whole["pod"] == pytest.approx(row["pod"], abs=0.03) and whole["pos"] == pytest.approx(0.9 * whole["pod"])
     assert report["refly"]["area_m2"] > 0.4 * row["area_m2"]
     assert (tmp_path / "holes.kml").stat().st_size > 300 and (tmp_path / "holes.plan").is_file()
+
+
+class Counting(Comparing):
+    """Counts the pictures that it is shown."""
+
+    shown = 0
+
+    def detect(self, *args: Any, **wishes: Any) -> Any:
+        self.shown += 1
+        return super().detect(*args, **wishes)
+
+
+def test_a_flight_is_searched_once(site: Path, tmp_path: Path) -> None:
+    """A later search takes what was planted from the first's file, unless anything that counts is another."""
+    settings = SearchSettings(plants=12, classes=("car", "person"), sun_deg=(215, 48))
+    detector, out = Counting(site), tmp_path / "out"
+    first = _report(site, out, detector, settings)
+    plants = json.loads((out / "plants.geojson").read_text())
+    shown = detector.shown
+    again = _report(site, out, detector, settings)
+    assert detector.shown == shown > 0
+    (one,), (other,) = first["flights"], again["flights"]
+    assert not one["measured_before"] and other["measured_before"]
+    assert {**one, "measured_before": True} == other and first["classes"] == again["classes"]
+    counts = {label: (row["planted"], row["found"]) for label, row in one["classes"].items()}
+    for label, (planted, found) in counts.items():
+        own = [each for each in plants["features"] if each["properties"]["class"] == label]
+        assert len(own) >= planted > 0 and sum(each["properties"]["found"] for each in own) >= found
+    with Archive.open(site, write=False) as archive:
+        origin = archive.site().origin
+    for each in plants["features"]:
+        east, north = each["geometry"]["coordinates"]
+        assert abs(east - origin.longitude_deg) < 0.005 and abs(north - origin.latitude_deg) < 0.005
+    _report(site, out, detector, replace(settings, seed=2))
+    assert detector.shown > shown
+    shown = detector.shown
+    (out / "plants.geojson").write_text(json.dumps(plants)[:-400])
+    assert _report(site, out, detector, replace(settings, seed=2))["classes"] and detector.shown > shown
+
+
+def test_plants_serve_another_search_of_the_same_frames_alone() -> None:
+    basis = Basis("1", "model", "frames", False, 0.0, None, ("person", "car"), 80, 1, "")
+    assert basis.serves(replace(basis, plants=20, seed=4, area="field"))
+    assert basis.serves(replace(basis, classes=("car",)))
+    for other in (
+        {"model": "x"}, {"frames": "x"}, {"program": "2"}, {"heights": True}, {"through_crowns": 0.3},
+        {"sun_deg": (1.0, 2.0)}, {"classes": ("small object",)},
+    ):
+        assert not basis.serves(replace(basis, **other))
+    assert Basis.from_json(json.loads(json.dumps(asdict(replace(basis, sun_deg=(1.0, 2.0)))))).sun_deg == (1.0, 2.0)
 
 
 def test_a_map_without_metres_is_refused(tmp_path: Path, filmed: Path) -> None:

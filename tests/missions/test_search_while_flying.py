@@ -4,6 +4,7 @@ import json
 import shutil
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,12 @@ from sorvolo.errors import SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.search import while_flying
+from sorvolo.missions.search.earlier import EarlierFlights
+from sorvolo.missions.search.flights import search_site
 from sorvolo.missions.search.frames import flights_to_search, search_frames
 from sorvolo.missions.search.growing import GrowingMeasure
 from sorvolo.missions.search.measure import MeasuredFlight, measure_flight
+from sorvolo.missions.search.prepare import prepare_search
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.missions.search.while_flying import Pace, SearchWhileFlying
 from sorvolo.search.cells import cells_of
@@ -204,12 +208,39 @@ def test_files_and_waypoints_follow_the_flight(photographed: Path, site: Path, t
     assert refly.is_file() and (tmp_path / "out" / "pod.tif").is_file()
 
 
+def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(site: Path, tmp_path: Path) -> None:
+    """What it states of its ground is what the search itself stated, over other cells too."""
+    settings, outputs = replace(_SETTINGS, plants=10), SearchOutputs(tmp_path / "out")
+    *_, whole = search_site(site, settings, outputs, Comparing(site))
+    assert isinstance(whole, dict)
+    prepared = prepare_search(settings, outputs, Comparing(site))
+    with Archive.open(site, write=False) as archive:
+        (name,) = flights_to_search(archive, ())
+        earlier = EarlierFlights(archive, "other", prepared, replace(settings, plants=90, seed=7), outputs)
+        for _ in search_frames(archive, name):
+            assert not earlier.frames and earlier.look()
+        assert not earlier.look()
+        frames_m = [each.placed.outline_m for each in earlier.frames[name]]
+        (flight,) = earlier.on(cells_of(frames_m, archive.site(), None))
+        (beside,) = earlier.on(cells_of([each + np.array([25.0, 0.0]) for each in frames_m], archive.site(), None))
+        blind = EarlierFlights(archive, "other", prepared, replace(settings, through_crowns=0.5), outputs)
+        assert not blind.look() and len(blind.uncounted_m) == len(frames_m) and not earlier.uncounted_m
+    for own, other in zip(flight.classes, beside.classes, strict=True):
+        row = whole["classes"][own.label]
+        assert float(np.nansum(own.chances.mean)) == pytest.approx(row["swept_m2"], rel=0.02)
+        assert 0.3 * row["swept_m2"] < float(np.nansum(other.chances.mean)) < 0.9 * row["swept_m2"]
+        assert own.seen.seen.sum() > other.seen.seen.sum() > 0
+
+
 @pytest.mark.usefixtures("threads")
 def test_a_flight_that_is_stopped_leaves_no_waypoints(photographed: Path, site: Path, tmp_path: Path) -> None:
-    """And a page that states it, not one that is loaded anew for ever."""
+    """And a page that states it, not one that is loaded anew for ever. A flight before it counts as well."""
     refly = tmp_path / "holes.kml"
     outputs = SearchOutputs(tmp_path / "out", area=_area(site, tmp_path), refly=(refly,))
-    flying = SearchWhileFlying(_SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02))
+    shutil.copytree(site, tmp_path / "site")
+    settings, pace = replace(_SETTINGS, plants=10), Pace(again_s=0.0, rest=0.0, look_s=0.02, earlier=99)
+    *_, whole = search_site(tmp_path / "site", settings, outputs, Comparing(site))
+    flying = SearchWhileFlying(settings, outputs, Comparing(site), pace)
     photos = Arriving(photographed / "flight1" / "photos", tmp_path / "in", 0.0)
     over = threading.Event()
     thread = photos.fly(flying, tmp_path / "out" / "search.json", over)
@@ -229,6 +260,14 @@ def test_a_flight_that_is_stopped_leaves_no_waypoints(photographed: Path, site: 
     thread.join()
     page = (tmp_path / "out" / "search.html").read_text()
     assert "when the flight was stopped" in page and "refresh" not in page and not refly.exists()
+    assert "of the flight in and 1 flight before it" in page
+    report = json.loads((tmp_path / "out" / "search.json").read_bytes())
+    assert report["so_far"]["earlier"] == ["photos"] and isinstance(whole, dict)
+    assert [(each["name"], each["measured_before"]) for each in report["flights"]] == [("photos", True), ("in", False)]
+    for label in ("car", "person"):
+        before, now = whole["classes"][label], report["classes"][label]
+        assert now["seen_m2"] >= 0.97 * before["seen_m2"] and now["pod"] > 0.97 * before["pod"]
+        assert now["swept_m2"] > before["swept_m2"]
 
 
 @pytest.mark.usefixtures("threads")

@@ -66,6 +66,12 @@ class Cells:
         wanted_m = self.centres_m[self.wanted]
         return float(KDTree(np.array(places_m)).query(wanted_m)[0].min()) if len(wanted_m) else 0.0
 
+    def rows_at(self, places_m: PointsM) -> NDArray[np.intp]:
+        """(N,) the numbers of the cells in which places (N, 2) lie, site metres; -1 beyond all cells."""
+        column, row = (np.floor(self.site_grid.grid_from_site(places_m) + 0.5).astype(int) - (self.left, self.top)).T
+        inside = (column >= 0) & (row >= 0) & (column < self.columns) & (row < self.rows)
+        return np.where(inside, row * self.columns + column, -1)
+
     def outer_corner_m(self) -> tuple[float, float]:
         """Easting and northing of the grid's north-west corner, in the grid's own projection."""
         corner = self.site_grid.grid.projected_from_grid(np.array([[self.left - 0.5, self.top - 0.5]]))[0]

@@ -1,11 +1,12 @@
 """Under which conditions ground was seen: how finely, how often, how sharp, in which light, on what ground."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Floats16, ImageRGB, Mask, PointsM, Vector3, frozen
 from sorvolo.geometry.camera import Camera
@@ -87,6 +88,14 @@ class Conditions:
         """(N,) whether any view shows crowns there: they may hide some of the ground."""
         return np.asarray(self.crowns > 0, bool)
 
+    def at(self, rows: NDArray[np.intp]) -> "Conditions":
+        """Of M of the places, by their numbers (M,); below 0: of one that no frame shows."""
+        known = rows >= 0
+        return Conditions(
+            np.where(known, self.views[rows], 0), np.where(known[:, None], self.columns[rows], np.nan),
+            np.where(known, self.crowns[rows], 0), known & self.roofs[rows],
+        )
+
     def m_per_px(self) -> Floats:
         """(N,) the ground that a pixel covers, the geometric mean over the views."""
         return np.exp(self.columns[:, CONDITIONS.index("resolution")])
@@ -123,45 +132,66 @@ def _sunward(site_from_camera: Pose, sun: Vector3 | None) -> Floats | None:
 
 
 def gather(
-    looks: Sequence[FrameLook], places_m: PointsM | Sequence[Floats], reach_m: float, above: AboveGround | None = None
+    looks: Iterable[FrameLook], places_m: PointsM | Sequence[Floats], reach_m: float,
+    above: AboveGround | None = None,
 ) -> Conditions:
     """The conditions of places (N, 2); a frame counts that shows what reaches `reach_m` about a place whole.
 
     What stands higher than people and cars by `above` hides the ground as well as the crowns that the pictures show.
     """
-    places_m = np.reshape(np.asarray(places_m, np.float64), (-1, 2))
-    count = len(places_m)
-    views, sums, crowns, plants = np.zeros(count), np.zeros((count, 5)), np.zeros(count), np.zeros(count)
+    gathering = Gathering(places_m, reach_m, above)
     for look in looks:
-        about = np.flatnonzero(_about(look, places_m))
+        gathering.add(look)
+    return gathering.conditions()
+
+
+class Gathering:
+    """Conditions of places, as `gather` takes them, while looks come one by one and none is kept."""
+
+    def __init__(
+        self, places_m: PointsM | Sequence[Floats], reach_m: float, above: AboveGround | None = None
+    ) -> None:
+        self._places_m = np.reshape(np.asarray(places_m, np.float64), (-1, 2))
+        self._reach_m, self._above = reach_m, above
+        count = len(self._places_m)
+        self._views, self._sums = np.zeros(count), np.zeros((count, 5))
+        self._crowns, self._plants = np.zeros(count), np.zeros(count)
+
+    def add(self, look: FrameLook) -> None:
+        """Count what one frame shows."""
+        about = np.flatnonzero(_about(look, self._places_m))
         if not len(about):
-            continue
-        shown, pixels, m_per_px, slant = _projected(look, places_m[about], reach_m)
+            return
+        shown, pixels, m_per_px, slant = _projected(look, self._places_m[about], self._reach_m)
         if not shown.any():
-            continue
+            return
         at = about[shown]
         rows, columns = look.lightness.shape
         x, y = (pixels[shown] / look.scale).astype(int).clip(0, [columns - 1, rows - 1]).T
         near_m = m_per_px[shown]
-        sums[at] += np.column_stack([
+        self._sums[at] += np.column_stack([
             np.log(near_m), np.log(look.blur_px * near_m), look.texture[y, x], look.lightness[y, x], slant[shown],
         ])
-        crowns[at] += look.crowns[y, x]
-        plants[at] += look.plants[y, x]
-        views[at] += 1
-    with np.errstate(invalid="ignore", divide="ignore"):
-        means, share, green = sums / views[:, None], crowns / views, plants / views
-        log_views = np.where(views > 0, np.log(views), np.nan)
-    roofs = np.zeros(count, bool)
-    if above is not None and count:
-        raised = _raised(*above(places_m)) & (views > 0)
-        roofs = raised & (green <= _CROWN_SHARE)
-        share = np.where(roofs, 0.0, np.where(raised, 1.0, share))
-    columns = np.column_stack([
-        means[:, 0], log_views, np.where(views > 0, views == 1, np.nan), means[:, 1], means[:, 2], means[:, 3],
-        means[:, 4], share,
-    ])
-    return Conditions(views, columns, np.nan_to_num(share), roofs)
+        self._crowns[at] += look.crowns[y, x]
+        self._plants[at] += look.plants[y, x]
+        self._views[at] += 1
+
+    def conditions(self) -> Conditions:
+        """What the looks so far show."""
+        views = self._views.copy()
+        with np.errstate(invalid="ignore", divide="ignore"):
+            means, share, green = self._sums / views[:, None], self._crowns / views, self._plants / views
+            log_views = np.where(views > 0, np.log(views), np.nan)
+        roofs = np.zeros(len(views), bool)
+        if self._above is not None and len(views):
+            raised = _raised(*self._above(self._places_m)) & (views > 0)
+            roofs = raised & (green <= _CROWN_SHARE)
+            share = np.where(roofs, 0.0, np.where(raised, 1.0, share))
+        columns = np.column_stack([
+            means[:, 0], log_views, np.where(views > 0, views == 1, np.nan), means[:, 1], means[:, 2], means[:, 3],
+            means[:, 4], share,
+        ])
+        return Conditions(views, columns, np.nan_to_num(share), roofs)
 
 
 def _raised(above_m: Floats, sigma_m: Floats) -> Mask:

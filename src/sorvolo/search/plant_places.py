@@ -29,6 +29,11 @@ class PlantPlace:
     label: str
     place_m: Floats
 
+    @classmethod
+    def at(cls, label: str, x_m: float, y_m: float) -> "PlantPlace":
+        """One at these site metres."""
+        return cls(label, np.array([x_m, y_m], np.float64))
+
 
 def plant_places(
     cells: Cells, seen: Conditions, labels: Sequence[str], plants: int, *, keep_off_m: Sequence[Floats], free_m: float,

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Mask, frozen
 
@@ -79,6 +80,10 @@ class Chances:
     def __post_init__(self) -> None:
         for name in ("mean", "low", "high"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    def at(self, rows: NDArray[np.intp]) -> "Chances":
+        """Of M of them, by their numbers (M,); below 0: unknown."""
+        return Chances(*(np.where(rows >= 0, each[rows], np.nan) for each in (self.mean, self.low, self.high)))
 
 
 def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSettings()) -> Recall:

@@ -9,10 +9,12 @@ from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.files import write_search
 from sorvolo.missions.search.frames import flights_to_search, heights_for, search_frames
 from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, SearchProgress, measure_flight
-from sorvolo.missions.search.prepare import known_places, prepare_search, site_with_metres
+from sorvolo.missions.search.measured_before import Basis, read_plants, write_plants
+from sorvolo.missions.search.prepare import PreparedSearch, known_places, prepare_search, site_with_metres
 from sorvolo.missions.search.report import Searched
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells, cells_of
+from sorvolo.store.atomic import writing
 from sorvolo.store.site.archive import Archive
 
 
@@ -26,7 +28,7 @@ def search_site(
     not installed; what `prepare_search` refuses is refused before any work.
     """
     prepared = prepare_search(settings, outputs, detector)
-    area, looks = prepared.area, prepared.detector
+    area = prepared.area
     with Archive.open(site_folder, write=False) as archive:
         site = site_with_metres(archive)
         names = flights_to_search(archive, outputs.flights)
@@ -35,25 +37,35 @@ def search_site(
             raise InputError(f"{site_folder} has no mapped flight: sorvolo map INPUT --site {site_folder} makes one")
         outlines_m = [each.placed.outline_m for own in frames.values() for each in own]
         cells = cells_of(outlines_m, site, None if area is None else area.polygons_m(site.frame))
-        measured = yield from _measured(frames, cells, archive, looks, settings)
+        measured = yield from _measured(frames, cells, archive, prepared, settings, outputs.folder)
         searched = Searched(
             site, cells, tuple(measured), {name: tuple(own) for name, own in frames.items()}, prepared.segments
         )
-        yield write_search(searched, archive.tiles(), archive.site_grid(), settings, outputs, looks)
+        yield write_search(searched, archive.tiles(), archive.site_grid(), settings, outputs, prepared.detector)
 
 
 def _measured(
-    frames: Mapping[str, Sequence[SearchFrame]], cells: Cells, archive: Archive, detector: ObjectDetector,
-    settings: SearchSettings,
+    frames: Mapping[str, Sequence[SearchFrame]], cells: Cells, archive: Archive, prepared: PreparedSearch,
+    settings: SearchSettings, folder: Path,
 ) -> Generator[SearchProgress, None, list[MeasuredFlight]]:
-    """Each flight measured, one after the other."""
+    """Each flight measured, one after the other; what an earlier search of the same measured is taken from it."""
     site, known_m, measured = archive.site(), known_places(archive), []
+    mapped, before = flights_to_search(archive, ()), read_plants(folder)
+    known = {name: each for name, each in before.items() if name in mapped}
     for name, own in frames.items():
+        above = heights_for(archive, name)
+        basis = Basis.of(own, prepared, settings, has_heights=above is not None)
+        earlier = known[name][1] if name in known and known[name][0] == basis else None
         for each in measure_flight(
-            name, own, cells, site, detector, settings, known_m, heights_for(archive, name)
+            name, own, cells, site, prepared.detector, settings, known_m, above, earlier
         ):
-            if isinstance(each, MeasuredFlight):
-                measured.append(each)
-            else:
+            if isinstance(each, SearchProgress):
                 yield each
+                continue
+            measured.append(each)
+            if earlier is None:
+                known[name] = basis, each.searched
+                with writing(folder):
+                    folder.mkdir(parents=True, exist_ok=True)
+                write_plants(folder, site, known)
     return measured

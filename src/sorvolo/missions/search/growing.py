@@ -10,6 +10,7 @@ from sorvolo.missions.search.measure import (
     KEEP_OFF_M,
     MeasuredFlight,
     SearchedPicture,
+    SearchedPlants,
     SearchFrame,
     measured_class,
     planted_classes,
@@ -95,10 +96,13 @@ class GrowingMeasure:
         self._blur_px = max(self._blur_px, light.blur_px)
         self._seconds += time.monotonic() - started_s
 
-    def measured(self) -> tuple[Cells, MeasuredFlight]:
-        """The cells of the ground by now, and what the frames so far state of them. At least one was added."""
-        placed = [each.placed for each in self.frames]
-        cells = cells_of([each.outline_m for each in placed], self._site, self._area_m)
+    def measured(self, beside_m: Sequence[PointsM] = ()) -> tuple[Cells, MeasuredFlight]:
+        """The cells of the ground by now, and what the frames so far state of them. At least one was added.
+
+        The ground of other flights' frames, (4, 2) site metres each, counts as flown as well.
+        """
+        outlines_m = [*beside_m, *(each.placed.outline_m for each in self.frames)]
+        cells = cells_of(outlines_m, self._site, self._area_m)
         places = [] if self._field is None else self._field.places
         self._judge_fresh(places)
         conditions_at = partial(gather, self._looks, above=self._above)
@@ -109,12 +113,13 @@ class GrowingMeasure:
         ]
         classes = tuple(
             measured_class(
-                label, conditions_at(cells.centres_m, reach_m(label)), conditions_at, gathered, self._settings
+                label, conditions_at(cells.centres_m, reach_m(label)), gathered, conditions_at, self._settings
             ) for label in self._wanted
         )
+        searched = SearchedPlants(len(self._pictures), 1, self._seconds, tuple(gathered))
         return cells, MeasuredFlight(
-            self._name, len(self.frames), len(self._pictures), 1, self._seconds, self._has_shadows,
-            self._above is not None, self._is_thermal, self._blur_px, classes,
+            self._name, len(self.frames), searched, self._has_shadows, self._above is not None, self._is_thermal,
+            self._blur_px, classes,
         )
 
     def _judge_fresh(self, places: Sequence[PlantPlace]) -> None:

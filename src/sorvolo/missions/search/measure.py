@@ -1,7 +1,7 @@
 """One flight measured: plants into its own frames, the detector over them, and what a map would have reported."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
@@ -32,6 +32,9 @@ from sorvolo.tracking.view_evidence import least_seen
 ConditionsAt: TypeAlias = Callable[[Sequence[Floats], float], Conditions]
 """The conditions of places, (2,) each, that reach so far, m."""
 
+Planted: TypeAlias = tuple[PlantPlace, bool]
+"""Where one plant stood, and whether a map would report it."""
+
 KEEP_OFF_M = 4.0  # plants from what a map shows already
 _MOST_DETECTIONS = 60  # of one frame beside its plants, as maps take them
 
@@ -42,6 +45,16 @@ class SearchFrame:
 
     placed: PlacedFrame
     image: Callable[[], ImageRGB]
+
+
+@dataclass(frozen=True, eq=False)
+class SearchedPlants:
+    """All that was planted into a flight; `looked` counts the planted pictures that the detector searched."""
+
+    looked: int
+    rounds: int
+    seconds: float
+    plants: tuple[Planted, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,18 +70,17 @@ class MeasuredClass:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredFlight:
-    """One flight as it was measured. `looked` counts pictures that the detector searched."""
+    """One flight as it was measured; `is_earlier`: what was planted was searched for by an earlier run."""
 
     name: str
     frames: int
-    looked: int
-    rounds: int
-    seconds: float
+    searched: SearchedPlants
     has_shadows: bool
     has_heights: bool
     is_thermal: bool
     blur_px: float
     classes: tuple[MeasuredClass, ...]
+    is_earlier: bool = False
 
 
 @dataclass(frozen=True)
@@ -85,24 +97,42 @@ class SearchProgress:
 def measure_flight(
     name: str, frames: Sequence[SearchFrame], cells: Cells, site: Site, detector: ObjectDetector,
     settings: SearchSettings, keep_off_m: Sequence[Floats], above: AboveGround | None = None,
+    before: SearchedPlants | None = None,
 ) -> Iterator[SearchProgress | MeasuredFlight]:
     """Measure one flight over a site with metres; yields progress and, at last, what was measured.
 
     `keep_off_m` are places, (2,) each, of what stands on the map already: no plant is put beside it.
-    `above` has how high things stand, where the flight has heights. Raises SettingsError as `planted_classes` does.
+    `above` has how high things stand, where the flight has heights. With plants that were searched for `before` nothing
+    is planted, only the cells' conditions are looked at. Raises SettingsError as `planted_classes` does.
     """
-    started_s = time.monotonic()
     wanted = planted_classes(detector, settings)
     sun = sun_at(frames[len(frames) // 2], site, settings)
     lights, looks = _looks(frames, sun)
     conditions_at = partial(gather, looks, above=above)
     seen = {label: conditions_at(cells.centres_m, reach_m(label)) for label in wanted}
-    usable = _usable(seen[wanted[0]], cells, settings)
-    rounds = plant_places(
-        cells, seen[wanted[0]], wanted, settings.plants, keep_off_m=keep_off_m, free_m=KEEP_OFF_M,
-        rng=seeded(settings.seed), usable=usable,
+    if before is None:
+        places = plant_places(
+            cells, seen[wanted[0]], wanted, settings.plants, keep_off_m=keep_off_m, free_m=KEEP_OFF_M,
+            rng=seeded(settings.seed), usable=_usable(seen[wanted[0]], cells, settings),
+        )
+        searched = yield from _searched(name, frames, lights, conditions_at, places, sun, detector, wanted, settings)
+    else:
+        searched = before
+    classes = tuple(measured_class(label, seen[label], searched.plants, conditions_at, settings) for label in wanted)
+    yield MeasuredFlight(
+        name, len(frames), searched, sun is not None, above is not None, any(each.is_thermal for each in lights),
+        max((each.blur_px for each in lights), default=0.0), classes, is_earlier=before is not None,
     )
-    gathered: list[tuple[PlantPlace, bool]] = []
+
+
+def _searched(
+    name: str, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], conditions_at: ConditionsAt,
+    rounds: Sequence[Sequence[PlantPlace]], sun: Vector3 | None, detector: ObjectDetector, wanted: Sequence[str],
+    settings: SearchSettings,
+) -> Generator[SearchProgress, None, SearchedPlants]:
+    """Plant one round after the other and search the frames."""
+    started_s = time.monotonic()
+    gathered: list[Planted] = []
     number = looked = 0
     for place_round in rounds:
         things = [new_plant(number + k, each.label, each.place_m, settings.seed) for k, each in enumerate(place_round)]
@@ -112,12 +142,7 @@ def measure_flight(
         looked += run.looked
         reported = run.reported()
         gathered += [(place, k in reported) for k, place in enumerate(place_round)]
-    measured = tuple(measured_class(label, seen[label], conditions_at, gathered, settings) for label in wanted)
-    yield MeasuredFlight(
-        name, len(frames), looked, len(rounds), time.monotonic() - started_s, sun is not None,
-        above is not None, any(each.is_thermal for each in lights), max((each.blur_px for each in lights), default=0.0),
-        measured,
-    )
+    return SearchedPlants(looked, len(rounds), time.monotonic() - started_s, tuple(gathered))
 
 
 def planted_classes(detector: ObjectDetector, settings: SearchSettings) -> tuple[str, ...]:
@@ -200,7 +225,7 @@ class _Round:
 
     def search(
         self, name: str, detector: ObjectDetector, wanted: Sequence[str], before: int, total: int,
-        gathered: Sequence[tuple[PlantPlace, bool]],
+        gathered: Sequence[Planted],
     ) -> Iterator[SearchProgress]:
         """Plant into one frame after the other and search it; those that show no plant are left out."""
         for number, (each, light) in enumerate(zip(self._frames, self._lights)):
@@ -226,12 +251,18 @@ class _Round:
 def _looks(frames: Sequence[SearchFrame], sun: Vector3 | None) -> tuple[list[FrameLight], list[FrameLook]]:
     lights, looks = [], []
     for each in frames:
-        image, pose = each.image(), pose_of(each.placed)
-        assert pose is not None
-        light = frame_light(image)
+        light, look = look_of(each, sun)
         lights.append(light)
-        looks.append(look_at(image, each.placed.camera, pose, light.blur_px, sun))
+        looks.append(look)
     return lights, looks
+
+
+def look_of(frame: SearchFrame, sun: Vector3 | None) -> tuple[FrameLight, FrameLook]:
+    """A frame's light, and its small maps."""
+    image, pose = frame.image(), pose_of(frame.placed)
+    assert pose is not None  # frames without a place are none of these
+    light = frame_light(image)
+    return light, look_at(image, frame.placed.camera, pose, light.blur_px, sun)
 
 
 def _usable(seen: Conditions, cells: Cells, settings: SearchSettings) -> Mask:
@@ -248,13 +279,20 @@ def sun_at(frame: SearchFrame, site: Site, settings: SearchSettings) -> Vector3 
 
 
 def measured_class(
-    label: str, seen: Conditions, conditions_at: ConditionsAt, gathered: Sequence[tuple[PlantPlace, bool]],
-    settings: SearchSettings,
+    label: str, seen: Conditions, planted: Sequence[Planted], conditions_at: ConditionsAt, settings: SearchSettings
 ) -> MeasuredClass:
-    """What plants of a class, found or not, state of all cells, which were `seen` under their conditions."""
-    places_m: list[Floats] = [place.place_m for place, _ in gathered if place.label == label]
-    hits = [hit for place, hit in gathered if place.label == label]
+    """What plants of a class state of all cells, which were `seen` under their conditions; others are left out.
+
+    `conditions_at` is asked for the places of these plants alone.
+    """
+    places_m, hits = plants_of(label, planted)
     outcomes = found_rows(places_m, conditions_at(places_m, reach_m(label)), hits)
     recall = fit_recall(outcomes.columns, outcomes.found) if len(outcomes) else None
     hidden = seen.roofs | seen.under_trees if settings.through_crowns == 0 else seen.roofs
     return MeasuredClass(label, seen, outcomes, recall, map_chances(recall, seen.columns, hidden))
+
+
+def plants_of(label: str, planted: Sequence[Planted]) -> tuple[list[Floats], list[bool]]:
+    """Where the plants of a class stand, (2,) each, and whether each was found."""
+    own = [(place.place_m, hit) for place, hit in planted if place.label == label]
+    return [place_m for place_m, _ in own], [hit for _, hit in own]

@@ -42,13 +42,14 @@ class State(StrEnum):
 @dataclass(frozen=True)
 class SoFar:
     """A flight that is not mapped whole: how many pictures were measured of those that have a place, by when (ISO 8601,
-    UTC), and what it does."""
+    UTC), what it does, and the flights before it that count as well."""
 
     flight: str
     measured: int
     placed: int
     as_of: str
     state: State
+    earlier: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,8 +172,9 @@ def _flight_row(flight: MeasuredFlight) -> dict[str, Any]:
             "calibration": [asdict(row) for row in calibration(held_out, own.found)],
         }
     return {
-        "name": flight.name, "frames": flight.frames, "searched_pictures": flight.looked, "rounds": flight.rounds,
-        "seconds": round(flight.seconds, 1), "shadows": flight.has_shadows,
+        "name": flight.name, "frames": flight.frames, "searched_pictures": flight.searched.looked,
+        "rounds": flight.searched.rounds, "seconds": round(flight.searched.seconds, 1),
+        "measured_before": flight.is_earlier, "shadows": flight.has_shadows,
         "heights": flight.has_heights, "thermal": flight.is_thermal, "blur_px": round(flight.blur_px, 2),
         "classes": classes,
     }
@@ -197,7 +199,8 @@ def _headline(
     holes = ", ".join(f"{share:.0%} {reason}" for reason, share in shares.items() if share >= 0.005)
     chance = f"{row['pod']:.2f} (90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f})"
     by = "" if so_far is None else (
-        f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')} of the flight {so_far.flight} alone: "
+        f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')} of the flight {so_far.flight} "
+        f"{'and ' + counted(len(so_far.earlier), 'flight') + ' before it' if so_far.earlier else 'alone'}: "
     )
     text = f"{by}probability of detection of a {label} anywhere in the area: {chance}"
     total = sum(shares.values())

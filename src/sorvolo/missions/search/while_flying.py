@@ -4,19 +4,19 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Self
 
 from sorvolo.errors import SorvoloError, SorvoloWarning
-from sorvolo.geometry.arrays import PointsM
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.priority import lower_priority
 from sorvolo.missions.map.run import FlightRun
+from sorvolo.missions.search.earlier import EarlierFlights
 from sorvolo.missions.search.files import write_search
-from sorvolo.missions.search.frames import flights_to_search, heights_for, search_frame, search_frames
+from sorvolo.missions.search.frames import heights_for, search_frame
 from sorvolo.missions.search.growing import GrowingMeasure
 from sorvolo.missions.search.prepare import PreparedSearch, known_places, prepare_search, site_with_metres
 from sorvolo.missions.search.report import Searched, SoFar, State
@@ -35,6 +35,7 @@ class Pace:
     rest: float = 4.0  # times as long as the last writing took: most of the time is the measure's
     look_s: float = 0.2  # until it is asked again whether there is a frame
     most_behind: int = 8  # frames that wait: of more every second is put off, so that new ground is measured soon
+    earlier: int = 4  # pictures of earlier flights that are looked at for one that is searched, which takes longer
     land_s: float = 20.0  # for the frame that is being searched as the flight lands; a report that takes longer is lost
 
 
@@ -143,10 +144,7 @@ class SearchWhileFlying:
             area_m=None if area is None else area.polygons_m(site.frame), keep_off_m=known_places(archive),
             above=heights_for(archive, flight_id),
         )
-        seen_before_m = [
-            each.placed.outline_m for name in flights_to_search(archive, ()) if name != flight_id
-            for each in search_frames(archive, name)
-        ]
+        earlier = EarlierFlights(archive, flight_id, self._prepared, self._settings, self._outputs)
         unwritten, again_s = 0, time.monotonic() + self._pace.again_s
         while not self._landed.is_set():
             stored = self._next()
@@ -158,14 +156,18 @@ class SearchWhileFlying:
                     else:
                         measure.add(frame)
                         unwritten += 1
-            elif not unwritten or time.monotonic() < again_s:
-                self._landed.wait(self._pace.look_s)
-            if unwritten and time.monotonic() >= again_s:
+            is_idle, counted = stored is None, len(earlier.frames)
+            with self._warning():
+                is_idle &= not any([earlier.look() for _ in range(self._pace.earlier)])
+                unwritten += len(earlier.frames) - counted
+            if unwritten and measure.frames and time.monotonic() >= again_s:
                 started_s = time.monotonic()
                 with self._warning():
-                    unwritten = 0 if self._write(measure, archive, seen_before_m) else unwritten
+                    unwritten = 0 if self._write(measure, archive, earlier) else unwritten
                 took_s = time.monotonic() - started_s
                 again_s = time.monotonic() + max(self._pace.again_s, self._pace.rest * took_s)
+            elif is_idle:
+                self._landed.wait(self._pace.look_s)
 
     def _next(self) -> StoredKeyframe | None:
         """The frame that is measured next: in their order, those that were put off when no others wait."""
@@ -178,25 +180,28 @@ class SearchWhileFlying:
                 return queue.popleft()
         return None
 
-    def _write(self, measure: GrowingMeasure, archive: Archive, seen_before_m: Sequence[PointsM]) -> bool:
+    def _write(self, measure: GrowingMeasure, archive: Archive, earlier: EarlierFlights) -> bool:
         """Write what is known by now; whether there is a map yet to show it on."""
         tiles, placed = archive.live_tiles(), self.placed
         if not tiles:
             return False
-        cells, flight = measure.measured()
+        cells, flight = measure.measured([each.placed.outline_m for own in earlier.frames.values() for each in own])
         searched = Searched(
-            archive.site(), cells, (flight,), {flight.name: tuple(measure.frames)}, self._prepared.segments
+            archive.site(), cells, (*earlier.on(cells), flight), {**earlier.frames, flight.name: tuple(measure.frames)},
+            self._prepared.segments,
         )
 
         def show(so_far: SoFar) -> None:
             write_search(
                 searched, tiles, archive.site_grid(), self._settings, self._outputs, self._prepared.detector, so_far,
-                seen_before_m,
+                earlier.uncounted_m,
             )
 
         if self._landed.is_set():
             return False
-        self._last = SoFar(flight.name, len(measure.frames), placed, utc_now(), State.FLYING)
+        self._last = SoFar(
+            flight.name, len(measure.frames), placed, utc_now(), State.FLYING, tuple(earlier.frames)
+        )
         show(self._last)
         self._shown = show
         self.written += 1

@@ -17,8 +17,9 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.polygons import swollen
 from sorvolo.store.atomic import atomic_path
 from sorvolo.store.exports.map_pictures import Picture, with_room
-from sorvolo.store.exports.places import near_longitudes
+from sorvolo.store.exports.places import longitude_latitude, near_longitudes
 from sorvolo.store.rasters.gdal import crs_of_epsg, quiet_gdal
+from sorvolo.survey.flight import Site
 
 PICTURE_PX = 1200
 """The longer side of a picture, at most."""
@@ -101,6 +102,18 @@ def region_features(regions: Sequence[Region], properties: Sequence[Mapping[str,
             "properties": {**own, "area_m2": round(region.area_m2, 1)},
         })
     return features
+
+
+def point_features(
+    places_m: Sequence[Floats], site: Site, properties: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Places, (2,) site metres each, as GeoJSON features with these properties each."""
+    longitudes, latitudes = longitude_latitude(np.reshape(places_m, (-1, 2)), site)
+    places = np.round(np.column_stack([longitudes, latitudes]), 9).tolist()
+    return [
+        {"type": "Feature", "geometry": {"type": "Point", "coordinates": place}, "properties": dict(own)}
+        for place, own in zip(places, properties, strict=True)
+    ]
 
 
 def pod_picture(
