@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -19,7 +20,8 @@ class Comparing:
     provider = "comparison"
     notices = ()
     info = ModelInfo(
-        "comparing", CLASSES, dict.fromkeys(CLASSES, 0.3), dict.fromkeys(CLASSES, (4.0, 400.0)), version="1",
+        "comparing", CLASSES, MappingProxyType(dict.fromkeys(CLASSES, 0.3)),
+        MappingProxyType(dict.fromkeys(CLASSES, (4.0, 400.0))), version="1",
         licence="CC0-1.0", trained_on="nothing",
     )
 

@@ -48,7 +48,7 @@ class Basis:
         area = "" if prepared.area is None else _hashed(prepared.area.rings_lonlat)
         places = [[asdict(each.placed.camera), pose_of(each.placed)] for each in frames]
         return cls(
-            __version__, _hashed(asdict(prepared.detector.info)), _hashed(places), has_heights,
+            __version__, _hashed(repr(prepared.detector.info)), _hashed(places), has_heights,
             settings.through_crowns, settings.sun_deg, planted_classes(prepared.detector, settings), settings.plants,
             settings.seed, area,
         )
