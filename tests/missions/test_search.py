@@ -61,17 +61,43 @@ def test_a_blind_detector_finds_nothing_and_the_headline_reports_it(site: Path, 
     assert sum(report["classes"]["car"]["holes_m2"].values()) == pytest.approx(report["classes"]["car"]["area_m2"])
 
 
-def test_an_area_elsewhere_is_asked_about(site: Path, tmp_path: Path) -> None:
-    """A file of another search, some 30 km away."""
+def _triangles(site: Path, path: Path, *away_deg: float, swapped: bool = False) -> Path:
+    """An area of triangles of some 200 m, so far north of the site each; latitude comes first where `swapped`.
+
+    The first of several is a square around the site.
+    """
     with Archive.open(site, write=False) as archive:
         origin = archive.site().origin
-    south, west = origin.latitude_deg + 0.27, origin.longitude_deg
-    ring = [[west, south], [west + 0.002, south], [west + 0.002, south + 0.002], [west, south]]
-    area = tmp_path / "area.geojson"
-    area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    west, south = origin.longitude_deg - 1e-3, origin.latitude_deg - 1e-3
+    around = [[west, south], [west + 2e-3, south], [west + 2e-3, south + 2e-3], [west, south + 2e-3], [west, south]]
+    polygons = [] if len(away_deg) < 2 else [[around]]
+    for each in away_deg[len(polygons):]:
+        south, west = origin.latitude_deg + each, origin.longitude_deg
+        ring = [[west, south], [west + 0.002, south], [west + 0.002, south + 0.002], [west, south]]
+        polygons.append([[place[::-1] if swapped else place for place in ring]])
+    path.write_text(json.dumps({"type": "MultiPolygon", "coordinates": polygons}))
+    return path
+
+
+def test_an_area_that_no_drone_reaches_is_refused(site: Path, tmp_path: Path) -> None:
+    """Of another search, with a stray polygon, or with latitude before longitude: never an area without holes."""
+    settings = SearchSettings(plants=10, classes=("car",), sun_deg=(215, 48))
+    for far, words in (((0.27,), "the area begins 30 km"), ((0.0, 3.0), "polygon 2 of the area begins 33. km")):
+        area = _triangles(site, tmp_path / "area.geojson", *far)
+        with pytest.raises(InputError, match=words):
+            _report(site, tmp_path / "out", Comparing(site), settings, area=area)
+    area = _triangles(site, tmp_path / "area.geojson", 0.0, swapped=True)
+    with pytest.raises(InputError, match="longitude before latitude"):
+        _report(site, tmp_path / "out", Comparing(site), settings, area=area)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_area_elsewhere_is_asked_about(site: Path, tmp_path: Path) -> None:
+    area = _triangles(site, tmp_path / "area.geojson", 0.09)
     settings = SearchSettings(plants=10, classes=("car",), sun_deg=(215, 48))
     report = _report(site, tmp_path / "out", Comparing(site), settings, area=area)
-    assert any("begins 30.0 km" in each and "is it the right --area" in each for each in report["warnings"])
+    assert any("begins 10.0 km" in each and "is it the right --area" in each for each in report["warnings"])
+    assert not any("plants" in each for each in report["warnings"])
     assert report["headline"]["hole_share"] == pytest.approx(1) and report["classes"]["car"]["pod"] == 0
 
 
@@ -99,6 +125,35 @@ def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(site: Pa
     assert whole["pod"] == pytest.approx(row["pod"], abs=0.03) and whole["pos"] == pytest.approx(0.9 * whole["pod"])
     assert report["refly"]["area_m2"] > 0.4 * row["area_m2"]
     assert (tmp_path / "holes.kml").stat().st_size > 300 and (tmp_path / "holes.plan").is_file()
+
+
+def test_a_sweep_width_is_the_flights_and_not_the_areas(site: Path, tmp_path: Path) -> None:
+    """Over a corner of what was flown it is as wide as over all; and nothing to fly is stated, old waypoints go."""
+    settings, old = SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48)), tmp_path / "old.kml"
+    whole = _report(site, tmp_path / "out", Comparing(site), settings)
+    with Archive.open(site, write=False) as archive:
+        origin = archive.site().origin
+    west, south = origin.longitude_deg, origin.latitude_deg
+    ring = [[west, south], [west + 5e-5, south], [west + 5e-5, south + 5e-5], [west, south]]
+    area = tmp_path / "area.geojson"
+    area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    old.write_text("of an earlier search")
+    part = _report(site, tmp_path / "part", Comparing(site), settings, area=area, refly=(old,))
+    one, other = whole["classes"]["car"], part["classes"]["car"]
+    assert other["area_m2"] < 0.05 * one["area_m2"]
+    assert other["sweep_width_m"] == pytest.approx(one["sweep_width_m"], rel=0.3)
+    assert not old.exists() and "no waypoints were written" in part["warnings"][0]
+    assert str(old) in part["warnings"][0] and "Found over stated" in (tmp_path / "out" / "search.html").read_text()
+
+
+@pytest.mark.parametrize("name", ["area.geojson", "out/pod.geojson", "out/plants.geojson"])
+def test_waypoints_never_take_the_place_of_an_input_or_a_result(site: Path, tmp_path: Path, name: str) -> None:
+    area = _triangles(site, tmp_path / "area.geojson", 0.0)
+    (tmp_path / "out").mkdir()
+    outputs = SearchOutputs(tmp_path / "out", area=area, refly=(tmp_path / name,))
+    with pytest.raises(SettingsError, match="another name"):
+        next(search_site(site, SearchSettings(), outputs, Comparing(site)))
+    assert area.stat().st_size > 100
 
 
 class Counting(Comparing):
@@ -163,7 +218,10 @@ def test_a_map_without_metres_is_refused(tmp_path: Path, filmed: Path) -> None:
 
 def test_the_command_refuses_what_it_cannot_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["search", str(tmp_path / "nothing")]) == 1
-    assert "--site" in capsys.readouterr().err
+    assert "there is no" in (words := capsys.readouterr().err) and "--site" in words
+    for option in ("--camera", "--telemetry"):
+        assert main(["search", str(tmp_path), option, "missing.csv"]) == 1
+        assert f"{option} is for flights that are mapped now" in capsys.readouterr().err
     assert main(["search", str(tmp_path), "--plants", "2"]) == 1
     assert "--plants" in capsys.readouterr().err
     assert main(["search", str(tmp_path), "--sun", "south"]) == 1

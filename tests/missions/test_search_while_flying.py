@@ -248,8 +248,11 @@ def test_a_flight_that_is_stopped_leaves_no_waypoints(photographed: Path, site: 
         [f"follow:{tmp_path / 'in'}"], tmp_path / "site", MapSettings(model="none", live_s=0.2),
         camera=photographed / "camera.xml", live=_LIVE, until=photos.landed, search=flying,
     )
+    refly.write_text("of an earlier search")
     next(updates)
     assert "Waiting for the first pictures" in (tmp_path / "out" / "search.html").read_text()
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"search.html", "plants.geojson"}
+    assert not refly.exists()
     for _ in updates:
         _wait(lambda: flying.written > 0, 3.0 if flying.placed else 0.0)
         if flying.written:

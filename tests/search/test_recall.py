@@ -71,7 +71,7 @@ def test_figures_count_unseen_ground_as_nought() -> None:
     found = figures([chances], np.array([True, True, True, False]), 10.0, 20.0)
     assert found.area_m2 == 300 and found.seen_m2 == 200
     assert found.pod == pytest.approx(1.6 / 3) and found.swept_m2 == pytest.approx(160)
-    assert found.sweep_width_m == pytest.approx(8.0) and found.random_pod == pytest.approx(1 - np.exp(-1.6 / 3))
+    assert found.sweep_width_m == pytest.approx(12.0) and found.random_pod == pytest.approx(1 - np.exp(-1.6 / 3))
     north = segment("north", 0.6, chances, np.array([True, True, False, False]), 10.0, 400.0)
     assert north.pod == pytest.approx(0.4) and north.pos == pytest.approx(0.24) and north.left == pytest.approx(0.36)
 

@@ -92,6 +92,8 @@ def search_command(
     """
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 
+    if not site and (unused := [name for name, value in (("--camera", camera), ("--telemetry", telemetry)) if value]):
+        raise SettingsError(f"{unused[0]} is for flights that are mapped now; give --site FOLDER, or leave it out")
     settings = SearchSettings(plants, names(classes), model, enough, through_crowns, _sun(sun), seed)
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
         outputs = SearchOutputs(
@@ -138,9 +140,12 @@ def _map_all(
 
 def _map_of(inputs: Sequence[str]) -> str:
     """The only input, where it is a map. Raises SettingsError for anything else."""
-    if len(inputs) > 1 or not ("://" in inputs[0] or Path(inputs[0]).is_dir()):
-        raise SettingsError("give the folder of a map, or flights and --site FOLDER to map them into")
-    return inputs[0]
+    if len(inputs) == 1 and ("://" in inputs[0] or Path(inputs[0]).is_dir()):
+        return inputs[0]
+    found = f"{len(inputs)} inputs" if len(inputs) > 1 else (
+        f"{inputs[0]} is a file" if Path(inputs[0]).exists() else f"there is no {inputs[0]}"
+    )
+    raise SettingsError(f"{found}; give the folder of a map, or flights and --site FOLDER to map them into")
 
 
 def _measured(site: Path, settings: "SearchSettings", outputs: "SearchOutputs") -> Mapping[str, Any]:

@@ -18,7 +18,8 @@ class SearchFigures:
 
     `pod` with its interval is the chance that one who lay anywhere in the area was found, by all flights together.
     `swept_m2` is the ground times its chance, summed over the flights: effort adds up, even over the same ground.
-    `sweep_width_m` is that over the path of all flights, `coverage` that over the area, so it may exceed 1.
+    `coverage` is that over the area, so it may exceed 1. `sweep_width_m` is all ground that the flights saw, within the
+    area or not, times its chance, over the path of all flights; NaN where they have none.
     `random_pod` is what Koopman's formula of random search, 1 - exp(-coverage), makes of it.
     """
 
@@ -70,11 +71,13 @@ def figures(flights: Sequence[Chances], wanted: Mask, cell_m: float, path_m: flo
     total = together(flights)
     mean, low, high = (np.nan_to_num(each[inside]) for each in (total.mean, total.low, total.high))
     swept_m2 = sum(float(np.nansum(each.mean[inside])) for each in flights) * cell_m2
+    anywhere_m2 = sum(float(np.nansum(each.mean)) for each in flights) * cell_m2
+    width_m = anywhere_m2 / path_m if path_m > 0 and anywhere_m2 > 0 else float("nan")
     coverage = swept_m2 / area_m2 if area_m2 else 0.0
     pod, pod_low, pod_high = (float(each.mean()) if len(each) else 0.0 for each in (mean, low, high))
     return SearchFigures(
         area_m2, float(np.isfinite(total.mean[inside]).sum()) * cell_m2, pod, pod_low, pod_high, swept_m2,
-        swept_m2 / path_m if path_m > 0 else float("nan"), coverage, float(1 - np.exp(-coverage)),
+        width_m, coverage, float(1 - np.exp(-coverage)),
     )
 
 

@@ -1,14 +1,16 @@
 """What a measured search leaves: maps of the probability, holes, waypoints over them, the page, the numbers."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from sorvolo.geometry.arrays import ImageRGBA, PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.plan_flight import ReflySettings
 from sorvolo.missions.search.refly import write_refly
 from sorvolo.missions.search.report import Searched, SoFar, State, build_search_report, hole_numbers, total_of
-from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.missions.search.settings import FIGURES, SearchOutputs, SearchSettings
 from sorvolo.search.holes import POD_EDGES, REASONS, flyable, pod_classes, without_seen
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.exports.map_pictures import picture
@@ -33,8 +35,8 @@ def write_search(
     """Write all files of a measured search over the map of these `tiles`, and return its report.
 
     `so_far` is given of a flight that is not mapped whole; what earlier flights' frames of these outlines, (4, 2) site
-    metres each, show need not be flown again by it. Files of waypoints are taken away where nothing has to be flown, or
-    the flight was stopped. Raises StoreError where the disk is full.
+    metres each, show need not be flown again by it. Files of waypoints are taken away where nothing has to be flown
+    (which a warning states), or the flight was stopped. Raises StoreError where the disk is full.
     """
     site, cells = searched.site, searched.cells
     grid = CellGrid(cells.outer_corner_m(), cells.cell_m, site.crs, site.origin.longitude_deg)
@@ -59,12 +61,31 @@ def write_search(
     refly = None if was_stopped else write_refly(
         again, grid, searched, settings, detector.info, outputs.refly, dji_drone=outputs.dji_drone
     )
-    for path in outputs.refly if refly is None else ():
-        path.unlink(missing_ok=True)  # an earlier search's, or of this flight when it had less
-    report = build_search_report(searched, settings, detector, refly, so_far)
+    warnings = [] if refly is not None else _without_waypoints(outputs.refly)
+    report = build_search_report(searched, settings, detector, refly, so_far, warnings)
     atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
     atomic_write_bytes(outputs.folder / "search.html", search_page(report, pictures).encode())
     return report
+
+
+def remove_figures(outputs: SearchOutputs) -> None:
+    """Take away the figures and waypoints of an earlier search: a flight begins whose own come in their place."""
+    for path in (*(outputs.folder / name for name in FIGURES), *outputs.refly):
+        path.unlink(missing_ok=True)
+
+
+def _without_waypoints(files: Sequence[Path]) -> list[str]:
+    """Take away earlier waypoints at these files, and what a person who asked for some has to know."""
+    old = [str(path) for path in files if path.is_file()]
+    for path in files:
+        path.unlink(missing_ok=True)
+    if not files:
+        return []
+    removed = f"; earlier ones were taken away: {', '.join(old)}" if old else ""
+    return [
+        f"no waypoints were written: no hole of {ReflySettings().least_m2:g} m2 or more is left that another flight "
+        f"may see{removed}"
+    ]
 
 
 def _features(label: str, classes: Sequence[Region], holes: Sequence[Region]) -> list[dict[str, Any]]:

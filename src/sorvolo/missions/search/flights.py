@@ -10,7 +10,7 @@ from sorvolo.missions.search.files import write_search
 from sorvolo.missions.search.frames import flights_to_search, heights_for, search_frames
 from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, SearchProgress, measure_flight
 from sorvolo.missions.search.measured_before import Basis, read_plants, write_plants
-from sorvolo.missions.search.prepare import PreparedSearch, known_places, prepare_search, site_with_metres
+from sorvolo.missions.search.prepare import PreparedSearch, check_area, known_places, prepare_search, site_with_metres
 from sorvolo.missions.search.report import Searched
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells, cells_of
@@ -31,6 +31,7 @@ def search_site(
     area = prepared.area
     with Archive.open(site_folder, write=False) as archive:
         site = site_with_metres(archive)
+        check_area(area, site)
         names = flights_to_search(archive, outputs.flights)
         frames = {name: search_frames(archive, name) for name in names}
         if not frames:

@@ -10,7 +10,7 @@ from typing import Any, Self
 from sorvolo import __version__
 from sorvolo.missions.search.measure import SearchedPlants, SearchFrame, planted_classes
 from sorvolo.missions.search.prepare import PreparedSearch
-from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.missions.search.settings import PLANTS, SearchSettings
 from sorvolo.search.plant_places import PlantPlace
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.plain import feature_collection, geojson_bytes, plain_json
@@ -18,7 +18,6 @@ from sorvolo.store.exports.pod_files import point_features
 from sorvolo.survey.flight import Site
 from sorvolo.tracking.laying import pose_of
 
-PLANTS = "plants.geojson"
 _FORMAT = 1
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from sorvolo.capture.areas import read_area, read_segments
 from sorvolo.errors import InputError, SettingsError
@@ -9,11 +10,14 @@ from sorvolo.geometry.arrays import Floats
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import open_detector, why_not_searched
 from sorvolo.missions.search.measure import planted_classes
-from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
+from sorvolo.missions.search.settings import RESULTS, SearchOutputs, SearchSettings
+from sorvolo.store.atomic import scratch_folder, writing
 from sorvolo.store.exports.waypoints import check_waypoint_files
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Site
+
+_FARTHEST_M = 20_000.0  # of an area from its site: no small drone flies so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +28,17 @@ class PreparedSearch:
     area: Area | None
     segments: Sequence[tuple[str, Area, float]]
     detector: ObjectDetector
+
+
+def check_area(area: Area | None, site: Site) -> None:
+    """Raise InputError for an area with a polygon farther from the site than any small drone flies."""
+    far_m = [] if area is None else area.distances_m(site.origin)
+    if far_m and max(far_m) > _FARTHEST_M:
+        which = "the area" if len(far_m) == 1 else f"polygon {far_m.index(max(far_m)) + 1} of the area"
+        raise InputError(
+            f"--area: {which} begins {max(far_m) / 1000:,.0f} km from the site, out of reach; is it "
+            "the right file, and does it have longitude before latitude?"
+        )
 
 
 def prepare_search(
@@ -37,7 +52,9 @@ def prepare_search(
     """
     if outputs.folder.exists() and not outputs.folder.is_dir():
         raise SettingsError(f"--out {outputs.folder} is a file, a folder was needed")
+    _check_writable(outputs.folder)
     check_waypoint_files(outputs.refly, outputs.folder, outputs.dji_drone)
+    _check_apart(outputs)
     area = None if outputs.area is None else read_area(outputs.area)
     segments = [] if outputs.poa is None else read_segments(outputs.poa)
     looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
@@ -45,6 +62,22 @@ def prepare_search(
         raise InputError(f"nothing to measure: {why_not_searched(settings.model)}")
     planted_classes(looks, settings)
     return PreparedSearch(area, segments, looks)
+
+
+def _check_writable(folder: Path) -> None:
+    """Raise StoreError where the folder, or those that it would lie in, cannot be written; nothing stays behind."""
+    there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    with writing(folder), scratch_folder(there):
+        pass
+
+
+def _check_apart(outputs: SearchOutputs) -> None:
+    """Raise SettingsError for waypoints that would take the place of an input, or of another file of the search."""
+    taken = {path.resolve(): name for name, path in (("--area", outputs.area), ("--poa", outputs.poa)) if path}
+    taken |= {(outputs.folder / name).resolve(): f"a result, {name}" for name in RESULTS}
+    for path in outputs.refly:
+        if (name := taken.get(path.resolve())) is not None:
+            raise SettingsError(f"--refly {path} is the file of {name}; give the waypoints another name")
 
 
 def site_with_metres(archive: Archive) -> Site:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from sorvolo.missions.search.refly import Refly
 
 _FEW_PLANTS = 25  # fewer outcomes of a class leave its probability a guess
+_WIDE_CELL_M = 10.0  # of a cell: a path, a hedge, a hole that is worth a flight
 _MOST_HOLES = 0.01  # of the area: more is reported in the headline and the exit code
 
 
@@ -137,9 +138,9 @@ def is_coarse(searched: Searched, settings: SearchSettings, info: ModelInfo) -> 
 
 def build_search_report(
     searched: Searched, settings: SearchSettings, detector: ObjectDetector, refly: "Refly | None",
-    so_far: SoFar | None = None,
+    so_far: SoFar | None = None, warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """search.json (docs/formats.md); `so_far` is given while the flight goes on."""
+    """search.json (docs/formats.md), these warnings first; `so_far` is given while the flight goes on."""
     rows = {label: _class_row(searched, label, settings, detector.info) for label in searched.labels}
     first = searched.labels[0]
     report = {
@@ -149,7 +150,7 @@ def build_search_report(
         "classes": rows, "flights": [_flight_row(each) for each in searched.flights],
         "segments": _segment_rows(searched, first), "refly": None if refly is None else asdict(refly),
         "notices": [asdict(each) for each in detector.notices],
-        "warnings": _warnings(searched, settings, is_over=so_far is None),
+        "warnings": [*warnings, *_warnings(searched, settings, is_over=so_far is None)],
     }
     return dict(plain_json(report))
 
@@ -219,7 +220,11 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
             f"no picture{'' if is_over else ' so far'} shows any of the area, which begins {distance} "
             "from what they show: is it the right --area?"
         )
-    for flight in searched.flights:
+    if searched.cells.cell_m >= _WIDE_CELL_M:
+        warnings.append(
+            f"the area is so wide that it is counted in cells of {searched.cells.cell_m:g} m; what is narrower is lost"
+        )
+    for flight in searched.flights if away_m is None else ():
         few = [each for each in flight.classes if len(each.outcomes) < _FEW_PLANTS]
         warnings += [
             f"{flight.name}: {'only ' * bool(len(each.outcomes))}{counted(len(each.outcomes), 'plant')} of the class "

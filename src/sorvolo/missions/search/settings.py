@@ -5,6 +5,15 @@ from pathlib import Path
 
 from sorvolo.errors import SettingsError
 
+FIGURES = ("search.html", "search.json", "pod.tif", "pod.geojson")
+"""The files of a search's folder that hold its figures."""
+
+PLANTS = "plants.geojson"
+"""The file of a search's folder that holds what was planted and found."""
+
+RESULTS = (*FIGURES, PLANTS)
+"""All files of a search's folder."""
+
 
 @dataclass(frozen=True)
 class SearchSettings:

@@ -15,10 +15,10 @@ from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.priority import lower_priority
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.search.earlier import EarlierFlights
-from sorvolo.missions.search.files import write_search
+from sorvolo.missions.search.files import remove_figures, write_search
 from sorvolo.missions.search.frames import heights_for, search_frame
 from sorvolo.missions.search.growing import GrowingMeasure
-from sorvolo.missions.search.prepare import PreparedSearch, known_places, prepare_search, site_with_metres
+from sorvolo.missions.search.prepare import PreparedSearch, check_area, known_places, prepare_search, site_with_metres
 from sorvolo.missions.search.report import Searched, SoFar, State
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.atomic import atomic_write_bytes, writing
@@ -93,7 +93,7 @@ class SearchWhileFlying:
                 self.placed += 1
         self._unplaced = later
         if self._thread is None and self._waiting:
-            self._thread = threading.Thread(target=self._measure, args=(archive,), name="search", daemon=True)
+            self._thread = threading.Thread(target=self._measure, args=(archive,), name="search")
             self._thread.start()
 
     def land(self, state: State = State.LANDED) -> None:
@@ -113,9 +113,10 @@ class SearchWhileFlying:
                 self._shown(self._last)
 
     def _write_waiting(self, *, is_over: bool = False) -> None:
-        """A page that waits for the first figures, in the place of an earlier search's; or waits no more."""
+        """A page that waits for the first figures, in the place of an earlier search's files; or waits no more."""
         with self._warning(), writing(self._outputs.folder):
             self._outputs.folder.mkdir(parents=True, exist_ok=True)
+            remove_figures(self._outputs)
             page = waiting_page(is_over=is_over).encode()
             atomic_write_bytes(self._outputs.folder / "search.html", page, durable=False)
 
@@ -139,6 +140,7 @@ class SearchWhileFlying:
     def _measure_all(self, archive: Archive) -> None:
         site = site_with_metres(archive)
         area, flight_id = self._prepared.area, self._waiting[0].flight_id
+        check_area(area, site)
         measure = GrowingMeasure(
             flight_id, site, self._prepared.detector, self._settings,
             area_m=None if area is None else area.polygons_m(site.frame), keep_off_m=known_places(archive),

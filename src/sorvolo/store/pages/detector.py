@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
-from sorvolo.store.pages.plots import Axes, Label, Line, Scale, colour_class, line_plot
+from sorvolo.store.pages.plots import SIDE_PX, Line, colour_class, line_plot, unit_axes
 from sorvolo.store.pages.render import cell, render
 from sorvolo.store.pages.words import known, picture_uri
 
@@ -16,7 +16,6 @@ _KIND_WORDS = {
     "false alarm": "The most certain false alarms", "miss": "The largest misses",
     "confusion": "The most certain confusions",
 }
-_SIDE_PX, _MARGIN_PX = 420.0, 44.0
 _SET_NAMES = ("set", "pictures", "videos", "AP", "AP50", "AP75", "AP small", "medium", "large", "thesis mAP")
 _CLASS_NAMES = (
     "class", "labels", "AP", "AP50", "AP75", "reported from", "precision", "recall", "F1", "thesis AP", "best F1",
@@ -124,9 +123,7 @@ def _curves(scores: Any) -> dict[str, Any] | None:
     shown = [row for row in scores.classes if len(row.curve) and row.labels]
     if not shown:
         return None
-    x = Scale(0, 1, _MARGIN_PX, _SIDE_PX - 12)
-    y = Scale(0, 1, _SIDE_PX - _MARGIN_PX, 12)
-    frame = _unit_axes(x, y)
+    x, y, frame = unit_axes("recall", "precision")
     lines = []
     for place, row in enumerate(shown):
         at = (row.reported.recall, row.reported.precision)
@@ -134,19 +131,7 @@ def _curves(scores: Any) -> dict[str, Any] | None:
         points = [(x(recall), y(precision)) for _, precision, recall in row.curve]
         lines.append(Line(colour_class(place), points, dots, "reported", 4.5))
     keys = [(colour_class(place), row.label) for place, row in enumerate(shown)]
-    return {"drawing": line_plot("Precision over recall", lines, frame, _SIDE_PX, _SIDE_PX), "legend": keys}
-
-
-def _unit_axes(x: Scale, y: Scale) -> Axes:
-    """Recall to the right and precision upwards, both 0 to 1."""
-    ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
-    labels = [Label(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
-    labels += [Label(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
-    labels += [Label(x(1), _SIDE_PX - 8, "recall", "end"), Label(6, _SIDE_PX - 8, "precision upwards", "start")]
-    return Axes(
-        x(0), x(1), 12, y(0), tuple(("grid", y(tick)) for tick in ticks), tuple(("grid", x(tick)) for tick in ticks),
-        tuple(labels),
-    )
+    return {"drawing": line_plot("Precision over recall", lines, frame, SIDE_PX, SIDE_PX), "legend": keys}
 
 
 def _sizes(scores: Any) -> list[tuple[str, list[list[Any]]]]:

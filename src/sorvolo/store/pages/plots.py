@@ -15,6 +15,9 @@ _WIDE_PX = 720  # of all drawings: a phone's screen and a page's column take it;
 _LOW_PX = 250
 _MARGIN_PX = 46.0
 _PLAN_HIGHEST_PX = 620.0
+SIDE_PX = 420.0
+"""A side of a square plot."""
+
 _SCATTER_PX = 360.0
 _COLOURS = 5  # styles of a line, c0 to c4; c5 is for what was rejected
 _STATUS_WORDS = {"vision": "matched", "gps-only": "GPS only", "rejected": "not placed"}
@@ -145,6 +148,19 @@ def line_plot(title: str, lines: Sequence[Line], frame: Axes, width: float, heig
     return render("plots/lines.svg", title=title, lines=lines, frame=frame, width=width, height=height)
 
 
+def unit_axes(across: str, upwards: str) -> tuple[Scale, Scale, Axes]:
+    """Scales and axes of a square plot, SIDE_PX a side, of two shares from 0 to 1."""
+    x, y = Scale(0, 1, _MARGIN_PX, SIDE_PX - 12), Scale(0, 1, SIDE_PX - _MARGIN_PX, 12)
+    ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
+    labels = [Label(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
+    labels += [Label(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
+    labels += [Label(x(1), SIDE_PX - 8, across, "end"), Label(6, SIDE_PX - 8, f"{upwards} upwards", "start")]
+    return x, y, Axes(
+        x(0), x(1), 12, y(0), tuple(("grid", y(tick)) for tick in ticks), tuple(("grid", x(tick)) for tick in ticks),
+        tuple(labels),
+    )
+
+
 def track_plan(track: TrackColumns, *, unit: str) -> str:
     """Camera positions seen from above, coloured by status, each tied to its GPS fix; north is up.
 
@@ -225,6 +241,23 @@ def gps_scatter(track: TrackColumns, *, unit: str) -> str:
         marks=[_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(known)],
         circle=(x(0), y(0), half_px), width=size, height=size,
     )
+
+
+def stated_and_found(rows: Sequence[tuple[str, float, float, float, float, int]]) -> Markup:
+    """What came true over what was stated, both 0 to 1; on the rising line both agree.
+
+    Rows of a name, stated, found with the bounds of its interval, and how many; rows of one name have one colour.
+    """
+    x, y, frame = unit_axes("stated", "found")
+    names = list(dict.fromkeys(name for name, *_ in rows))
+    lines = [Line("median", [(x(0), y(0)), (x(1), y(1))])]
+    for name, stated, found, found_low, found_high, count in rows:
+        words = f"{name}: {stated:.2f} stated, {found:.2f} found of {count}"
+        lines.append(Line(
+            colour_class(names.index(name)), [(x(stated), y(found_low)), (x(stated), y(found_high))],
+            [(x(stated), y(found))], words, 4.0,
+        ))
+    return line_plot("Found over stated", lines, frame, SIDE_PX, SIDE_PX)
 
 
 def _plan_scales(east: Floats, north: Floats) -> tuple[Scale, Scale, float, float]:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from sorvolo.geometry.arrays import ImageRGBA
+from sorvolo.store.pages.plots import colour_class, stated_and_found
 from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import area_words, at, known, number_at, picture_uri, seconds_words, with_unit
 
@@ -18,6 +19,7 @@ def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) ->
         maps=[(label, picture_uri(picture)) for label, picture in pictures.items()],
         figures=_figures(report["classes"][first]), holes=_holes(report["classes"]), segments=_segments(report),
         refly=_refly(report.get("refly")), plants=_plants(report), calibration=_calibration(report),
+        calibration_plot=_calibration_plot(report),
         cell=with_unit("{:g} m", report["cell_m"]), so_far=report["so_far"],
     )
     return str(page)
@@ -38,7 +40,7 @@ def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         ("probability of detection (POD)", f"{row['pod']:.2f}", interval),
         ("area", area_words(row["area_m2"]), f"of it seen: {area_words(row['seen_m2'])}"),
         ("effective sweep width", with_unit("{:.1f} m", row["sweep_width_m"]) or "unknown",
-         "ground times its probability, over the path of all flights"),
+         "ground times its probability, within the area or not, over the path of all flights"),
         ("coverage", f"{row['coverage']:.2f}", f"a random search of that effort has POD {row['random_pod']:.2f}"),
     ]
 
@@ -77,6 +79,19 @@ def _plants(report: Mapping[str, Any]) -> list[list[str]]:
          "{:.2f} to {:.2f}".format(*row["interval"]), str(flight["frames"]), seconds_words(flight["seconds"])]
         for flight in report["flights"] for label, row in flight["classes"].items()
     ]
+
+
+def _calibration_plot(report: Mapping[str, Any]) -> dict[str, Any]:
+    """The drawing of `_calibration`, and what its colours are."""
+    rows = [
+        (f"{known(flight['name'])}, {label}", float(each["stated"]), float(each["found"]), float(each["found_low"]),
+         float(each["found_high"]), int(each["count"]))
+        for flight in report["flights"] for label, row in flight["classes"].items() for each in row["calibration"]
+    ]
+    names = list(dict.fromkeys(name for name, *_ in rows))
+    return {
+        "drawing": stated_and_found(rows), "legend": [(colour_class(k), name) for k, name in enumerate(names)],
+    }
 
 
 def _calibration(report: Mapping[str, Any]) -> list[list[str]]:
