@@ -19,6 +19,8 @@ def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Fram
     for _ in range(most):
         free.put(None)
     is_over = threading.Event()
+    # Python 3.11's join takes a thread for ended where Ctrl-C meets it; one that decodes then aborts the process's end
+    has_ended = threading.Event()
 
     def put(item: Frame | LostFrame | BaseException | None) -> None:
         while not is_over.is_set():
@@ -36,9 +38,10 @@ def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Fram
             put(None)
         except BaseException as error:  # raised anew where the frames are taken
             put(error)
+        finally:
+            has_ended.set()
 
-    thread = threading.Thread(target=read, name="decoding", daemon=True)
-    thread.start()
+    threading.Thread(target=read, name="decoding", daemon=True).start()
     try:
         while (item := waiting.get()) is not None:
             free.put(None)
@@ -47,4 +50,4 @@ def read_ahead(frames: Iterator[Frame | LostFrame], most: int) -> Generator[Fram
             yield item
     finally:
         is_over.set()
-        thread.join()
+        has_ended.wait()

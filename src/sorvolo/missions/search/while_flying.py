@@ -59,6 +59,8 @@ class SearchWhileFlying:
         self._waiting: deque[StoredKeyframe] = deque()
         self._put_off: deque[StoredKeyframe] = deque()
         self._landed = threading.Event()
+        # Python 3.11's join takes a thread for ended where Ctrl-C meets it: the process's end would abort it
+        self._ended = threading.Event()
         self._thread: threading.Thread | None = None
         self._shown: Callable[[SoFar], None] | None = None  # writes the last report again, in another state
         self._last: SoFar | None = None
@@ -103,7 +105,7 @@ class SearchWhileFlying:
         """
         self._landed.set()
         if self._thread is not None:
-            self._thread.join(self._pace.land_s)
+            self._ended.wait(self._pace.land_s)
         if self._shown is None or self._last is None:
             if state is State.STOPPED and (self.placed or self._unplaced):  # else an earlier search's page stands
                 self._write_waiting(is_over=True)
@@ -134,8 +136,11 @@ class SearchWhileFlying:
 
     def _measure(self, archive: Archive) -> None:
         lower_priority()
-        with self._warning():
-            self._measure_all(archive)
+        try:
+            with self._warning():
+                self._measure_all(archive)
+        finally:
+            self._ended.set()
 
     def _measure_all(self, archive: Archive) -> None:
         site = site_with_metres(archive)
