@@ -36,8 +36,11 @@ if TYPE_CHECKING:
         plan_over,
         write_plan,
     )
+    from sorvolo.missions.search.flights import search_site
+    from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
     from sorvolo.missions.simulate.pictures import simulate_pictures
     from sorvolo.missions.simulate.site import simulate_site
+    from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
     from sorvolo.missions.train.detector import train_detector
     from sorvolo.missions.train.sets import DataOptions
     from sorvolo.missions.train.settings import TrainSettings
@@ -58,6 +61,7 @@ __all__ = [
     "Archive",
     "CompareSettings",
     "Comparison",
+    "CotReceiver",
     "DataOptions",
     "Detections",
     "Detector",
@@ -69,6 +73,8 @@ __all__ = [
     "PictureSettings",
     "PlanSettings",
     "RobustSettings",
+    "SearchOutputs",
+    "SearchSettings",
     "SettingsError",
     "SimulationSettings",
     "SorvoloError",
@@ -85,6 +91,7 @@ __all__ = [
     "camera_to_plan_with",
     "compare_flights",
     "compare_images",
+    "correct_telemetry",
     "evaluate_changes",
     "evaluate_detector",
     "evaluate_mosaic",
@@ -101,6 +108,7 @@ __all__ = [
     "read_area",
     "read_dataset",
     "read_sets",
+    "search_site",
     "simulate_pictures",
     "simulate_site",
     "thesis_steps",
@@ -131,8 +139,11 @@ _HOMES = {
         "PlanSettings", "answer_questions", "camera_to_plan_with", "plan_over", "write_plan",
     ),
     "missions.flight.settings": ("CompareSettings", "MapSettings"),
+    "missions.search.flights": ("search_site",),
+    "missions.search.settings": ("SearchOutputs", "SearchSettings"),
     "missions.simulate.pictures": ("simulate_pictures",),
     "missions.simulate.site": ("simulate_site",),
+    "missions.telemetry.doctor": ("CotReceiver", "correct_telemetry"),
     "missions.train.detector": ("train_detector",),
     "missions.train.settings": ("TrainSettings",),
     "missions.train.sets": ("DataOptions",),
