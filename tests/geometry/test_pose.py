@@ -9,6 +9,7 @@ from sorvolo.errors import GeometryError
 from sorvolo.geometry.pose import (
     NADIR_CAMERA_NORTH_UP,
     Pose,
+    body_nadir_angles_from_rotation,
     gimbal_angles_from_rotation,
     rotation_from_vector,
     site_from_body_nadir_rotation,
@@ -89,6 +90,13 @@ def test_body_nose_up_and_right_side_down_tilt_the_camera_as_they_should():
 @given(st.floats(0, 359.99), st.floats(-89.9, 89.9), st.floats(-179, 179))
 def test_gimbal_angles_there_and_back(yaw_deg, pitch_deg, roll_deg):
     found = gimbal_angles_from_rotation(site_from_gimbal_rotation(yaw_deg, pitch_deg, roll_deg))
+    turn = np.radians(np.subtract(found, (yaw_deg, pitch_deg, roll_deg)))
+    np.testing.assert_allclose(np.exp(1j * turn), 1, atol=1e-6)
+
+
+@given(st.floats(0, 359.99), st.floats(-89.9, 89.9), st.floats(-179, 179))
+def test_body_angles_there_and_back(yaw_deg, pitch_deg, roll_deg):
+    found = body_nadir_angles_from_rotation(site_from_body_nadir_rotation(yaw_deg, pitch_deg, roll_deg))
     turn = np.radians(np.subtract(found, (yaw_deg, pitch_deg, roll_deg)))
     np.testing.assert_allclose(np.exp(1j * turn), 1, atol=1e-6)
 

@@ -279,11 +279,10 @@ def test_files_for_other_programs_hold_the_same_places(corrected: tuple[dict[str
     first, *lines = (out / "geo.txt").read_text().splitlines()
     assert first == "EPSG:4326" and len(lines) == len(rows)
     for line, row in zip(lines, rows):
-        name, lon, lat, height, _, pitch, *_ = line.split()
+        name, lon, lat, height, *_ = line.split()
         assert name == row["name"] and float(lon) == pytest.approx(float(row["longitude_deg"]), abs=1e-8)
         assert float(lat) == pytest.approx(float(row["latitude_deg"]), abs=1e-8)
         assert float(height) == pytest.approx(float(row["height_m"]), abs=1e-2)
-        assert float(pitch) == pytest.approx(float(row["pitch_deg"]) + 90, abs=1e-2)
     space = {"g": "http://www.topografix.com/GPX/1/1"}
     points = ElementTree.parse(out / "track.gpx").getroot().findall(".//g:trkpt", space)
     latitudes = [float(row["latitude_deg"]) for row in rows]

@@ -79,20 +79,29 @@ def site_from_body_nadir_rotation(yaw_deg: float, pitch_deg: float, roll_deg: fl
 
     The angles are the body's: yaw clockwise from north, pitch nose up, roll right side down (z-y-x).
     """
-    mount = _ned_from_angles(0.0, -90.0, 0.0)
-    return _ENU_FROM_NED @ _ned_from_angles(yaw_deg, pitch_deg, roll_deg) @ mount @ _GIMBAL_FROM_CAMERA
+    return _ENU_FROM_NED @ _ned_from_angles(yaw_deg, pitch_deg, roll_deg) @ _NADIR_MOUNT @ _GIMBAL_FROM_CAMERA
+
+
+def body_nadir_angles_from_rotation(site_from_camera_rotation: Matrix3) -> tuple[float, float, float]:
+    """Yaw, pitch, roll in degrees, the inverse of `site_from_body_nadir_rotation`; at the horizon roll is given as 0."""
+    ned_from_body = _ENU_FROM_NED.T @ site_from_camera_rotation @ (_NADIR_MOUNT @ _GIMBAL_FROM_CAMERA).T
+    return _angles_from_ned(ned_from_body)
 
 
 def gimbal_angles_from_rotation(site_from_camera_rotation: Matrix3) -> tuple[float, float, float]:
     """Yaw, pitch, roll in degrees, the inverse of `site_from_gimbal_rotation`; at the nadir roll is given as 0."""
-    ned_from_gimbal = _ENU_FROM_NED.T @ site_from_camera_rotation @ _GIMBAL_FROM_CAMERA.T
-    pitch = np.arcsin(np.clip(-ned_from_gimbal[2, 0], -1.0, 1.0))
-    if np.hypot(ned_from_gimbal[0, 0], ned_from_gimbal[1, 0]) < 1e-6:
-        yaw = np.arctan2(-ned_from_gimbal[0, 1], ned_from_gimbal[1, 1])
+    return _angles_from_ned(_ENU_FROM_NED.T @ site_from_camera_rotation @ _GIMBAL_FROM_CAMERA.T)
+
+
+def _angles_from_ned(rotation: Matrix3) -> tuple[float, float, float]:
+    """The angles of `_ned_from_angles`, yaw from 0 to 360; where pitch is +-90 roll is given as 0."""
+    pitch = np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0))
+    if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-6:
+        yaw = np.arctan2(-rotation[0, 1], rotation[1, 1])
         roll = 0.0
     else:
-        yaw = np.arctan2(ned_from_gimbal[1, 0], ned_from_gimbal[0, 0])
-        roll = np.arctan2(ned_from_gimbal[2, 1], ned_from_gimbal[2, 2])
+        yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+        roll = np.arctan2(rotation[2, 1], rotation[2, 2])
     return float(np.degrees(yaw)) % 360.0, float(np.degrees(pitch)), float(np.degrees(roll))
 
 
@@ -102,3 +111,6 @@ def _ned_from_angles(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matri
     ry = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
     rx = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
     return rz @ ry @ rx
+
+
+_NADIR_MOUNT = _ned_from_angles(0.0, -90.0, 0.0)  # a gimbal's axes in those of the body that it hangs below

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from xml.etree.ElementTree import Element, SubElement, tostring
 
+from sorvolo.geometry.pose import body_nadir_angles_from_rotation, site_from_gimbal_rotation
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.corrected import CorrectedFrame
 
@@ -19,14 +20,18 @@ _EARTH_M = 6_371_000.0  # mean radius, good enough for a speed
 def geo_txt(frames: Sequence[CorrectedFrame]) -> str:
     """OpenDroneMap's image geolocation file: name, longitude, latitude, height, yaw, pitch, roll, two accuracies.
 
-    ODM counts the pitch from straight down. A name with spaces would end its column early: these become underscores.
+    ODM's angles are those of a body, x to the top of the picture, y to its right, z along the view (compute_opk of its
+    photo.py): a gimbal's pitch plus 90 is the same only where its roll is 0. A name with spaces would end its column early: these become underscores.
     """
     rows = ["EPSG:4326"]
     for each in frames:
         sigma = "" if math.isnan(each.sigma_m) else f" {each.sigma_m:.3f} {1.5 * each.sigma_m:.3f}"
+        yaw_deg, pitch_deg, roll_deg = body_nadir_angles_from_rotation(
+            site_from_gimbal_rotation(each.yaw_deg, each.pitch_deg, each.roll_deg)
+        )
         rows.append(
             f"{each.name.replace(' ', '_')} {each.longitude_deg:.9f} {each.latitude_deg:.9f} {each.height_m:.3f} "
-            f"{each.yaw_deg:.3f} {each.pitch_deg + 90:.3f} {each.roll_deg:.3f}{sigma}"
+            f"{yaw_deg:.3f} {pitch_deg:.3f} {roll_deg:.3f}{sigma}"
         )
     return "\n".join(rows) + "\n"
 
