@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 
 from small_flights import simulate_into, small_flight
-from sorvolo.capture.correction import fitted, path_fit, telemetry_faults
+from sorvolo.capture.correction import corrected_poses, fitted, path_fit, telemetry_faults
 from sorvolo.capture.live.klv_telemetry import read_klv_file
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError
-from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
+from sorvolo.geometry.pose import Pose, gimbal_angles_from_rotation, site_from_gimbal_rotation
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry, mapped_flights
@@ -179,6 +179,44 @@ def test_what_cannot_be_known_of_a_compass_is_not_called_right() -> None:
     assert any("cannot be known: the GPS track is too short" in each for each in fault_sentences(hovering, names))
     few = telemetry_faults(fixes[:3], near[:3], Bias(0.0, 0.01), path_fit(fixes[:3], near[:3], 0.0), knows_height=True)
     assert any("cannot be known: too few frames have a fix" in each for each in fault_sentences(few, names))
+
+
+def test_heights_that_made_the_map_are_not_confirmed_by_it() -> None:
+    """Two frames: 12 m too high in the log made the map 1.4 times as large, and "heights were right within 0.1 m"."""
+    poses, priors = _strips()
+    mapped = [Pose(each.rotation, 1.4 * each.translation_m) for each in poses]
+    high = [replace(each, position_m=each.position_m + [0.0, 0.0, 12.0]) for each in priors]
+    for count, words in ((2, "cannot be known: too few frames have a fix"), (26, "m too high")):
+        path = path_fit(high[:count], mapped[:count], 0.0)
+        faults = telemetry_faults(
+            high[:count], fitted(mapped[:count], path), Bias(0.0, 0.01), path, knows_height=True
+        )
+        (found,) = [each for each in fault_sentences(faults, [""] * count) if "heights above the ground" in each]
+        assert words in found
+    assert faults.height_m.value == pytest.approx(12.0, abs=3 * faults.height_m.sigma)
+
+
+def test_between_frames_of_a_log_without_angles_the_camera_turns_as_the_pictures_show() -> None:
+    """Its course turns before the nose does: followed, it put the camera up to 51 degrees beside."""
+    key_s, times_s = [0.0, 2.0, 4.0], [0.0, 0.5, 1.0, 1.5, 2.0, 3.0]
+    solved = [Pose(site_from_gimbal_rotation(yaw_deg, -90.0, 0.0), np.array([5.0 * yaw_deg, 0.0, 30.0]))
+              for yaw_deg in (0.0, 20.0, 40.0)]
+
+    def priors(moments_s: list[float], sigma: float) -> list[CameraPrior]:
+        """Of a course that is 60 degrees further from the first half second on."""
+        return [CameraPrior(np.array([50.0 * s + 3.0, 40.0 * (s == 1.0) * np.isinf(sigma), 30.0]), np.full(3, sigma),
+                            site_from_gimbal_rotation(10.0 * s + 60.0 * (s >= 0.5), -90.0, 0.0),
+                            np.array([12.0, 12.0, sigma])) for s in moments_s]
+
+    found = corrected_poses(times_s, priors(times_s, np.inf), key_s, priors(key_s, np.inf), solved)
+    for second, pose in zip(times_s, found):
+        truth = Pose(site_from_gimbal_rotation(10.0 * second, -90.0, 0.0), np.array([50.0 * second, 0.0, 30.0]))
+        np.testing.assert_allclose(pose.rotation, truth.rotation, atol=1e-6)
+        np.testing.assert_allclose(pose.translation_m, truth.translation_m, atol=1e-6)
+    stated = corrected_poses(times_s, priors(times_s, 1.0), key_s, priors(key_s, 1.0), solved)[1]
+    turned_deg = gimbal_angles_from_rotation(stated.rotation)[0]  # the log's 65, less a quarter of the 60 at 2 s
+    assert turned_deg == pytest.approx(65.0 - 15.0, abs=0.01)
+    np.testing.assert_allclose(stated.translation_m, [25.0, 0.0, 30.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("quality", ["contradictory", "doubtful", "map"])

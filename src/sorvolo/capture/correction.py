@@ -94,7 +94,7 @@ def telemetry_faults(
     `knows_height`: telemetry's heights count from something that is taken for the ground; else they do not show it.
     An error that all fixes share does not show in the pictures: `position_m` has the scatter alone.
     """
-    knows_heading = np.array([np.isfinite(each.attitude_sigma_deg[2]) for each in priors], bool)
+    knows_heading = np.array([_knows_heading(each) for each in priors], bool)
     off_deg = np.array(
         [_heading_and_tilt(prior.rotation, pose) for prior, pose in zip(priors, poses)]
     ).reshape(-1, 3)[knows_heading]
@@ -120,17 +120,26 @@ def corrected_poses(
     """The cameras at any moments between the solved frames, by telemetry and what it was off at these frames.
 
     `priors` are telemetry's cameras at `times_s`, `key_priors` those at the solved frames' times `key_s`; between two
-    of these the correction changes evenly.
+    of these the correction changes evenly. Where telemetry knows no heading or no place, at the moment or at the solved
+    frame before or after it, the solved cameras themselves are interpolated: what stands there is a guess.
     """
-    turns = Rotation.from_matrix([pose.rotation @ prior.rotation.T for prior, pose in zip(key_priors, key_poses)])
-    shifts = np.array([pose.translation_m - prior.position_m for prior, pose in zip(key_priors, key_poses)])
-    within_s = np.clip(times_s, key_s[0], key_s[-1])
-    turned = Slerp(key_s, turns)(within_s).as_matrix() if len(key_s) > 1 else [turns[0].as_matrix()] * len(times_s)
-    poses = []
-    for time_s, prior, turn in zip(times_s, priors, turned):
-        shift = np.array([np.interp(time_s, key_s, shifts[:, k]) for k in range(3)])
-        poses.append(Pose(_orthonormal(turn @ prior.rotation), prior.position_m + shift))
-    return poses
+    knows_heading, knows_place = (
+        _known_around(times_s, [knows(each) for each in priors], key_s, [knows(each) for each in key_priors])
+        for knows in (_knows_heading, lambda each: each.knows_place)
+    )
+    solved = np.array([each.rotation for each in key_poses])
+    turns = _turning(key_s, solved @ np.array([each.rotation.T for each in key_priors]), times_s)
+    rotations = np.where(
+        knows_heading[:, None, None], turns @ np.array([each.rotation for each in priors]),
+        _turning(key_s, solved, times_s),
+    )
+    solved_m = np.array([each.translation_m for each in key_poses])
+    shifts_m = _moving(key_s, solved_m - np.array([each.position_m for each in key_priors]), times_s)
+    places_m = np.where(
+        knows_place[:, None], np.array([each.position_m for each in priors]) + shifts_m,
+        _moving(key_s, solved_m, times_s),
+    )
+    return [Pose(_orthonormal(rotation), place_m) for rotation, place_m in zip(rotations, places_m)]
 
 
 def headings_deg(
@@ -159,6 +168,33 @@ def headings_deg(
 def even_times_s(key_s: Sequence[float], step_s: float) -> list[float]:
     """Moments from the first solved frame to the last, so far apart."""
     return [float(each) for each in np.arange(min(key_s), max(key_s) + step_s / 2, step_s)]
+
+
+def _knows_heading(prior: CameraPrior) -> bool:
+    return bool(np.isfinite(prior.attitude_sigma_deg[2]))
+
+
+def _known_around(
+    times_s: Sequence[float], known: Sequence[bool], key_s: Sequence[float], key_known: Sequence[bool]
+) -> Mask:
+    """(N,) whether something is known at each moment, and at the solved frames before and after it."""
+    after = np.clip(np.searchsorted(key_s, times_s), 0, len(key_s) - 1)
+    before = np.maximum(after - 1, 0)
+    at_keys = np.array(key_known, bool)
+    return np.array(known, bool) & at_keys[before] & at_keys[after]
+
+
+def _turning(key_s: Sequence[float], rotations: Floats, times_s: Sequence[float]) -> Floats:
+    """(N, 3, 3) rotations, (K, 3, 3) at `key_s`, at other moments, by the shortest turns; the ends' beyond these."""
+    if len(key_s) == 1:
+        return np.repeat(rotations, len(times_s), axis=0)
+    within_s = np.clip(times_s, key_s[0], key_s[-1])
+    return np.asarray(Slerp(key_s, Rotation.from_matrix(rotations))(within_s).as_matrix(), np.float64)
+
+
+def _moving(key_s: Sequence[float], places_m: PointsM, times_s: Sequence[float]) -> PointsM:
+    """(N, 3) places, (K, 3) at `key_s`, at other moments, on straight lines; the ends' beyond these."""
+    return np.column_stack([np.interp(times_s, key_s, places_m[:, k]) for k in range(3)])
 
 
 def _courses(
@@ -256,10 +292,13 @@ def _heading(off_deg: Floats, near: Mask, path: PathFit, settings: CompassSettin
 
 
 def _height(errors_m: Floats, poses: Sequence[Pose], scale: Bias) -> Bias:
-    """The bias of heights; a scale that is wrong by a share makes them wrong by that share."""
+    """The bias of heights; a scale that is wrong by a share makes them wrong by that share.
+
+    Where fixes do not show the scale, the map has it from these very heights: then the sigma is infinite.
+    """
     found = _bias(errors_m)
     usual_m = float(np.median([each.translation_m[2] for each in poses]))
-    shared_m = usual_m * scale.sigma if np.isfinite(scale.sigma) else 0.0
+    shared_m = usual_m * scale.sigma if np.isfinite(scale.sigma) else inf
     return Bias(found.value, float(np.hypot(found.sigma, shared_m)), found.scatter)
 
 

@@ -75,7 +75,7 @@ class TelemetryFaults:
     """What was wrong with a flight's telemetry. `clock_s` is telemetry's clock less the video's; `heading_deg` positive
     where the compass read too far clockwise, its sigma infinite where it cannot be known; `tilt_deg` how far the camera
     looked from its stated direction, sideways and forward together; `height_m` positive where the log was too high
-    above the ground. `path` is the fixes' path held against the map. `outlying` are the rows of compared frames whose
+    above the ground, its sigma infinite where that cannot be known. `path` is the fixes' path held against the map. `outlying` are the rows of compared frames whose
     stated angles are far beside what those of the others are off, `outlying_deg` their median."""
 
     clock_s: Bias

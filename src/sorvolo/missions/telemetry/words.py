@@ -7,17 +7,16 @@ from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
 from sorvolo.survey.wording import counted
 
 _LEAST = {"clock": 0.04, "heading": 0.5, "tilt": 0.5, "height": 0.3}  # s, deg, deg, m: smaller ones matter to nobody
-
-
+_NOT_KNOWN = {"heading": 10.0, "height": 10.0}  # deg, m: right within more than this is no knowledge; by choice
+_TOO_FEW = "too few frames have a fix"
 _MOST_NAMED = 6  # frames in a sentence
-_NOT_KNOWN_DEG = 10.0  # right within more than this is no knowledge of a compass; by choice
 
 
 def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     """One sentence for each quantity that telemetry states; `names` are those of the compared frames."""
     return [
         *_clock(faults.clock_s), *_heading(faults.heading_deg, faults.path), *_outlying(faults, names),
-        *_tilt(faults.tilt_deg), *_height(faults.height_m), *_map(faults.path),
+        *_tilt(faults.tilt_deg), *_height(faults.height_m, faults.path), *_map(faults.path),
         f"fixes scatter by {faults.position_m.scatter:.2f} m about the path in the pictures (1 sigma per axis)",
     ]
 
@@ -34,7 +33,7 @@ def _clock(found: Bias) -> list[str]:
 def _heading(found: Bias, path: PathFit) -> list[str]:
     if not isfinite(found.value):
         return ["telemetry has no heading to compare"]
-    if not 2 * found.sigma <= _NOT_KNOWN_DEG:
+    if not 2 * found.sigma <= _NOT_KNOWN["heading"]:
         return [f"whether the compass was right cannot be known: {_why_unknown(path)}"]
     if abs(found.value) < _LEAST["heading"] or not found.is_significant:
         return [f"the compass was right within {_within(found, 0.1):.1f} deg"]
@@ -47,8 +46,8 @@ def _heading(found: Bias, path: PathFit) -> list[str]:
 
 def _why_unknown(path: PathFit) -> str:
     if not isfinite(path.turn_deg.value):
-        return "too few frames have a fix"
-    if 2 * path.turn_deg.sigma > _NOT_KNOWN_DEG:
+        return _TOO_FEW
+    if 2 * path.turn_deg.sigma > _NOT_KNOWN["heading"]:
         return f"the GPS track is too short for its scatter (its direction: 1 sigma {path.turn_deg.sigma:.0f} deg)"
     return "the frames' angles disagree with each other"
 
@@ -85,9 +84,12 @@ def _tilt(found: Bias) -> list[str]:
     return [f"the camera looked {found.value:.1f} deg beside where telemetry puts it (1 sigma {found.sigma:.1f} deg)"]
 
 
-def _height(found: Bias) -> list[str]:
+def _height(found: Bias, path: PathFit) -> list[str]:
     if not isfinite(found.value):
         return ["telemetry has no height above the ground to compare"]
+    if not 2 * found.sigma <= _NOT_KNOWN["height"]:
+        why = "the GPS track is too short for its scatter" if isfinite(path.scale.value) else _TOO_FEW
+        return [f"whether heights above the ground were right cannot be known: {why}"]
     if abs(found.value) < _LEAST["height"] or not found.is_significant:
         return [f"heights above the ground were right within {_within(found, 0.1):.1f} m"]
     side = "too high" if found.value > 0 else "too low"
