@@ -250,6 +250,20 @@ def test_sigmas_cover_the_errors():
     assert 0.3 < np.median(ratios) < 1.5
 
 
+def test_of_a_frame_without_links_and_fix_no_accuracy_is_stated():
+    """As after the last fix: what stands in for an infinite sigma was given as one, 1,000,153 m."""
+    rng = np.random.default_rng(14)
+    poses = flown(14)
+    priors = [prior_of(pose, rng) for pose in poses]
+    graph = build(poses, priors, rng)
+    unknown = replace(priors[-1], position_sigma_m=np.full(3, np.inf))
+    graph.add(len(poses), CAMERA, unknown, [], poses[-1])
+    graph.add(len(poses) + 1, CAMERA, priors[-1], [], poses[-1])
+    sigmas_m = graph.sigmas_m()
+    assert np.isnan(sigmas_m.pop(len(poses)))
+    assert 0 < max(sigmas_m.values()) < 10
+
+
 def test_a_false_link_is_dropped():
     rng = np.random.default_rng(12)
     poses = flown(12)

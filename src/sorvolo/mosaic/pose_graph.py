@@ -114,14 +114,8 @@ class PoseGraph:
     def pieces(self) -> list[list[int]]:
         """The flight's keyframes in groups that links tie together, in the order of their coming; a known map's
         keyframes tie as well."""
-        size = len(self._nodes)
-        ties = coo_matrix((np.ones(len(self._links)), (self._links.old, self._links.new)), shape=(size, size))
-        known = np.flatnonzero(~self._own())
-        if len(known):
-            ones = np.ones(len(known))
-            ties = ties + coo_matrix((ones, (known, np.full(len(known), known[0]))), shape=(size, size))
-        count, labels = connected_components(ties, directed=False)
-        groups: list[list[int]] = [[] for _ in range(count)]
+        labels = self._piece_labels()
+        groups: list[list[int]] = [[] for _ in range(int(labels.max(initial=-1)) + 1)]
         for at in np.flatnonzero(self._own()).tolist():
             groups[labels[at]].append(self._names[at])
         return [each for each in groups if each]
@@ -246,17 +240,19 @@ class PoseGraph:
         return result
 
     def sigmas_m(self) -> dict[int, float]:
-        """Each own keyframe's one-sigma error on the ground at its image centre, per axis, by the covariance."""
+        """Each own keyframe's one-sigma error on the ground at its image centre, per axis, by the covariance; NaN where
+        nothing shows where it lies."""
         own = self._own()
         solution = self._solve(own, shared=True, iterations=0)
-        index = np.flatnonzero(own)
+        sigmas = dict.fromkeys((self._names[at] for at in np.flatnonzero(own)), float("nan"))
+        index = np.flatnonzero(own & self._held())
         sample = index if len(index) <= 250 else index[np.linspace(0, len(index) - 1, 250).round().astype(int)]
         found = ground_sigmas_m(
             self._rows.rotations[sample], self._rows.centres_m[sample, 2], 6 * solution.position[sample],
             solution.equations.factorised(),
         )
         every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
-        return {self._names[at]: float(value) for at, value in zip(index, every, strict=True)}
+        return sigmas | {self._names[at]: float(value) for at, value in zip(index, every, strict=True)}
 
     def common_sigma_m(self) -> float:
         """What all fixes of the flight err in common, per axis, m; 0 without fixes.
@@ -278,6 +274,24 @@ class PoseGraph:
         return {self._names[at]: miss_m[at] for at in np.flatnonzero(self._own())}
 
     # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _piece_labels(self) -> Rows:
+        """(N,) which piece each node belongs to; see `pieces`."""
+        size = len(self._nodes)
+        ties = coo_matrix((np.ones(len(self._links)), (self._links.old, self._links.new)), shape=(size, size))
+        known = np.flatnonzero(~self._own())
+        if len(known):
+            ones = np.ones(len(known))
+            ties = ties + coo_matrix((ones, (known, np.full(len(known), known[0]))), shape=(size, size))
+        return np.asarray(connected_components(ties, directed=False)[1], int)
+
+    def _held(self) -> NDArray[np.bool_]:
+        """(N,) nodes whose piece has a fix, a known keyframe or known ground: the others have a place by guess alone,
+        such as a frame without links after telemetry's last fix."""
+        anchored = np.isfinite(self._rows.stated_sigma_m[:, :2]).all(axis=1) | ~self._own()
+        anchored[self._ground.node] = True
+        labels = self._piece_labels()
+        return np.isin(labels, labels[anchored])
 
     def _append(self, keyframe_id: int, node: _Node, prior: CameraPrior, pose: Pose) -> None:
         self._ids[keyframe_id] = len(self._nodes)
