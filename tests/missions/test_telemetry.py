@@ -5,6 +5,8 @@ import json
 import re
 import shutil
 import socket
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -95,6 +97,59 @@ def test_frames_whose_angles_are_far_beside_the_others_are_named() -> None:
     assert "4 frames of 12" in words and words.endswith("4.jpg, 5.jpg, 6.jpg, 7.jpg")
     straight = telemetry_faults(priors[:4], poses[:4], Bias(0.0, 0.01), AS_THE_MAP, knows_height=True)
     assert not straight.outlying and not any("far beside" in each for each in fault_sentences(straight, names))
+
+
+def test_where_place_and_angles_leave_the_log_the_map_is_doubted_not_the_log() -> None:
+    """Two pictures laid 12 m aside and turned by 27 degrees passed for wrong angles of the log; a fix that jumped by 15 m
+    may be either's fault, and is no fault of the angles."""
+    poses, priors = _strips()
+    aside = site_from_gimbal_rotation(27.0, -90.0, 0.0) @ site_from_gimbal_rotation(0.0, -90.0, 0.0).T
+    mapped = [
+        Pose(aside @ each.rotation, each.translation_m + [0.0, 12.0, 3.0]) if k in (4, 5) else each
+        for k, each in enumerate(poses)
+    ]
+    log = [
+        replace(each, position_m=each.position_m + [15.0 * (k == 20), 0.0, 0.0],
+                rotation=site_from_gimbal_rotation(100.0, -90.0, 0.0) if k == 9 else each.rotation)
+        for k, each in enumerate(priors)
+    ]
+    path = path_fit(log, mapped, 0.0)
+    faults = telemetry_faults(log, fitted(mapped, path), Bias(0.0, 0.01), path, knows_height=True)
+    assert (faults.misplaced, faults.apart, faults.outlying) == ((4, 5), (20,), (9,))
+    assert faults.misplaced_m == pytest.approx([12.4, 12.4], abs=1) and faults.apart_m == pytest.approx([15.0], abs=1)
+    words = "; ".join(fault_sentences(faults, [str(k) for k in range(len(poses))]))
+    assert "the map is doubtful at 2 frames of 26" in words and "follow the log there: 4, 5;" in words
+    assert "at 1 frame of 26 the map or the log is wrong" in words and "accuracy: 20;" in words
+    sound = telemetry_faults(priors, poses, Bias(0.0, 0.01), path_fit(priors, poses, 0.0), knows_height=True)
+    assert not (sound.misplaced or sound.apart or sound.outlying)
+
+
+def test_a_misplaced_frame_is_laid_by_the_log(
+    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+) -> None:
+    """It stays out of the correction of the frames around it, and its accuracy is not the map's."""
+    site, out = tmp_path / "site", tmp_path / "out"
+    shutil.copytree(corrected[1] / "site", site)
+    before = list(csv.DictReader((corrected[1] / "out" / "track.csv").read_text().splitlines()))
+    wrong = before[len(before) // 2]
+    with closing(sqlite3.connect(site / "site.db")) as database, database:
+        where = f"where frame_index = {wrong['index']}"
+        (place, turned), = database.execute(f"select translation_m, rotation from keyframes {where}")
+        aside = site_from_gimbal_rotation(30.0, -90.0, 0.0) @ site_from_gimbal_rotation(0.0, -90.0, 0.0).T
+        database.execute(f"update keyframes set translation_m = ?, rotation = ? {where}", (
+            json.dumps((np.array(json.loads(place)) + [12.0, 0.0, 3.0]).tolist()),
+            json.dumps((aside @ np.array(json.loads(turned)).reshape(3, 3)).tolist()),
+        ))
+    report = correct_telemetry(
+        site, out, source=faulty / "flight1" / "flight1.mp4", camera=str(faulty / "camera.xml")
+    )
+    assert any("the map is doubtful at 1 frame" in each and each.endswith(wrong["name"]) for each in report["sentences"])
+    (row,) = [each for each in csv.DictReader((out / "track.csv").read_text().splitlines())
+              if each["name"] == wrong["name"]]
+    assert row["status"] == "interpolated" and float(row["sigma_m"]) > float(wrong["sigma_m"])
+    east_m, north_m = ((float(row[each]) - float(wrong[each])) * 111_200 for each in ("longitude_deg", "latitude_deg"))
+    assert np.hypot(east_m * np.cos(np.radians(41.9)), north_m) < 1.5
+    assert float(row["height_m"]) == pytest.approx(float(wrong["height_m"]), abs=1.0)
 
 
 def _strips(clock_s: float = 0.0) -> tuple[list[Pose], list[CameraPrior]]:
@@ -226,10 +281,15 @@ def test_a_doubt_about_the_map_is_passed_on(
     site = tmp_path / "site"
     shutil.copytree(corrected[1] / "site", site)
     path = site / "flights" / "flight1" / "report.json"
-    mapped = {**json.loads(path.read_text()), "headline": {"quality": quality, "text": "too large by half"}}
+    mapped = {
+        **json.loads(path.read_text()), "headline": {"quality": quality, "text": "too large by half"},
+        "warnings": ["by half", "is it the telemetry of this flight?"],
+    }
     path.write_text(json.dumps(mapped))
     report = correct_telemetry(site, tmp_path / "out")
     assert ("too large by half" in report["warnings"]) == (quality != "map")
+    assert "of the map: is it the telemetry of this flight?" in report["warnings"]
+    assert ("of the map: by half" in report["warnings"]) == (quality == "map")  # else the headline has it
 
 
 def test_a_map_that_control_points_hold_is_not_bent_to_the_fixes(

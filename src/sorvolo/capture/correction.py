@@ -16,7 +16,8 @@ from sorvolo.survey.flight import CameraPrior
 
 _FIXES_ALIKE = 1.5  # neighbouring fixes err alike: they are fewer than they look
 _LEAST_FIXES = 4  # a similarity has four unknowns; by choice
-_MOST_ROUNDS = 20  # of moving to the middle of a group of angles
+_MOST_ROUNDS = 20  # of a search that comes nearer with each; most need five
+_FAR_SIGMAS = 6.0  # from its fix: of thousands of frames chance leaves none there, and wandering fixes hardly any
 _UNKNOWN = Bias(float("nan"), float("nan"), float("nan"))
 
 
@@ -53,14 +54,14 @@ def path_fit(priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_sigma_s
             [prior.velocity_m_s for prior in priors],
         )
     )
-    kept = np.ones(len(placed), bool)
+    kept = _usual_misses(_least_misses(seen, fixes))
     factor, scatter, a = 1.0 + 0j, 0.0, seen
     for _ in range(3):
         a, b = seen - seen[kept].mean(), fixes - fixes[kept].mean()
         factor = np.vdot(a[kept], b[kept]) / _square(a[kept])
         miss = np.abs(b - factor * a)
         scatter = float(np.sqrt(np.sum(miss[kept] ** 2) / max(2 * int(kept.sum()) - 4, 1)))
-        kept = miss <= 3 * max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(miss)), 1e-6)
+        kept = _usual_misses(miss)
     size = float(abs(factor))
     if size < 1e-6:
         return PathFit(_UNKNOWN, _UNKNOWN)
@@ -103,13 +104,21 @@ def telemetry_faults(
     scatter_m = _together([_bias(moved[placed, k]) for k in range(2)]).scatter / float(np.sqrt(2))
     beside_deg = _beside_usual(off_deg, settings.outlying_deg)
     near = beside_deg <= settings.outlying_deg
+    turned = np.zeros(len(priors), bool)
+    turned[knows_heading] = ~near
+    apart_m = _apart_m(priors, moved)
+    is_misplaced = (apart_m > 0) & turned
+    misplaced, apart = np.flatnonzero(is_misplaced), np.flatnonzero((apart_m > 0) & ~turned)
+    outlying = turned & ~is_misplaced
     tilt_deg = _together([_bias(off_deg[near, k]) for k in (1, 2)])
     return TelemetryFaults(
         clock_s, _heading(off_deg[:, 0], near, path, settings),
         tilt_deg if _agree(near, settings) else replace(tilt_deg, sigma=inf),
         _height(moved[placed, 2], poses, path.scale) if knows_height else _UNKNOWN,
-        Bias(0.0, float("nan"), scatter_m), path, tuple(np.flatnonzero(knows_heading)[~near].tolist()),
-        float(np.median(beside_deg[~near])) if not near.all() else 0.0,
+        Bias(0.0, float("nan"), scatter_m), path, tuple(np.flatnonzero(outlying).tolist()),
+        float(np.median(beside_deg[outlying[knows_heading]])) if outlying.any() else 0.0,
+        tuple(misplaced.tolist()), tuple(apart_m[misplaced].tolist()),
+        tuple(apart.tolist()), tuple(apart_m[apart].tolist()),
     )
 
 
@@ -218,6 +227,25 @@ def _nearest(known: Rows, count: int) -> Rows:
     return np.where(is_before, before, after)
 
 
+def _least_misses(seen: NDArray[np.complex128], fixes: NDArray[np.complex128]) -> Floats:
+    """(N,) how far the similarity with the least sum of distances takes places from their fixes, by reweighted squares.
+
+    One frame of a few that lies far aside bends the least squares so much that it no longer stands out itself.
+    """
+    miss = np.ones(len(seen))
+    for _ in range(_MOST_ROUNDS):
+        weights = 1 / np.maximum(miss, 1e-3 * max(float(np.median(miss)), 1e-6))
+        a, b = (each - np.average(each, weights=weights) for each in (seen, fixes))
+        root = np.sqrt(weights)
+        miss = np.abs(b - np.vdot(root * a, root * b) / _square(root * a) * a)
+    return miss
+
+
+def _usual_misses(miss: Floats) -> Mask:
+    """(N,) the misses that are no outliers."""
+    return miss <= 3 * max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(miss)), 1e-6)
+
+
 def _square(numbers: NDArray[np.complex128]) -> float:
     """The sum of the squares of these numbers' sizes, never 0."""
     return max(float(np.vdot(numbers, numbers).real), 1e-9)
@@ -270,6 +298,23 @@ def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
 def _wrapped(angles_deg: Floats) -> Floats:
     """The same angles from -180 to 180 degrees."""
     return (angles_deg + 180.0) % 360.0 - 180.0
+
+
+def _apart_m(priors: Sequence[CameraPrior], moved_m: PointsM) -> Floats:
+    """(N,) how far each frame's place lies from its fix where that is far; 0 where it is not, or nothing is known.
+
+    `moved_m` (N, 3) are the fixes less the places. Far is beyond `_FAR_SIGMAS`, along an axis, of what fixes and heights
+    state or scatter by, whichever is more, from what they usually are off.
+    """
+    stated_m = np.array([each.position_sigma_m for each in priors]).reshape(-1, 3)
+    beside_m = np.zeros_like(moved_m)
+    far = np.zeros(len(priors), bool)
+    for axis in range(3):
+        known = np.isfinite(stated_m[:, axis])
+        usual = _bias(moved_m[known, axis])
+        beside_m[known, axis] = np.abs(moved_m[known, axis] - usual.value)
+        far[known] |= beside_m[known, axis] > _FAR_SIGMAS * np.maximum(stated_m[known, axis], usual.scatter)
+    return np.where(far, np.linalg.norm(beside_m, axis=1), 0.0)
 
 
 def _agree(near: Mask, settings: CompassSettings) -> bool:

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from math import isfinite, nan
+from math import hypot, isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +43,7 @@ from sorvolo.survey.wording import counted
 _HOLDING = 2  # control points that hold a map's scale and direction
 _REPORT = "telemetry.json"
 _UNDIAGNOSED = "no diagnosis was made: it takes the flight's own video or photos, with --site"
+_INTERPOLATED = "interpolated"  # a camera by telemetry, corrected by the frames before and after
 _KLV_STEP_S = 0.2  # between samples, five a second; by choice
 
 
@@ -56,11 +57,13 @@ class CotReceiver:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """A frame that has a camera, and when it was taken, seconds into the flight."""
+    """A frame that has a camera, when it was taken, seconds into the flight, and how well and by what it is known."""
 
     stored: StoredKeyframe
     pose: Pose
     seconds: float
+    sigma_m: float
+    status: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +192,7 @@ def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
     stored = [each for each in archive.keyframes(name) if each.status is not Status.REJECTED]
     begin_ns = first_ns or min((each.time_ns for each in stored), default=0)
     solved = [
-        _Solved(each, each.site_from_camera, (each.time_ns - begin_ns) / 1e9)
+        _Solved(each, each.site_from_camera, (each.time_ns - begin_ns) / 1e9, each.sigma_m, each.status.value)
         for each in stored if each.site_from_camera is not None
     ]
     if not solved:
@@ -200,8 +203,8 @@ def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
 def _compared(
     setup: FlightSetup, solved: Sequence[_Solved], report: Mapping[str, Any]
 ) -> tuple[list[_Solved], _Compared]:
-    """The cameras in the fixes' own scale and direction, and what was wrong with the telemetry by the frames that
-    pictures placed."""
+    """The cameras in the fixes' own scale and direction, by telemetry where the map is doubtful; and what was wrong with
+    the telemetry by the frames that pictures placed."""
     track = setup.telemetry
     seen = [number for number, each in enumerate(solved) if each.stored.status is Status.VISION]
     if not seen:
@@ -223,8 +226,33 @@ def _compared(
     path = AS_THE_MAP if _is_tied(report) else path_fit(priors, [solved[k].pose for k in seen], sigma_s)
     poses = fitted([each.pose for each in solved], path)
     faults = telemetry_faults(priors, [poses[k] for k in seen], clock, path, knows_height=track.knows_ground)
+    compared = _Compared(setup, track, applied_s, faults, [solved[k].stored.name for k in seen])
     moved = [replace(each, pose=pose) for each, pose in zip(solved, poses)]
-    return moved, _Compared(setup, track, applied_s, faults, [solved[k].stored.name for k in seen])
+    for row, apart_m in zip(faults.apart, faults.apart_m):
+        moved[seen[row]] = replace(moved[seen[row]], sigma_m=max(apart_m, solved[seen[row]].sigma_m))
+    return _without_misplaced(moved, [seen[row] for row in faults.misplaced], compared), compared
+
+
+def _without_misplaced(solved: Sequence[_Solved], misplaced: Sequence[int], compared: _Compared) -> list[_Solved]:
+    """The frames, those where the map is doubtful placed by telemetry between the others, as KLV is."""
+    if not misplaced:
+        return list(solved)
+    kept = [each for number, each in enumerate(solved) if number not in misplaced]
+    doubted = [solved[number] for number in misplaced]
+    poses = _between([each.seconds for each in doubted], kept, compared)
+    scatter_m = compared.faults.position_m.scatter
+    laid = [
+        replace(each, pose=pose, sigma_m=hypot(each.sigma_m, scatter_m), status=_INTERPOLATED)
+        for each, pose in zip(doubted, poses)
+    ]
+    return sorted([*kept, *laid], key=lambda each: each.seconds)
+
+
+def _between(times_s: Sequence[float], solved: Sequence[_Solved], compared: _Compared) -> list[Pose]:
+    """The cameras at any moments, by telemetry as the solved frames correct it."""
+    smooth_s, key_s = compared.setup.plan.smooth_s, [each.seconds for each in solved]
+    priors, key_priors = (compared.track.priors(each, compared.applied_s, smooth_s) for each in (times_s, key_s))
+    return corrected_poses(times_s, priors, key_s, key_priors, [each.pose for each in solved])
 
 
 def _is_tied(report: Mapping[str, Any]) -> bool:
@@ -282,16 +310,12 @@ def _samples(
 ) -> tuple[list[CorrectedFrame], list[float]]:
     """The corrected camera five times a second, by the telemetry between the solved frames; and the aircraft's
     headings, deg."""
-    smooth_s = compared.setup.plan.smooth_s
-    key_s = [each.seconds for each in solved]
-    times_s = even_times_s(key_s, _KLV_STEP_S)
-    key_priors = compared.track.priors(key_s, compared.applied_s, smooth_s)
-    priors = compared.track.priors(times_s, compared.applied_s, smooth_s)
-    poses = corrected_poses(times_s, priors, key_s, key_priors, [each.pose for each in solved])
+    times_s = even_times_s([each.seconds for each in solved], _KLV_STEP_S)
+    poses = _between(times_s, solved, compared)
     stored, first_ns = solved[0].stored, _first_ns(compared.setup)
     stated_deg = compared.track.body_headings_deg(times_s, compared.applied_s)
     rows = [
-        _row("", number, first_ns + round(time_s * 1e9), time_s, pose, stored.camera, nan, "interpolated", site)
+        _row("", number, first_ns + round(time_s * 1e9), time_s, pose, stored.camera, nan, _INTERPOLATED, site)
         for number, (time_s, pose) in enumerate(zip(times_s, poses))
     ]
     return rows, headings_deg(stated_deg, compared.faults.heading_deg, times_s, poses)
@@ -300,8 +324,8 @@ def _samples(
 def _frame(each: _Solved, site: Site) -> CorrectedFrame:
     stored = each.stored
     return _row(
-        stored.name, stored.index, stored.time_ns, each.seconds, each.pose, stored.camera, stored.sigma_m,
-        stored.status.value, site,
+        stored.name, stored.index, stored.time_ns, each.seconds, each.pose, stored.camera, each.sigma_m, each.status,
+        site,
     )
 
 
@@ -320,8 +344,10 @@ def _row(
 
 
 def _warnings(site: Site, mapped: Mapping[str, Any]) -> list[str]:
-    """Doubts about the map that all is measured by, and what the files leave out."""
-    warnings = [doubt] if (doubt := doubt_about(mapped)) else []
+    """The warnings about the map that all is measured by, and what the files leave out."""
+    doubt = doubt_about(mapped)
+    warnings = [doubt] if doubt else []
+    warnings += [f"of the map: {each}" for each in mapped.get("warnings") or () if each not in doubt]
     if site.height_reference not in ("ellipsoidal", "orthometric"):
         warnings.append(
             f"heights are {site.height_reference}: geo.txt, GPX and CSV hold them as such, and KLV and Cursor on "

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from math import isfinite
+from statistics import median
 
 from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
 from sorvolo.survey.wording import counted
@@ -16,6 +17,7 @@ def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     """One sentence for each quantity that telemetry states; `names` are those of the compared frames."""
     return [
         *_clock(faults.clock_s), *_heading(faults.heading_deg, faults.path), *_outlying(faults, names),
+        *_misplaced(faults, names),
         *_tilt(faults.tilt_deg), *_height(faults.height_m, faults.path), *_map(faults.path),
         f"fixes scatter by {faults.position_m.scatter:.2f} m about the path in the pictures (1 sigma per axis)",
     ]
@@ -69,13 +71,35 @@ def _map(path: PathFit) -> list[str]:
 def _outlying(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     if not faults.outlying:
         return []
-    known = [names[row] for row in faults.outlying]
-    more = f" and {len(known) - _MOST_NAMED} more" if len(known) > _MOST_NAMED else ""
     return [
-        f"the stated angles of {counted(len(known), 'frame')} of {len(names)} are far beside the others', by "
+        f"the stated angles of {counted(len(faults.outlying), 'frame')} of {len(names)} are far beside the others', by "
         f"{faults.outlying_deg:.0f} deg in the median, so that places by telemetry alone are wrong there: "
-        f"{', '.join(known[:_MOST_NAMED])}{more}"
+        f"{_named(faults.outlying, names)}"
     ]
+
+
+def _misplaced(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
+    """Where the map itself is doubtful."""
+    found = []
+    if faults.misplaced:
+        found.append(
+            f"the map is doubtful at {counted(len(faults.misplaced), 'frame')} of {len(names)}, where the log contradicts "
+            f"both places (by {median(faults.misplaced_m):.1f} m in the median) and angles; the corrected cameras follow "
+            f"the log there: {_named(faults.misplaced, names)}"
+        )
+    if faults.apart:
+        found.append(
+            f"at {counted(len(faults.apart), 'frame')} of {len(names)} the map or the log is wrong, "
+            f"{median(faults.apart_m):.1f} m apart in the median; the corrected cameras follow the map, with that as "
+            f"their accuracy: {_named(faults.apart, names)}"
+        )
+    return found
+
+
+def _named(rows: Sequence[int], names: Sequence[str]) -> str:
+    """Which frames these are, the first of them by name."""
+    more = f" and {len(rows) - _MOST_NAMED} more" if len(rows) > _MOST_NAMED else ""
+    return f"{', '.join(names[row] for row in rows[:_MOST_NAMED])}{more}"
 
 
 def _tilt(found: Bias) -> list[str]:
