@@ -100,16 +100,16 @@ def test_frames_whose_angles_are_far_beside_the_others_are_named() -> None:
 
 
 def test_where_place_and_angles_leave_the_log_the_map_is_doubted_not_the_log() -> None:
-    """Two pictures laid 12 m aside and turned by 27 degrees passed for wrong angles of the log; a fix that jumped by 15 m
-    may be either's fault, and is no fault of the angles."""
+    """Two pictures laid 12 m aside and turned by 27 degrees passed for wrong angles of the log; a fix that jumped by
+    15 m may be either's fault, and is no fault of the angles."""
     poses, priors = _strips()
     aside = site_from_gimbal_rotation(27.0, -90.0, 0.0) @ site_from_gimbal_rotation(0.0, -90.0, 0.0).T
     mapped = [
-        Pose(aside @ each.rotation, each.translation_m + [0.0, 12.0, 3.0]) if k in (4, 5) else each
+        Pose(aside @ each.rotation, each.translation_m + np.array([0.0, 12.0, 3.0])) if k in (4, 5) else each
         for k, each in enumerate(poses)
     ]
     log = [
-        replace(each, position_m=each.position_m + [15.0 * (k == 20), 0.0, 0.0],
+        replace(each, position_m=each.position_m + np.array([15.0 * (k == 20), 0.0, 0.0]),
                 rotation=site_from_gimbal_rotation(100.0, -90.0, 0.0) if k == 9 else each.rotation)
         for k, each in enumerate(priors)
     ]
@@ -137,13 +137,14 @@ def test_a_misplaced_frame_is_laid_by_the_log(
         (place, turned), = database.execute(f"select translation_m, rotation from keyframes {where}")
         aside = site_from_gimbal_rotation(30.0, -90.0, 0.0) @ site_from_gimbal_rotation(0.0, -90.0, 0.0).T
         database.execute(f"update keyframes set translation_m = ?, rotation = ? {where}", (
-            json.dumps((np.array(json.loads(place)) + [12.0, 0.0, 3.0]).tolist()),
+            json.dumps((np.array(json.loads(place)) + np.array([12.0, 0.0, 3.0])).tolist()),
             json.dumps((aside @ np.array(json.loads(turned)).reshape(3, 3)).tolist()),
         ))
     report = correct_telemetry(
         site, out, source=faulty / "flight1" / "flight1.mp4", camera=str(faulty / "camera.xml")
     )
-    assert any("the map is doubtful at 1 frame" in each and each.endswith(wrong["name"]) for each in report["sentences"])
+    (words,) = [each for each in report["sentences"] if "the map is doubtful at 1 frame" in each]
+    assert words.endswith(f": {wrong['name']}")
     (row,) = [each for each in csv.DictReader((out / "track.csv").read_text().splitlines())
               if each["name"] == wrong["name"]]
     assert row["status"] == "interpolated" and float(row["sigma_m"]) > float(wrong["sigma_m"])
@@ -240,7 +241,7 @@ def test_heights_that_made_the_map_are_not_confirmed_by_it() -> None:
     """Two frames: 12 m too high in the log made the map 1.4 times as large, and "heights were right within 0.1 m"."""
     poses, priors = _strips()
     mapped = [Pose(each.rotation, 1.4 * each.translation_m) for each in poses]
-    high = [replace(each, position_m=each.position_m + [0.0, 0.0, 12.0]) for each in priors]
+    high = [replace(each, position_m=each.position_m + np.array([0.0, 0.0, 12.0])) for each in priors]
     for count, words in ((2, "cannot be known: too few frames have a fix"), (26, "m too high")):
         path = path_fit(high[:count], mapped[:count], 0.0)
         faults = telemetry_faults(

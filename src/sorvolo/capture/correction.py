@@ -303,8 +303,8 @@ def _wrapped(angles_deg: Floats) -> Floats:
 def _apart_m(priors: Sequence[CameraPrior], moved_m: PointsM) -> Floats:
     """(N,) how far each frame's place lies from its fix where that is far; 0 where it is not, or nothing is known.
 
-    `moved_m` (N, 3) are the fixes less the places. Far is beyond `_FAR_SIGMAS`, along an axis, of what fixes and heights
-    state or scatter by, whichever is more, from what they usually are off.
+    `moved_m` (N, 3) are the fixes less the places. Far is beyond `_FAR_SIGMAS`, along an axis, of what fixes and
+    heights state or scatter by, whichever is more, from what they usually are off.
     """
     stated_m = np.array([each.position_sigma_m for each in priors]).reshape(-1, 3)
     beside_m = np.zeros_like(moved_m)

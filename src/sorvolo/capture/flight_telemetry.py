@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sorvolo.capture.clock_offset import OffsetEstimate, estimate_offset
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import (
     Clock,
-    OffsetEstimate,
     Track,
-    estimate_offset,
     shifted,
     tie_clocks,
     track_from_telemetry,

@@ -1,4 +1,4 @@
-"""Frames and telemetry on one clock: the tie, telemetry at a frame's time, the offset that motion shows."""
+"""Frames and telemetry on one clock: the tie, and telemetry at a frame's time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -9,7 +9,6 @@ import numpy as np
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows, Vector3
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.geometry.homography import fit_similarity
 from sorvolo.geometry.pose import rotation_between, site_from_body_nadir_rotation, site_from_gimbal_rotation
 from sorvolo.geometry.summary import median_or_nan
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
@@ -49,34 +48,6 @@ class Clock:
     def is_per_photo(self) -> bool:
         """Whether each frame carries its own fix and attitude, so that nothing is interpolated."""
         return self.tie == PHOTO_TIE
-
-
-@dataclass(frozen=True)
-class OffsetEstimate:
-    """A clock offset seen in motion, with its one-sigma uncertainty, and what a fit at 0 and at it leaves over."""
-
-    offset_s: float
-    sigma_s: float
-    rms_at_zero_m: float
-    rms_m: float
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the motion shows an offset at all, however badly."""
-        return bool(np.isfinite(self.sigma_s))
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether the offset is well seen and worth applying."""
-        return (
-            np.isfinite(self.sigma_s)
-            and abs(self.offset_s) > max(3 * self.sigma_s, 0.04)
-            and self.rms_m < 0.97 * self.rms_at_zero_m
-        )
-
-    def refined(self, found: "OffsetEstimate", applied_s: float) -> "OffsetEstimate":
-        """This estimate after another search, which began at `applied_s` and found so much more."""
-        return OffsetEstimate(applied_s + found.offset_s, found.sigma_s, self.rms_at_zero_m, found.rms_m)
 
 
 def tie_clocks(
@@ -330,70 +301,6 @@ def site_origin(telemetry: Telemetry) -> Geodetic | None:
     return Geodetic(
         round(float(telemetry["latitude_deg"][middle]), 7), round(float(telemetry["longitude_deg"][middle]), 7), 0.0
     )
-
-
-def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: float) -> OffsetEstimate:
-    """The clock offset that makes telemetry's path fit the path seen in the pictures (N, 2), up to a similarity.
-
-    Straight flight at constant speed fits at any offset: then the uncertainty comes out infinite or large. It comes
-    from the motion that the pictures show, with the misfit as the noise: the fixes' own noise bends a path as well,
-    and would pass for motion.
-    """
-    usable = np.isfinite(track.east_north_m[:, 0])
-    path_s, path_m = track.sample_s[usable], track.east_north_m[usable]
-    unknown = OffsetEstimate(0.0, float("inf"), float("nan"), float("nan"))
-    if len(path_s) < 4 or len(times_s) < 6 or reach_s <= 0:
-        return unknown
-
-    def misfit(offset_s: float) -> tuple[float, int]:
-        at = times_s + offset_s
-        inside = (at >= path_s[0]) & (at <= path_s[-1])
-        if inside.sum() < max(6, 0.6 * len(at)):
-            return float("inf"), 0
-        fixes = np.column_stack([np.interp(at[inside], path_s, path_m[:, k]) for k in range(2)])
-        seen = seen_m[inside]
-        if np.ptp(seen, axis=0).max() <= 0:
-            return float("inf"), 0
-        change = fit_similarity(fixes, seen)
-        miss = np.linalg.norm(seen @ change[:2, :2].T + change[:2, 2] - fixes, axis=1)
-        limit = 3 * float(np.median(miss)) + 1e-9
-        return float(np.mean(np.minimum(miss, limit) ** 2)), int(inside.sum())
-
-    step = max(0.02, reach_s / 100)
-    offsets = np.arange(-reach_s, reach_s + step / 2, step)
-    costs = np.array([misfit(each)[0] for each in offsets])
-    if not np.isfinite(costs).any():
-        return unknown
-    best = float(offsets[int(np.argmin(costs))])
-    for _ in range(3):
-        step /= 4
-        nearby = best + step * np.arange(-4, 5)
-        best = float(nearby[int(np.argmin([misfit(each)[0] for each in nearby]))])
-    lowest, count = misfit(best)
-    at_zero = misfit(0.0)[0]
-    inside = (times_s + best >= path_s[0]) & (times_s + best <= path_s[-1])
-    fixes = np.column_stack([np.interp(times_s[inside] + best, path_s, path_m[:, k]) for k in range(2)])
-    change = fit_similarity(fixes, seen_m[inside])
-    motion = _telling_motion(times_s[inside], seen_m[inside] @ change[:2, :2].T + change[:2, 2])
-    # residuals of a 1 Hz receiver repeat over the frames between its fixes
-    independent = min(count, max(3.0, (times_s[-1] - times_s[0]) / max(track.interval_s, 1e-3)))
-    sigma = float(np.sqrt(lowest / (independent * motion))) if motion > 1e-9 else float("inf")
-    if abs(best) > 0.97 * reach_s:
-        return replace(unknown, rms_at_zero_m=float(np.sqrt(at_zero)), rms_m=float(np.sqrt(lowest)))
-    return OffsetEstimate(best, sigma, float(np.sqrt(at_zero)), float(np.sqrt(lowest)))
-
-
-def _telling_motion(times_s: Floats, path_m: PointsM) -> float:
-    """Mean square (m2/s2) of the velocity along a path, (N, 2), that no similarity of the path can stand in for."""
-    velocity = np.gradient(path_m, times_s, axis=0).T.ravel()
-    east, north = (path_m - path_m.mean(axis=0)).T
-    one, zero = np.ones(len(times_s)), np.zeros(len(times_s))
-    similar = np.column_stack([
-        np.concatenate([one, zero]), np.concatenate([zero, one]), np.concatenate([east, north]),
-        np.concatenate([-north, east]),
-    ])
-    taken_up, *_ = np.linalg.lstsq(similar, velocity, rcond=None)
-    return float(((velocity - similar @ taken_up) ** 2).sum() / len(times_s))
 
 
 def _line(times_s: Floats, values: Floats) -> tuple[Floats, Floats, float]:

@@ -83,7 +83,7 @@ def site_from_body_nadir_rotation(yaw_deg: float, pitch_deg: float, roll_deg: fl
 
 
 def body_nadir_angles_from_rotation(site_from_camera_rotation: Matrix3) -> tuple[float, float, float]:
-    """Yaw, pitch, roll in degrees, the inverse of `site_from_body_nadir_rotation`; at the horizon roll is given as 0."""
+    """Yaw, pitch, roll in degrees, the inverse of `site_from_body_nadir_rotation`; towards the horizon roll is 0."""
     ned_from_body = _ENU_FROM_NED.T @ site_from_camera_rotation @ (_NADIR_MOUNT @ _GIMBAL_FROM_CAMERA).T
     return _angles_from_ned(ned_from_body)
 

@@ -75,11 +75,13 @@ class TelemetryFaults:
     """What was wrong with a flight's telemetry. `clock_s` is telemetry's clock less the video's; `heading_deg` positive
     where the compass read too far clockwise, its sigma infinite where it cannot be known; `tilt_deg` how far the camera
     looked from its stated direction, sideways and forward together; `height_m` positive where the log was too high
-    above the ground, its sigma infinite where that cannot be known. `path` is the fixes' path held against the map. The rest are rows of compared
-    frames: `outlying`, whose stated angles alone are far beside what those of the others
-    are off, by `outlying_deg` in the median; `misplaced`, whose places and angles both are, so that the map is doubtful there; `apart`,
-    whose places alone are, so that the map or the fix is. `misplaced_m` and `apart_m` are how far each of these lies
-    from its fix."""
+    above the ground, its sigma infinite where that cannot be known. `path` is the fixes' path held against the map.
+
+    The rest are rows of compared frames: `outlying`, whose stated angles alone are far beside what those of the others
+    are off, by `outlying_deg` in the median; `misplaced`, whose places and angles both are, so that the map is doubtful
+    there; `apart`, whose places alone are, so that the map or the fix is wrong. `misplaced_m` and `apart_m` are how far
+    each of these lies from its fix.
+    """
 
     clock_s: Bias
     heading_deg: Bias

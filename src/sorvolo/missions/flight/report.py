@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import sorvolo
-from sorvolo.capture.sync import OffsetEstimate
+from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.capture.video import VideoSource
 from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.headline import map_headline

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
+from sorvolo.capture.clock_offset import OffsetEstimate
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource
-from sorvolo.capture.sync import OffsetEstimate
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3
 from sorvolo.geometry.camera import Camera

@@ -203,8 +203,8 @@ def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
 def _compared(
     setup: FlightSetup, solved: Sequence[_Solved], report: Mapping[str, Any]
 ) -> tuple[list[_Solved], _Compared]:
-    """The cameras in the fixes' own scale and direction, by telemetry where the map is doubtful; and what was wrong with
-    the telemetry by the frames that pictures placed."""
+    """The cameras in the fixes' own scale and direction, by telemetry where the map is doubtful; and what was wrong
+    with the telemetry by the frames that pictures placed."""
     track = setup.telemetry
     seen = [number for number, each in enumerate(solved) if each.stored.status is Status.VISION]
     if not seen:

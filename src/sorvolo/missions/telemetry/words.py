@@ -83,9 +83,9 @@ def _misplaced(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     found = []
     if faults.misplaced:
         found.append(
-            f"the map is doubtful at {counted(len(faults.misplaced), 'frame')} of {len(names)}, where the log contradicts "
-            f"both places (by {median(faults.misplaced_m):.1f} m in the median) and angles; the corrected cameras follow "
-            f"the log there: {_named(faults.misplaced, names)}"
+            f"the map is doubtful at {counted(len(faults.misplaced), 'frame')} of {len(names)}, where the log "
+            f"contradicts both places (by {median(faults.misplaced_m):.1f} m in the median) and angles; the corrected "
+            f"cameras follow the log there: {_named(faults.misplaced, names)}"
         )
     if faults.apart:
         found.append(

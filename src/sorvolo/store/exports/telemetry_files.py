@@ -21,7 +21,8 @@ def geo_txt(frames: Sequence[CorrectedFrame]) -> str:
     """OpenDroneMap's image geolocation file: name, longitude, latitude, height, yaw, pitch, roll, two accuracies.
 
     ODM's angles are those of a body, x to the top of the picture, y to its right, z along the view (compute_opk of its
-    photo.py): a gimbal's pitch plus 90 is the same only where its roll is 0. A name with spaces would end its column early: these become underscores.
+    photo.py): a gimbal's pitch plus 90 is the same only where its roll is 0. A name with spaces would end its column
+    early: these become underscores.
     """
     rows = ["EPSG:4326"]
     for each in frames:
