@@ -223,6 +223,59 @@ def test_an_unknown_server_is_refused(certificates: dict[str, Path]) -> None:
     assert not received
 
 
+def test_a_server_that_is_not_trusted_is_asked_once_and_the_remedy_named(certificates: dict[str, Path]) -> None:
+    """Each event made a handshake, and a later "Connection refused" took the place of the cause."""
+    received: list[bytes] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        thread = _tls_server(certificates, server, received)  # takes one connection
+        place = CotPlace("tls", "127.0.0.1", server.getsockname()[1])
+        with pytest.raises(InputError, match=r"certificate is not trusted \(self.signed certificate\).*--cot-ca"):
+            send_all([b"<event/>"] * 3, place)
+        thread.join(5)
+        server.settimeout(0.2)
+        with pytest.raises(TimeoutError):
+            server.accept()
+    assert not received
+
+
+def test_a_receiver_that_does_not_answer_is_waited_for_once() -> None:
+    """40 events to a server whose queue is full took two minutes."""
+    with socket.socket() as server:
+        server.bind(("127.0.0.1", 0))
+        server.listen(0)
+        place = CotPlace("tcp", "127.0.0.1", server.getsockname()[1])
+        waiting = [socket.socket() for _ in range(4)]
+        for each in waiting:  # more than the queue takes
+            each.setblocking(False)
+            each.connect_ex(("127.0.0.1", place.port))
+        began_s = time.monotonic()
+        with pytest.raises(InputError, match=r"nothing could be sent \(timed out\)"):
+            send_all([b"<event/>"] * 5, place)
+        assert time.monotonic() - began_s < 5
+        for each in waiting:
+            each.close()
+
+
+def test_a_receiver_that_goes_away_is_tried_once_more() -> None:
+    """What it took counts, and nothing more is waited for."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(5)
+        place = CotPlace("tcp", "127.0.0.1", server.getsockname()[1])
+
+        def take_one() -> None:
+            taken, _ = server.accept()
+            server.close()
+            taken.recv(1000)
+            taken.close()
+
+        thread = threading.Thread(target=take_one, daemon=True)
+        thread.start()
+        sent = send_all([b"<event/>" * 10_000] * 200, place)
+        thread.join(5)
+    assert 1 <= sent < 200
+
+
 def test_certificates_that_cannot_be_used(tmp_path: Path) -> None:
     broken = tmp_path / "broken.pem"
     broken.write_text("nothing")

@@ -275,6 +275,15 @@ def test_between_frames_of_a_log_without_angles_the_camera_turns_as_the_pictures
     np.testing.assert_allclose(stated.translation_m, [25.0, 0.0, 30.0], atol=1e-6)
 
 
+def test_a_clock_that_is_known_to_seconds_only_is_not_called_right() -> None:
+    """10 s of straight flight: "the clocks agree within 14.29 s"."""
+    poses, priors = _strips()
+    for sigma_s, words in ((6.7, "whether the clocks agree cannot be known"), (0.4, "the clocks agree within 1.68 s")):
+        clock_s = Bias(-0.88, sigma_s)
+        faults = telemetry_faults(priors, poses, clock_s, path_fit(priors, poses, 0.0), knows_height=True)
+        assert fault_sentences(faults, [""] * len(poses))[0].startswith(words)
+
+
 @pytest.mark.parametrize("quality", ["contradictory", "doubtful", "map"])
 def test_a_doubt_about_the_map_is_passed_on(
     corrected: tuple[dict[str, Any], Path], tmp_path: Path, quality: str

@@ -8,7 +8,8 @@ from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
 from sorvolo.survey.wording import counted
 
 _LEAST = {"clock": 0.04, "heading": 0.5, "tilt": 0.5, "height": 0.3}  # s, deg, deg, m: smaller ones matter to nobody
-_NOT_KNOWN = {"heading": 10.0, "height": 10.0}  # deg, m: right within more than this is no knowledge; by choice
+_NOT_KNOWN = {"clock": 1.0, "heading": 10.0, "height": 10.0}
+"""s (10 m of flight, or less), deg, m: right within more than this is no knowledge; by choice."""
 _TOO_FEW = "too few frames have a fix"
 _MOST_NAMED = 6  # frames in a sentence
 
@@ -26,6 +27,8 @@ def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
 def _clock(found: Bias) -> list[str]:
     if not isfinite(found.value):
         return ["the clocks cannot be compared: the motion does not show an offset"]
+    if not 2 * found.sigma <= _NOT_KNOWN["clock"]:
+        return ["whether the clocks agree cannot be known: the flight turns too little to show an offset"]
     if abs(found.value) < _LEAST["clock"] or not found.is_significant:
         return [f"the clocks agree within {_within(found, 0.01):.2f} s"]
     side = "ahead of" if found.value > 0 else "behind"

@@ -89,20 +89,24 @@ def check_host(place: CotPlace) -> None:
 def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -> int:
     """Send recorded events one after the other; how many arrived as far as the sender can know.
 
-    Raises InputError where nothing can be sent at all, where a host refuses datagrams because nothing listens there,
-    and where the receiver breaks the connection at the end.
+    A connection that breaks is made anew once: a receiver that is not there would be waited for with each event. Raises
+    InputError where nothing can be sent at all, where a host refuses datagrams because nothing listens there, and where
+    the receiver breaks the connection at the end.
     """
-    sender, sent, is_refused, last = CotSender(place, tls), 0, False, ""
+    sender, sent, first, is_refused, was_sent = CotSender(place, tls), 0, "", False, False
+    advice = "; check the address, the port and the network"
     try:
         for event in events:
             try:
                 sender.send(event)
-                sent += 1
+                sent, was_sent = sent + 1, True
             except OSError as error:
-                last = str(error)
+                first = first or str(error)
                 is_refused = isinstance(error, ConnectionRefusedError)
-                if is_refused and (not sent or place.transport == "udp"):
+                advice = "" if isinstance(error, ssl.SSLCertVerificationError) else advice
+                if not was_sent or (is_refused and place.transport == "udp"):
                     break
+                was_sent = False
         sender.finish()
     except OSError as error:
         raise InputError(
@@ -113,11 +117,11 @@ def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -
         sender.close()
     if is_refused and place.transport == "udp":
         raise InputError(
-            f"--cot {place}: nothing listens there ({last}), so that how many of {counted(len(events), 'event')} "
+            f"--cot {place}: nothing listens there ({first}), so that how many of {counted(len(events), 'event')} "
             "arrived is not known; check the address and the port, start the receiver, and send them again"
         )
     if events and not sent:
-        raise InputError(f"--cot {place}: nothing could be sent ({last}); check the address, the port and the network")
+        raise InputError(f"--cot {place}: nothing could be sent ({first}){advice}")
     return sent
 
 
@@ -175,7 +179,13 @@ class CotSender:
             self._socket = None
 
     def _raise_refusal(self, error: OSError) -> None:
-        """Raise ConnectionRefusedError, which names --cot-cert, for an error by which a TLS server refuses a client."""
+        """Raise ConnectionRefusedError, which names --cot-cert, for an error by which a TLS server refuses a client, and
+        ssl.SSLCertVerificationError, which names --cot-ca, for a server that is not trusted."""
+        if isinstance(error, ssl.SSLCertVerificationError):
+            raise ssl.SSLCertVerificationError(error.errno, (
+                f"the server's certificate is not trusted ({error.verify_message.rstrip('.')}): give the certificate of "
+                "the authority that signed it as --cot-ca, and the server by the name that is in it"
+            )) from error
         if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
             words = (error.reason or "").lower().replace("_", " ")
             raise ConnectionRefusedError(f"the server refuses this client ({words}); {self._advice}") from error
