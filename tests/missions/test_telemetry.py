@@ -479,7 +479,9 @@ def test_a_flight_is_recognised_under_any_name_and_another_one_refused(
     right = (out / "telemetry.json").read_bytes()
     other = str(filmed / "flight1" / "flight1.mp4")
     assert main(["telemetry", other, *command, "--flight", "flight1"]) == 1
-    assert "flight1.mp4 is of another flight: flight1 of" in capsys.readouterr().err
+    assert f"{other} is of another flight: flight1 of {site} was mapped from another file of that name" in (
+        capsys.readouterr().err
+    )
     assert main(["telemetry", other, *command, "--flight", "DJI_8"]) == 1
     assert "has no flight 'DJI_8', only flight1: leave --flight out" in capsys.readouterr().err
     assert len(mapped_flights(site)) == 1 and (out / "telemetry.json").read_bytes() == right
@@ -488,6 +490,35 @@ def test_a_flight_is_recognised_under_any_name_and_another_one_refused(
     log.write_text(re.sub(r"T\d\d:", "T07:", text))
     with pytest.raises(InputError, match=r"at none of the .* its telemetry has a position"):
         correct_telemetry(site, out, source=faulty / "flight1" / "flight1.mp4", telemetry=str(log))
+
+
+def test_what_other_programs_cannot_take_is_warned_of(corrected: tuple[dict[str, Any], Path], tmp_path: Path) -> None:
+    """A flight without a date has no events; photos whose names have spaces are not found by OpenDroneMap."""
+    site, out = tmp_path / "site", tmp_path / "out"
+    shutil.copytree(corrected[1] / "site", site)
+    with closing(sqlite3.connect(site / "site.db")) as database, database:
+        database.execute("update keyframes set name = 'IMG ' || name, time_ns = time_ns % 60000000000")
+    with pytest.raises(InputError, match="the date of flight1 is not known"):
+        correct_telemetry(site, out, cot=CotReceiver(CotPlace("udp", "127.0.0.1", 9)))
+    assert not out.exists()
+    report = correct_telemetry(site, out)
+    assert "cot.xml" not in report["files"] and not (out / "cot.xml").exists()
+    undated, spaced = report["warnings"][-2:]
+    assert "GPX and CSV have no times" in undated and "OpenDroneMap finds 'IMG 0' once" in spaced
+    assert (out / "geo.txt").read_text().splitlines()[1].startswith("IMG_0 ")
+
+
+def test_files_of_two_flights_do_not_mix(
+    corrected: tuple[dict[str, Any], Path], faulty: Path, tmp_path: Path
+) -> None:
+    """An earlier flight's transport stream stayed beside the files of the next."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "telemetry.json").write_text(json.dumps({"flight": "flight7", "site": "field"}))
+    for source in (None, faulty / "flight1" / "flight1.mp4"):
+        with pytest.raises(InputError, match="has the telemetry of flight7 of field, not of flight1 of site"):
+            correct_telemetry(corrected[1] / "site", out, source=source, camera=str(faulty / "camera.xml"))
+    assert [each.name for each in out.iterdir()] == ["telemetry.json"]
 
 
 @pytest.mark.parametrize(("arguments", "words"), [

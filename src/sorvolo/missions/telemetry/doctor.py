@@ -30,7 +30,14 @@ from sorvolo.missions.watch.cot_sender import CotPlace, CotTls, send_all
 from sorvolo.store.atomic import atomic_path, atomic_write_bytes, writing
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import json_bytes, plain_json
-from sorvolo.store.exports.telemetry_files import cot_track, geo_txt, track_csv, track_gpx
+from sorvolo.store.exports.telemetry_files import (
+    cot_track,
+    geo_txt,
+    is_dated,
+    name_for_odm,
+    track_csv,
+    track_gpx,
+)
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.catalogue_place import is_site
@@ -89,8 +96,9 @@ def correct_telemetry(
     own telemetry is compared with the map, and a video is written again as a transport stream with corrected metadata.
     The events of cot.xml, with their own times, are sent to `cot`. Without `source` a folder with a diagnosis is left
     as it is: its events are sent, and `diagnosed_before` is true in the report. Raises InputError for a site without
-    GPS, a flight that it has not, a source of another flight or without a fix at any of its frames, a receiver that
-    takes nothing, and without `source` for a folder with a diagnosis, which would be lost, if there is nothing to send.
+    GPS, a flight that it has not, a source of another flight or without a fix at any of its frames, a folder that has
+    another flight's files, a receiver that takes nothing or would get events without a date, and without `source` for a
+    folder with a diagnosis, which would be lost, if there is nothing to send.
     """
     with Archive.open(site_folder, write=False) as archive:
         site = archive.site()
@@ -101,13 +109,15 @@ def correct_telemetry(
             )
         if source is None:
             name = _flight(archive, flight)
+            _check_folder(folder, name, site)
             if (earlier := _diagnosis(folder)) is not None:
-                return _sent_again(earlier, name, folder, cot)
+                return _sent_again(earlier, folder, cot)
             return _written(site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot)
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
             name = _flight(archive, flight or opened.name)
-            _check_same(archive, name, opened)
+            _check_same(archive, name, opened, source)
+            _check_folder(folder, name, site)
             setup = prepare(opened, MapSettings(), site, telemetry_named=telemetry is not None)
             solved = _solved(archive, name, _first_ns(setup))
             mapped = archive.report(name)
@@ -146,34 +156,52 @@ def _flight(archive: Archive, wanted: str) -> str:
     return wanted or known[0]
 
 
-def _check_same(archive: Archive, name: str, source: Source) -> None:
+def _check_same(archive: Archive, name: str, source: Source, given: Path) -> None:
     """Raise InputError for the source of another flight. A live one has no file that it could be recognised by."""
     report = archive.report(name)
     if _mapped(archive)[name] != source.fingerprint and not report.get("delay_s"):
         first = next(iter(report.get("inputs") or ()), "another file")
+        if first == source.inputs[0]:
+            first = "another file of that name"
         raise InputError(
-            f"{source.inputs[0]} is of another flight: {name} of {archive.folder} was mapped from {first}. Give that, "
-            "or leave --flight out for a flight of its own"
+            f"{given} is of another flight: {name} of {archive.folder} was mapped from {first}. Give that, or leave "
+            "--flight out for a flight of its own"
+        )
+
+
+def _earlier(folder: Path) -> dict[str, Any]:
+    """The report whose files the folder has; empty where it has none."""
+    try:
+        report = json.loads((folder / _REPORT).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return report if isinstance(report, dict) else {}
+
+
+def _check_folder(folder: Path, name: str, site: Site) -> None:
+    """Raise InputError for a folder that has the files of another flight: some would be replaced, and some stay."""
+    earlier = _earlier(folder)
+    if earlier and (earlier.get("flight"), earlier.get("site")) != (name, site.name):
+        raise InputError(
+            f"{folder} has the telemetry of {earlier.get('flight')} of {earlier.get('site')}, not of {name} of "
+            f"{site.name}: give another folder with --out, or delete that one"
         )
 
 
 def _diagnosis(folder: Path) -> dict[str, Any] | None:
     """The report of the diagnosis whose files the folder has; None where it has none."""
-    try:
-        report = json.loads((folder / _REPORT).read_bytes())
-    except (OSError, ValueError):
-        return None
-    return report if isinstance(report, dict) and report.get("faults") else None
+    report = _earlier(folder)
+    return report if report.get("faults") else None
 
 
-def _sent_again(earlier: dict[str, Any], name: str, folder: Path, cot: CotReceiver | None) -> dict[str, Any]:
+def _sent_again(earlier: dict[str, Any], folder: Path, cot: CotReceiver | None) -> dict[str, Any]:
     """Send the events of the diagnosis that a folder has; its report.
 
-    Raises InputError where there is nobody to send them to, or they are another flight's: files of the map alone would
-    take the diagnosis's place.
+    Raises InputError where there is nobody to send them to, or none: files of the map alone would take the diagnosis's
+    place.
     """
     events = folder / "cot.xml"
-    if cot is None or earlier.get("flight") != name or not events.is_file():
+    if cot is None or not events.is_file():
         raise InputError(
             f"{folder} has the diagnosis of {earlier.get('flight')} and files corrected by it, which files of the map "
             "alone would replace: use those, give the flight's video or photos with --site for new ones, or another "
@@ -273,13 +301,19 @@ def _written(
     mapped: Mapping[str, Any], cot: CotReceiver | None,
 ) -> dict[str, Any]:
     frames = [_frame(each, site) for each in solved]
-    with writing(folder):
-        folder.mkdir(parents=True, exist_ok=True)
     texts = {
         "geo.txt": geo_txt(frames).encode(), "track.csv": track_csv(frames, site.height_reference).encode(),
         "track.gpx": track_gpx(frames, name),
-        "cot.xml": cot_track(frames, name, is_ellipsoidal=site.height_reference == "ellipsoidal"),
     }
+    if is_dated(frames):
+        texts["cot.xml"] = cot_track(frames, name, is_ellipsoidal=site.height_reference == "ellipsoidal")
+    elif cot is not None:
+        raise InputError(
+            f"the date of {name} is not known, and Cursor on Target events need one: map the flight with a log that "
+            "has a date (`sorvolo map --telemetry FILE`), or leave --cot out"
+        )
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     for file, text in texts.items():
         atomic_write_bytes(folder / file, text)
     files = [*texts]
@@ -293,7 +327,7 @@ def _written(
         "faults": None if compared is None else asdict(compared.faults),
         "sentences": [_UNDIAGNOSED] if compared is None else fault_sentences(compared.faults, compared.names),
         "files": files,
-        "warnings": _warnings(site, mapped),
+        "warnings": _warnings(site, mapped, frames),
     }))
     atomic_write_bytes(folder / _REPORT, json_bytes(report))
     sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
@@ -343,7 +377,7 @@ def _row(
     )
 
 
-def _warnings(site: Site, mapped: Mapping[str, Any]) -> list[str]:
+def _warnings(site: Site, mapped: Mapping[str, Any], frames: Sequence[CorrectedFrame]) -> list[str]:
     """The warnings about the map that all is measured by, and what the files leave out."""
     doubt = doubt_about(mapped)
     warnings = [doubt] if doubt else []
@@ -352,5 +386,16 @@ def _warnings(site: Site, mapped: Mapping[str, Any]) -> list[str]:
         warnings.append(
             f"heights are {site.height_reference}: geo.txt, GPX and CSV hold them as such, and KLV and Cursor on "
             "Target leave the height out, since both want it above the ellipsoid or the sea"
+        )
+    if not is_dated(frames):
+        warnings.append(
+            "neither the frames nor the log have a date: GPX and CSV have no times, KLV counts from 1970, and cot.xml "
+            "is not written, since its events need a date"
+        )
+    spaced = [each.name for each in frames if name_for_odm(each.name) != each.name]
+    if spaced:
+        warnings.append(
+            f"geo.txt cannot hold names with spaces, which {counted(len(spaced), 'frame')} of {len(frames)} have: "
+            f"OpenDroneMap finds {spaced[0]!r} once the photo is renamed {name_for_odm(spaced[0])!r}"
         )
     return warnings

@@ -179,12 +179,12 @@ class CotSender:
             self._socket = None
 
     def _raise_refusal(self, error: OSError) -> None:
-        """Raise ConnectionRefusedError, which names --cot-cert, for an error by which a TLS server refuses a client, and
-        ssl.SSLCertVerificationError, which names --cot-ca, for a server that is not trusted."""
+        """Raise ConnectionRefusedError, which names --cot-cert, for an error by which a TLS server refuses a client,
+        and ssl.SSLCertVerificationError, which names --cot-ca, for a server that is not trusted."""
         if isinstance(error, ssl.SSLCertVerificationError):
             raise ssl.SSLCertVerificationError(error.errno, (
-                f"the server's certificate is not trusted ({error.verify_message.rstrip('.')}): give the certificate of "
-                "the authority that signed it as --cot-ca, and the server by the name that is in it"
+                f"the server's certificate is not trusted ({error.verify_message.rstrip('.')}): give the certificate "
+                "of the authority that signed it as --cot-ca, and the server by the name that is in it"
             )) from error
         if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
             words = (error.reason or "").lower().replace("_", " ")

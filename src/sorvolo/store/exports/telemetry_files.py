@@ -8,37 +8,46 @@ from dataclasses import asdict
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 from sorvolo.geometry.pose import body_nadir_angles_from_rotation, site_from_gimbal_rotation
+from sorvolo.geometry.units import DAY_NS
 from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.corrected import CorrectedFrame
 
 _UNKNOWN_M = "9999999.0"
 _DRONE = "a-f-A-M-H-Q"  # friendly, air, military, rotary wing, unmanned: how TAK shows small drones
 _STALE_NS = 30_000_000_000  # after which TAK shows a drone as lost; by choice
+_NADIR_DEG = -80.0  # pitch below which a camera hovering in wind may look to any side; by choice
 _EARTH_M = 6_371_000.0  # mean radius, good enough for a speed
+
+
+def is_dated(frames: Sequence[CorrectedFrame]) -> bool:
+    """Whether the flight's date is known; else its times count from 1970."""
+    return all(each.time_ns >= DAY_NS for each in frames)
 
 
 def geo_txt(frames: Sequence[CorrectedFrame]) -> str:
     """OpenDroneMap's image geolocation file: name, longitude, latitude, height, yaw, pitch, roll, two accuracies.
 
     ODM's angles are those of a body, x to the top of the picture, y to its right, z along the view (compute_opk of its
-    photo.py): a gimbal's pitch plus 90 is the same only where its roll is 0. A name with spaces would end its column
-    early: these become underscores.
+    photo.py): a gimbal's pitch plus 90 is the same only where its roll is 0. Names are as `name_for_odm` has them.
     """
     rows = ["EPSG:4326"]
     for each in frames:
         sigma = "" if math.isnan(each.sigma_m) else f" {each.sigma_m:.3f} {1.5 * each.sigma_m:.3f}"
-        yaw_deg, pitch_deg, roll_deg = body_nadir_angles_from_rotation(
-            site_from_gimbal_rotation(each.yaw_deg, each.pitch_deg, each.roll_deg)
-        )
+        yaw_deg, pitch_deg, roll_deg = _body_angles_deg(each)
         rows.append(
-            f"{each.name.replace(' ', '_')} {each.longitude_deg:.9f} {each.latitude_deg:.9f} {each.height_m:.3f} "
+            f"{name_for_odm(each.name)} {each.longitude_deg:.9f} {each.latitude_deg:.9f} {each.height_m:.3f} "
             f"{yaw_deg:.3f} {pitch_deg:.3f} {roll_deg:.3f}{sigma}"
         )
     return "\n".join(rows) + "\n"
 
 
+def name_for_odm(name: str) -> str:
+    """A photo's name as geo.txt can hold it: a space would end its column, and becomes an underscore."""
+    return "_".join(name.split())
+
+
 def track_csv(frames: Sequence[CorrectedFrame], height_reference: str) -> str:
-    """One line for each frame; the header names what heights count from."""
+    """One line for each frame; the header names what heights count from. Without a date `utc` is empty."""
     text = io.StringIO()
     names = list(asdict(frames[0])) if frames else []
     writer = csv.writer(text, lineterminator="\n")
@@ -46,12 +55,12 @@ def track_csv(frames: Sequence[CorrectedFrame], height_reference: str) -> str:
     for each in frames:
         row = {name: value for name, value in asdict(each).items() if name != "time_ns"}
         plain = ["" if isinstance(value, float) and math.isnan(value) else value for value in row.values()]
-        writer.writerow([*plain, utc_text(each.time_ns), height_reference])
+        writer.writerow([*plain, utc_text(each.time_ns) if is_dated(frames) else "", height_reference])
     return text.getvalue()
 
 
 def track_gpx(frames: Sequence[CorrectedFrame], name: str) -> bytes:
-    """A GPX 1.1 track; each point's description has its sigma."""
+    """A GPX 1.1 track; each point's description has its sigma. Without a date no point has a time."""
     gpx = Element("gpx", {"version": "1.1", "creator": "sorvolo", "xmlns": "http://www.topografix.com/GPX/1/1"})
     track = SubElement(gpx, "trk")
     SubElement(track, "name").text = name
@@ -59,7 +68,8 @@ def track_gpx(frames: Sequence[CorrectedFrame], name: str) -> bytes:
     for each in frames:
         point = SubElement(segment, "trkpt", {"lat": f"{each.latitude_deg:.9f}", "lon": f"{_wrapped(each):.9f}"})
         SubElement(point, "ele").text = f"{each.height_m:.3f}"
-        SubElement(point, "time").text = utc_text(each.time_ns)
+        if is_dated(frames):
+            SubElement(point, "time").text = utc_text(each.time_ns)
         SubElement(point, "name").text = each.name
         if not math.isnan(each.sigma_m):
             SubElement(point, "desc").text = f"position accuracy {each.sigma_m:.2f} m (1 sigma)"
@@ -67,10 +77,12 @@ def track_gpx(frames: Sequence[CorrectedFrame], name: str) -> bytes:
 
 
 def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bool) -> bytes:
-    """A Cursor on Target event a line for each frame: the drone, its course, and its camera's field of view.
+    """A Cursor on Target event a line for each frame, which has a date: the drone, its course, and its camera's field
+    of view.
 
     `<sensor>` has the azimuth of the view, its angles across (`fov`) and along (`vfov`), the elevation (-90 is down)
-    and the distance to the ground along the axis, metres.
+    and the distance to the ground along the axis, metres. Where the camera looks nearly straight down the azimuth is
+    where the top of the picture points: the view's own swings all round with each tremor.
     """
     lines = []
     for number, each in enumerate(frames):
@@ -95,12 +107,20 @@ def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bo
 
 def _sensor(each: CorrectedFrame) -> dict[str, str]:
     down = math.sin(math.radians(-each.pitch_deg))
+    azimuth_deg, roll_deg = each.yaw_deg, each.roll_deg
+    if each.pitch_deg < _NADIR_DEG:
+        azimuth_deg, roll_deg = _body_angles_deg(each)[0], 0.0
     return {
-        "azimuth": f"{each.yaw_deg % 360:.1f}", "elevation": f"{each.pitch_deg:.1f}", "roll": f"{each.roll_deg:.1f}",
+        "azimuth": f"{azimuth_deg % 360:.1f}", "elevation": f"{each.pitch_deg:.1f}", "roll": f"{roll_deg:.1f}",
         "fov": f"{each.horizontal_fov_deg:.1f}", "vfov": f"{each.vertical_fov_deg:.1f}",
         "range": f"{each.above_ground_m / down:.0f}" if down > 0.05 else "0", "model": "camera", "type": "r-e",
         "version": "0.6",
     }
+
+
+def _body_angles_deg(each: CorrectedFrame) -> tuple[float, float, float]:
+    """Yaw, pitch and roll of a body that the camera looks straight down from, x to the top of the picture."""
+    return body_nadir_angles_from_rotation(site_from_gimbal_rotation(each.yaw_deg, each.pitch_deg, each.roll_deg))
 
 
 def _course(before: CorrectedFrame, now: CorrectedFrame) -> dict[str, str]:
