@@ -31,6 +31,7 @@ _OF_SITE: Mapping[str, str] = {
     "search/search.html": "Search: probability of detection, one file",
     "search/pod.tif": "Probability of detection, GeoTIFF",
     "search/pod.geojson": "Probability of detection, GeoJSON",
+    "search/plants.geojson": "Search: what was planted and what of it found, GeoJSON",
 }
 _OF_FLIGHT: Mapping[str, str] = {
     "report.html": "report, one file", "report.json": "report, JSON", "changes.html": "changes, one file",
