@@ -205,6 +205,20 @@ def test_the_command(folder: Path, model: Path, capsys: pytest.CaptureFixture[st
     assert "found well from 8 to 120 px" in capsys.readouterr().out
 
 
+def test_classes_on_request_are_named(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    model = rectangle_model(tmp_path / "asked.onnx", name="asked", on_request=["small object"])
+    assert cli.main(["models", "show", str(model)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert sum("reported only where asked for (--classes), from score" in line for line in lines) == 1
+    assert sum("reported from score" in line for line in lines) == 2
+    fetch_model(str(model), _hash(model))
+    assert cli.main(["models", "list"]) == 0
+    assert "person, car, small object (on request)" in capsys.readouterr().out
+
+
 def test_a_card_s_measurements_are_a_table(folder: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fetch_model(str(model), _hash(model))
     ap50, ap = {"value": 0.6224, "low": 0.4, "high": 0.77}, {"value": 0.264, "low": None, "high": None}

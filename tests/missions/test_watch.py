@@ -296,7 +296,9 @@ def test_only_the_classes_asked_for_in_the_frames_asked_for(
     with av.open(str(_video(flown))) as container:
         frames = sum(1 for _ in container.decode(video=0))
     assert frames % 7 != 1, "frames follow the last one that is searched"
-    counts = _read(tmp_path / "watch" / "report.json")["frames"]
+    report = _read(tmp_path / "watch" / "report.json")
+    counts = report["frames"]
+    assert report["looked_for"] == ["car"]
     assert (counts["read"], counts["detected"]) == (frames, len(updates)) == (frames, -(-frames // 7))
     assert [int(update.frame_name) % 7 for update in updates] == [0] * len(updates)
     lines = [json.loads(line) for line in (tmp_path / "watch" / "detections.jsonl").read_text().splitlines()]
@@ -305,6 +307,15 @@ def test_only_the_classes_asked_for_in_the_frames_asked_for(
     assert pictures == {int(line["frame"]) for line in lines}
     with pytest.raises(SettingsError, match=r"knows no 'boat'; it knows person, car"):
         _watch(flown, tmp_path / "other", detector, WatchSettings(classes=("boat",)))
+
+
+def test_what_is_looked_for_is_reported(photographs: Path, detector: TruthDetector, tmp_path: Path) -> None:
+    """Classes on request are in the report where they were searched for, not where the model knows them."""
+    finder = _Squares(replace(detector.info, on_request=("small object",)))
+    outputs = WatchOutputs(folder=tmp_path / "out")
+    list(watch(photographs, outputs=outputs, camera="aov=60", detector=finder))
+    assert _read(tmp_path / "out" / "report.json")["looked_for"] == ["person", "car"]
+    assert "4 frames were searched for person, car." in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_labels_can_be_read_back(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:

@@ -10,12 +10,12 @@ from sorvolo.store.pages.watch import watch_page
 
 _REPORT: dict[str, Any] = {
     "sorvolo": "0.1.0", "flight": "DJI<1>", "georeferenced": True, "first_frame": "2026-05-01T10:00:00Z",
-    "last_frame": "2026-05-01T10:01:00Z", "ended": "the source ended",
+    "last_frame": "2026-05-01T10:01:00Z", "ended": "the source ended", "looked_for": ["person", "car"],
     "objects": {"total": 2, "by_class": {"person": 1, "car": 1}},
     "frames": {"read": 100, "detected": 50, "with_detections": 20, "skipped": 3, "lost": 1, "reasons": {}},
     "detections": {"total": 40, "placed": 39, "not_placed": 1}, "latency_s": {"median": 0.05, "max": 0.2},
     "frames_per_second": 20.0, "seconds": {"total": 5.0, "detect": 4.0},
-    "model": {"name": "fast", "licence": "Apache-2.0 & others", "classes": ["person", "car"]},
+    "model": {"name": "fast", "licence": "Apache-2.0 & others", "classes": ["person", "car", "small object"]},
     "camera": {"origin": "guess"}, "telemetry": {"height": "above take-off", "attitude": "gimbal"},
     "notices": [{"code": "x", "count": 1, "text": "a <notice>"}], "warnings": ["a <warning>"],
     "settings": {"classes": []}, "versions": {"python": "3.11"},
@@ -36,7 +36,8 @@ def test_a_page_states_what_where_and_how_sure() -> None:
     way_m = np.column_stack([np.linspace(0, 50, 9), np.zeros(9)])
     page = checked(watch_page(_REPORT, tracks, {1: b"\xff\xd8picture"}, way_m))
     text = " ".join(page.text)
-    assert "Objects found: 1 car, 1 person." in text and "person, car" in text
+    assert "Objects found: 1 car, 1 person." in text
+    assert "50 frames were searched for person, car." in text
     assert "41.900000, 12.600000" in text and "1.2 m" in text and "5.0 m/s" in text and "passes" in text
     assert "a <notice>" in text and "a <warning>" in text and "DJI<1>" in text and "Apache-2.0 & others" in text
     assert page.names.count("img") == 1 and page.names.count("circle") == 4 and "polyline" in page.names

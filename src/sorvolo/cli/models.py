@@ -60,7 +60,7 @@ def _show_rows(rows: Sequence[Mapping[str, Any]]) -> None:
         table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(
-            escape(row["name"]), escape(row["preset"]), escape(", ".join(row["classes"])),
+            escape(row["name"]), escape(row["preset"]), escape(", ".join(_classes(row))),
             _light(row), row["precision"], f"{row['bytes'] / 1e6:.1f}",
             "with the package" if row["is_packaged"] else escape(row["path"]),
         )
@@ -101,7 +101,9 @@ def show(
     table.add_row("light", _light(facts))
     for each in info.classes:
         least_px, most_px = info.best_px[each]
-        words = f"reported from score {info.thresholds[each]:.2f} on; found well from {least_px:g} to {most_px:g} px"
+        reported = "reported only where asked for (--classes)," if each in info.on_request else "reported"
+        sizes = f"found well from {least_px:g} to {most_px:g} px"
+        words = f"{reported} from score {info.thresholds[each]:.2f} on; {sizes}"
         table.add_row(escape(each), words)
     for key, value in card.items():
         if key not in facts and key != _MEASURED:
@@ -260,6 +262,11 @@ def _facts(info: "ModelInfo") -> dict[str, Any]:
     from sorvolo.store.exports.plain import plain_json
 
     return {key: plain_json(value) for key, value in vars(info).items()}
+
+
+def _classes(facts: Mapping[str, Any]) -> list[str]:
+    """The classes of a model, with a word on those that are reported on request alone."""
+    return [f"{name} (on request)" if name in facts["on_request"] else name for name in facts["classes"]]
 
 
 def _light(facts: Mapping[str, Any]) -> str:

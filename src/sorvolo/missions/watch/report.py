@@ -83,8 +83,8 @@ def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:
 
 def build_watch_report(
     setup: FlightSetup, settings: WatchSettings, outputs: WatchOutputs, model: ModelInfo, provider: str, log: WatchLog,
-    tracks: Sequence[Track], notices: Sequence[Notice], warnings: Sequence[str], *, ended: str, skipped: int,
-    set_aside: int, on_ground: bool,
+    tracks: Sequence[Track], notices: Sequence[Notice], warnings: Sequence[str], *, looked_for: Sequence[str],
+    ended: str, skipped: int, set_aside: int, on_ground: bool,
 ) -> dict[str, Any]:
     """report.json of one watch; its keys are specified in docs/formats.md. Numbers that are not known are None."""
     source, camera = setup.source, setup.source.camera
@@ -98,6 +98,7 @@ def build_watch_report(
         "first_frame": utc_text(log.first_ns) if log.first_ns >= 0 else None,
         "last_frame": utc_text(log.last_ns) if log.last_ns >= 0 else None,
         "ended": ended,
+        "looked_for": list(looked_for),
         "objects": {"total": len(tracks), "by_class": count_by_class(tracks)},
         "frames": {
             "read": log.read, "detected": log.detected, "with_detections": log.with_detections, "skipped": skipped,

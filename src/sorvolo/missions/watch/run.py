@@ -275,7 +275,7 @@ class WatchRun:
         self.log.wall_s["write, beside the rest"] = self._files.seconds
         report = build_watch_report(
             self._setup, self._settings, self._outputs, self._detector.info, self._detector.provider, self.log, tracks,
-            notices, self._warnings(tracks), ended=ended, skipped=skipped,
+            notices, self._warnings(tracks), looked_for=self._classes, ended=ended, skipped=skipped,
             set_aside=self._places.set_aside, on_ground=not site.is_local,
         )
         crops = {track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()}

@@ -52,7 +52,8 @@ def watch_page(
         "watch.html", title=f"{report.get('flight')} - watch", flight=known(report.get("flight")),
         first=_when(report.get("first_frame")), last=_when(report.get("last_frame")),
         counts=counted_list(most_first(str(each["class"]) for each in tracks)),
-        frames=known(at(report, "frames", "detected")), looked_for=_searched_for(report),
+        frames=known(at(report, "frames", "detected")),
+        looked_for=", ".join(map(str, report.get("looked_for") or ["objects"])),
         warning_lines=report.get("warnings") or [],
         maps=_maps(report, tracks, drone_m), rows=_rows(tracks, is_local=is_local),
         systems=() if is_local else tuple(SYSTEMS.items()),
@@ -63,10 +64,6 @@ def watch_page(
         versions=join_words(f"Sorvolo {known(report.get('sorvolo'))},", _versions(report)),
     )
     return str(page)
-
-
-def _searched_for(report: Mapping[str, Any]) -> str:
-    return ", ".join(map(str, at(report, "settings", "classes") or at(report, "model", "classes") or ["objects"]))
 
 
 def _versions(report: Mapping[str, Any]) -> str:
