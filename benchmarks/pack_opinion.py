@@ -46,7 +46,7 @@ SOURCES = (
 INFO = {
     "name": NAME, "version": "3", "preset": "nanodet and lite0", "classes": ["person"], "thermal": False,
     "stride": CELL_PX, "thresholds": {"person": 0.5}, "best_px": {"person": [24, 200]}, "licence": "CC-BY-SA-4.0",
-    "created": f"{datetime.now(UTC):%Y-%m-%d}",
+    "created": f"{datetime.now(UTC):%Y-%m-%d}", "second_only": True,
     "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in SOURCES), "format": FORMAT,
 }
 

@@ -275,6 +275,26 @@ def test_verify_finds_changed_damaged_and_unknown_files(
     assert cli.main(["models", "verify", "none"]) == 1
 
 
+def test_a_model_that_only_looks_again_searches_nothing(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It finds nobody in whole pictures, so that an empty watch would mislead; it is asked by other models alone."""
+    monkeypatch.setenv("COLUMNS", "200")
+    model = rectangle_model(tmp_path / "again.onnx", name="again", second_only=True)
+    fetch_model(str(model), _hash(model))
+    for wanted in ("again", model):
+        with pytest.raises(InputError, match=r"'again' only looks again at what other models report.*default") as no:
+            Detector.load(wanted, provider="cpu", threads=1)
+        assert not {"again", "second-opinion"} & set(str(no.value).split("pictures: ")[1].split(", "))
+    with pytest.raises(InputError, match="installed are: ") as unknown:
+        find_model("gone")
+    assert "again" not in str(unknown.value) and "second-opinion" not in str(unknown.value)
+    assert cli.main(["models", "list"]) == 0
+    assert "person (in other models' reports)" in capsys.readouterr().out
+    assert cli.main(["models", "show", "again"]) == 0
+    assert "it cannot search whole pictures" in capsys.readouterr().out
+
+
 def test_help_of_every_command_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
     for command in ("list", "show", "fetch", "verify", "quantise"):
         assert cli.main(["models", command, "--help"]) == 0
@@ -290,6 +310,7 @@ def test_packaged_models_are_what_their_cards_state() -> None:
     for each in packaged:
         assert integrity(each) is Integrity.GOOD
         assert each.path.stat().st_size <= 40e6
+        assert read_info(each.path).second_only is (each.name == "second-opinion")
         assert read_info(each.path).classes == (("person",) if each.name == "second-opinion" else CLASSES)
     assert sum(each.path.stat().st_size for each in packaged) <= 55e6
     for name in ("default", "default-int8"):

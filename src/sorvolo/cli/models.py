@@ -99,6 +99,8 @@ def show(
     for name in ("preset", "version", "precision", "licence", "trained_on", "created", "path", "sha256"):
         table.add_row(name.replace("_", " "), escape(str(facts[name])))
     table.add_row("light", _light(facts))
+    if info.second_only:
+        table.add_row("use", "looks again at what other models report; it cannot search whole pictures (--model)")
     for each in info.classes:
         least_px, most_px = info.best_px[each]
         reported = "reported only where asked for (--classes)," if each in info.on_request else "reported"
@@ -265,7 +267,9 @@ def _facts(info: "ModelInfo") -> dict[str, Any]:
 
 
 def _classes(facts: Mapping[str, Any]) -> list[str]:
-    """The classes of a model, with a word on those that are reported on request alone."""
+    """The classes of a model, with a word on those that are not reported in every picture."""
+    if facts["second_only"]:
+        return [f"{name} (in other models' reports)" for name in facts["classes"]]
     return [f"{name} (on request)" if name in facts["on_request"] else name for name in facts["classes"]]
 
 

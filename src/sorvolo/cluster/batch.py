@@ -17,7 +17,8 @@ from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
 from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites, sites_of
 from sorvolo.cluster.table import FINAL, BatchTable, Row, State
 from sorvolo.cluster.watches import ENDING, existing_watches, is_watched, watch_outputs, watch_settings
-from sorvolo.detection.models import find_model
+from sorvolo.detection.models import demand_searching, find_model
+from sorvolo.detection.session import read_info
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.software import software
 
@@ -67,7 +68,7 @@ class BatchSettings:
 
             MapSettings(m_per_px=self.wish.m_per_px)  # states what is out of range
         if self.wish.model not in ("none", "default"):
-            find_model(self.wish.model)
+            demand_searching(read_info(find_model(self.wish.model)))
         if self.wish.copy_to:
             from sorvolo.missions.site.copy import open_end
 

@@ -83,7 +83,8 @@ class ModelInfo:
     in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
     person asks for them. `turned`: pictures from straight above are looked at twice, once turned by a quarter, and each
     class is reported from this mean score on; empty: once. `second_look`: classes whose reports are looked at again.
-    `pyramid`: classes that are looked for in several sizes where a picture's scale is not known.
+    `pyramid`: classes that are looked for in several sizes where a picture's scale is not known. `second_only`: it only
+    looks again at what other models report, and whole pictures mean nothing to it.
     """
 
     name: str
@@ -104,6 +105,7 @@ class ModelInfo:
     turned: Mapping[str, float] = field(default_factory=dict)
     second_look: Mapping[str, SecondLook] = field(default_factory=dict)
     pyramid: Mapping[str, Pyramid] = field(default_factory=dict)
+    second_only: bool = False
 
     @property
     def usual_classes(self) -> tuple[str, ...]:
@@ -154,7 +156,8 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
         str(fields["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
         bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request,
         turned=MappingProxyType(turned), second_look=MappingProxyType(_second_look(fields, classes)),
-        pyramid=MappingProxyType(_pyramid(fields, classes)), **texts,
+        pyramid=MappingProxyType(_pyramid(fields, classes)), second_only=bool(fields.get("second_only", False)),
+        **texts,
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
-from sorvolo.detection.models import find_model, thermal_model
+from sorvolo.detection.models import demand_searching, find_model, thermal_model
 from sorvolo.detection.pyramid import agreed_in_sizes, closer_for, sizes_for
 from sorvolo.detection.second_look import looked_again
 from sorvolo.detection.session import Seen, Session
@@ -60,10 +60,11 @@ class Detector:
         None takes as many as the process may use. `stand_in`: where a model knows daylight alone and names no other,
         any installed one that knows thermal frames looks at those; False to measure the model itself. `shared`: the
         socket of a process that holds the models for several, see `Session`. Raises InputError for a name that is not
-        installed and for a file that is missing, damaged or no model of Sorvolo's, SettingsError for a provider that
-        is not there.
+        installed, for a file that is missing, damaged or no model of Sorvolo's, and for a model that searches no whole
+        pictures (`second_only`); SettingsError for a provider that is not there.
         """
         session = Session(find_model(name_or_path), provider, threads, shared)
+        demand_searching(session.info)
         return cls(session, provider=provider, threads=threads, stand_in=stand_in, shared=shared)
 
     @property

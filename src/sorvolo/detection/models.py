@@ -10,6 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.session import read_info, read_model
 from sorvolo.errors import InputError
 
@@ -70,16 +71,23 @@ def find_model(name_or_path: str | Path) -> Path:
     return installed_model(name_or_path).path
 
 
+def demand_searching(info: ModelInfo) -> None:
+    """Raise InputError for a model that searches no whole pictures, with the installed ones that do."""
+    if info.second_only:
+        raise InputError(
+            f"the model '{info.name}' only looks again at what other models report, a whole picture means nothing to "
+            f"it; give one that searches pictures: {_searching()}"
+        )
+
+
 def installed_model(name: str) -> InstalledModel:
     """The installed model of this name; raises InputError where there is none, with those that are."""
-    there = installed_models()
-    for each in there:
+    for each in installed_models():
         if each.name == name:
             return each
-    names = ", ".join(each.name for each in there) or "none"
     raise InputError(
-        f"there is no model {name!r}; installed are: {names} (own ones lie in {models_folder()}); give one of them, a "
-        ".onnx file, or fetch one with `sorvolo models fetch`"
+        f"there is no model {name!r}; installed are: {_searching()} (own ones lie in {models_folder()}); give one of "
+        "them, a .onnx file, or fetch one with `sorvolo models fetch`"
     )
 
 
@@ -97,7 +105,7 @@ def thermal_model(classes: Sequence[str], name: str = "") -> Path | None:
             info = read_info(each.path)
         except InputError:
             continue
-        if info.thermal and set(info.classes) & set(classes):
+        if info.thermal and not info.second_only and set(info.classes) & set(classes):
             found.append((each.is_packaged, info.daylight, each.path))
     return min(found, key=lambda row: row[:2])[2] if found else None
 
@@ -127,6 +135,18 @@ def integrity(model: InstalledModel) -> Integrity:
 def file_sha256(path: Path) -> str:
     """The SHA-256 of a model file, in hexadecimal. Raises InputError where it cannot be read."""
     return hashlib.sha256(read_model(path)).hexdigest()
+
+
+def _searching() -> str:
+    """The names of the installed models that search pictures; those of files that cannot be used among them."""
+    return ", ".join(each.name for each in installed_models() if not _is_second_only(each.path)) or "none"
+
+
+def _is_second_only(path: Path) -> bool:
+    try:
+        return read_info(path).second_only
+    except InputError:
+        return False
 
 
 def _models_in(folder: Path, *, is_packaged: bool) -> list[InstalledModel]:

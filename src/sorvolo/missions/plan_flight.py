@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sorvolo.capture.calibration import camera_from_option
 from sorvolo.capture.camera_presets import find_presets
-from sorvolo.detection.models import find_model
+from sorvolo.detection.models import demand_searching, find_model
 from sorvolo.detection.session import read_info
 from sorvolo.detection.tiling import needed_px_per_m
 from sorvolo.errors import InputError, SettingsError
@@ -211,6 +211,7 @@ def _detector_bound(focal_px: float, settings: PlanSettings) -> dict[str, float]
     if settings.model == "none" or math.isnan(settings.person_m):
         return {}
     info = read_info(find_model(settings.model))
+    demand_searching(info)
     if "person" not in info.best_px:
         raise InputError(f"the model {settings.model} does not look for people; give another --model, or none")
     needed = needed_px_per_m(info, "person", settings.person_m)
