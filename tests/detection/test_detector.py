@@ -224,11 +224,12 @@ class TestThermalFramesAndDaylightModels:
         rectangle_model(self.folder / "another.onnx", name="another")
         rectangle_model(self.folder / "night.onnx", name="night", daylight=False, **high)
         detector = Detector.load(both, provider="cpu", threads=1)
-        assert len(detector.detect(picture)) == 3 and detector.notices == ()
+        assert len(detector.detect(picture)) == 3 and detector.notices == detector.others == ()
         assert len(detector.detect(grey)) == 0, "the thresholds are those of the model that looks"
         assert len(detector.detect(grey, least_score=0.4)) == 3
         (notice,) = detector.notices
         assert (notice.code, notice.count) == ("thermal_model", 2) and "'night', which was trained" in notice.text
+        assert [each.name for each in detector.others] == ["night"]
 
     def test_a_thermal_model_states_that_colour_is_not_known(self, picture: np.ndarray) -> None:
         night = rectangle_model(self.folder / "night.onnx", name="night", daylight=False)
@@ -236,6 +237,7 @@ class TestThermalFramesAndDaylightModels:
         detector.detect(picture[:, :, 0])
         assert detector.notices == ()
         detector.detect(picture)
+        detector.detect(picture, is_part=True)
         (notice,) = detector.notices
         assert (notice.code, notice.count) == ("daylight_untrained", 1) and "'night'" in notice.text
 

@@ -18,7 +18,7 @@ class Comparing:
 
     classes = CLASSES
     provider = "comparison"
-    notices = ()
+    notices = others = ()
     info = ModelInfo(
         "comparing", CLASSES, MappingProxyType(dict.fromkeys(CLASSES, 0.3)),
         MappingProxyType(dict.fromkeys(CLASSES, (4.0, 400.0))), version="1",
@@ -42,7 +42,7 @@ class Comparing:
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False,
+        overlapping: bool = False, is_part: bool = False,
     ) -> Detections:
         """Boxes around what differs from the frame that is most like the picture; cars are the large ones."""
         apart = [int(cv2.norm(each, image, cv2.NORM_L1)) for each in self._frames]

@@ -200,7 +200,7 @@ class Sees(Knowing):
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False,
+        overlapping: bool = False, is_part: bool = False,
     ) -> Detections:
         """See `Knowing.detect`."""
         x, y = image.shape[1] / 2, image.shape[0] / 2
@@ -243,7 +243,7 @@ def test_a_changes_own_pictures_are_searched_for_the_classes_asked_for(simulated
         def detect(
             self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
             least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-            overlapping: bool = False,
+            overlapping: bool = False, is_part: bool = False,
         ) -> Detections:
             asked.append(classes)
             return super().detect(image)
@@ -279,7 +279,7 @@ def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, 
         def detect(
             self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
             least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-            overlapping: bool = False,
+            overlapping: bool = False, is_part: bool = False,
         ) -> Detections:
             asked.append(tuple(classes or ()))
             assert overlapping, "a thing is seen in many frames, none is worth several sizes"

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import Affine
+from toy_models import rectangle_model
 from truth_detector import TruthDetector
 
 from small_flights import simulate_into, small_flight
@@ -190,7 +191,7 @@ def test_after_a_cut_places_and_objects_begin_anew(flown: Path, detector: TruthD
 class _InTheMiddle:
     """Finds a person in the middle of every picture that is not noise."""
 
-    classes, provider, notices = CLASSES, "the middle", ()
+    classes, provider, notices, others = CLASSES, "the middle", (), ()
 
     def __init__(self, info: ModelInfo) -> None:
         self.info = info
@@ -318,6 +319,27 @@ def test_what_is_looked_for_is_reported(photographs: Path, detector: TruthDetect
     assert "4 frames were searched for person, car." in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_the_model_that_looked_at_thermal_photos_is_reported(
+    photographs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With its thresholds and licence; each photo counts once, however often its middle is looked at as well."""
+    monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "models"))
+    (tmp_path / "models").mkdir()
+    night = {"name": "night", "licence": "CC0-1.0 of the night", "thresholds": dict.fromkeys(CLASSES, 0.77)}
+    rectangle_model(tmp_path / "models" / "night.onnx", **night)
+    day = rectangle_model(tmp_path / "models" / "day.onnx", name="day", thermal=False, thermal_by="night")
+    list(watch(
+        photographs, WatchSettings(model=str(day)), WatchOutputs(folder=tmp_path / "out"), camera="aov=60"
+    ))
+    report = _read(tmp_path / "out" / "report.json")
+    (other,) = report["other_models"]
+    assert report["model"]["name"] == "day" and other["name"] == "night"
+    assert (other["licence"], other["thresholds"]["car"]) == ("CC0-1.0 of the night", 0.77)
+    assert "CC0-1.0 of the night" in (tmp_path / "out" / "report.html").read_text()
+    notices = {each["code"]: each["count"] for each in report["notices"]}
+    assert notices["thermal_model"] == report["frames"]["detected"] == 4
+
+
 def test_labels_can_be_read_back(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
     updates = _watch(flown, tmp_path / "watch", detector, labels=("coco", "yolo"))
     labels = tmp_path / "watch" / "labels"
@@ -380,7 +402,7 @@ class _Squares:
     """A detector that needs no truth: bright squares on dark ground."""
 
     classes = ("person",)
-    provider, notices = "here", ()
+    provider, notices, others = "here", (), ()
 
     def __init__(self, info: Any) -> None:
         self.info = info

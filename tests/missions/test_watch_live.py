@@ -40,7 +40,7 @@ class _SlowDetector:
     """Bright rectangles are cars; it takes its time."""
 
     classes = ("car",)
-    provider, notices = "here", ()
+    provider, notices, others = "here", (), ()
     info = ModelInfo("slow", ("car",), {"car": 0.5}, {"car": (4.0, 60.0)}, licence="CC0-1.0")
 
     def detect(self, image: ImageRGB, **_: object) -> Detections:

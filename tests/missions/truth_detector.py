@@ -24,7 +24,7 @@ class TruthDetector:
 
     classes = CLASSES
     provider = "the truth"
-    notices = ()
+    notices = others = ()
 
     def __init__(
         self, simulated: Path, flight: str = "flight1", *, misses: float = 0.15, false_alarms: float = 0.1,
@@ -59,7 +59,7 @@ class TruthDetector:
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False,
+        overlapping: bool = False, early: object = None, is_part: bool = False,
     ) -> Detections:
         """The boxes of a frame of the flight; KeyError for any other picture, nothing in one without tiles: a part."""
         if tiles is None:
@@ -98,7 +98,7 @@ class Knowing(TruthDetector):
     def detect(
         self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False,
+        overlapping: bool = False, early: object = None, is_part: bool = False,
     ) -> Detections:
         """See `TruthDetector.detect`."""
         try:

@@ -78,6 +78,12 @@ class Detector:
         return self._session.info
 
     @property
+    def others(self) -> tuple[ModelInfo, ...]:
+        """The models that looked at pictures in its place, or a second time, as far as any did."""
+        night = [self._at_night] if self._at_night is not None and self._thermal_frames else []
+        return tuple(each.info for each in (*night, *self._opinions.values()))
+
+    @property
     def provider(self) -> str:
         """Where it runs, in words."""
         return self._session.provider
@@ -116,20 +122,20 @@ class Detector:
     def detect(
         self, image: Picture, *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, early: Early | None = None,
+        overlapping: bool = False, early: Early | None = None, is_part: bool = False,
     ) -> Detections: ...
 
     @overload
     def detect(
         self, image: Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False,
+        overlapping: bool = False, is_part: bool = False,
     ) -> list[Detections]: ...
 
     def detect(
         self, image: Picture | Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, early: Early | None = None,
+        overlapping: bool = False, early: Early | None = None, is_part: bool = False,
     ) -> Detections | list[Detections]:
         """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
 
@@ -142,6 +148,7 @@ class Detector:
         `overlapping`: others show the same (a video's frames), and none is worth looks in several sizes (`pyramid`).
         `early`, for one picture, is given the classes that have a look of their own (see `looks_for`), and what was
         found of them, while the picture is searched for the others; in the end the same objects are among all.
+        `is_part`: it is part of a frame, or made from frames, and counts as none in `notices`.
         Raises InputError for anything that is no picture, SettingsError for a class, score or tile that cannot be.
         """
         wanted = self._wanted(classes)
@@ -149,8 +156,10 @@ class Detector:
             raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
         sampling = math.nan if m_per_px is None else float(m_per_px)
         if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
-            return self._seen(image, tiles, sampling, wanted, least_score, from_above, overlapping, early)
-        return [self._seen(each, tiles, sampling, wanted, least_score, from_above, overlapping) for each in image]
+            return self._seen(image, tiles, sampling, wanted, least_score, from_above, overlapping, is_part, early)
+        return [
+            self._seen(each, tiles, sampling, wanted, least_score, from_above, overlapping, is_part) for each in image
+        ]
 
     def thresholds_for(
         self, picture: Picture, *, from_above: bool = False, m_per_px: float | None = None,
@@ -183,14 +192,15 @@ class Detector:
 
     def _seen(
         self, picture: Picture, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
-        least_score: float | None, from_above: bool, overlapping: bool, early: Early | None = None,
+        least_score: float | None, from_above: bool, overlapping: bool, is_part: bool, early: Early | None = None,
     ) -> Detections:
         thermal = is_thermal(picture)
-        session = self._session_for(thermal)
+        session = self._session if self._is_own(thermal=thermal) else self._night_session()
         rgb = rgb_from_picture(picture)
         asked = [name for name in wanted if name in session.info.classes]
         small = _too_small(asked, m_per_px, thermal=thermal, from_above=from_above)
-        self._too_small_frames += bool(small)
+        if not is_part:
+            self._count(thermal=thermal, too_small=bool(small))
         asked = [name for name in asked if name not in small]
         if not asked:
             return no_detections(self.classes)
@@ -238,13 +248,11 @@ class Detector:
         seen = _seen_turned(rgb, whole) if looks_twice else whole(rgb)
         return reported(self._seen_again(session, rgb, seen, asked), asked)
 
-    def _session_for(self, thermal: bool) -> Session:
-        """This model, or for a thermal frame an installed one: the one it names, or any where one may stand in."""
+    def _count(self, *, thermal: bool, too_small: bool) -> None:
+        """Count a frame for the notices."""
         self._daylight_frames += not (thermal or self.info.daylight)
-        if self._is_own(thermal=thermal):
-            return self._session
-        self._thermal_frames += 1
-        return self._night_session()
+        self._thermal_frames += not self._is_own(thermal=thermal)
+        self._too_small_frames += too_small
 
     def _is_own(self, *, thermal: bool) -> bool:
         """Whether this model itself looks at frames of such light, and no other is sought."""

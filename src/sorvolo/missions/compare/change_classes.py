@@ -56,5 +56,6 @@ class ChangeClasses:
         seen = self._detector.detect(
             picture, tiles="auto", m_per_px=change.patch.m_per_px,
             least_score=self._settings.lenient * min(thresholds.values(), default=0.5), classes=self._wanted,
+            is_part=True,
         )
         return class_of_change(change.patch, seen, thresholds, offset_px, self._settings)

@@ -21,6 +21,10 @@ class ObjectDetector(Protocol):
         """The model's own description."""
 
     @property
+    def others(self) -> tuple[ModelInfo, ...]:
+        """The models that looked at pictures in its place, or a second time, as far as any did."""
+
+    @property
     def provider(self) -> str:
         """Where it runs, in words."""
 
@@ -39,7 +43,7 @@ class ObjectDetector(Protocol):
     def detect(
         self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
         least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, early: Early | None = None,
+        overlapping: bool = False, early: Early | None = None, is_part: bool = False,
     ) -> Detections:
         """The objects in one picture, (H, W, 3), best first.
 
@@ -47,5 +51,5 @@ class ObjectDetector(Protocol):
         or None for the picture as a whole. None for `least_score` means each class's own; for `classes`, all.
         `from_above`: the camera looked about straight down. `overlapping`: others show the same, so that none is worth
         much time. `early` may be given classes, and all that is found of them, while the picture is still searched for
-        others.
+        others. `is_part`: it is part of a frame, or made from frames, and counts as none in the notices.
         """

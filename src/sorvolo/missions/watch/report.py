@@ -15,6 +15,7 @@ import sorvolo
 from sorvolo.capture.source import Source
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.geometry.coordinates import Coordinates, place_text
+from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.exports.plain import utc_text
@@ -82,7 +83,7 @@ def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:
 
 
 def build_watch_report(
-    setup: FlightSetup, settings: WatchSettings, outputs: WatchOutputs, model: ModelInfo, provider: str, log: WatchLog,
+    setup: FlightSetup, settings: WatchSettings, outputs: WatchOutputs, detector: ObjectDetector, log: WatchLog,
     tracks: Sequence[Track], notices: Sequence[Notice], warnings: Sequence[str], *, looked_for: Sequence[str],
     ended: str, skipped: int, set_aside: int, on_ground: bool,
 ) -> dict[str, Any]:
@@ -109,7 +110,8 @@ def build_watch_report(
             "set_aside": set_aside,
             "by_class": dict(log.found.most_common()),
         },
-        "model": {**_facts(model), "runs_on": provider},
+        "model": {**_facts(detector.info), "runs_on": detector.provider},
+        "other_models": [_facts(each) for each in detector.others],
         "camera": {
             "origin": camera.origin, "width_px": camera.camera.width_px, "height_px": camera.camera.height_px,
             "focal_px": camera.camera.fx_px, "focal_sigma_relative": camera.focal_sigma,

@@ -150,7 +150,7 @@ class WatchRun:
 
         def look(part: ImageRGB) -> Detections:
             known = None if earlier is None else earlier.looks[len(looks)]
-            looks.append(self._detector.detect(part, classes=classes) if known is None else known)
+            looks.append(self._detector.detect(part, classes=classes, is_part=True) if known is None else known)
             return looks[-1]
 
         def known(names: tuple[str, ...], found: Detections) -> None:
@@ -168,7 +168,7 @@ class WatchRun:
         found = self._detector.detect(
             frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes,
             from_above=self._places.is_from_above(frame), overlapping=overlapping,
-            **({} if self._early is None else {"early": known}),
+            early=None if self._early is None else known,
         ) if earlier is None else earlier.found
         if magnifier is not None:
             magnifier.see(found, frame.image)
@@ -274,8 +274,8 @@ class WatchRun:
         )
         self.log.wall_s["write, beside the rest"] = self._files.seconds
         report = build_watch_report(
-            self._setup, self._settings, self._outputs, self._detector.info, self._detector.provider, self.log, tracks,
-            notices, self._warnings(tracks), looked_for=self._classes, ended=ended, skipped=skipped,
+            self._setup, self._settings, self._outputs, self._detector, self.log, tracks, notices,
+            self._warnings(tracks), looked_for=self._classes, ended=ended, skipped=skipped,
             set_aside=self._places.set_aside, on_ground=not site.is_local,
         )
         crops = {track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()}

@@ -60,10 +60,15 @@ def watch_page(
         files=_LOCAL_FILES if is_local else _FILES,
         crops=shown, without_crop=len(tracks) - len(shown), course=_course(report),
         notices=[str(each["text"]) for each in report.get("notices") or []],
-        model=[(str(name), known(_plain(value))) for name, value in (report.get("model") or {}).items()],
+        model=_model_rows(report.get("model") or {}),
+        others=[_model_rows(each) for each in report.get("other_models") or []],
         versions=join_words(f"Sorvolo {known(report.get('sorvolo'))},", _versions(report)),
     )
     return str(page)
+
+
+def _model_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return [(str(name), known(_plain(value))) for name, value in facts.items()]
 
 
 def _versions(report: Mapping[str, Any]) -> str:
