@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 import pytest
 
-from sorvolo.detection.held_out import Checked
+from sorvolo.detection.held_out import Checked, best_sizes_px
 from sorvolo.detection.intervals import differences, draw_groups, group_tables, intervals
 from sorvolo.detection.metrics import (
     SIZES_PX,
@@ -277,7 +277,7 @@ def coco_row(row_id, index, label, box, crowd):
 
 
 @pytest.mark.parametrize(("people", "kept"), [(8, True), (60, False)])
-def test_few_held_out_labels_keep_the_threshold_of_the_model_before(people: int, kept: bool) -> None:
+def test_few_held_out_labels_keep_threshold_and_sizes_of_the_model_before(people: int, kept: bool) -> None:
     boxes = [square(20 * index, 0) for index in range(people)]
     truth = LabelledSet("held out", CLASSES, (picture(boxes, [0] * people),))
     found = [(box, 0, 0.99 - 0.8 * index / people) for index, box in enumerate(boxes)]
@@ -290,3 +290,8 @@ def test_few_held_out_labels_keep_the_threshold_of_the_model_before(people: int,
     assert chosen["car"].score == 0.4 and np.isnan(chosen["car"].recall)
     assert checked.thresholds(CLASSES)["car"].score == 0.5
     assert checked.too_few(CLASSES) == (("person", "car") if kept else ("car",))
+    scores = {"person": 0.2, "car": 0.4, "small object": 0.4}
+    before = {"person": (12.0, 130.0), "car": (40.0, 110.0)}
+    sizes = best_sizes_px(checked, scores, (), CLASSES, before)
+    assert sizes["car"] == before["car"] and (sizes["person"] == before["person"]) is kept
+    assert best_sizes_px(checked, scores, (), CLASSES)["person"] != before["person"]

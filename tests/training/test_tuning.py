@@ -109,6 +109,8 @@ def test_new_classes_are_learnt_from_the_beginning_and_reported(
     assert not_carried_on in printed
     assert any(not_carried_on in each and "person on semantic_drone 15.7 alone" in each for each in notices)
     assert any("car kept those of the model's aerial network by itself" in each for each in notices)
+    assert info.best_px["car"] == tuple(card["best_px"]["car"])
+    assert any("at which sizes they are found well: car kept those of the model default" in each for each in notices)
     assert "the judge of cars" in json.loads((out / "training.json").read_text())["not_carried_on"]
 
 

@@ -69,11 +69,16 @@ class Checked:
 
 
 def best_sizes_px(
-    checked: Checked, thresholds: Mapping[str, float], learnt: Sequence[LabelledSet], classes: Sequence[str]
+    checked: Checked, thresholds: Mapping[str, float], learnt: Sequence[LabelledSet], classes: Sequence[str],
+    before: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> dict[str, tuple[float, float]]:
     """Of each class the longer sides between which nine of ten objects lie: of those found where enough were held out,
-    else of those learnt from."""
-    found = found_sizes_px(checked, thresholds, classes)
+    else of those learnt from.
+
+    `before` are the sizes of the model that was learnt on from: kept for `too_few` classes, as its thresholds are.
+    """
+    kept = {name: before[name] for name in checked.too_few(classes) if name in before}
+    found = found_sizes_px(checked, thresholds, classes) | kept
     learnt_px = {name: np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)]) for name in classes}
     return {name: found.get(name) or _most_of(learnt_px[name]) for name in classes}
 

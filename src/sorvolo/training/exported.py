@@ -26,8 +26,8 @@ class ExportedModel:
     """A model file of ours to learn on from, and what it states about itself; `origin` names it in words.
 
     `thresholds` are those of the network that is learnt on from. `left` names in words what else the file joins with it
-    and a training does not carry on, `cost` what that costs, by the model's card. `on_request` and `thermal_by` are
-    those of `detection.contract.ModelInfo`.
+    and a training does not carry on, `cost` what that costs, by the model's card. `on_request`, `thermal_by` and
+    `best_px` are those of `detection.contract.ModelInfo`.
     """
 
     content: bytes
@@ -41,6 +41,7 @@ class ExportedModel:
     cost: tuple[str, ...] = ()
     on_request: tuple[str, ...] = ()
     thermal_by: str = ""
+    best_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def load_exported(

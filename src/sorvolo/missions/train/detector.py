@@ -26,6 +26,7 @@ from sorvolo.missions.train.start import (
     load_start,
     part_notices,
     request_notices,
+    size_notices,
     threshold_notices,
 )
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers, writing
@@ -285,6 +286,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     notices = _closing_notices(run, agreement, check)
     if isinstance(run.start, ExportedModel):
         notices += tuple(threshold_notices(run.start, checked.too_few(classes)))
+        notices += tuple(size_notices(run.start, checked.too_few(classes)))
         notices += tuple(request_notices(run.start, info["on_request"]))
     report = _report(run, info, agreement, len(exported), check, notices) | {
         "reported": {name: asdict(each) for name, each in thresholds.items()},
@@ -299,10 +301,11 @@ def _info(run: _Run, checked: Checked, thresholds: dict[str, float]) -> dict[str
     """What the model file states of itself."""
     learnt = [share.labelled for share in run.sets.shares]
     classes, (thermal, by_day) = run.sets.classes, run.sets.lights
+    before = run.start.best_px if isinstance(run.start, ExportedModel) else {}
     return {
         "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
         "classes": list(classes), "thresholds": thresholds,
-        "best_px": best_sizes_px(checked, thresholds, learnt, classes),
+        "best_px": best_sizes_px(checked, thresholds, learnt, classes, before),
         **_descent(run, ", ".join(each.name for each in learnt)),
         "thermal": thermal, "daylight": by_day, **_kept(run, checked, thermal=thermal),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),

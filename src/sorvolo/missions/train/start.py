@@ -105,6 +105,17 @@ def threshold_notices(start: ExportedModel, too_few: Sequence[str]) -> list[str]
     return notices
 
 
+def size_notices(start: ExportedModel, too_few: Sequence[str]) -> list[str]:
+    """Of which classes the new model keeps the sizes at which they are found well (`best_px`)."""
+    kept = [name for name in too_few if name in start.best_px]
+    if not kept:
+        return []
+    return [
+        "too few objects were held out to measure at which sizes they are found well: "
+        f"{', '.join(kept)} kept those of {start.origin}"
+    ]
+
+
 def kept_on_request(start: ExportedModel, classes: Sequence[str], too_few: Sequence[str]) -> tuple[str, ...]:
     """Which of the new model's classes are reported on request alone: those of the model before that are `too_few`
     among the held-out objects, since nothing shows that they became surer. None where no other class would be left."""
@@ -155,7 +166,7 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
     sha256 = file_sha256(path)
     start = ExportedModel(
         content, info.classes, f"the model {info.name}", sha256, info.licence, info.trained_on, info.thresholds,
-        on_request=info.on_request, thermal_by=info.thermal_by,
+        on_request=info.on_request, thermal_by=info.thermal_by, best_px=info.best_px,
     )
     return _aerial(start, info, path) if other_networks(content) else start
 
