@@ -126,6 +126,10 @@ def test_a_model_of_several_networks_without_its_card_keeps_no_thresholds(tmp_pa
     packaged = load_start("thermal", "fast")
     assert isinstance(packaged, ExportedModel)
     assert set(packaged.thresholds) == set(packaged.classes)
+    by_day = load_start("default", "fast")
+    assert isinstance(by_day, ExportedModel)
+    softening = "the softening of sharp pictures"  # in front of the aerial network, since version 12
+    assert softening in by_day.left and softening in part_notices(by_day)[0] and softening not in packaged.left
 
 
 def test_a_tuned_model_is_used_as_the_one_before_where_nothing_new_was_measured(
@@ -187,6 +191,10 @@ def test_models_that_do_not_fit_are_reported(
     assert "is of the preset fast, not accurate: train with --preset fast" in words(
         "--weights", str(learnt), "--preset", "accurate"
     )
+    assert "is of the preset yolo, which cannot be trained; there are fast, accurate, thesis" in words(
+        "--weights", told_as(preset="yolo")
+    )
+    assert "'second-opinion' only looks again at what other models report" in words("--weights", "second-opinion")
     accurate = told_as(preset="accurate")
     assert "cannot be learnt on from: a model file of the preset accurate lacks" in words(
         "--weights", accurate, "--preset", "accurate"

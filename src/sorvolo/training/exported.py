@@ -17,7 +17,10 @@ from sorvolo.training.faster_rcnn import FasterRCNN
 
 _WEIGHTED = ("Conv", "Gemm")
 _AERIAL = "/aerial/"  # of a model of two networks, such as the packaged one, the part that can be learnt on from
-_OTHER_PARTS = {"backbone": "NanoDet's network", "coco": "NanoDet's network", "judge": "the judge of cars"}
+_OTHER_PARTS = {
+    "backbone": "NanoDet's network", "coco": "NanoDet's network", "judge": "the judge of cars",
+    "softened": "the softening of sharp pictures",
+}
 _OF_CLASSES = "head.scores"  # the one layer with a row for each class; the background's comes last
 
 

@@ -11,6 +11,7 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.models import (
     HASH_KEY,
     InstalledModel,
+    demand_searching,
     file_sha256,
     find_model,
     installed_models,
@@ -161,6 +162,9 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
         raise InputError(
             f"{path} is in {info.precision} and cannot be learnt on from; give the float32 model that it was made from"
         )
+    demand_searching(info)
+    if info.preset and info.preset not in NETS:
+        raise InputError(f"{path} is of the preset {info.preset}, which cannot be trained; there are {', '.join(NETS)}")
     if info.preset and info.preset != preset:
         raise InputError(f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}")
     sha256 = file_sha256(path)
