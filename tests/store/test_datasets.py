@@ -69,6 +69,16 @@ def test_yolo_folders_and_names_as_tools_lay_them(tmp_path, picture, label, name
     assert labelled.pictures[0].group == "v"
 
 
+def test_look_alikes_that_are_ignored_are_counted(tmp_path):
+    boxes = "2 0.5 0.5 0.1 0.2\n2 0.2 0.5 0.1 0.2\n3 0.8 0.5 0.1 0.2\n"
+    folder = yolo_folder(tmp_path, boxes, "person\ncar\nTruck\nothers\n")
+    labelled = read_dataset(folder)
+    assert len(labelled.pictures[0].ignored_px) == 3 and not len(labelled.pictures[0].labels)
+    assert notices(labelled) == {"look_alikes_ignored": 2}, "what a set ignores itself is not counted"
+    assert "Truck (2)" in labelled.notices[0].text and "--classes" in labelled.notices[0].text
+    assert notices(read_dataset(folder, classes={"car": "car", "truck": "car"})) == {"unmapped_classes": 1}
+
+
 def test_linked_folders_count_and_rings_of_links_end(tmp_path):
     put.put_picture(tmp_path / "elsewhere" / "a_1.jpg")
     put.put_text(tmp_path / "set" / "labels" / "a_1.txt", "0 0.5 0.5 0.1 0.2\n")

@@ -287,6 +287,11 @@ def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
         path.write_text("0 1.5 1.5 0.1 0.1\n")
     with pytest.raises(InputError, match=r"has a labelled object that can be used .*outside"):
         _sets(place)
+    (place / "classes.txt").write_text("car\ntruck")
+    for path in (place / "labels").glob("*.txt"):
+        path.write_text("1 0.5 0.5 0.1 0.1\n")
+    with pytest.raises(InputError, match=r"that can be used .*look-alikes .*truck \(.*--classes"):
+        _sets(place)
 
 
 def test_a_model_that_finds_nothing_is_warned_of(

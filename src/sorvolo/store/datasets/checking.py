@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.store.datasets.groups import group_of
-from sorvolo.store.datasets.naming import Naming, nothing_maps, of_one_unnamed
+from sorvolo.store.datasets.naming import LOOK_ALIKES, Naming, nothing_maps, of_one_unnamed, plain
 from sorvolo.store.datasets.parsed import (
     SHARES,
     Finding,
@@ -43,7 +43,7 @@ def labelled_set(
             f"{place}: none of its {len(parsed.pictures)} pictures can be used: "
             + "; ".join(each.text for each in found)
         )
-    notices = (*found, *_left_out(counts, names))
+    notices = (*found, *_left_out(counts, names), *_look_alikes(counts, names))
     return LabelledSet(place.stem if place.is_file() else place.name, classes, pictures, frozenset(unlabelled), notices)
 
 
@@ -159,7 +159,22 @@ def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
     rest = {name: count for name, count in counts.items() if not names.is_target(name) and not names.is_ignored(name)}
     if not rest:
         return ()
-    found = ", ".join(f"{name} ({count})" for name, count in rest.items())
     total = sum(rest.values())
-    text = f"{total} boxes of classes that stand for none of ours left out: {found}"
+    text = f"{total} boxes of classes that stand for none of ours left out: {_counted(rest)}"
     return (Notice("unmapped_classes", total, text),)
+
+
+def _look_alikes(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
+    alike = {name: count for name, count in counts.items() if names.is_ignored(name) and plain(name) in LOOK_ALIKES}
+    if not alike:
+        return ()
+    total = sum(alike.values())
+    text = (
+        f"{total} boxes of look-alikes are neither right nor wrong, as regions to ignore: {_counted(alike)}; "
+        "--classes THEIRS=OURS,... states which of a set's classes count"
+    )
+    return (Notice("look_alikes_ignored", total, text),)
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} ({count})" for name, count in counts.items())

@@ -23,14 +23,16 @@ DEFAULT_CLASSES: Mapping[str, str] = {
 }
 """Common names and the class they stand for unless the user maps them; compared as `plain` writes them."""
 
-DEFAULT_IGNORED = frozenset({
-    "ignored regions", "ignored", "ignore", "dontcare", "dont care", "others", "crowd",
+LOOK_ALIKES = frozenset({
     "truck", "lorry", "bus", "othervehicle", "other vehicle",
     "biker", "bicyclist", "cyclist", "rider", "motorcyclist", "skater", "bicycle", "bike", "motor", "motorcycle",
     "motorbike", "scooter", "tricycle", "awning tricycle", "cart",
 })
-"""Names that become regions where nothing counts: what a set ignores itself, and what looks like a class of ours but
-is none (calling a truck a car, or a cyclist a person, is neither right nor wrong)."""
+"""Names of what looks like a class of ours but is none: calling a truck a car, or a cyclist a person, is neither right
+nor wrong."""
+
+DEFAULT_IGNORED = LOOK_ALIKES | {"ignored regions", "ignored", "ignore", "dontcare", "dont care", "others", "crowd"}
+"""Names that become regions where nothing counts: look-alikes, and what a set ignores itself."""
 
 
 def plain(name: str) -> str:
