@@ -156,6 +156,22 @@ def test_settings_out_of_range_are_errors(
     assert words in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", [
+    "watch x.mp4", "map x.mp4 --site SITE", "compare x.mp4 --site SITE", "search x.mp4 --site SITE",
+    "batch x.mp4 --root SITE --mission watch", "train x --out SITE", "evaluate detector default x",
+])
+@pytest.mark.parametrize("empty", ["", " ,"])
+def test_classes_that_name_none_are_an_error(
+    command: str, empty: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As of a variable of a shell that is not set; nothing is searched for all classes then."""
+    site = tmp_path / "site"
+    words = [str(site) if word == "SITE" else word for word in command.split()]
+    assert cli.main([*words, "--classes", empty]) == 1
+    assert f"--classes {empty!r} names no class" in " ".join(capsys.readouterr().err.split())
+    assert not site.exists()
+
+
 @pytest.mark.parametrize(("options", "words"), [
     (["--thermal", "0.3"], "give their number with --pictures"), (["--ground", "urbn"], "none of dirt, countryside"),
     (["--pictures", "3", "--preset", "survey", "--fps", "5"], "leave out --preset, --fps"),

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from sorvolo.cli.archive_table import export_command
 from sorvolo.cli.exit_codes import FAILED
-from sorvolo.cli.options import AsJson, names
+from sorvolo.cli.options import AsJson, wanted_classes
 from sorvolo.cli.progress import shown_work
 from sorvolo.survey.wording import counted
 
@@ -78,8 +78,8 @@ def find_command(
     first: Annotated[str, typer.Option("--from", help="From this date or time (UTC) on.")] = "",
     last: Annotated[str, typer.Option("--to", help="Up to this date or time (UTC).")] = "",
     classes: Annotated[
-        str, typer.Option("--class", help="Only flights that found one of these there, such as car,appeared.")
-    ] = "",
+        str | None, typer.Option("--class", help="Only flights that found one of these there, such as car,appeared.")
+    ] = None,
     within: Annotated[float, typer.Option(help="How near a finding must be to count as there, m.")] = 2.0,
     as_json: AsJson = False,
 ) -> None:
@@ -92,7 +92,7 @@ def find_command(
     from sorvolo.missions.archive.find import find_place
     from sorvolo.store.exports.plain import plain_json
 
-    found = find_place(root, at, first=first, last=last, classes=names(classes), within_m=within)
+    found = find_place(root, at, first=first, last=last, classes=wanted_classes(classes, "--class"), within_m=within)
     if as_json:
         typer.echo(json.dumps({"root": str(root), "at": at, "flights": plain_json(found)}, indent=1))
     else:

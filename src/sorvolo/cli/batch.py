@@ -16,7 +16,7 @@ from rich.table import Table
 
 from sorvolo.cli.exit_codes import FAILED, TO_CHECK
 from sorvolo.cli.map import ended_by_signal
-from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate, GiveUp, names
+from sorvolo.cli.options import AsJson, Camera, CotAuthority, CotCertificate, GiveUp, wanted_classes
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import show_path
 from sorvolo.cli.watch import (
@@ -133,7 +133,7 @@ def batch(
     blocks: Blocks = 1,
     share_detector: Shares = None,
     gpus: Gpus = 0.0,
-    classes: SearchedClasses = "",
+    classes: SearchedClasses = None,
     least_score: LeastScore = None,
     fps: SearchRate = None,
     save: SaveOption = Save.NONE,
@@ -162,7 +162,8 @@ def batch(
 
     context.obj.stop_words = f"stopped; run the same command to continue: {root} holds what is done"
     watch = WatchWish(
-        names(classes), least_score, fps, save.value, cot, _whole(cot_ca), _whole(cot_cert), alert_command, alert_url,
+        wanted_classes(classes), least_score, fps, save.value, cot, _whole(cot_ca), _whole(cot_cert), alert_command,
+        alert_url,
     )
     place = _place(copy_to, root)
     wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch, place)

@@ -26,7 +26,7 @@ from sorvolo.cli.options import (
     Offset,
     PlaceFormat,
     PlaceFormatOption,
-    names,
+    wanted_classes,
 )
 from sorvolo.cli.places import place_heading, place_words
 from sorvolo.cli.places_of_sites import Passing, not_sent, opened_site
@@ -90,7 +90,7 @@ TrustsMap = Annotated[
     bool, typer.Option("--trust-map", help="Compare even with a map that contradicts itself.")
 ]
 NamedClasses = Annotated[
-    str, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
+    str | None, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
 ]
 NamingModel = Annotated[str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")]
 
@@ -113,7 +113,7 @@ def compare(
     update: UpdatesMap = True,
     trust_map: TrustsMap = False,
     model: NamingModel = "default",
-    classes: NamedClasses = "",
+    classes: NamedClasses = None,
     give_up: GiveUp = 30.0,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     again: Again = False,
@@ -135,7 +135,7 @@ def compare(
     settings = CompareSettings(
         method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
         model=model, thesis=thesis_options(thesis or []), trusts_map=trust_map,
-        classes=names(classes),
+        classes=wanted_classes(classes),
     )
     with opened_site(site, writes=True) as place:
         results = compare_and_read_results(

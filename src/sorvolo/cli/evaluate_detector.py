@@ -30,7 +30,9 @@ ComparedModels = Annotated[
     list[str] | None, typer.Option(help="Another model to compare on the same pictures. Can be repeated.")
 ]
 LabelFormat = Annotated[str | None, typer.Option(help="Label format: coco, yolo, voc ...", show_default="recognised")]
-ClassNames = Annotated[str, typer.Option(help="Class names of the set as ours, such as 'Pedestrian=person,Van=car'.")]
+ClassNames = Annotated[
+    str | None, typer.Option(help="Class names of the set as ours, such as 'Pedestrian=person,Van=car'.")
+]
 IgnoredClasses = Annotated[str, typer.Option(help="Class names whose boxes are ignored.")]
 UnlabelledClasses = Annotated[str, typer.Option(help="Our classes that may be there without a label.")]
 VideoPattern = Annotated[str, typer.Option(help="Regular expression: use only pictures of matching videos.")]
@@ -54,7 +56,7 @@ def detector(
     data: LabelledPictures,
     compare: ComparedModels = None,
     form: LabelFormat = None,
-    classes: ClassNames = "",
+    classes: ClassNames = None,
     ignore: IgnoredClasses = "",
     unlabelled: UnlabelledClasses = "",
     group_pattern: GroupPattern = None,

@@ -27,6 +27,7 @@ from sorvolo.cli.options import (
     LiveTelemetry,
     Offset,
     names,
+    wanted_classes,
 )
 from sorvolo.cli.places_of_sites import Passing, not_sent, opened_site
 from sorvolo.cli.progress import show_progress
@@ -96,7 +97,7 @@ Model = Annotated[
     str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
 ]
 SearchedClasses = Annotated[
-    str, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
+    str | None, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
 ]
 Memory = Annotated[
     float | None,
@@ -145,7 +146,7 @@ def map_command(
     transform: TransformOption = Transform.SIMILARITY,
     thesis: StitchingValues = None,
     model: Model = "default",
-    classes: SearchedClasses = "",
+    classes: SearchedClasses = None,
     memory: Memory = None,
     give_up: GiveUp = 30.0,
     catalogue: CatalogueAddress = "",
@@ -174,7 +175,7 @@ def map_command(
     settings = MapSettings(
         method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
         model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
-        control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory, classes=names(classes),
+        control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory, classes=wanted_classes(classes),
     )
     with opened_site(site, writes=True) as place:
         catalogues = _catalogues(site, place.folder, catalogue)

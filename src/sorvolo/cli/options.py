@@ -72,9 +72,23 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-def class_names(text: str) -> dict[str, str] | None:
-    """ "Van=car,person" as {"Van": "car", "person": "person"}; None of nothing. Raises SettingsError."""
-    pairs = [each.partition("=") for each in names(text)]
+def wanted_classes(text: str | None, option: str = "--classes") -> tuple[str, ...]:
+    """The classes in a list with commas; none where the option is not given.
+
+    Raises SettingsError where it is given and names none, such as by a variable of a shell that is not set.
+    """
+    found = names(text or "")
+    if text is not None and not found:
+        raise SettingsError(f"{option} {text!r} names no class; give some, separated by commas, or leave {option} out")
+    return found
+
+
+def class_names(text: str | None) -> dict[str, str] | None:
+    """ "Van=car,person" as {"Van": "car", "person": "person"}; None where the option is not given.
+
+    Raises SettingsError for anything else, and as `wanted_classes`.
+    """
+    pairs = [each.partition("=") for each in wanted_classes(text)]
     if not all(theirs.strip() and (ours.strip() or not equals) for theirs, equals, ours in pairs):
         raise SettingsError(f"--classes {text!r}: give names as THEIRS=OURS, separated by commas")
     return {theirs.strip(): ours.strip() or theirs.strip() for theirs, _, ours in pairs} or None

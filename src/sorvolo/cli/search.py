@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sorvolo.cli.exit_codes import TO_CHECK
-from sorvolo.cli.options import AsJson, Camera, GiveUp, LiveTelemetry, names
+from sorvolo.cli.options import AsJson, Camera, GiveUp, LiveTelemetry, wanted_classes
 from sorvolo.cli.places_of_sites import opened_site
 from sorvolo.cli.progress import ProgressReport
 from sorvolo.cli.shown import show_notices_and_warnings, show_path
@@ -40,7 +40,9 @@ Segments = Annotated[
     Path | None, typer.Option(help="Segments as GeoJSON polygons with the property poa (probability of area).")
 ]
 DetectorName = Annotated[str, typer.Option(help="Detector: a model's name or a file.")]
-PlantedClasses = Annotated[str, typer.Option(help="Classes, with commas.", show_default="those it usually reports")]
+PlantedClasses = Annotated[
+    str | None, typer.Option(help="Classes, with commas.", show_default="those it usually reports")
+]
 Plants = Annotated[int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")]
 Enough = Annotated[float, typer.Option(help="Ground with a lower probability is a hole.")]
 ThroughCrowns = Annotated[
@@ -63,7 +65,7 @@ def search_command(
     area: SearchedArea = None,
     poa: Segments = None,
     model: DetectorName = "default",
-    classes: PlantedClasses = "",
+    classes: PlantedClasses = None,
     plants: Plants = 80,
     enough: Enough = 0.5,
     through_crowns: ThroughCrowns = 0.0,
@@ -94,7 +96,7 @@ def search_command(
 
     if not site and (unused := [name for name, value in (("--camera", camera), ("--telemetry", telemetry)) if value]):
         raise SettingsError(f"{unused[0]} is for flights that are mapped now; give --site FOLDER, or leave it out")
-    settings = SearchSettings(plants, names(classes), model, enough, through_crowns, _sun(sun), seed)
+    settings = SearchSettings(plants, wanted_classes(classes), model, enough, through_crowns, _sun(sun), seed)
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
         outputs = SearchOutputs(
             out or place.results("search"), area, poa, tuple(flight or ()), tuple(refly or ()), dji_drone

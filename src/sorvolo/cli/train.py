@@ -67,7 +67,7 @@ Patience = Annotated[int, typer.Option(help="Stop after this many of the 20 chec
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")]
 LabelFormat = Annotated[str | None, typer.Option(help="Label format.", show_default="recognised")]
-ClassNames = Annotated[str, typer.Option(help="Class names of the labels as ours: Pedestrian=person,Van=car.")]
+ClassNames = Annotated[str | None, typer.Option(help="Class names of the labels as ours: Pedestrian=person,Van=car.")]
 IgnoredClasses = Annotated[str, typer.Option(help="Class names whose boxes are ignored: Bicycle,DontCare.")]
 UnlabelledClasses = Annotated[str, typer.Option(help="Classes that may be in the pictures without a label: person.")]
 
@@ -90,7 +90,7 @@ def train(
     device: Device = "auto",
     resume: Resume = False,
     form: LabelFormat = None,
-    classes: ClassNames = "",
+    classes: ClassNames = None,
     ignore: IgnoredClasses = "",
     unlabelled: UnlabelledClasses = "",
     group_pattern: GroupPattern = None,

@@ -25,6 +25,7 @@ from sorvolo.cli.options import (
     PlaceFormat,
     PlaceFormatOption,
     names,
+    wanted_classes,
 )
 from sorvolo.cli.places import place_heading
 from sorvolo.cli.progress import ProgressReport, Resumed, rate_words
@@ -55,7 +56,7 @@ WatchTelemetry = Annotated[
 ]
 Model = Annotated[str, typer.Option(help="Detector: a model's name (sorvolo models list), or a file.")]
 SearchedClasses = Annotated[
-    str, typer.Option(help="Classes to search for, such as person,car.", show_default="all but those on request")
+    str | None, typer.Option(help="Classes to search for, such as person,car.", show_default="all but those on request")
 ]
 ResultsFolder = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")]
 SaveOption = Annotated[Save, typer.Option(help="Keep the frames with the objects drawn in.")]
@@ -97,7 +98,7 @@ def watch_command(
     telemetry: WatchTelemetry = "",
     camera: Camera = "",
     model: Model = "default",
-    classes: SearchedClasses = "",
+    classes: SearchedClasses = None,
     out: ResultsFolder = None,
     save: SaveOption = Save.NONE,
     labels: Labels = "",
@@ -135,7 +136,7 @@ def watch_command(
     from sorvolo.store.exports.cursor_on_target import COT_TYPES
 
     settings = WatchSettings(
-        model, names(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
+        model, wanted_classes(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
     )
     outputs = WatchOutputs(
         out, save.value, names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
