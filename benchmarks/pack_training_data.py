@@ -7,7 +7,6 @@ does every set without a licence that lets models be given on (below).
 """
 
 import argparse
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,8 +29,6 @@ LICENCES = {
 }
 """Of each set that may be packed, by its name."""
 
-_OWN_CARS = re.compile(r"DJI[-_]\d")  # the publisher's own pictures; harlem-* are of a video under YouTube's licence
-
 
 def main() -> None:
     """Write the file."""
@@ -45,7 +42,8 @@ def main() -> None:
     )
     wishes = parser.parse_args()
     starts = backbone_weights(wishes.weights)
-    shares = licensed(training_shares(wishes.data, wishes.simulated or wishes.file.parent / "simulated"))
+    shares = training_shares(wishes.data, wishes.simulated or wishes.file.parent / "simulated")
+    demand_licences(shares)
     write_archive(wishes.file, shares, starts, LICENCES)
     for line in described(shares):
         print(line)
@@ -66,18 +64,11 @@ def backbone_weights(files: Sequence[Path]) -> list[ImageNetWeights]:
     ]
 
 
-def licensed(shares: Sequence[Share]) -> list[Share]:
-    """The shares without pictures of aerial_cars that are not its publisher's own. Ends with the name of a set whose
-    licence is not known."""
+def demand_licences(shares: Sequence[Share]) -> None:
+    """End with the name of a set whose licence is not known."""
     for share in shares:
         if share.labelled.name not in LICENCES:
             raise SystemExit(f"no licence is known for {share.labelled.name}: it is not packed")
-    return [_own_cars(each) if each.labelled.name == "aerial_cars" else each for each in shares]
-
-
-def _own_cars(share: Share) -> Share:
-    own = [each for each in share.labelled.pictures if _OWN_CARS.match(Path(each.path).name)]
-    return replace(share, labelled=share.labelled.only(own))
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 import torch
 
-from sorvolo.errors import InputError
+from sorvolo.errors import InputError, SorvoloError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers
 from sorvolo.survey.objects import CLASSES
@@ -70,8 +70,15 @@ PACES: dict[Literal["fast", "accurate"], Pace] = {
 
 
 def main() -> None:
-    """Train and leave checkpoint, weights and the log in OUT."""
-    wishes = arguments()
+    """Train as the command line asks; what cannot be used ends it with one line."""
+    try:
+        train(arguments())
+    except SorvoloError as error:
+        raise SystemExit(f"error: {error}") from None
+
+
+def train(wishes: argparse.Namespace) -> None:
+    """Train and leave checkpoint, weights and the log in OUT. Raises InputError and SettingsError as its parts do."""
     torch.set_num_threads(wishes.threads)
     torch.set_flush_denormal(True)
     torch.manual_seed(wishes.seed)
@@ -112,7 +119,7 @@ def main() -> None:
 
 
 def arguments() -> argparse.Namespace:
-    """What the command line asks for, what the preset leaves open filled in."""
+    """What the command line asks for, what the preset leaves open filled in. Raises InputError without data."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="the folder of labelled sets, or the file of pack_training_data.py")
     parser.add_argument("out", type=Path)
@@ -130,6 +137,11 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--device", default="auto", help="auto (a GPU where torch sees one), cpu or cuda")
     parser.add_argument("--save-s", type=float, default=60.0, help="seconds between checkpoints: what a kill costs")
     wishes = parser.parse_args()
+    if not wishes.data.exists():
+        raise InputError(
+            f"there is no file {wishes.data}; make it by `make training-data DATA=FOLDER` and copy it here, or give "
+            "the folder of the labelled sets"
+        )
     if not wishes.data.is_file() and wishes.weights is None and wishes.start is None:
         parser.error("a folder has no weights to start from; give --weights or --start")
     if wishes.data.is_file() and wishes.thermal:

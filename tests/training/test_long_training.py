@@ -18,7 +18,7 @@ from real_data import real_data  # noqa: E402
 from sorvolo.errors import InputError, SettingsError  # noqa: E402
 from sorvolo.store.datasets import read_dataset  # noqa: E402
 from sorvolo.store.exports.label_files import write_coco  # noqa: E402
-from sorvolo.survey.labels import LabelledPicture, LabelledSet  # noqa: E402
+from sorvolo.survey.labels import LabelledSet  # noqa: E402
 from sorvolo.survey.objects import CLASSES  # noqa: E402
 from sorvolo.training.drawing import batches_from  # noqa: E402
 from sorvolo.training.joint import JointSettings, JointTraining  # noqa: E402
@@ -129,18 +129,46 @@ def test_weights_fit_the_network_that_their_run_names(recipe: Callable[[str], Mo
             assert [*again.state_dict()] == [*built.state_dict()]
 
 
-def test_only_pictures_of_a_known_licence_are_packed(recipe: Callable[[str], ModuleType]) -> None:
-    def share(name: str, *pictures: str) -> Share:
-        none = np.zeros((0, 4), np.float32)
-        made = tuple(LabelledPicture(each, 10, 10, "a", none, np.zeros(0), none) for each in pictures)
-        return Share(LabelledSet(name, CLASSES, made), 1.0)
+def test_only_sets_of_a_known_licence_are_packed(recipe: Callable[[str], ModuleType]) -> None:
+    def share(name: str) -> Share:
+        return Share(LabelledSet(name, CLASSES, ()), 1.0)
 
-    licensed = recipe("pack_training_data").licensed
-    (own,) = licensed([share("aerial_cars", "x/DJI_0005-0018.jpg", "x/harlem-0005.jpg", "x/DJI-007-01.jpg", "x/M.png")])
-    assert [Path(each.path).name for each in own.labelled.pictures] == ["DJI_0005-0018.jpg", "DJI-007-01.jpg"]
+    demand_licences = recipe("pack_training_data").demand_licences
+    demand_licences([share("hituav"), share("aerial_cars")])
     for name in ("cats", "sdd", "semantic_drone"):
         with pytest.raises(SystemExit, match=name):
-            licensed([share("hituav", "a.jpg"), share(name, "a.jpg")])
+            demand_licences([share("hituav"), share(name)])
+
+
+def test_only_the_publishers_own_cars_are_read(tmp_path: Path, recipe: Callable[[str], ModuleType]) -> None:
+    """For every training, from a folder as from a pack: another's video is under another licence."""
+    place = labelled_squares(tmp_path / "aerial_cars", 1, 5)
+    for old, new in zip(range(5), ("DJI_0005-0018", "harlem-0005", "DJI-007-01", "M", "DJI_0762-1")):
+        for part, end in (("images", ".png"), ("labels", ".txt")):
+            (place / part / f"flight0_{old:04d}{end}").rename(place / part / f"{new}{end}")
+    parts = recipe("detection_data").aerial_cars(tmp_path)
+    names = {part: [Path(each.path).stem for each in labelled.pictures] for part, labelled in parts.items()}
+    assert names == {"train": ["DJI-007-01", "DJI_0005-0018"], "val": [], "test": ["DJI_0762-1"]}
+
+
+def test_what_a_long_training_cannot_use_ends_it_with_one_line(
+    packed: Path, tmp_path: Path, recipe: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.set_flush_denormal", lambda _: True)  # it would hold for the tests after this one
+
+    def trained(data: Path, steps: str = "1") -> None:
+        words = ["--weights", "none", "--steps", steps, "--batch", "1", "--side", "64", "--device", "cpu"]
+        monkeypatch.setattr("sys.argv", ["train_default_model.py", str(data), str(tmp_path / "out"), *words])
+        recipe("train_default_model").main()
+
+    with pytest.raises(SystemExit, match=r"error: there is no file .*none\.zip; make it by `make training-data"):
+        trained(tmp_path / "none.zip")
+    (tmp_path / "cut.zip").write_bytes(packed.read_bytes()[:-300])
+    with pytest.raises(SystemExit, match=r"error: .* no whole archive"):
+        trained(tmp_path / "cut.zip")
+    trained(packed)
+    with pytest.raises(SystemExit, match=r"error: .*steps was 1, is 2"):
+        trained(packed, "2")
 
 
 def test_held_out_pictures_stay_out_of_the_pack(tmp_path: Path, recipe: Callable[[str], ModuleType]) -> None:
@@ -148,7 +176,8 @@ def test_held_out_pictures_stay_out_of_the_pack(tmp_path: Path, recipe: Callable
     sets, pack = recipe("detection_data"), recipe("pack_training_data")
     simulated = labelled_squares(tmp_path / "squares", 1, 1)
     write_coco(simulated / "boxes.json", read_dataset(simulated))
-    packed = pack.licensed(pack.training_shares(data, simulated))
+    packed = pack.training_shares(data, simulated)
+    pack.demand_licences(packed)
     paths = {each.path for share in packed for each in share.labelled.pictures}
     for read in (sets.hituav, sets.tinyperson, sets.aerial_cars):
         parts = read(data)
