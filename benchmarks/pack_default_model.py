@@ -39,8 +39,14 @@ VALIDATION_SEED, VALIDATION_PICTURES = 2, 60
 BEST_PX = {"person": [12, 130], "car": [14, 110], "small object": [10, 130]}  # what training shows it, and finds well
 LABELLED = (
     ("HIT-UAV, thermal, blocks of ids", "CC BY 4.0", "Suo et al., HIT-UAV, Scientific Data 2023"),
-    ("TinyPerson, videos", "CC BY 4.0", "Yu et al., Scale Match for Tiny Person Detection, 2020"),
-    ("a dummy on a pond, one video", "CC BY 4.0", "as published under that licence"),
+    (
+        "TinyPerson, videos", "CC BY 4.0",
+        "Yu et al., Scale Match for Tiny Person Detection, 2020; frames from web video",
+    ),
+    (
+        "a dummy on a pond, one video", "CC BY 4.0",
+        "published under that licence; the publisher's name is not known to us (see NOTICE)",
+    ),
     ("aerial cars, flights", "CC BY-SA", "Yauhen Kharuzhy and the Minsk OpenStreetMap community"),
     (f"simulated pictures, seed {SIMULATED_SEED}, {SIMULATED_PICTURES} of them", "Apache-2.0", "sorvolo simulate"),
     ("ground of two flights of photos, with composed small objects", "BSD-2-Clause, CC0", "brighton_beach, caliterra"),

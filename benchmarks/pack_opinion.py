@@ -40,8 +40,14 @@ SOURCES = (
     ("simulated pictures by Sorvolo", "Apache-2.0", "sorvolo simulate --pictures"),
     ("ground of caliterra (to its 46th photo)", "CC0", "see NOTICE"),
     ("HIT-UAV, thermal, blocks of ids", "CC BY 4.0", "Suo et al., HIT-UAV, Scientific Data 2023"),
-    ("TinyPerson, videos", "CC BY 4.0", "Yu et al., Scale Match for Tiny Person Detection, 2020"),
-    ("a dummy on a pond, one video", "CC BY 4.0", "as published under that licence"),
+    (
+        "TinyPerson, videos", "CC BY 4.0",
+        "Yu et al., Scale Match for Tiny Person Detection, 2020; frames from web video",
+    ),
+    (
+        "a dummy on a pond, one video", "CC BY 4.0",
+        "published under that licence; the publisher's name is not known to us (see NOTICE)",
+    ),
 )
 INFO = {
     "name": NAME, "version": "3", "preset": "nanodet and lite0", "classes": ["person"], "thermal": False,

@@ -21,8 +21,8 @@ from training_shares import training_shares
 
 LICENCES = {
     "hituav": "CC BY 4.0: Suo et al., HIT-UAV, Scientific Data 2023",
-    "tinyperson": "CC BY 4.0: Yu et al., Scale Match for Tiny Person Detection, 2020",
-    "mannequin": "CC BY 4.0, as published under that licence",
+    "tinyperson": "CC BY 4.0: Yu et al., Scale Match for Tiny Person Detection, 2020; frames from web video",
+    "mannequin": "CC BY 4.0, published under that licence; the publisher's name is not known to us (see NOTICE)",
     "aerial_cars": "CC BY-SA: Yauhen Kharuzhy and the Minsk OpenStreetMap community",
     "simulated": "Apache-2.0: sorvolo simulate",
     "ground": "BSD-2-Clause: brighton_beach, Piero Toffanin; CC0: caliterra",
