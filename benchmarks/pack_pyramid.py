@@ -35,7 +35,10 @@ def main() -> None:
         }
         path = wishes.home / f"{name}.onnx"
         path.write_bytes(with_fields(path.read_bytes(), fields))
-        card = json.loads(path.with_suffix(".json").read_text()) | fields
+        before = json.loads(path.with_suffix(".json").read_text())
+        card = before | fields
+        if "measured" in before and before["version"] != version:  # figures stay those of the version that gave them
+            card.setdefault("measured_by", f"version {before['version']}, whose networks are the same")
         if "of" in card:
             card["of"] = f"default, version {version}"
         card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 models_app = typer.Typer(no_args_is_help=True)
 
-_MEASURED = "measured"
-"""In a card: {set: {class: {labels, AP50, AP}}}, each share with value, low and high."""
+_MEASURED, _MEASURED_BY = "measured", "measured_by"
+"""In a card: {set: {class: {labels, AP50, AP}}}, each share with value, low and high; by which version and how, where
+that is not this one."""
 
 
 @models_app.callback()
@@ -108,11 +109,11 @@ def show(
         words = f"{reported} from score {info.thresholds[each]:.2f} on; {sizes}"
         table.add_row(escape(each), words)
     for key, value in card.items():
-        if key not in facts and key != _MEASURED:
+        if key not in facts and key not in (_MEASURED, _MEASURED_BY):
             table.add_row(escape(key.replace("_", " ")), escape(_in_words(value)))
     console = Console()
     console.print(table)
-    if measured := _measured(card.get(_MEASURED)):
+    if measured := _measured(card.get(_MEASURED), str(card.get(_MEASURED_BY, ""))):
         console.print(measured)
 
 
@@ -228,9 +229,10 @@ def _in_words(value: Any) -> str:
     return str(value)
 
 
-def _measured(sets: Any) -> Table | None:
+def _measured(sets: Any, by: str) -> Table | None:
     """The card's measurements, a row for each class of each set; None where it has none of the usual form."""
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title="measured on pictures held out", title_justify="left")
+    title = f"measured on pictures held out{f', by {escape(by)}' if by else ''}"
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title, title_justify="left")
     for name in ("set", "class", "labels", "AP50 %", "AP %"):
         table.add_column(name, justify="left" if name in ("set", "class") else "right", overflow="fold")
     for name, classes in sets.items() if isinstance(sets, Mapping) else ():
