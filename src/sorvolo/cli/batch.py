@@ -161,11 +161,10 @@ def batch(
     from sorvolo.cluster.orders import FlightWish, Mission, WatchWish
 
     context.obj.stop_words = f"stopped; run the same command to continue: {root} holds what is done"
+    place, wanted = _place(copy_to, root), wanted_classes(classes)
     watch = WatchWish(
-        wanted_classes(classes), least_score, fps, save.value, cot, _whole(cot_ca), _whole(cot_cert), alert_command,
-        alert_url,
+        wanted, least_score, fps, save.value, cot, _whole(cot_ca), _whole(cot_cert), alert_command, alert_url,
     )
-    place = _place(copy_to, root)
     wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch, place)
     settings = BatchSettings(wish, _site_by(site_by, mission), tries, stall, retry, blocks)
     report = _run(places, telemetry or (), root, settings, _Running(executor, workers, share_detector, gpus))
