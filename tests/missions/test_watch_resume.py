@@ -5,6 +5,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -85,7 +86,10 @@ def ids(alerts: Path, count: int) -> list[int]:
     return sent()
 
 
-def test_it_goes_on_and_notifies_nobody_twice(video: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_it_goes_on_and_notifies_nobody_twice(
+    video: Path, detector: TruthDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(detector, "others", (replace(detector.info, name="night"),))
     whole, amid, alerts = tmp_path / "whole", tmp_path / "amid", tmp_path / "sent"
     reported: list[int] = []
 
@@ -102,12 +106,14 @@ def test_it_goes_on_and_notifies_nobody_twice(video: Path, detector: TruthDetect
     shutil.move(amid, whole)
     alerts.unlink()
     detector.asked = 0
+    monkeypatch.setattr(detector, "others", ())  # it looked at earlier frames alone, and is in the report all the same
     resumed = watched(video, whole, detector, alerts)
     assert [each.is_resumed for each in resumed] == [number < _KILLED_AT for number in range(len(updates))]
     assert detector.asked == len(updates) - _KILLED_AT
     assert ids(alerts, len(found) - len(reported)) == found[len(reported):]
     assert content(whole) == content(tmp_path / "first")
     assert "run.journal" not in content(whole)
+    assert [each["name"] for each in json.loads((whole / "report.json").read_text())["other_models"]] == ["night"]
 
 
 def test_an_alert_that_was_not_sent_is_sent(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:

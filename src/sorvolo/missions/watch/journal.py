@@ -1,7 +1,7 @@
 """A watch's detections and sent notices, in its journal: a killed watch continues where it was."""
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from sorvolo.store.site.journal_records import RecordPacker, unpacked
 from sorvolo.survey.objects import Detections
 from sorvolo.tracking.following import Located
 
-_SENT, _FRAME = "sent", "frame"
+_SENT, _FRAME, _MODEL = "sent", "frame", "model"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +48,25 @@ class Sent:
     track_id: int
 
 
+@dataclass(frozen=True)
+class LookedModel:
+    """What the report states of a model that looked at pictures besides the one that was asked for."""
+
+    facts: Mapping[str, Any]
+
+
 class WatchJournal:
     """A watch's frames and what was sent, in a journal of its folder; `sent` is what a killed watch had sent.
 
-    `notes` are those of a live source.
+    `models` are those that had looked, in their order. `notes` are those of a live source.
     """
 
     def __init__(self, journal: RunJournal, notes: SourceNotes | None = None) -> None:
         self.file = journal
         self._notes = notes
-        self.sent = frozenset(each for each in self._read() if isinstance(each, Sent))
+        read = [each for each in self._read() if not isinstance(each, SearchedFrame)]
+        self.sent = frozenset(each for each in read if isinstance(each, Sent))
+        self.models = tuple(each for each in read if isinstance(each, LookedModel))
         self._replay = ResumedFrames(self.frames())
 
     @property
@@ -83,17 +92,21 @@ class WatchJournal:
         """Note what a receiver has got; from any thread. Raises StoreError when the disk is full."""
         self.file.append(Entry(_SENT, {"receiver": receiver, "track": track_id}))
 
+    def keep_model(self, model: LookedModel) -> None:
+        """Note a model that looked for the first time. Raises StoreError when the disk is full."""
+        self.file.append(Entry(_MODEL, model.facts))
+
     def next_frame(self, index: int) -> SearchedFrame | None:
         """The next frame that a killed watch searched, if it is the one of this index."""
         return None if self.is_live else self._replay.take(index)
 
-    def _read(self) -> Iterator[SearchedFrame | Sent]:
+    def _read(self) -> Iterator[SearchedFrame | Sent | LookedModel]:
         """What a killed watch noted, in order; it ends where an entry is not as one was written."""
         for entry in self.file.entries():
             if entry.kind in (BEGUN, SAMPLES):
                 continue
             try:
-                read = _sent(entry) if entry.kind == _SENT else _frame(entry)
+                read = _noted(entry)
             except (KeyError, TypeError, ValueError, IndexError, SorvoloError):
                 return  # a damaged entry: what comes after it is done again
             yield read
@@ -150,6 +163,12 @@ class WatchOrder:
 
     def _at(self, folder: Path, request: str) -> RunJournal:
         return RunJournal(folder / JOURNAL, content_sha256(request), 0, sorvolo.__version__)
+
+
+def _noted(entry: Entry) -> SearchedFrame | Sent | LookedModel:
+    if entry.kind == _MODEL:
+        return LookedModel(entry.values)
+    return _sent(entry) if entry.kind == _SENT else _frame(entry)
 
 
 def _frame(entry: Entry) -> SearchedFrame:

@@ -82,12 +82,24 @@ def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:
     return most_first(each.label for each in tracks if each.confirmed)
 
 
+def model_facts(model: ModelInfo) -> dict[str, Any]:
+    """What the report states of a model that looked at pictures."""
+    return {
+        "name": model.name, "version": model.version, "preset": model.preset, "precision": model.precision,
+        "classes": list(model.classes), "thresholds": dict(model.thresholds), "licence": model.licence,
+        "trained_on": model.trained_on, "created": model.created,
+    }
+
+
 def build_watch_report(
     setup: FlightSetup, settings: WatchSettings, outputs: WatchOutputs, detector: ObjectDetector, log: WatchLog,
     tracks: Sequence[Track], notices: Sequence[Notice], warnings: Sequence[str], *, looked_for: Sequence[str],
-    ended: str, skipped: int, set_aside: int, on_ground: bool,
+    others: Sequence[Mapping[str, Any]], ended: str, skipped: int, set_aside: int, on_ground: bool,
 ) -> dict[str, Any]:
-    """report.json of one watch; its keys are specified in docs/formats.md. Numbers that are not known are None."""
+    """report.json of one watch; its keys are specified in docs/formats.md. Numbers that are not known are None.
+
+    `others` are the `model_facts` of the models that looked at pictures besides the detector's own.
+    """
     source, camera = setup.source, setup.source.camera
     total = sum(log.found.values())
     seconds = log.seconds
@@ -110,8 +122,8 @@ def build_watch_report(
             "set_aside": set_aside,
             "by_class": dict(log.found.most_common()),
         },
-        "model": {**_facts(detector.info), "runs_on": detector.provider},
-        "other_models": [_facts(each) for each in detector.others],
+        "model": {**model_facts(detector.info), "runs_on": detector.provider},
+        "other_models": list(others),
         "camera": {
             "origin": camera.origin, "width_px": camera.camera.width_px, "height_px": camera.camera.height_px,
             "focal_px": camera.camera.fx_px, "focal_sigma_relative": camera.focal_sigma,
@@ -151,11 +163,3 @@ def source_notices(source: Source, log: WatchLog) -> tuple[Notice, ...]:
     unusable = (Notice("lost_frames", lost, f"{counted(lost, 'frame')} could not be used: {reasons}"),) if lost else ()
     others = [each for each in source.notices() if not (lost and each.code in _OF_LOST_FRAMES)]
     return (*source.telemetry.notices, *others, *unusable)
-
-
-def _facts(model: ModelInfo) -> Mapping[str, Any]:
-    return {
-        "name": model.name, "version": model.version, "preset": model.preset, "precision": model.precision,
-        "classes": list(model.classes), "thresholds": dict(model.thresholds), "licence": model.licence,
-        "trained_on": model.trained_on, "created": model.created,
-    }

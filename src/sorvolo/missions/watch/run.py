@@ -16,10 +16,16 @@ from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
-from sorvolo.missions.watch.journal import SearchedFrame, WatchJournal
+from sorvolo.missions.watch.journal import LookedModel, SearchedFrame, WatchJournal
 from sorvolo.missions.watch.notifier import Notifier
 from sorvolo.missions.watch.places import Places
-from sorvolo.missions.watch.report import WatchLog, build_watch_report, count_by_class, source_notices
+from sorvolo.missions.watch.report import (
+    WatchLog,
+    build_watch_report,
+    count_by_class,
+    model_facts,
+    source_notices,
+)
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.detection_files import write_detections
@@ -118,6 +124,7 @@ class WatchRun:
         self._settings, self._outputs, self._folder = settings, outputs, folder
         self._classes = settings.classes or detector.info.usual_classes
         self._magnifier = SceneMagnifier(detector.info, self._classes)
+        self._others = list(journal.models)  # that looked besides it, in the order of their first looks
         self.log = WatchLog()
         self._stack = ExitStack()
         self._files = self._stack.enter_context(WatchFiles(folder, outputs, places.site))
@@ -188,8 +195,16 @@ class WatchRun:
         with self.log.stage("track"):
             taken = self._places.take(frame, time_ns, searched.found)
         if not is_resumed:
+            self._note_others()
             self._journal.keep_frame(replace(searched, located=taken.located if self._journal.is_live else None))
         return self._update(frame, time_ns, searched, taken, arrived_s, is_resumed=is_resumed)
+
+    def _note_others(self) -> None:
+        """Note each model that looked at a picture for the first time."""
+        known = {each.facts["name"] for each in self._others}
+        for each in [LookedModel(model_facts(info)) for info in self._detector.others if info.name not in known]:
+            self._journal.keep_model(each)
+            self._others.append(each)
 
     def recall(self, searched: SearchedFrame) -> WatchUpdate:
         """Take in a frame of a live source that a watch that was killed had searched, as far as its picture is not
@@ -275,8 +290,8 @@ class WatchRun:
         self.log.wall_s["write, beside the rest"] = self._files.seconds
         report = build_watch_report(
             self._setup, self._settings, self._outputs, self._detector, self.log, tracks, notices,
-            self._warnings(tracks), looked_for=self._classes, ended=ended, skipped=skipped,
-            set_aside=self._places.set_aside, on_ground=not site.is_local,
+            self._warnings(tracks), looked_for=self._classes, others=[each.facts for each in self._others],
+            ended=ended, skipped=skipped, set_aside=self._places.set_aside, on_ground=not site.is_local,
         )
         crops = {track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()}
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
