@@ -276,7 +276,7 @@ def coco_row(row_id, index, label, box, crowd):
             "bbox": [left, top, right - left, bottom - top], "area": (right - left) * (bottom - top)}
 
 
-@pytest.mark.parametrize(("people", "kept"), [(8, True), (60, False)])
+@pytest.mark.parametrize(("people", "kept"), [(8, True), (40, True), (60, False)])
 def test_few_held_out_labels_keep_threshold_and_sizes_of_the_model_before(people: int, kept: bool) -> None:
     boxes = [square(20 * index, 0) for index in range(people)]
     truth = LabelledSet("held out", CLASSES, (picture(boxes, [0] * people),))
