@@ -9,7 +9,8 @@ Hidden people are of two renderings: drawn limb by limb, as the plants are (othe
 plain figures of simulated flights, which no plant is like. Poses of the frames are the true ones. What crowns hide by
 the measure's own judgement is counted apart.
 
-Writes results/search_pod.json.
+Writes results/search_pod.json, and with it the plot docs/images/search-stated-found.svg; --plot draws that alone, of
+the results that are there.
 """
 
 import argparse
@@ -50,6 +51,7 @@ from sorvolo.simulation.settings import (
 )
 from sorvolo.simulation.thermal import heat_picture, warm_day
 from sorvolo.simulation.world import build_day, is_free
+from sorvolo.store.pages.plots import stated_and_found
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status
 from sorvolo.tracking.laying import LaidSighting, lay_on_ground
@@ -57,6 +59,12 @@ from sorvolo.tracking.planted import reported_plants
 from sorvolo.tracking.view_evidence import least_seen
 
 RESULTS = Path(__file__).parent / "results" / "search_pod.json"
+PLOT = Path(__file__).parents[1] / "docs" / "images" / "search-stated-found.svg"
+COLOURS = ("#2660c9", "#b86e00", "#12805c", "#8c3fc4", "#6b7a76")  # c0 to c4 of the pages
+STYLE = (
+    "svg{background:#fff}.label{fill:#55635f;font:12px sans-serif}.grid{stroke:#dfe5e2}"
+    ".line{fill:none;stroke-width:1.5}.median{stroke:#1d2624;stroke-dasharray:4 4}"
+)
 SUN_DEG = (215.0, 48.0)  # of every first day in the simulation
 PEOPLE, CARS = 28, 12  # hidden in a flight
 CLASSES = ("person", "car")
@@ -73,7 +81,11 @@ def main() -> None:
     parser.add_argument("--plants", type=int, default=60)
     parser.add_argument("--minutes", type=float, default=1e9, help="Begin no flight after so many minutes.")
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--plot", action="store_true", help="Draw the results that are there.")
     wishes = parser.parse_args()
+    if wishes.plot:
+        draw(json.loads(wishes.results.read_text())["groups"])
+        return
     started = time.monotonic()
     detector = Detector.load("default", provider="cpu", threads=1)
     rows: list[dict] = []
@@ -91,6 +103,25 @@ def main() -> None:
         }
         wishes.results.write_text(json.dumps(document, indent=1) + "\n")
         print(number, seed, {name: each["bins"] for name, each in summarised(rows).items()}, flush=True)
+    if wishes.results == RESULTS:
+        draw(summarised(rows))
+
+
+def draw(groups: dict) -> None:
+    """Found over stated of each group, by fifths of what was stated, with what the colours are."""
+    names = [name for name in groups if name not in ("all but plain figures", "people, thermal, plain figures")]
+    names = [name for name in names if groups[name]["bins"]]
+    rows = [
+        (name, each["stated"], each["found"], each["found_low"], each["found_high"], each["count"])
+        for name in names for each in groups[name]["bins_whole"]
+    ]
+    style = STYLE + "".join(f".c{k}{{stroke:{colour}}}" for k, colour in enumerate(COLOURS))
+    words = "".join(
+        f'<text x="60" y="{32 + 16 * k}" style="font:12px sans-serif;fill:{COLOURS[k]}">{name}</text>'
+        for k, name in enumerate(names)
+    )
+    drawn = str(stated_and_found(rows)).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
+    PLOT.write_text(drawn.replace("<title>", f"<style>{style}</style><title>", 1).replace("</svg>", f"{words}</svg>"))
 
 
 def flown(seed: int, number: int) -> tuple[SimulatedFlight, list]:
