@@ -231,6 +231,12 @@ def test_sentences_with_a_right_checksum_and_nonsense_fields(body, kind):
     assert all(np.isfinite(column[~np.isnan(column)]).all() for column in telemetry.columns.values())
 
 
+@pytest.mark.parametrize("kind", ["GGA", "RMC"])
+def test_a_sentence_that_was_cut_after_its_time_states_no_fix(kind):
+    telemetry = nmea.read((sentence(f"GP{kind},115959.00") + flight(2)).encode(), "a.log")
+    assert len(telemetry) >= 2 and np.isfinite(telemetry.columns["latitude_deg"]).sum() == 2
+
+
 def test_a_receiver_that_does_not_know_the_time_yet():
     telemetry = nmea.read((sentence("GPGGA,,,,,,0,00,99.9,,,,,,") + flight(2)).encode(), "a.log")
     assert len(telemetry) == 2

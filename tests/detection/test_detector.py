@@ -229,7 +229,7 @@ class TestThermalFramesAndDaylightModels:
         assert len(detector.detect(grey, least_score=0.4)) == 3
         (notice,) = detector.notices
         assert (notice.code, notice.count) == ("thermal_model", 2) and "'night', which was trained" in notice.text
-        assert [each.name for each in detector.others] == ["night"]
+        assert [(each.name, count) for each, count in detector.others] == [("night", 2)]
 
     def test_a_thermal_model_states_that_colour_is_not_known(self, picture: np.ndarray) -> None:
         night = rectangle_model(self.folder / "night.onnx", name="night", daylight=False)

@@ -191,16 +191,18 @@ def test_a_flight_is_searched_once(site: Path, tmp_path: Path) -> None:
     assert basis.seed == 1 and len(searched.plants) == len(plants["features"]) and searched.looked == shown
     (out / "plants.geojson").write_text(json.dumps(plants)[:-400])
     assert not read_plants(out) and not read_plants(tmp_path)
+    (tmp_path / "plants.geojson").write_text('{"format": 1, "flights": [], "features": []}')
+    assert not read_plants(tmp_path)
     next(search_site(site, settings, SearchOutputs(out), detector))  # what cannot be read is measured anew
     assert detector.shown == shown + 1
 
 
 def test_plants_serve_another_search_of_the_same_frames_alone() -> None:
-    basis = Basis("1", "model", "frames", False, 0.0, None, ("person", "car"), 80, 1, "")
+    basis = Basis("1", "model", "frames", "", 0.0, None, ("person", "car"), 80, 1, "")
     assert basis.serves(replace(basis, plants=20, seed=4, area="field"))
     assert basis.serves(replace(basis, classes=("car",)))
     for other in (
-        {"model": "x"}, {"frames": "x"}, {"program": "2"}, {"heights": True}, {"through_crowns": 0.3},
+        {"model": "x"}, {"frames": "x"}, {"program": "2"}, {"heights": "x"}, {"through_crowns": 0.3},
         {"sun_deg": (1.0, 2.0)}, {"classes": ("small object",)},
     ):
         assert not basis.serves(replace(basis, **other))

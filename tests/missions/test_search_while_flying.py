@@ -218,7 +218,7 @@ def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(s
         (name,) = flights_to_search(archive, ())
         earlier = EarlierFlights(archive, "other", prepared, replace(settings, plants=90, seed=7), outputs)
         for _ in search_frames(archive, name):
-            assert not earlier.frames and earlier.look()
+            assert not earlier.frames and earlier.uncounted_m and earlier.look()
         assert not earlier.look()
         frames_m = [each.placed.outline_m for each in earlier.frames[name]]
         (flight,) = earlier.on(cells_of(frames_m, archive.site(), None))
@@ -263,7 +263,8 @@ def test_a_flight_that_is_stopped_leaves_no_waypoints(photographed: Path, site: 
     thread.join()
     page = (tmp_path / "out" / "search.html").read_text()
     assert "when the flight was stopped" in page and "refresh" not in page and not refly.exists()
-    assert "of the flight in and 1 flight before it" in page
+    assert "of the flight in and 1 flight before it" in page and "no waypoints were written" not in page
+    assert "the flight was stopped, and its waypoints were taken away" in page
     report = json.loads((tmp_path / "out" / "search.json").read_bytes())
     assert report["so_far"]["earlier"] == ["photos"] and isinstance(whole, dict)
     assert [(each["name"], each["measured_before"]) for each in report["flights"]] == [("photos", True), ("in", False)]

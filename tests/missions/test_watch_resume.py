@@ -89,7 +89,7 @@ def ids(alerts: Path, count: int) -> list[int]:
 def test_it_goes_on_and_notifies_nobody_twice(
     video: Path, detector: TruthDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(detector, "others", (replace(detector.info, name="night"),))
+    monkeypatch.setattr(detector, "night", replace(detector.info, name="night"))
     whole, amid, alerts = tmp_path / "whole", tmp_path / "amid", tmp_path / "sent"
     reported: list[int] = []
 
@@ -106,7 +106,7 @@ def test_it_goes_on_and_notifies_nobody_twice(
     shutil.move(amid, whole)
     alerts.unlink()
     detector.asked = 0
-    monkeypatch.setattr(detector, "others", ())  # it looked at earlier frames alone, and is in the report all the same
+    monkeypatch.setattr(detector, "night", None)  # it looked at earlier frames alone, and is in the report all the same
     resumed = watched(video, whole, detector, alerts)
     assert [each.is_resumed for each in resumed] == [number < _KILLED_AT for number in range(len(updates))]
     assert detector.asked == len(updates) - _KILLED_AT

@@ -24,7 +24,14 @@ class TruthDetector:
 
     classes = CLASSES
     provider = "the truth"
-    notices = others = ()
+    notices = ()
+    night: ModelInfo | None = None
+    """A model that looks at all pictures in its place."""
+
+    @property
+    def others(self) -> tuple[tuple[ModelInfo, int], ...]:
+        """`night`, as often as pictures were asked about."""
+        return () if self.night is None or not self.asked else ((self.night, self.asked),)
 
     def __init__(
         self, simulated: Path, flight: str = "flight1", *, misses: float = 0.15, false_alarms: float = 0.1,

@@ -6,6 +6,7 @@ from scipy.ndimage import gaussian_filter
 
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.search.cells import cells_over
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.exports.pod_files import PICTURE_PX, CellGrid, pod_picture, regions_of, swollen_polygons
 from sorvolo.survey.area import Area
@@ -43,4 +44,16 @@ def test_a_picture_shows_holes_beyond_the_map() -> None:
         assert hole[3] == 255 and hole[0] == hole[1] and 140 < hole[0] < 170
         assert rgba[height - 165 * times, 150 * times, 3] == 0
     bounded = pod_picture(shown, site_grid, classes, is_hole, CellGrid(grid.corner_m, 100.0, grid.crs, 11.0))
-    assert max(bounded.shape[:2]) <= PICTURE_PX + 1
+    assert max(bounded.shape[:2]) <= PICTURE_PX
+
+
+def test_an_area_narrower_than_a_cell_is_its_own_cells_alone() -> None:
+    site_grid = SiteGrid.at(Geodetic(48.0, 11.0, 0.0), 5.0, "EPSG:32632")
+    frame_m = np.array([[-50.0, -50.0], [50.0, -50.0], [50.0, 50.0], [-50.0, 50.0]])
+    speck = [[np.array([[1.0, 1.0], [1.3, 1.0], [1.3, 1.3]])]]
+    path = [[np.array([[-40.0, 1.0], [40.0, 1.0], [40.0, 1.3], [-40.0, 1.3]])]]
+    assert cells_over([frame_m], site_grid, speck).wanted.sum() == 1
+    cells = cells_over([frame_m], site_grid, path)
+    assert 15 <= cells.wanted.sum() <= 18 and np.ptp(cells.centres_m[cells.wanted][:, 0]) >= 75
+    far = cells_over([frame_m + 9000.0], site_grid, speck)
+    assert len(far) <= 4 and far.wanted.sum() == 1 and far.wanted_from_m([*frame_m + 9000.0]) > 12_000

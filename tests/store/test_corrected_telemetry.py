@@ -54,7 +54,7 @@ def test_a_camera_straight_down_has_no_pitch_and_roll_for_odm() -> None:
 
 def test_names_with_spaces_keep_the_columns_of_geo_txt() -> None:
     line = geo_txt([replace(FRAME, name="IMG  IMG 0001.jpg")]).splitlines()[1]
-    assert line.split()[0] == "IMG_IMG_0001.jpg" and len(line.split()) == 9
+    assert line.split()[0] == "IMG__IMG_0001.jpg" and len(line.split()) == 9
 
 
 def test_no_time_is_invented_for_a_flight_without_a_date() -> None:

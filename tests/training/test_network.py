@@ -114,9 +114,9 @@ def _found_share(model, pictures):
 
 @pytest.fixture(scope="module")
 def trained():
-    training = JointTraining(tiny(), JointSettings(steps=160, batch=4, rate=3e-3, averaging=0.9, warm_steps=10), 1)
-    stream = fours(squares(160 * 4, 1))
-    losses = [training.learn(each).loss for each in islice(stream, 160)]
+    training = JointTraining(tiny(), JointSettings(steps=200, batch=4, rate=3e-3, averaging=0.9, warm_steps=10), 1)
+    stream = fours(squares(200 * 4, 1))
+    losses = [training.learn(each).loss for each in islice(stream, 200)]
     return training, losses
 
 

@@ -54,10 +54,11 @@ def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: 
     and would pass for motion. How far neighbouring misfits err alike is learnt from them (`_offset_sigma_s`).
     """
     usable = np.isfinite(track.east_north_m[:, 0])
-    path_s, path_m = _smooth_path(track.sample_s[usable], track.east_north_m[usable], track.interval_s)
     unknown = OffsetEstimate(0.0, float("inf"), float("nan"), float("nan"))
     if usable.sum() < _LEAST_FIXES or len(times_s) < _LEAST_FRAMES or reach_s <= 0:
         return unknown
+    within_s = float(times_s.min()) - reach_s, float(times_s.max()) + reach_s
+    path_s, path_m = _smooth_path(track.sample_s[usable], track.east_north_m[usable], track.interval_s, within_s)
 
     def laid(offset_s: float) -> tuple[Floats, PointsM, PointsM]:
         """The times within the path, the fixes then, and the seen path laid on these."""
@@ -98,16 +99,22 @@ def _outlying_m(miss_m: Floats) -> float:
     return 3 * float(np.median(miss_m)) + 1e-9
 
 
-def _smooth_path(fix_s: Floats, fixes_m: PointsM, interval_s: float) -> tuple[Floats, PointsM]:
-    """Fixes as a path, (M,) s and (M, 2): by a parabola through the fixes around each moment, weighted by nearness; as
-    they are where these are few, and of photos, which carry one each.
+def _smooth_path(
+    fix_s: Floats, fixes_m: PointsM, interval_s: float, within_s: tuple[float, float]
+) -> tuple[Floats, PointsM]:
+    """Fixes as a path, (M,) s and (M, 2), from the one to the other time: by a parabola through the fixes around
+    each moment, weighted by nearness; as they are where these are few, and of photos, which carry one each.
 
     On straight lines from fix to fix noise is halved midway between two. Where frames and fixes keep step, an offset of
     half an interval then fits better than the true one: by 0.04 s on flights with fixes ten times a second.
     """
     if interval_s <= 0 or len(fix_s) <= 2 * _REACH:
         return fix_s, fixes_m
-    path_s = np.arange(fix_s[0], fix_s[-1] + interval_s / _STEPS / 2, interval_s / _STEPS)
+    step_s = interval_s / _STEPS
+    first_s, last_s = max(fix_s[0], within_s[0] - step_s), min(fix_s[-1], within_s[1] + step_s)
+    path_s = np.arange(first_s, last_s + step_s / 2, step_s)
+    if len(path_s) < 2:
+        return fix_s, fixes_m
     first = np.clip(np.searchsorted(fix_s, path_s) - _REACH, 0, len(fix_s) - 2 * _REACH)
     rows = first[:, None] + np.arange(2 * _REACH)
     along = (fix_s[rows] - path_s[:, None]) / (_WIDTH * interval_s)

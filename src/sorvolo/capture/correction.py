@@ -301,7 +301,7 @@ def _wrapped(angles_deg: Floats) -> Floats:
 
 
 def _apart_m(priors: Sequence[CameraPrior], moved_m: PointsM) -> Floats:
-    """(N,) how far each frame's place lies from its fix where that is far; 0 where it is not, or nothing is known.
+    """(N,) how far each frame's place lies beside where fixes usually put it, m; 0 where near, or nothing is known.
 
     `moved_m` (N, 3) are the fixes less the places. Far is beyond `_FAR_SIGMAS`, along an axis, of what fixes and
     heights state or scatter by, whichever is more, from what they usually are off.

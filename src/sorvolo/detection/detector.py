@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,6 +49,7 @@ class Detector:
         self._opinions: dict[str, Session] = {}  # by name, those who look a second time
         self._seeking = threading.Lock()
         self._thermal_frames = self._daylight_frames = self._too_small_frames = 0
+        self._looks: Counter[str] = Counter()  # of the others
 
     @classmethod
     def load(
@@ -78,10 +80,11 @@ class Detector:
         return self._session.info
 
     @property
-    def others(self) -> tuple[ModelInfo, ...]:
-        """The models that looked at pictures in its place, or a second time, as far as any did."""
-        night = [self._at_night] if self._at_night is not None and self._thermal_frames else []
-        return tuple(each.info for each in (*night, *self._opinions.values()))
+    def others(self) -> tuple[tuple[ModelInfo, int], ...]:
+        """The models that looked at pictures in its place, or a second time, and how often each has."""
+        sessions = [] if self._at_night is None else [self._at_night]
+        looks = [(each.info, self._looks[each.info.name]) for each in (*sessions, *self._opinions.values())]
+        return tuple((info, count) for info, count in looks if count)
 
     @property
     def provider(self) -> str:
@@ -196,6 +199,7 @@ class Detector:
     ) -> Detections:
         thermal = is_thermal(picture)
         session = self._session if self._is_own(thermal=thermal) else self._night_session()
+        self._looks[session.info.name] += session is not self._session
         rgb = rgb_from_picture(picture)
         asked = [name for name in wanted if name in session.info.classes]
         small = _too_small(asked, m_per_px, thermal=thermal, from_above=from_above)
@@ -276,8 +280,18 @@ class Detector:
             looking = self._second(session, by)
             mine = {label: how for label, how in hows.items() if how.by == by}
             if looking.fixed_px is None:  # sheets have sizes of their own
-                seen = looked_again(seen, rgb, _in_labels_of(looking, info.classes), mine)
+                seen = looked_again(seen, rgb, self._counted(looking, info.classes), mine)
         return seen
+
+    def _counted(self, looking: Session, classes: Sequence[str]) -> Callable[[ImageRGB], Seen]:
+        """`_in_labels_of` of a model whose looks count."""
+        sees = _in_labels_of(looking, classes)
+
+        def counts(picture: ImageRGB) -> Seen:
+            self._looks[looking.info.name] += 1
+            return sees(picture)
+
+        return counts
 
     def _second(self, session: Session, by: str) -> Session:
         """Who looks a second time; threads that ask at once wait for it."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 from scipy.spatial import KDTree
 
-from sorvolo.geometry.arrays import Floats, Mask, PointsM, frozen
+from sorvolo.geometry.arrays import Floats, Mask, PointsM, PointsPx, frozen
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.geometry.polygons import points_inside
@@ -111,8 +111,10 @@ def cells_over(
     else:
         wanted = _inside_any(area_m, centres_m)
         if not wanted.any():  # narrower than a cell
-            x, y = np.floor(corners_px + 0.5).astype(int).T
-            wanted[(y - top) * columns + x - left] = True
+            for rings in area_m:
+                for ring_m in rings:
+                    x, y = np.floor(_along(site_grid.grid_from_site(np.asarray(ring_m))) + 0.5).astype(int).T
+                    wanted[(y - top) * columns + x - left] = True
     return Cells(site_grid, left, top, columns, rows, wanted)
 
 
@@ -125,6 +127,13 @@ def _rings_to_cover(outlines_m: Sequence[PointsM], area_m: Sequence[Sequence[Poi
     shown, asked = np.concatenate(own), np.concatenate(wanted)
     apart_m = np.maximum(shown.min(axis=0) - asked.max(axis=0), asked.min(axis=0) - shown.max(axis=0))
     return wanted if (apart_m > np.ptp(asked, axis=0) + np.ptp(shown, axis=0)).any() else own + wanted
+
+
+def _along(ring_px: PointsPx) -> PointsPx:
+    """(M, 2) points along a ring, (N, 2), at most half a pixel apart."""
+    ends = np.roll(ring_px, -1, axis=0)
+    counts = np.ceil(2 * np.linalg.norm(ends - ring_px, axis=1)).astype(int) + 1
+    return np.concatenate([np.linspace(*each) for each in zip(ring_px, ends, counts)])
 
 
 def _centres_m(site_grid: SiteGrid, left: int, top: int, columns: int, rows: int) -> PointsM:

@@ -19,7 +19,7 @@ class SearchFigures:
     `pod` with its interval is the chance that one who lay anywhere in the area was found, by all flights together.
     `swept_m2` is the ground times its chance, summed over the flights: effort adds up, even over the same ground.
     `coverage` is that over the area, so it may exceed 1. `sweep_width_m` is all ground that the flights saw, within the
-    area or not, times its chance, over the path of all flights; NaN where they have none.
+    area or not, times its chance, over the path of all flights; NaN without a path, or where no cell was seen.
     `random_pod` is what Koopman's formula of random search, 1 - exp(-coverage), makes of it.
     """
 
@@ -72,7 +72,8 @@ def figures(flights: Sequence[Chances], wanted: Mask, cell_m: float, path_m: flo
     mean, low, high = (np.nan_to_num(each[inside]) for each in (total.mean, total.low, total.high))
     swept_m2 = sum(float(np.nansum(each.mean[inside])) for each in flights) * cell_m2
     anywhere_m2 = sum(float(np.nansum(each.mean)) for each in flights) * cell_m2
-    width_m = anywhere_m2 / path_m if path_m > 0 and anywhere_m2 > 0 else float("nan")
+    is_seen = any(np.isfinite(each.mean).any() for each in flights)
+    width_m = anywhere_m2 / path_m if path_m > 0 and is_seen else float("nan")
     coverage = swept_m2 / area_m2 if area_m2 else 0.0
     pod, pod_low, pod_high = (float(each.mean()) if len(each) else 0.0 for each in (mean, low, high))
     return SearchFigures(

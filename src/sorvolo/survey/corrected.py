@@ -80,7 +80,7 @@ class TelemetryFaults:
     The rest are rows of compared frames: `outlying`, whose stated angles alone are far beside what those of the others
     are off, by `outlying_deg` in the median; `misplaced`, whose places and angles both are, so that the map is doubtful
     there; `apart`, whose places alone are, so that the map or the fix is wrong. `misplaced_m` and `apart_m` are how far
-    each of these lies from its fix.
+    each of these lies beside where the fixes usually put the camera: an error that all fixes share is taken off.
     """
 
     clock_s: Bias

@@ -118,7 +118,12 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
 def _dated(messages: list[Any]) -> list[Any]:
     """The sentences whose date can be trusted: a receiver without a fix often invents its date."""
     dated = [message for message in messages if isinstance(getattr(message, "date", None), date)]
-    return [message for message in dated if message.status == "A"] or dated
+    return [message for message in dated if _is_valid(message)] or dated
+
+
+def _is_valid(message: Any) -> bool:
+    """Whether an RMC sentence states a fix; one that was cut before its status states none."""
+    return getattr(message, "status", "") == "A"
 
 
 def _forget_without_fix(epochs: list[Epoch]) -> None:
@@ -130,7 +135,7 @@ def _forget_without_fix(epochs: list[Epoch]) -> None:
 def _add(epoch: Epoch, message: Any) -> None:
     """Add a sentence's values to its moment; a GGA's position goes before an RMC's."""
     if message.msgID == "GGA":
-        epoch.has_fix &= message.quality != 0
+        epoch.has_fix &= getattr(message, "quality", 0) != 0
         altitude_m, separation_m = _number(message, "alt"), _number(message, "sep")
         values = {
             "latitude_deg": _number(message, "lat"),
@@ -140,7 +145,7 @@ def _add(epoch: Epoch, message: Any) -> None:
             "horizontal_sigma_m": sigma_from_hdop_m(_number(message, "HDOP")),
         }
     else:
-        epoch.has_fix &= message.status == "A"
+        epoch.has_fix &= _is_valid(message)
         values = {
             "speed_m_s": _number(message, "spd") * KNOT_M_S,
             "course_deg": _number(message, "cog"),

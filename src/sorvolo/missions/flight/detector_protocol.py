@@ -21,8 +21,8 @@ class ObjectDetector(Protocol):
         """The model's own description."""
 
     @property
-    def others(self) -> tuple[ModelInfo, ...]:
-        """The models that looked at pictures in its place, or a second time, as far as any did."""
+    def others(self) -> tuple[tuple[ModelInfo, int], ...]:
+        """The models that looked at pictures in its place, or a second time, and how often each has."""
 
     @property
     def provider(self) -> str:

@@ -7,7 +7,7 @@ from functools import partial
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import PointsM
-from sorvolo.missions.search.frames import flights_to_search, heights_for, search_frames
+from sorvolo.missions.search.frames import flights_to_search, heights_for, heights_mark, search_frames
 from sorvolo.missions.search.measure import (
     MeasuredClass,
     MeasuredFlight,
@@ -43,19 +43,22 @@ class EarlierFlights:
         self._measured: list[tuple[Cells, MeasuredFlight]] = []
         self.frames: dict[str, tuple[SearchFrame, ...]] = {}
         """Of the flights that count, by their names."""
-        self.uncounted_m: list[PointsM] = []
-        """The ground of each frame of the flights that no earlier search measured, (4, 2) site metres."""
+        self._outlines_m: dict[str, list[PointsM]] = {}
         for name in flights_to_search(archive, ()):
             frames = [] if name == but else _frames_of(archive, name)
             if not frames:
                 continue
+            self._outlines_m[name] = [each.placed.outline_m for each in frames]
             above = heights_for(archive, name)
-            basis = Basis.of(frames, prepared, settings, has_heights=above is not None)
+            basis = Basis.of(frames, prepared, settings, heights=heights_mark(archive, name))
             known, searched = before.get(name, (None, None))
             if known is not None and searched is not None and known.serves(basis):
                 self._left.append(_Flight(name, frames, site, basis.classes, searched, above, settings))
-            else:
-                self.uncounted_m += [each.placed.outline_m for each in frames]
+
+    @property
+    def uncounted_m(self) -> list[PointsM]:
+        """The ground of each frame of the flights that do not count yet, or never will, (4, 2) site metres."""
+        return [each for name, own in self._outlines_m.items() if name not in self.frames for each in own]
 
     def look(self) -> bool:
         """Look at one more frame; whether there was one."""

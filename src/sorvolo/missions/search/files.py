@@ -61,26 +61,37 @@ def write_search(
     refly = None if was_stopped else write_refly(
         again, grid, searched, settings, detector.info, outputs.refly, dji_drone=outputs.dji_drone
     )
-    warnings = [] if refly is not None else _without_waypoints(outputs.refly)
+    warnings = [] if refly is not None else _without_waypoints(outputs.refly, was_stopped=was_stopped)
     report = build_search_report(searched, settings, detector, refly, so_far, warnings)
     atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
     atomic_write_bytes(outputs.folder / "search.html", search_page(report, pictures).encode())
     return report
 
 
-def remove_figures(outputs: SearchOutputs) -> None:
-    """Take away the figures and waypoints of an earlier search: a flight begins whose own come in their place."""
-    for path in (*(outputs.folder / name for name in FIGURES), *outputs.refly):
-        path.unlink(missing_ok=True)
+def remove_figures(outputs: SearchOutputs) -> list[str]:
+    """Take away the figures and waypoints of an earlier search: a flight begins whose own come in their place.
+
+    Returns the files of waypoints that there were.
+    """
+    _removed([outputs.folder / name for name in FIGURES])
+    return _removed(outputs.refly)
 
 
-def _without_waypoints(files: Sequence[Path]) -> list[str]:
-    """Take away earlier waypoints at these files, and what a person who asked for some has to know."""
-    old = [str(path) for path in files if path.is_file()]
+def _removed(files: Sequence[Path]) -> list[str]:
+    """Take these files away; those that there were."""
+    there = [str(path) for path in files if path.is_file()]
     for path in files:
         path.unlink(missing_ok=True)
+    return there
+
+
+def _without_waypoints(files: Sequence[Path], *, was_stopped: bool) -> list[str]:
+    """Take away earlier waypoints at these files, and what a person who asked for some has to know."""
+    old = _removed(files)
     if not files:
         return []
+    if was_stopped:
+        return [f"the flight was stopped, and its waypoints were taken away: {', '.join(old)}"] if old else []
     removed = f"; earlier ones were taken away: {', '.join(old)}" if old else ""
     return [
         f"no waypoints were written: no hole of {ReflySettings().least_m2:g} m2 or more is left that another flight "

@@ -1,5 +1,6 @@
 """A site's flights as they are searched: their kept frames on their final places, and the heights of the ground."""
 
+import hashlib
 from collections.abc import Sequence
 from functools import partial
 
@@ -50,14 +51,27 @@ def heights_for(archive: Archive, flight_id: str) -> AboveGround | None:
 
     None where the site has no heights of a present map that can be read.
     """
-    for each in (flight_id, flight_with_heights(archive, "")):
+    for each in _with_heights(archive, flight_id):
         try:
-            if each is not None and archive.height_path(each, HeightFile.REPORT).exists():
+            if archive.height_path(each, HeightFile.REPORT).exists():
                 surface, ground = (read_field(archive, each, file) for file in (HeightFile.SURFACE, HeightFile.GROUND))
                 return partial(above_ground, surface, ground)
         except InputError:
             continue  # of an earlier map, or damaged: a search can do without
     return None
+
+
+def heights_mark(archive: Archive, flight_id: str) -> str:
+    """By what the heights for a flight are known from others, made before or after; "" where there are none."""
+    reports = (archive.height_path(each, HeightFile.REPORT) for each in _with_heights(archive, flight_id))
+    own = next((path for path in reports if path.exists()), None)
+    return "" if own is None else hashlib.sha256(own.read_bytes()).hexdigest()[:16]
+
+
+def _with_heights(archive: Archive, flight_id: str) -> list[str]:
+    """The flights whose heights may serve, the best first."""
+    newest = flight_with_heights(archive, "")
+    return [flight_id] if newest is None else [flight_id, newest]
 
 
 def _placed(stored: StoredKeyframe) -> PlacedFrame | None:

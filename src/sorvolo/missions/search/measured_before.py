@@ -25,13 +25,13 @@ _FORMAT = 1
 class Basis:
     """By what the plants of a flight were measured.
 
-    `model`, `frames` (their cameras and places) and `area` are hashes, "" for no area.
+    `model`, `frames` (their cameras and places), `heights` and `area` are hashes, "" for no heights and no area.
     """
 
     program: str
     model: str
     frames: str
-    heights: bool
+    heights: str
     through_crowns: float
     sun_deg: tuple[float, float] | None
     classes: tuple[str, ...]
@@ -41,13 +41,13 @@ class Basis:
 
     @classmethod
     def of(
-        cls, frames: Sequence[SearchFrame], prepared: PreparedSearch, settings: SearchSettings, *, has_heights: bool
+        cls, frames: Sequence[SearchFrame], prepared: PreparedSearch, settings: SearchSettings, *, heights: str
     ) -> Self:
         """The basis of a search of these frames."""
         area = "" if prepared.area is None else _hashed(prepared.area.rings_lonlat)
         places = [[asdict(each.placed.camera), pose_of(each.placed)] for each in frames]
         return cls(
-            __version__, _hashed(repr(prepared.detector.info)), _hashed(places), has_heights,
+            __version__, _hashed(repr(prepared.detector.info)), _hashed(places), heights,
             settings.through_crowns, settings.sun_deg, planted_classes(prepared.detector, settings), settings.plants,
             settings.seed, area,
         )
@@ -83,7 +83,7 @@ def read_plants(folder: Path) -> dict[str, tuple[Basis, SearchedPlants]]:
             )
             for name, row in content["flights"].items()
         }
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
 
 

@@ -14,6 +14,7 @@ from sorvolo.missions.search.settings import RESULTS, SearchOutputs, SearchSetti
 from sorvolo.store.atomic import scratch_folder, writing
 from sorvolo.store.exports.waypoints import check_waypoint_files
 from sorvolo.store.site.archive import Archive
+from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.survey.area import Area
 from sorvolo.survey.flight import Site
 
@@ -41,6 +42,14 @@ def check_area(area: Area | None, site: Site) -> None:
         )
 
 
+def check_area_of(site_folder: Path, area: Area | None) -> None:
+    """As `check_area` for the site that the folder holds, before anything is mapped into it; a new one has no place."""
+    if area is not None and is_site(site_folder):
+        with Archive.open(site_folder, write=False) as archive:
+            if not archive.site().is_local:
+                check_area(area, archive.site())
+
+
 def prepare_search(
     settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector | None = None, *, is_live: bool = False
 ) -> PreparedSearch:
@@ -48,7 +57,8 @@ def prepare_search(
 
     Beside an `is_live` flight's map the detector runs at low priority.
     Raises InputError for a broken area or file of segments and for a model that is not there, SettingsError for classes
-    that cannot be measured, and for a folder or a file of waypoints that cannot be written.
+    that cannot be measured, for a folder that is a file, and for a file of waypoints that cannot be one, StoreError for
+    a folder that cannot be written.
     """
     if outputs.folder.exists() and not outputs.folder.is_dir():
         raise SettingsError(f"--out {outputs.folder} is a file, a folder was needed")
@@ -66,9 +76,10 @@ def prepare_search(
 
 def _check_writable(folder: Path) -> None:
     """Raise StoreError where the folder, or those that it would lie in, cannot be written; nothing stays behind."""
-    there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
-    with writing(folder), scratch_folder(there):
-        pass
+    with writing(folder):
+        there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+        with scratch_folder(there):
+            pass
 
 
 def _check_apart(outputs: SearchOutputs) -> None:

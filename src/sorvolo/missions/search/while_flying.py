@@ -118,7 +118,9 @@ class SearchWhileFlying:
         """A page that waits for the first figures, in the place of an earlier search's files; or waits no more."""
         with self._warning(), writing(self._outputs.folder):
             self._outputs.folder.mkdir(parents=True, exist_ok=True)
-            remove_figures(self._outputs)
+            if old := remove_figures(self._outputs):
+                text = f"waypoints of an earlier search were taken away, as a flight begins: {', '.join(old)}"
+                warnings.warn(text, SorvoloWarning, stacklevel=4)
             page = waiting_page(is_over=is_over).encode()
             atomic_write_bytes(self._outputs.folder / "search.html", page, durable=False)
 

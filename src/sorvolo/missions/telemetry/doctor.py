@@ -201,7 +201,7 @@ def _sent_again(earlier: dict[str, Any], folder: Path, cot: CotReceiver | None) 
     place.
     """
     events = folder / "cot.xml"
-    if cot is None or not events.is_file():
+    if cot is None or "cot.xml" not in earlier["files"] or not events.is_file():
         raise InputError(
             f"{folder} has the diagnosis of {earlier.get('flight')} and files corrected by it, which files of the map "
             "alone would replace: use those, give the flight's video or photos with --site for new ones, or another "
@@ -314,6 +314,8 @@ def _written(
         )
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
+    if "cot.xml" not in texts:
+        (folder / "cot.xml").unlink(missing_ok=True)  # an earlier version's, with invented dates
     for file, text in texts.items():
         atomic_write_bytes(folder / file, text)
     files = [*texts]

@@ -27,7 +27,7 @@ def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
 def _clock(found: Bias) -> list[str]:
     if not isfinite(found.value):
         return ["the clocks cannot be compared: the motion does not show an offset"]
-    if not 2 * found.sigma <= _NOT_KNOWN["clock"]:
+    if _is_unknown(found, "clock"):
         return ["whether the clocks agree cannot be known: the flight turns too little to show an offset"]
     if abs(found.value) < _LEAST["clock"] or not found.is_significant:
         return [f"the clocks agree within {_within(found, 0.01):.2f} s"]
@@ -38,7 +38,7 @@ def _clock(found: Bias) -> list[str]:
 def _heading(found: Bias, path: PathFit) -> list[str]:
     if not isfinite(found.value):
         return ["telemetry has no heading to compare"]
-    if not 2 * found.sigma <= _NOT_KNOWN["heading"]:
+    if _is_unknown(found, "heading"):
         return [f"whether the compass was right cannot be known: {_why_unknown(path)}"]
     if abs(found.value) < _LEAST["heading"] or not found.is_significant:
         return [f"the compass was right within {_within(found, 0.1):.1f} deg"]
@@ -114,13 +114,18 @@ def _tilt(found: Bias) -> list[str]:
 def _height(found: Bias, path: PathFit) -> list[str]:
     if not isfinite(found.value):
         return ["telemetry has no height above the ground to compare"]
-    if not 2 * found.sigma <= _NOT_KNOWN["height"]:
+    if _is_unknown(found, "height"):
         why = "the GPS track is too short for its scatter" if isfinite(path.scale.value) else _TOO_FEW
         return [f"whether heights above the ground were right cannot be known: {why}"]
     if abs(found.value) < _LEAST["height"] or not found.is_significant:
         return [f"heights above the ground were right within {_within(found, 0.1):.1f} m"]
     side = "too high" if found.value > 0 else "too low"
     return [f"heights above the ground were {abs(found.value):.1f} m {side} (1 sigma {found.sigma:.1f} m)"]
+
+
+def _is_unknown(found: Bias, what: str) -> bool:
+    """Whether an error could be so large that "right within" would mislead; one that surely is an error is known."""
+    return not 2 * found.sigma <= _NOT_KNOWN[what] and not (isfinite(found.sigma) and found.is_significant)
 
 
 def _within(found: Bias, least: float) -> float:

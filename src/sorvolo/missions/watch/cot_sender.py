@@ -89,7 +89,8 @@ def check_host(place: CotPlace) -> None:
 def send_all(events: Sequence[bytes], place: CotPlace, tls: CotTls = CotTls()) -> int:
     """Send recorded events one after the other; how many arrived as far as the sender can know.
 
-    A connection that breaks is made anew once: a receiver that is not there would be waited for with each event. Raises
+    A connection that breaks after an event was sent is made anew; the first one that cannot be made, and a second
+    failure in a row, end it, for a receiver that is not there would be waited for with each event. Raises
     InputError where nothing can be sent at all, where a host refuses datagrams because nothing listens there, and where
     the receiver breaks the connection at the end.
     """

@@ -125,6 +125,7 @@ class WatchRun:
         self._classes = settings.classes or detector.info.usual_classes
         self._magnifier = SceneMagnifier(detector.info, self._classes)
         self._others = list(journal.models)  # that looked besides it, in the order of their first looks
+        self._looks_before = {info.name: count for info, count in detector.others}  # at another flight's pictures
         self.log = WatchLog()
         self._stack = ExitStack()
         self._files = self._stack.enter_context(WatchFiles(folder, outputs, places.site))
@@ -202,9 +203,11 @@ class WatchRun:
     def _note_others(self) -> None:
         """Note each model that looked at a picture for the first time."""
         known = {each.facts["name"] for each in self._others}
-        for each in [LookedModel(model_facts(info)) for info in self._detector.others if info.name not in known]:
-            self._journal.keep_model(each)
-            self._others.append(each)
+        for info, count in self._detector.others:
+            if info.name not in known and count > self._looks_before.get(info.name, 0):
+                each = LookedModel(model_facts(info))
+                self._journal.keep_model(each)
+                self._others.append(each)
 
     def recall(self, searched: SearchedFrame) -> WatchUpdate:
         """Take in a frame of a live source that a watch that was killed had searched, as far as its picture is not

@@ -135,7 +135,7 @@ def with_room(shown: Picture, corners_px: PointsPx, max_px: int) -> Picture:
     height, width = shown.rgba.shape[:2]
     low = np.minimum(corner_px, np.floor(corners_px.min(axis=0)))
     high = np.maximum(corner_px + step * np.array([width, height]), corners_px.max(axis=0))
-    times = max(1, int(np.ceil((high - low).max() / (step * max_px))))
+    times = max(1, int(np.ceil((high - low).max() / (step * (max_px - 2)))))  # room at both ends is rounded up
     wider = step * times
     before = np.ceil((corner_px - low) / wider).astype(int)  # pixels of the wider picture
     own = -(-np.array([width, height]) // times)

@@ -3,6 +3,7 @@
 import csv
 import io
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import asdict
 from xml.etree.ElementTree import Element, SubElement, tostring
@@ -43,19 +44,19 @@ def geo_txt(frames: Sequence[CorrectedFrame]) -> str:
 
 def name_for_odm(name: str) -> str:
     """A photo's name as geo.txt can hold it: a space would end its column, and becomes an underscore."""
-    return "_".join(name.split())
+    return re.sub(r"\s", "_", name)
 
 
 def track_csv(frames: Sequence[CorrectedFrame], height_reference: str) -> str:
     """One line for each frame; the header names what heights count from. Without a date `utc` is empty."""
-    text = io.StringIO()
+    text, has_dates = io.StringIO(), is_dated(frames)
     names = list(asdict(frames[0])) if frames else []
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*(name for name in names if name != "time_ns"), "utc", "height_reference"])
     for each in frames:
         row = {name: value for name, value in asdict(each).items() if name != "time_ns"}
         plain = ["" if isinstance(value, float) and math.isnan(value) else value for value in row.values()]
-        writer.writerow([*plain, utc_text(each.time_ns) if is_dated(frames) else "", height_reference])
+        writer.writerow([*plain, utc_text(each.time_ns) if has_dates else "", height_reference])
     return text.getvalue()
 
 
@@ -64,11 +65,11 @@ def track_gpx(frames: Sequence[CorrectedFrame], name: str) -> bytes:
     gpx = Element("gpx", {"version": "1.1", "creator": "sorvolo", "xmlns": "http://www.topografix.com/GPX/1/1"})
     track = SubElement(gpx, "trk")
     SubElement(track, "name").text = name
-    segment = SubElement(track, "trkseg")
+    segment, has_dates = SubElement(track, "trkseg"), is_dated(frames)
     for each in frames:
         point = SubElement(segment, "trkpt", {"lat": f"{each.latitude_deg:.9f}", "lon": f"{_wrapped(each):.9f}"})
         SubElement(point, "ele").text = f"{each.height_m:.3f}"
-        if is_dated(frames):
+        if has_dates:
             SubElement(point, "time").text = utc_text(each.time_ns)
         SubElement(point, "name").text = each.name
         if not math.isnan(each.sigma_m):
