@@ -126,14 +126,16 @@ def _map_all(
     from sorvolo.missions.search.prepare import check_area_of, prepare_search
     from sorvolo.missions.search.while_flying import SearchWhileFlying
 
-    prepared = prepare_search(settings, outputs)  # mapping takes long: what cannot be used is refused before
-    check_area_of(place.folder, prepared.area)
     flying = None
     if live := sum(is_live_address(each) for each in inputs):
         if live > 1:
             raise SettingsError(f"one live flight is measured while it is on, not {live}; search them one by one")
         flying = SearchWhileFlying(settings, outputs)
+        area = flying.area
         show_path("page, once the flight is on", outputs.folder / "search.html", Console(stderr=True))
+    else:
+        area = prepare_search(settings, outputs).area  # mapping takes long: what cannot be used is refused before
+    check_area_of(place.folder, area)
     map_and_read_reports(
         list(inputs), place.folder, MapSettings(model=settings.model), telemetry=telemetry, camera=camera or None,
         live=LiveSettings(keeps_all=True, give_up_s=give_up_s), sent=place.sent, search=flying,

@@ -25,6 +25,7 @@ from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.pages.search import waiting_page
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe, utc_now
+from sorvolo.survey.area import Area
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,11 @@ class SearchWhileFlying:
         """How often the files were written."""
         self.placed = 0
         """How many pictures have a place so far."""
+
+    @property
+    def area(self) -> Area | None:
+        """The area that is to be searched; None for what is flown."""
+        return self._prepared.area
 
     def __enter__(self) -> Self:
         return self
