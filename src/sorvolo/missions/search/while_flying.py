@@ -36,7 +36,7 @@ class Pace:
     rest: float = 4.0  # times as long as the last writing took: most of the time is the measure's
     look_s: float = 0.2  # until it is asked again whether there is a frame
     most_behind: int = 8  # frames that wait: of more every second is put off, so that new ground is measured soon
-    earlier: int = 4  # pictures of earlier flights that are looked at for one that is searched, which takes longer
+    earlier: float = 1.0  # times as long as a picture is searched, those of earlier flights are looked at
     land_s: float = 20.0  # for the frame that is being searched as the flight lands; a report that takes longer is lost
 
 
@@ -162,7 +162,7 @@ class SearchWhileFlying:
         earlier = EarlierFlights(archive, flight_id, self._prepared, self._settings, self._outputs)
         unwritten, again_s = 0, time.monotonic() + self._pace.again_s
         while not self._landed.is_set():
-            stored = self._next()
+            stored, began_s = self._next(), time.monotonic()
             if stored is not None:
                 with self._warning():
                     frame = search_frame(archive, stored)
@@ -171,18 +171,27 @@ class SearchWhileFlying:
                     else:
                         measure.add(frame)
                         unwritten += 1
-            is_idle, counted = stored is None, len(earlier.frames)
-            with self._warning():
-                is_idle &= not any([earlier.look() for _ in range(self._pace.earlier)])
-                unwritten += len(earlier.frames) - counted
+            counted = len(earlier.frames)
+            has_looked = self._look_back(earlier, self._pace.earlier * (time.monotonic() - began_s))
+            unwritten += len(earlier.frames) - counted
             if unwritten and measure.frames and time.monotonic() >= again_s:
                 started_s = time.monotonic()
                 with self._warning():
                     unwritten = 0 if self._write(measure, archive, earlier) else unwritten
                 took_s = time.monotonic() - started_s
                 again_s = time.monotonic() + max(self._pace.again_s, self._pace.rest * took_s)
-            elif is_idle:
+            elif stored is None and not has_looked:
                 self._landed.wait(self._pace.look_s)
+
+    def _look_back(self, earlier: EarlierFlights, for_s: float) -> bool:
+        """Look at one picture of earlier flights, and at more for so many seconds; whether there was one."""
+        until_s, has_looked = time.monotonic() + for_s, False
+        with self._warning():
+            while earlier.look():
+                has_looked = True
+                if time.monotonic() >= until_s or self._landed.is_set():
+                    break
+        return has_looked
 
     def _next(self) -> StoredKeyframe | None:
         """The frame that is measured next: in their order, those that were put off when no others wait."""
