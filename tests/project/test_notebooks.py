@@ -21,7 +21,7 @@ def test_every_notebook_is_tried_and_kept_without_output() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [
-    "map_and_changes",
+    pytest.param("map_and_changes", marks=pytest.mark.long),  # so have `map` and `compare`
     pytest.param("tune_detector", marks=pytest.mark.long),  # `train` has tests of its own
 ])
 def test_notebook_runs(

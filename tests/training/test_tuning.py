@@ -132,6 +132,7 @@ def test_a_model_of_several_networks_without_its_card_keeps_no_thresholds(tmp_pa
     assert softening in by_day.left and softening in part_notices(by_day)[0] and softening not in packaged.left
 
 
+@pytest.mark.long  # its rules have tests of their own below
 def test_a_tuned_model_is_used_as_the_one_before_where_nothing_new_was_measured(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
