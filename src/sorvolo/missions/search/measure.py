@@ -181,11 +181,12 @@ class SearchedPicture:
 
 def search_planted(
     frame: SearchFrame, image: ImageRGB, light: FrameLight, things: Sequence[Thing], sun: Vector3 | None,
-    shown: Sequence[float], seed: int, detector: ObjectDetector, wanted: Sequence[str],
+    shown: Sequence[float], seed: int, detector: ObjectDetector, wanted: Sequence[str], *, is_again: bool = False,
 ) -> SearchedPicture | None:
     """Plant things into a frame's picture and have it searched as a map's is; None where it shows none of them.
 
-    `light` is the picture's; `sun`, `shown` and `seed` as `plant` takes them.
+    `light` is the picture's; `sun`, `shown` and `seed` as `plant` takes them. `is_again`: the frame was searched with
+    other plants in it, and the detector's notices count it once.
     """
     pose = pose_of(frame.placed)
     assert pose is not None  # frames without a place are none of these
@@ -197,7 +198,7 @@ def search_planted(
     least = detector.thresholds_for(planted.image, from_above=from_above)
     found = detector.detect(
         planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / camera.fx_px, classes=wanted,
-        from_above=from_above, least_score=least_seen(least),
+        from_above=from_above, least_score=least_seen(least), is_part=is_again,
     ).surest(_MOST_DETECTIONS + len(things))
     laid = [each for each in lay_on_ground(found, frame.placed) if each is not None]
     return SearchedPicture(planted.boxes_px, laid, least)
@@ -231,7 +232,7 @@ class _Round:
         for number, (each, light) in enumerate(zip(self._frames, self._lights)):
             seen = search_planted(
                 each, each.image(), light, self._things, self._sun, self._shown, self._settings.seed + number, detector,
-                wanted,
+                wanted, is_again=before > 0,
             )
             if seen is not None:
                 self._least = strictest(self._least, seen.least)
