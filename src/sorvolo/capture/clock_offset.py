@@ -8,14 +8,27 @@ from sorvolo.capture.sync import Track
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.homography import fit_similarity
 
-_LEAST_FIXES, _LEAST_FRAMES = 4, 6  # by choice: a similarity and an offset have five unknowns
-_WIDTH = 1.5  # intervals of the receiver, one sigma of the weights: a parabola's noise then hardly depends on phase
-_STEPS = 4  # places of the smooth path in each interval
-_REACH = 6  # fixes to each side, four sigmas
-_AROUND = 5  # fixes within two sigmas, of seven: fewer stand at an end or a gap, where a parabola would run away
-_MOST_FRAMES = 400  # that a noise is learnt from
-_SHARES = (0.0, 0.25, 0.5, 0.75, 0.9, 0.97)  # of the noise's variance that neighbouring frames may have in common
-_MEMORIES = 6  # times in which it is forgotten that are tried, from one frame's step to the whole flight
+
+@dataclass(frozen=True)
+class OffsetSettings:
+    """When an offset is looked for, how fixes become a smooth path, and how their noise is learnt; all by choice.
+
+    A similarity and an offset have five unknowns: fewer than `least_fixes` or `least_frames` show none. The path is a
+    parabola through `reach` fixes to each side, weighted by nearness with one sigma of `width` intervals of the
+    receiver, at which its noise hardly depends on where between two fixes it is; fewer than `around` fixes within two
+    sigmas (of seven) stand at an end or a gap, where a parabola would run away. `shares` are of the noise's variance,
+    that neighbouring frames may have in common.
+    """
+
+    least_fixes: int = 4
+    least_frames: int = 6
+    width: float = 1.5
+    steps: int = 4  # places of the smooth path in each interval
+    reach: int = 6  # four sigmas
+    around: int = 5
+    most_frames: int = 400  # that a noise is learnt from
+    shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 0.9, 0.97)
+    memories: int = 6  # times in which it is forgotten that are tried, from one frame's step to the whole flight
 
 
 @dataclass(frozen=True)
@@ -46,7 +59,9 @@ class OffsetEstimate:
         return OffsetEstimate(applied_s + found.offset_s, found.sigma_s, self.rms_at_zero_m, found.rms_m)
 
 
-def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: float) -> OffsetEstimate:
+def estimate_offset(
+    track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: float, settings: OffsetSettings = OffsetSettings()
+) -> OffsetEstimate:
     """The clock offset that makes telemetry's path fit the path seen in the pictures (N, 2), up to a similarity.
 
     Straight flight at constant speed fits at any offset: then the uncertainty comes out infinite or large. It comes
@@ -55,10 +70,12 @@ def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: 
     """
     usable = np.isfinite(track.east_north_m[:, 0])
     unknown = OffsetEstimate(0.0, float("inf"), float("nan"), float("nan"))
-    if usable.sum() < _LEAST_FIXES or len(times_s) < _LEAST_FRAMES or reach_s <= 0:
+    if usable.sum() < settings.least_fixes or len(times_s) < settings.least_frames or reach_s <= 0:
         return unknown
     within_s = float(times_s.min()) - reach_s, float(times_s.max()) + reach_s
-    path_s, path_m = _smooth_path(track.sample_s[usable], track.east_north_m[usable], track.interval_s, within_s)
+    path_s, path_m = _smooth_path(
+        track.sample_s[usable], track.east_north_m[usable], track.interval_s, within_s, settings
+    )
 
     def laid(offset_s: float) -> tuple[Floats, PointsM, PointsM]:
         """The times within the path, the fixes then, and the seen path laid on these."""
@@ -66,7 +83,7 @@ def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: 
         inside = (at >= path_s[0]) & (at <= path_s[-1])
         fixes = np.column_stack([np.interp(at[inside], path_s, path_m[:, k]) for k in range(2)])
         seen = seen_m[inside]
-        if inside.sum() < max(_LEAST_FRAMES, 0.6 * len(at)) or np.ptp(seen, axis=0).max() <= 0:
+        if inside.sum() < max(settings.least_frames, 0.6 * len(at)) or np.ptp(seen, axis=0).max() <= 0:
             return times_s[:0], fixes[:0], seen[:0]
         change = fit_similarity(fixes, seen)
         return times_s[inside], fixes, seen @ change[:2, :2].T + change[:2, 2]
@@ -91,7 +108,7 @@ def estimate_offset(track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: 
     rms_at_zero_m, rms_m = (float(np.sqrt(misfit(each))) for each in (0.0, best))
     if abs(best) > 0.97 * reach_s:
         return replace(unknown, rms_at_zero_m=rms_at_zero_m, rms_m=rms_m)
-    return OffsetEstimate(best, _offset_sigma_s(*laid(best)), rms_at_zero_m, rms_m)
+    return OffsetEstimate(best, _offset_sigma_s(*laid(best), settings), rms_at_zero_m, rms_m)
 
 
 def _outlying_m(miss_m: Floats) -> float:
@@ -100,7 +117,7 @@ def _outlying_m(miss_m: Floats) -> float:
 
 
 def _smooth_path(
-    fix_s: Floats, fixes_m: PointsM, interval_s: float, within_s: tuple[float, float]
+    fix_s: Floats, fixes_m: PointsM, interval_s: float, within_s: tuple[float, float], settings: OffsetSettings
 ) -> tuple[Floats, PointsM]:
     """Fixes as a path, (M,) s and (M, 2), from the one to the other time: by a parabola through the fixes around
     each moment, weighted by nearness; as they are where these are few, and of photos, which carry one each.
@@ -108,28 +125,31 @@ def _smooth_path(
     On straight lines from fix to fix noise is halved midway between two. Where frames and fixes keep step, an offset of
     half an interval then fits better than the true one: by 0.04 s on flights with fixes ten times a second.
     """
-    if interval_s <= 0 or len(fix_s) <= 2 * _REACH:
+    reach = settings.reach
+    if interval_s <= 0 or len(fix_s) <= 2 * reach:
         return fix_s, fixes_m
-    step_s = interval_s / _STEPS
+    step_s = interval_s / settings.steps
     first_s, last_s = max(fix_s[0], within_s[0] - step_s), min(fix_s[-1], within_s[1] + step_s)
     path_s = np.arange(first_s, last_s + step_s / 2, step_s)
     if len(path_s) < 2:
         return fix_s, fixes_m
-    first = np.clip(np.searchsorted(fix_s, path_s) - _REACH, 0, len(fix_s) - 2 * _REACH)
-    rows = first[:, None] + np.arange(2 * _REACH)
-    along = (fix_s[rows] - path_s[:, None]) / (_WIDTH * interval_s)
+    first = np.clip(np.searchsorted(fix_s, path_s) - reach, 0, len(fix_s) - 2 * reach)
+    rows = first[:, None] + np.arange(2 * reach)
+    along = (fix_s[rows] - path_s[:, None]) / (settings.width * interval_s)
     weight = np.exp(-0.5 * along**2)
     powers = along[..., None] ** np.arange(3)
     normal = np.einsum("nk,nki,nkj->nij", weight, powers, powers)
     straight_m = np.column_stack([np.interp(path_s, fix_s, fixes_m[:, k]) for k in range(2)])
-    fitted = (np.abs(along) <= 2.0).sum(axis=1) >= _AROUND
+    fitted = (np.abs(along) <= 2.0).sum(axis=1) >= settings.around
     if fitted.any():
         right = np.einsum("nk,nki,nkd->nid", weight, powers, fixes_m[rows])
         straight_m[fitted] = np.linalg.solve(normal[fitted], right[fitted])[:, 0]
     return path_s, straight_m
 
 
-def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> float:
+def _offset_sigma_s(
+    times_s: Floats, fixes_m: PointsM, places_m: PointsM, settings: OffsetSettings
+) -> float:
     """One sigma of an offset by what it leaves between N fixes and places, (N, 2) each; infinite without motion.
 
     Receivers wander, so that neighbouring frames err alike, and a strip's frames, which all pull an offset one way, are
@@ -141,7 +161,7 @@ def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> flo
     miss_m = np.linalg.norm(fixes_m - places_m, axis=1)
     rows = np.flatnonzero(miss_m <= _outlying_m(miss_m))
     velocity_m_s = np.gradient(places_m, times_s, axis=0)[rows]
-    some = np.unique(np.linspace(0, len(rows) - 1, _MOST_FRAMES).round().astype(int))
+    some = np.unique(np.linspace(0, len(rows) - 1, settings.most_frames).round().astype(int))
     rows, velocity_m_s = rows[some], velocity_m_s[some]
     at_s, places, misses = times_s[rows], places_m[rows], (fixes_m - places_m)[rows].T.ravel()
     similar = _similarity_rows(places)
@@ -152,8 +172,8 @@ def _offset_sigma_s(times_s: Floats, fixes_m: PointsM, places_m: PointsM) -> flo
     model = np.column_stack([similar, motion])
     apart_s = np.abs(at_s[:, None] - at_s)
     likelihoods, variances = [], []
-    for memory_s in np.geomspace(float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], _MEMORIES):
-        for share in _SHARES:
+    for memory_s in np.geomspace(float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], settings.memories):
+        for share in settings.shares:
             alike = (1 - share) * np.eye(len(at_s)) + share * np.exp(-apart_s / memory_s)
             likelihood, noise = _restricted_likelihood(alike, model, misses)
             likelihoods.append(likelihood)

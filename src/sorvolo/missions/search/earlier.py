@@ -7,7 +7,7 @@ from functools import partial
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import PointsM
-from sorvolo.missions.search.frames import flights_to_search, heights_for, heights_mark, search_frames
+from sorvolo.missions.search.frames import flights_to_search, marked_heights, search_frames
 from sorvolo.missions.search.measure import (
     MeasuredClass,
     MeasuredFlight,
@@ -49,8 +49,8 @@ class EarlierFlights:
             if not frames:
                 continue
             self._outlines_m[name] = [each.placed.outline_m for each in frames]
-            above = heights_for(archive, name)
-            basis = Basis.of(frames, prepared, settings, heights=heights_mark(archive, name))
+            above, mark = marked_heights(archive, name)
+            basis = Basis.of(frames, prepared, settings, heights=mark)
             known, searched = before.get(name, (None, None))
             if known is not None and searched is not None and known.serves(basis):
                 self._left.append(_Flight(name, frames, site, basis.classes, searched, above, settings))

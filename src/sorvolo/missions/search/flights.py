@@ -7,7 +7,7 @@ from typing import Any
 from sorvolo.errors import InputError
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.files import write_search
-from sorvolo.missions.search.frames import flights_to_search, heights_for, heights_mark, search_frames
+from sorvolo.missions.search.frames import flights_to_search, marked_heights, search_frames
 from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, SearchProgress, measure_flight
 from sorvolo.missions.search.measured_before import Basis, read_plants, write_plants
 from sorvolo.missions.search.prepare import PreparedSearch, check_area, known_places, prepare_search, site_with_metres
@@ -54,8 +54,8 @@ def _measured(
     mapped, before = flights_to_search(archive, ()), read_plants(folder)
     known = {name: each for name, each in before.items() if name in mapped}
     for name, own in frames.items():
-        above = heights_for(archive, name)
-        basis = Basis.of(own, prepared, settings, heights=heights_mark(archive, name))
+        above, mark = marked_heights(archive, name)
+        basis = Basis.of(own, prepared, settings, heights=mark)
         earlier = known[name][1] if name in known and known[name][0] == basis else None
         for each in measure_flight(
             name, own, cells, site, prepared.detector, settings, known_m, above, earlier

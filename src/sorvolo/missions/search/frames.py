@@ -1,6 +1,5 @@
 """A site's flights as they are searched: their kept frames on their final places, and the heights of the ground."""
 
-import hashlib
 from collections.abc import Sequence
 from functools import partial
 
@@ -14,6 +13,7 @@ from sorvolo.search.conditions import AboveGround
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.files import HeightFile
+from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.mosaic import PlacedFrame, Status
 
 
@@ -51,27 +51,20 @@ def heights_for(archive: Archive, flight_id: str) -> AboveGround | None:
 
     None where the site has no heights of a present map that can be read.
     """
-    for each in _with_heights(archive, flight_id):
+    return marked_heights(archive, flight_id)[0]
+
+
+def marked_heights(archive: Archive, flight_id: str) -> tuple[AboveGround | None, str]:
+    """As `heights_for`, and by what these heights are known from others, made before or after; "" where there are
+    none."""
+    for each in (flight_id, flight_with_heights(archive, "")):
         try:
-            if archive.height_path(each, HeightFile.REPORT).exists():
+            if each is not None and (report := archive.height_path(each, HeightFile.REPORT)).exists():
                 surface, ground = (read_field(archive, each, file) for file in (HeightFile.SURFACE, HeightFile.GROUND))
-                return partial(above_ground, surface, ground)
+                return partial(above_ground, surface, ground), content_sha256(report.read_text())
         except InputError:
             continue  # of an earlier map, or damaged: a search can do without
-    return None
-
-
-def heights_mark(archive: Archive, flight_id: str) -> str:
-    """By what the heights for a flight are known from others, made before or after; "" where there are none."""
-    reports = (archive.height_path(each, HeightFile.REPORT) for each in _with_heights(archive, flight_id))
-    own = next((path for path in reports if path.exists()), None)
-    return "" if own is None else hashlib.sha256(own.read_bytes()).hexdigest()[:16]
-
-
-def _with_heights(archive: Archive, flight_id: str) -> list[str]:
-    """The flights whose heights may serve, the best first."""
-    newest = flight_with_heights(archive, "")
-    return [flight_id] if newest is None else [flight_id, newest]
+    return None, ""
 
 
 def _placed(stored: StoredKeyframe) -> PlacedFrame | None:

@@ -1,6 +1,5 @@
 """What was planted into each flight and found is kept beside a search's results, so that none is searched twice."""
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -8,13 +7,15 @@ from pathlib import Path
 from typing import Any, Self
 
 from sorvolo import __version__
+from sorvolo.missions.flight.software import software
 from sorvolo.missions.search.measure import SearchedPlants, SearchFrame, planted_classes
 from sorvolo.missions.search.prepare import PreparedSearch
 from sorvolo.missions.search.settings import PLANTS, SearchSettings
 from sorvolo.search.plant_places import PlantPlace
 from sorvolo.store.atomic import atomic_write_bytes
-from sorvolo.store.exports.plain import feature_collection, geojson_bytes, plain_json
+from sorvolo.store.exports.plain import feature_collection, geojson_bytes
 from sorvolo.store.exports.pod_files import point_features
+from sorvolo.store.site.journal import content_sha256
 from sorvolo.survey.flight import Site
 from sorvolo.tracking.laying import pose_of
 
@@ -25,7 +26,8 @@ _FORMAT = 1
 class Basis:
     """By what the plants of a flight were measured.
 
-    `model`, `frames` (their cameras and places), `heights` and `area` are hashes, "" for no heights and no area.
+    `program` (with the libraries that it runs on), `model`, `frames` (their cameras and places), `heights` and `area`
+    are hashes, "" for no heights and no area.
     """
 
     program: str
@@ -44,12 +46,12 @@ class Basis:
         cls, frames: Sequence[SearchFrame], prepared: PreparedSearch, settings: SearchSettings, *, heights: str
     ) -> Self:
         """The basis of a search of these frames."""
-        area = "" if prepared.area is None else _hashed(prepared.area.rings_lonlat)
-        places = [[asdict(each.placed.camera), pose_of(each.placed)] for each in frames]
+        area = "" if prepared.area is None else content_sha256(prepared.area.polygons_lonlat)
+        places = [(each.placed.camera, pose_of(each.placed)) for each in frames]
         return cls(
-            __version__, _hashed(repr(prepared.detector.info)), _hashed(places), heights,
-            settings.through_crowns, settings.sun_deg, planted_classes(prepared.detector, settings), settings.plants,
-            settings.seed, area,
+            content_sha256(__version__, software()), content_sha256(prepared.detector.info), content_sha256(places),
+            heights, settings.through_crowns, settings.sun_deg, planted_classes(prepared.detector, settings),
+            settings.plants, settings.seed, area,
         )
 
     @classmethod
@@ -101,7 +103,3 @@ def write_plants(folder: Path, site: Site, flights: Mapping[str, tuple[Basis, Se
         for name, (basis, own) in flights.items()
     }}
     atomic_write_bytes(folder / PLANTS, geojson_bytes(collection))
-
-
-def _hashed(value: Any) -> str:
-    return hashlib.sha256(json.dumps(plain_json(value), sort_keys=True).encode()).hexdigest()[:16]

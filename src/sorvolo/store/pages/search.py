@@ -1,6 +1,6 @@
 """What a search would have found, as one page of HTML that needs no other file, no network and no script."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from sorvolo.geometry.arrays import ImageRGBA
@@ -84,9 +84,8 @@ def _plants(report: Mapping[str, Any]) -> list[list[str]]:
 def _calibration_plot(report: Mapping[str, Any]) -> dict[str, Any]:
     """The drawing of `_calibration`, and what its colours are."""
     rows = [
-        (f"{known(flight['name'])}, {label}", float(each["stated"]), float(each["found"]), float(each["found_low"]),
-         float(each["found_high"]), int(each["count"]))
-        for flight in report["flights"] for label, row in flight["classes"].items() for each in row["calibration"]
+        (f"{name}, {label}", float(each["stated"]), float(each["found"]), float(each["found_low"]),
+         float(each["found_high"]), int(each["count"])) for name, label, each in _calibrated(report)
     ]
     names = list(dict.fromkeys(name for name, *_ in rows))
     return {
@@ -96,7 +95,15 @@ def _calibration_plot(report: Mapping[str, Any]) -> dict[str, Any]:
 
 def _calibration(report: Mapping[str, Any]) -> list[list[str]]:
     return [
-        [known(flight["name"]), label, f"{each['stated']:.2f}", f"{each['found']:.2f}",
+        [name, label, f"{each['stated']:.2f}", f"{each['found']:.2f}",
          f"{each['found_low']:.2f} to {each['found_high']:.2f}", str(each["count"])]
-        for flight in report["flights"] for label, row in flight["classes"].items() for each in row["calibration"]
+        for name, label, each in _calibrated(report)
     ]
+
+
+def _calibrated(report: Mapping[str, Any]) -> Iterator[tuple[str, str, Mapping[str, Any]]]:
+    """Each row of stated and found, with its flight's name and its class."""
+    for flight in report["flights"]:
+        for label, row in flight["classes"].items():
+            for each in row["calibration"]:
+                yield known(flight["name"]), label, each
