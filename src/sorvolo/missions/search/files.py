@@ -61,7 +61,9 @@ def write_search(
     refly = None if was_stopped else write_refly(
         again, grid, searched, settings, detector.info, outputs.refly, dji_drone=outputs.dji_drone
     )
-    warnings = [] if refly is not None else _without_waypoints(outputs.refly, was_stopped=was_stopped)
+    warnings = [] if refly is not None else _without_waypoints(
+        outputs.refly, was_stopped=was_stopped, leaves_earlier=len(seen_before_m) > 0
+    )
     report = build_search_report(searched, settings, detector, refly, so_far, warnings)
     atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
     atomic_write_bytes(outputs.folder / "search.html", search_page(report, pictures).encode())
@@ -85,17 +87,19 @@ def _removed(files: Sequence[Path]) -> list[str]:
     return there
 
 
-def _without_waypoints(files: Sequence[Path], *, was_stopped: bool) -> list[str]:
-    """Take away earlier waypoints at these files, and what a person who asked for some has to know."""
+def _without_waypoints(files: Sequence[Path], *, was_stopped: bool, leaves_earlier: bool) -> list[str]:
+    """Take away earlier waypoints at these files, and what a person who asked for some has to know; `leaves_earlier`:
+    what earlier flights show was not to be flown."""
     old = _removed(files)
     if not files:
         return []
     if was_stopped:
         return [f"the flight was stopped, and its waypoints were taken away: {', '.join(old)}"] if old else []
     removed = f"; earlier ones were taken away: {', '.join(old)}" if old else ""
+    beside = " and that flights before it do not show" if leaves_earlier else ""
     return [
         f"no waypoints were written: no hole of {ReflySettings().least_m2:g} m2 or more is left that another flight "
-        f"may see{removed}"
+        f"may see{beside}{removed}"
     ]
 
 
