@@ -26,6 +26,7 @@ import numpy as np
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.turning import is_from_above
+from sorvolo.geometry.calibration_bins import calibration_bins
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
@@ -35,7 +36,6 @@ from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, measure
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import cell_side_m, cells_over
 from sorvolo.search.conditions import gather, look_at
-from sorvolo.search.recall import calibration
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
 from sorvolo.simulation.frame_light import frame_light
 from sorvolo.simulation.objects import Thing
@@ -301,9 +301,9 @@ def summarised(rows: Sequence[dict]) -> dict:
             "difference": round(float(found.mean() - chances.mean()), 4),
             "difference_90": bootstrapped([[row for row in own if row["flight"] == flight] for flight in flights]),
             "bins": [
-                [round(each.stated, 3), round(each.found, 3), each.count] for each in calibration(chances, found)
+                [round(each.stated, 3), round(each.found, 3), each.count] for each in calibration_bins(chances, found)
             ],
-            "bins_whole": [asdict(each) for each in calibration(chances, found)],
+            "bins_whole": [asdict(each) for each in calibration_bins(chances, found)],
         }
     hidden = [row for row in rows if row["trees"]]
     if hidden:

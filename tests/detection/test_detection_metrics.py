@@ -17,6 +17,7 @@ from sorvolo.detection.metrics import (
     precision_recall,
     recall_by_size,
     reporting_threshold,
+    right_by_score,
     thesis_ap,
     thesis_map,
 )
@@ -55,6 +56,19 @@ def test_a_reporting_threshold_does_not_hang_on_one_picture_s_chance():
     best, reported = best_threshold(match), reporting_threshold(match)
     assert best.score > 0.99 and best.f1 > reported.f1 > best.f1 - 0.1
     assert reported.score == pytest.approx(0.59) and reported.recall == pytest.approx(22 / 25)
+
+
+def test_what_a_score_means_worked_by_hand():
+    """Of three reports around 0.55 two are right, a fourth lies in an ignored region; of two around 0.95 both are."""
+    people = [square(20 * index, 0) for index in range(4)]
+    truth = LabelledSet("flat", CLASSES, (picture(people, [0] * 4, ignored=[square(0, 60, 30)]),))
+    doubtful = [(people[0], 0, 0.5), (people[1], 0, 0.55), (square(60, 60), 0, 0.59), (square(5, 65), 0, 0.57)]
+    sure = [(people[2], 0, 0.9), (people[3], 0, 1.0)]
+    (match, _), _, _ = match_pictures(truth, [seen(*doubtful, *sure)], CLASSES)
+    low, high = right_by_score(match)
+    assert (low.low, low.high, low.count, low.found) == (0.5, 0.6, 3, pytest.approx(2 / 3))
+    assert low.stated == pytest.approx((0.5 + 0.55 + 0.59) / 3) and low.found_low < 2 / 3 < low.found_high
+    assert (high.low, high.count, high.found) == (0.9, 2, 1.0)
 
 
 def test_average_precision_worked_by_hand():

@@ -99,7 +99,7 @@ def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"format": 2}, "update sorvolo"),
+        ({"format": 3}, "update sorvolo"),
         ({"classes": []}, "classes"),
         ({"classes": ["person", "person"]}, "classes"),
         ({"thresholds": {"person": 0.5}}, "it lacks 'car'"),

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from sorvolo.geometry.calibration_bins import calibration_bins, wilson
 from sorvolo.search.figures import figures, segment, together
-from sorvolo.search.recall import Chances, calibration, fit_recall, held_out_chances, map_chances, wilson
+from sorvolo.search.recall import Chances, fit_recall, held_out_chances, map_chances
 
 
 def _tried(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -25,7 +26,7 @@ def test_chances_fit_the_truth_and_their_intervals_hold_it() -> None:
 
 def test_what_is_stated_as_eight_of_ten_comes_true_eight_times_of_ten() -> None:
     columns, _, found = _tried(1500, 3)
-    for each in calibration(held_out_chances(columns, found), found):
+    for each in calibration_bins(held_out_chances(columns, found), found):
         assert each.count < 60 or abs(each.stated - each.found) < 0.07
 
 

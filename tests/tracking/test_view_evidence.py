@@ -23,9 +23,18 @@ def test_many_views_are_worth_a_few_that_err_apart() -> None:
     """What every view scores 0.7 becomes surer with each, but never surer than 1 / shared views that err apart."""
     scores = [score_from_views([0.7] * views, views) for views in (1, 2, 5, 20, 2000)]
     assert all(np.diff(scores) > 0)
-    bound = np.log(0.7 / 0.3) / EvidenceSettings().shared
+    settings = EvidenceSettings()
+    bound = settings.usual + (np.log(0.7 / 0.3) - settings.usual) / settings.shared
     assert scores[-1] == pytest.approx(1 / (1 + np.exp(-bound)), abs=0.001)
-    assert scores[-1] < 0.8
+    assert scores[-1] < 0.92
+
+
+def test_what_is_as_weak_as_usual_says_nothing() -> None:
+    """Views of the share of all that is shown leave it where it is; surer ones raise it, weaker ones lower it."""
+    usual = 1 / (1 + np.exp(-EvidenceSettings().usual))
+    assert score_from_views([usual] * 9, 9) == pytest.approx(usual)
+    assert score_from_views([0.4, 0.4], 2) > 0.4
+    assert score_from_views([0.4, usual - 0.05], 2) < score_from_views([0.4, usual], 2)
 
 
 def test_a_weak_sighting_is_less_against_it_than_none() -> None:

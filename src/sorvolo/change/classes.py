@@ -23,7 +23,7 @@ class ClassSettings:
     least_side_px: int = 160  # of a picture that a detector is shown
     least_share: float = 0.5  # of the box or of the change, whichever is smaller, that both have in common
     like_lengths: float = 1.6  # times the other's, at most
-    lenient: float = 0.6  # times each class's score: that something is there is known already
+    lenient: float = 0.4  # times each class's score: that something is there is known already
 
 
 def stands_in(change: Change, thing: MapObject, settings: ClassSettings = ClassSettings()) -> bool:

@@ -12,8 +12,8 @@ from sorvolo.errors import InputError
 METADATA_KEY = "sorvolo"
 """The key among an ONNX file's `metadata_props` under which the JSON lies."""
 
-FORMAT = 1
-"""The newest contract that this version reads; docs/detector.md lists its fields."""
+FORMAT = 2
+"""The newest contract that this version reads; docs/detector.md lists its fields. 2 brought `calibration`."""
 
 _FALLBACK_STRIDE = 32  # px: what a picture's sides are multiples of, in a model whose file does not state it
 _NEEDED = ("name", "classes", "thresholds", "best_px")
@@ -74,10 +74,20 @@ class Pyramid:
 
 
 @dataclass(frozen=True)
+class Calibration:
+    """How a class's scores become the share of such reports that is right: their log-odds become `shift` and `slope`
+    times themselves (Platt 1999)."""
+
+    slope: float
+    shift: float
+
+
+@dataclass(frozen=True)
 class ModelInfo:
     """One model, as its file describes it.
 
-    `thresholds`: each class is reported from this score on. `best_px`: from which to which longer side, in pixels, the
+    `thresholds`: each class is reported from this score on. `calibration`: what becomes, in the end, of the scores of
+    some classes; thresholds are of what comes out. `best_px`: from which to which longer side, in pixels, the
     model finds a class well. `stride`: the sides of its input are multiples of it. `thermal`: it was trained on
     thermal frames; `daylight`: on daylight. `thermal_by`: the installed model that looks at thermal frames
     in its place, "" for none. `precision` is float32 or int8. `on_request`: classes too unsure to be reported unless a
@@ -105,6 +115,7 @@ class ModelInfo:
     turned: Mapping[str, float] = field(default_factory=dict)
     second_look: Mapping[str, SecondLook] = field(default_factory=dict)
     pyramid: Mapping[str, Pyramid] = field(default_factory=dict)
+    calibration: Mapping[str, Calibration] = field(default_factory=dict)
     second_only: bool = False
 
     @property
@@ -156,7 +167,8 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
         str(fields["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
         bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request,
         turned=MappingProxyType(turned), second_look=MappingProxyType(_second_look(fields, classes)),
-        pyramid=MappingProxyType(_pyramid(fields, classes)), second_only=bool(fields.get("second_only", False)),
+        pyramid=MappingProxyType(_pyramid(fields, classes)),
+        calibration=MappingProxyType(_calibration(fields, classes)), second_only=bool(fields.get("second_only", False)),
         **texts,
     )
 
@@ -216,6 +228,18 @@ def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str,
             raise ValueError(f"its second_look must have 1 to {len(POSITIONS)} positions, not {positions}")
         own, again, shift, least, enlarged = weights
         found[name] = SecondLook(looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions)
+    return found
+
+
+def _calibration(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Calibration]:
+    found = {}
+    for name, each in fields.get("calibration", {}).items():
+        slope, shift = float(each["slope"]), float(each["shift"])
+        if name not in classes or not 0 < slope < math.inf or not math.isfinite(shift):
+            raise ValueError(
+                f"its calibration must name classes, with a slope above 0 and a shift, not {name}, {slope} and {shift}"
+            )
+        found[name] = Calibration(slope, shift)
     return found
 
 

@@ -10,6 +10,7 @@ from typing import overload
 
 import numpy as np
 
+from sorvolo.detection.calibration import calibrated
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Provider
 from sorvolo.detection.light import Picture, is_thermal, rgb_from_picture
@@ -210,7 +211,8 @@ class Detector:
             return no_detections(self.classes)
         looks_twice = from_above and bool(session.info.turned)
 
-        def reported(seen: Seen, names: Sequence[str]) -> Detections:
+        def reported(looks: Seen, names: Sequence[str]) -> Detections:
+            seen = calibrated(looks, session.info)
             least = _least_scores(session.info, _thresholds(session.info, from_above), names, least_score)
             kept = seen.scores >= least[seen.labels]
             labels = seen.labels[kept]

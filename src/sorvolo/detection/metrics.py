@@ -20,6 +20,7 @@ from pycocotools.cocoeval import COCOeval
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import BoxesPx, Counts, Floats, Mask, Rows
 from sorvolo.geometry.box_overlap import iou_matrix
+from sorvolo.geometry.calibration_bins import CalibrationBin, calibration_bins
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import Detections
 
@@ -34,6 +35,8 @@ SIZES_PX = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, np.inf)
 
 SIZES_M = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
 """Edges of the bins of an object's longer side on the ground, m."""
+
+_TENTHS = tuple(each / 10 for each in range(11))
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +163,15 @@ def counts_at(match: ClassMatch, score: float) -> tuple[int, int, int]:
     right = int((reported & match.right[0]).sum())
     wrong = int((reported & ~match.right[0] & ~match.ignored[0]).sum())
     return right, wrong, len(match.true_scores) - right
+
+
+def right_by_score(match: ClassMatch) -> list[CalibrationBin]:
+    """Which share of the reports of each tenth of the score is right, at IoU 0.5: where 0.5 means half, half of them.
+
+    Reports within ignored regions do not count; tenths without any are left out.
+    """
+    counted = ~match.ignored[0]
+    return calibration_bins(match.scores[counted].astype(float), match.right[0][counted], _TENTHS)
 
 
 def thesis_ap(match: ClassMatch, score: float) -> float:

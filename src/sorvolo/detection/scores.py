@@ -20,11 +20,13 @@ from sorvolo.detection.metrics import (
     match_pictures,
     precision_recall,
     recall_by_size,
+    right_by_score,
     thesis_ap,
     thesis_map,
 )
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Counts, Floats, Rows
+from sorvolo.geometry.calibration_bins import CalibrationBin
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
 
@@ -35,7 +37,8 @@ _CURVE_POINTS = 200  # of a curve that a page draws some hundred pixels wide
 class ClassScores:
     """One class: COCO's numbers, what reporting at the model's own threshold gives, the best threshold in hindsight.
 
-    `curve` (N, 3) is score, precision and recall at IoU 0.5, thinned. `thesis_ap` is eq. 4.3 at `reported.score`.
+    `curve` (N, 3) is score, precision and recall at IoU 0.5, thinned; `by_score` has what share of each tenth of the
+    score is right. `thesis_ap` is eq. 4.3 at `reported.score`.
     """
 
     label: str
@@ -45,6 +48,7 @@ class ClassScores:
     thesis_ap: float
     best: Threshold
     curve: Floats
+    by_score: tuple[CalibrationBin, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +131,7 @@ def score_set(
             match.label, len(match.true_scores), by_class[match.label],
             Threshold(thresholds[match.label], precision, recall, f1), thesis_ap(match, thresholds[match.label]),
             best_threshold(match), _thinned(np.column_stack(precision_recall(match))),
+            tuple(right_by_score(match)),
         ))
     m_per_px = np.array([picture.m_per_px for picture in labelled.pictures])
     return SetScores(

@@ -24,6 +24,7 @@ from sorvolo.tracking.common_shift import CommonShift, ShiftSettings
 from sorvolo.tracking.doubles import JoiningSettings, double_of, earlier_mover, frame_doubles, inward_m, neighbours
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of, predicted
+from sorvolo.tracking.view_evidence import USUAL_LOG_ODDS
 
 
 @dataclass(frozen=True)
@@ -54,9 +55,9 @@ class EvidenceRules:
 class TrackerSettings:
     """When sightings make an object. `unit_m` is how many metres a unit of the places is, for speeds and distances.
 
-    `evidence` grows with each sighting by its score's log odds plus one, and shrinks by `missed` with each frame that
-    shows the place without the object. `alone` has the score of each class from which one frame that alone shows a
-    place is enough: photos, which may show it once; empty for a video, which shows it in many frames.
+    `evidence` grows with each sighting by its score's log odds beyond the usual ones, and shrinks by `missed` with each
+    frame that shows the place without the object. `alone` has the score of each class from which one frame that alone
+    shows a place is enough: photos, which may show it once; empty for a video, which shows it in many frames.
     """
 
     sure_score: float = 0.4  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
@@ -540,6 +541,6 @@ def _stacked(near: list[Followed], time_ns: int) -> Motions:
 
 
 def _log_odds(score: float) -> float:
-    """How much a sighting of this score speaks for an object."""
+    """How much a sighting of this score speaks for an object, beyond what is usual."""
     share = min(max(score, 0.01), 0.99)
-    return float(np.clip(np.log(share / (1 - share)) + 1.0, 0.3, 2.5))
+    return float(np.clip(np.log(share / (1 - share)) - USUAL_LOG_ODDS, 0.3, 2.5))

@@ -5,14 +5,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+USUAL_LOG_ODDS = -1.7
+"""Log-odds of whatever detectors show, however weakly, on photos that they did not learn from: 0.15 of it is right."""
+
 
 @dataclass(frozen=True)
 class EvidenceSettings:
     """What a view is worth; the share is that of the things that the packaged detector saw in 29 photos of `caliterra`
     and the 32 of `fixed_wing`, nearly all of them false (decisions 0039, 0079)."""
 
-    least_seen: float = 0.2  # weaker sightings are none
-    missed: float = -2.2  # log-odds of a view without a sighting: a score of 0.1, half of the least
+    least_seen: float = 0.05  # weaker sightings are none
+    usual: float = USUAL_LOG_ODDS  # of whatever a view shows: what is beyond it speaks for the thing, below it against
+    missed: float = -2.0  # log-odds that a view without a sighting adds: a score of 0.025, half of the least
     shared: float = 0.63  # share of the variance of log-odds that lies between things, not between views of one
 
 
@@ -22,12 +26,14 @@ def score_from_views(
     """The score, 0 to 1, of a thing that views of these scores show, of `views` that could show it.
 
     `scores`, each 0 to 1, hold one a view and at most `views`; `more_log_odds` is what else is known. The views'
-    log-odds are added. But views of one thing err together, so that n of them count as n / (1 + (n - 1) shared): the
-    design effect of a sample drawn in clusters (Kish 1965). One view counts for what it is.
+    log-odds beyond the usual ones are added to these, as likelihood ratios are. But views of one thing err together, so
+    that n of them count as n / (1 + (n - 1) shared): the design effect of a sample drawn in clusters (Kish 1965). One
+    view counts for what it is.
     """
     inside = np.clip(np.asarray(scores, np.float64), 1e-3, 1 - 1e-3)
-    total = float(np.log(inside / (1 - inside)).sum()) + (views - len(scores)) * settings.missed
-    return float(1 / (1 + np.exp(-total / (1 + (views - 1) * settings.shared) - more_log_odds)))
+    beyond = float((np.log(inside / (1 - inside)) - settings.usual).sum()) + (views - len(scores)) * settings.missed
+    odds = settings.usual + beyond / (1 + (views - 1) * settings.shared) + more_log_odds
+    return float(1 / (1 + np.exp(-odds)))
 
 
 def least_seen(thresholds: Mapping[str, float], settings: EvidenceSettings = EvidenceSettings()) -> float:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.tiling import TASK
+from sorvolo.geometry.calibration_bins import calibration_bins, wilson
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.planning import BOTTOM_CRITICAL_M
 from sorvolo.geometry.summary import median_of_known
@@ -16,7 +17,7 @@ from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
 from sorvolo.search.figures import figures, path_length_m, segment, together
 from sorvolo.search.holes import Holes, Reason, hole_areas_m2, hole_reasons, reasons_together
-from sorvolo.search.recall import Chances, calibration, held_out_chances, wilson
+from sorvolo.search.recall import Chances, held_out_chances
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.area import Area, inside_any
 from sorvolo.survey.flight import Site
@@ -170,7 +171,7 @@ def _flight_row(flight: MeasuredFlight) -> dict[str, Any]:
         held_out = held_out_chances(own.columns, own.found)
         classes[each.label] = {
             "planted": len(own), "found": hits, "interval": wilson(hits, len(own)),
-            "calibration": [asdict(row) for row in calibration(held_out, own.found)],
+            "calibration": [asdict(row) for row in calibration_bins(held_out, own.found)],
         }
     return {
         "name": flight.name, "frames": flight.frames, "searched_pictures": flight.searched.looked,

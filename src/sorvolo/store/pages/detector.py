@@ -8,7 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
-from sorvolo.store.pages.plots import SIDE_PX, Line, colour_class, line_plot, unit_axes
+from sorvolo.store.pages.plots import SIDE_PX, Line, colour_class, line_plot, stated_and_found, unit_axes
 from sorvolo.store.pages.render import cell, render
 from sorvolo.store.pages.words import known, picture_uri
 
@@ -21,6 +21,7 @@ _CLASS_NAMES = (
     "class", "labels", "AP", "AP50", "AP75", "reported from", "precision", "recall", "F1", "thesis AP", "best F1",
     "from",
 )
+_SCORE_NAMES = ("class", "score", "candidates", "right", "90 % interval")
 _SIZE_NAMES = ("class", "longer side", "labels", "recall as reported", "with any candidate")
 
 
@@ -43,6 +44,7 @@ def detector_page(
         summary=f"Measured on {pictures} labelled pictures of {_videos(sets)}. All shares are in per cent.",
         overview_names=_SET_NAMES, overview=[_overview_row(each) for each in sets], remarks=_remarks(sets),
         comparisons=[_comparison(each) for each in comparisons], class_names=_CLASS_NAMES, size_names=_SIZE_NAMES,
+        score_names=_SCORE_NAMES,
         sets=[_set(each, worst.get(each.name, ())) for each in sets],
         description=[(str(key), known(value)) for key, value in description.items()],
     )
@@ -52,7 +54,8 @@ def detector_page(
 def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, Any]:
     labels = [row.label for row in scores.classes]
     return {
-        "name": scores.name, "classes": _class_rows(scores), "curves": _curves(scores), "sizes": _sizes(scores),
+        "name": scores.name, "classes": _class_rows(scores), "curves": _curves(scores),
+        "by_score": _by_score(scores), "sizes": _sizes(scores),
         "confusion_names": ["label", *(f"reported as {name}" for name in labels), "missed"],
         "confusion": _confusion(scores, labels), "mistakes": _mistakes(scores, worst),
     }
@@ -132,6 +135,23 @@ def _curves(scores: Any) -> dict[str, Any] | None:
         lines.append(Line(colour_class(place), points, dots, "reported", 4.5))
     keys = [(colour_class(place), row.label) for place, row in enumerate(shown)]
     return {"drawing": line_plot("Precision over recall", lines, frame, SIDE_PX, SIDE_PX), "legend": keys}
+
+
+def _by_score(scores: Any) -> dict[str, Any] | None:
+    """Which share of reports of each score is right: drawn, and as rows."""
+    shown = [(row, each) for row in scores.classes if row.labels for each in row.by_score]
+    if not shown:
+        return None
+    rows = [(row.label, each.stated, each.found, each.found_low, each.found_high, each.count) for row, each in shown]
+    names = list(dict.fromkeys(row.label for row, _ in shown))
+    return {
+        "drawing": stated_and_found(rows, across="score", upwards="right"),
+        "legend": [(colour_class(place), name) for place, name in enumerate(names)],
+        "rows": [
+            [row.label, f"{each.low:.1f} to {each.high:.1f}", each.count, _share(each.found),
+             f"{_share(each.found_low)} to {_share(each.found_high)}"] for row, each in shown
+        ],
+    }
 
 
 def _sizes(scores: Any) -> list[tuple[str, list[list[Any]]]]:

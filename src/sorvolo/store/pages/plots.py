@@ -243,21 +243,24 @@ def gps_scatter(track: TrackColumns, *, unit: str) -> str:
     )
 
 
-def stated_and_found(rows: Sequence[tuple[str, float, float, float, float, int]]) -> Markup:
+def stated_and_found(
+    rows: Sequence[tuple[str, float, float, float, float, int]], *, across: str = "stated", upwards: str = "found",
+) -> Markup:
     """What came true over what was stated, both 0 to 1; on the rising line both agree.
 
     Rows of a name, stated, found with the bounds of its interval, and how many; rows of one name have one colour.
+    `across` and `upwards` name the two in words.
     """
-    x, y, frame = unit_axes("stated", "found")
+    x, y, frame = unit_axes(across, upwards)
     names = list(dict.fromkeys(name for name, *_ in rows))
     lines = [Line("median", [(x(0), y(0)), (x(1), y(1))])]
     for name, stated, found, found_low, found_high, count in rows:
-        words = f"{name}: {stated:.2f} stated, {found:.2f} found of {count}"
+        words = f"{name}: {stated:.2f} {across}, {found:.2f} {upwards} of {count}"
         lines.append(Line(
             colour_class(names.index(name)), [(x(stated), y(found_low)), (x(stated), y(found_high))],
             [(x(stated), y(found))], words, 4.0,
         ))
-    return line_plot("Found over stated", lines, frame, SIDE_PX, SIDE_PX)
+    return line_plot(f"{upwards.capitalize()} over {across}", lines, frame, SIDE_PX, SIDE_PX)
 
 
 def _plan_scales(east: Floats, north: Floats) -> tuple[Scale, Scale, float, float]:

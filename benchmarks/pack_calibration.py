@@ -1,0 +1,68 @@
+"""What the packaged models' scores mean, into their files: benchmarks/pack_calibration.py [--results FILE]
+
+The last step of packing (decision 0091); no weight of the networks changes, only the metadata of default.onnx,
+default-int8.onnx and thermal.onnx and their cards. Slopes and shifts are those that `score_calibration.py --fit` left
+in its result file. Thresholds are scaled alike, so that the same is reported as before.
+"""
+
+import argparse
+import hashlib
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pack_default_model import HOME
+from pack_second_look import with_fields
+from score_calibration import RESULTS
+from sorvolo.detection.calibration import platt_scaled
+from sorvolo.detection.contract import FORMAT
+
+MODELS = {"default": ("14", "default"), "default-int8": ("14", "default"), "thermal": ("5", "thermal")}
+OWN = {
+    "default": {"person": 0.85, "car": 0.76, "small object": 0.44},
+    "thermal": {"person": 0.46, "car": 0.26, "small object": 0.28},
+}
+"""The thresholds that were chosen, in the networks' own scale."""
+
+
+def main() -> None:
+    """Rewrite the files and their cards."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--home", type=Path, default=HOME)
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    wishes = parser.parse_args()
+    fits = json.loads(wishes.results.read_text())
+    for name, (version, source) in MODELS.items():
+        fit = fits[source]["classes"]
+        calibration = {label: {key: each[key] for key in ("slope", "shift")} for label, each in fit.items()}
+        fields: dict[str, Any] = {
+            "format": FORMAT, "version": version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
+            "calibration": calibration, "thresholds": OWN[source] | {
+                label: scaled(OWN[source][label], each) for label, each in calibration.items()
+            },
+        }
+        path = wishes.home / f"{name}.onnx"
+        path.write_bytes(with_fields(path.read_bytes(), fields))
+        before = json.loads(path.with_suffix(".json").read_text())
+        if "calibration" in before and before["version"] != version:  # that of each network, before they were joined
+            before["calibration_of_networks"] = before.pop("calibration")
+        card = before | fields
+        if "measured" in before and before["version"] != version:  # figures stay those of the version that gave them
+            card.setdefault("measured_by", f"version {before['version']}, whose networks are the same")
+        if "of" in card:
+            card["of"] = f"default, version {version}"
+        card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
+        path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
+        print(name, fields["thresholds"], calibration)
+
+
+def scaled(own: float, how: dict[str, float]) -> float:
+    """A threshold of the networks' own scale, in that of the calibrated scores, to two digits."""
+    return round(float(platt_scaled(np.array([own]), how["slope"], how["shift"])[0]), 2)
+
+
+if __name__ == "__main__":
+    main()
