@@ -12,13 +12,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pack_default_model import HOME
 from pack_second_look import with_fields
 from score_calibration import RESULTS
 from sorvolo.detection.calibration import platt_scaled
-from sorvolo.detection.contract import FORMAT
+from sorvolo.detection.contract import FORMAT, Calibration
 
 MODELS = {"default": ("14", "default"), "default-int8": ("14", "default"), "thermal": ("5", "thermal")}
 OWN = {
@@ -61,7 +59,7 @@ def main() -> None:
 
 def scaled(own: float, how: dict[str, float]) -> float:
     """A threshold of the networks' own scale, in that of the calibrated scores, to two digits."""
-    return round(float(platt_scaled(np.array([own]), how["slope"], how["shift"])[0]), 2)
+    return round(float(platt_scaled(own, Calibration(**how))), 2)
 
 
 if __name__ == "__main__":

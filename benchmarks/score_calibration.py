@@ -27,8 +27,8 @@ import numpy as np
 
 import detection_data
 from provenance import commit, machine, note_scoring
-from sorvolo.detection.calibration import platt_scaled
-from sorvolo.detection.contract import ModelInfo
+from sorvolo.detection.calibration import platt_fit, platt_scaled
+from sorvolo.detection.contract import Calibration
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.metrics import match_pictures
 from sorvolo.detection.models import find_model
@@ -37,7 +37,6 @@ from sorvolo.geometry.calibration_bins import calibration_bins
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 from train_default_model import reader
-from train_judge import fitted, odds
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "score_calibration.json"
@@ -92,8 +91,8 @@ def main() -> None:
     for label in SHOWN:
         own = [each for each in reports if each.label == label]
         names = FIT[wishes.model][label]
-        fit = fit_of([each for each in own if each.is_of(names)]) if wishes.fit else _stated(stated, label)
-        found[label] = {"slope": fit[0], "shift": fit[1], "fit_on": names} | judged(own, names, fit)
+        fit = fit_of([each for each in own if each.is_of(names)]) if wishes.fit else stated.calibration[label]
+        found[label] = {"slope": fit.slope, "shift": fit.shift, "fit_on": names} | judged(own, names, fit)
         print(label, json.dumps(found[label], indent=1), flush=True)
     document = json.loads(wishes.results.read_text()) if wishes.results.is_file() else {}
     document[wishes.model] = {
@@ -204,20 +203,21 @@ def _sized(picture: LabelledPicture) -> LabelledPicture:
     return replace(picture, width_px=10_000, height_px=10_000) if picture.width_px == 1 else picture
 
 
-def fit_of(reports: Sequence[Reports]) -> tuple[float, float]:
-    """Slope and shift of the log-odds of a class's reports; each group counts the same."""
+def fit_of(reports: Sequence[Reports]) -> Calibration:
+    """The scale of a class's reports; each group counts the same."""
     rows = [each for each in reports if len(each.scores)]
     sizes: dict[str, int] = {}
     for each in rows:
         sizes[each.group] = sizes.get(each.group, 0) + len(each.scores)
     mean = sum(sizes.values()) / len(sizes)
     counts = np.concatenate([np.full(len(each.scores), mean / sizes[each.group]) for each in rows])
-    inputs = odds(np.concatenate([each.scores for each in rows]))[:, None]
-    slope, shift = fitted(inputs, np.concatenate([each.right for each in rows]).astype(float), counts)
-    return round(float(slope), 3), round(float(shift), 3)
+    scores, right = (np.concatenate([getattr(each, key) for each in rows]) for key in ("scores", "right"))
+    fit = platt_fit(scores.astype(float), right, counts)
+    assert fit is not None  # of the packaged models right reports score higher
+    return Calibration(round(fit.slope, 3), round(fit.shift, 3))
 
 
-def judged(reports: Sequence[Reports], names: Sequence[str], fit: tuple[float, float]) -> dict[str, Any]:
+def judged(reports: Sequence[Reports], names: Sequence[str], fit: Calibration) -> dict[str, Any]:
     """In tenths of the scaled score, how many, and which share is right: of all that is held out, and set by set."""
     sets = []
     for place, kind, way in dict.fromkeys((each.place, each.kind(names), each.way) for each in reports):
@@ -229,11 +229,11 @@ def judged(reports: Sequence[Reports], names: Sequence[str], fit: tuple[float, f
     return {"held out": tenths([each for each in reports if each.kind(names) == "held out"], fit), "sets": sets}
 
 
-def tenths(reports: Sequence[Reports], fit: tuple[float, float]) -> list[dict[str, float | int]]:
+def tenths(reports: Sequence[Reports], fit: Calibration) -> list[dict[str, float | int]]:
     """Where there are any: how many, their mean score, and which share is right with its interval of 90 %."""
     if not reports:
         return []
-    scores = platt_scaled(np.concatenate([each.scores for each in reports]).astype(float), *fit)
+    scores = platt_scaled(np.concatenate([each.scores for each in reports]).astype(float), fit)
     rows = calibration_bins(scores, np.concatenate([each.right for each in reports]), TENTHS)
     return [
         {
@@ -242,11 +242,6 @@ def tenths(reports: Sequence[Reports], fit: tuple[float, float]) -> list[dict[st
         }
         for each in rows
     ]
-
-
-def _stated(info: ModelInfo, label: str) -> tuple[float, float]:
-    how = info.calibration.get(label)
-    return (1.0, 0.0) if how is None else (how.slope, how.shift)
 
 
 if __name__ == "__main__":

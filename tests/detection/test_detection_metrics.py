@@ -5,6 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
+from sorvolo.detection.calibration import platt_scaled
+from sorvolo.detection.contract import Calibration
 from sorvolo.detection.held_out import Checked, best_sizes_px
 from sorvolo.detection.intervals import differences, draw_groups, group_tables, intervals
 from sorvolo.detection.metrics import (
@@ -309,3 +311,24 @@ def test_few_held_out_labels_keep_threshold_and_sizes_of_the_model_before(people
     sizes = best_sizes_px(checked, scores, (), CLASSES, before)
     assert sizes["car"] == before["car"] and (sizes["person"] == before["person"]) is kept
     assert best_sizes_px(checked, scores, (), CLASSES)["person"] != before["person"]
+
+
+def test_what_held_out_scores_mean() -> None:
+    """Of 60 people each is found by one of 60 reports, 20 reports of low scores are of nothing: those become shares.
+
+    Of a class with too few labels the scale of the model before is kept, where it had one.
+    """
+    people = [square(20 * index, 0) for index in range(60)]
+    truth = LabelledSet("held out", CLASSES, (picture(people, [0] * 60),))
+    right = [(box, 0, 0.9 - 0.008 * index) for index, box in enumerate(people)]
+    wrong = [(square(20 * index, 50), 0, 0.5 - 0.01 * index) for index in range(20)]
+    matches, _, _ = match_pictures(truth, [seen(*right, *wrong)], CLASSES)
+    checked = Checked({each.label: (each,) for each in matches if each.label == "person"}, {})
+    before = {"person": Calibration(0.5, 0.0), "car": Calibration(2.0, -1.0)}
+    found = checked.calibration(CLASSES, before)
+    assert found["car"] == before["car"] and found["person"] != before["person"]
+    sure, unsure = platt_scaled(np.array([0.85, 0.42]), found["person"])
+    assert sure > 0.95 and 0.3 < unsure < 0.7
+    assert set(checked.calibration(CLASSES)) == {"person"}
+    perfect, _, _ = match_pictures(truth, [seen(*right)], CLASSES)
+    assert not Checked({"person": (perfect[0],)}, {}).calibration(("person",))

@@ -9,8 +9,8 @@ import onnx
 import pytest
 from toy_models import draw, rectangle_model
 
-from sorvolo.detection.calibration import platt_scaled
-from sorvolo.detection.contract import FORMAT, METADATA_KEY
+from sorvolo.detection.calibration import in_own_scale, platt_fit, platt_scaled, scaled_thresholds
+from sorvolo.detection.contract import FORMAT, METADATA_KEY, Calibration
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import installed_models
 from sorvolo.errors import InputError
@@ -48,9 +48,43 @@ def test_thresholds_are_of_what_comes_out(tmp_path: Path) -> None:
         assert detector.thresholds_for(picture)["person"] == least
 
 
+def test_a_fit_finds_what_scores_mean() -> None:
+    """Reports right as often as a known scale states: it is found again, and then 0.5 means half."""
+    rng = np.random.default_rng(5)
+    own, truth = rng.uniform(0.02, 0.98, 200_000), Calibration(0.7, -1.4)
+    right = rng.random(len(own)) < platt_scaled(own, truth)
+    fit = platt_fit(own, right)
+    assert fit is not None
+    assert fit.slope == pytest.approx(truth.slope, abs=0.05) and fit.shift == pytest.approx(truth.shift, abs=0.05)
+    scores = platt_scaled(own, fit)
+    half = (scores > 0.4) & (scores < 0.6)
+    assert right[half].mean() == pytest.approx(0.5, abs=0.03)
+
+
+def test_what_counts_twice_is_there_twice() -> None:
+    own, right = np.array([0.2, 0.3, 0.6, 0.9]), np.array([False, True, False, True])
+    twice = [0, 1, 1, 2, 3]
+    counted, doubled = platt_fit(own, right, np.array([1.0, 2.0, 1.0, 1.0])), platt_fit(own[twice], right[twice])
+    assert counted is not None and doubled is not None
+    assert counted.slope == pytest.approx(doubled.slope, abs=1e-3)
+
+
+def test_no_scale_where_scores_tell_nothing() -> None:
+    own = np.array([0.2, 0.4, 0.6, 0.8])
+    assert platt_fit(own, np.ones(4, bool)) is None and platt_fit(own, np.zeros(4, bool)) is None
+    assert platt_fit(own, own < 0.5) is None
+
+
+def test_thresholds_go_there_and_back(tmp_path: Path) -> None:
+    info = loaded(tmp_path, calibration=PEOPLE).info
+    own = in_own_scale(info)
+    assert own["car"] == info.thresholds["car"] and own["person"] > info.thresholds["person"]
+    assert scaled_thresholds(own, info.calibration) == pytest.approx(dict(info.thresholds))
+
+
 @pytest.mark.parametrize("score", [0.0, 1.0])
 def test_scores_at_the_ends_stay_between(score: float) -> None:
-    assert 0 < platt_scaled(np.array([score]), 1.2, -0.5)[0] < 1
+    assert 0 < platt_scaled(score, Calibration(1.2, -0.5)) < 1
 
 
 @pytest.mark.parametrize(

@@ -108,6 +108,7 @@ def show(
         sizes = f"found well from {least_px:g} to {most_px:g} px"
         words = f"{reported} from score {info.thresholds[each]:.2f} on; {sizes}"
         table.add_row(escape(each), words)
+    table.add_row("scores", _meaning(info))
     for key, value in card.items():
         if key not in facts and key not in (_MEASURED, _MEASURED_BY):
             table.add_row(escape(key.replace("_", " ")), escape(_in_words(value)))
@@ -273,6 +274,18 @@ def _classes(facts: Mapping[str, Any]) -> list[str]:
     if facts["second_only"]:
         return [f"{name} (in other models' reports)" for name in facts["classes"]]
     return [f"{name} (on request)" if name in facts["on_request"] else name for name in facts["classes"]]
+
+
+def _meaning(info: "ModelInfo") -> str:
+    """What the model's scores mean, in words."""
+    if info.second_only:
+        return "what it makes of a report; the model that reported weighs them"
+    known = [name for name in info.classes if name in info.calibration]
+    shares = f"shares, of {', '.join(known)}: of what has 0.5, about half is right"
+    if len(known) == len(info.classes):
+        return shares
+    others = ", ".join(name for name in info.classes if name not in known)
+    return f"{shares}; of {others} they only order reports" if known else "they only order reports"
 
 
 def _light(facts: Mapping[str, Any]) -> str:

@@ -6,6 +6,8 @@ from types import MappingProxyType
 
 import numpy as np
 
+from sorvolo.detection.calibration import platt_fit
+from sorvolo.detection.contract import Calibration
 from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, at_score, reporting_threshold
 from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
@@ -13,7 +15,7 @@ from sorvolo.survey.labels import LabelledPicture, LabelledSet
 _FALLBACK_THRESHOLD = 0.5  # where nothing was held out to choose one
 _FEW_LABELS = 50  # held-out labels of a class: with fewer, the best score on them may lie anywhere
 _NONE = Threshold(*[float("nan")] * 4)
-_FEW = 10  # objects found, from which on the range of their sizes means something
+_FEW = 10  # objects found, from which on the range of their sizes means something; right and wrong reports likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,24 @@ class Checked:
             matches = self.matches.get(name, ())
             chosen[name] = at_score(_pooled(matches), before[name]) if matches else replace(unknown, score=before[name])
         return {name: chosen[name] if np.isfinite(chosen.get(name, _NONE).score) else unknown for name in classes}
+
+    def calibration(
+        self, classes: Sequence[str], before: Mapping[str, Calibration] = MappingProxyType({})
+    ) -> dict[str, Calibration]:
+        """The scale by which scores of each class become the share that is right among the held-out pictures' reports.
+
+        `before` is that of the model that was learnt on from: kept for `too_few` classes. Nothing of a class of which
+        too few reports are right, or wrong, to tell.
+        """
+        found = {}
+        for name in set(classes) - set(self.too_few(classes)):
+            match = _pooled(self.matches[name])
+            counted = ~match.ignored[0]
+            right = match.right[0][counted]
+            fit = platt_fit(match.scores[counted].astype(float), right)
+            if fit is not None and min(np.count_nonzero(right), np.count_nonzero(~right)) >= _FEW:
+                found[name] = fit
+        return {name: before[name] for name in self.too_few(classes) if name in before} | found
 
     def too_few(self, classes: Sequence[str]) -> tuple[str, ...]:
         """The classes with so few held-out labels that a threshold chosen by them is chance."""

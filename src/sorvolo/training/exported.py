@@ -28,9 +28,10 @@ _OF_CLASSES = "head.scores"  # the one layer with a row for each class; the back
 class ExportedModel:
     """A model file of ours to learn on from, and what it states about itself; `origin` names it in words.
 
-    `thresholds` are those of the network that is learnt on from. `left` names in words what else the file joins with it
-    and a training does not carry on, `cost` what that costs, by the model's card. `on_request`, `thermal_by` and
-    `best_px` are those of `detection.contract.ModelInfo`.
+    `thresholds` are those of the network that is learnt on from, in its own scale, and `calibration` (slope and shift)
+    what that scale means. `left` names in words what else the file joins with it and a training does not carry on,
+    `cost` what that costs, by the model's card. `on_request`, `thermal_by` and `best_px` are those of
+    `detection.contract.ModelInfo`.
     """
 
     content: bytes
@@ -40,6 +41,7 @@ class ExportedModel:
     licence: str
     trained_on: str
     thresholds: Mapping[str, float] = field(default_factory=dict)
+    calibration: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     left: tuple[str, ...] = ()
     cost: tuple[str, ...] = ()
     on_request: tuple[str, ...] = ()

@@ -5,7 +5,7 @@ import os
 import time
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from functools import lru_cache
 from pathlib import Path
@@ -13,6 +13,8 @@ from typing import Any
 
 from sorvolo import __version__
 from sorvolo.capture.photos import read_picture
+from sorvolo.detection.calibration import scaled_thresholds
+from sorvolo.detection.contract import FORMAT, Calibration
 from sorvolo.detection.held_out import Checked, best_sizes_px, found_sizes_px
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
@@ -278,7 +280,13 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     before = run.start.thresholds if isinstance(run.start, ExportedModel) else {}
     thresholds = checked.thresholds(classes, before)
     scores = {name: each.score for name, each in thresholds.items()}
-    info = _info(run, checked, scores)
+    known = run.start.calibration if isinstance(run.start, ExportedModel) else {}
+    calibration = checked.calibration(classes, {name: Calibration(**each) for name, each in known.items()})
+    scaled = scaled_thresholds(scores, calibration)
+    info = _info(run, checked, scores) | {
+        "format": FORMAT, "thresholds": scaled,
+        "calibration": {name: asdict(each) for name, each in calibration.items()},
+    }
     exported = export_onnx(model, info)
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
@@ -289,7 +297,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
         notices += tuple(size_notices(run.start, checked.too_few(classes)))
         notices += tuple(request_notices(run.start, info["on_request"]))
     report = _report(run, info, agreement, len(exported), check, notices) | {
-        "reported": {name: asdict(each) for name, each in thresholds.items()},
+        "reported": {name: asdict(replace(each, score=scaled[name])) for name, each in thresholds.items()},
         "found_px": found_sizes_px(checked, scores, classes),
     }
     atomic_write_bytes(run.out / REPORT, json_bytes(report))

@@ -2,11 +2,12 @@
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from sorvolo.detection.calibration import in_own_scale
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.models import (
     HASH_KEY,
@@ -169,8 +170,9 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
         raise InputError(f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}")
     sha256 = file_sha256(path)
     start = ExportedModel(
-        content, info.classes, f"the model {info.name}", sha256, info.licence, info.trained_on, info.thresholds,
-        on_request=info.on_request, thermal_by=info.thermal_by, best_px=info.best_px,
+        content, info.classes, f"the model {info.name}", sha256, info.licence, info.trained_on, in_own_scale(info),
+        {name: asdict(each) for name, each in info.calibration.items()}, on_request=info.on_request,
+        thermal_by=info.thermal_by, best_px=info.best_px,
     )
     return _aerial(start, info, path) if other_networks(content) else start
 
@@ -184,7 +186,7 @@ def _aerial(start: ExportedModel, info: ModelInfo, path: Path) -> ExportedModel:
     left += [f"the second look at reports ({', '.join(info.second_look)})"] if info.second_look else []
     left += ["the search in several sizes"] if info.pyramid else []
     cost = tuple(_lost(alone.get("measured") or {}, card.get("measured") or {})) if alone else ()
-    return replace(start, thresholds=alone.get("thresholds", {}), left=tuple(left), cost=cost)
+    return replace(start, thresholds=alone.get("thresholds", {}), calibration={}, left=tuple(left), cost=cost)
 
 
 def _lost(alone: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterator[str]:

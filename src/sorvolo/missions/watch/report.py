@@ -86,7 +86,7 @@ def model_facts(model: ModelInfo) -> dict[str, Any]:
     """What the report states of a model that looked at pictures."""
     return {
         "name": model.name, "version": model.version, "preset": model.preset, "precision": model.precision,
-        "classes": list(model.classes), "thresholds": dict(model.thresholds), "licence": model.licence,
+        "classes": list(model.classes), "thresholds": dict(model.thresholds), "calibrated": list(model.calibration), "licence": model.licence,
         "trained_on": model.trained_on, "created": model.created,
     }
 
