@@ -86,8 +86,8 @@ def model_facts(model: ModelInfo) -> dict[str, Any]:
     """What the report states of a model that looked at pictures."""
     return {
         "name": model.name, "version": model.version, "preset": model.preset, "precision": model.precision,
-        "classes": list(model.classes), "thresholds": dict(model.thresholds), "calibrated": list(model.calibration), "licence": model.licence,
-        "trained_on": model.trained_on, "created": model.created,
+        "classes": list(model.classes), "thresholds": dict(model.thresholds), "calibrated": list(model.calibration),
+        "licence": model.licence, "trained_on": model.trained_on, "created": model.created,
     }
 
 
