@@ -22,6 +22,7 @@ import numpy as np
 
 from provenance import commit, drawn_seeds, machine
 from sorvolo.capture.source import open_sources
+from sorvolo.detection.calibration import in_own_scale
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.session import Seen
 from sorvolo.detection.tiling import whole_m_per_px
@@ -118,7 +119,8 @@ def glanced(detector: Detector, image: ImageRGB, *, again: bool) -> Boxes:
     seen: Seen = session.see(image, 0.5)
     if again:
         seen = detector._seen_again(session, image, seen, _CLASSES)
-    least = np.array([info.thresholds[each] for each in info.classes])
+    own = in_own_scale(info)
+    least = np.array([own[each] for each in info.classes])
     kept = seen.scores >= least[seen.labels]
     return {name: seen.boxes_px[kept & (seen.labels == info.classes.index(name))] for name in _CLASSES}
 

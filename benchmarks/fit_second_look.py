@@ -26,6 +26,7 @@ import numpy as np
 
 from detection_data import hituav, tinyperson
 from fit_people import nobody
+from own_scale import own_scale
 from pack_opinion import LOOK_PX
 from painted_grounds import painted_ground
 from people_samples import Source, ground, shown
@@ -101,7 +102,7 @@ def main() -> None:
 def collected(wishes: argparse.Namespace, path: Path) -> None:
     """Search all development pictures by the model without a second look, and write what it reports."""
     session = Session(find_model(wishes.model), "cpu", 1)
-    session.info = replace(session.info, second_look={}, pyramid={})
+    session.info = own_scale(session.info, second_look={}, pyramid={})
     by = Session(find_model(wishes.by), "cpu", 1) if wishes.by else session
     reports: list[Report] = []
     photos: Counter[str] = Counter()

@@ -2,7 +2,8 @@
 
 The last step of packing (decision 0091); no weight of the networks changes, only the metadata of default.onnx,
 default-int8.onnx and thermal.onnx and their cards. Slopes and shifts are those that `score_calibration.py --fit` left
-in its result file. Thresholds are scaled alike, so that the same is reported as before.
+in its result file. Thresholds are scaled alike, so that the same is reported as before: the cards keep those of the
+networks' own scale (`thresholds_own`; of a file without a calibration its thresholds are).
 """
 
 import argparse
@@ -19,11 +20,6 @@ from sorvolo.detection.calibration import platt_scaled
 from sorvolo.detection.contract import FORMAT, Calibration
 
 MODELS = {"default": ("14", "default"), "default-int8": ("14", "default"), "thermal": ("5", "thermal")}
-OWN = {
-    "default": {"person": 0.85, "car": 0.76, "small object": 0.44},
-    "thermal": {"person": 0.46, "car": 0.26, "small object": 0.28},
-}
-"""The thresholds that were chosen, in the networks' own scale."""
 
 
 def main() -> None:
@@ -35,19 +31,17 @@ def main() -> None:
     fits = json.loads(wishes.results.read_text())
     for name, (version, source) in MODELS.items():
         fit = fits[source]["classes"]
+        path = wishes.home / f"{name}.onnx"
+        before = json.loads(path.with_suffix(".json").read_text())
+        own = before.get("thresholds_own", before["thresholds"])
         calibration = {label: {key: each[key] for key in ("slope", "shift")} for label, each in fit.items()}
         fields: dict[str, Any] = {
             "format": FORMAT, "version": version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
-            "calibration": calibration, "thresholds": OWN[source] | {
-                label: scaled(OWN[source][label], each) for label, each in calibration.items()
-            },
+            "calibration": calibration,
+            "thresholds": own | {label: scaled(own[label], each) for label, each in calibration.items()},
         }
-        path = wishes.home / f"{name}.onnx"
         path.write_bytes(with_fields(path.read_bytes(), fields))
-        before = json.loads(path.with_suffix(".json").read_text())
-        if "calibration" in before and before["version"] != version:  # that of each network, before they were joined
-            before["calibration_of_networks"] = before.pop("calibration")
-        card = before | fields
+        card = before | fields | {"thresholds_own": own}
         if "measured" in before and before["version"] != version:  # figures stay those of the version that gave them
             card.setdefault("measured_by", f"version {before['version']}, whose networks are the same")
         if "of" in card:

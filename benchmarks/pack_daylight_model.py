@@ -96,7 +96,7 @@ def main() -> None:
         **info, "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in sources],
         "training": TRAINING + TRAINING_OF_PEOPLE * bool(wishes.people),
         "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size, "export": check,
-        "calibration": learnt, "fails": list(FAILS),
+        "calibration_of_networks": learnt, "fails": list(FAILS),
     }
     if alone := aerial_alone(wishes.aerial):
         card["aerial_alone"] = alone
@@ -141,7 +141,7 @@ def judge_and_probabilities(folder: Path | None, packed: str) -> tuple[dict[str,
         name.removeprefix("judge."): torch.from_numpy(numpy_helper.to_array(each).copy())
         for name, each in weights.items()
     }
-    return json.loads(path.with_suffix(".json").read_text())["calibration"], judge
+    return json.loads(path.with_suffix(".json").read_text())["calibration_of_networks"], judge
 
 
 def with_people(learnt: dict[str, Any], people: dict[str, Any]) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from provenance import note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.quantise import quantise
 from sorvolo.detection.scores import score_set
+from sorvolo.missions.evaluate.detector import LEAST_SCORE
 from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
@@ -35,7 +36,9 @@ FLOAT_PARTS = (
     "backbone/stem", "backbone/stages.0", "softened",
 )
 CALIBRATION_OF_EACH, MOST_PICTURES = 16, 60
-_LATER = ("version", "best_px", "second_look", "second_look_fit", "second_look_measured", "pyramid")
+_LATER = (
+    "version", "best_px", "second_look", "second_look_fit", "second_look_measured", "pyramid", "format", "calibration",
+)
 _KEPT = ("preset", "classes", "thresholds", "on_request", "licence", "trained_on", "fails")
 
 
@@ -112,7 +115,7 @@ def compared(labelled: LabelledSet, whole: Path, small: Path) -> dict[str, dict[
     out: dict[str, dict[str, float]] = {}
     for precision, path in (("float32", whole), ("int8", small)):
         detector = Detector.load(path)
-        found = [detector.detect(read(each.path), least_score=0.02) for each in labelled.pictures]
+        found = [detector.detect(read(each.path), least_score=LEAST_SCORE) for each in labelled.pictures]
         scores = score_set(labelled, found, CLASSES, detector.info.thresholds, draws=20)
         for row in scores.classes:
             if row.labels:

@@ -22,7 +22,6 @@ from torch.nn import functional
 
 from pack_daylight_model import half_stored
 from pack_default_model import HOME
-from sorvolo.detection.contract import FORMAT
 from sorvolo.detection.second_look import SheetSettings
 from sorvolo.training.backbone import EfficientNetLite0
 from sorvolo.training.nanodet import NanoDetBackbone, NanoDetHead, nanodet_from_graph
@@ -53,7 +52,7 @@ INFO = {
     "name": NAME, "version": "3", "preset": "nanodet and lite0", "classes": ["person"], "thermal": False,
     "stride": CELL_PX, "thresholds": {"person": 0.5}, "best_px": {"person": [24, 200]}, "licence": "CC-BY-SA-4.0",
     "created": f"{datetime.now(UTC):%Y-%m-%d}", "second_only": True,
-    "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in SOURCES), "format": FORMAT,
+    "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in SOURCES), "format": 1,
 }
 
 

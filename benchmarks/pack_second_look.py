@@ -1,8 +1,9 @@
 """How reports are looked at again, into the packaged models: benchmarks/pack_second_look.py WEIGHTS [--measured FILE]
 
-The last step of packing. WEIGHTS is what fit_second_look.py wrote; no weight of the networks changes, only the metadata
-of default.onnx and default-int8.onnx and their cards. With --measured, results of second_look.py, made with these very
-files, go into the cards; the models' bytes stay the same.
+WEIGHTS is what fit_second_look.py wrote; no weight of the networks changes, only the metadata of default.onnx and
+default-int8.onnx and their cards. Its threshold is of the networks' own scale, in which the files then report: what
+their scores mean is fitted and packed anew (pack_calibration.py). With --measured, results of second_look.py, made with
+these very networks, go into the cards.
 """
 
 import argparse
@@ -38,13 +39,16 @@ def main() -> None:
     for name in MODELS:
         path = wishes.home / f"{name}.onnx"
         card = json.loads(path.with_suffix(".json").read_text())
-        fields["thresholds"] = card["thresholds"] | {"person": fit["threshold"]}
+        own = card.pop("thresholds_own", card["thresholds"])
+        fields |= {"format": 1, "calibration": {}, "thresholds": own | {"person": fit["threshold"]}}
         path.write_bytes(with_fields(path.read_bytes(), fields))
         card |= fields
         if name != "default":
             card["of"] = f"default, version {wishes.version}"
         card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
-        card["second_look_fit"] = {key: fit[key] for key in ("threshold", "reports", "photos", "right_and_false")}
+        card["second_look_fit"] = {"threshold_own": fit["threshold"]} | {
+            key: fit[key] for key in ("reports", "photos", "right_and_false")
+        }
         if wishes.measured is not None:
             sets = json.loads(wishes.measured.read_text())["sets"]
             card["second_look_measured"] = {"what": FIGURES} | {

@@ -44,7 +44,7 @@ def main() -> None:
     card, model = json.loads(path.with_suffix(".json").read_text()), onnx.load(path)
     if any(each.name == "softened.bell" for each in model.graph.initializer):
         raise SystemExit(f"{path} has its picture softened already")
-    known = card["calibration"]
+    known = card["calibration_of_networks"]
     soften(model.graph)
     judge_anew(model.graph, judge, known["car"], learnt["car"])
     onnx.checker.check_model(model)

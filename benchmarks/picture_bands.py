@@ -21,6 +21,7 @@ import numpy as np
 from look_scales import CUTOUTS, FOUND_IOU, M_PER_PX, middle, planted
 from photo_cutouts import cutouts
 from provenance import commit, machine
+from sorvolo.detection.calibration import in_own_scale
 from sorvolo.detection.detector import Detector, _look
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Seen
@@ -90,7 +91,7 @@ def searched(detector: Detector, shown: ImageRGB, cuts: tuple[int, ...], spent: 
 
 def count(counts: Counter[str], seen: Seen, truth: list[np.ndarray] | None, detector: Detector) -> None:
     """Count the people found, or reported on bare ground."""
-    least = detector.info.thresholds["person"]
+    least = in_own_scale(detector.info)["person"]
     people = seen.labels == detector.classes.index("person")
     scores, boxes = seen.scores[people], seen.boxes_px[people]
     if truth is None:

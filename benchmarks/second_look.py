@@ -21,12 +21,14 @@ import numpy as np
 
 import detection_data
 from false_alarms import FIRST, M_PER_PX, SCALE, SHOWN, crop, possible, sheet
+from own_scale import own_scale
 from provenance import commit, machine, note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import score_set
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.missions.evaluate.detector import LEAST_SCORE
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections
@@ -34,18 +36,20 @@ from train_default_model import reader
 
 RESULTS = Path(__file__).parent / "results" / "second_look_people.json"
 SETS = (*FIRST, "semantic_drone", "sdd", "tinyperson", "tinyperson val", "mannequin", "aerial_cars", "cats")
-LEAST, EVERY = 0.02, {"mannequin": 4}
+LEAST, EVERY = LEAST_SCORE, {"mannequin": 4}
 BECAME = {(False, False): "", (True, True): "kept", (True, False): "gone", (False, True): "new"}
 SCORES = (0.5, 0.6, 0.7, 0.78, 0.84, 0.9, 0.94, 0.96)
 
 
 class Looker:
-    """A model that looks once, and again as its file states; counts what both take, processor seconds."""
+    """A model that looks once, and again as its file states, both in the own scale; counts what they take, processor
+    seconds."""
 
     def __init__(self, model: str) -> None:
-        self.whole = Detector.load(model, provider="cpu", threads=1)
-        session = Session(find_model(model), "cpu", 1)
-        session.info = replace(session.info, second_look={})
+        whole, session = (Session(find_model(model), "cpu", 1) for _ in range(2))
+        whole.info = own_scale(whole.info)
+        session.info = own_scale(session.info, second_look={})
+        self.whole = Detector(whole)
         self.detector = Detector(session)
         self.first_s = self.again_s = 0.0
 

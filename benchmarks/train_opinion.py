@@ -24,6 +24,7 @@ import torch
 from torch import nn
 
 from fit_second_look import POSITIONS, balanced, bounded_odds, judged_reports
+from own_scale import own_scale
 from pack_opinion import CELL_PX, LOOK_PX, Looking, looking
 from people_samples import Source, sources
 from provenance import commit
@@ -105,7 +106,7 @@ class Cutter:
         self._plan = plan + [replace(each, pasted=0.0) for each in plan if _name(each) in BARE]
         self._samples = Samples(self._plan, read_scenes(wishes.scenes), SIDE_PX, SEED)
         session = Session(find_model("default"), "cpu", 1)
-        session.info = replace(session.info, second_look={}, pyramid={})
+        session.info = own_scale(session.info, second_look={}, pyramid={})
         self._detector = Detector(session)
 
     def cut(self, number: int) -> Cutouts:

@@ -270,6 +270,22 @@ def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(simulated: 
     assert set(reported["classes"]) == {"person", "car"} and reported["count"] > 0
 
 
+def test_frames_of_another_light_are_reported_by_their_own_thresholds(simulated: Path, tmp_path: Path) -> None:
+    """As thermal frames by the night model's: what the day's model would not report is on the map."""
+
+    class Night(Knowing):
+        """Of frames of this light all is reported from 0.3 on."""
+
+        def thresholds_for(self, picture: ImageRGB, **_: object) -> dict[str, float]:
+            return dict.fromkeys(self.classes, 0.3)
+
+    night = Night(simulated)
+    night.info = replace(night.info, thresholds=dict.fromkeys(night.classes, 0.999))
+    for _ in map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", detector=night):
+        pass
+    assert report_of(tmp_path / "site", "flight1")["objects"]["count"] >= 5
+
+
 def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, tmp_path: Path) -> None:
     asked: list[tuple[str, ...]] = []
 

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from sorvolo.survey.objects import Track
 
 _MOST_ROWS = 40  # of a table on a terminal; by choice
-_COLUMNS_EXPLAINED = "score: 0 to 1, how sure; accuracy: 1 sigma; views: frames that show it"
+_COLUMNS_EXPLAINED = "score: 0 to 1, about the share that is right; accuracy: 1 sigma; views: frames that show it"
 
 
 class Save(StrEnum):

@@ -55,7 +55,7 @@ class Checked:
         """The scale by which scores of each class become the share that is right among the held-out pictures' reports.
 
         `before` is that of the model that was learnt on from: kept for `too_few` classes. Nothing of a class of which
-        too few reports are right, or wrong, to tell.
+        too few reports are right, or wrong, to know.
         """
         found = {}
         for name in set(classes) - set(self.too_few(classes)):

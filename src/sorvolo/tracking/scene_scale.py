@@ -19,7 +19,7 @@ _CAR, _PERSON = "car", "person"
 class SceneSettings:
     """Which boxes show the scale, and how well."""
 
-    least_score: float = 0.5  # boxes of less are too often none
+    least_score: float = 0.4  # boxes of less are too often none
     least_boxes: int = 8  # of a class; fewer may be mistakes, or all of one odd kind
     most_boxes: int = 400  # the newest: a drone climbs
     least_spread: float = 0.03  # of the sizes around the fit: boxes are no more exact

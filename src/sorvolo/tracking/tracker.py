@@ -60,10 +60,10 @@ class TrackerSettings:
     shows a place is enough: photos, which may show it once; empty for a video, which shows it in many frames.
     """
 
-    sure_score: float = 0.4  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
+    sure_score: float = 0.3  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
     least_views: int = 3  # two are enough where they lie a second apart
-    least_evidence: float = 3.5
-    missed: float = 0.7
+    least_evidence: float = 2.5  # odds of about two to one, where views err apart
+    missed: float = 0.4  # people by day are reported in a third of the views that show them
     alone: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     new_per_m2: float = 5e-4  # how densely objects lie that nobody has seen yet
     neighbour_m: float = 4.0  # within which two tracks may be one object

@@ -28,8 +28,8 @@ from sorvolo.survey.objects import Detections, no_detections
 from sorvolo.survey.wording import counted
 
 LEAST_SCORE = 1e-4
-"""Candidates from this score on are measured: average precision needs the doubtful ones, and packaged models give those
-that a second look has no room for scores down to 0.0002."""
+"""Candidates from this score on are measured: average precision needs the doubtful ones, which packaged models score
+0.0002 and more."""
 
 PAGE, NUMBERS, FOUND = "detector.html", "detector.json", "detections.json"
 

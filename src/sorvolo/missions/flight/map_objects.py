@@ -175,9 +175,11 @@ class ObjectFinder:
         )
 
     def _least(self, frames: Sequence[PlacedFrame]) -> dict[str, float]:
-        """From which score on each class is reported: where frames of two lights differ, the higher."""
-        of_frames = [self._detector.info.thresholds, *(self._seen[each.index].least for each in frames)]
-        return {name: max(each.get(name, 0.0) for each in of_frames) for name in self._detector.classes}
+        """From which score on each class is reported: where frames of two lights differ, the higher; of a class that no
+        frame was searched for, from the model's own."""
+        of_frames = [self._seen[each.index].least for each in frames]
+        highest = {name: max(each.get(name, 0.0) for each in of_frames) for name in set().union(*of_frames)}
+        return {**self._detector.info.thresholds, **highest}
 
     def _take(self, left: float) -> None:
         """Collect what was seen until this many frames still wait."""

@@ -284,7 +284,7 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     calibration = checked.calibration(classes, {name: Calibration(**each) for name, each in known.items()})
     scaled = scaled_thresholds(scores, calibration)
     info = _info(run, checked, scores) | {
-        "format": FORMAT, "thresholds": scaled,
+        "format": FORMAT if calibration else 1, "thresholds": scaled,
         "calibration": {name: asdict(each) for name, each in calibration.items()},
     }
     exported = export_onnx(model, info)

@@ -34,6 +34,7 @@ _CROPS_BYTES = 8_000_000  # of all crops in the page together
 _COLOURS = 6  # that the styles of pages have, c0 to c5
 _FILES = "tracks.geojson, tracks.kml (Google Earth), tracks.gpx (GPS receivers)"
 _LOCAL_FILES = "tracks.json, coordinates in pixels of the first picture. " + NO_PLACE_FILES
+_FACTS = {"thresholds": "reported from a score of", "calibrated": "half are right at 0.5", "trained_on": "trained on"}
 _Box = tuple[float, float, float, float]  # left, top, right, bottom
 _Track = Mapping[str, Any]
 
@@ -68,7 +69,7 @@ def watch_page(
 
 
 def _model_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(str(name), known(_plain(value))) for name, value in facts.items()]
+    return [(_FACTS.get(str(name), str(name)), known(_plain(value))) for name, value in facts.items()]
 
 
 def _versions(report: Mapping[str, Any]) -> str:
@@ -254,6 +255,8 @@ def _detections(report: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {each}" for name, each in value.items())
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
 
 
