@@ -82,11 +82,12 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--model", default="default", choices=sorted(FIT))
+    parser.add_argument("--file", type=Path, help="of the model; else the installed one")
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--results", type=Path, default=RESULTS)
     wishes = parser.parse_args()
     wishes.out.mkdir(parents=True, exist_ok=True)
-    session = Session(find_model(wishes.model), "cpu", 1)
+    session = Session(wishes.file or find_model(wishes.model), "cpu", 1)
     stated = session.info
     session.info = own_scale(stated)
     plan = THERMAL if wishes.model == "thermal" else DAYLIGHT
