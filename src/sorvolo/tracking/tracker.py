@@ -543,4 +543,4 @@ def _stacked(near: list[Followed], time_ns: int) -> Motions:
 def _log_odds(score: float) -> float:
     """How much a sighting of this score speaks for an object, beyond what is usual."""
     share = min(max(score, 0.01), 0.99)
-    return float(np.clip(np.log(share / (1 - share)) - USUAL_LOG_ODDS, 0.3, 2.5))
+    return float(np.clip(np.log(share / (1 - share)) - USUAL_LOG_ODDS, 0.0, 2.5))
