@@ -289,6 +289,21 @@ def test_a_small_raster_of_many_pixels_is_no_ground_to_simulate_over(tmp_path: P
         read_orthophoto(sparse)
 
 
+def test_a_raster_in_coordinates_of_a_building_site_has_no_place_on_earth(tmp_path: Path) -> None:
+    local = 'LOCAL_CS["site",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
+    for bands, dtype, reader in (
+        (3, "uint8", BaseMap.open), (1, "float32", lambda path: read_height_model(path, (8.9, 46.0, 9.1, 46.1))),
+    ):
+        path = tmp_path / f"{dtype}.tif"
+        with rasterio.open(
+            path, "w", driver="GTiff", width=64, height=64, count=bands, dtype=dtype, crs=local,
+            transform=rasterio.Affine(0.5, 0, 1000, 0, -0.5, 2000),
+        ) as sink:
+            sink.write(np.ones((bands, 64, 64), dtype))
+        with pytest.raises(InputError, match="a local coordinate reference system"):
+            reader(path)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_any_raster_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:

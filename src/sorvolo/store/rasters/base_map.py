@@ -17,7 +17,7 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGBA, PointsM
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.grid import SiteGrid, TileIndex
-from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, transform_on_grid
+from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, transform_on_grid, why_no_place
 
 _WGS84 = CRS.from_epsg(4326)
 _SITE_MAP = "mosaic.tif"
@@ -39,8 +39,8 @@ class BaseMap:
         path = path / _SITE_MAP if path.is_dir() else path
         try:
             with open_raster(path, "a GeoTIFF, or a site folder with a map,") as source:
-                if source.crs is None:
-                    raise InputError(f"{path} has no place on Earth (no CRS); give a map with one as --base")
+                if why := why_no_place(source.crs):
+                    raise InputError(f"{path} has no place on Earth ({why}); give a map with one as --base")
                 if source.count == 2 or set(source.dtypes) != {"uint8"}:
                     raise InputError(
                         f"{path} has {source.count} bands of {'/'.join(sorted(set(source.dtypes)))}; a base map has "

@@ -72,6 +72,14 @@ def _opened(path: Path, drivers: Sequence[str]) -> rasterio.DatasetReader:
         return rasterio.open(path, driver=drivers[-1], sharing=False)
 
 
+def why_no_place(crs: CRS | None) -> str:
+    """Why coordinates are no places on Earth, in words: there is no CRS, or a local one, as of a building site's plan;
+    "" where they are."""
+    if crs is None:
+        return "no coordinate reference system"
+    return "" if crs.is_geographic or crs.is_projected else "a local coordinate reference system, of no known place"
+
+
 def crs_of_epsg(code: str) -> CRS:
     """The CRS of a code such as EPSG:32633. Raises SettingsError for all else: GDAL would fetch an address."""
     match = re.fullmatch(r"(?:EPSG|epsg):([1-9][0-9]{0,8})", code)

@@ -18,7 +18,7 @@ from scipy.ndimage import map_coordinates
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats
 from sorvolo.geometry.units import FOOT_M, SURVEY_FOOT_M
-from sorvolo.store.rasters.gdal import open_raster
+from sorvolo.store.rasters.gdal import open_raster, why_no_place
 
 _WGS84 = "EPSG:4326"
 _LOWEST_M, _HIGHEST_M = -1_000.0, 10_000.0  # no ground on Earth lies beyond: a hole that its file does not declare
@@ -62,8 +62,8 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
     """
     try:
         with open_raster(path, "a GeoTIFF of heights") as source:
-            if source.crs is None:
-                raise InputError(f"{path} has no coordinate reference system; export it with one")
+            if why := why_no_place(source.crs):
+                raise InputError(f"{path} has {why}; export it with one that has a place on Earth")
             if source.count != 1:
                 raise InputError(
                     f"{path} has {source.count} bands; a height model has one, of heights (of `sorvolo heights`: "
