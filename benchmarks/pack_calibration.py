@@ -7,14 +7,13 @@ networks' own scale (`thresholds_own`; of a file without a calibration its thres
 """
 
 import argparse
-import hashlib
 import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from pack_default_model import HOME
-from pack_second_look import with_fields
+from pack_second_look import repack
 from score_calibration import RESULTS
 from sorvolo.detection.calibration import platt_scaled
 from sorvolo.detection.contract import FORMAT, Calibration
@@ -32,22 +31,15 @@ def main() -> None:
     for name, (version, source) in MODELS.items():
         fit = fits[source]["classes"]
         path = wishes.home / f"{name}.onnx"
-        before = json.loads(path.with_suffix(".json").read_text())
-        own = before.get("thresholds_own", before["thresholds"])
+        card = json.loads(path.with_suffix(".json").read_text())
+        own = card.get("thresholds_own", card["thresholds"])
         calibration = {label: {key: each[key] for key in ("slope", "shift")} for label, each in fit.items()}
         fields: dict[str, Any] = {
             "format": FORMAT, "version": version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
             "calibration": calibration,
             "thresholds": own | {label: scaled(own[label], each) for label, each in calibration.items()},
         }
-        path.write_bytes(with_fields(path.read_bytes(), fields))
-        card = before | fields | {"thresholds_own": own}
-        if "measured" in before and before["version"] != version:  # figures stay those of the version that gave them
-            card.setdefault("measured_by", f"version {before['version']}, whose networks are the same")
-        if "of" in card:
-            card["of"] = f"default, version {version}"
-        card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
-        path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
+        repack(path, fields, {"thresholds_own": own})
         print(name, fields["thresholds"], calibration)
 
 

@@ -7,14 +7,12 @@ its sizes.
 """
 
 import argparse
-import hashlib
-import json
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from pack_default_model import HOME
-from pack_second_look import with_fields
+from pack_second_look import repack
 
 DAYLIGHT: dict[str, Any] = {"times": [0.5, 0.75, 1.5, 2.0, 3.0], "known_px": 32, "octaves": 1.0, "shift": 0.6}
 CLOSER = {"person": {"closer": [4.0]}}  # decision 0089
@@ -33,16 +31,7 @@ def main() -> None:
             "version": version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
             "pyramid": {each: sizes | more.get(each, {}) for each in CLASSES},
         }
-        path = wishes.home / f"{name}.onnx"
-        path.write_bytes(with_fields(path.read_bytes(), fields))
-        before = json.loads(path.with_suffix(".json").read_text())
-        card = before | fields
-        if "measured" in before and before["version"] != version:  # figures stay those of the version that gave them
-            card.setdefault("measured_by", f"version {before['version']}, whose networks are the same")
-        if "of" in card:
-            card["of"] = f"default, version {version}"
-        card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
-        path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
+        repack(wishes.home / f"{name}.onnx", fields)
 
 
 if __name__ == "__main__":

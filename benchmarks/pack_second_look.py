@@ -9,8 +9,10 @@ these very networks, go into the cards.
 import argparse
 import hashlib
 import json
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import onnx
@@ -65,6 +67,20 @@ def people_of(row: dict[str, Any]) -> dict[str, Any]:
         for key, value in row["person"].items()
     }
     return {key: row[key] for key in ("photos", "pictures", "times_scored") if key in row} | {"person": people}
+
+
+def repack(path: Path, fields: dict[str, Any], of_card: Mapping[str, Any] = MappingProxyType({})) -> None:
+    """Set fields of a packed model, its `version` among them, in the file and its card, which has those of `of_card`
+    besides."""
+    path.write_bytes(with_fields(path.read_bytes(), fields))
+    before, version = json.loads(path.with_suffix(".json").read_text()), fields["version"]
+    card = before | fields | of_card
+    if "measured" in before and before["version"] != version:  # figures stay those of the version that gave them
+        card.setdefault("measured_by", f"version {before['version']}, whose networks are the same")
+    if "of" in card:
+        card["of"] = f"default, version {version}"
+    card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
+    path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
 
 
 def with_fields(model: bytes, fields: dict[str, Any]) -> bytes:

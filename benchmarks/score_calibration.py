@@ -31,7 +31,7 @@ from provenance import commit, machine, note_scoring
 from sorvolo.detection.calibration import platt_fit, platt_scaled
 from sorvolo.detection.contract import Calibration
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.metrics import match_pictures
+from sorvolo.detection.metrics import TENTHS, match_pictures
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session
 from sorvolo.geometry.calibration_bins import calibration_bins
@@ -42,7 +42,6 @@ from train_default_model import reader
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "score_calibration.json"
 LEAST, SCALE, SHOWN = 0.05, 0.5, ("person", "car")
-TENTHS = tuple(round(0.1 * each, 1) for each in range(11))
 
 
 @dataclass(frozen=True)
@@ -172,10 +171,10 @@ def reports_of(name: str, labelled: LabelledSet, photos: Photos, detector: Detec
     names = SHOWN if name in GROUND else [each for each in SHOWN if each in shown - labelled.unlabelled]
     for group, label in ((group, label) for group in groups for label in names):
         pictures = [each for each in labelled.pictures if each.group == group]
-        for way in sorted({way for each in pictures for way in seen[Path(each.path).name]}):
-            own = [each for each in pictures if way in seen[Path(each.path).name]]
-            found = [_detections(seen[Path(each.path).name][way]) for each in own]
-            (match,), _, _ = match_pictures(labelled.only([_sized(each) for each in own]), found, [label])
+        own = labelled.only([_sized(each) for each in pictures])
+        for way in sorted(seen[Path(pictures[0].path).name]):
+            found = [_detections(seen[Path(each.path).name][way]) for each in pictures]
+            (match,), _, _ = match_pictures(own, found, [label])
             counts = ~match.ignored[0]
             yield Reports(
                 label, name, group, way, match.scores[counts], match.right[0][counts], len(match.true_scores)

@@ -62,8 +62,9 @@ class Checked:
             match = _pooled(self.matches[name])
             counted = ~match.ignored[0]
             right = match.right[0][counted]
-            fit = platt_fit(match.scores[counted].astype(float), right)
-            if fit is not None and min(np.count_nonzero(right), np.count_nonzero(~right)) >= _FEW:
+            if min(np.count_nonzero(right), np.count_nonzero(~right)) < _FEW:
+                continue
+            if (fit := platt_fit(match.scores[counted].astype(float), right)) is not None:
                 found[name] = fit
         return {name: before[name] for name in self.too_few(classes) if name in before} | found
 

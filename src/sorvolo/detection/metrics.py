@@ -36,7 +36,8 @@ SIZES_PX = (0.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, np.inf)
 SIZES_M = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
 """Edges of the bins of an object's longer side on the ground, m."""
 
-_TENTHS = tuple(each / 10 for each in range(11))
+TENTHS = tuple(each / 10 for each in range(11))
+"""Edges of the bins of a score."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +172,7 @@ def right_by_score(match: ClassMatch) -> list[CalibrationBin]:
     Reports within ignored regions do not count; tenths without any are left out.
     """
     counted = ~match.ignored[0]
-    return calibration_bins(match.scores[counted].astype(float), match.right[0][counted], _TENTHS)
+    return calibration_bins(match.scores[counted].astype(float), match.right[0][counted], TENTHS)
 
 
 def thesis_ap(match: ClassMatch, score: float) -> float:
