@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from sorvolo.child_process import python_command
 from sorvolo.cluster.orders import FINISH, WORKER, Ending, Order, Outcome, ScoutOrder, answer_of
 
 _LOOK_EVERY_S = 1.0  # at what a worker uses; by choice
@@ -32,7 +33,7 @@ class WorkerProcess:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (until `end`)
         self._started_s = time.monotonic()
         self._process = subprocess.Popen(
-            [sys.executable, "-m", WORKER], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            python_command(WORKER), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=self._log, start_new_session=True, pass_fds=tuple(held),
         )
         assert self._process.stdin is not None

@@ -1,7 +1,6 @@
 """The process that holds the detector of a machine's flights, as the batch sees it: started when needed, and again."""
 
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -9,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
+from sorvolo.child_process import python_command
 from sorvolo.cluster.orders import Order
 from sorvolo.cluster.process import most_memory_mb
 from sorvolo.detection.sharing import READY, answers
@@ -82,7 +82,7 @@ class SharedDetector:
     def _start(self) -> None:
         self._starts += 1
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "sorvolo.detection.shared_process", self._socket()], stdin=subprocess.PIPE,
+            python_command("sorvolo.detection.shared_process", self._socket()), stdin=subprocess.PIPE,
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
         )
         assert self._process.stdout is not None

@@ -11,6 +11,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from sorvolo.child_process import python_command
 from sorvolo.detection.contract import METADATA_KEY, info_from_metadata
 from sorvolo.detection.engine import CUDA, Engine, Planes, Provider, Run, describe, open_engine, output_names
 from sorvolo.detection.process_messages import outputs_from, read_message, write_message, write_outputs
@@ -63,7 +64,7 @@ class _Process:
         package = str(Path(__file__).parents[2])
         paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
         self._child = subprocess.Popen(
-            [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            python_command(__name__), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
         )
         self.end = weakref.finalize(self, _end, self._child)

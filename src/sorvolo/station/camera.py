@@ -18,6 +18,7 @@ from typing import Any
 from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.growing import ENDED_SUFFIX
 from sorvolo.capture.live.reconnect import LiveSettings
+from sorvolo.child_process import python_command
 from sorvolo.errors import InputError, SorvoloError
 from sorvolo.station.orders import Order
 
@@ -79,7 +80,7 @@ class _Camera:
         job = CameraJob(order.source, order.telemetry, order.stream, order.door, str(folder.resolve() / "spool"))
         self._spool = Path(job.spool)
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "sorvolo.station.camera"], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            python_command("sorvolo.station.camera"), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
             cwd=Path(order.door).parent,
         )
         assert self._process.stdin is not None

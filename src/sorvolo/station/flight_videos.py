@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import sys
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Depends, Response
 from fastapi.responses import FileResponse
 
+from sorvolo.child_process import python_command
 from sorvolo.station.collections import SiteCollections
 from sorvolo.station.crops import CROP_M, CROP_PX, JpegResponse
 from sorvolo.station.inputs import Inputs
@@ -116,7 +116,7 @@ def _cut(path: Path, frame: int, corners: Sequence[Sequence[float]]) -> bytes:
     with _CUTTING:
         try:
             done = subprocess.run(
-                [sys.executable, "-m", "sorvolo.station.cut_video"], input=order.encode(), capture_output=True,
+                python_command("sorvolo.station.cut_video"), input=order.encode(), capture_output=True,
                 timeout=_WITHIN_S, check=False,
             )
         except subprocess.TimeoutExpired as error:

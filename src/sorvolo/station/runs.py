@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from sorvolo.child_process import python_command
 from sorvolo.station.camera_door import door_path
 from sorvolo.station.collections import SEARCH_FOLDER
 from sorvolo.station.disk_room import Reserve, shortage
@@ -506,7 +507,7 @@ def _spawned(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
         take_lock(lock)
         with (folder / LOG_FILE).open("ab") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", "sorvolo.station.worker", str(folder.resolve())], cwd=folder,
+                python_command("sorvolo.station.worker", str(folder.resolve())), cwd=folder,
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=(lock,),
                 env={**os.environ, LOCK_VARIABLE: str(lock), SOURCE_VARIABLE: order.source},
             )

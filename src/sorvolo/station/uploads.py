@@ -7,7 +7,6 @@ import re
 import secrets
 import shutil
 import subprocess
-import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from typing import Any
 
 import anyio
 
+from sorvolo.child_process import python_command
 from sorvolo.station.events import EventLog, NewEvent
 from sorvolo.station.problems import Problem
 from sorvolo.station.settings import StationSettings
@@ -275,10 +275,9 @@ def checked_apart(
     part: Path, target: Path, most_bytes: int, keep_free_bytes: int, run: Callable[[Sequence[str], float], bytes]
 ) -> tuple[str | None, Mapping[str, Any] | None]:
     """What is wrong with an upload (None: nothing), and what it holds, found in a process with limits of its own."""
-    command = [
-        sys.executable, "-m", "sorvolo.station.check_upload", str(part), str(target), str(most_bytes),
-        str(keep_free_bytes),
-    ]
+    command = python_command(
+        "sorvolo.station.check_upload", str(part), str(target), str(most_bytes), str(keep_free_bytes)
+    )
     try:
         answer = json.loads(run(command, _CHECK_WITHIN_S))
         return answer["error"], answer.get("facts")
