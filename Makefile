@@ -19,7 +19,8 @@ test-long: $(TRAINS)
 	$(BIN)/python -m pytest -m long
 
 check: $(TRAINS)
-	$(BIN)/ruff check
+	$(BIN)/ruff format --check --quiet
+	$(BIN)/ruff check --quiet
 	$(BIN)/mypy --num-workers 2
 	$(BIN)/lint-imports
 

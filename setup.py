@@ -12,7 +12,10 @@ FOLDER = "src/sorvolo/kernels"
 
 native = Pybind11Extension(
     "sorvolo.kernels._native",
-    [f"{FOLDER}/{name}.cpp" for name in ("_native", "_regions", "_robust", "_differences", "_light")],
+    [
+        f"{FOLDER}/{name}.cpp"
+        for name in ("_native", "_regions", "_robust", "_differences", "_light")
+    ],
     depends=[f"{FOLDER}/_native.hpp", "setup.py"],
     cxx_std=17,
     extra_compile_args=OPTIONS,

@@ -37,7 +37,9 @@ RESULTS = Path(__file__).parent / "results" / "alignment_speed.json"
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, nargs="+", default=[301, 302])
     options = parser.parse_args()
     cv2.setNumThreads(1)
@@ -46,24 +48,40 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             runs[seed] = measured(Path(folder), seed)
         print(seed, runs[seed], flush=True)
-    RESULTS.write_text(json.dumps({
-        "benchmark": "alignment_speed", "machine": machine(), "commit": commit(), "seeds": options.seeds, "runs": runs,
-    }, indent=1) + "\n")
+    RESULTS.write_text(
+        json.dumps(
+            {
+                "benchmark": "alignment_speed",
+                "machine": machine(),
+                "commit": commit(),
+                "seeds": options.seeds,
+                "runs": runs,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def measured(folder: Path, seed: int) -> dict[str, float]:
     """The figures of one pair of flights."""
     settings = preset("compare")
     settings = replace(settings, seed=seed, path=replace(settings.path, length_m=40, strips=1))
-    for _ in simulate_site(folder / "flown", replace(settings, imaging=replace(settings.imaging, fps=10.0))):
+    for _ in simulate_site(
+        folder / "flown", replace(settings, imaging=replace(settings.imaging, fps=10.0))
+    ):
         pass
     camera = folder / "flown" / "camera.xml"
-    for _ in map_flights([folder / "flown" / "flight1"], folder / "site", MapSettings(model="none"), camera=camera):
+    for _ in map_flights(
+        [folder / "flown" / "flight1"], folder / "site", MapSettings(model="none"), camera=camera
+    ):
         pass
     source = open_sources([folder / "flown" / "flight2"], None, camera)[0]
     truth = {
         each["properties"]["frame"]: np.array(each["geometry"]["coordinates"][0][:4])
-        for each in json.loads((folder / "flown" / "truth" / "frames.geojson").read_text())["features"]
+        for each in json.loads((folder / "flown" / "truth" / "frames.geojson").read_text())[
+            "features"
+        ]
         if each["properties"]["flight"] == "flight2"
     }
     with Archive.open(folder / "site", write=False) as archive:
@@ -78,7 +96,9 @@ def measured(folder: Path, seed: int) -> dict[str, float]:
                 continue
             frames += 1
             image, prior = lens.undistort(each.image), setup.prior(each, first=False)
-            Aligner(reference, grid).align(image, lens.camera, prior, each.time_ns)  # finds the map's features there
+            Aligner(reference, grid).align(
+                image, lens.camera, prior, each.time_ns
+            )  # finds the map's features there
             started = time.thread_time()
             first = Aligner(reference, grid).align(image, lens.camera, prior, each.time_ns)
             first_ms.append(1e3 * (time.thread_time() - started))
@@ -94,7 +114,9 @@ def measured(folder: Path, seed: int) -> dict[str, float]:
     found, true = np.concatenate(found_m), np.concatenate(true_m)
     rest_m = np.linalg.norm(apply_homography(fit_similarity(true, found), found) - true, axis=1)
     return {
-        "frames": frames, "aligned": len(found_m), "followed": len(followed_ms),
+        "frames": frames,
+        "aligned": len(found_m),
+        "followed": len(followed_ms),
         "first_lock_cpu_ms_median": round(float(np.median(first_ms)), 1),
         "followed_cpu_ms_median": round(float(np.median(followed_ms)), 1),
         "followed_cpu_ms_p95": round(float(np.percentile(followed_ms, 95)), 1),

@@ -59,32 +59,58 @@ def flight(site: int, number: int, chance: np.random.Generator) -> FlightRows:
     turn = chance.normal(0, 0.1)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     moved_m = chance.normal(0, 15, 2)
-    grid = np.array([
-        [step * _FRAME_M[0] * 0.3, strip * _FRAME_M[1] * 0.5] for strip in range(strips) for step in range(steps)
-    ])
+    grid = np.array(
+        [
+            [step * _FRAME_M[0] * 0.3, strip * _FRAME_M[1] * 0.5]
+            for strip in range(strips)
+            for step in range(steps)
+        ]
+    )
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * _FRAME_M
-    outlines_m = (grid[:, None] + corners + chance.normal(0, 0.3, (len(grid), 4, 2))) @ rotation.T + moved_m
+    outlines_m = (
+        grid[:, None] + corners + chance.normal(0, 0.3, (len(grid), 4, 2))
+    ) @ rotation.T + moved_m
     outlines = outlines_m / scale + [longitude, latitude]
     start_ns = _START_NS + number * _DAY_NS
     count = len(grid)
     frames = FrameRows(
-        tuple(map(str, range(count))), outlines, start_ns + np.arange(count) * 10**9, chance.uniform(0, 1, count) < 0.9
+        tuple(map(str, range(count))),
+        outlines,
+        start_ns + np.arange(count) * 10**9,
+        chance.uniform(0, 1, count) < 0.9,
     )
     area_m = grid.max(axis=0)
     things = chance.uniform(0, 1, (int(chance.integers(0, 12)), 2)) * area_m @ rotation.T + moved_m
     changed = chance.uniform(0, 1, (int(chance.integers(0, 6)), 2)) * area_m @ rotation.T + moved_m
     span = {"score": 0.8, "first_ns": start_ns, "last_ns": start_ns + count * 10**9}
     return FlightRows(
-        f"flight-{number}", "1", "compare" if number else "map", frames,
+        f"flight-{number}",
+        "1",
+        "compare" if number else "map",
+        frames,
         PlacedRows(
             list(shapely.points(things / scale + [longitude, latitude])),
-            [{"object_id": f"{number}-o{k}", "label": _LABELS[k % 3], "sigma_m": 0.5, **span}
-             for k in range(len(things))],
+            [
+                {"object_id": f"{number}-o{k}", "label": _LABELS[k % 3], "sigma_m": 0.5, **span}
+                for k in range(len(things))
+            ],
         ),
         PlacedRows(
-            list(shapely.buffer(shapely.points(changed / scale + [longitude, latitude]), 2e-5, quad_segs=2)),
-            [{"change_id": f"{number}-{k}", "kind": "appeared", "label": _LABELS[k % 3], "verdict": "", **span}
-             for k in range(len(changed))],
+            list(
+                shapely.buffer(
+                    shapely.points(changed / scale + [longitude, latitude]), 2e-5, quad_segs=2
+                )
+            ),
+            [
+                {
+                    "change_id": f"{number}-{k}",
+                    "kind": "appeared",
+                    "label": _LABELS[k % 3],
+                    "verdict": "",
+                    **span,
+                }
+                for k in range(len(changed))
+            ],
         ),
     )
 
@@ -105,7 +131,10 @@ def questions(counts: list[int], seed: int) -> Iterator[tuple[str, Place]]:
     for k, site in enumerate(sites.tolist()):
         latitude, longitude = origin(site)
         east_m, north_m = chance.uniform(0, 60), chance.uniform(0, 20)
-        at = (latitude + north_m / _M_PER_DEG, longitude + east_m / (_M_PER_DEG * np.cos(np.radians(latitude))))
+        at = (
+            latitude + north_m / _M_PER_DEG,
+            longitude + east_m / (_M_PER_DEG * np.cos(np.radians(latitude))),
+        )
         if k % 3 == 0:
             yield "place", Place(*at)
         elif k % 3 == 1:
@@ -129,7 +158,9 @@ def server_busy_s(process: int) -> float:
     return int(times.read_text().split()[0]) / 1e9 if process and times.exists() else 0.0
 
 
-def measure(index: ArchiveIndex, counts: list[int], seed: int) -> tuple[dict[str, Any], list[object]]:
+def measure(
+    index: ArchiveIndex, counts: list[int], seed: int
+) -> tuple[dict[str, Any], list[object]]:
     """Milliseconds of each kind of question and of all; the answers, to hold those of two databases together."""
     index.find(Place(*origin(0)))  # opens the connection
     taken: dict[str, list[float]] = {}
@@ -143,13 +174,25 @@ def measure(index: ArchiveIndex, counts: list[int], seed: int) -> tuple[dict[str
         busy_s, served_s = time.process_time() - busy, server_busy_s(server) - served
         taken.setdefault("all, processor time of Sorvolo", []).append(1000 * busy_s)
         if server:
-            taken.setdefault("all, processor time with the server's", []).append(1000 * (busy_s + served_s))
+            taken.setdefault("all, processor time with the server's", []).append(
+                1000 * (busy_s + served_s)
+            )
         sizes.append(len(answer))
-        found.append([(each.site, each.flight, each.frames, [thing.id for thing in each.things]) for each in answer])
-    taken["all"] = [each for kind in list(taken) if kind.startswith("place") for each in taken[kind]]
+        found.append(
+            [
+                (each.site, each.flight, each.frames, [thing.id for thing in each.things])
+                for each in answer
+            ]
+        )
+    taken["all"] = [
+        each for kind in list(taken) if kind.startswith("place") for each in taken[kind]
+    ]
     rows = {
-        kind: {"questions": len(times), **{f"p{p}_ms": round(float(np.percentile(times, p)), 2) for p in (50, 95, 99)},
-               "max_ms": round(max(times), 2)}
+        kind: {
+            "questions": len(times),
+            **{f"p{p}_ms": round(float(np.percentile(times, p)), 2) for p in (50, 95, 99)},
+            "max_ms": round(max(times), 2),
+        }
         for kind, times in taken.items()
     }
     return {**rows, "flights_found": {"median": int(np.median(sizes)), "max": max(sizes)}}, found
@@ -159,7 +202,9 @@ def run(address: str, counts: list[int], seed: int) -> tuple[dict[str, Any], lis
     """One database filled and asked."""
     catalogues = Catalogues().choosing(address)
     with tempfile.TemporaryDirectory() as folder:
-        with ArchiveIndex.open(Path(folder), write=True, address=address, catalogues=catalogues) as index:
+        with ArchiveIndex.open(
+            Path(folder), write=True, address=address, catalogues=catalogues
+        ) as index:
             begun = time.perf_counter()
             fill(index, counts, seed)
             filled_s = time.perf_counter() - begun
@@ -182,8 +227,13 @@ def main() -> None:
     (seed,) = provenance.drawn_seeds("archive_place", 1)
     counts = visits(chosen.flights)
     result: dict[str, Any] = {
-        "machine": provenance.machine(), "commit": provenance.commit(), "seed": seed, "flights": chosen.flights,
-        "sites": len(counts), "most_flights_of_a_site": max(counts), "load": round(os.getloadavg()[0], 1),
+        "machine": provenance.machine(),
+        "commit": provenance.commit(),
+        "seed": seed,
+        "flights": chosen.flights,
+        "sites": len(counts),
+        "most_flights_of_a_site": max(counts),
+        "load": round(os.getloadavg()[0], 1),
     }
     result["sqlite"], found = run("", counts, seed)
     if chosen.postgres:

@@ -89,7 +89,9 @@ class Disturbed(LocalExecutor):
         fault, wait_s = self._draw.choice(FAULTS), self._draw.random() * self._options.within
         if poisoned:
             fault, wait_s = signal.SIGKILL, self._draw.random()
-        threading.Thread(target=self._strike, args=(name, worker, fault, wait_s), daemon=True).start()
+        threading.Thread(
+            target=self._strike, args=(name, worker, fault, wait_s), daemon=True
+        ).start()
 
     def _strike(self, name: str, worker: object, fault: signal.Signals, wait_s: float) -> None:
         time.sleep(wait_s)
@@ -107,14 +109,18 @@ def batch(folder: Path, options: argparse.Namespace) -> None:
     @contextmanager
     def executor(table: BatchTable) -> Iterator[Executor]:
         if options.ray:
-            with ray_executor("ray", None, options.stall, table.root, SharingSettings(options.model != "none")) as made:
+            with ray_executor(
+                "ray", None, options.stall, table.root, SharingSettings(options.model != "none")
+            ) as made:
                 yield made
             return
         with Disturbed(options, table.lock, folder / "faults.txt") as made:
             yield made
 
     wish = FlightWish(
-        camera=str(folder / "flown-0" / "camera.xml"), model=options.model, copy_to=PLACE if options.outages else ""
+        camera=str(folder / "flown-0" / "camera.xml"),
+        model=options.model,
+        copy_to=PLACE if options.outages else "",
     )
     settings = BatchSettings(wish, stall_s=options.stall)
     running = run_batch([folder / "in"], folder / "maps", settings, executor)
@@ -122,10 +128,14 @@ def batch(folder: Path, options: argparse.Namespace) -> None:
         try:
             update = next(running)
         except StopIteration as end:
-            (folder / "report.json").write_text(json.dumps({"seconds": end.value.seconds, **end.value.counts()}))
+            (folder / "report.json").write_text(
+                json.dumps({"seconds": end.value.seconds, **end.value.counts()})
+            )
             return
         if update.row is not None:
-            print(update.done, update.row.state, update.row.source, update.row.words[:160], flush=True)
+            print(
+                update.done, update.row.state, update.row.source, update.row.words[:160], flush=True
+            )
 
 
 def flown(folder: Path, options: argparse.Namespace) -> None:
@@ -133,7 +143,10 @@ def flown(folder: Path, options: argparse.Namespace) -> None:
     demo = preset("demo")
     for base in range(options.bases):
         settings = replace(
-            demo, seed=31 + base, flights=1, scene=replace(demo.scene, has_scenery=False),
+            demo,
+            seed=31 + base,
+            flights=1,
+            scene=replace(demo.scene, has_scenery=False),
             path=replace(demo.path, height_m=20, speed_m_s=5, length_m=28, strips=1),
             imaging=replace(demo.imaging, width_px=320, height_px=180, fps=2),
             output=replace(demo.output, photos=True),
@@ -144,7 +157,9 @@ def flown(folder: Path, options: argparse.Namespace) -> None:
         name = f"poisoned-{number}" if number < options.poisoned else f"flight-{number}"
         another(folder / f"flown-{number % options.bases}", folder / "in" / name)
     (folder / "in" / "broken.mp4").write_text("no video")
-    shutil.copytree(folder / "in" / f"flight-{options.flights - 1}", folder / "in" / "twice" / "copy")
+    shutil.copytree(
+        folder / "in" / f"flight-{options.flights - 1}", folder / "in" / "twice" / "copy"
+    )
 
 
 def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
@@ -154,7 +169,10 @@ def compared(folder: Path, options: argparse.Namespace) -> dict[str, object]:
         site, wanted = folder / "maps" / flight.name, folder / "wanted" / flight.name
         with mock.patch.dict(os.environ, {VARIABLE: ""}):
             for _ in map_flights(
-                [flight], wanted, MapSettings(model=options.model), camera=folder / "flown-0" / "camera.xml"
+                [flight],
+                wanted,
+                MapSettings(model=options.model),
+                camera=folder / "flown-0" / "camera.xml",
             ):
                 pass
         wrong = other_files(site, wanted)
@@ -175,7 +193,9 @@ def other_files(site: Path, wanted: Path) -> list[str]:
     """The files in which two sites differ, but for where their catalogues lie."""
     found, expected = content(site), content(wanted)
     found.pop(POINTER, None)
-    return sorted(name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name))
+    return sorted(
+        name for name in found.keys() | expected.keys() if found.get(name) != expected.get(name)
+    )
 
 
 def measured(folder: Path, options: argparse.Namespace) -> dict[str, object]:
@@ -200,7 +220,9 @@ def struck(folder: Path, options: argparse.Namespace) -> dict[str, object]:
     while True:
         process = context.Process(target=batch, args=(folder, options))
         process.start()
-        process.join(draw.uniform(0.3, 1.0) * options.kill_within if killed < options.kills else None)
+        process.join(
+            draw.uniform(0.3, 1.0) * options.kill_within if killed < options.kills else None
+        )
         if process.exitcode is not None:
             break
         process.kill()
@@ -215,14 +237,23 @@ def struck(folder: Path, options: argparse.Namespace) -> dict[str, object]:
     through = [row for row in rows if row.state in (State.DONE, State.DOUBTFUL)]
     faults = Counter(line.split()[1] for line in lines_of(folder / "faults.txt"))
     return {
-        "flights": options.flights, "poisoned": options.poisoned, "workers": options.workers, "seed": options.seed,
-        "batch_killed": killed, "faults": dict(faults), "seconds": round(seconds, 1),
+        "flights": options.flights,
+        "poisoned": options.poisoned,
+        "workers": options.workers,
+        "seed": options.seed,
+        "batch_killed": killed,
+        "faults": dict(faults),
+        "seconds": round(seconds, 1),
         "endings": dict(Counter(lines_of(folder / "endings.txt"))),
-        "states": dict(Counter(row.state.value for row in rows)), "tries": sum(row.tries for row in rows),
-        "crashes": sum(row.crashes for row in rows), "cpu_s": round(sum(row.cpu_s for row in rows), 1),
+        "states": dict(Counter(row.state.value for row in rows)),
+        "tries": sum(row.tries for row in rows),
+        "crashes": sum(row.crashes for row in rows),
+        "cpu_s": round(sum(row.cpu_s for row in rows), 1),
         "set_aside": sorted(Path(row.source).name for row in rows if row.state is State.SET_ASIDE),
         "not_through": sorted(
-            Path(row.source).name for row in rows if Path(row.source).name.startswith("flight-") and row not in through
+            Path(row.source).name
+            for row in rows
+            if Path(row.source).name.startswith("flight-") and row not in through
         ),
     }
 
@@ -243,16 +274,27 @@ def main() -> None:
     parser.add_argument("--within", type=float, default=12.0, help="of a try's start, s")
     parser.add_argument("--kills", type=int, default=2)
     parser.add_argument("--kill-within", type=float, default=120.0, help="of the batch's start, s")
-    parser.add_argument("--stall", type=float, default=8.0, help="after which a worker that does nothing is ended, s")
-    parser.add_argument("--outages", type=float, default=0.0, help="of database and store, s at most; 0: none")
+    parser.add_argument(
+        "--stall",
+        type=float,
+        default=8.0,
+        help="after which a worker that does nothing is ended, s",
+    )
+    parser.add_argument(
+        "--outages", type=float, default=0.0, help="of database and store, s at most; 0: none"
+    )
     parser.add_argument("--ray", action="store_true", help="on a Ray cluster of two machines")
     parser.add_argument("--model", default="none", help="of the detector")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "batch_faults.json")
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "results" / "batch_faults.json"
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         result = measured(Path(folder), options)
-    options.out.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
+    options.out.write_text(
+        json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n"
+    )
     print(json.dumps(result))
 
 

@@ -36,8 +36,18 @@ def flown(folder: Path, options: argparse.Namespace) -> None:
     demo = preset("demo")
     height_px = options.width * 9 // 16
     settings = replace(
-        demo, flights=1, scene=replace(demo.scene, has_scenery=False), output=replace(demo.output, photos=True),
-        path=replace(demo.path, height_m=20, speed_m_s=5, length_m=options.length, strips=2, strip_spacing_m=8),
+        demo,
+        flights=1,
+        scene=replace(demo.scene, has_scenery=False),
+        output=replace(demo.output, photos=True),
+        path=replace(
+            demo.path,
+            height_m=20,
+            speed_m_s=5,
+            length_m=options.length,
+            strips=2,
+            strip_spacing_m=8,
+        ),
         imaging=replace(demo.imaging, width_px=options.width, height_px=height_px),
     )
     for _ in simulate_site(folder / "flown", settings):
@@ -52,10 +62,20 @@ def once(way: str, folder: Path) -> dict[str, float]:
     sorvolo = [sys.executable, "-m", "sorvolo"]
     shared = ["--camera", str(folder / "flown" / "camera.xml"), "--model", "none", "--json"]
     executor, _, workers = way.partition(" ")
-    commands = [[
-        *sorvolo, "batch", str(folder / "in"), "--root", str(folder / "maps"), "--executor", executor, "--workers",
-        workers, *shared,
-    ]]
+    commands = [
+        [
+            *sorvolo,
+            "batch",
+            str(folder / "in"),
+            "--root",
+            str(folder / "maps"),
+            "--executor",
+            executor,
+            "--workers",
+            workers,
+            *shared,
+        ]
+    ]
     if way == "loop":
         commands = [
             [*sorvolo, "map", str(flight), "--site", str(folder / "maps" / flight.name), *shared]
@@ -81,7 +101,9 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=60.0, help="of a strip, m")
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--ways", default=",".join(WAYS))
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "batch_speed.json")
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "results" / "batch_speed.json"
+    )
     options = parser.parse_args()
     rows: dict[str, list[dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as name:
@@ -93,7 +115,10 @@ def main() -> None:
                 rows.setdefault(way, []).append(once(way, folder))
                 print(way, rows[way][-1], f"load {os.getloadavg()[0]:.1f}", flush=True)
     medians = {
-        way: {name: round(statistics.median(each[name] for each in found), 2) for name in ("seconds", "cpu_s")}
+        way: {
+            name: round(statistics.median(each[name] for each in found), 2)
+            for name in ("seconds", "cpu_s")
+        }
         for way, found in rows.items()
     }
     base = medians["loop"]
@@ -101,10 +126,16 @@ def main() -> None:
         found["overhead_cpu"] = round(found["cpu_s"] / base["cpu_s"] - 1, 3)
         found["speed_up"] = round(base["seconds"] / found["seconds"], 2)
     result = {
-        "flights": options.flights, "pictures": pictures, "width_px": options.width, "rounds": options.rounds,
-        "load": round(os.getloadavg()[0], 1), "ways": medians,
+        "flights": options.flights,
+        "pictures": pictures,
+        "width_px": options.width,
+        "rounds": options.rounds,
+        "load": round(os.getloadavg()[0], 1),
+        "ways": medians,
     }
-    options.out.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
+    options.out.write_text(
+        json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n"
+    )
     print(json.dumps(result))
 
 

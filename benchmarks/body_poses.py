@@ -22,7 +22,9 @@ def drawn_pose(rng: np.random.Generator) -> tuple[Directions, Floats]:
 def _standing(rng: np.random.Generator) -> tuple[Directions, Floats]:
     wide = rng.uniform(0.0, 0.25)
     calf = (wide, -1, -0.05)
-    legs = _legs((wide, -1, rng.uniform(-0.08, 0.1)), calf, (wide, -1, rng.uniform(-0.1, 0.08)), calf)
+    legs = _legs(
+        (wide, -1, rng.uniform(-0.08, 0.1)), calf, (wide, -1, rng.uniform(-0.1, 0.08)), calf
+    )
     return legs | _upright(rng) | _arms(rng), np.eye(3)
 
 
@@ -37,7 +39,9 @@ def _walking(rng: np.random.Generator) -> tuple[Directions, Floats]:
     if rng.random() < 0.75:
         for (side, sign), swing in zip(_SIDES, (right, left)):
             arms[f"upperarm_{side}"] = np.array([0.25 * sign, -1, swing * 0.8])
-            arms[f"lowerarm_{side}"] = np.array([0.1 * sign, -1, swing * 0.8 + rng.uniform(0.2, 0.8)])
+            arms[f"lowerarm_{side}"] = np.array(
+                [0.1 * sign, -1, swing * 0.8 + rng.uniform(0.2, 0.8)]
+            )
     return legs | _upright(rng, forward=rng.uniform(0, 0.25)) | arms, np.eye(3)
 
 
@@ -63,7 +67,9 @@ def _on_the_ground(rng: np.random.Generator) -> tuple[Directions, Floats]:
 def _crouching(rng: np.random.Generator) -> tuple[Directions, Floats]:
     wide = rng.uniform(0.1, 0.6)
     legs = _legs((wide, rng.uniform(-0.1, 0.4), 1), (wide / 2, -1, -0.7))
-    return legs | _upright(rng, forward=rng.uniform(0.2, 1.0)) | _arms(rng, reaching=True), np.eye(3)
+    return legs | _upright(rng, forward=rng.uniform(0.2, 1.0)) | _arms(rng, reaching=True), np.eye(
+        3
+    )
 
 
 def _kneeling(rng: np.random.Generator) -> tuple[Directions, Floats]:
@@ -76,29 +82,42 @@ def _kneeling(rng: np.random.Generator) -> tuple[Directions, Floats]:
 def _bending(rng: np.random.Generator) -> tuple[Directions, Floats]:
     wide = rng.uniform(0.05, 0.3)
     legs = _legs((wide, -1, rng.uniform(0, 0.4)), (wide, -1, rng.uniform(-0.3, 0)))
-    return legs | _upright(rng, forward=rng.uniform(0.6, 2.5)) | _arms(rng, reaching=True), np.eye(3)
+    return legs | _upright(rng, forward=rng.uniform(0.6, 2.5)) | _arms(rng, reaching=True), np.eye(
+        3
+    )
 
 
 def _lying(rng: np.random.Generator) -> tuple[Directions, Floats]:
     """On the back, on the belly or on a side, limbs anyhow."""
     legs = {}
     for side, sign in _SIDES:
-        drawn_up, bent = rng.uniform(-0.1, 0.9) * (rng.random() < 0.5), rng.uniform(0, 0.9) * (rng.random() < 0.5)
+        drawn_up, bent = (
+            rng.uniform(-0.1, 0.9) * (rng.random() < 0.5),
+            rng.uniform(0, 0.9) * (rng.random() < 0.5),
+        )
         legs[f"thigh_{side}"] = np.array([sign * rng.uniform(-0.05, 0.5), -1, drawn_up])
         legs[f"calf_{side}"] = np.array([sign * rng.uniform(-0.2, 0.3), -1, -bent])
     roll = rng.choice([0.0, np.pi, np.pi / 2, -np.pi / 2]) + rng.normal(0, 0.15)
-    about_y = np.array([[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]])
-    down = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # the face, which looked forward, looks down or up
+    about_y = np.array(
+        [[np.cos(roll), 0, np.sin(roll)], [0, 1, 0], [-np.sin(roll), 0, np.cos(roll)]]
+    )
+    down = np.array(
+        [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+    )  # the face, which looked forward, looks down or up
     pitch = down if rng.random() < 0.5 else down.T
     return legs | _upright(rng) | _arms(rng), pitch @ about_y
 
 
-def _legs(thigh: tuple, calf: tuple, right_thigh: tuple | None = None, right_calf: tuple | None = None) -> Directions:
+def _legs(
+    thigh: tuple, calf: tuple, right_thigh: tuple | None = None, right_calf: tuple | None = None
+) -> Directions:
     """Both legs; the right ones mirrored, and as the left ones where they are not given."""
     mirror = np.array([-1.0, 1, 1])
     return {
-        "thigh_l": np.array(thigh, float), "calf_l": np.array(calf, float),
-        "thigh_r": mirror * (right_thigh or thigh), "calf_r": mirror * (right_calf or calf),
+        "thigh_l": np.array(thigh, float),
+        "calf_l": np.array(calf, float),
+        "thigh_r": mirror * (right_thigh or thigh),
+        "calf_r": mirror * (right_calf or calf),
     }
 
 
@@ -106,7 +125,8 @@ def _upright(rng: np.random.Generator, forward: float = 0.0) -> Directions:
     """The trunk, leaning forward by the tangent `forward` in all, and the head."""
     aside = rng.normal(0, 0.08)
     return {
-        "spine_01": np.array([aside, 1, forward / 2]), "spine_02": np.array([aside, 1, forward / 3]),
+        "spine_01": np.array([aside, 1, forward / 2]),
+        "spine_02": np.array([aside, 1, forward / 3]),
         "spine_03": np.array([0, 1, forward / 4 + 0.05]),
         "neck_01": np.array([rng.normal(0, 0.1), 1, rng.uniform(0.1, 0.5)]),
         "head": np.array([rng.normal(0, 0.15), 1, rng.uniform(-0.2, 0.5)]),
@@ -116,20 +136,32 @@ def _upright(rng: np.random.Generator, forward: float = 0.0) -> Directions:
 def _arms(rng: np.random.Generator, *, reaching: bool = False) -> Directions:
     """Each arm in a way of its own, or both alike; `reaching` ones go forward and down."""
     ways = (
-        ((0.25, -1, 0), (0.1, -1, 0.25)), ((0.3, -1, -0.05), (-0.3, 0.1, 1)), ((0.3, -1, 0.2), (-0.5, 0.6, 0.9)),
-        ((0.45, -1, -0.25), (-0.15, -0.8, 0.6)), ((0.2, -1, 0.2), (-1, 0.1, 0.5)),
-        ((0.7, -0.8, -0.2), (-0.7, -0.5, 0.4)), ((0.1, -0.3, 1), (0, 0, 1)), ((1, 0.1, 0), (1, 0.2, 0.2)),
-        ((0.5, 1, 0.1), (-0.1, 1, 0.1)), ((0.7, 0.4, 0.3), (-0.2, 1, 0)),
+        ((0.25, -1, 0), (0.1, -1, 0.25)),
+        ((0.3, -1, -0.05), (-0.3, 0.1, 1)),
+        ((0.3, -1, 0.2), (-0.5, 0.6, 0.9)),
+        ((0.45, -1, -0.25), (-0.15, -0.8, 0.6)),
+        ((0.2, -1, 0.2), (-1, 0.1, 0.5)),
+        ((0.7, -0.8, -0.2), (-0.7, -0.5, 0.4)),
+        ((0.1, -0.3, 1), (0, 0, 1)),
+        ((1, 0.1, 0), (1, 0.2, 0.2)),
+        ((0.5, 1, 0.1), (-0.1, 1, 0.1)),
+        ((0.7, 0.4, 0.3), (-0.2, 1, 0)),
     )
     shares = np.array([5, 3, 2, 2, 1.5, 1.5, 1, 1, 1, 0.7])
     if reaching:
-        ways = (((0.1, -0.6, 1), (0, -0.8, 1)), ((0.2, 0, 1), (-0.2, -0.2, 1)), ((0.3, -1, 0.3), (-0.2, -0.5, 1)))
+        ways = (
+            ((0.1, -0.6, 1), (0, -0.8, 1)),
+            ((0.2, 0, 1), (-0.2, -0.2, 1)),
+            ((0.3, -1, 0.3), (-0.2, -0.5, 1)),
+        )
         shares = np.ones(3)
     first, second = rng.choice(len(ways), 2, p=shares / shares.sum())
     if rng.random() < 0.5:
         second = first
     mirror = np.array([-1.0, 1, 1])
     return {
-        "upperarm_l": np.array(ways[first][0], float), "lowerarm_l": np.array(ways[first][1], float),
-        "upperarm_r": mirror * ways[second][0], "lowerarm_r": mirror * ways[second][1],
+        "upperarm_l": np.array(ways[first][0], float),
+        "lowerarm_l": np.array(ways[first][1], float),
+        "upperarm_r": mirror * ways[second][0],
+        "lowerarm_r": mirror * ways[second][1],
     }

@@ -59,7 +59,9 @@ _CARRY = """async ({ code, steps, asked }) => {
   });
 }"""
 
-Truth = dict[int, tuple[str, np.ndarray[Any, Any]]]  # by object: its class, and its box as left, top, right, bottom
+Truth = dict[
+    int, tuple[str, np.ndarray[Any, Any]]
+]  # by object: its class, and its box as left, top, right, bottom
 
 
 @dataclass(frozen=True)
@@ -77,9 +79,13 @@ class Flown:
 
 def main() -> None:
     """Carry the boxes of each flight and write how far off they are."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="default-int8")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="one for each flight; drawn without it")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[], help="one for each flight; drawn without it"
+    )
     parser.add_argument("--chromium", default="/usr/bin/chromium")
     parser.add_argument("--flights", type=Path, help="simulated before, or where to keep them")
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -89,15 +95,28 @@ def main() -> None:
     detector = Detector.load(options.model, threads=1)
     flights = {}
     with tempfile.TemporaryDirectory() as scratch, sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=options.chromium, args=["--no-sandbox", "--disable-gpu"])
+        browser = playwright.chromium.launch(
+            executable_path=options.chromium, args=["--no-sandbox", "--disable-gpu"]
+        )
         for seed, (name, pitch_deg) in zip(seeds, views.items(), strict=True):
-            flown = simulated((options.flights or Path(scratch)) / name.replace(" ", "_"), seed, pitch_deg)
-            flights[name] = carried(browser.new_page(), flown, detector, Path(scratch) / f"watch-{seed}")
+            flown = simulated(
+                (options.flights or Path(scratch)) / name.replace(" ", "_"), seed, pitch_deg
+            )
+            flights[name] = carried(
+                browser.new_page(), flown, detector, Path(scratch) / f"watch-{seed}"
+            )
         browser.close()
     result = {
-        "benchmark": "carried_boxes", "machine": machine(), "commit": commit(), "model": options.model, "seeds": seeds,
+        "benchmark": "carried_boxes",
+        "machine": machine(),
+        "commit": commit(),
+        "model": options.model,
+        "seeds": seeds,
         **note_scoring(f"carried_boxes, seeds {' '.join(map(str, seeds))}"),
-        "size": _SIZE, "looks_s_apart": _LOOK_FRAMES / _FPS, "look_late_s": _LOOK_LATE_S, "steps_late_s": _STEPS_LATE_S,
+        "size": _SIZE,
+        "looks_s_apart": _LOOK_FRAMES / _FPS,
+        "look_late_s": _LOOK_LATE_S,
+        "steps_late_s": _STEPS_LATE_S,
         "flights": flights,
     }
     options.output.write_text(json.dumps(result, indent=1) + "\n")
@@ -108,7 +127,9 @@ def simulated(folder: Path, seed: int, pitch_deg: float) -> Flown:
     """A strip with people and cars, the true boxes known in every frame."""
     if not folder.is_dir():
         settings = SimulationSettings(
-            seed=seed, flights=2, scene=SceneSettings(people=14, cars=10, small_objects=0, moving_share=0.6),
+            seed=seed,
+            flights=2,
+            scene=SceneSettings(people=14, cars=10, small_objects=0, moving_share=0.6),
             path=PathSettings(height_m=40, speed_m_s=8, length_m=8 * _SECONDS, strips=1),
             motion=MotionSettings(camera_pitch_deg=pitch_deg),
             imaging=ImagingSettings(width_px=_SIZE[0], height_px=_SIZE[1], fps=_FPS),
@@ -131,21 +152,47 @@ def carried(page: Any, flown: Flown, detector: Detector, scratch: Path) -> dict[
     """How far off boxes are, px: carried, and left where they were seen; and what a step took."""
     steps, step_ms = followed(flown.video)
     settings = WatchSettings(every=_LOOK_FRAMES)
-    looks = list(watch(flown.video, settings, WatchOutputs(scratch), detector=detector,
-                       camera=flown.folder / "camera.xml"))
+    looks = list(
+        watch(
+            flown.video,
+            settings,
+            WatchOutputs(scratch),
+            detector=detector,
+            camera=flown.folder / "camera.xml",
+        )
+    )
     asked = []
     for number in range(len(flown.truth)):
-        known = [each for each in looks if each.clip_ns / 1e9 + _LOOK_LATE_S <= number / _FPS + 1e-6]
+        known = [
+            each for each in looks if each.clip_ns / 1e9 + _LOOK_LATE_S <= number / _FPS + 1e-6
+        ]
         if known:
             asked.append((number, known[-1]))
-    answers = {late_s: page.evaluate(_CARRY, {
-        "code": PAGE.read_text(),
-        "steps": [{
-            "from_us": each.from_ns // 1000, "pts_us": each.to_ns // 1000, "to_from": each.to_from.ravel().tolist(),
-        } for each in steps],
-        "asked": [{"look": as_sent(look), "to_us": round(1e6 * number / _FPS),
-                   "known_us": round(1e6 * (number / _FPS - late_s))} for number, look in asked],
-    }) for late_s in _STEPS_LATE_S}
+    answers = {
+        late_s: page.evaluate(
+            _CARRY,
+            {
+                "code": PAGE.read_text(),
+                "steps": [
+                    {
+                        "from_us": each.from_ns // 1000,
+                        "pts_us": each.to_ns // 1000,
+                        "to_from": each.to_from.ravel().tolist(),
+                    }
+                    for each in steps
+                ],
+                "asked": [
+                    {
+                        "look": as_sent(look),
+                        "to_us": round(1e6 * number / _FPS),
+                        "known_us": round(1e6 * (number / _FPS - late_s)),
+                    }
+                    for number, look in asked
+                ],
+            },
+        )
+        for late_s in _STEPS_LATE_S
+    }
     errors: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     moving = movers(flown)
     for at, (number, look) in enumerate(asked):
@@ -161,10 +208,15 @@ def carried(page: Any, flown: Flown, detector: Detector, scratch: Path) -> dict[
                 off_px = float(np.hypot(x + w / 2 - middle[0], y + h / 2 - middle[1]))
                 errors[kind][f"carried_{late_s}_s_late"].append(off_px)
     counts = {"steps": len(steps), "frames": len(flown.truth), "looks": len(looks)}
-    return counts | {"cpu_ms_a_step": round(step_ms, 2)} | {
-        kind: {"boxes": len(of["left"])} | {way: figures(np.array(each)) for way, each in of.items()}
-        for kind, of in sorted(errors.items())
-    }
+    return (
+        counts
+        | {"cpu_ms_a_step": round(step_ms, 2)}
+        | {
+            kind: {"boxes": len(of["left"])}
+            | {way: figures(np.array(each)) for way, each in of.items()}
+            for kind, of in sorted(errors.items())
+        }
+    )
 
 
 def figures(errors_px: np.ndarray[Any, Any]) -> dict[str, Any]:
@@ -181,7 +233,9 @@ def followed(video: Path) -> tuple[list[PictureStep], float]:
         for number, frame in enumerate(container.decode(video=0)):
             began_s = time.process_time()
             height_px = round(SMALL_WIDTH_PX * frame.height / frame.width)
-            gray = frame.reformat(SMALL_WIDTH_PX, height_px, "gray", interpolation="AREA").to_ndarray()
+            gray = frame.reformat(
+                SMALL_WIDTH_PX, height_px, "gray", interpolation="AREA"
+            ).to_ndarray()
             steps.append(following.add(round(1e9 * number / _FPS), gray, frame.width))
             taken_s += time.process_time() - began_s
     return [each for each in steps if each is not None], 1000 * taken_s / len(steps)
@@ -189,10 +243,14 @@ def followed(video: Path) -> tuple[list[PictureStep], float]:
 
 def as_sent(look: WatchUpdate) -> dict[str, Any]:
     """A look's boxes as the page gets them."""
-    return {"pts_us": look.clip_ns // 1000, "frame_size_px": look.size_px, "boxes": [
-        {"number": row, "xywh_px": [float(x0), float(y0), float(x1 - x0), float(y1 - y0)]}
-        for row, (x0, y0, x1, y1) in enumerate(look.detections.boxes_px)
-    ]}
+    return {
+        "pts_us": look.clip_ns // 1000,
+        "frame_size_px": look.size_px,
+        "boxes": [
+            {"number": row, "xywh_px": [float(x0), float(y0), float(x1 - x0), float(y1 - y0)]}
+            for row, (x0, y0, x1, y1) in enumerate(look.detections.boxes_px)
+        ],
+    }
 
 
 def matched(look: WatchUpdate, truth: Truth) -> dict[int, int]:
@@ -201,10 +259,16 @@ def matched(look: WatchUpdate, truth: Truth) -> dict[int, int]:
     things = list(truth)
     if not things or not len(look.detections):
         return found
-    overlap = iou_matrix(look.detections.boxes_px, np.array([truth[each][1] for each in things], np.float32))
+    overlap = iou_matrix(
+        look.detections.boxes_px, np.array([truth[each][1] for each in things], np.float32)
+    )
     for row, name in enumerate(look.detections.names):
         best = int(np.argmax(overlap[row]))
-        if overlap[row, best] >= _SEEN_IOU and truth[things[best]][0] == name and is_whole(truth[things[best]][1]):
+        if (
+            overlap[row, best] >= _SEEN_IOU
+            and truth[things[best]][0] == name
+            and is_whole(truth[things[best]][1])
+        ):
             found[row] = things[best]
     return found
 

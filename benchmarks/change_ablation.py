@@ -60,7 +60,11 @@ from sorvolo.survey.findings import ComparedView
 RESULTS = Path(__file__).parent / "results" / "change_ablation.json"
 SEEDS_FROM = "16ebd5df70a31436834ccd2cd668cb9935c3628a"
 FLIGHTS = (
-    ("compare", 25), ("compare-urban", 25), ("compare-dirt", 25), ("compare-photos", 40), ("compare-photos", 40),
+    ("compare", 25),
+    ("compare-urban", 25),
+    ("compare-dirt", 25),
+    ("compare-photos", 40),
+    ("compare-photos", 40),
     ("compare-none", 25),
 )
 """Preset and length of a strip, m: short, for each rule is one more run over all of them."""
@@ -77,9 +81,13 @@ def main() -> None:
     parser.add_argument("cache", type=Path)
     parser.add_argument("--record", action="store_true")
     parser.add_argument("--real", type=Path, help="folder of real flights, recorded as well")
-    parser.add_argument("--dates", type=Path, help="folder of real flights: the first pair of real_dates.py as well")
+    parser.add_argument(
+        "--dates", type=Path, help="folder of real flights: the first pair of real_dates.py as well"
+    )
     parser.add_argument("--presets", nargs="*", help="record flights of these presets only")
-    parser.add_argument("--seeds-from", default=SEEDS_FROM, help="hash of a commit that seeds are drawn from")
+    parser.add_argument(
+        "--seeds-from", default=SEEDS_FROM, help="hash of a commit that seeds are drawn from"
+    )
     parser.add_argument("--digest", action="store_true")
     parser.add_argument("--stage", choices=("decision", "evidence", "pair"), default="decision")
     parser.add_argument("--rules", nargs="*", help="names of RULES; all of the stage without it")
@@ -92,7 +100,11 @@ def main() -> None:
         if options.dates is not None:
             record_dates(options.cache, options.dates)
         return
-    recorded = [each for each in read_all(options.cache) if not options.flights or each.name in options.flights]
+    recorded = [
+        each
+        for each in read_all(options.cache)
+        if not options.flights or each.name in options.flights
+    ]
     if options.digest:
         for each in recorded:
             print(each.name, digest(each, options.stage), flush=True)
@@ -110,9 +122,13 @@ class Recorded:
     name: str
     folder: Path
     m_per_px: float
-    truth: tuple[Any, ...] | None  # true events, settings, compared m2, how far the truth's clock is ahead
+    truth: (
+        tuple[Any, ...] | None
+    )  # true events, settings, compared m2, how far the truth's clock is ahead
     events: int
-    drawn: tuple[Any, ...] | None = None  # of the real pair of dates: frame, map from true, size of the orthophoto
+    drawn: tuple[Any, ...] | None = (
+        None  # of the real pair of dates: frame, map from true, size of the orthophoto
+    )
 
     def views(self) -> Iterator[tuple[ComparedView, list[tuple[Any, Any]]]]:
         """What was compared, with what the earlier pictures showed of it, in order of time."""
@@ -141,17 +157,35 @@ class RecordingViewMaker(views.ViewMaker):
         if isinstance(looked, views.OneSided):
             height, width = looked.valid.shape
             aligned, frame = looked.aligned, looked.posed.frame
-            earlier = [] if self._pictures is None else [
-                (picture.copy(), sees & self._lens_sees) for picture, sees in self._pictures.seen_from(
-                    aligned.site_from_image, aligned.camera_m, width, height,
-                    views.ViewSettings().witnesses,
-                )
-            ]
+            earlier = (
+                []
+                if self._pictures is None
+                else [
+                    (picture.copy(), sees & self._lens_sees)
+                    for picture, sees in self._pictures.seen_from(
+                        aligned.site_from_image,
+                        aligned.camera_m,
+                        width,
+                        height,
+                        views.ViewSettings().witnesses,
+                    )
+                ]
+            )
             blank = np.zeros(looked.valid.shape, np.uint8)
             view = ComparedView(
-                frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
-                looked.image, looked.reference, looked.valid, blank, np.zeros((0, 4), np.int64), np.zeros(0),
-                aligned.residual_px, blank,
+                frame.index,
+                frame.name,
+                self._flight.utc_ns(frame.time_ns),
+                aligned.site_from_image,
+                aligned.camera_m,
+                looked.image,
+                looked.reference,
+                looked.valid,
+                blank,
+                np.zeros((0, 4), np.int64),
+                np.zeros(0),
+                aligned.residual_px,
+                blank,
             )
             place = self.folder / f"view-{frame.index:06d}.pickle"
             place.write_bytes(pickle.dumps((view, earlier), protocol=5))
@@ -166,7 +200,9 @@ def seed_of(name: str, number: int, seeds_from: str = SEEDS_FROM) -> int:
     return int(hashlib.sha256(f"{seeds_from} {name} {number}".encode()).hexdigest()[:6], 16)
 
 
-def record_all(cache: Path, real: Path | None, presets: Sequence[str] | None, seeds_from: str) -> None:
+def record_all(
+    cache: Path, real: Path | None, presets: Sequence[str] | None, seeds_from: str
+) -> None:
     """Simulate, map and compare each flight once; what is there already is kept."""
     for number, (name, length_m) in enumerate(FLIGHTS):
         folder = cache / f"{number}-{name}"
@@ -177,7 +213,9 @@ def record_all(cache: Path, real: Path | None, presets: Sequence[str] | None, se
         settings = replace(settings, path=replace(settings.path, length_m=length_m))
         # no more frames than are compared: five a second
         settings = replace(
-            settings, imaging=replace(settings.imaging, fps=5.0), output=replace(settings.output, truth_step=1)
+            settings,
+            imaging=replace(settings.imaging, fps=5.0),
+            output=replace(settings.output, truth_step=1),
         )
         simulation, site = folder / "simulation", folder / "site"
         if not simulation.is_dir():
@@ -185,7 +223,9 @@ def record_all(cache: Path, real: Path | None, presets: Sequence[str] | None, se
                 pass
         print(folder.name, "simulated", round(time.process_time() - started), "s", flush=True)
         camera = simulation / "camera.xml"
-        for _ in map_flights([flight_path(simulation, 1)], site, MapSettings(model="none"), camera=camera):
+        for _ in map_flights(
+            [flight_path(simulation, 1)], site, MapSettings(model="none"), camera=camera
+        ):
             pass
         print(folder.name, "mapped", round(time.process_time() - started), "s", flush=True)
         record(folder, flight_path(simulation, 2), site, camera, simulation)
@@ -228,7 +268,9 @@ def record_dates(cache: Path, data: Path) -> None:
     (folder / "recorded.pickle").write_bytes(pickle.dumps(replace(stored, drawn=truth)))
 
 
-def record(folder: Path, later: Path, site: Path, camera: Path | None, simulation: Path | None) -> None:
+def record(
+    folder: Path, later: Path, site: Path, camera: Path | None, simulation: Path | None
+) -> None:
     """Compare a flight, writing down its views, and match its events with the truth."""
     scales: list[float] = []
 
@@ -253,12 +295,16 @@ def record(folder: Path, later: Path, site: Path, camera: Path | None, simulatio
             kept.append(area_m2)
             return score_events(match, area_m2, settings)
 
-        with mock.patch.object(evaluation, "match_events", keeping_match), \
-                mock.patch.object(evaluation, "score_events", keeping_score):
+        with (
+            mock.patch.object(evaluation, "match_events", keeping_match),
+            mock.patch.object(evaluation, "score_events", keeping_score),
+        ):
             evaluation.evaluate_changes(site, simulation)
         found, true, settings, area_m2 = kept
         truth, events = (true, settings, area_m2, found), len(found)
-    (folder / "recorded.pickle").write_bytes(pickle.dumps(Recorded(folder.name, folder, scales[0], truth, events)))
+    (folder / "recorded.pickle").write_bytes(
+        pickle.dumps(Recorded(folder.name, folder, scales[0], truth, events))
+    )
 
 
 def read_all(cache: Path) -> list[Recorded]:
@@ -274,7 +320,9 @@ def compared_again(recorded: Recorded) -> Iterator[ComparedView]:
     tuning = FlightTuning()
     rules = CorroborationSettings()
     for view, earlier in recorded.views():
-        reference, query = (cv2.cvtColor(each, cv2.COLOR_RGB2BGR) for each in (view.reference, view.image))
+        reference, query = (
+            cv2.cvtColor(each, cv2.COLOR_RGB2BGR) for each in (view.reference, view.image)
+        )
         found = robust.compare_robust(
             reference, query, view.valid, replace(tuning.settings(), least_score=rules.least_score)
         )
@@ -287,7 +335,11 @@ def compared_again(recorded: Recorded) -> Iterator[ComparedView]:
             opinions.append((Difference(other.mask, other.boxes, other.scores), sees))
         kept = believed((by_map, view.valid), opinions, rules)
         if np.count_nonzero(kept.mask) <= 0.5 * max(1, np.count_nonzero(view.valid)):
-            yield with_shade(replace(view, changed=kept.mask, boxes=kept.boxes, scores=kept.scores, shade=kept.mask))
+            yield with_shade(
+                replace(
+                    view, changed=kept.mask, boxes=kept.boxes, scores=kept.scores, shade=kept.mask
+                )
+            )
 
 
 def gathered(recorded: Recorded, compared: Iterator[ComparedView]) -> tuple[list[Any], int]:
@@ -342,20 +394,31 @@ def scored(recorded: Recorded, changes: Sequence[Any], withdrawn: int) -> dict[s
         by_hand = json.loads((Path(__file__).parent / "real_dates.json").read_text())
         drawn = real_dates.found_among(rings_m, frame, map_from_true, by_hand, size_px)
         keys = {"found": "drawn_found", "false": "drawn_false", "elsewhere": "drawn_elsewhere"}
-        return {ours: drawn[theirs] for theirs, ours in keys.items()} | {"drawn_withdrawn": withdrawn}
+        return {ours: drawn[theirs] for theirs, ours in keys.items()} | {
+            "drawn_withdrawn": withdrawn
+        }
     if recorded.truth is None:
         return {"real": len(changes), "withdrawn": withdrawn}
     true, settings, area_m2, first = recorded.truth
     ahead_ns = {each.id: each.announced_ns for each in first}
-    found = [FoundEvent(each.id, each.kind, each.outline_m, each.sigma_m, _when(each, ahead_ns)) for each in changes]
+    found = [
+        FoundEvent(each.id, each.kind, each.outline_m, each.sigma_m, _when(each, ahead_ns))
+        for each in changes
+    ]
     match = match_events(found, true, settings)
     scores = score_events(match, area_m2, settings)
     still = [each for each in match.pairs if not len(each.true.path_m)]
     ious = [overlap(each.found.outline_m, each.true.outline_m)[0] for each in still]
     return {
-        "found": scores.found, "of": scores.must_find, "false": scores.false, "twice": scores.twice,
-        "named": scores.named_right, "optional": scores.optional,
-        "withdrawn": withdrawn, "outlines": len(still), "iou_sum": round(sum(ious), 3),
+        "found": scores.found,
+        "of": scores.must_find,
+        "false": scores.false,
+        "twice": scores.twice,
+        "named": scores.named_right,
+        "optional": scores.optional,
+        "withdrawn": withdrawn,
+        "outlines": len(still),
+        "iou_sum": round(sum(ious), 3),
     }
 
 
@@ -375,8 +438,18 @@ def wanted_rules(options: argparse.Namespace) -> list[Rule]:
 
 def totals_of(flights: Sequence[dict[str, Any]]) -> dict[str, float]:
     """The scores of all flights together; `iou` is the mean over their outlines."""
-    keys = ("found", "of", "false", "twice", "withdrawn", "named", "real", "drawn_found", "drawn_false",
-            "drawn_elsewhere")
+    keys = (
+        "found",
+        "of",
+        "false",
+        "twice",
+        "withdrawn",
+        "named",
+        "real",
+        "drawn_found",
+        "drawn_false",
+        "drawn_elsewhere",
+    )
     outlines = sum(each.get("outlines", 0) for each in flights)
     iou = round(sum(each.get("iou_sum", 0) for each in flights) / max(outlines, 1), 4)
     return {key: sum(each.get(key, 0) for each in flights) for key in keys} | {"iou": iou}
@@ -394,12 +467,28 @@ def ablate(recorded: Sequence[Recorded], options: argparse.Namespace) -> None:
         if (name, stage) in done:
             continue
         decision = "" if rule is None else rule.decision
-        rows.append({"rule": name, "stage": stage, "decision": decision, **scored_without(rule, stage, recorded)})
-        options.output.write_text(json.dumps({
-            "benchmark": "change_ablation", "machine": machine(), "commit": commit(),
-            "seeds_from": options.seeds_from, "lengths_m": dict(FLIGHTS),
-            "rows": rows,
-        }, indent=1) + "\n")
+        rows.append(
+            {
+                "rule": name,
+                "stage": stage,
+                "decision": decision,
+                **scored_without(rule, stage, recorded),
+            }
+        )
+        options.output.write_text(
+            json.dumps(
+                {
+                    "benchmark": "change_ablation",
+                    "machine": machine(),
+                    "commit": commit(),
+                    "seeds_from": options.seeds_from,
+                    "lengths_m": dict(FLIGHTS),
+                    "rows": rows,
+                },
+                indent=1,
+            )
+            + "\n"
+        )
 
 
 def scored_without(rule: Rule | None, stage: str, recorded: Sequence[Recorded]) -> dict[str, Any]:
@@ -410,7 +499,12 @@ def scored_without(rule: Rule | None, stage: str, recorded: Sequence[Recorded]) 
             flights[each.name] = scored(each, *run_of(each, stage))
             gc.collect()
     totals, name = totals_of(list(flights.values())), "all rules" if rule is None else rule.name
-    print(f"{name:32} {stage:9}", *(f"{key} {value}" for key, value in totals.items()), file=sys.stderr, flush=True)
+    print(
+        f"{name:32} {stage:9}",
+        *(f"{key} {value}" for key, value in totals.items()),
+        file=sys.stderr,
+        flush=True,
+    )
     return {**totals, "flights": flights, "cpu_s": round(time.process_time() - started)}
 
 

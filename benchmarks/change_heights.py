@@ -32,12 +32,21 @@ RESULTS = Path(__file__).parent / "results" / "change_heights.json"
 
 def main() -> None:
     """Measure and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="without: one that nobody has scored")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="*", default=[], help="without: one that nobody has scored"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     seeds = seeds_or_drawn("change_heights", options.seeds, 1)
-    result: dict[str, Any] = {"benchmark": "change_heights", "machine": machine(), "commit": commit(), "seeds": seeds}
+    result: dict[str, Any] = {
+        "benchmark": "change_heights",
+        "machine": machine(),
+        "commit": commit(),
+        "seeds": seeds,
+    }
     if not options.seeds:
         result |= note_scoring(f"change_heights, seeds {seeds}")
     result["runs"] = {str(seed): measured(seed) for seed in seeds}
@@ -49,8 +58,12 @@ def measured(seed: int) -> dict[str, Any]:
     """One site: events without and with heights."""
     later = LaterSettings(revisit=RevisitSettings(height_factor=1.2, heading_change_deg=90.0))
     settings = replace(
-        _SURVEY, seed=seed, flights=2, later=later,
-        scene=replace(_SURVEY.scene, people=3, cars=3, small_objects=4), output=replace(_SURVEY.output, truth_step=3),
+        _SURVEY,
+        seed=seed,
+        flights=2,
+        later=later,
+        scene=replace(_SURVEY.scene, people=3, cars=3, small_objects=4),
+        output=replace(_SURVEY.output, truth_step=3),
     )
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
@@ -58,7 +71,11 @@ def measured(seed: int) -> dict[str, Any]:
         for _ in simulate_site(made, settings):
             pass
         camera = made / "camera.xml"
-        list(map_flights([made / "flight1" / "photos"], base, MapSettings(model="none"), camera=camera))
+        list(
+            map_flights(
+                [made / "flight1" / "photos"], base, MapSettings(model="none"), camera=camera
+            )
+        )
         found = {}
         for name in ("without", "with"):
             if name == "with":
@@ -66,11 +83,20 @@ def measured(seed: int) -> dict[str, Any]:
             site = folder / name
             shutil.copytree(base, site)
             started = time.process_time()
-            deque(compare_flights([made / "flight2" / "photos"], site, CompareSettings(model="none"), camera=camera), 1)
+            deque(
+                compare_flights(
+                    [made / "flight2" / "photos"],
+                    site,
+                    CompareSettings(model="none"),
+                    camera=camera,
+                ),
+                1,
+            )
             (each,) = evaluate_changes(site, made)
             plain = as_json([each])[0]
             found[name] = {
-                "events": plain["events"], "pixels": plain["pixels"],
+                "events": plain["events"],
+                "pixels": plain["pixels"],
                 "cpu_s": round(time.process_time() - started, 1),
             }
         return found

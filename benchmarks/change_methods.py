@@ -34,8 +34,12 @@ Images = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 def main() -> None:
     """Run the suites, print a table, write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="else two drawn from the commit's hash")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[], help="else two drawn from the commit's hash"
+    )
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
     parser.add_argument("--count", type=int, default=30, help="pairs of each suite and seed")
     parser.add_argument("--suites", nargs="+", choices=list(SUITES), default=list(SUITES))
@@ -52,17 +56,37 @@ def main() -> None:
     if sources == ["procedural"]:
         print(f"no photos in the data folder: procedural grounds instead ({len(places)})")
     suites = [each for each in options.suites if each != "real" or sources != ["procedural"]]
-    tasks = [(name, seed, options.count, places, options.split, tuple(options.methods))
-             for name in suites for seed in options.seeds]
+    tasks = [
+        (name, seed, options.count, places, options.split, tuple(options.methods))
+        for name in suites
+        for seed in options.seeds
+    ]
     with ProcessPoolExecutor(options.jobs) as pool:
         runs = [run for part in pool.map(measure, *zip(*tasks)) for run in part]
-    summary = [summarise(runs, suite, method)
-               for suite in dict.fromkeys(run["suite"] for run in runs) for method in options.methods]
+    summary = [
+        summarise(runs, suite, method)
+        for suite in dict.fromkeys(run["suite"] for run in runs)
+        for method in options.methods
+    ]
     options.output.parent.mkdir(exist_ok=True)
-    options.output.write_text(json.dumps({
-        "benchmark": "change_methods", "split": options.split, "seeds": options.seeds, "pairs": options.count,
-        **scoring, "sources": sources, "machine": machine(), "commit": commit(), "summary": summary, "runs": runs,
-    }, indent=1) + "\n")
+    options.output.write_text(
+        json.dumps(
+            {
+                "benchmark": "change_methods",
+                "split": options.split,
+                "seeds": options.seeds,
+                "pairs": options.count,
+                **scoring,
+                "sources": sources,
+                "machine": machine(),
+                "commit": commit(),
+                "summary": summary,
+                "runs": runs,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
     show(summary, options.methods)
 
 
@@ -86,7 +110,9 @@ def measure(
         for number in range(count):
             seen = views(suite, seed, number, places, split, VIEWS)
             for name, run in voted.items():
-                masks = [METHODS[name]((each.reference, each.query, each.valid)) > 0 for each in seen]
+                masks = [
+                    METHODS[name]((each.reference, each.query, each.valid)) > 0 for each in seen
+                ]
                 add(run, seen[0], vote(masks))
         found += list(voted.values())
     return found
@@ -101,8 +127,16 @@ def vote(masks: list[np.ndarray]) -> np.ndarray:
 
 def empty_run(suite: str, seed: int, method: str) -> dict[str, object]:
     """Nothing counted yet: [true positives, false positives, false negatives, true negatives]."""
-    return {"suite": suite, "seed": seed, "method": method, "pixels": [0] * 4, "frames": [0] * 4, "things": [0] * 3,
-            "times_ms": [], "by_source": {}}
+    return {
+        "suite": suite,
+        "seed": seed,
+        "method": method,
+        "pixels": [0] * 4,
+        "frames": [0] * 4,
+        "things": [0] * 3,
+        "times_ms": [],
+        "by_source": {},
+    }
 
 
 def add(run: dict[str, object], pair: Pair, mask: np.ndarray) -> None:
@@ -112,8 +146,12 @@ def add(run: dict[str, object], pair: Pair, mask: np.ndarray) -> None:
     pixels = [int((truth & found).sum()), int((~truth & found).sum()), int((truth & ~found).sum())]
     run["pixels"] = [a + b for a, b in zip(run["pixels"], [*pixels, int(truth.size) - sum(pixels)])]
     is_changed, is_found = bool(truth.any()), bool(found.any())
-    outcome = [is_changed and is_found, not is_changed and is_found, is_changed and not is_found,
-               not is_changed and not is_found]
+    outcome = [
+        is_changed and is_found,
+        not is_changed and is_found,
+        is_changed and not is_found,
+        not is_changed and not is_found,
+    ]
     run["frames"] = [a + int(b) for a, b in zip(run["frames"], outcome)]
     frames = run["by_source"].setdefault(pair.source, [0] * 4)
     run["by_source"][pair.source] = [a + int(b) for a, b in zip(frames, outcome)]
@@ -154,11 +192,25 @@ def show(summary: list[dict[str, object]], methods: list[str]) -> None:
     table = Table("suite", *heads, "alarms without change", "found / false / missed")
     for suite in dict.fromkeys(each["suite"] for each in summary):
         rows = {each["method"]: each for each in summary if each["suite"] == suite}
-        cells = [f"{100 * rows[name]['pixels_f1']:.1f} / {100 * rows[name]['frames_f1']:.1f}" for name in methods]
+        cells = [
+            f"{100 * rows[name]['pixels_f1']:.1f} / {100 * rows[name]['frames_f1']:.1f}"
+            for name in methods
+        ]
         last = rows.get("robust", rows[methods[-1]])
-        table.add_row(suite, *cells, last["alarms_without_change"], " / ".join(str(each) for each in last["things"]))
-    times = {name: [each["cpu_ms_1280x720"] for each in summary if each["method"] == name and each["cpu_ms_1280x720"]]
-             for name in methods}
+        table.add_row(
+            suite,
+            *cells,
+            last["alarms_without_change"],
+            " / ".join(str(each) for each in last["things"]),
+        )
+    times = {
+        name: [
+            each["cpu_ms_1280x720"]
+            for each in summary
+            if each["method"] == name and each["cpu_ms_1280x720"]
+        ]
+        for name in methods
+    }
     cells = [f"{median(times[name]):.1f}" if times[name] else "-" for name in methods]
     table.add_row("CPU ms at 1280x720", *cells, "", "")
     Console(width=150).print(table)
@@ -179,14 +231,19 @@ def by_robust(images: Images) -> np.ndarray:
 def by_difference(images: Images) -> np.ndarray:
     """Gray levels 40 or more apart; specks opened away."""
     reference, query, valid = images
-    grays = [cv2.GaussianBlur(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), (5, 5), 0) for each in (reference, query)]
+    grays = [
+        cv2.GaussianBlur(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), (5, 5), 0)
+        for each in (reference, query)
+    ]
     return _opened(np.asarray(cv2.absdiff(*grays)) >= 40, valid)
 
 
 def by_ssim(images: Images) -> np.ndarray:
     """Structural similarity below 0.2 over windows of 11 px; specks opened away."""
     reference, query, valid = images
-    a, b = (cv2.cvtColor(each, cv2.COLOR_BGR2GRAY).astype(np.float32) for each in (reference, query))
+    a, b = (
+        cv2.cvtColor(each, cv2.COLOR_BGR2GRAY).astype(np.float32) for each in (reference, query)
+    )
 
     def mean(values: np.ndarray) -> np.ndarray:
         return np.asarray(cv2.GaussianBlur(values, (11, 11), 1.5))
@@ -196,16 +253,23 @@ def by_ssim(images: Images) -> np.ndarray:
     common = mean(a * b) - mean_a * mean_b
     first, second = (0.01 * 255) ** 2, (0.03 * 255) ** 2
     above = (2 * mean_a * mean_b + first) * (2 * common + second)
-    return _opened(above / ((mean_a**2 + mean_b**2 + first) * (spread_a + spread_b + second)) < 0.2, valid)
+    return _opened(
+        above / ((mean_a**2 + mean_b**2 + first) * (spread_a + spread_b + second)) < 0.2, valid
+    )
 
 
 def _opened(changed: np.ndarray, valid: np.ndarray) -> np.ndarray:
-    mask = (changed & (cv2.erode(valid.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0)).astype(np.uint8) * 255
+    mask = (changed & (cv2.erode(valid.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0)).astype(
+        np.uint8
+    ) * 255
     return np.asarray(cv2.morphologyEx(mask, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8)))
 
 
 METHODS: dict[str, Callable[[Images], np.ndarray]] = {
-    "robust": by_robust, "thesis": by_thesis, "difference": by_difference, "ssim": by_ssim,
+    "robust": by_robust,
+    "thesis": by_thesis,
+    "difference": by_difference,
+    "ssim": by_ssim,
 }
 
 if __name__ == "__main__":

@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-LEAST_CONTRAST = 25.0  # mean largest difference of a channel between a thing and its ground, grey levels
+LEAST_CONTRAST = (
+    25.0  # mean largest difference of a channel between a thing and its ground, grey levels
+)
 LEAST_LOW_CONTRAST = 10.0
 
 
@@ -29,8 +31,13 @@ class Scene:
 
 
 def paint_objects(
-    scene: Scene, rng: np.random.Generator, scale: float, low_contrast: float, cutouts: list[Cutout],
-    donor: np.ndarray, margin_px: int,
+    scene: Scene,
+    rng: np.random.Generator,
+    scale: float,
+    low_contrast: float,
+    cutouts: list[Cutout],
+    donor: np.ndarray,
+    margin_px: int,
 ) -> Scene:
     """One to three more things put on the ground before or after; each 12 to 80 px times `scale`."""
     pictures = [scene.before.copy(), scene.after.copy()]
@@ -67,7 +74,12 @@ def paint_objects(
 
 
 def _shade(
-    shape: tuple[int, ...], alpha: np.ndarray, at: tuple[int, int], sun: float, rng: np.random.Generator, length: float
+    shape: tuple[int, ...],
+    alpha: np.ndarray,
+    at: tuple[int, int],
+    sun: float,
+    rng: np.random.Generator,
+    length: float,
 ) -> np.ndarray:
     """The soft shadow that a thing casts, how much it darkens."""
     shade = np.zeros(shape[:2], np.float32)
@@ -81,7 +93,12 @@ def _shade(
 
 
 def _thing(
-    rng: np.random.Generator, length: float, ground: np.ndarray, is_low: bool, cutouts: list[Cutout], donor: np.ndarray
+    rng: np.random.Generator,
+    length: float,
+    ground: np.ndarray,
+    is_low: bool,
+    cutouts: list[Cutout],
+    donor: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A thing's picture and cover in its bounding rectangle."""
     breadth = max(length * rng.uniform(0.4, 1.0), min(length, 6.0))
@@ -113,7 +130,11 @@ def _thing(
 
 
 def _texture(
-    rng: np.random.Generator, shape: tuple[int, int], donor: np.ndarray, brightness: float, is_low: bool
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    donor: np.ndarray,
+    brightness: float,
+    is_low: bool,
 ) -> np.ndarray:
     """A surface: a piece of a photo, or a colour with grain and a gradient."""
     if is_low or rng.uniform() < 0.35:
@@ -122,15 +143,23 @@ def _texture(
         piece = donor[y : y + shape[0], x : x + shape[1]].astype(np.float32)
         return np.clip(piece * rng.uniform(0.75, 1.3), 0, 255)
     hsv = np.uint8([[[rng.integers(180), 255 * rng.beta(1, 1.7), rng.uniform(20, 245)]]])
-    colour = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].astype(np.float32) * np.clip(brightness, 0.6, 1.3)
-    grain = cv2.GaussianBlur(rng.normal(0, 1, shape).astype(np.float32), (0, 0), rng.uniform(0.8, 3))
+    colour = cv2.cvtColor(hsv, cv2.COLOR_HSV2BGR)[0, 0].astype(np.float32) * np.clip(
+        brightness, 0.6, 1.3
+    )
+    grain = cv2.GaussianBlur(
+        rng.normal(0, 1, shape).astype(np.float32), (0, 0), rng.uniform(0.8, 3)
+    )
     grain *= rng.uniform(2, 10) / max(float(grain.std()), 1e-6)
     slope = np.linspace(-1, 1, shape[1], dtype=np.float32) * rng.uniform(-12, 12)
     return np.clip(colour + (grain + slope)[..., None], 0, 255)
 
 
 def _detailed(
-    skin: np.ndarray, rng: np.random.Generator, axes: tuple[float, float], angle: float, is_person: bool
+    skin: np.ndarray,
+    rng: np.random.Generator,
+    axes: tuple[float, float],
+    angle: float,
+    is_person: bool,
 ) -> np.ndarray:
     """Windows of a car, or the head of a person seen from above."""
     skin = np.ascontiguousarray(skin)
@@ -138,13 +167,17 @@ def _detailed(
     along = np.array([np.cos(np.radians(angle)), np.sin(np.radians(angle))])
     if is_person:
         head = tuple(float(v) for v in rng.uniform(20, 150, 3))
-        cv2.circle(skin, (round(middle), round(middle)), max(1, int(axes[1] * 0.28)), head, -1, cv2.LINE_AA)
+        cv2.circle(
+            skin, (round(middle), round(middle)), max(1, int(axes[1] * 0.28)), head, -1, cv2.LINE_AA
+        )
         return skin
     glass = float(rng.uniform(15, 70))
     for offset, part in ((0.2, 0.12), (-0.3, 0.1)):
         centre = np.array([middle, middle]) + along * axes[0] * offset
         box = (tuple(float(v) for v in centre), (axes[0] * part, axes[1] * 0.75), angle)
-        cv2.fillConvexPoly(skin, cv2.boxPoints(box).astype(np.int32), (glass + 10, glass, glass), cv2.LINE_AA)
+        cv2.fillConvexPoly(
+            skin, cv2.boxPoints(box).astype(np.int32), (glass + 10, glass, glass), cv2.LINE_AA
+        )
     return skin
 
 
@@ -153,7 +186,13 @@ def _pasted(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A cut-out at the wanted length, its corners rounded off, turned."""
     factor = length / max(cut.shape[:2])
-    small = cv2.resize(cut, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC)
+    small = cv2.resize(
+        cut,
+        None,
+        fx=factor,
+        fy=factor,
+        interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC,
+    )
     high, wide = small.shape[:2]
     y, x = np.mgrid[:high, :wide]
     radius = np.abs((x + 0.5) / wide * 2 - 1) ** 4 + np.abs((y + 0.5) / high * 2 - 1) ** 4
@@ -161,6 +200,8 @@ def _pasted(
     reach = int(np.ceil(np.hypot(high, wide))) + 4
     turn = cv2.getRotationMatrix2D(((wide - 1) / 2, (high - 1) / 2), angle, 1.0)
     turn[:, 2] += [(reach - wide) / 2, (reach - high) / 2]
-    turned = cv2.warpAffine(small, turn, (reach, reach), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    turned = cv2.warpAffine(
+        small, turn, (reach, reach), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
     cover = cv2.warpAffine(alpha, turn, (reach, reach), flags=cv2.INTER_LINEAR)
     return turned.astype(np.float32) * rng.uniform(0.9, 1.1), cover

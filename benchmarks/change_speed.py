@@ -53,20 +53,46 @@ def main() -> None:
         for number, pair in enumerate(pairs(suite, options.seed, options.pairs, places, "dev")):
             for size in SIZES:
                 reference, query = (cv2.resize(each, size) for each in (pair.reference, pair.query))
-                about = {"suite": suite, "pair": number, "source": pair.source, "size": f"{size[0]}x{size[1]}"}
-                runs.append(about | thesis_times(reference, query, options.repeats) | {
-                    "robust_cpu_ms": cpu_ms(lambda: compare_images(reference, query, method="robust"), options.repeats),  # noqa: B023
-                })
+                about = {
+                    "suite": suite,
+                    "pair": number,
+                    "source": pair.source,
+                    "size": f"{size[0]}x{size[1]}",
+                }
+                runs.append(
+                    about
+                    | thesis_times(reference, query, options.repeats)
+                    | {
+                        "robust_cpu_ms": cpu_ms(
+                            lambda: compare_images(reference, query, method="robust"),
+                            options.repeats,
+                        ),
+                    }
+                )
                 if suite == "plain":
                     times = thesis_times(reference, 255 - reference, options.repeats)
                     runs.append(about | {"suite": "inverted"} | times)
     summary = summarise(runs)
     options.output.parent.mkdir(exist_ok=True)
-    options.output.write_text(json.dumps({
-        "benchmark": "change_speed", "seed": options.seed, "pairs": options.pairs, "repeats": options.repeats,
-        "ground": "procedural" if places[0].source == "procedural" else "photos", "compiled": kernels.COMPILED,
-        "machine": machine(), "load_1_min": os.getloadavg()[0], "commit": commit(), "summary": summary, "runs": runs,
-    }, indent=1) + "\n")
+    options.output.write_text(
+        json.dumps(
+            {
+                "benchmark": "change_speed",
+                "seed": options.seed,
+                "pairs": options.pairs,
+                "repeats": options.repeats,
+                "ground": "procedural" if places[0].source == "procedural" else "photos",
+                "compiled": kernels.COMPILED,
+                "machine": machine(),
+                "load_1_min": os.getloadavg()[0],
+                "commit": commit(),
+                "summary": summary,
+                "runs": runs,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
     show(summary)
 
 
@@ -83,8 +109,12 @@ def thesis_times(reference: np.ndarray, query: np.ndarray, repeats: int) -> dict
         "thesis_cpu_ms": cpu_ms(lambda: compare_images(prepared, query), repeats),
         "thesis_unprepared_cpu_ms": cpu_ms(lambda: compare_images(reference, query), repeats),
         "thesis_two_at_once_wall_ms": wall_ms(two_at_once, repeats) / frames,
-        "thesis_two_at_once_half_cpu_ms": _median_ms(two_at_once, repeats, time.process_time) / frames / 2,
-        "thesis_split_wall_ms": wall_ms(lambda: compare_images(prepared, query, threads=2), repeats),
+        "thesis_two_at_once_half_cpu_ms": _median_ms(two_at_once, repeats, time.process_time)
+        / frames
+        / 2,
+        "thesis_split_wall_ms": wall_ms(
+            lambda: compare_images(prepared, query, threads=2), repeats
+        ),
     }
 
 
@@ -117,7 +147,11 @@ def summarise(runs: list[dict]) -> list[dict]:
         for name in mine[0]:
             if name.endswith("_ms"):
                 values = [run[name] for run in mine]
-                row[name] = {"median": median(values), "lowest": min(values), "highest": max(values)}
+                row[name] = {
+                    "median": median(values),
+                    "lowest": min(values),
+                    "highest": max(values),
+                }
         rows.append(row)
     return rows
 
@@ -127,7 +161,10 @@ def show(summary: list[dict]) -> None:
     names = [name for name in summary[0] if name.endswith("_ms")]
     table = Table("suite", "size", *(name.removesuffix("_ms").replace("_", " ") for name in names))
     for row in summary:
-        cells = [f"{row[name]['median']:.1f} ({row[name]['highest']:.1f})" if name in row else "" for name in names]
+        cells = [
+            f"{row[name]['median']:.1f} ({row[name]['highest']:.1f})" if name in row else ""
+            for name in names
+        ]
         table.add_row(row["suite"], row["size"], *cells)
     Console(width=150).print(table)
 

@@ -34,7 +34,9 @@ class Nuisance:
     object_scale: float = 1.0
     low_contrast: float = 0.0  # how often an object has the ground's own colours
     changed: float = 0.5  # how often anything changed
-    cast_shadows: float = 0.0  # how often shadows of standing things lie elsewhere: the sun has moved
+    cast_shadows: float = (
+        0.0  # how often shadows of standing things lie elsewhere: the sun has moved
+    )
     exact: bool = True  # the value itself rather than anything up to it
 
 
@@ -57,7 +59,10 @@ SUITES: dict[str, Nuisance] = {
     "cast shadows": Nuisance(0.3, parallax_px=3.0, misaligned_px=1.0, cast_shadows=1.0),
     "real": Nuisance(),
 }
-REAL = ("brighton_beach", "caliterra")  # neighbouring photos of a flight, registered: leaning trees as they are
+REAL = (
+    "brighton_beach",
+    "caliterra",
+)  # neighbouring photos of a flight, registered: leaning trees as they are
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +92,14 @@ def grounds(data: Path, split: str) -> list[Ground]:
     """The photos of `split` ("dev" or "test"), or procedural grounds where `data` has none."""
     wanted: dict[str, dict[str, tuple[str, ...]]] = {
         "dev": {
-            "flights/caliterra": ("IMG_",), "detection/aerial_cars/images": ("DJI",),
-            "detection/cats/images": ("0_", "2_", "4_"), "detection/sdd/images": ("nexus", "quad"),
+            "flights/caliterra": ("IMG_",),
+            "detection/aerial_cars/images": ("DJI",),
+            "detection/cats/images": ("0_", "2_", "4_"),
+            "detection/sdd/images": ("nexus", "quad"),
         },
         "test": {
-            "flights/brighton_beach": ("DJI",), "detection/cats/images": ("1_", "3_", "Drone2"),
+            "flights/brighton_beach": ("DJI",),
+            "detection/cats/images": ("1_", "3_", "Drone2"),
             "detection/sdd/images": ("gates", "hyang"),
         },
     }
@@ -105,7 +113,9 @@ def grounds(data: Path, split: str) -> list[Ground]:
     if found:
         return found
     first = 0 if split == "dev" else 100
-    return [Ground("procedural", f"{kind.value} {first + n}") for kind in GroundKind for n in range(3)]
+    return [
+        Ground("procedural", f"{kind.value} {first + n}") for kind in GroundKind for n in range(3)
+    ]
 
 
 @lru_cache(maxsize=24)
@@ -129,7 +139,9 @@ def pairs(
         yield _pair(suite, source, scene, known, rng, clouds_before=True)
 
 
-def views(suite: str, seed: int, number: int, places: list[Ground], split: str, count: int = 5) -> list[Pair]:
+def views(
+    suite: str, seed: int, number: int, places: list[Ground], split: str, count: int = 5
+) -> list[Pair]:
     """`count` views of one ground, each with nuisances of its own; they show the same changes."""
     rng = _random(f"{suite} views", seed, number, split)
     scene, source, known = _scene(rng, suite, places)
@@ -176,7 +188,9 @@ def _scene(
     return scene, source, inside
 
 
-def _cut(pictures: tuple[np.ndarray, ...], size: tuple[int, int], rng: np.random.Generator) -> list[np.ndarray]:
+def _cut(
+    pictures: tuple[np.ndarray, ...], size: tuple[int, int], rng: np.random.Generator
+) -> list[np.ndarray]:
     """The same piece of all pictures as frames of `size` with the margin, float32, turned and mirrored at random."""
     width, height = size[0] + 2 * MARGIN_PX, size[1] + 2 * MARGIN_PX
     whole = pictures[0].shape
@@ -188,7 +202,9 @@ def _cut(pictures: tuple[np.ndarray, ...], size: tuple[int, int], rng: np.random
     across, down = (-1 if rng.uniform() < 0.5 else 1 for _ in range(2))
     how = cv2.INTER_AREA if factor > 1 else cv2.INTER_CUBIC
     pieces = [
-        cv2.resize(each[y : y + cut_height, x : x + cut_width], (width, height), interpolation=how)[::down, ::across]
+        cv2.resize(each[y : y + cut_height, x : x + cut_width], (width, height), interpolation=how)[
+            ::down, ::across
+        ]
         for each in pictures
     ]
     return [np.ascontiguousarray(piece, np.float32) for piece in pieces]
@@ -201,7 +217,9 @@ def _registered(path: str, other: str) -> tuple[np.ndarray, np.ndarray, np.ndarr
     factor = 1000 / before.shape[1]
     sift = cv2.SIFT_create(4000)
     found = [
-        sift.detectAndCompute(cv2.resize(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), None, fx=factor, fy=factor), None)
+        sift.detectAndCompute(
+            cv2.resize(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY), None, fx=factor, fy=factor), None
+        )
         for each in (after, before)
     ]
     pairs_of = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
@@ -235,7 +253,12 @@ def _cutout(choice: list[Ground], rng: np.random.Generator) -> Cutout | None:
 
 
 def _pair(
-    suite: str, source: str, scene: Scene, known: np.ndarray, rng: np.random.Generator, clouds_before: bool
+    suite: str,
+    source: str,
+    scene: Scene,
+    known: np.ndarray,
+    rng: np.random.Generator,
+    clouds_before: bool,
 ) -> Pair:
     nuisance = SUITES[suite]
     size = scene.before.shape[1] - 2 * MARGIN_PX, scene.before.shape[0] - 2 * MARGIN_PX
@@ -299,21 +322,27 @@ def _flow(shape: tuple[int, int], rng: np.random.Generator, size_px: float) -> n
     moves *= size_px / np.linalg.norm(moves, axis=1).max()
     homography = cv2.getPerspectiveTransform(corners, np.float32(corners + moves))
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    moved = cv2.perspectiveTransform(np.dstack([x, y]).reshape(-1, 1, 2), homography).reshape(height, width, 2)
+    moved = cv2.perspectiveTransform(np.dstack([x, y]).reshape(-1, 1, 2), homography).reshape(
+        height, width, 2
+    )
     return moved - np.dstack([x, y])
 
 
 def _warped(image: np.ndarray, flow: np.ndarray) -> np.ndarray:
     height, width = image.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
-    warped = cv2.remap(image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+    warped = cv2.remap(
+        image, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
     return warped[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
 
 
 def _clouds(shape: tuple[int, int], rng: np.random.Generator, grain_px: float) -> np.ndarray:
     """A smooth random field of spread one whose grain has about the size given."""
     small = max(2, int(shape[0] / grain_px)), max(2, int(shape[1] / grain_px))
-    noise = cv2.resize(rng.normal(size=small).astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC)
+    noise = cv2.resize(
+        rng.normal(size=small).astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC
+    )
     return noise / max(float(noise.std()), 1e-6)
 
 
@@ -327,7 +356,10 @@ def _plants(world: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _wobble(plants: np.ndarray, size_px: float, rng: np.random.Generator) -> np.ndarray:
-    moves = [0.5 * _clouds(plants.shape, rng, 14.0) + 0.35 * _clouds(plants.shape, rng, 6.0) for _ in range(2)]
+    moves = [
+        0.5 * _clouds(plants.shape, rng, 14.0) + 0.35 * _clouds(plants.shape, rng, 6.0)
+        for _ in range(2)
+    ]
     return np.dstack(moves).astype(np.float32) * plants[..., None] * np.float32(size_px)
 
 
@@ -340,7 +372,9 @@ def _heights(plants: np.ndarray, rng: np.random.Generator, size_px: float) -> np
         axes = tuple(int(v) for v in rng.uniform(25, 90, 2))
         one = np.zeros(plants.shape, np.float32)
         if rng.uniform() < 0.7:
-            cv2.ellipse(one, centre, axes, rng.uniform(0, 180), 0, 360, float(rng.uniform(0.5, 1)), -1)
+            cv2.ellipse(
+                one, centre, axes, rng.uniform(0, 180), 0, 360, float(rng.uniform(0.5, 1)), -1
+            )
             leaves = cv2.GaussianBlur(one, (0, 0), 5) * (1 + 0.12 * _clouds(one.shape, rng, 8.0))
             lean = np.maximum(lean, leaves * (0.3 + 0.7 * plants))
         else:
@@ -368,16 +402,22 @@ def _cast_shadows(shape: tuple[int, int], rng: np.random.Generator) -> np.ndarra
         axes = tuple(int(v) for v in np.exp(rng.uniform(np.log(12), np.log(110), 2)))
         if rng.uniform() < 0.6:
             cv2.ellipse(one, centre, axes, rng.uniform(0, 180), 0, 360, 1.0, -1)
-            one = (cv2.GaussianBlur(one, (0, 0), 3) + 0.15 * _clouds(shape, rng, 9.0) > 0.5).astype(np.float32)
+            one = (cv2.GaussianBlur(one, (0, 0), 3) + 0.15 * _clouds(shape, rng, 9.0) > 0.5).astype(
+                np.float32
+            )
         else:
-            cv2.fillConvexPoly(one, cv2.boxPoints((centre, axes, float(rng.uniform(0, 90)))).astype(np.int32), 1.0)
+            cv2.fillConvexPoly(
+                one, cv2.boxPoints((centre, axes, float(rng.uniform(0, 90)))).astype(np.int32), 1.0
+            )
         cover = np.maximum(cover, one)
     cover = cv2.GaussianBlur(cover, (0, 0), rng.uniform(0.7, 2.5))
     return 1 - cover[..., None] * rng.uniform(0.35, 0.6) * np.float32([0.88, 0.98, 1.04])
 
 
 def _relit(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    powered = 255 * np.clip(image / 255, 0, None) ** rng.uniform(0.75, 1.35) * rng.uniform(0.85, 1.15, 3)
+    powered = (
+        255 * np.clip(image / 255, 0, None) ** rng.uniform(0.75, 1.35) * rng.uniform(0.85, 1.15, 3)
+    )
     # a camera exposes for the picture as a whole: never black, never overexposed everywhere
     powered *= rng.uniform(0.6, 1.5) * float(image.mean()) / max(float(powered.mean()), 1.0)
     return powered * min(1.0, 235 / max(float(np.quantile(powered, 0.95)), 1.0))

@@ -49,13 +49,22 @@ NIGHT = WeatherSettings(has_clouds=False, brightness=0.06)
 
 def main() -> None:
     """Measure every case on every seed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="without: two that nobody has scored")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="*", default=[], help="without: two that nobody has scored"
+    )
     parser.add_argument("--cases", nargs="+", choices=CASES, default=CASES)
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     seeds = seeds_or_drawn("change_unfit", options.seeds, 2)
-    result: dict[str, Any] = {"benchmark": "change_unfit", "machine": machine(), "commit": commit(), "seeds": seeds}
+    result: dict[str, Any] = {
+        "benchmark": "change_unfit",
+        "machine": machine(),
+        "commit": commit(),
+        "seeds": seeds,
+    }
     if not options.seeds:
         result |= note_scoring(f"change_unfit, seeds {seeds}")
     result["runs"] = []
@@ -85,16 +94,22 @@ def measured(case: str, seed: int, scratch: Path) -> dict[str, Any]:
     camera = made / "camera.xml"
     deque(map_flights([first], site, MapSettings(model="none"), camera=camera), 0)
     try:
-        flight = deque(compare_flights([later], site, CompareSettings(model="none"), camera=camera), 1)[0].flight
+        flight = deque(
+            compare_flights([later], site, CompareSettings(model="none"), camera=camera), 1
+        )[0].flight
     except SorvoloError as error:
         return {"exit_code": 1, "text": str(error).replace(str(scratch), "FOLDER")}
     report = json.loads((site / "flights" / flight / "report.json").read_text())
     comparison = report["comparison"]
     doubtful = comparison["headline"]["quality"] != "compared"
     row = {
-        "exit_code": 3 if doubtful else 0, "text": comparison["headline"]["text"], "warnings": report["warnings"],
-        "compared_m2": comparison["compared_area_m2"], "gaps_m2": comparison["coverage"]["gaps_m2"],
-        "areas": comparison["changes"]["area"], "views": comparison["views"],
+        "exit_code": 3 if doubtful else 0,
+        "text": comparison["headline"]["text"],
+        "warnings": report["warnings"],
+        "compared_m2": comparison["compared_area_m2"],
+        "gaps_m2": comparison["coverage"]["gaps_m2"],
+        "areas": comparison["changes"]["area"],
+        "views": comparison["views"],
     }
     if case in ("other place", "snow on both"):  # the truth is another map's
         return row | {"reported": sum(comparison["changes"].values())}
@@ -105,9 +120,13 @@ def measured(case: str, seed: int, scratch: Path) -> dict[str, Any]:
 def settings_of(case: str, seed: int) -> SimulationSettings:
     """The flights of a case: two strips of photos, 40 m long."""
     settings = preset("compare-photos")
-    weather = {"night": NIGHT, "snow later": SNOW, "snow on both": SNOW}.get(case, settings.later.weather)
+    weather = {"night": NIGHT, "snow later": SNOW, "snow on both": SNOW}.get(
+        case, settings.later.weather
+    )
     return replace(
-        settings, seed=seed, flights=3 if case == "snow on both" else 2,
+        settings,
+        seed=seed,
+        flights=3 if case == "snow on both" else 2,
         path=replace(settings.path, length_m=40.0, strips=2),
         imaging=replace(settings.imaging, width_px=1280, height_px=720),
         later=replace(settings.later, weather=weather),
@@ -120,7 +139,9 @@ def rewritten(photos: Path, folder: Path, changed: Callable[[np.ndarray, int], n
     for index, path in enumerate(sorted(photos.glob("*.jpg"))):
         with Image.open(path) as photo:
             image = Image.fromarray(changed(np.asarray(photo.convert("RGB")), index))
-            image.save(folder / path.name, quality=93, exif=photo.info["exif"], xmp=photo.info["xmp"])
+            image.save(
+                folder / path.name, quality=93, exif=photo.info["exif"], xmp=photo.info["xmp"]
+            )
     return folder
 
 
@@ -133,9 +154,15 @@ def flooded(photos: Path, flight: SimulatedFlight, folder: Path) -> Path:
         height, width = image.shape[:2]
         x, y = np.meshgrid(np.arange(width), np.arange(height))
         site_from_image = site_from_image_homography(camera, flight.true_poses[index])
-        east_m = apply_homography(site_from_image, np.column_stack([x.ravel(), y.ravel()]).astype(float))[:, 0]
+        east_m = apply_homography(
+            site_from_image, np.column_stack([x.ravel(), y.ravel()]).astype(float)
+        )[:, 0]
         rng = np.random.default_rng(index)
-        waves = cv2.resize(rng.normal(size=(height // 8, width // 14)), (width, height), interpolation=cv2.INTER_CUBIC)
+        waves = cv2.resize(
+            rng.normal(size=(height // 8, width // 14)),
+            (width, height),
+            interpolation=cv2.INTER_CUBIC,
+        )
         water = np.array([60, 84, 92]) + 7 * waves[..., None] + rng.normal(0, 2, (height, width, 1))
         is_wet = (east_m > middle_m).reshape(height, width, 1)
         return np.clip(np.where(is_wet, water, image), 0, 255).astype(np.uint8)
@@ -150,7 +177,9 @@ def with_shuffled_fixes(photos: Path, folder: Path) -> Path:
     others = random.Random(3).sample(paths, len(paths))
     for path, other in zip(paths, others, strict=True):
         with Image.open(path) as photo, Image.open(other) as stated:
-            photo.save(folder / path.name, quality=93, exif=stated.info["exif"], xmp=stated.info["xmp"])
+            photo.save(
+                folder / path.name, quality=93, exif=stated.info["exif"], xmp=stated.info["xmp"]
+            )
     return folder
 
 

@@ -23,7 +23,11 @@ def run_child(script: str, arguments: Sequence[str], limit_s: float) -> dict[str
     """What `script` prints as JSON on its last line; as "failure", why it did not."""
     try:
         done = subprocess.run(
-            [sys.executable, script, *arguments], capture_output=True, text=True, check=False, timeout=limit_s
+            [sys.executable, script, *arguments],
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=limit_s,
         )
     except subprocess.TimeoutExpired:
         return {"failure": f"not done after {limit_s:.0f} s"}
@@ -38,7 +42,18 @@ def map_costs(flight: Path, site: Path, options: Sequence[str]) -> dict[str, Any
 
     Ends the benchmark with the command's words where it fails.
     """
-    command = [sys.executable, "-m", "sorvolo", "map", str(flight), "--site", str(site), "--model", "none", *options]
+    command = [
+        sys.executable,
+        "-m",
+        "sorvolo",
+        "map",
+        str(flight),
+        "--site",
+        str(site),
+        "--model",
+        "none",
+        *options,
+    ]
     load = os.getloadavg()[0]
     before, started_s = resource.getrusage(resource.RUSAGE_CHILDREN), time.monotonic()
     done = subprocess.run(command, check=False, capture_output=True, text=True)
@@ -46,7 +61,8 @@ def map_costs(flight: Path, site: Path, options: Sequence[str]) -> dict[str, Any
     if done.returncode not in (0, 3):
         sys.exit(done.stderr)
     return {
-        "seconds": round(seconds, 1), "load_before": load,
+        "seconds": round(seconds, 1),
+        "load_before": load,
         "cpu_s": round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1),
         "peak_mb": round(after.ru_maxrss / 1024),
     }

@@ -44,19 +44,26 @@ class Differences:
     @property
     def is_good(self) -> bool:
         """Rounding in float32, no more."""
-        return max(self.torch_score, self.onnx_score) < 1e-4 and max(self.torch_bin, self.onnx_box_px) < 1e-2
+        return (
+            max(self.torch_score, self.onnx_score) < 1e-4
+            and max(self.torch_bin, self.onnx_box_px) < 1e-2
+        )
 
 
 def main() -> None:
     """Convert, compare, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("graph", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("pictures", type=Path, nargs="*")
     wishes = parser.parse_args()
     digest = hashlib.sha256(wishes.graph.with_suffix(".bin").read_bytes()).hexdigest()
     if digest != WEIGHTS_SHA256:
-        raise SystemExit(f"{wishes.graph.with_suffix('.bin')} is another file than was measured: SHA-256 {digest}")
+        raise SystemExit(
+            f"{wishes.graph.with_suffix('.bin')} is another file than was measured: SHA-256 {digest}"
+        )
     pictures = [read_rgb(each) for each in wishes.pictures] or [noise()]
     exported, found = converted(read_graph(wishes.graph), pictures)
     print(found, flush=True)
@@ -70,12 +77,19 @@ def converted(graph: TfjsGraph, pictures: list[ImageRGB]) -> tuple[bytes, Differ
     backbone, head = nanodet_from_graph(graph)
     model = CocoDetector(backbone, head, list(COCO_OF_CLASS.values())).eval()
     info = {
-        "name": "nanodet", "classes": list(COCO_OF_CLASS), "thresholds": dict.fromkeys(COCO_OF_CLASS, 0.4),
-        "best_px": {name: [24, 300] for name in COCO_OF_CLASS}, "stride": model.stride, "thermal": False,
-        "licence": "Apache-2.0", "trained_on": "COCO 2017 (NanoDet-g by RangiLyu, converted)",
+        "name": "nanodet",
+        "classes": list(COCO_OF_CLASS),
+        "thresholds": dict.fromkeys(COCO_OF_CLASS, 0.4),
+        "best_px": {name: [24, 300] for name in COCO_OF_CLASS},
+        "stride": model.stride,
+        "thermal": False,
+        "licence": "Apache-2.0",
+        "trained_on": "COCO 2017 (NanoDet-g by RangiLyu, converted)",
     }
     exported = onnx_from_module(model, info)
-    from_graph = np.array([torch_difference(graph, backbone, head, each) for each in pictures]).max(0)
+    from_graph = np.array([torch_difference(graph, backbone, head, each) for each in pictures]).max(
+        0
+    )
     from_torch = np.array([onnx_difference(model, exported, each) for each in pictures]).max(0)
     return exported, Differences(*(float(each) for each in (*from_graph, *from_torch)))
 
@@ -87,7 +101,9 @@ def torch_difference(
     shown = np.asarray(cv2.resize(picture, (SIDE_PX, SIDE_PX)), np.float32)
     batch = np.ascontiguousarray(shown.transpose(2, 0, 1))[None]
     fed = (batch[:, ::-1] - np.reshape(MEAN_BGR, (1, 3, 1, 1))) / np.reshape(STD_BGR, (1, 3, 1, 1))
-    original = run_graph(graph, {"input_1": fed.astype(np.float32)}, [name for pair in OUTPUTS for name in pair])
+    original = run_graph(
+        graph, {"input_1": fed.astype(np.float32)}, [name for pair in OUTPUTS for name in pair]
+    )
     with torch.no_grad():
         levels = head(backbone(torch.from_numpy(batch)))
     worst = [0.0, 0.0]
@@ -103,12 +119,16 @@ def onnx_difference(model: CocoDetector, exported: bytes, picture: ImageRGB) -> 
     """Largest differences of scores and of the boxes of the twenty best, of ONNX Runtime to torch."""
     height, width = (side // model.stride * model.stride for side in picture.shape[:2])
     if not height or not width:
-        raise InputError(f"a picture to compare on needs {model.stride} px a side, not {picture.shape[:2]}")
+        raise InputError(
+            f"a picture to compare on needs {model.stride} px a side, not {picture.shape[:2]}"
+        )
     planes = np.ascontiguousarray(picture[:height, :width].transpose(2, 0, 1))[None]
     session = onnxruntime.InferenceSession(exported, providers=["CPUExecutionProvider"])
     boxes, scores, labels = session.run(None, {"image": planes})
     with torch.no_grad():
-        own_boxes, own_scores, own_labels = (each.numpy() for each in model(torch.from_numpy(planes)))
+        own_boxes, own_scores, own_labels = (
+            each.numpy() for each in model(torch.from_numpy(planes))
+        )
     if len(scores) != len(own_scores):
         return 1.0, float(max(height, width))
     same = labels[:20] == own_labels[:20]

@@ -37,15 +37,22 @@ class Gatherer(EvidenceMap):
 
     def under(self, settings: EvidenceSettings) -> None:
         """Decide by other settings from here on."""
-        self._settings, self._rules, self._gathering = settings, settings.announcing, settings.gathering
+        self._settings, self._rules, self._gathering = (
+            settings,
+            settings.announcing,
+            settings.gathering,
+        )
         for candidate in (*self._found.values(), *self._seeds):
             candidate.pictures._settings = settings.gathering.pictures
 
     def withdrawn(self) -> int:
         """After `conclude`: how many candidates were announced after some view and are not at the end."""
         early = {
-            self._current(number) for number, tallies in self.noted.items()
-            if any(isinstance(judge(each, self._rules, is_over=False), Announce) for each in tallies)
+            self._current(number)
+            for number, tallies in self.noted.items()
+            if any(
+                isinstance(judge(each, self._rules, is_over=False), Announce) for each in tallies
+            )
         }
         return len(early - (self._announced_ns.keys() - self._stopped.keys()))
 

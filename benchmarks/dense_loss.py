@@ -55,9 +55,11 @@ def dense_loss(
     if not shares:
         return focal
     total = torch.cat(shares).sum().clamp(min=1e-3)
-    return focal / count + (
-        _BOX_WEIGHT * torch.cat(box_losses).sum() + _BIN_WEIGHT * torch.cat(bin_losses).sum()
-    ) / total
+    return (
+        focal / count
+        + (_BOX_WEIGHT * torch.cat(box_losses).sum() + _BIN_WEIGHT * torch.cat(bin_losses).sum())
+        / total
+    )
 
 
 def assigned(places: Tensor, wanted: Wanted) -> Tensor:
@@ -95,7 +97,9 @@ def _inside(places: Tensor, boxes: Tensor) -> Tensor:
 
 def _overlap(a: Tensor, b: Tensor) -> Tensor:
     """(N,) intersection over union of pairs."""
-    shared = (torch.minimum(a[:, 2:], b[:, 2:]) - torch.maximum(a[:, :2], b[:, :2])).clamp(min=0).prod(1)
+    shared = (
+        (torch.minimum(a[:, 2:], b[:, 2:]) - torch.maximum(a[:, :2], b[:, :2])).clamp(min=0).prod(1)
+    )
     union = (a[:, 2:] - a[:, :2]).prod(1) + (b[:, 2:] - b[:, :2]).prod(1) - shared
     return shared / union.clamp(min=1e-6)
 

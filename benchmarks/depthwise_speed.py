@@ -26,16 +26,21 @@ from sorvolo.training.depthwise import depthwise
 RESULTS = Path(__file__).parent / "results" / "depthwise_speed.json"
 LAYERS = {  # channels, side of its features, kernel, stride, whether the kernel learns
     "backbone, stride 2, kernel kept": (96, 208, 3, 2, False),
-    "backbone, stride 4, kernel kept": (144, 104, 5, 2, False), "backbone, stride 8": (240, 52, 3, 2, True),
-    "backbone, stride 16": (480, 26, 5, 1, True), "stack, level 4, 3x3": (64, 104, 3, 1, True),
-    "stack, level 4, 7x7": (64, 104, 7, 1, True), "stack, level 8, 5x5": (64, 52, 5, 1, True),
+    "backbone, stride 4, kernel kept": (144, 104, 5, 2, False),
+    "backbone, stride 8": (240, 52, 3, 2, True),
+    "backbone, stride 16": (480, 26, 5, 1, True),
+    "stack, level 4, 3x3": (64, 104, 3, 1, True),
+    "stack, level 4, 7x7": (64, 104, 7, 1, True),
+    "stack, level 8, 5x5": (64, 52, 5, 1, True),
 }
 BATCH = 4
 
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--repeats", type=int, default=15)
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -59,19 +64,42 @@ def main() -> None:
                     run()
                     milliseconds[way].append(1000 * (time.process_time() - started_s))
             row = {
-                "layer": name, "channels": channels, "side": side, "kernel": kernel, "stride": stride,
+                "layer": name,
+                "channels": channels,
+                "side": side,
+                "kernel": kernel,
+                "stride": stride,
                 "kernel_learns": learns,
                 "numbers": "bfloat16" if half else "float32",
-                **{f"{way}_ms": round(statistics.median(each), 2) for way, each in milliseconds.items()},
-                **{f"{way}_spread_ms": round(max(each) - min(each), 2) for way, each in milliseconds.items()},
+                **{
+                    f"{way}_ms": round(statistics.median(each), 2)
+                    for way, each in milliseconds.items()
+                },
+                **{
+                    f"{way}_spread_ms": round(max(each) - min(each), 2)
+                    for way, each in milliseconds.items()
+                },
                 "difference": max(map(difference, answers["ours"], answers["torch"])),
             }
             rows.append(row)
             print(row, flush=True)
-    RESULTS.write_text(json.dumps({
-        "benchmark": "depthwise_speed", "machine": machine(), "commit": commit(), "torch": torch.__version__,
-        "threads": 1, "batch": BATCH, "repeats": options.repeats, "clock": "processor time", "rows": rows,
-    }, indent=1) + "\n")
+    RESULTS.write_text(
+        json.dumps(
+            {
+                "benchmark": "depthwise_speed",
+                "machine": machine(),
+                "commit": commit(),
+                "torch": torch.__version__,
+                "threads": 1,
+                "batch": BATCH,
+                "repeats": options.repeats,
+                "clock": "processor time",
+                "rows": rows,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def step(
@@ -90,7 +118,9 @@ def difference(mine: Tensor, theirs: Tensor) -> float:
     return float((mine.float() - theirs.float()).abs().max() / theirs.float().abs().max())
 
 
-def _torchs(features: Tensor, weight: Tensor, bias: Tensor | None, stride: int, padding: int) -> Tensor:
+def _torchs(
+    features: Tensor, weight: Tensor, bias: Tensor | None, stride: int, padding: int
+) -> Tensor:
     return functional.conv2d(features, weight, bias, stride, padding, groups=len(weight))
 
 

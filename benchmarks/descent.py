@@ -14,7 +14,12 @@ class Descent:
     """`net` learns, `averaged` is what is kept of it. Only `descend` and `load` change them."""
 
     def __init__(
-        self, net: nn.Module, rate: float, steps: int, device: str, shares: Mapping[str, float] | None = None
+        self,
+        net: nn.Module,
+        rate: float,
+        steps: int,
+        device: str,
+        shares: Mapping[str, float] | None = None,
     ) -> None:
         """`shares`: for the names of modules that `net` has, by which part of the rate each learns; None: all of it."""
         self.net = net.to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
@@ -22,15 +27,23 @@ class Descent:
         self.rate, self.steps, self.step = rate, steps, 0
         parts = {name: self.net.get_submodule(name).parameters() for name in shares or {"": 1.0}}
         self.optimiser = torch.optim.AdamW(
-            [{"params": each, "share": (shares or {}).get(name, 1.0)} for name, each in parts.items()],
-            rate, weight_decay=DECAY,
+            [
+                {"params": each, "share": (shares or {}).get(name, 1.0)}
+                for name, each in parts.items()
+            ],
+            rate,
+            weight_decay=DECAY,
         )
 
     def descend(self, loss: Tensor) -> float:
         """One step; the loss before it."""
         falling = 0.5 + 0.5 * math.cos(math.pi * min(self.step / self.steps, 1.0))
         for group in self.optimiser.param_groups:
-            group["lr"] = self.rate * group["share"] * min((self.step + 1) / WARM, LEAST + (1 - LEAST) * falling)
+            group["lr"] = (
+                self.rate
+                * group["share"]
+                * min((self.step + 1) / WARM, LEAST + (1 - LEAST) * falling)
+            )
         self.optimiser.zero_grad()
         loss.backward()
         nn.utils.clip_grad_norm_(self.net.parameters(), CLIP)
@@ -45,8 +58,10 @@ class Descent:
     def state(self) -> dict[str, object]:
         """All that `load` needs to go on."""
         return {
-            "net": self.net.state_dict(), "averaged": self.averaged.state_dict(),
-            "optimiser": self.optimiser.state_dict(), "step": self.step,
+            "net": self.net.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
         }
 
     def load(self, state: dict[str, object]) -> None:

@@ -26,7 +26,9 @@ _TINYPERSON_LARGEST_PX = 60.0  # larger boxes of that set are often regions to i
 def hituav(data: Path) -> dict[str, LabelledSet]:
     """HIT-UAV's thermal frames as "train", "val" and "test"; bicycles and other vehicles are ignored."""
     whole = read_dataset(
-        data / "hituav", classes={"Person": "person", "Car": "car"}, ignore=("Bicycle", "OtherVehicle", "DontCare")
+        data / "hituav",
+        classes={"Person": "person", "Car": "car"},
+        ignore=("Bicycle", "OtherVehicle", "DontCare"),
     )
     whole = in_order(whole)
     ids = np.array([int(re.findall(r"\d+", Path(each.path).stem)[-1]) for each in whole.pictures])
@@ -35,14 +37,19 @@ def hituav(data: Path) -> dict[str, LabelledSet]:
     parts: dict[str, list[LabelledPicture]] = {"train": [], "val": [], "test": []}
     blocks = np.array_split(np.arange(len(pictures)), HITUAV_BLOCKS)
     part_of = {
-        index: "test" if index in HITUAV_HELD_OUT else "val" if index in HITUAV_VALIDATION else "train"
+        index: "test"
+        if index in HITUAV_HELD_OUT
+        else "val"
+        if index in HITUAV_VALIDATION
+        else "train"
         for index in range(HITUAV_BLOCKS)
     }
     for index, block in enumerate(blocks):
         own = part_of[index]
         for row in block:
             others = [
-                other for other in (index - 1, index + 1)
+                other
+                for other in (index - 1, index + 1)
                 if 0 <= other < HITUAV_BLOCKS and part_of[other] != own and own != "test"
             ]
             if any(np.abs(ids[blocks[other]] - ids[row]).min() <= HITUAV_GAP for other in others):
@@ -56,11 +63,22 @@ def tinyperson(data: Path) -> dict[str, LabelledSet]:
     whole = in_order(read_dataset(data / "tinyperson", classes={"person": "person"}))
     pictures = []
     for each in whole.pictures:
-        large = np.max(each.boxes_px[:, 2:] - each.boxes_px[:, :2], axis=1, initial=0) > _TINYPERSON_LARGEST_PX
-        pictures.append(LabelledPicture(
-            each.path, each.width_px, each.height_px, each.group, each.boxes_px[~large], each.labels[~large],
-            np.vstack([each.ignored_px, each.boxes_px[large]]), each.m_per_px,
-        ))
+        large = (
+            np.max(each.boxes_px[:, 2:] - each.boxes_px[:, :2], axis=1, initial=0)
+            > _TINYPERSON_LARGEST_PX
+        )
+        pictures.append(
+            LabelledPicture(
+                each.path,
+                each.width_px,
+                each.height_px,
+                each.group,
+                each.boxes_px[~large],
+                each.labels[~large],
+                np.vstack([each.ignored_px, each.boxes_px[large]]),
+                each.m_per_px,
+            )
+        )
     return _by_name(whole.only(pictures), TINYPERSON_HELD_OUT, TINYPERSON_VALIDATION)
 
 
@@ -70,10 +88,14 @@ def aerial_cars(data: Path) -> dict[str, LabelledSet]:
     Only the publisher's own pictures: harlem-* and others are of videos and sets under other licences, harlem-* under
     YouTube's, and no part of them may be learnt from.
     """
-    whole = in_order(read_dataset(
-        data / "aerial_cars", classes={"car": "car", "minibus": "car"}, ignore=("truck", "bus", "cyclist"),
-        unlabelled=("person", SMALL),
-    ))
+    whole = in_order(
+        read_dataset(
+            data / "aerial_cars",
+            classes={"car": "car", "minibus": "car"},
+            ignore=("truck", "bus", "cyclist"),
+            unlabelled=("person", SMALL),
+        )
+    )
     own = [each for each in whole.pictures if _OWN_CARS.match(Path(each.path).name)]
     return _by_name(whole.only(own), AERIAL_HELD_OUT, ())
 
@@ -88,8 +110,10 @@ def cats(data: Path) -> dict[str, LabelledSet]:
 def sdd(data: Path) -> dict[str, LabelledSet]:
     """Stanford Drone Dataset, non-commercial: only to measure."""
     whole = read_dataset(
-        data / "sdd", classes={"person": "person", "pedestrian": "person", "car": "car"},
-        ignore=("biker", "cart", "skater", "bus", "bicyclist"), unlabelled=(SMALL,),
+        data / "sdd",
+        classes={"person": "person", "pedestrian": "person", "car": "car"},
+        ignore=("biker", "cart", "skater", "bus", "bicyclist"),
+        unlabelled=(SMALL,),
     )
     return {"test": in_order(whole)}
 
@@ -97,7 +121,9 @@ def sdd(data: Path) -> dict[str, LabelledSet]:
 def semantic_drone(data: Path) -> dict[str, LabelledSet]:
     """Straight down from 5 to 30 m, of which nothing was learnt or tuned (non-commercial): only to measure."""
     whole = read_dataset(
-        data / "semantic_drone", classes={"person": "person", "car": "car"}, ignore=("bicycle", "dog"),
+        data / "semantic_drone",
+        classes={"person": "person", "car": "car"},
+        ignore=("bicycle", "dog"),
         unlabelled=(SMALL,),
     )
     return {"test": in_order(whole)}
@@ -105,7 +131,11 @@ def semantic_drone(data: Path) -> dict[str, LabelledSet]:
 
 def mannequin(data: Path) -> dict[str, LabelledSet]:
     """A dummy that floats on a pond, one video: only to train."""
-    return {"train": in_order(read_dataset(data / "mannequin", classes={"person": "person", "mannequin": "person"}))}
+    return {
+        "train": in_order(
+            read_dataset(data / "mannequin", classes={"person": "person", "mannequin": "person"})
+        )
+    }
 
 
 def in_order(labelled: LabelledSet) -> LabelledSet:
@@ -113,18 +143,29 @@ def in_order(labelled: LabelledSet) -> LabelledSet:
     to_own = np.array([CLASSES.index(name) for name in labelled.classes], np.int64)
     pictures = [
         LabelledPicture(
-            each.path, each.width_px, each.height_px, each.group, each.boxes_px,
-            to_own[each.labels] if len(each.labels) else each.labels, each.ignored_px, each.m_per_px,
+            each.path,
+            each.width_px,
+            each.height_px,
+            each.group,
+            each.boxes_px,
+            to_own[each.labels] if len(each.labels) else each.labels,
+            each.ignored_px,
+            each.m_per_px,
         )
         for each in labelled.pictures
     ]
-    return LabelledSet(labelled.name, CLASSES, tuple(pictures), labelled.unlabelled, labelled.notices)
+    return LabelledSet(
+        labelled.name, CLASSES, tuple(pictures), labelled.unlabelled, labelled.notices
+    )
 
 
 def _by_name(whole: LabelledSet, test: Iterable[str], val: Iterable[str]) -> dict[str, LabelledSet]:
     """Parts by how the pictures' names begin, up to what is no letter or digit."""
+
     def begins(each: LabelledPicture, names: Iterable[str]) -> bool:
-        return any(re.match(re.escape(name) + r"(?![A-Za-z0-9])", Path(each.path).name) for name in names)
+        return any(
+            re.match(re.escape(name) + r"(?![A-Za-z0-9])", Path(each.path).name) for name in names
+        )
 
     held = [each for each in whole.pictures if begins(each, test)]
     checks = [each for each in whole.pictures if begins(each, val)]

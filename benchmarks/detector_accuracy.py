@@ -21,7 +21,11 @@ import detection_data
 from mosaic_methods import commit, machine
 from provenance import note_scoring
 from sorvolo.detection.scores import score_set
-from sorvolo.missions.evaluate.detector import EvaluationSettings, evaluate_detector, write_evaluation
+from sorvolo.missions.evaluate.detector import (
+    EvaluationSettings,
+    evaluate_detector,
+    write_evaluation,
+)
 from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.flight import simulate_flight
 from sorvolo.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
@@ -37,25 +41,43 @@ from sorvolo.survey.objects import CLASSES
 RESULTS = Path(__file__).parent / "results" / "detector_accuracy.json"
 REAL = ("hituav", "tinyperson", "aerial_cars", "cats", "sdd", "semantic_drone")
 FIRST_SEED = 301
-FLIGHTS, FRAMES_OF_ONE, PICTURES = ("compare", "compare-urban", "compare-dirt", "survey", "survey-urban"), 8, 120
+FLIGHTS, FRAMES_OF_ONE, PICTURES = (
+    ("compare", "compare-urban", "compare-dirt", "survey", "survey-urban"),
+    8,
+    120,
+)
 TARGETS = {"people": 16, "cars": 8, "small_objects": 16}
 
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("model", help="a model's name or file")
     parser.add_argument("--data", type=Path, help="folder of the data sets")
-    parser.add_argument("--sets", nargs="+", default=[*REAL, "simulated", "pictures", "pictures_thermal"])
-    parser.add_argument("--seeds", type=int, default=4, help="so many simulated flights of each preset")
+    parser.add_argument(
+        "--sets", nargs="+", default=[*REAL, "simulated", "pictures", "pictures_thermal"]
+    )
+    parser.add_argument(
+        "--seeds", type=int, default=4, help="so many simulated flights of each preset"
+    )
     parser.add_argument("--tiles", default="auto", help="auto, none, or pixels a side")
     parser.add_argument("--from-above", action="store_true", help="the pictures look straight down")
     parser.add_argument("--out", type=Path, help="folder for the pages")
     parser.add_argument("--results", type=Path, default=RESULTS, help="the file that is written")
     options = parser.parse_args()
-    tiles = int(options.tiles) if options.tiles.isdecimal() else options.tiles if options.tiles != "none" else None
+    tiles = (
+        int(options.tiles)
+        if options.tiles.isdecimal()
+        else options.tiles
+        if options.tiles != "none"
+        else None
+    )
     settings = EvaluationSettings(tiles, from_above=options.from_above)
-    scoring = note_scoring(f"detector_accuracy, {' '.join(options.sets)}{' from above' * options.from_above}")
+    scoring = note_scoring(
+        f"detector_accuracy, {' '.join(options.sets)}{' from above' * options.from_above}"
+    )
     runs = {}
     for name in options.sets:
         with tempfile.TemporaryDirectory() as folder:
@@ -66,18 +88,39 @@ def main() -> None:
             measured = evaluate_detector([[options.model]], [labelled], settings)
         runs[name] = figures(measured.sets[0]) | {
             "seconds_per_picture": measured.found.seconds_per_picture,
-            "people_by_centre": people_by_centre(labelled, measured.found.sets[labelled.name], measured.found.classes),
-            "people_from_8_px": people_from(8.0, labelled, measured.found.sets[labelled.name], measured.found.classes),
+            "people_by_centre": people_by_centre(
+                labelled, measured.found.sets[labelled.name], measured.found.classes
+            ),
+            "people_from_8_px": people_from(
+                8.0, labelled, measured.found.sets[labelled.name], measured.found.classes
+            ),
         }
         print(name, json.dumps(plain_json(runs[name]["classes"])), flush=True)
         if options.out is not None:
-            write_evaluation(measured, options.out / name, {"benchmark": "detector_accuracy", "set": name})
-    options.results.write_text(json.dumps(plain_json({
-        "benchmark": "detector_accuracy", "machine": machine(), "commit": commit(), "model": Path(options.model).name,
-        "tiles": options.tiles, "from_above": options.from_above, **scoring,
-        "draws": settings.draws, "seed": settings.seed, "first_simulated_seed": FIRST_SEED,
-        "sets": runs,
-    }), indent=1) + "\n")
+            write_evaluation(
+                measured, options.out / name, {"benchmark": "detector_accuracy", "set": name}
+            )
+    options.results.write_text(
+        json.dumps(
+            plain_json(
+                {
+                    "benchmark": "detector_accuracy",
+                    "machine": machine(),
+                    "commit": commit(),
+                    "model": Path(options.model).name,
+                    "tiles": options.tiles,
+                    "from_above": options.from_above,
+                    **scoring,
+                    "draws": settings.draws,
+                    "seed": settings.seed,
+                    "first_simulated_seed": FIRST_SEED,
+                    "sets": runs,
+                }
+            ),
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def held_out(name: str, data: Path | None, folder: Path, seeds: int) -> LabelledSet | None:
@@ -93,14 +136,20 @@ def held_out(name: str, data: Path | None, folder: Path, seeds: int) -> Labelled
         labelled = getattr(detection_data, name)(data)["test"]
     else:
         return None
-    labels = {labelled.classes[label] for picture in labelled.pictures for label in picture.labels.tolist()}
+    labels = {
+        labelled.classes[label]
+        for picture in labelled.pictures
+        for label in picture.labels.tolist()
+    }
     unlabelled = labelled.unlabelled | (set(labelled.classes) - labels)
     return LabelledSet(name, labelled.classes, labelled.pictures, frozenset(unlabelled))
 
 
 def simulated_pictures(folder: Path, thermal_share: float) -> LabelledSet:
     """Single pictures, each of a site of its own."""
-    for _ in simulate_pictures(folder, PictureSettings(PICTURES, FIRST_SEED, thermal_share=thermal_share)):
+    for _ in simulate_pictures(
+        folder, PictureSettings(PICTURES, FIRST_SEED, thermal_share=thermal_share)
+    ):
         pass
     return read_dataset(folder)
 
@@ -128,28 +177,43 @@ def simulated_flights(folder: Path, seeds: int) -> LabelledSet:
                     else:
                         boxes.append(box)
                         labels.append(row["category_id"] - 1)
-                pictures.append(LabelledPicture(
-                    str(path), flight.camera.width_px, flight.camera.height_px, f"{name}-{seed}",
-                    np.array(boxes, np.float32), np.array(labels, np.int64), np.array(ignored, np.float32),
-                    flight.path.height_m / flight.camera.fx_px,
-                ))
+                pictures.append(
+                    LabelledPicture(
+                        str(path),
+                        flight.camera.width_px,
+                        flight.camera.height_px,
+                        f"{name}-{seed}",
+                        np.array(boxes, np.float32),
+                        np.array(labels, np.int64),
+                        np.array(ignored, np.float32),
+                        flight.path.height_m / flight.camera.fx_px,
+                    )
+                )
     return LabelledSet("simulated", CLASSES, tuple(pictures))
 
 
 def figures(scores) -> dict[str, object]:
     """What the result file keeps of one set."""
     return {
-        "pictures": scores.pictures, "groups": scores.groups, "ignored_regions": scores.ignored_regions,
-        "AP": asdict(scores.intervals["AP"]), "AP50": asdict(scores.intervals["AP50"]),
+        "pictures": scores.pictures,
+        "groups": scores.groups,
+        "ignored_regions": scores.ignored_regions,
+        "AP": asdict(scores.intervals["AP"]),
+        "AP50": asdict(scores.intervals["AP50"]),
         "thesis_map": asdict(scores.intervals["thesis_map"]),
         "classes": {
             row.label: {
-                "labels": row.labels, "AP50": asdict(scores.intervals[f"AP50 {row.label}"]),
-                "AP": asdict(scores.intervals[f"AP {row.label}"]), "reported": asdict(row.reported),
-                "best_f1": asdict(row.best), "by_size_px": [
+                "labels": row.labels,
+                "AP50": asdict(scores.intervals[f"AP50 {row.label}"]),
+                "AP": asdict(scores.intervals[f"AP {row.label}"]),
+                "reported": asdict(row.reported),
+                "best_f1": asdict(row.best),
+                "by_size_px": [
                     {**asdict(each), "recall": each.recall} for each in scores.by_size_px[row.label]
                 ],
-                "by_size_m": [{**asdict(each), "recall": each.recall} for each in scores.by_size_m[row.label]],
+                "by_size_m": [
+                    {**asdict(each), "recall": each.recall} for each in scores.by_size_m[row.label]
+                ],
             }
             for row in scores.classes
         },
@@ -177,7 +241,12 @@ def people_by_centre(
         boxes, right = boxes + int(counts.sum()), right + int(inside.any(axis=0).sum())
     if not labels:
         return None
-    return {"labels": labels, "reported": boxes, "found": hits / labels, "right": right / max(boxes, 1)}
+    return {
+        "labels": labels,
+        "reported": boxes,
+        "found": hits / labels,
+        "right": right / max(boxes, 1),
+    }
 
 
 def people_from(
@@ -192,15 +261,25 @@ def people_from(
     for each in labelled.pictures:
         sides = np.max(each.boxes_px[:, 2:] - each.boxes_px[:, :2], axis=1, initial=0)
         small = (each.labels == own) & (sides < least_px)
-        pictures.append(replace(
-            each, boxes_px=each.boxes_px[~small], labels=each.labels[~small],
-            ignored_px=np.vstack([each.ignored_px, each.boxes_px[small]]),
-        ))
+        pictures.append(
+            replace(
+                each,
+                boxes_px=each.boxes_px[~small],
+                labels=each.labels[~small],
+                ignored_px=np.vstack([each.ignored_px, each.boxes_px[small]]),
+            )
+        )
     scores = score_set(labelled.only(pictures), found.detections, classes, found.thresholds)
     rows = [row for row in scores.classes if row.label == "person" and row.labels]
-    return {
-        "labels": rows[0].labels, "AP50": asdict(scores.intervals["AP50 person"]), "reported": asdict(rows[0].reported),
-    } if rows else None
+    return (
+        {
+            "labels": rows[0].labels,
+            "AP50": asdict(scores.intervals["AP50 person"]),
+            "reported": asdict(rows[0].reported),
+        }
+        if rows
+        else None
+    )
 
 
 def _holds(boxes_px: np.ndarray, points_px: np.ndarray) -> np.ndarray:

@@ -37,17 +37,30 @@ from sorvolo.survey.objects import CLASSES
 
 RESULTS = Path(__file__).parent / "results"
 SEED = 401
-CALIBRATION, CALIBRATION_PX = 8, 256  # how fast eight bits are does not depend on the pictures that scale them
+CALIBRATION, CALIBRATION_PX = (
+    8,
+    256,
+)  # how fast eight bits are does not depend on the pictures that scale them
 
 
 def main() -> None:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("models", nargs="*", help="names or files")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--provider", default="auto")
-    parser.add_argument("--eager", nargs="*", default=[], help="presets to time in eager PyTorch as well")
-    parser.add_argument("--untrained", nargs="*", default=[], metavar="PRESET:REGIONS", help="random weights, exported")
+    parser.add_argument(
+        "--eager", nargs="*", default=[], help="presets to time in eager PyTorch as well"
+    )
+    parser.add_argument(
+        "--untrained",
+        nargs="*",
+        default=[],
+        metavar="PRESET:REGIONS",
+        help="random weights, exported",
+    )
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--warm", type=int, default=3, help="frames first that are not counted")
     parser.add_argument("--sizes", nargs="+", default=["640x640", "1280x720"])
@@ -56,7 +69,8 @@ def main() -> None:
     cv2.setNumThreads(options.threads)
     frames = town(options.frames)
     detectors = {
-        name: Detector.load(name, provider=options.provider, threads=options.threads) for name in options.models
+        name: Detector.load(name, provider=options.provider, threads=options.threads)
+        for name in options.models
     }
     looks: dict[str, Callable] = {Path(name).name: each.detect for name, each in detectors.items()}
     looks |= {f"eager {name}": eager(untrained(name), options.threads) for name in options.eager}
@@ -78,30 +92,48 @@ def main() -> None:
             with video_writer(video, (1280, 720), 30.0, 0, 23) as write:
                 for frame in frames:
                     write(frame)
-            decoded = {Path(name).name: with_decoding(each, video) for name, each in detectors.items()}
+            decoded = {
+                Path(name).name: with_decoding(each, video) for name, each in detectors.items()
+            }
         print("with decoding", decoded, flush=True)
-    (RESULTS / options.out).write_text(json.dumps({
-        "benchmark": "detector_speed", "machine": machine(), "commit": commit(), "seed": SEED,
-        "threads": options.threads, "frames": len(frames), "load_average_before_and_after": load,
-        "providers": providers,
-        "sizes": runs, "with_decoding_1280x720": decoded,
-    }, indent=1) + "\n")
+    (RESULTS / options.out).write_text(
+        json.dumps(
+            {
+                "benchmark": "detector_speed",
+                "machine": machine(),
+                "commit": commit(),
+                "seed": SEED,
+                "threads": options.threads,
+                "frames": len(frames),
+                "load_average_before_and_after": load,
+                "providers": providers,
+                "sizes": runs,
+                "with_decoding_1280x720": decoded,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def town(count: int) -> list[np.ndarray]:
     """So many frames of a flight over a town, evenly chosen."""
     settings = replace(preset("compare-urban"), seed=SEED)
-    flight = simulate_flight(replace(settings, scene=replace(settings.scene, people=12, cars=10, small_objects=10)))
+    flight = simulate_flight(
+        replace(settings, scene=replace(settings.scene, people=12, cars=10, small_objects=10))
+    )
     return [flight.frame(int(index)).image for index in np.linspace(0, len(flight) - 1, count)]
 
 
 def cropped(frame: np.ndarray, width: int, height: int) -> np.ndarray:
     """The middle of a frame."""
     top, left = (frame.shape[0] - height) // 2, (frame.shape[1] - width) // 2
-    return np.ascontiguousarray(frame[top:top + height, left:left + width])
+    return np.ascontiguousarray(frame[top : top + height, left : left + width])
 
 
-def timed(looks: dict[str, Callable], pictures: list[np.ndarray], warm: int) -> dict[str, dict[str, float]]:
+def timed(
+    looks: dict[str, Callable], pictures: list[np.ndarray], warm: int
+) -> dict[str, dict[str, float]]:
     """Frame by frame, each of the rivals in turn; the first few are not counted."""
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in looks}
     for picture in [*pictures[:warm], *pictures]:
@@ -111,11 +143,18 @@ def timed(looks: dict[str, Callable], pictures: list[np.ndarray], warm: int) -> 
             seconds[name].append((time.perf_counter() - started, time.process_time() - spent))
     measured = {}
     for name, each in seconds.items():
-        (low, middle, high), processor = np.percentile(1e3 * np.array(each[warm:]), (5, 50, 95), axis=0).T
+        (low, middle, high), processor = np.percentile(
+            1e3 * np.array(each[warm:]), (5, 50, 95), axis=0
+        ).T
         measured[name] = {
-            "median_ms": round(float(middle), 1), "p5_ms": round(float(low), 1), "p95_ms": round(float(high), 1),
+            "median_ms": round(float(middle), 1),
+            "p5_ms": round(float(low), 1),
+            "p95_ms": round(float(high), 1),
             "frames_per_second": round(1e3 / float(middle), 1),
-        } | {f"processor_{key}_ms": round(float(value), 1) for key, value in zip(("p5", "median", "p95"), processor)}
+        } | {
+            f"processor_{key}_ms": round(float(value), 1)
+            for key, value in zip(("p5", "median", "p95"), processor)
+        }
     return measured
 
 
@@ -138,7 +177,9 @@ def untrained(spec: str) -> Any:
 
     name, _, regions = spec.partition(":")
     torch.manual_seed(SEED)
-    model = build(name, CLASSES, "extended" if name == "thesis" else "extended-residual", None).eval()
+    model = build(
+        name, CLASSES, "extended" if name == "thesis" else "extended-residual", None
+    ).eval()
     if regions:
         model.reach = replace(model.reach, regions=int(regions))
     return model
@@ -152,7 +193,7 @@ def eager(model: Any, threads: int) -> Callable[[np.ndarray], object]:
         torch.set_num_threads(threads)
         height, width = (-(-side // model.stride) * model.stride for side in picture.shape[:2])
         padded = np.zeros((height, width, 3), np.uint8)
-        padded[:picture.shape[0], :picture.shape[1]] = picture
+        padded[: picture.shape[0], : picture.shape[1]] = picture
         with torch.inference_mode():
             return model(torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1)))[None])
 
@@ -179,7 +220,9 @@ def exported(
     eager(model, threads)(cropped(frames[0], CALIBRATION_PX, CALIBRATION_PX))
     model.eval()
     info = {
-        "name": spec, "classes": list(CLASSES), "thresholds": dict.fromkeys(CLASSES, 0.5),
+        "name": spec,
+        "classes": list(CLASSES),
+        "thresholds": dict.fromkeys(CLASSES, 0.5),
         "best_px": dict.fromkeys(CLASSES, (8, 200)),
     }
     looks: dict[str, Callable] = {}

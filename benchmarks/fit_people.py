@@ -40,7 +40,9 @@ class Opinions:
 
 def main() -> None:
     """Look, fit, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--nanodet", type=Path, required=True)
@@ -57,7 +59,9 @@ def main() -> None:
 def people_head(path: Path) -> NanoDetHead:
     """The head that was learnt, its weights as float16 holds them, as NanoDet's own."""
     head = NanoDetHead(1, deeper=True).eval()
-    head.load_state_dict({name: each.half().float() for name, each in torch.load(path, weights_only=True).items()})
+    head.load_state_dict(
+        {name: each.half().float() for name, each in torch.load(path, weights_only=True).items()}
+    )
     return head
 
 
@@ -92,7 +96,9 @@ def nobody(scene: Scene) -> Scene:
 def opinions(model: Daylight, planes: torch.Tensor, truth: Truth) -> Opinions:
     """What the head finds in a picture (1, 3, H, W)."""
     levels = model.coco.backbone(planes)
-    boxes, opinion, supporting = model.people_of(levels, model.coco.head(levels), (planes.shape[2], planes.shape[3]))
+    boxes, opinion, supporting = model.people_of(
+        levels, model.coco.head(levels), (planes.shape[2], planes.shape[3])
+    )
     right, known = truth.of(boxes.numpy())
     kept = known[:, PERSON] & (opinion.numpy() >= odds(np.array(LEAST_SCORE)))
     return Opinions(np.stack([opinion.numpy(), supporting.numpy(), right[:, PERSON]], 1)[kept])
@@ -104,7 +110,8 @@ def calibrated(found: list[Opinions]) -> dict[str, object]:
     fit = fitted(rows[:, :2], rows[:, 2])
     return {
         "person": asdict(Calibration(float(fit[0]), float(fit[2]), float(fit[1]))),
-        "threshold": FIRST_LOOK, "looks": len(found),
+        "threshold": FIRST_LOOK,
+        "looks": len(found),
         "reliability": reliability(rows[:, :2] @ fit[:2] + fit[2], rows[:, 2]),
     }
 

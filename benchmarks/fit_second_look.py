@@ -48,10 +48,16 @@ PERSON, THERMAL = 0, "hituav"
 LEAST, POSITIONS = 0.3, 2
 PEOPLE = Path(__file__).parent / "brighton_people.json"
 RENDERED, PAINTED, FRAMES, SIDE_PX, SEED = 60, 15, 60, 640, 5
-THRESHOLDS, ALARMS = (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9), 0.12  # 2 of brighton_beach's 18 photos
+THRESHOLDS, ALARMS = (
+    (0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9),
+    0.12,
+)  # 2 of brighton_beach's 18 photos
 BARE = ("caliterra", "fixed_wing", "brighton_beach")
 TINT = (8, 0, -8)  # levels
-MOST_CUTS, MOST_OF_A_SET = 160, 60  # right reports, and false ones, of a set count as so many at most
+MOST_CUTS, MOST_OF_A_SET = (
+    160,
+    60,
+)  # right reports, and false ones, of a set count as so many at most
 ALOFT = "IMG_9364.jpg"  # before it the ground is nearer and shows the crew
 
 
@@ -78,13 +84,19 @@ class Shot:
 
 def main() -> None:
     """Look where that was not done yet, fit, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--model", default="default")
-    parser.add_argument("--by", default="second-opinion", help="who looks a second time; '' for the same model")
+    parser.add_argument(
+        "--by", default="second-opinion", help="who looks a second time; '' for the same model"
+    )
     parser.add_argument("--scenes", type=Path, required=True, help="people and things")
-    parser.add_argument("--things", type=Path, required=True, help="scenes of which only the things are laid")
+    parser.add_argument(
+        "--things", type=Path, required=True, help="scenes of which only the things are laid"
+    )
     wishes = parser.parse_args()
     wishes.out.mkdir(parents=True, exist_ok=True)
     path = wishes.out / "reports.npz"
@@ -133,9 +145,16 @@ def shots(data: Path, scenes: list[Scene], things: list[Scene]) -> Iterator[Shot
                 whole = tinted(whole)
             for scale in scales:
                 way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-                image = np.ascontiguousarray(cv2.resize(whole, None, fx=scale, fy=scale, interpolation=way))
+                image = np.ascontiguousarray(
+                    cv2.resize(whole, None, fx=scale, fy=scale, interpolation=way)
+                )
                 truth = LabelledPicture(
-                    picture.path, 1, 1, picture.group, picture.boxes_px * scale, picture.labels,
+                    picture.path,
+                    1,
+                    1,
+                    picture.group,
+                    picture.boxes_px * scale,
+                    picture.labels,
                     picture.ignored_px * scale,
                 )
                 yield Shot(labelled.name, Path(picture.path).stem, image, truth, m_per_px)
@@ -145,7 +164,10 @@ def shots(data: Path, scenes: list[Scene], things: list[Scene]) -> Iterator[Shot
         photo = read(flight.pictures[int(rng.integers(len(flight.pictures)))].path)
         yield Shot("painted", str(number), painted_ground(photo, rng), _nobody(none, none), None)
     source = Source(Share(flight, 1.0, (0.5, 2.0)), 1.0)
-    for place, own in {"rendered people": scenes, "rendered things": [nobody(each) for each in things]}.items():
+    for place, own in {
+        "rendered people": scenes,
+        "rendered things": [nobody(each) for each in things],
+    }.items():
         for number in range(RENDERED):
             made = shown(source, own, read, SIDE_PX, rng)
             yield Shot(place, str(number), made.image, _nobody(made.boxes, made.ignored), None)
@@ -160,7 +182,9 @@ def with_people(flight: LabelledSet) -> LabelledSet:
             np.array(known[what].get(Path(picture.path).stem, []), np.float32).reshape(-1, 4)
             for what in ("people", "around")
         )
-        return replace(picture, boxes_px=people, labels=np.full(len(people), PERSON), ignored_px=around)
+        return replace(
+            picture, boxes_px=people, labels=np.full(len(people), PERSON), ignored_px=around
+        )
 
     return flight.only([labelled(each) for each in flight.pictures])
 
@@ -186,11 +210,19 @@ def reported(detector: Detector, by: Session, shot: Shot) -> Iterator[Report]:
         shot.image, tiles="auto", m_per_px=shot.m_per_px, classes=("person",), least_score=LEAST
     )
     seen = Seen(first.boxes_px, first.scores, first.labels)
-    how = SecondLook((LOOK_PX,), own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf, positions=POSITIONS)
-    again = opinions(seen, shot.image, by.see, {PERSON: how}, SheetSettings(cuts=(MOST_CUTS, MOST_CUTS)))
-    rows, right = judged_reports(seen.boxes_px, shot.truth.boxes_px[shot.truth.labels == PERSON], shot.truth.ignored_px)
+    how = SecondLook(
+        (LOOK_PX,), own=1.0, again=0.0, shift=0.0, least=LEAST, enlarged=np.inf, positions=POSITIONS
+    )
+    again = opinions(
+        seen, shot.image, by.see, {PERSON: how}, SheetSettings(cuts=(MOST_CUTS, MOST_CUTS))
+    )
+    rows, right = judged_reports(
+        seen.boxes_px, shot.truth.boxes_px[shot.truth.labels == PERSON], shot.truth.ignored_px
+    )
     for row in rows.tolist():
-        looked = float(1 / (1 + np.exp(-bounded_odds(again[row]).mean()))) if row in again else np.nan
+        looked = (
+            float(1 / (1 + np.exp(-bounded_odds(again[row]).mean()))) if row in again else np.nan
+        )
         yield Report(shot.place, shot.name, float(seen.scores[row]), looked, bool(right[row]))
 
 
@@ -214,7 +246,10 @@ def fit_of(reports: Sequence[Report], photos: Mapping[str, int]) -> dict[str, An
     """Weights and threshold, and what every set keeps at the thresholds by weights that did not see that set."""
     own = bounded_odds(np.minimum([each.score for each in reports], SheetSettings().surest))
     again = bounded_odds(np.array([each.again for each in reports]))
-    right, places = np.array([each.is_right for each in reports]), np.array([each.place for each in reports])
+    right, places = (
+        np.array([each.is_right for each in reports]),
+        np.array([each.place for each in reports]),
+    )
     inputs, counts = np.column_stack([own, again]), balanced(places, right, MOST_OF_A_SET)
     crossed = np.zeros(len(reports))
     for place in photos:
@@ -228,16 +263,24 @@ def fit_of(reports: Sequence[Report], photos: Mapping[str, int]) -> dict[str, An
         return [int(np.count_nonzero(mine & right)), int(np.count_nonzero(mine & ~right))]
 
     quiet = [
-        each for each in THRESHOLDS if all(above(place, each)[1] <= ALARMS * photos[place] for place in BARE)
+        each
+        for each in THRESHOLDS
+        if all(above(place, each)[1] <= ALARMS * photos[place] for place in BARE)
     ]
     weights = {
-        "own": fit[0], "again": fit[1], "shift": fit[2], "least": LEAST, "enlarged": 1000.0,
+        "own": fit[0],
+        "again": fit[1],
+        "shift": fit[2],
+        "least": LEAST,
+        "enlarged": 1000.0,
         "threshold": min(quiet, default=max(THRESHOLDS)),
     }
     return {
-        "looks_px": [LOOK_PX], "positions": POSITIONS,
+        "looks_px": [LOOK_PX],
+        "positions": POSITIONS,
         **{name: round(float(each), 3) for name, each in weights.items()},
-        "reports": len(reports), "photos": dict(photos),
+        "reports": len(reports),
+        "photos": dict(photos),
         "right_and_false": {
             str(each): {place: above(place, each) for place in photos} for each in THRESHOLDS
         },

@@ -55,8 +55,12 @@ from sorvolo.survey.flight import Frame, PosedFrame
 
 RESULTS = Path(__file__).parent / "results" / "flight_on_map.json"
 APART = (  # four months and more
-    "2023-10-14/2024-02-24", "2023-10-14/2024-03-01", "2023-10-14/2024-03-12",
-    "2023-09-26/2024-02-24", "2023-09-26/2024-03-01", "2023-09-26/2024-03-12",
+    "2023-10-14/2024-02-24",
+    "2023-10-14/2024-03-01",
+    "2023-10-14/2024-03-12",
+    "2023-09-26/2024-02-24",
+    "2023-09-26/2024-03-01",
+    "2023-09-26/2024-03-12",
 )
 OWN = ("caliterra", "brighton_beach")
 HEIGHTS_M = (20.0, 60.0)
@@ -79,15 +83,25 @@ class Laid:
 
 def main() -> None:
     """Look for every flight in its place and aside of it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
-    parser.add_argument("--keep", type=Path, required=True,
-                        help="folder for photos and maps, used again when run again")
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        required=True,
+        help="folder for photos and maps, used again when run again",
+    )
     parser.add_argument("--pairs", nargs="*", choices=real_dates.PAIRS, default=APART)
     parser.add_argument("--seed", type=int, default=2, help="of the two flights of a pair")
-    parser.add_argument("--own", nargs="*", choices=OWN, default=OWN, help="real flights over their own maps")
+    parser.add_argument(
+        "--own", nargs="*", choices=OWN, default=OWN, help="real flights over their own maps"
+    )
     parser.add_argument("--simulated", type=int, default=3, help="simulated flights at each height")
-    parser.add_argument("--aside", type=int, default=4, help="other ground that each flight is looked for on")
+    parser.add_argument(
+        "--aside", type=int, default=4, help="other ground that each flight is looked for on"
+    )
     parser.add_argument("--note", default="", help="kept with the run")
     options = parser.parse_args()
     options.keep.mkdir(parents=True, exist_ok=True)
@@ -96,8 +110,13 @@ def main() -> None:
         rows.append(row)
         print(json.dumps(row), flush=True)
     run = {
-        "commit": commit(), "machine": machine(), "seed": options.seed, "settings": vars(FlightOnMapSettings()),
-        "scored": note_scoring(f"flight_on_map, dates by seed {options.seed}"), "summary": summary(rows), "rows": rows,
+        "commit": commit(),
+        "machine": machine(),
+        "seed": options.seed,
+        "settings": vars(FlightOnMapSettings()),
+        "scored": note_scoring(f"flight_on_map, dates by seed {options.seed}"),
+        "summary": summary(rows),
+        "rows": rows,
     } | ({"note": options.note} if options.note else {})
     RESULTS.write_text(json.dumps({"benchmark": "flight_on_map"} | run, indent=1) + "\n")
     print(json.dumps(run["summary"], indent=1))
@@ -111,7 +130,9 @@ def all_rows(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     for name in options.own:
         yield from over_own(name, options, next(seeds))
     for height_m in HEIGHTS_M:
-        yield from over_simulated(height_m, [next(seeds) for _ in range(options.simulated + 1)], options.keep)
+        yield from over_simulated(
+            height_m, [next(seeds) for _ in range(options.simulated + 1)], options.keep
+        )
 
 
 def over_dates(pair_name: str, options: argparse.Namespace, drawn: int) -> Iterator[dict[str, Any]]:
@@ -130,14 +151,22 @@ def over_dates(pair_name: str, options: argparse.Namespace, drawn: int) -> Itera
     pair = real_dates.Pair.of(pair_name, truth)
     with laid_on_itself(site, flown, len(seen), given) as (laid, archive):
         frame = archive.site().frame
-        off = real_dates.map_error(first, shown, map_frames(site, archive.site())[mapped.name], frame)
+        off = real_dates.map_error(
+            first, shown, map_frames(site, archive.site())[mapped.name], frame
+        )
         expected_m = {}
         for index in laid.photos:
-            outline_m = real_dates.footprint(second.camera, second.true_poses[seen[laid.names[index]]])
+            outline_m = real_dates.footprint(
+                second.camera, second.true_poses[seen[laid.names[index]]]
+            )
             on_earlier_px = pair.a_from_b(real_dates.pixels(outline_m, size_px), size_px)
-            there_m = real_dates.moved_frame(real_dates.metres(on_earlier_px, size_px), second.site, frame)
+            there_m = real_dates.moved_frame(
+                real_dates.metres(on_earlier_px, size_px), second.site, frame
+            )
             expected_m[index] = apply_homography(off, there_m)
-        yield from tries({"ground": "dates", "flight": pair_name}, laid, drawn, options.aside, expected_m)
+        yield from tries(
+            {"ground": "dates", "flight": pair_name}, laid, drawn, options.aside, expected_m
+        )
 
 
 def over_own(name: str, options: argparse.Namespace, drawn: int) -> Iterator[dict[str, Any]]:
@@ -147,7 +176,10 @@ def over_own(name: str, options: argparse.Namespace, drawn: int) -> Iterator[dic
     with laid_on_itself(site, photos, MOST_PHOTOS, None) as (laid, archive):
         rows = {row.name: row for row in map_frames(site, archive.site())[photos.name]}
         yield from tries(
-            {"ground": "own", "flight": name}, laid, drawn, options.aside,
+            {"ground": "own", "flight": name},
+            laid,
+            drawn,
+            options.aside,
             {index: rows[laid.names[index]].outline_m for index in laid.photos},
         )
 
@@ -167,11 +199,18 @@ def simulated(height_m: float, seed: int, keep: Path) -> Path:
     """Photos of two strips, in a folder."""
     folder = keep / f"simulated_{height_m:.0f}_{seed}"
     settings = SimulationSettings(
-        seed=seed, flights=1, scene=SceneSettings(people=0, cars=6, small_objects=0, has_scenery=False),
+        seed=seed,
+        flights=1,
+        scene=SceneSettings(people=0, cars=6, small_objects=0, has_scenery=False),
         path=PathSettings(
-            height_m=height_m, speed_m_s=0.2 * height_m, length_m=110, strips=2, strip_spacing_m=0.5 * height_m
+            height_m=height_m,
+            speed_m_s=0.2 * height_m,
+            length_m=110,
+            strips=2,
+            strip_spacing_m=0.5 * height_m,
         ),
-        imaging=ImagingSettings(width_px=480, height_px=360, fps=1), sensor=SensorSettings(noise_m=(1.0, 1.0, 1.0)),
+        imaging=ImagingSettings(width_px=480, height_px=360, fps=1),
+        sensor=SensorSettings(noise_m=(1.0, 1.0, 1.0)),
         output=OutputSettings(photos=True),
     )
     if not folder.is_dir():
@@ -186,13 +225,19 @@ def make_map(site: Path, photos: Path, camera: Path | None) -> None:
 
 
 @contextmanager
-def laid_on_itself(site: Path, photos: Path, most: int, camera: Path | None) -> Iterator[tuple[Laid, Archive]]:
+def laid_on_itself(
+    site: Path, photos: Path, most: int, camera: Path | None
+) -> Iterator[tuple[Laid, Archive]]:
     """The first photos of a flight laid on each other, to be looked for on the map of a site."""
     settings = CompareSettings(model="none")
     opened = opened_sources([photos], None, camera, known_flights(site))
     with Archive.open(site, write=False) as archive, opened as (source,):
         setup = prepare(
-            source, settings.mapping, archive.site(), telemetry_named=False, finds_itself=True,
+            source,
+            settings.mapping,
+            archive.site(),
+            telemetry_named=False,
+            finds_itself=True,
             ground_m=known_ground_m(archive),
         )
         newest = [each for each in archive.versions() if each.complete][-1].id
@@ -200,7 +245,9 @@ def laid_on_itself(site: Path, photos: Path, most: int, camera: Path | None) -> 
         accepts_all = FlightOnMapSettings(least_ratio=0.0, least_agree=0, least_spread=0.0)
         on_map = FlightOnMap(views.search, accepts_all)
         names = {}
-        with WholeFlight(setup, archive, views, on_map, min(most, source.frame_count or most)) as whole:
+        with WholeFlight(
+            setup, archive, views, on_map, min(most, source.frame_count or most)
+        ) as whole:
             for frame in source.frames(lambda index, _: index < most):
                 if isinstance(frame, Frame):
                     whole.add(PosedFrame(frame, setup.prior(frame, first=False)))
@@ -220,7 +267,11 @@ def tries(
     rng = np.random.default_rng(drawn)
     for _ in range(aside):
         far_m, turn = rng.uniform(*ASIDE_M), rng.uniform(0, 2 * np.pi)
-        yield row | tried(laid, far_m * np.array([np.cos(turn), np.sin(turn)]), {}) | {"is_own": False}
+        yield (
+            row
+            | tried(laid, far_m * np.array([np.cos(turn), np.sin(turn)]), {})
+            | {"is_own": False}
+        )
 
 
 def tried(laid: Laid, aside_m: np.ndarray, expected_m: Mapping[int, np.ndarray]) -> dict[str, Any]:
@@ -232,26 +283,40 @@ def tried(laid: Laid, aside_m: np.ndarray, expected_m: Mapping[int, np.ndarray])
     }
     fit = laid.on_map.find(laid.photos, moved)
     row: dict[str, Any] = {
-        "aside_m": [round(float(each), 1) for each in aside_m], "photos": len(laid.photos),
+        "aside_m": [round(float(each), 1) for each in aside_m],
+        "photos": len(laid.photos),
         "cpu_s": round(time.process_time() - began, 1),
     }
     if fit is None:
         return row | {"votes": None, "is_found": False}
     is_found = (
-        fit.ratio >= settings.least_ratio and fit.agree >= settings.least_agree and fit.spread >= settings.least_spread
+        fit.ratio >= settings.least_ratio
+        and fit.agree >= settings.least_agree
+        and fit.spread >= settings.least_spread
     )
     row |= {
-        "votes": round(fit.ratio, 1), "agree": fit.agree, "spread": round(fit.spread, 2),
-        "residual_m": round(fit.residual_m, 3), "left_to_search": len(fit.elsewhere), "is_found": is_found,
+        "votes": round(fit.ratio, 1),
+        "agree": fit.agree,
+        "spread": round(fit.spread, 2),
+        "residual_m": round(fit.residual_m, 3),
+        "left_to_search": len(fit.elsewhere),
+        "is_found": is_found,
     }
     errors_m = []
     for index, corners_m in expected_m.items():
         on_map = fit.map_from_flight @ site_from_image_homography(laid.camera, moved[index])
-        errors_m.append(float(np.median(np.linalg.norm(apply_homography(on_map, laid.corners_px) - corners_m, axis=1))))
+        errors_m.append(
+            float(
+                np.median(
+                    np.linalg.norm(apply_homography(on_map, laid.corners_px) - corners_m, axis=1)
+                )
+            )
+        )
     if errors_m and is_found:
         row |= {
             "right": sum(each < real_dates.RIGHT_M for each in errors_m),
-            "error_median_m": round(float(np.median(errors_m)), 2), "error_most_m": round(max(errors_m), 2),
+            "error_median_m": round(float(np.median(errors_m)), 2),
+            "error_most_m": round(max(errors_m), 2),
         }
     return row
 

@@ -35,16 +35,27 @@ MARCH_M = 0.5  # between the heights at which a ray is compared with the crowns
 COARSE = 4  # pixels a ray that is followed
 FIX_SIGMA_M, HEIGHT_SIGMA_M = 1.5, 0.5
 START_NS, PHOTO_EVERY_S = 1_790_000_000_000_000_000, 4
-AUTUMN_RGB = ((176, 116, 44), (150, 74, 38), (196, 160, 62), (92, 104, 48), (120, 128, 60), (70, 84, 44))
+AUTUMN_RGB = (
+    (176, 116, 44),
+    (150, 74, 38),
+    (196, 160, 62),
+    (92, 104, 48),
+    (120, 128, 60),
+    (70, 84, 44),
+)
 
 
 def main() -> None:
     """Draw the photos, or map them."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("what", choices=("make", "map"))
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seed", type=int, default=11)
-    parser.add_argument("--height", type=float, default=HEIGHT_M, help="of the flight above the ground, m")
+    parser.add_argument(
+        "--height", type=float, default=HEIGHT_M, help="of the flight above the ground, m"
+    )
     parser.add_argument("--width", type=int, default=WIDTH_PX)
     parser.add_argument("--output", type=Path, help="a JSON file for the figures")
     parser.add_argument("options", nargs="*", help="after --, of `sorvolo map`")
@@ -54,7 +65,11 @@ def main() -> None:
         return
     run = {"commit": commit(), "machine": machine(), **measure(options)}
     if options.output is not None:
-        found = json.loads(options.output.read_text()) if options.output.is_file() else {"benchmark": "forest_photos"}
+        found = (
+            json.loads(options.output.read_text())
+            if options.output.is_file()
+            else {"benchmark": "forest_photos"}
+        )
         found["runs"] = [*found.get("runs", ()), run]
         options.output.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     print(json.dumps(run, indent=1))
@@ -72,12 +87,25 @@ def make(folder: Path, seed: int, width_px: int, height_m: float) -> None:
         image = _picture(surface_m, texture, camera, pose, rng)
         name = f"DJI_{index + 1:04d}.JPG"
         time_ns = START_NS + index * PHOTO_EVERY_S * 1_000_000_000
-        write_photo(folder / "photos" / name, Frame(index, name, time_ns, image), camera, _telemetry(pose, rng))
+        write_photo(
+            folder / "photos" / name,
+            Frame(index, name, time_ns, image),
+            camera,
+            _telemetry(pose, rng),
+        )
         print(name, file=sys.stderr, flush=True)
-    (folder / "truth.json").write_text(json.dumps({
-        "photos": STRIPS * PHOTOS_A_STRIP, "width_px": camera.width_px, "height_px": camera.height_px, "seed": seed,
-        "flight_height_m": height_m,
-    }), encoding="utf-8")
+    (folder / "truth.json").write_text(
+        json.dumps(
+            {
+                "photos": STRIPS * PHOTOS_A_STRIP,
+                "width_px": camera.width_px,
+                "height_px": camera.height_px,
+                "seed": seed,
+                "flight_height_m": height_m,
+            }
+        ),
+        encoding="utf-8",
+    )
 
 
 def measure(options: argparse.Namespace) -> dict[str, object]:
@@ -88,9 +116,13 @@ def measure(options: argparse.Namespace) -> dict[str, object]:
         costs = map_costs(options.folder / "photos", site, options.options)
         report = json.loads((site / "flights/photos/report.json").read_text())
     return {
-        **truth, "options": options.options, **costs, "stages_cpu_s": report["cpu_s"],
+        **truth,
+        "options": options.options,
+        **costs,
+        "stages_cpu_s": report["cpu_s"],
         "paint_cpu_s_a_photo": round(report["cpu_s"]["paint"] / truth["photos"], 2),
-        "frames_of_report": report["frames"], "verdict": report.get("headline"),
+        "frames_of_report": report["frames"],
+        "verdict": report.get("headline"),
     }
 
 
@@ -114,24 +146,34 @@ def _forest(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         surface_m[rows, columns][higher] = dome_m[higher]
         crown[rows, columns][higher] = number
     surface_m += _detail(height, width, 4, 0.25, rng) * (surface_m > 0)
-    colours = np.array([(58, 52, 40), *(AUTUMN_RGB[i] for i in rng.integers(0, len(AUTUMN_RGB), count))], np.float32)
+    colours = np.array(
+        [(58, 52, 40), *(AUTUMN_RGB[i] for i in rng.integers(0, len(AUTUMN_RGB), count))],
+        np.float32,
+    )
     colours *= rng.uniform(0.8, 1.2, (count + 1, 1))
     return surface_m, _coloured(surface_m, crown, colours.astype(np.float32), rng)
 
 
-def _coloured(surface_m: np.ndarray, crown: np.ndarray, colours: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _coloured(
+    surface_m: np.ndarray, crown: np.ndarray, colours: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """The texture, (h, w, 3): each crown's colour, lit from the south-west, with leaves and twigs."""
     finer = round(SURFACE_M_PER_PX / TEXTURE_M_PER_PX)
     height, width = (each * finer for each in surface_m.shape)
     slope = cv2.Sobel(surface_m, cv2.CV_32F, 0, 1) - cv2.Sobel(surface_m, cv2.CV_32F, 1, 0)
-    light = cv2.resize(1 + 0.25 * np.clip(slope, -2, 2), (width, height), interpolation=cv2.INTER_LINEAR)
+    light = cv2.resize(
+        1 + 0.25 * np.clip(slope, -2, 2), (width, height), interpolation=cv2.INTER_LINEAR
+    )
     for octave, sigma in ((1, 0.10), (2, 0.10), (4, 0.12), (10, 0.12), (30, 0.08)):
         light += _detail(height, width, octave, sigma, rng)
     # borders of crowns are ragged: each texel takes the crown of a place a little aside
     ragged = [_detail(height, width, 6, 0.8, rng) for _ in range(2)]
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
     own = cv2.remap(
-        crown.astype(np.float32), columns / finer + ragged[0], rows / finer + ragged[1], cv2.INTER_NEAREST,
+        crown.astype(np.float32),
+        columns / finer + ragged[0],
+        rows / finer + ragged[1],
+        cv2.INTER_NEAREST,
         borderMode=cv2.BORDER_REPLICATE,
     ).astype(np.int32)
     texture = np.empty((height, width, 3), np.uint8)
@@ -140,8 +182,12 @@ def _coloured(surface_m: np.ndarray, crown: np.ndarray, colours: np.ndarray, rng
     return texture
 
 
-def _detail(height: int, width: int, octave: int, sigma: float, rng: np.random.Generator) -> np.ndarray:
-    cells = rng.standard_normal((-(-height // octave), -(-width // octave)), np.float32) * np.float32(sigma)
+def _detail(
+    height: int, width: int, octave: int, sigma: float, rng: np.random.Generator
+) -> np.ndarray:
+    cells = rng.standard_normal(
+        (-(-height // octave), -(-width // octave)), np.float32
+    ) * np.float32(sigma)
     return cv2.resize(cells, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
@@ -151,16 +197,26 @@ def _detail(height: int, width: int, octave: int, sigma: float, rng: np.random.G
 def _pose(index: int, height_m: float, rng: np.random.Generator) -> Pose:
     strip, along = divmod(index, PHOTOS_A_STRIP)
     along = along if strip % 2 == 0 else PHOTOS_A_STRIP - 1 - along
-    rotation = site_from_gimbal_rotation(rng.normal(0, 1.5), -90 + rng.normal(0, 1.0), rng.normal(0, 1.0))
-    return Pose(rotation, np.array([strip * ACROSS_M, along * ALONG_M, height_m]) + rng.normal(0, 0.5, 3))
+    rotation = site_from_gimbal_rotation(
+        rng.normal(0, 1.5), -90 + rng.normal(0, 1.0), rng.normal(0, 1.0)
+    )
+    return Pose(
+        rotation, np.array([strip * ACROSS_M, along * ALONG_M, height_m]) + rng.normal(0, 0.5, 3)
+    )
 
 
 def _telemetry(pose: Pose, rng: np.random.Generator) -> dict[str, float]:
     fix_m = pose.translation_m + rng.normal(0, (FIX_SIGMA_M, FIX_SIGMA_M, HEIGHT_SIGMA_M))
-    latitude_deg, longitude_deg, _ = (float(each[0]) for each in FRAME.wgs84_from_site(fix_m[None, :2]))
+    latitude_deg, longitude_deg, _ = (
+        float(each[0]) for each in FRAME.wgs84_from_site(fix_m[None, :2])
+    )
     return {
-        "latitude_deg": latitude_deg, "longitude_deg": longitude_deg, "orthometric_height_m": 35.0 + float(fix_m[2]),
-        "height_above_takeoff_m": float(fix_m[2]), "camera_yaw_deg": 0.0, "camera_pitch_deg": -90.0,
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
+        "orthometric_height_m": 35.0 + float(fix_m[2]),
+        "height_above_takeoff_m": float(fix_m[2]),
+        "camera_yaw_deg": 0.0,
+        "camera_pitch_deg": -90.0,
         "camera_roll_deg": 0.0,
     }
 
@@ -171,11 +227,15 @@ def _picture(
     """What the camera sees: each ray ends where it first meets the crowns."""
     east, north = _slopes(camera, pose, COARSE)
     met_m = np.zeros_like(east)
-    for up_m in np.arange(0.0, CROWN_TOP_M[1] + 1, MARCH_M):  # the highest that is met counts, so it comes last
+    for up_m in np.arange(
+        0.0, CROWN_TOP_M[1] + 1, MARCH_M
+    ):  # the highest that is met counts, so it comes last
         x, y = _places_px(east, north, np.float32(up_m), pose, SURFACE_M_PER_PX, len(surface_m))
         here_m = cv2.remap(surface_m, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         met_m[here_m >= up_m] = up_m
-    met_m = cv2.resize(cv2.blur(met_m, (3, 3)), (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)
+    met_m = cv2.resize(
+        cv2.blur(met_m, (3, 3)), (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR
+    )
     finer = round(SURFACE_M_PER_PX / TEXTURE_M_PER_PX)
     east, north = _slopes(camera, pose, 1)
     x, y = _places_px(east, north, met_m, pose, SURFACE_M_PER_PX / finer, len(texture))
@@ -186,15 +246,26 @@ def _picture(
 
 def _slopes(camera: Camera, pose: Pose, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Metres east and north that each `step`th pixel's ray goes for a metre down."""
-    u = ((np.arange(camera.width_px // step, dtype=np.float32) + 0.5) * step - 0.5 - camera.cx_px) / camera.fx_px
-    v = ((np.arange(camera.height_px // step, dtype=np.float32) + 0.5) * step - 0.5 - camera.cy_px) / camera.fy_px
+    u = (
+        (np.arange(camera.width_px // step, dtype=np.float32) + 0.5) * step - 0.5 - camera.cx_px
+    ) / camera.fx_px
+    v = (
+        (np.arange(camera.height_px // step, dtype=np.float32) + 0.5) * step - 0.5 - camera.cy_px
+    ) / camera.fy_px
     rotation = pose.rotation.astype(np.float32)
-    along = [rotation[i, 0] * u[None, :] + rotation[i, 1] * v[:, None] + rotation[i, 2] for i in range(3)]
+    along = [
+        rotation[i, 0] * u[None, :] + rotation[i, 1] * v[:, None] + rotation[i, 2] for i in range(3)
+    ]
     return -along[0] / along[2], -along[1] / along[2]
 
 
 def _places_px(
-    east: np.ndarray, north: np.ndarray, up_m: "np.ndarray | np.float32", pose: Pose, m_per_px: float, height: int
+    east: np.ndarray,
+    north: np.ndarray,
+    up_m: "np.ndarray | np.float32",
+    pose: Pose,
+    m_per_px: float,
+    height: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where rays at this height are on a raster of the forest."""
     x_m, y_m, z_m = (np.float32(each) for each in pose.translation_m)

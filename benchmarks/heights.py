@@ -54,20 +54,29 @@ from sorvolo.store.site.files import HeightFile
 
 RESULTS = Path(__file__).parent / "results" / "heights.json"
 _M_PER_PX = 0.05  # of the truth
-_CLEAR_M, _STEP_M = 0.1, 0.1  # above a place from where on, and in which steps, its line to a camera is followed
+_CLEAR_M, _STEP_M = (
+    0.1,
+    0.1,
+)  # above a place from where on, and in which steps, its line to a camera is followed
 _LEAST_PHOTOS = 2  # that see a place: one gives no height
 _SURVEY = SimulationSettings(
-    flights=1, scene=SceneSettings(ground="urban", people=0, cars=3, small_objects=3),
+    flights=1,
+    scene=SceneSettings(ground="urban", people=0, cars=3, small_objects=3),
     path=PathSettings(height_m=30, speed_m_s=5, length_m=40, strips=3, strip_spacing_m=10),
-    imaging=ImagingSettings(width_px=800, height_px=600, fps=6), sensor=SensorSettings(noise_m=(0.3, 0.3, 0.3)),
+    imaging=ImagingSettings(width_px=800, height_px=600, fps=6),
+    sensor=SensorSettings(noise_m=(0.3, 0.3, 0.3)),
     output=OutputSettings(photos=True, photo_overlap=0.75),
 )
 
 
 def main() -> None:
     """Measure and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="*", default=[], help="without: two that nobody has scored")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="*", default=[], help="without: two that nobody has scored"
+    )
     parser.add_argument("--relief", type=float, default=0.0, help="of hills under the sites, m")
     parser.add_argument("--flight", type=Path, nargs="*", default=[])
     parser.add_argument("--colmap", type=Path)
@@ -92,7 +101,11 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
         folder = Path(scratch)
         for _ in simulate_site(folder / "made", settings):
             pass
-        list(map_flights([folder / "made" / "flight1" / "photos"], folder / "site", MapSettings(model="none")))
+        list(
+            map_flights(
+                [folder / "made" / "flight1" / "photos"], folder / "site", MapSettings(model="none")
+            )
+        )
         list(make_heights(folder / "site", HeightSettings()))
         flown = next(iter(simulate_flights(settings)))
         day = flown.day
@@ -109,7 +122,8 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
         true = top - ground_heights(view, day.relief)
         houses = [thing for thing in day.things if thing.label is Label.HOUSE]
         paths = {
-            "flat": folder / "site" / "mosaic.tif", "true": folder / "site" / "flights" / flight / "orthophoto.tif",
+            "flat": folder / "site" / "mosaic.tif",
+            "true": folder / "site" / "flights" / flight / "orthophoto.tif",
         }
         pictures = _Pictures(paths, folder / "site", ground, m_per_px)
         bare = _bare_patches(field, true, view, shift_m)
@@ -118,11 +132,16 @@ def simulated(seed: int, relief_m: float = 0.0) -> dict[str, Any]:
         # phaseCorrelate's shift takes the map's picture to the true one
         moved_m = shift_m + common_px["true"] * m_per_px * [1, -1]
         return {
-            "photos": report["cameras"]["views"], "m_per_px": m_per_px, "cell_m": report["cell_m"],
+            "photos": report["cameras"]["views"],
+            "m_per_px": m_per_px,
+            "cell_m": report["cell_m"],
             "common_px": {name: each.tolist() for name, each in common_px.items()},
-            **_height_errors(field, true, view, moved_m, m_per_px, day.relief, _PhotosOver(flown, top, view)),
+            **_height_errors(
+                field, true, view, moved_m, m_per_px, day.relief, _PhotosOver(flown, top, view)
+            ),
             "roofs": _roofs(pictures, houses, shift_m, bare, bare_px, field),
-            "holes_share": report["surface"]["holes_share"], "seconds": report["seconds"],
+            "holes_share": report["surface"]["holes_share"],
+            "seconds": report["seconds"],
         }
 
 
@@ -130,7 +149,9 @@ def _site_shift(archive: Archive, settings: SimulationSettings) -> np.ndarray:
     """(2,) what is added to the map's site metres to get the simulator's, whose origin is another."""
     origin = settings.scene.origin
     frame = archive.site().frame
-    place = frame.site_from_wgs84(np.array([origin.latitude_deg]), np.array([origin.longitude_deg]), np.zeros(1))
+    place = frame.site_from_wgs84(
+        np.array([origin.latitude_deg]), np.array([origin.longitude_deg]), np.zeros(1)
+    )
     return -place[0, :2]
 
 
@@ -148,7 +169,9 @@ class _PhotosOver:
         for index in range(len(self.flown)):
             width_px, height_px = self.flown.camera.width_px, self.flown.camera.height_px
             pixels = self.flown.view(index).project(ground_m)
-            seen = np.flatnonzero(np.all((pixels > -0.5) & (pixels < [width_px - 0.5, height_px - 0.5]), axis=1))
+            seen = np.flatnonzero(
+                np.all((pixels > -0.5) & (pixels < [width_px - 0.5, height_px - 0.5]), axis=1)
+            )
             clear = ~self._is_hidden(ground_m[seen], self.flown.true_poses[index].translation_m)
             counts[seen[clear]] += 1
         return counts
@@ -165,7 +188,13 @@ class _PhotosOver:
 
 
 def _height_errors(
-    field: HeightField, true: Any, view: Any, shift_m: Any, m_per_px: float, relief: Relief, photos: _PhotosOver
+    field: HeightField,
+    true: Any,
+    view: Any,
+    shift_m: Any,
+    m_per_px: float,
+    relief: Relief,
+    photos: _PhotosOver,
 ) -> dict[str, float]:
     points = field.lattice.points_m().reshape(-1, 2)
     at = _true_at(true, view, points + shift_m).reshape(field.up_m.shape)
@@ -188,15 +217,20 @@ def _height_errors(
         "visible_ground_rms_px": _rms(off[visible]) / m_per_px,
         "visible_ground_rms_px_tilt_out": _rms(level[visible]) / m_per_px,
         "visible_ground_with_edges_rms_px_tilt_out": _rms(level[with_edges]) / m_per_px,
-        "visible_ground_with_edges_worse_than_half_a_metre": float((np.abs(off[with_edges]) > 0.5).mean()),
+        "visible_ground_with_edges_worse_than_half_a_metre": float(
+            (np.abs(off[with_edges]) > 0.5).mean()
+        ),
         "visible_ground_worse_than_half_a_metre": float((np.abs(off[visible]) > 0.5).mean()),
         "ground_not_visible_but_with_heights": 1 - float(visible.sum() / grounds.sum()),
-        "ground_rms_px": _rms(off[grounds]) / m_per_px, "ground_median_px": _median(off[grounds]) / m_per_px,
+        "ground_rms_px": _rms(off[grounds]) / m_per_px,
+        "ground_median_px": _median(off[grounds]) / m_per_px,
         "ground_worse_than_half_a_metre": float((np.abs(off[grounds]) > 0.5).mean()),
         "ground_rms_px_tilt_out": _rms(level[grounds]) / m_per_px,
         "ground_median_px_tilt_out": _median(level[grounds]) / m_per_px,
-        "roof_rms_px": _rms(off[roofs]) / m_per_px, "roof_median_px": _median(off[roofs]) / m_per_px,
-        "ground_within_2_sigma": float(inside[grounds].mean()), "all_within_2_sigma": float(inside[known].mean()),
+        "roof_rms_px": _rms(off[roofs]) / m_per_px,
+        "roof_median_px": _median(off[roofs]) / m_per_px,
+        "ground_within_2_sigma": float(inside[grounds].mean()),
+        "all_within_2_sigma": float(inside[known].mean()),
     }
 
 
@@ -232,7 +266,9 @@ class _Pictures:
 
     def shift_px(self, name: str, middle: Any, half_m: float, shift_m: Any) -> Any:
         """(2,) how far a square of the true picture lies from its place in one of them, pixels."""
-        return _shift_px(self.paths[name], self.site, self.ground, middle, half_m, shift_m, self.m_per_px)
+        return _shift_px(
+            self.paths[name], self.site, self.ground, middle, half_m, shift_m, self.m_per_px
+        )
 
     def bare_px(self, name: str, bare: Any, shift_m: Any) -> Any:
         """(N, 2) the shifts of patches of bare ground, (N, 2) middles."""
@@ -257,7 +293,12 @@ def _bare_patches(field: HeightField, true: Any, view: Any, shift_m: Any) -> Any
 
 
 def _roofs(
-    pictures: _Pictures, houses: Any, shift_m: Any, bare: Any, bare_px: dict[str, Any], field: HeightField
+    pictures: _Pictures,
+    houses: Any,
+    shift_m: Any,
+    bare: Any,
+    bare_px: dict[str, Any],
+    field: HeightField,
 ) -> list[dict[str, float]]:
     """For each house seen: how far its roof lies off the bare ground nearest to it in both pictures, map pixels."""
     found = []
@@ -286,13 +327,17 @@ def _shift_px(
         crs_m = archive.site_grid().projected_from_site(places)
         columns, rows = ~source.transform * (crs_m[:, 0], crs_m[:, 1])
         picture = np.moveaxis(source.read([1, 2, 3]), 0, 2)
-        across, down = ((each - 0.5).reshape(x.shape).astype(np.float32) for each in (columns, rows))
+        across, down = (
+            (each - 0.5).reshape(x.shape).astype(np.float32) for each in (columns, rows)
+        )
         mine = cv2.remap(picture, across, down, cv2.INTER_LINEAR)
     matrix = ground.raster_from_site_matrix
     at = np.column_stack([places + shift_m, np.ones(len(places))]) @ matrix.T
     true = cv2.remap(
-        ground.rgb, (at[:, 0] / at[:, 2]).reshape(x.shape).astype(np.float32),
-        (at[:, 1] / at[:, 2]).reshape(x.shape).astype(np.float32), cv2.INTER_LINEAR,
+        ground.rgb,
+        (at[:, 0] / at[:, 2]).reshape(x.shape).astype(np.float32),
+        (at[:, 1] / at[:, 2]).reshape(x.shape).astype(np.float32),
+        cv2.INTER_LINEAR,
     )
     grays = [cv2.cvtColor(each, cv2.COLOR_RGB2GRAY).astype(np.float32) for each in (mine, true)]
     shift, _ = cv2.phaseCorrelate(*grays, cv2.createHanningWindow((count, count), cv2.CV_32F))
@@ -308,11 +353,16 @@ def real(folder: Path, colmap: Path | None) -> dict[str, Any]:
         report = json.loads(next(site.glob("flights/*/heights.json")).read_text())
         frames = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())["features"]
         result = {
-            "photos": len(frames), "flat": flat, "heights": heights,
-            "residual_rms_px": report["cameras"]["residual_rms_px"], "surface": report["surface"],
+            "photos": len(frames),
+            "flat": flat,
+            "heights": heights,
+            "residual_rms_px": report["cameras"]["residual_rms_px"],
+            "surface": report["surface"],
         }
         if colmap is not None:
-            result["cameras_against_colmap_m"] = against_colmap(report, json.loads(colmap.read_text()))
+            result["cameras_against_colmap_m"] = against_colmap(
+                report, json.loads(colmap.read_text())
+            )
     return result
 
 
@@ -322,14 +372,19 @@ def _measured(arguments: list[str]) -> dict[str, float]:
         "used = resource.getrusage(resource.RUSAGE_SELF); "
         "print(json.dumps([code, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024]))"
     )
-    done = subprocess.run([sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True
+    )
     code, cpu_s, memory_mb = json.loads(done.stdout.splitlines()[-1])
     return {"exit_code": code, "cpu_s": round(cpu_s, 1), "peak_memory_mb": round(memory_mb)}
 
 
 def against_colmap(report: dict[str, Any], reference: dict[str, Any]) -> dict[str, float]:
     """Rms distance of the cameras after the best similarity in space: east and north, and up."""
-    places = {each["frame"]: [each["east_m"], each["north_m"], each["up_m"]] for each in report["cameras"]["places"]}
+    places = {
+        each["frame"]: [each["east_m"], each["north_m"], each["up_m"]]
+        for each in report["cameras"]["places"]
+    }
     names = sorted(set(places) & set(reference["cameras"]))
     ours = np.array([places[name] for name in names])
     theirs = np.array([reference["cameras"][name]["centre"] for name in names])
@@ -338,7 +393,11 @@ def against_colmap(report: dict[str, Any], reference: dict[str, Any]) -> dict[st
     turn = np.diag([1, 1, np.sign(np.linalg.det(u @ vt))])
     moved = (scale * np.diag(turn)).sum() / (b**2).sum() * b @ (u @ turn @ vt).T
     off = a - moved
-    return {"east_north": _rms(np.linalg.norm(off[:, :2], axis=1)), "up": _rms(off[:, 2]), "cameras": len(names)}
+    return {
+        "east_north": _rms(np.linalg.norm(off[:, :2], axis=1)),
+        "up": _rms(off[:, 2]),
+        "cameras": len(names),
+    }
 
 
 def _rms(values: Any) -> float:

@@ -33,8 +33,13 @@ from sorvolo.store.exports import map_pictures
 from sorvolo.store.site.flight_writer import FlightWriter
 
 PARTS = (
-    (PlanarMapper, "register"), (PlanarMapper, "place"), (PlanarMapper, "recent_exposure"),
-    (FlightPainter, "save"), (FlightPainter, "_show_now"), (FlightPainter, "show"), (FlightWriter, "flush"),
+    (PlanarMapper, "register"),
+    (PlanarMapper, "place"),
+    (PlanarMapper, "recent_exposure"),
+    (FlightPainter, "save"),
+    (FlightPainter, "_show_now"),
+    (FlightPainter, "show"),
+    (FlightWriter, "flush"),
     (map_pictures, "picture"),
 )
 SLOW_S = 1.0
@@ -42,7 +47,9 @@ SLOW_S = 1.0
 
 def main() -> None:
     """Map the stream and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("video", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=30.0)
@@ -50,8 +57,12 @@ def main() -> None:
     options = parser.parse_args()
     cv2.setNumThreads(2)
     found = {
-        "benchmark": "live_latency", "commit": commit(), "machine": machine(), "rate_hz": options.rate,
-        "load_before": os.getloadavg()[0], **measure(options.video, options.seconds, options.rate),
+        "benchmark": "live_latency",
+        "commit": commit(),
+        "machine": machine(),
+        "rate_hz": options.rate,
+        "load_before": os.getloadavg()[0],
+        **measure(options.video, options.seconds, options.rate),
         "load_after": os.getloadavg()[0],
     }
     if options.output is not None:
@@ -79,21 +90,30 @@ def measure(video: Path, seconds: float, rate_hz: float) -> dict[str, Any]:
         ):
             rows.append({name: round(value, 3) for name, value in spent.items()})
             spent.clear()
-        report = json.loads(next((site / "flights").glob("*/report.json")).read_text(encoding="utf-8"))
+        report = json.loads(
+            next((site / "flights").glob("*/report.json")).read_text(encoding="utf-8")
+        )
     flown_s = min(seconds, time.monotonic() - started_s)
     slow = sorted(rows, key=lambda row: -work_s(row))
     shown = [row for row in rows if "show" in row]
     return {
-        "delay_s": report["delay_s"], "key_frames": len(rows), "flown_s": round(flown_s, 1),
+        "delay_s": report["delay_s"],
+        "key_frames": len(rows),
+        "flown_s": round(flown_s, 1),
         "cpu_s": round(time.process_time() - cpu_s, 1),
-        "dropped": next((each["count"] for each in report["notices"] if each["code"] == "skipped_frame"), 0),
+        "dropped": next(
+            (each["count"] for each in report["notices"] if each["code"] == "skipped_frame"), 0
+        ),
         "work_s": delay_figures([work_s(row) for row in shown]),
         "work_cpu_s": delay_figures([work_s(row, " cpu") for row in shown]),
         "parts": {
             key: delay_figures([row[key] for row in rows if key in row])
-            for _, name in PARTS for key in (name, f"{name} cpu") if any(key in row for row in rows)
+            for _, name in PARTS
+            for key in (name, f"{name} cpu")
+            if any(key in row for row in rows)
         },
-        "slowest": slow[:8], "slower_than_a_second": sum(work_s(row) >= SLOW_S for row in rows),
+        "slowest": slow[:8],
+        "slower_than_a_second": sum(work_s(row) >= SLOW_S for row in rows),
     }
 
 
@@ -104,20 +124,26 @@ def work_s(row: dict[str, float], kind: str = "") -> float:
 
 def timed(method: Callable[..., Any], name: str, spent: dict[str, float]) -> Callable[..., Any]:
     """The method, its seconds and its thread's processor time added to `spent`."""
+
     def measured(*arguments: Any, **named: Any) -> Any:
         started_s, cpu_s = time.monotonic(), time.thread_time()
         try:
             return method(*arguments, **named)
         finally:
-            for key, value in ((name, time.monotonic() - started_s), (f"{name} cpu", time.thread_time() - cpu_s)):
+            for key, value in (
+                (name, time.monotonic() - started_s),
+                (f"{name} cpu", time.thread_time() - cpu_s),
+            ):
                 spent[key] = spent.get(key, 0.0) + value
+
     return measured
 
 
 def send(video: Path, path: Path, seconds: float, rate_hz: float) -> None:
     """Copy the video's pictures into a transport stream, so many a second, and state its end."""
     with (
-        av.open(str(video)) as source, path.open("wb", buffering=0) as sink,
+        av.open(str(video)) as source,
+        path.open("wb", buffering=0) as sink,
         av.open(sink, "w", format="mpegts", options={"flush_packets": "1"}) as target,
     ):
         taken = source.streams.video[0]

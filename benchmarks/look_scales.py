@@ -47,15 +47,22 @@ class Scored:
 
 def main() -> None:
     """Plant, look at each scale, write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--model", default="default-int8")
-    parser.add_argument("--scales", type=float, nargs="+", default=[1.4, 1.0, 0.8, 0.64, 0.5, 0.36, 0.25])
+    parser.add_argument(
+        "--scales", type=float, nargs="+", default=[1.4, 1.0, 0.8, 0.64, 0.5, 0.36, 0.25]
+    )
     parser.add_argument("--every", type=int, default=2, help="only each so-manieth photo")
     parser.add_argument("--seed", type=int, default=1)
     wishes = parser.parse_args()
     rng = np.random.default_rng(wishes.seed)
-    things = {name: list(islice(cutouts(wishes.data, name, rng), count)) for name, count in CUTOUTS.items()}
+    things = {
+        name: list(islice(cutouts(wishes.data, name, rng), count))
+        for name, count in CUTOUTS.items()
+    }
     detector = Detector.load(find_model(wishes.model), provider="cpu", threads=1)
     scored = {scale: Scored() for scale in wishes.scales}
     for path in sorted((wishes.data / "flights" / "brighton_beach").glob("*.JPG"))[:: wishes.every]:
@@ -65,8 +72,13 @@ def main() -> None:
             look(detector, full, bare, scale, truth, row)
     rows = [row_of(scale, row, detector) for scale, row in scored.items()]
     document = {
-        "benchmark": "look_scales", "machine": machine(), "commit": commit(), "seed": wishes.seed,
-        "model": wishes.model, "m_per_px": M_PER_PX, "rows": rows,
+        "benchmark": "look_scales",
+        "machine": machine(),
+        "commit": commit(),
+        "seed": wishes.seed,
+        "model": wishes.model,
+        "m_per_px": M_PER_PX,
+        "rows": rows,
     }
     RESULTS.write_text(json.dumps(document, indent=1) + "\n")
     print(json.dumps(rows, indent=1))
@@ -76,7 +88,7 @@ def middle(path: Path) -> Floats:
     """The middle of a photo, float32 (1125, 2000, 3) RGB."""
     whole = cv2.imread(str(path), cv2.IMREAD_COLOR)
     top, left = (whole.shape[0] - SIZE_PX[1]) // 2, (whole.shape[1] - SIZE_PX[0]) // 2
-    return whole[top:top + SIZE_PX[1], left:left + SIZE_PX[0], ::-1].astype(np.float32)
+    return whole[top : top + SIZE_PX[1], left : left + SIZE_PX[0], ::-1].astype(np.float32)
 
 
 def planted(
@@ -90,14 +102,22 @@ def planted(
             cutout = things[name][rng.integers(len(things[name]))]
             reach_px = cutout.length_m / M_PER_PX
             at_px = rng.uniform(reach_px, np.array(SIZE_PX) - reach_px)
-            while any(np.linalg.norm(at_px - other) < 0.75 * (reach_px + far_px) for other, far_px in taken):
+            while any(
+                np.linalg.norm(at_px - other) < 0.75 * (reach_px + far_px)
+                for other, far_px in taken
+            ):
                 at_px = rng.uniform(reach_px, np.array(SIZE_PX) - reach_px)
             taken.append((at_px, reach_px))
             column, row = at_px.astype(int)
-            ground = picture[row - 5:row + 6, column - 5:column + 6].mean(axis=(0, 1))
+            ground = picture[row - 5 : row + 6, column - 5 : column + 6].mean(axis=(0, 1))
             thing = Planted(
-                in_light_of(cutout, ground, False, rng), at_px * M_PER_PX * np.array([1, -1]),
-                float(rng.uniform(0, 360)), 40.0, 0.6 * cutout.height_m, 0.45, False,
+                in_light_of(cutout, ground, False, rng),
+                at_px * M_PER_PX * np.array([1, -1]),
+                float(rng.uniform(0, 360)),
+                40.0,
+                0.6 * cutout.height_m,
+                0.45,
+                False,
             )
             thing.paint(picture, image_from_site)
             outline_px = apply_homography(image_from_site, thing.outline_m)
@@ -106,14 +126,26 @@ def planted(
 
 
 def look(
-    detector: Detector, full: Floats, bare: Floats, scale: float, truth: list[tuple[str, Floats]], row: Scored
+    detector: Detector,
+    full: Floats,
+    bare: Floats,
+    scale: float,
+    truth: list[tuple[str, Floats]],
+    row: Scored,
 ) -> None:
     """Look at both pictures at one scale; `row` takes the scores."""
     for picture, is_full in ((full, True), (bare, False)):
-        shown = cv2.resize(np.clip(picture, 0, 255).astype(np.uint8), None, fx=scale, fy=scale,
-                           interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+        shown = cv2.resize(
+            np.clip(picture, 0, 255).astype(np.uint8),
+            None,
+            fx=scale,
+            fy=scale,
+            interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC,
+        )
         began_s = time.process_time()
-        seen = detector.detect(shown, tiles="auto", classes=tuple(COUNTS), from_above=True, least_score=LEAST_SCORE)
+        seen = detector.detect(
+            shown, tiles="auto", classes=tuple(COUNTS), from_above=True, least_score=LEAST_SCORE
+        )
         row.cpu_s += time.process_time() - began_s
         names = np.array(seen.names)
         if not is_full:
@@ -121,22 +153,28 @@ def look(
                 row.bare[name] += seen.scores[names == name].tolist()
             continue
         for name, box in truth:
-            same = (iou_matrix(seen.boxes_px / scale, box[None])[:, 0] >= FOUND_IOU) & (names == name)
+            same = (iou_matrix(seen.boxes_px / scale, box[None])[:, 0] >= FOUND_IOU) & (
+                names == name
+            )
             row.found[name].append(float(seen.scores[same].max(initial=0.0)))
 
 
 def row_of(scale: float, row: Scored, detector: Detector) -> dict[str, object]:
     """One scale's line of the table."""
     line: dict[str, object] = {
-        "scale": scale, "px_per_m": round(scale / M_PER_PX, 1),
-        "cpu_s_a_picture": round(row.cpu_s / 2 / max(1, len(row.found["person"]) / COUNTS["person"]), 2),
+        "scale": scale,
+        "px_per_m": round(scale / M_PER_PX, 1),
+        "cpu_s_a_picture": round(
+            row.cpu_s / 2 / max(1, len(row.found["person"]) / COUNTS["person"]), 2
+        ),
     }
     for name in COUNTS:
         found, bare = np.array(row.found[name]), np.sort(row.bare[name])[::-1]
         least = detector.info.thresholds[name]
         tenth = float(bare[FALSE - 1]) if len(bare) >= FALSE else LEAST_SCORE
         line[name] = {
-            "planted": len(found), "found": round(float((found >= least).mean()), 3),
+            "planted": len(found),
+            "found": round(float((found >= least).mean()), 3),
             "on_bare_ground": int((bare >= least).sum()),
             "found_at_ten_on_bare_ground": round(float((found >= tenth).mean()), 3),
         }

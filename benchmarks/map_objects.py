@@ -27,7 +27,9 @@ RESULTS = Path(__file__).parent / "results" / "map_objects.json"
 
 def main() -> None:
     """Fly, search, count, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--flights", type=int, default=18)
     parser.add_argument("--seeds", type=int, nargs="*", default=[])
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -39,13 +41,26 @@ def main() -> None:
         flight, images = flown(seed, number)
         counts += counted(flight, images, detector, "thermal" if number % 3 == 2 else "by day")
         print(number, seed, dict(counts), flush=True)
-    wishes.results.write_text(json.dumps({
-        "benchmark": "map_objects", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-        "seeds": seeds, "model": detector.info.name, "counts": dict(sorted(counts.items())),
-    }, indent=1) + "\n")
+    wishes.results.write_text(
+        json.dumps(
+            {
+                "benchmark": "map_objects",
+                "machine": machine(),
+                "commit": commit(),
+                "date": time.strftime("%Y-%m-%d"),
+                "seeds": seeds,
+                "model": detector.info.name,
+                "counts": dict(sorted(counts.items())),
+            },
+            indent=1,
+        )
+        + "\n"
+    )
 
 
-def counted(flight: SimulatedFlight, images: list[np.ndarray], detector: Detector, light: str) -> Counter[str]:
+def counted(
+    flight: SimulatedFlight, images: list[np.ndarray], detector: Detector, light: str
+) -> Counter[str]:
     """How many hidden things a frame shows, how many of them are reported, and how many reports are of none."""
     targets = [thing for thing in flight.day.things if thing.label.is_target]
     frames = [placed(flight, index) for index in range(len(images))]
@@ -59,7 +74,9 @@ def counted(flight: SimulatedFlight, images: list[np.ndarray], detector: Detecto
         else:
             counts[f"{each.label} {light}: false"] += 1
     for row, thing in enumerate(targets):
-        if str(thing.label) in CLASSES and any(np.isfinite(each[row]).all() for each in boxes.values()):
+        if str(thing.label) in CLASSES and any(
+            np.isfinite(each[row]).all() for each in boxes.values()
+        ):
             kind = "plain figure" if thing.kind == "person" else str(thing.label)
             counts[f"{kind} {light}: shown"] += 1
             counts[f"{kind} {light}: found"] += row in right

@@ -35,10 +35,17 @@ from sorvolo.simulation.presets import preset
 
 METHODS = ("planar", "thesis", "opencv-scans")
 COLUMNS = {
-    "shape_m": "shape rms m", "absolute_m": "absolute rms m", "floor_m": "floor m",
+    "shape_m": "shape rms m",
+    "absolute_m": "absolute rms m",
+    "floor_m": "floor m",
     "over_floor": "absolute over floor",
-    "deviation": "deviation", "placed": "placed", "frames": "of", "cpu_ms_per_frame": "CPU ms/frame",
-    "front_end_ms_per_frame": "registration ms/frame", "wall_s": "wall s", "peak_mb": "peak MB",
+    "deviation": "deviation",
+    "placed": "placed",
+    "frames": "of",
+    "cpu_ms_per_frame": "CPU ms/frame",
+    "front_end_ms_per_frame": "registration ms/frame",
+    "wall_s": "wall s",
+    "peak_mb": "peak MB",
 }
 RESULTS = Path(__file__).parent / "results" / "mosaic_methods.json"
 
@@ -47,7 +54,9 @@ def main() -> None:
     """Run the benchmark, or one method in the child process."""
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
-    parser.add_argument("seeds", type=int, nargs="*", help="else new ones, drawn from the commit's hash")
+    parser.add_argument(
+        "seeds", type=int, nargs="*", help="else new ones, drawn from the commit's hash"
+    )
     parser.add_argument("--count", type=int, default=3, help="how many seeds to draw")
     parser.add_argument("--preset", default="survey")
     parser.add_argument("--length", type=float, help="length of a strip, m, for a shorter flight")
@@ -55,7 +64,9 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--limit", type=float, default=1800.0, help="longest time of a run, s")
     parser.add_argument("--output", type=Path, default=RESULTS)
-    parser.add_argument("--run", nargs=3, metavar=("METHOD", "SIMULATION", "SITE"), help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--run", nargs=3, metavar=("METHOD", "SIMULATION", "SITE"), help=argparse.SUPPRESS
+    )
     options = parser.parse_args()
     if options.run:
         run_method(options.run[0], Path(options.run[1]), Path(options.run[2]))
@@ -75,11 +86,23 @@ def main() -> None:
                     runs.append({"seed": seed, "method": method, **measured})
     summary = summarise(runs, options.methods)
     options.output.parent.mkdir(exist_ok=True)
-    options.output.write_text(json.dumps({
-        "benchmark": "mosaic_methods", "preset": options.preset, "length_m": options.length,
-        "seeds": options.seeds, "repeats": options.repeats, "machine": machine(), "commit": commit(),
-        "summary": summary, "runs": runs,
-    }, indent=1) + "\n")
+    options.output.write_text(
+        json.dumps(
+            {
+                "benchmark": "mosaic_methods",
+                "preset": options.preset,
+                "length_m": options.length,
+                "seeds": options.seeds,
+                "repeats": options.repeats,
+                "machine": machine(),
+                "commit": commit(),
+                "summary": summary,
+                "runs": runs,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
     show(summary)
     for run in runs:
         if "failure" in run:
@@ -119,10 +142,16 @@ def run_method(method: str, simulation: Path, site: Path) -> None:
     after = resource.getrusage(resource.RUSAGE_SELF)
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     frames = len(list(photos.iterdir()))
-    print(json.dumps({
-        "cpu_ms_per_frame": 1000 * cpu_s / frames, "wall_s": time.monotonic() - started,
-        "peak_mb": peak_mb(), "frames": frames,
-    }))
+    print(
+        json.dumps(
+            {
+                "cpu_ms_per_frame": 1000 * cpu_s / frames,
+                "wall_s": time.monotonic() - started,
+                "peak_mb": peak_mb(),
+                "frames": frames,
+            }
+        )
+    )
 
 
 def stitch_with_opencv(photos: Path, site: Path) -> None:
@@ -138,8 +167,12 @@ def stitch_with_opencv(photos: Path, site: Path) -> None:
     scale = stitcher.workScale()
     at_scale = np.diag([scale, scale, 1.0])
     placed = {
-        files[index].name: (picture_from_image(np.asarray(camera.R, dtype=np.float64)) @ at_scale).tolist()
-        for index, camera in zip(np.ravel(stitcher.component()).tolist(), stitcher.cameras(), strict=True)
+        files[index].name: (
+            picture_from_image(np.asarray(camera.R, dtype=np.float64)) @ at_scale
+        ).tolist()
+        for index, camera in zip(
+            np.ravel(stitcher.component()).tolist(), stitcher.cameras(), strict=True
+        )
     }
     (site / "placed.json").write_text(json.dumps(placed))
 
@@ -155,15 +188,21 @@ def picture_from_image(rotation: np.ndarray) -> np.ndarray:
 def accuracy(method: str, simulation: Path, site: Path) -> dict[str, float]:
     """What a run's map is worth; only `placed` = 0 when there is none."""
     if method == "opencv-scans":
-        return opencv_accuracy(simulation, site) if (site / "placed.json").is_file() else {"placed": 0}
+        return (
+            opencv_accuracy(simulation, site) if (site / "placed.json").is_file() else {"placed": 0}
+        )
     if not (site / "mosaic.tif").is_file():
         return {"placed": 0}
     measured = evaluate_mosaic(site, truth=simulation)
     errors = measured.truth[-1].corners
     return {
-        "shape_m": errors.shape.rms_m, "absolute_m": errors.absolute.rms_m, "floor_m": errors.floor.rms_m,
-        "over_floor": errors.over_floor, "deviation": measured.deviation.mean,
-        "placed": sum(each.vision for each in measured.flights), **front_end(site),
+        "shape_m": errors.shape.rms_m,
+        "absolute_m": errors.absolute.rms_m,
+        "floor_m": errors.floor.rms_m,
+        "over_floor": errors.over_floor,
+        "deviation": measured.deviation.mean,
+        "placed": sum(each.vision for each in measured.flights),
+        **front_end(site),
     }
 
 
@@ -180,23 +219,36 @@ def opencv_accuracy(simulation: Path, site: Path) -> dict[str, float]:
     placed = json.loads((site / "placed.json").read_text())
     truth = json.loads((simulation / "truth" / "frames.geojson").read_text())
     origin = truth["site"]
-    frame = LocalFrame(Geodetic(origin["latitude_deg"], origin["longitude_deg"], origin["height_m"]))
+    frame = LocalFrame(
+        Geodetic(origin["latitude_deg"], origin["longitude_deg"], origin["height_m"])
+    )
     first = cv2.imread(str(next(photos_of(simulation).iterdir())))
     height, width = first.shape[:2]
-    corners = np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]])
+    corners = np.array(
+        [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]]
+    )
     mine, true = [], []
     for feature in truth["features"]:
         matrix = placed.get(str(feature["properties"]["frame"]))
         if matrix is None:
             continue
         ring = np.array(feature["geometry"]["coordinates"][0][:4])
-        true.append(frame.site_from_wgs84(ring[:, 1], ring[:, 0], np.full(4, origin["height_m"]))[:, :2])
+        true.append(
+            frame.site_from_wgs84(ring[:, 1], ring[:, 0], np.full(4, origin["height_m"]))[:, :2]
+        )
         mine.append(apply_homography(np.array(matrix), corners) * [1.0, -1.0])
     true_m, mine_px = np.array(true), np.array(mine)
-    metres = float(np.sqrt(abs(np.linalg.det(
-        fit_similarity(true_m.reshape(-1, 2), mine_px.reshape(-1, 2))[:2, :2]
-    ))))
-    return {"shape_m": corner_errors(mine_px * metres, true_m, metres).shape.rms_m, "placed": len(true)}
+    metres = float(
+        np.sqrt(
+            abs(
+                np.linalg.det(fit_similarity(true_m.reshape(-1, 2), mine_px.reshape(-1, 2))[:2, :2])
+            )
+        )
+    )
+    return {
+        "shape_m": corner_errors(mine_px * metres, true_m, metres).shape.rms_m,
+        "placed": len(true),
+    }
 
 
 def summarise(runs: list[dict], methods: list[str]) -> dict[str, dict[str, dict[str, float]]]:
@@ -209,7 +261,9 @@ def summarise(runs: list[dict], methods: list[str]) -> dict[str, dict[str, dict[
             values = [run[name] for run in mine if name in run and np.isfinite(run[name])]
             if values:
                 summary[method][name] = {
-                    "median": median(values), "lowest": min(values), "highest": max(values),
+                    "median": median(values),
+                    "lowest": min(values),
+                    "highest": max(values),
                     "runs": len(values),
                 }
     return summary

@@ -28,14 +28,19 @@ from sorvolo.cluster.table import TABLE
 MISSION, DETECTOR = b"sorvolo.cluster.worker", b"sorvolo.detection.shared_process"
 RAYS_WORKER, ACTOR = b"ray::sorvolo", b"ray::_Detector"  # as Ray names its processes
 KINDS = {
-    "machine killed": (b"", signal.SIGKILL), "Ray's worker killed": (RAYS_WORKER, signal.SIGKILL),
-    "mission killed": (MISSION, signal.SIGKILL), "mission crashed": (MISSION, signal.SIGSEGV),
-    "mission stopped": (MISSION, signal.SIGSTOP), "detector's actor killed": (ACTOR, signal.SIGKILL),
+    "machine killed": (b"", signal.SIGKILL),
+    "Ray's worker killed": (RAYS_WORKER, signal.SIGKILL),
+    "mission killed": (MISSION, signal.SIGKILL),
+    "mission crashed": (MISSION, signal.SIGSEGV),
+    "mission stopped": (MISSION, signal.SIGSTOP),
+    "detector's actor killed": (ACTOR, signal.SIGKILL),
     "detector killed": (DETECTOR, signal.SIGKILL),
 }
 POISON_EVERY_S = 0.25
 MOST_STARTS = 5  # of one machine
-PATIENCE_MS = 60_000  # before Ray counts a machine as dead that does not answer: it may only be busy
+PATIENCE_MS = (
+    60_000  # before Ray counts a machine as dead that does not answer: it may only be busy
+)
 
 
 class NodeFaults:
@@ -45,7 +50,9 @@ class NodeFaults:
         self.counts: Counter[str] = Counter()
         self._cluster, self._root = cluster, root
         self._draw, self._is_over = random.Random(seed), threading.Event()
-        self._threads = [threading.Thread(target=each, daemon=True) for each in (self._strike_all, self._poison)]
+        self._threads = [
+            threading.Thread(target=each, daemon=True) for each in (self._strike_all, self._poison)
+        ]
         for each in self._threads:
             each.start()
 
@@ -80,7 +87,9 @@ class NodeFaults:
         """Do it to one that there is; False where there is none."""
         name, fault = KINDS[kind]
         if not name:
-            self._cluster.remove_node(self._draw.choice(sorted(self._cluster.worker_nodes, key=id)), False)
+            self._cluster.remove_node(
+                self._draw.choice(sorted(self._cluster.worker_nodes, key=id)), False
+            )
             self._add_machine()
             return True
         found = sorted(self._processes(name))
@@ -111,7 +120,9 @@ class NodeFaults:
 
     def _processes(self, name: bytes) -> set[int]:
         """The cluster's processes with this in their command lines."""
-        nodes = [each.all_processes["raylet"][0].process.pid for each in list(self._cluster.worker_nodes)]
+        nodes = [
+            each.all_processes["raylet"][0].process.pid for each in list(self._cluster.worker_nodes)
+        ]
         found = set()
         for pid in descendants(set(nodes)):
             with suppress(OSError):  # it has ended
@@ -124,12 +135,16 @@ class NodeFaults:
 def node_faults(root: Path, seed: int) -> Iterator[NodeFaults]:
     """The cluster, which the environment names meanwhile, and what strikes it."""
     settings = {
-        "RAY_USAGE_STATS_ENABLED": "0", "RAY_AUTH_MODE": "disabled", "RAY_health_check_timeout_ms": str(PATIENCE_MS),
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "RAY_AUTH_MODE": "disabled",
+        "RAY_health_check_timeout_ms": str(PATIENCE_MS),
     }
     with mock.patch.dict(os.environ, settings):
         from ray.cluster_utils import Cluster
 
-        cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+        cluster = Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False}
+        )
         os.environ["RAY_ADDRESS"] = cluster.address
         for _ in range(2):
             cluster.add_node(num_cpus=1)

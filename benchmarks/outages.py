@@ -32,7 +32,10 @@ class Outages:
     """Strikes from a thread of its own until `end`: every 4 to 15 s one outage of 0.5 to `longest_s`."""
 
     def __init__(
-        self, servers: Mapping[str, PostgresServer | KilledBucket], links: Mapping[str, FaultyLink], seed: int,
+        self,
+        servers: Mapping[str, PostgresServer | KilledBucket],
+        links: Mapping[str, FaultyLink],
+        seed: int,
         longest_s: float,
     ) -> None:
         """Servers and their links have the same names."""
@@ -52,7 +55,9 @@ class Outages:
         kinds = [(name, how) for name in self._links for how in ("killed", "cut", "stalled")]
         waiting: list[tuple[str, str]] = []
         while not self._is_over.wait(self._draw.uniform(4.0, 15.0)):
-            waiting = waiting or self._draw.sample(kinds, len(kinds))  # each kind once before the first comes again
+            waiting = waiting or self._draw.sample(
+                kinds, len(kinds)
+            )  # each kind once before the first comes again
             name, how = waiting.pop()
             wait_s = self._draw.uniform(0.5, self._longest_s)
             self.counts[f"{name} {how}"] += 1
@@ -69,14 +74,21 @@ def outages(seed: int, longest_s: float) -> Iterator[Outages]:
     """Both servers, which the environment names meanwhile, and what strikes them."""
     server = PostgresServer()
     try:
-        with KilledBucket() as bucket, FaultyLink(server.port) as database, FaultyLink(bucket.port) as store:
+        with (
+            KilledBucket() as bucket,
+            FaultyLink(server.port) as database,
+            FaultyLink(bucket.port) as store,
+        ):
             named = {
                 VARIABLE: server.url.replace(f":{server.port}", f":{database.port}"),
                 **environment(f"http://127.0.0.1:{store.port}"),
             }
             with mock.patch.dict(os.environ, named):
                 made = Outages(
-                    {"database": server, "store": bucket}, {"database": database, "store": store}, seed, longest_s
+                    {"database": server, "store": bucket},
+                    {"database": database, "store": store},
+                    seed,
+                    longest_s,
                 )
                 try:
                     yield made

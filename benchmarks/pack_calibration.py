@@ -18,12 +18,18 @@ from score_calibration import RESULTS
 from sorvolo.detection.calibration import platt_scaled
 from sorvolo.detection.contract import FORMAT, Calibration
 
-MODELS = {"default": ("14", "default"), "default-int8": ("14", "default"), "thermal": ("5", "thermal")}
+MODELS = {
+    "default": ("14", "default"),
+    "default-int8": ("14", "default"),
+    "thermal": ("5", "thermal"),
+}
 
 
 def main() -> None:
     """Rewrite the files and their cards."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--home", type=Path, default=HOME)
     parser.add_argument("--results", type=Path, default=RESULTS)
     wishes = parser.parse_args()
@@ -33,11 +39,16 @@ def main() -> None:
         path = wishes.home / f"{name}.onnx"
         card = json.loads(path.with_suffix(".json").read_text())
         own = card.get("thresholds_own", card["thresholds"])
-        calibration = {label: {key: each[key] for key in ("slope", "shift")} for label, each in fit.items()}
+        calibration = {
+            label: {key: each[key] for key in ("slope", "shift")} for label, each in fit.items()
+        }
         fields: dict[str, Any] = {
-            "format": FORMAT, "version": version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
+            "format": FORMAT,
+            "version": version,
+            "created": f"{datetime.now(UTC):%Y-%m-%d}",
             "calibration": calibration,
-            "thresholds": own | {label: scaled(own[label], each) for label, each in calibration.items()},
+            "thresholds": own
+            | {label: scaled(own[label], each) for label, each in calibration.items()},
         }
         repack(path, fields, {"thresholds_own": own})
         print(name, fields["thresholds"], calibration)

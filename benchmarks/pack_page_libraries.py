@@ -17,11 +17,14 @@ TESTS = ROOT / "tests" / "station" / "vendor"
 
 # name on npm: version, the files that are taken and where they go
 PAGE_LIBRARIES = {
-    "maplibre-gl": ("6.17.0", {
-        "dist/maplibre-gl.mjs": "maplibre-gl.mjs",
-        "dist/maplibre-gl-worker.mjs": "maplibre-gl-worker.mjs",
-        "dist/maplibre-gl.css": "maplibre-gl.css",
-    }),
+    "maplibre-gl": (
+        "6.17.0",
+        {
+            "dist/maplibre-gl.mjs": "maplibre-gl.mjs",
+            "dist/maplibre-gl-worker.mjs": "maplibre-gl-worker.mjs",
+            "dist/maplibre-gl.css": "maplibre-gl.css",
+        },
+    ),
     "pmtiles": ("4.5.0", {"dist/pmtiles.js": "pmtiles.js"}),
 }
 TEST_LIBRARIES = {"axe-core": ("4.14.1", {"axe.min.js": "axe.min.js"})}
@@ -47,7 +50,11 @@ def pack(libraries: dict[str, tuple[str, dict[str, str]]], target: Path, work: P
     work.mkdir(parents=True)
     (work / "package.json").write_text('{"private": true}')
     wanted = [f"{name}@{version}" for name, (version, _) in libraries.items()]
-    subprocess.run(["npm", "install", "--ignore-scripts", "--save-exact", "--no-audit", *wanted], cwd=work, check=True)
+    subprocess.run(
+        ["npm", "install", "--ignore-scripts", "--save-exact", "--no-audit", *wanted],
+        cwd=work,
+        check=True,
+    )
     shutil.rmtree(target, ignore_errors=True)
     (target / "licences").mkdir(parents=True)
     lock = json.loads((work / "package-lock.json").read_text())["packages"]
@@ -60,12 +67,17 @@ def pack(libraries: dict[str, tuple[str, dict[str, str]]], target: Path, work: P
         for source, copied in files.items():
             shutil.copyfile(work / path / source, target / copied)
         licence = copy_licence(name, work / path, target / "licences")
-        entries.append({
-            "name": name, "version": locked["version"], "licence": locked["license"], "licence_file": licence,
-            "source": f"https://www.npmjs.com/package/{name}/v/{locked['version']}",
-            "npm_integrity": locked["integrity"],
-            "files": [described(target / copied) for copied in files.values()],
-        })
+        entries.append(
+            {
+                "name": name,
+                "version": locked["version"],
+                "licence": locked["license"],
+                "licence_file": licence,
+                "source": f"https://www.npmjs.com/package/{name}/v/{locked['version']}",
+                "npm_integrity": locked["integrity"],
+                "files": [described(target / copied) for copied in files.values()],
+            }
+        )
     manifest = {"made_by": "make page-vendor", "libraries": entries}
     (target / "manifest.json").write_text(json.dumps(manifest, indent=2) + "\n")
 
@@ -73,9 +85,13 @@ def pack(libraries: dict[str, tuple[str, dict[str, str]]], target: Path, work: P
 def copy_licence(name: str, package: Path, target: Path) -> str:
     """Copy the package's licence, or write the one that its repository states. Gives the file's place."""
     path = target / f"{name.replace('@', '').replace('/', '-')}.txt"
-    found = sorted(each for each in package.iterdir() if each.name.lower().startswith(("license", "copying")))
+    found = sorted(
+        each for each in package.iterdir() if each.name.lower().startswith(("license", "copying"))
+    )
     if found:
-        path.write_text("\n".join(each.read_text(encoding="utf-8") for each in found), encoding="utf-8")
+        path.write_text(
+            "\n".join(each.read_text(encoding="utf-8") for each in found), encoding="utf-8"
+        )
     else:
         copyright_line, kind = STATED_LICENCES[name]
         path.write_text(f"{copyright_line}\n\n{LICENCE_TEXTS[kind]}", encoding="utf-8")

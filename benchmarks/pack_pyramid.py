@@ -14,21 +14,33 @@ from typing import Any
 from pack_default_model import HOME
 from pack_second_look import repack
 
-DAYLIGHT: dict[str, Any] = {"times": [0.5, 0.75, 1.5, 2.0, 3.0], "known_px": 32, "octaves": 1.0, "shift": 0.6}
+DAYLIGHT: dict[str, Any] = {
+    "times": [0.5, 0.75, 1.5, 2.0, 3.0],
+    "known_px": 32,
+    "octaves": 1.0,
+    "shift": 0.6,
+}
 CLOSER = {"person": {"closer": [4.0]}}  # decision 0089
 THERMAL = {"times": [0.667, 1.333], "known_px": 44, "octaves": 1.0, "shift": 0.6}
-MODELS = {"default": ("13", DAYLIGHT, CLOSER), "default-int8": ("13", DAYLIGHT, CLOSER), "thermal": ("4", THERMAL, {})}
+MODELS = {
+    "default": ("13", DAYLIGHT, CLOSER),
+    "default-int8": ("13", DAYLIGHT, CLOSER),
+    "thermal": ("4", THERMAL, {}),
+}
 CLASSES = ("person", "car")
 
 
 def main() -> None:
     """Rewrite the files and their cards."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--home", type=Path, default=HOME)
     wishes = parser.parse_args()
     for name, (version, sizes, more) in MODELS.items():
         fields: dict[str, Any] = {
-            "version": version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
+            "version": version,
+            "created": f"{datetime.now(UTC):%Y-%m-%d}",
             "pyramid": {each: sizes | more.get(each, {}) for each in CLASSES},
         }
         repack(wishes.home / f"{name}.onnx", fields)

@@ -27,7 +27,9 @@ FIGURES = "before and after the second look (benchmarks/second_look.py)"
 
 def main() -> None:
     """Rewrite both files and their cards."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("weights", type=Path)
     parser.add_argument("--version", default="10")
     parser.add_argument("--measured", type=Path, help="results of second_look.py")
@@ -35,7 +37,8 @@ def main() -> None:
     wishes = parser.parse_args()
     fit = json.loads(wishes.weights.read_text())["person"]
     fields: dict[str, Any] = {
-        "version": wishes.version, "created": f"{datetime.now(UTC):%Y-%m-%d}",
+        "version": wishes.version,
+        "created": f"{datetime.now(UTC):%Y-%m-%d}",
         "second_look": {"person": {key: fit[key] for key in KEYS}},
     }
     for name in MODELS:
@@ -47,7 +50,10 @@ def main() -> None:
         card |= fields
         if name != "default":
             card["of"] = f"default, version {wishes.version}"
-        card |= {"sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "bytes": path.stat().st_size}
+        card |= {
+            "sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "bytes": path.stat().st_size,
+        }
         card["second_look_fit"] = {"threshold_own": fit["threshold"]} | {
             key: fit[key] for key in ("reports", "photos", "right_and_false")
         }
@@ -63,19 +69,26 @@ def people_of(row: dict[str, Any]) -> dict[str, Any]:
     """A set's figures of people, without the course of their curve."""
     people = {
         key: {name: share for name, share in value.items() if name != "found_from_score_on"}
-        if isinstance(value, dict) else value
+        if isinstance(value, dict)
+        else value
         for key, value in row["person"].items()
     }
-    return {key: row[key] for key in ("photos", "pictures", "times_scored") if key in row} | {"person": people}
+    return {key: row[key] for key in ("photos", "pictures", "times_scored") if key in row} | {
+        "person": people
+    }
 
 
-def repack(path: Path, fields: dict[str, Any], of_card: Mapping[str, Any] = MappingProxyType({})) -> None:
+def repack(
+    path: Path, fields: dict[str, Any], of_card: Mapping[str, Any] = MappingProxyType({})
+) -> None:
     """Set fields of a packed model, its `version` among them, in the file and its card, which has those of `of_card`
     besides."""
     path.write_bytes(with_fields(path.read_bytes(), fields))
     before, version = json.loads(path.with_suffix(".json").read_text()), fields["version"]
     card = before | fields | of_card
-    if "measured" in before and before["version"] != version:  # figures stay those of the version that gave them
+    if (
+        "measured" in before and before["version"] != version
+    ):  # figures stay those of the version that gave them
         card.setdefault("measured_by", f"version {before['version']}, whose networks are the same")
     if "of" in card:
         card["of"] = f"default, version {version}"

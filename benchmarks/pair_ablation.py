@@ -35,10 +35,16 @@ def main() -> None:
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("--count", type=int, default=12, help="pairs of each suite")
-    parser.add_argument("--sites", type=int, default=4, help=f"simulated sites, {PAIRS_A_SITE} pairs each")
+    parser.add_argument(
+        "--sites", type=int, default=4, help=f"simulated sites, {PAIRS_A_SITE} pairs each"
+    )
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
-    parser.add_argument("--rules", nargs="*", help="names of rules; all without it, none with nothing after it")
-    parser.add_argument("--seeds-from", default=SEEDS_FROM, help="hash of a commit that seeds are drawn from")
+    parser.add_argument(
+        "--rules", nargs="*", help="names of rules; all without it, none with nothing after it"
+    )
+    parser.add_argument(
+        "--seeds-from", default=SEEDS_FROM, help="hash of a commit that seeds are drawn from"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     cv2.setNumThreads(1)
@@ -56,13 +62,27 @@ def main() -> None:
             f" things {each['things']} alarms {each['alarms']}"
         )
     sources = sorted({each.source for each in places})
-    options.output.write_text(json.dumps({
-        "benchmark": "pair_ablation", "pairs": options.count, "sites": options.sites, "seeds_from": options.seeds_from,
-        "sources": sources, "machine": machine(), "commit": commit(), "rows": rows,
-    }, indent=1) + "\n")
+    options.output.write_text(
+        json.dumps(
+            {
+                "benchmark": "pair_ablation",
+                "pairs": options.count,
+                "sites": options.sites,
+                "seeds_from": options.seeds_from,
+                "sources": sources,
+                "machine": machine(),
+                "commit": commit(),
+                "rows": rows,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
 
 
-def all_pairs(places: list[Ground], count: int, sites: int, seeds_from: str) -> Iterator[tuple[str, Pair]]:
+def all_pairs(
+    places: list[Ground], count: int, sites: int, seeds_from: str
+) -> Iterator[tuple[str, Pair]]:
     """The pairs of all suites, with the suite's name; simulated ones last."""
     has_photos = {each.source for each in places} != {"procedural"}
     for suite in SUITES:
@@ -91,7 +111,11 @@ def counts_of(pair: Pair, mask: np.ndarray) -> list[int]:
     truth, shown = pair.truth[counted], mask[counted]
     pixels = [int((truth & shown).sum()), int((~truth & shown).sum()), int((truth & ~shown).sum())]
     is_changed, is_shown = bool(truth.any()), bool(shown.any())
-    frame = [int(is_changed and is_shown), int(not is_changed and is_shown), int(is_changed and not is_shown)]
+    frame = [
+        int(is_changed and is_shown),
+        int(not is_changed and is_shown),
+        int(is_changed and not is_shown),
+    ]
     things, labels = cv2.connectedComponents(pair.truth.astype(np.uint8))
     hit = int((np.bincount(labels[mask], minlength=things)[1:] > 0).sum())
     regions, marks = cv2.connectedComponents(mask.astype(np.uint8))
@@ -99,28 +123,39 @@ def counts_of(pair: Pair, mask: np.ndarray) -> list[int]:
     return [*pixels, *frame, hit, false, things - 1 - hit]
 
 
-def row(name: str, outcomes: dict[str, dict[str, list[list[int]]]], rules: list[Rule]) -> dict[str, object]:
+def row(
+    name: str, outcomes: dict[str, dict[str, list[list[int]]]], rules: list[Rule]
+) -> dict[str, object]:
     """One rule's figures, and how they differ from those with all rules."""
     own = {suite: np.array(counts) for suite, counts in outcomes[name].items()}
     base = {suite: np.array(counts) for suite, counts in outcomes["all rules"].items()}
     total = np.sum([each.sum(axis=0) for each in own.values()], axis=0).tolist()
     result: dict[str, object] = {
-        "rule": name, "decision": next((each.decision for each in rules if each.name == name), ""),
-        "things": total[6:], "alarms": total[4],
+        "rule": name,
+        "decision": next((each.decision for each in rules if each.name == name), ""),
+        "things": total[6:],
+        "alarms": total[4],
     }
     rng = np.random.default_rng(0)
-    drawn = [{suite: rng.integers(len(each), size=len(each)) for suite, each in own.items()} for _ in range(400)]
+    drawn = [
+        {suite: rng.integers(len(each), size=len(each)) for suite, each in own.items()}
+        for _ in range(400)
+    ]
     for field, first in (("pixels", 0), ("frames", 3)):
         mean = mean_f1(own, first)
         changes = [
             mean_f1({suite: own[suite][rows] for suite, rows in each.items()}, first)
-            - mean_f1({suite: base[suite][rows] for suite, rows in each.items()}, first) for each in drawn
+            - mean_f1({suite: base[suite][rows] for suite, rows in each.items()}, first)
+            for each in drawn
         ]
         result[f"{field}_f1"] = round(mean, 2)
         result[f"{field}_change"] = round(mean - mean_f1(base, first), 2)
-        result[f"{field}_range"] = [round(float(each), 2) for each in np.percentile(changes, (2.5, 97.5))]
+        result[f"{field}_range"] = [
+            round(float(each), 2) for each in np.percentile(changes, (2.5, 97.5))
+        ]
     result["suites"] = {
-        suite: [round(f1(each.sum(axis=0)[first : first + 3]), 1) for first in (0, 3)] for suite, each in own.items()
+        suite: [round(f1(each.sum(axis=0)[first : first + 3]), 1) for first in (0, 3)]
+        for suite, each in own.items()
     }
     return result
 

@@ -69,14 +69,19 @@ json.dump({"cameras": rows, "points": points[:: max(1, len(points) // 20000)].to
 
 def main() -> None:
     """Run every program on every flight and write the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--flights", nargs="+", default=["brighton_beach", "caliterra"])
     parser.add_argument("--peer-bin", type=Path)
     parser.add_argument("--three-d", action="store_true")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
-    flights = {name: compared(options.data / name, options.peer_bin, options.three_d) for name in options.flights}
+    flights = {
+        name: compared(options.data / name, options.peer_bin, options.three_d)
+        for name in options.flights
+    }
     if options.output.is_file():
         keep_earlier(flights, json.loads(options.output.read_text()))
     result = {"benchmark": "peers", "machine": machine(), "commit": commit(), "flights": flights}
@@ -90,7 +95,9 @@ def keep_earlier(flights: dict[str, Any], before: dict[str, Any]) -> None:
         if name not in flights:
             flights[name] = {"commit": before["commit"]} | known
         elif "pyorthomosaic_3d" in known and "pyorthomosaic_3d" not in flights[name]:
-            flights[name]["pyorthomosaic_3d"] = {"commit": before["commit"]} | known["pyorthomosaic_3d"]
+            flights[name]["pyorthomosaic_3d"] = {"commit": before["commit"]} | known[
+                "pyorthomosaic_3d"
+            ]
 
 
 def compared(folder: Path, peer_bin: Path | None, three_d: bool) -> dict[str, Any]:
@@ -101,16 +108,30 @@ def compared(folder: Path, peer_bin: Path | None, three_d: bool) -> dict[str, An
         runs: dict[str, Any] = {"photos": len(photos)}
         centres: dict[str, dict[str, Sequence[float]]] = {}
         site = place / "site"
-        runs["sorvolo"] = measured([sys.executable, "-m", "sorvolo", "map", folder, "--site", site, "--model", "none"])
+        runs["sorvolo"] = measured(
+            [sys.executable, "-m", "sorvolo", "map", folder, "--site", site, "--model", "none"]
+        )
         centres["sorvolo"] = ours(site, runs["sorvolo"])
         found = place / "stitcher.json"
         runs["opencv_stitcher"] = measured([sys.executable, "-c", _STITCHER, found, *photos])
-        runs["opencv_stitcher"]["used"] = json.loads(found.read_text())["used"] if found.exists() else 0
+        runs["opencv_stitcher"]["used"] = (
+            json.loads(found.read_text())["used"] if found.exists() else 0
+        )
         if peer_bin is not None:
             runs["pyorthomosaic_2d"] = measured(
-                [peer_bin / "orthomosaic", folder, "-o", place / "po.tif", "--workers", "2", "--no-preview"]
+                [
+                    peer_bin / "orthomosaic",
+                    folder,
+                    "-o",
+                    place / "po.tif",
+                    "--workers",
+                    "2",
+                    "--no-preview",
+                ]
             )
-            centres["pyorthomosaic_2d"] = theirs(place / "po_report.json", photos[0], runs["pyorthomosaic_2d"])
+            centres["pyorthomosaic_2d"] = theirs(
+                place / "po_report.json", photos[0], runs["pyorthomosaic_2d"]
+            )
             if three_d:
                 runs["pyorthomosaic_3d"] = measured(
                     [peer_bin / "orthomosaic-3d", folder, "-o", place / "po3d", "--workers", "2"]
@@ -126,13 +147,17 @@ def measured(command: Sequence[Path | str]) -> dict[str, Any]:
     started_s = time.monotonic()
     environment = {**os.environ, "OMP_NUM_THREADS": "2"}
     child = subprocess.Popen(
-        ["timeout", str(_LIMIT_S), *map(str, command)], env=environment,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        ["timeout", str(_LIMIT_S), *map(str, command)],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     _, status, usage = os.wait4(child.pid, 0)
     return {
-        "exit": os.waitstatus_to_exitcode(status), "wall_s": round(time.monotonic() - started_s, 1),
-        "cpu_s": round(usage.ru_utime + usage.ru_stime, 1), "peak_memory_mb": round(usage.ru_maxrss / 1024),
+        "exit": os.waitstatus_to_exitcode(status),
+        "wall_s": round(time.monotonic() - started_s, 1),
+        "cpu_s": round(usage.ru_utime + usage.ru_stime, 1),
+        "peak_memory_mb": round(usage.ru_maxrss / 1024),
     }
 
 
@@ -141,11 +166,17 @@ def ours(site: Path, run: dict[str, Any]) -> dict[str, Sequence[float]]:
     frames = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())["features"]
     placed = [each for each in frames if each["properties"]["status"] == "vision"]
     run["used"] = len(placed)
-    corners = {each["properties"]["frame"]: np.array(each["geometry"]["coordinates"][0][:4]) for each in placed}
+    corners = {
+        each["properties"]["frame"]: np.array(each["geometry"]["coordinates"][0][:4])
+        for each in placed
+    }
     longitude, latitude = next(iter(corners.values()))[0]
     zone = 32600 + int((longitude + 180) // 6) + 1 + (100 if latitude < 0 else 0)
     to_utm = Transformer.from_crs(4326, zone, always_xy=True)
-    return {name: _crossing(np.column_stack(to_utm.transform(*points.T))) for name, points in corners.items()}
+    return {
+        name: _crossing(np.column_stack(to_utm.transform(*points.T)))
+        for name, points in corners.items()
+    }
 
 
 def _crossing(corners_m: np.ndarray) -> Sequence[float]:
@@ -159,14 +190,21 @@ def theirs(report: Path, photo: Path, run: dict[str, Any]) -> dict[str, Sequence
     """pyOrthomosaic's picture centres, from the affine maps of its report (pixels of the full photo to UTM metres)."""
     from PIL import Image
 
-    record = json.loads(report.read_text()) if report.exists() else {"images_used": 0, "cameras": {}}
+    record = (
+        json.loads(report.read_text()) if report.exists() else {"images_used": 0, "cameras": {}}
+    )
     run["used"] = record["images_used"]
     with Image.open(photo) as picture:
         middle = np.array([(picture.width - 1) / 2, (picture.height - 1) / 2, 1.0])
-    return {name: (np.array(each["affine"]) @ middle).tolist() for name, each in record["cameras"].items()}
+    return {
+        name: (np.array(each["affine"]) @ middle).tolist()
+        for name, each in record["cameras"].items()
+    }
 
 
-def colmap_centres(peer_bin: Path, folder: Path, place: Path, runs: dict[str, Any]) -> dict[str, Sequence[float]]:
+def colmap_centres(
+    peer_bin: Path, folder: Path, place: Path, runs: dict[str, Any]
+) -> dict[str, Sequence[float]]:
     """Where COLMAP's optical axes meet the plane through its points, in that plane's own coordinates."""
     found = place / "colmap.json"
     runs["colmap"] = measured([peer_bin / "python", "-c", _COLMAP, found, folder])
@@ -176,8 +214,13 @@ def colmap_centres(peer_bin: Path, folder: Path, place: Path, runs: dict[str, An
     runs["colmap"]["used"] = len(record["cameras"])
     points = np.array(record["points"])
     middle = np.median(points, axis=0)
-    near = points[np.linalg.norm(points - middle, axis=1) < 5 * np.median(np.linalg.norm(points - middle, axis=1))]
-    for _ in range(5):  # trees stand on one side of the ground only: the plane is fitted to what lies close to it
+    near = points[
+        np.linalg.norm(points - middle, axis=1)
+        < 5 * np.median(np.linalg.norm(points - middle, axis=1))
+    ]
+    for _ in range(
+        5
+    ):  # trees stand on one side of the ground only: the plane is fitted to what lies close to it
         middle = near.mean(axis=0)
         axes = np.linalg.svd(near - middle, full_matrices=False)[2]
         off = np.abs((near - middle) @ axes[2])
@@ -190,12 +233,17 @@ def colmap_centres(peer_bin: Path, folder: Path, place: Path, runs: dict[str, An
     return result
 
 
-def shape_rms_m(found_m: dict[str, Sequence[float]], reference: dict[str, Sequence[float]]) -> float | None:
+def shape_rms_m(
+    found_m: dict[str, Sequence[float]], reference: dict[str, Sequence[float]]
+) -> float | None:
     """Rms distance after the best similarity (mirrored or not) of the reference onto what was found, m."""
     names = sorted(set(found_m) & set(reference))
     if len(names) < 4:
         return None
-    here, there = np.array([found_m[each] for each in names]), np.array([reference[each] for each in names])
+    here, there = (
+        np.array([found_m[each] for each in names]),
+        np.array([reference[each] for each in names]),
+    )
     misses = []
     for mirror in (1.0, -1.0):
         moved = apply_homography(fit_similarity(here, there * [1.0, mirror]), there * [1.0, mirror])

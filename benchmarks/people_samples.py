@@ -17,7 +17,9 @@ from sorvolo.survey.objects import CLASSES
 from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample
 
 PERSON = 0
-_PLAIN = Augmentation(blur=0.0, haze=0.0, grey=0.0, noise=0.0)  # what is pasted gets the rest together with the ground
+_PLAIN = Augmentation(
+    blur=0.0, haze=0.0, grey=0.0, noise=0.0
+)  # what is pasted gets the rest together with the ground
 _FEW_BARE = 0.15  # of thermal crops without people
 _LEAST_SEEN, _LEAST_PX = 0.45, 11.0  # of a pasted person; less teaches nothing
 
@@ -45,7 +47,9 @@ class Shown:
     ignored: Floats
 
 
-def sources(data: Path, simulated: LabelledSet, ignored: Callable[[LabelledSet], LabelledSet]) -> list[Source]:
+def sources(
+    data: Path, simulated: LabelledSet, ignored: Callable[[LabelledSet], LabelledSet]
+) -> list[Source]:
     """All that people are learnt from. Pictures with unlabelled people pass through `ignored` first."""
     cars, dummy = ignored(aerial_cars(data)["train"]), mannequin(data)["train"]
     site, thermal = ground(data, "caliterra", "IMG_9354.jpg", "IMG_9399.jpg"), hituav(data)["train"]
@@ -72,7 +76,9 @@ class Painted:
         """One of them."""
         number = int(rng.integers(self._count))
         if number not in self._made:
-            self._made[number] = np.ascontiguousarray(painted_ground(picture, np.random.default_rng((number, 99))))
+            self._made[number] = np.ascontiguousarray(
+                painted_ground(picture, np.random.default_rng((number, 99)))
+            )
         return self._made[number]
 
 
@@ -91,20 +97,29 @@ def ground(data: Path, flight: str, first: str = "", last: str = "~") -> Labelle
     none = np.zeros((0, 4), np.float32)
     pictures = tuple(
         LabelledPicture(str(path), 1, 1, flight, none, np.zeros(0, np.int64), none)
-        for path in sorted((data.parent / "flights" / flight).glob("*.[jJ][pP][gG]")) if first <= path.name <= last
+        for path in sorted((data.parent / "flights" / flight).glob("*.[jJ][pP][gG]"))
+        if first <= path.name <= last
     )
     return LabelledSet(flight, CLASSES, pictures, frozenset({SMALL}))
 
 
 def shown(
-    source: Source, scenes: Sequence[Scene], read: Callable[[str], ImageRGB], side_px: int, rng: np.random.Generator,
+    source: Source,
+    scenes: Sequence[Scene],
+    read: Callable[[str], ImageRGB],
+    side_px: int,
+    rng: np.random.Generator,
     stones: Callable[["Shown", np.random.Generator], "Shown"] | None = None,
 ) -> Shown:
     """One picture to learn from; `stones` lays some on it."""
     pictures, plain = source.share.labelled.pictures, replace(_PLAIN, side_px=side_px)
     while True:
         picture = pictures[int(rng.integers(len(pictures)))]
-        own = people_of(cut_sample(source.seen(read(picture.path), rng), picture, source.share, CLASSES, plain, rng))
+        own = people_of(
+            cut_sample(
+                source.seen(read(picture.path), rng), picture, source.share, CLASSES, plain, rng
+            )
+        )
         if not source.least_px or len(own.boxes) or rng.random() < _FEW_BARE:
             break
     if source.least_px:
@@ -119,7 +134,11 @@ def shown(
 
 def people_of(sample: Sample) -> Shown:
     """The sample's people alone."""
-    return Shown(sample.image, sample.boxes[sample.labels == PERSON].astype(float), sample.ignored.astype(float))
+    return Shown(
+        sample.image,
+        sample.boxes[sample.labels == PERSON].astype(float),
+        sample.ignored.astype(float),
+    )
 
 
 def pasted(below: Shown, scene: Scene, rng: np.random.Generator) -> Shown:
@@ -132,7 +151,9 @@ def pasted(below: Shown, scene: Scene, rng: np.random.Generator) -> Shown:
     areas: dict[int, int] = {}
     soft = max(0.0, rng.normal(0.3, 0.45))  # as the ground below may be
     for number, (index, centre) in enumerate(places(scene, px_per_m, side, rng), 1):
-        cut = resized(scene.sprites[index], px_per_m / scene.px_per_m * rng.uniform(0.93, 1.07), turns, mirror)
+        cut = resized(
+            scene.sprites[index], px_per_m / scene.px_per_m * rng.uniform(0.93, 1.07), turns, mirror
+        )
         cut = softened(cut, soft)
         corner = np.round(centre - np.array(cut.shape[1::-1]) / 2).astype(int)
         if not _is_free(below.boxes, corner, cut.shape):
@@ -142,11 +163,15 @@ def pasted(below: Shown, scene: Scene, rng: np.random.Generator) -> Shown:
             areas[number] = area
     boxes, hidden = _boxes(owner, areas)
     return Shown(
-        np.clip(picture, 0, 255).astype(np.uint8), np.vstack([below.boxes, boxes]), np.vstack([below.ignored, hidden])
+        np.clip(picture, 0, 255).astype(np.uint8),
+        np.vstack([below.boxes, boxes]),
+        np.vstack([below.ignored, hidden]),
     )
 
 
-def places(scene: Scene, px_per_m: float, side: int, rng: np.random.Generator) -> list[tuple[int, Floats]]:
+def places(
+    scene: Scene, px_per_m: float, side: int, rng: np.random.Generator
+) -> list[tuple[int, Floats]]:
     """Which sprites are laid where, their centres (2,) px: alone or in groups, things among them."""
     count = int(rng.choice([0, 1, 2, 3, 5, 8], p=[0.12, 0.28, 0.2, 0.2, 0.12, 0.08]))
     people = rng.permutation(np.nonzero(scene.is_person)[0])[:count]
@@ -175,7 +200,9 @@ def resized(sprite: Sprite, scale: float, turns: int, mirror: bool) -> np.ndarra
     size = np.maximum(np.round(np.array(whole.shape[1::-1]) * scale), 2).astype(int)
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     to = (int(size[0]), int(size[1]))
-    small = np.dstack([cv2.resize(whole[..., part], to, interpolation=way) for part in (slice(4), 4)])
+    small = np.dstack(
+        [cv2.resize(whole[..., part], to, interpolation=way) for part in (slice(4), 4)]
+    )
     small = np.rot90(small, turns)
     return np.ascontiguousarray(small[:, ::-1] if mirror else small)
 
@@ -185,7 +212,9 @@ def softened(cut: np.ndarray, sigma_px: float) -> np.ndarray:
     if sigma_px < 0.25:
         return cut
     wide = np.pad(cut, ((2, 2), (2, 2), (0, 0)))
-    return np.dstack([cv2.GaussianBlur(wide[..., part], (0, 0), sigma_px) for part in (slice(4), 4)])
+    return np.dstack(
+        [cv2.GaussianBlur(wide[..., part], (0, 0), sigma_px) for part in (slice(4), 4)]
+    )
 
 
 def finished(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
@@ -196,7 +225,9 @@ def finished(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
     if rng.random() < 0.5:
         x = cv2.GaussianBlur(x, (0, 0), rng.uniform(0.3, 1.1))
     if rng.random() < 0.3:
-        x = x + rng.uniform(0.2, 0.8) * (x - cv2.GaussianBlur(x, (0, 0), 1.2))  # sharpened, as small cameras do
+        x = x + rng.uniform(0.2, 0.8) * (
+            x - cv2.GaussianBlur(x, (0, 0), 1.2)
+        )  # sharpened, as small cameras do
     if rng.random() < 0.5:
         x = x + rng.normal(0, rng.uniform(1, 8), x.shape).astype(np.float32)
     out = np.clip(x, 0, 255).astype(np.uint8)
@@ -210,12 +241,19 @@ def _is_free(boxes: Floats, corner: np.ndarray, shape: Sequence[int]) -> bool:
     """Whether a cut-out hides none of the real people."""
     left, top = corner
     right, bottom = left + shape[1], top + shape[0]
-    over = (boxes[:, 0] < right) & (boxes[:, 2] > left) & (boxes[:, 1] < bottom) & (boxes[:, 3] > top)
+    over = (
+        (boxes[:, 0] < right) & (boxes[:, 2] > left) & (boxes[:, 1] < bottom) & (boxes[:, 3] > top)
+    )
     return not over.any()
 
 
 def laid(
-    picture: np.ndarray, owner: np.ndarray, cut: np.ndarray, corner: np.ndarray, number: int, light: Floats,
+    picture: np.ndarray,
+    owner: np.ndarray,
+    cut: np.ndarray,
+    corner: np.ndarray,
+    number: int,
+    light: Floats,
     sunlight: float,
 ) -> int:
     """Lay one cut-out on the picture, in place; how many pixels it would have if all of it showed."""

@@ -70,22 +70,29 @@ class Planted:
 
     def paint(self, photo: Floats, image_from_site: Floats, gain: float = 1.0) -> None:
         """Put the thing on the photo, float32 (h, w, 3); `gain` is the photo's light over the cut-out's."""
-        ends = apply_homography(image_from_site, np.concatenate([self.outline_m, self.shadow_outline_m]))
+        ends = apply_homography(
+            image_from_site, np.concatenate([self.outline_m, self.shadow_outline_m])
+        )
         low = np.maximum(np.floor(ends.min(axis=0)).astype(int) - 8, 0)
         high = np.minimum(np.ceil(ends.max(axis=0)).astype(int) + 9, photo.shape[1::-1])
         if (high <= low).any():
             return
-        part = photo[low[1]:high[1], low[0]:high[0]]
+        part = photo[low[1] : high[1], low[0] : high[0]]
         to_part = np.array([[1, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]]) @ image_from_site
         size = part.shape[1], part.shape[0]
-        shade = np.max([
-            self._laid(self.cutout.alpha, to_part @ self._site_from_sprite(share), size)
-            for share in np.linspace(0, 1, 9)
-        ], axis=0)
+        shade = np.max(
+            [
+                self._laid(self.cutout.alpha, to_part @ self._site_from_sprite(share), size)
+                for share in np.linspace(0, 1, 9)
+            ],
+            axis=0,
+        )
         lit = part * (1 - self.darkness * cv2.GaussianBlur(shade, (0, 0), 1.5)[..., None])
         to_part = to_part @ self._site_from_sprite(0.0)
         cover = self._laid(self.cutout.alpha, to_part, size)[..., None]
-        part[:] = lit * (1 - cover) + cover * np.clip(self._laid(self.cutout.rgb, to_part, size) * gain, 0, 255)
+        part[:] = lit * (1 - cover) + cover * np.clip(
+            self._laid(self.cutout.rgb, to_part, size) * gain, 0, 255
+        )
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -94,22 +101,36 @@ class Planted:
         high, wide = self.cutout.alpha.shape
         m_per_px = self.cutout.length_m / max(high, wide)
         turn, along = np.radians([self.angle_deg, self.shadow_deg])
-        east, north = np.array([np.cos(turn), np.sin(turn)]), np.array([np.sin(turn), -np.cos(turn)])
+        east, north = (
+            np.array([np.cos(turn), np.sin(turn)]),
+            np.array([np.sin(turn), -np.cos(turn)]),
+        )
         corner = self.place_m + share * self.shadow_m * np.array([np.cos(along), np.sin(along)])
         corner = corner - m_per_px * ((wide - 1) / 2 * east + (high - 1) / 2 * north)
-        return np.array([[*(m_per_px * np.array([east[0], north[0]])), corner[0]],
-                         [*(m_per_px * np.array([east[1], north[1]])), corner[1]], [0, 0, 1]])
+        return np.array(
+            [
+                [*(m_per_px * np.array([east[0], north[0]])), corner[0]],
+                [*(m_per_px * np.array([east[1], north[1]])), corner[1]],
+                [0, 0, 1],
+            ]
+        )
 
     def _laid(self, picture: Floats, image_from_sprite: Floats, size: tuple[int, int]) -> Floats:
         """The cut-out as the photo shows it: made smaller first, so that no pixel is skipped."""
         high, wide = picture.shape[:2]
-        ends = apply_homography(image_from_sprite, np.array([[0, 0], [wide - 1, 0], [0, high - 1]], float))
-        scale = min(1.0, np.linalg.norm(ends[1] - ends[0]) / wide, np.linalg.norm(ends[2] - ends[0]) / high)
+        ends = apply_homography(
+            image_from_sprite, np.array([[0, 0], [wide - 1, 0], [0, high - 1]], float)
+        )
+        scale = min(
+            1.0, np.linalg.norm(ends[1] - ends[0]) / wide, np.linalg.norm(ends[2] - ends[0]) / high
+        )
         small = max(2, round(wide * scale)), max(2, round(high * scale))
         shown = cv2.resize(picture, small, interpolation=cv2.INTER_AREA)
         full_from_small = np.diag([wide / small[0], high / small[1], 1.0])
         full_from_small[:2, 2] = 0.5 * np.diag(full_from_small)[:2] - 0.5
-        return cv2.warpPerspective(shown, image_from_sprite @ full_from_small, size, flags=cv2.INTER_LINEAR)
+        return cv2.warpPerspective(
+            shown, image_from_sprite @ full_from_small, size, flags=cv2.INTER_LINEAR
+        )
 
 
 def cutouts(data: Path, kind: str, rng: np.random.Generator) -> Iterator[Cutout]:
@@ -117,7 +138,9 @@ def cutouts(data: Path, kind: str, rng: np.random.Generator) -> Iterator[Cutout]
     chosen = []
     for name, labels in SETS.items():
         folder = data / "detection" / name
-        chosen += [(path, labels) for path in sorted(folder.glob("*.txt")) if path.stem != "classes"]
+        chosen += [
+            (path, labels) for path in sorted(folder.glob("*.txt")) if path.stem != "classes"
+        ]
     for number in rng.permutation(len(chosen)):
         path, labels = chosen[number]
         wanted = _labelled(path, labels, kind)
@@ -137,8 +160,14 @@ def in_light_of(cutout: Cutout, ground: Floats, is_low: bool, rng: np.random.Gen
         rgb = ground + shift + 0.3 * (cutout.rgb - mean)
     else:
         rgb = cutout.rgb * float(np.clip(ground.mean() / 110, 0.5, 1.5))
-    return Cutout(cutout.kind, cutout.label, np.float32(np.clip(rgb, 0, 255)), cutout.alpha, cutout.length_m,
-                  cutout.height_m)
+    return Cutout(
+        cutout.kind,
+        cutout.label,
+        np.float32(np.clip(rgb, 0, 255)),
+        cutout.alpha,
+        cutout.length_m,
+        cutout.height_m,
+    )
 
 
 def contrast(cutout: Cutout, ground: Floats) -> float:
@@ -155,13 +184,16 @@ def _labelled(path: Path, labels: tuple[str, ...], kind: str) -> list[tuple[str,
 
 def _rides(box: Floats, boxes: list[tuple[str, Floats]]) -> bool:
     """Whether another label's middle lies in the box, or this one's in another's: a person on a bicycle, in a car."""
+
     def holds(outer: Floats, inner: Floats) -> bool:
         return bool((np.abs(outer[:2] - inner[:2]) < 0.5 * outer[2:]).all())
 
     return any(other is not box and (holds(other, box) or holds(box, other)) for _, other in boxes)
 
 
-def _cut(picture: np.ndarray, box: Floats, kind: str, label: str, rng: np.random.Generator) -> Cutout | None:
+def _cut(
+    picture: np.ndarray, box: Floats, kind: str, label: str, rng: np.random.Generator
+) -> Cutout | None:
     """One label's thing; None where it is too small, cut by the picture's rim, or not clear."""
     size = np.array(picture.shape[1::-1])
     low, high = (box[:2] - box[2:] / 2) * size, (box[:2] + box[2:] / 2) * size
@@ -169,10 +201,13 @@ def _cut(picture: np.ndarray, box: Floats, kind: str, label: str, rng: np.random
     shape = SHAPES[label]
     if max(sides) < LEAST_SIDE_PX[kind] or not shape[0] <= max(sides) / min(sides) <= shape[1]:
         return None
-    from_px, to_px = np.floor(low - MARGIN * sides).astype(int), np.ceil(high + MARGIN * sides).astype(int)
+    from_px, to_px = (
+        np.floor(low - MARGIN * sides).astype(int),
+        np.ceil(high + MARGIN * sides).astype(int),
+    )
     if (from_px < 0).any() or (to_px > size).any():
         return None
-    crop = picture[from_px[1]:to_px[1], from_px[0]:to_px[0]]
+    crop = picture[from_px[1] : to_px[1], from_px[0] : to_px[0]]
     scale = min(1.0, SIDE_PX / max(crop.shape[:2]))
     crop = cv2.resize(crop, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     inner = np.round(np.array([*(low - from_px), *sides]) * scale).astype(int)
@@ -187,9 +222,15 @@ def _cut(picture: np.ndarray, box: Floats, kind: str, label: str, rng: np.random
         return None
     alpha = cv2.GaussianBlur(thing.astype(np.float32), (0, 0), 0.8)
     x, y, wide, tall = cv2.boundingRect(thing)
-    window = np.s_[max(y - 2, 0):y + tall + 2, max(x - 2, 0):x + wide + 2]
-    return Cutout(kind, label, crop[window][..., ::-1].astype(np.float32), alpha[window],
-                  float(rng.uniform(*LENGTH_M[label])), HEIGHT_M[label])
+    window = np.s_[max(y - 2, 0) : y + tall + 2, max(x - 2, 0) : x + wide + 2]
+    return Cutout(
+        kind,
+        label,
+        crop[window][..., ::-1].astype(np.float32),
+        alpha[window],
+        float(rng.uniform(*LENGTH_M[label])),
+        HEIGHT_M[label],
+    )
 
 
 def _one_part(mask: np.ndarray, box_px: float) -> np.ndarray | None:

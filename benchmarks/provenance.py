@@ -30,7 +30,9 @@ def machine() -> dict[str, str | int]:
                 model = line.partition(":")[2].strip()
                 break
     return {
-        "cpu": model, "cores": os.cpu_count() or 0, "python": platform.python_version(),
+        "cpu": model,
+        "cores": os.cpu_count() or 0,
+        "python": platform.python_version(),
         "opencv": cv2.__version__,
     }
 
@@ -41,7 +43,15 @@ def commit(repository: Path = Path(__file__).parents[1]) -> str:
     Result files do not count: a benchmark writes them. Empty where there is no repository.
     """
     head = _git(repository, "rev-parse", "--short", "HEAD")
-    changed = _git(repository, "status", "--porcelain", "--untracked-files=no", "--", ".", ":!benchmarks/results")
+    changed = _git(
+        repository,
+        "status",
+        "--porcelain",
+        "--untracked-files=no",
+        "--",
+        ".",
+        ":!benchmarks/results",
+    )
     return f"{head}-dirty" if head and changed else head
 
 
@@ -52,7 +62,8 @@ def drawn_seeds(benchmark: str, count: int, hash_of_commit: str | None = None) -
     """
     drawn_from = (hash_of_commit or commit()).removesuffix("-dirty")
     return [
-        _FIRST_DRAWN + int.from_bytes(hashlib.sha256(f"{drawn_from} {benchmark} {number}".encode()).digest()[:8])
+        _FIRST_DRAWN
+        + int.from_bytes(hashlib.sha256(f"{drawn_from} {benchmark} {number}".encode()).digest()[:8])
         % _DRAWN_RANGE
         for number in range(count)
     ]
@@ -63,7 +74,9 @@ def fresh_seeds(
 ) -> list[int]:
     """As `drawn_seeds`, but never one that the ledger has: a commit that is measured again gets others."""
     scored = {
-        int(seed) for held_out in _known(ledger) if held_out.startswith(f"{benchmark}, seeds ")
+        int(seed)
+        for held_out in _known(ledger)
+        if held_out.startswith(f"{benchmark}, seeds ")
         for seed in re.findall(r"\d+", held_out.removeprefix(benchmark))
     }
     drawn = drawn_seeds(benchmark, count + len(scored), hash_of_commit)
@@ -89,5 +102,7 @@ def _known(ledger: Path) -> dict[str, int]:
 
 
 def _git(repository: Path, *words: str) -> str:
-    done = subprocess.run(["git", *words], cwd=repository, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["git", *words], cwd=repository, capture_output=True, text=True, check=False
+    )
     return done.stdout.strip() if done.returncode == 0 else ""

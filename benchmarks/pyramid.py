@@ -37,12 +37,22 @@ from train_default_model import CLASSES, reader
 RESULTS = Path(__file__).parent / "results" / "pyramid.json"
 CAR, LEAST, MOST_PX = 1, 0.02, 6_600_000
 BASES: Mapping[str, tuple[float, ...]] = {
-    THERMAL: (0.5, 1.0), "tinyperson": (0.4,), "rendered people": (0.5, 1.0), "rendered things": (0.5, 1.0),
-    "fixed_wing": (1.0,), "painted": (1.0,), "brighton_beach": (0.5,), "caliterra": (0.5,), "cats": (1.0,),
+    THERMAL: (0.5, 1.0),
+    "tinyperson": (0.4,),
+    "rendered people": (0.5, 1.0),
+    "rendered things": (0.5, 1.0),
+    "fixed_wing": (1.0,),
+    "painted": (1.0,),
+    "brighton_beach": (0.5,),
+    "caliterra": (0.5,),
+    "cats": (1.0,),
 }
 SIZES = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 SETTINGS = (
-    *((sizes, 32, 1.0) for sizes in ((1.0, 1.5), (1.0, 1.5, 2.0), (1.0, 1.5, 2.0, 3.0), (0.5, 0.75, 1.0))),
+    *(
+        (sizes, 32, 1.0)
+        for sizes in ((1.0, 1.5), (1.0, 1.5, 2.0), (1.0, 1.5, 2.0, 3.0), (0.5, 0.75, 1.0))
+    ),
     *((SIZES, known_px, octaves) for known_px in (24, 32, 44) for octaves in (0.7, 1.0, 1.5)),
 )
 EVERY = 4  # HIT-UAV has many frames: those whose number this divides
@@ -60,26 +70,50 @@ class Searched:
 
 def main() -> None:
     """Search, put together, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path, help="the folder of the labelled sets")
     parser.add_argument("--model", default="default")
     parser.add_argument("--scenes", type=Path, required=True, help="people and things")
-    parser.add_argument("--things", type=Path, required=True, help="scenes of which only the things are laid")
+    parser.add_argument(
+        "--things", type=Path, required=True, help="scenes of which only the things are laid"
+    )
     parser.add_argument("--results", type=Path, default=RESULTS)
     wishes = parser.parse_args()
     looker = Looker(wishes.model)
     by_place: dict[str, list[Searched]] = {}
-    for shot in (*shots(wishes.data, read_scenes(wishes.scenes), read_scenes(wishes.things)), *streets(wishes.data)):
+    for shot in (
+        *shots(wishes.data, read_scenes(wishes.scenes), read_scenes(wishes.things)),
+        *streets(wishes.data),
+    ):
         for each in searched(looker, shot):
             if each.place not in by_place:
                 print(each.place, flush=True)
             by_place.setdefault(each.place, []).append(each)
     thresholds = looker.whole.info.thresholds
-    rows = {place: sizes_of(each) | {"reported": reported(each, thresholds)} for place, each in by_place.items()}
-    wishes.results.write_text(json.dumps(plain_json({
-        "benchmark": "pyramid", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-        "model": wishes.model, "version": looker.whole.info.version, "packed": PACKED, "sets": rows,
-    }), indent=1) + "\n")
+    rows = {
+        place: sizes_of(each) | {"reported": reported(each, thresholds)}
+        for place, each in by_place.items()
+    }
+    wishes.results.write_text(
+        json.dumps(
+            plain_json(
+                {
+                    "benchmark": "pyramid",
+                    "machine": machine(),
+                    "commit": commit(),
+                    "date": time.strftime("%Y-%m-%d"),
+                    "model": wishes.model,
+                    "version": looker.whole.info.version,
+                    "packed": PACKED,
+                    "sets": rows,
+                }
+            ),
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def streets(data: Path) -> Iterator[Shot]:
@@ -98,11 +132,18 @@ def searched(looker: Looker, shot: Shot) -> Iterator[Searched]:
         picture = resized(shot.image, base)
         seen = {size: first_look(looker, picture, size) for size in SIZES if fits(picture, size)}
         truth = LabelledPicture(
-            shot.name, picture.shape[1], picture.shape[0], shot.truth.group, shot.truth.boxes_px * base,
-            shot.truth.labels, shot.truth.ignored_px * base,
+            shot.name,
+            picture.shape[1],
+            picture.shape[0],
+            shot.truth.group,
+            shot.truth.boxes_px * base,
+            shot.truth.labels,
+            shot.truth.ignored_px * base,
         )
         sizes = (1.0, *PACKED["times"])
-        packed = pyramid_of(sizes, seen, label, PACKED["known_px"], PACKED["octaves"], PACKED["shift"])
+        packed = pyramid_of(
+            sizes, seen, label, PACKED["known_px"], PACKED["octaves"], PACKED["shift"]
+        )
         reports = {"one size": only(seen[1.0], label), "pyramid": packed}
         again = {
             name: looker.whole._seen_again(looker.whole._session, picture, each, (CLASSES[label],))
@@ -114,7 +155,9 @@ def searched(looker: Looker, shot: Shot) -> Iterator[Searched]:
 def resized(picture: ImageRGB, times: float) -> ImageRGB:
     """The picture so many times as large."""
     way = cv2.INTER_AREA if times < 1 else cv2.INTER_LINEAR
-    shown = picture if times == 1 else cv2.resize(picture, None, fx=times, fy=times, interpolation=way)
+    shown = (
+        picture if times == 1 else cv2.resize(picture, None, fx=times, fy=times, interpolation=way)
+    )
     return np.ascontiguousarray(shown, np.uint8)
 
 
@@ -136,13 +179,20 @@ def only(seen: Seen, label: int) -> Seen:
 
 
 def pyramid_of(
-    sizes: Sequence[float], seen: Mapping[float, Seen], label: int, known_px: float, octaves: float,
+    sizes: Sequence[float],
+    seen: Mapping[float, Seen],
+    label: int,
+    known_px: float,
+    octaves: float,
     shift: float = 0.0,
 ) -> Seen:
     """What the looks in these sizes agree on."""
     there = [size for size in sizes if size in seen]
     return agreed_in_sizes(
-        [seen[size] for size in there], there, label, Pyramid(tuple(sizes), float(known_px), float(octaves), shift)
+        [seen[size] for size in there],
+        there,
+        label,
+        Pyramid(tuple(sizes), float(known_px), float(octaves), shift),
     )
 
 
@@ -155,11 +205,15 @@ def sizes_of(pictures: Sequence[Searched]) -> dict[str, object]:
         return rows
     every = [size for size in SIZES if all(size in each.seen for each in pictures)]
     rows["alone"] = {
-        str(size): accuracy(pictures, [only(each.seen[size], label) for each in pictures], label) for size in every
+        str(size): accuracy(pictures, [only(each.seen[size], label) for each in pictures], label)
+        for size in every
     }
     rows["pyramids"] = [
-        {"sizes": sizes, "known_px": known_px, "octaves": octaves} | accuracy(
-            pictures, [pyramid_of(sizes, each.seen, label, known_px, octaves) for each in pictures], label
+        {"sizes": sizes, "known_px": known_px, "octaves": octaves}
+        | accuracy(
+            pictures,
+            [pyramid_of(sizes, each.seen, label, known_px, octaves) for each in pictures],
+            label,
         )
         for sizes, known_px, octaves in SETTINGS
     ]
@@ -181,13 +235,16 @@ def reported(pictures: Sequence[Searched], thresholds: Mapping[str, float]) -> d
     rows: dict[str, object] = {}
     for name in pictures[0].reports:
         found = [each.reports[name] for each in pictures]
-        count = sum(int(np.count_nonzero(each.scores >= thresholds[CLASSES[label]])) for each in found)
+        count = sum(
+            int(np.count_nonzero(each.scores >= thresholds[CLASSES[label]])) for each in found
+        )
         rows[name] = {"reports": count}
         if any((each.truth.labels == label).any() for each in pictures):
             scores = score_set(as_set(pictures), as_detections(found), CLASSES, thresholds, draws=1)
             row = next(each for each in scores.classes if each.label == CLASSES[label])
             rows[name] = accuracy(pictures, found, label) | {
-                "found": round(100 * row.reported.recall, 1), "right": round(100 * row.reported.precision, 1),
+                "found": round(100 * row.reported.recall, 1),
+                "right": round(100 * row.reported.precision, 1),
             }
     return rows
 
@@ -195,7 +252,9 @@ def reported(pictures: Sequence[Searched], thresholds: Mapping[str, float]) -> d
 def as_set(pictures: Sequence[Searched]) -> LabelledSet:
     """The pictures as a labelled set."""
     return LabelledSet(
-        pictures[0].place, CLASSES, tuple(replace(each.truth, path=str(row)) for row, each in enumerate(pictures)),
+        pictures[0].place,
+        CLASSES,
+        tuple(replace(each.truth, path=str(row)) for row, each in enumerate(pictures)),
         frozenset({CLASSES[2]}),
     )
 

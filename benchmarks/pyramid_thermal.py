@@ -29,7 +29,9 @@ CLASSES = {"person": PERSON, "car": CAR}
 
 def main() -> None:
     """Search, put together, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path, help="the folder of the labelled sets")
     parser.add_argument("--results", type=Path, default=RESULTS)
     wishes = parser.parse_args()
@@ -37,7 +39,9 @@ def main() -> None:
     frames: list[Searched] = []
     for each in hituav(wishes.data)["val"].pictures:
         frame = rgb_from_picture(read(each.path))
-        frames.append(Searched("hituav", each, {size: session.see(frame, size) for size in SIZES}, {}))
+        frames.append(
+            Searched("hituav", each, {size: session.see(frame, size) for size in SIZES}, {})
+        )
         print(len(frames), flush=True)
     alone = {
         str(size): {
@@ -47,16 +51,37 @@ def main() -> None:
         for size in SIZES
     }
     pyramids = [
-        {"sizes": sizes, "known_px": known_px, "octaves": octaves} | {
-            name: accuracy(frames, [pyramid_of(sizes, each.seen, label, known_px, octaves) for each in frames], label)
+        {"sizes": sizes, "known_px": known_px, "octaves": octaves}
+        | {
+            name: accuracy(
+                frames,
+                [pyramid_of(sizes, each.seen, label, known_px, octaves) for each in frames],
+                label,
+            )
             for name, label in CLASSES.items()
         }
-        for sizes in PYRAMIDS for known_px in KNOWN_PX for octaves in OCTAVES
+        for sizes in PYRAMIDS
+        for known_px in KNOWN_PX
+        for octaves in OCTAVES
     ]
-    wishes.results.write_text(json.dumps(plain_json({
-        "benchmark": "pyramid_thermal", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-        "version": session.info.version, "frames": len(frames), "alone": alone, "pyramids": pyramids,
-    }), indent=1) + "\n")
+    wishes.results.write_text(
+        json.dumps(
+            plain_json(
+                {
+                    "benchmark": "pyramid_thermal",
+                    "machine": machine(),
+                    "commit": commit(),
+                    "date": time.strftime("%Y-%m-%d"),
+                    "version": session.info.version,
+                    "frames": len(frames),
+                    "alone": alone,
+                    "pyramids": pyramids,
+                }
+            ),
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 if __name__ == "__main__":

@@ -34,20 +34,38 @@ class QuickTable:
 
 
 TABLES = {
-    "mosaic_methods": QuickTable("mosaic_methods", ("--count", "1", "--methods", "planar", "thesis"), 2.0),
+    "mosaic_methods": QuickTable(
+        "mosaic_methods", ("--count", "1", "--methods", "planar", "thesis"), 2.0
+    ),
     "planar_survey": QuickTable(
-        "mosaic_methods", ("--methods", "planar", "--output", str(HERE / "results" / "planar_survey.json")), 1.2,
+        "mosaic_methods",
+        ("--methods", "planar", "--output", str(HERE / "results" / "planar_survey.json")),
+        1.2,
     ),
     "watch_counts": QuickTable("watch_counts", (), 7.2),
     "peers": QuickTable(
-        "peers", ("{data}/flights", "--flights", "brighton_beach", "--peer-bin", "{peers}", "--three-d"), 4.7,
+        "peers",
+        ("{data}/flights", "--flights", "brighton_beach", "--peer-bin", "{peers}", "--three-d"),
+        4.7,
     ),
-    "change_methods": QuickTable("change_methods", ("--split", "test", "--data", "{data}", "--jobs", "1"), 4.1),
+    "change_methods": QuickTable(
+        "change_methods", ("--split", "test", "--data", "{data}", "--jobs", "1"), 4.1
+    ),
     "change_events": QuickTable("change_events", ("--count", "1", "--methods", "robust"), 8.5),
     "thesis_tables": QuickTable("thesis_tables", (), 8.5),
     "planar_sand": QuickTable(
-        "mosaic_methods", ("--count", "1", "--preset", "sand", "--methods", "planar", "--output",
-                           str(HERE / "results" / "planar_sand.json")), 0.3,
+        "mosaic_methods",
+        (
+            "--count",
+            "1",
+            "--preset",
+            "sand",
+            "--methods",
+            "planar",
+            "--output",
+            str(HERE / "results" / "planar_sand.json"),
+        ),
+        0.3,
     ),
     "real_flights": QuickTable("real_flights", ("{data}/flights",), 3.0),
     "first_look": QuickTable("first_look", (), 2.6),
@@ -57,11 +75,17 @@ TABLES = {
 
 def main() -> None:
     """Run them in order, or list what there is."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(TABLES)}; else all")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"of {', '.join(TABLES)}; else all"
+    )
     parser.add_argument("--data", type=Path, help="the folder of real data")
     parser.add_argument("--peer-bin", type=Path)
-    parser.add_argument("--list", action="store_true", help="only print the commit of each result file")
+    parser.add_argument(
+        "--list", action="store_true", help="only print the commit of each result file"
+    )
     options = parser.parse_args()
     if unknown := [name for name in options.names if name not in TABLES]:
         parser.error(f"there is no table {', '.join(unknown)}; there are {', '.join(TABLES)}")
@@ -79,15 +103,26 @@ def main() -> None:
 
 def made(name: str, table: QuickTable, places: dict[str, Path | None]) -> bool:
     """Run one benchmark; False where it failed. One that needs a folder that was not given is left out."""
-    missing = [key for key, place in places.items() if place is None and f"{{{key}}}" in " ".join(table.arguments)]
+    missing = [
+        key
+        for key, place in places.items()
+        if place is None and f"{{{key}}}" in " ".join(table.arguments)
+    ]
     if missing:
         print(f"{name}: left out, needs the folder of {' and of '.join(missing)}", flush=True)
         return True
     words = [each.format(**places) for each in table.arguments]
     before_s = _children_s()
-    done = subprocess.run([sys.executable, HERE / f"{table.script}.py", *words], stdout=subprocess.DEVNULL, check=False)
+    done = subprocess.run(
+        [sys.executable, HERE / f"{table.script}.py", *words],
+        stdout=subprocess.DEVNULL,
+        check=False,
+    )
     minutes = (_children_s() - before_s) / 60
-    print(f"{name}: exit {done.returncode}, {minutes:.1f} min of processor time (about {table.minutes:g})", flush=True)
+    print(
+        f"{name}: exit {done.returncode}, {minutes:.1f} min of processor time (about {table.minutes:g})",
+        flush=True,
+    )
     return done.returncode == 0
 
 

@@ -34,11 +34,19 @@ _SEED = 1
 
 def main() -> None:
     """Tie the later flight of every pair to the earlier map, with and without GPS."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
-    parser.add_argument("--keep", type=Path, required=True,
-                        help="folder for photos and maps, used again when run again")
-    parser.add_argument("--pairs", nargs="+", default=[*real_dates.HELD_OUT, *real_dates.DEVELOPMENT])
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        required=True,
+        help="folder for photos and maps, used again when run again",
+    )
+    parser.add_argument(
+        "--pairs", nargs="+", default=[*real_dates.HELD_OUT, *real_dates.DEVELOPMENT]
+    )
     options = parser.parse_args()
     truth = json.loads((real_dates.HERE / "real_dates.json").read_text())
     runs = []
@@ -47,7 +55,13 @@ def main() -> None:
         for gps in ("1 m", "none"):
             runs.append({"pair": name, "gps": gps, **tied(pair, gps, options.data, options.keep)})
             print(json.dumps(runs[-1]))
-    result = {"benchmark": "real_base", "commit": commit(), "machine": machine(), "seed": _SEED, "runs": runs}
+    result = {
+        "benchmark": "real_base",
+        "commit": commit(),
+        "machine": machine(),
+        "seed": _SEED,
+        "runs": runs,
+    }
     RESULTS.write_text(json.dumps(result, indent=1) + "\n")
 
 
@@ -56,7 +70,10 @@ def tied(pair: real_dates.Pair, gps: str, data: Path, keep: Path) -> dict[str, A
     earlier, later = pair.name.split("/")
     first, size_px = real_dates.fly(data, earlier, 2 * _SEED)
     second, _ = real_dates.fly(data, later, 2 * _SEED + 1)
-    mapped, flown = keep / f"photos_{earlier}_{2 * _SEED}_known", keep / f"photos_{later}_{2 * _SEED + 1}_none"
+    mapped, flown = (
+        keep / f"photos_{earlier}_{2 * _SEED}_known",
+        keep / f"photos_{later}_{2 * _SEED + 1}_none",
+    )
     shown = real_dates.write_photos(first, mapped, size_px, "known", real_dates.begins_ns(earlier))
     seen = real_dates.write_photos(second, flown, size_px, "none", real_dates.begins_ns(later))
     base, site = keep / f"map_{earlier}_{2 * _SEED}", keep / "tied"
@@ -66,28 +83,39 @@ def tied(pair: real_dates.Pair, gps: str, data: Path, keep: Path) -> dict[str, A
     if gps == "none":
         flown = without_telemetry(flown)
     shutil.rmtree(site, ignore_errors=True)
-    tying = map_flights([flown], site, MapSettings(model="none"), camera=keep / "camera.xml", base=base)
+    tying = map_flights(
+        [flown], site, MapSettings(model="none"), camera=keep / "camera.xml", base=base
+    )
     try:
         deque(tying, 0)
     except InputError as error:
         return {"frames": len(seen), "refused": str(error).replace(str(base), "MAP")}
     with Archive.open(base, write=False) as archive:
         frame = archive.site().frame
-        map_from_true = real_dates.map_error(first, shown, map_frames(base, archive.site())[mapped.name], frame)
+        map_from_true = real_dates.map_error(
+            first, shown, map_frames(base, archive.site())[mapped.name], frame
+        )
     with Archive.open(site, write=False) as archive:
         theirs, rows = archive.site().frame, map_frames(site, archive.site())[flown.name]
         report = archive.report(flown.name)
     errors_m = []
     for row in rows:
         if row.status == "vision":
-            true_px = real_dates.pixels(real_dates.footprint(second.camera, second.true_poses[seen[row.name]]), size_px)
+            true_px = real_dates.pixels(
+                real_dates.footprint(second.camera, second.true_poses[seen[row.name]]), size_px
+            )
             on_a_m = real_dates.metres(pair.a_from_b(true_px, size_px), size_px)
-            expected_m = apply_homography(map_from_true, real_dates.moved_frame(on_a_m, second.site, frame))
+            expected_m = apply_homography(
+                map_from_true, real_dates.moved_frame(on_a_m, second.site, frame)
+            )
             there_m = real_dates.moved_frame(row.outline_m, theirs, frame)
             errors_m.append(float(np.median(np.linalg.norm(there_m - expected_m, axis=1))))
     return {
-        "frames": len(seen), "matched": len(errors_m), "found_on_base": report["base"]["found"],
-        "error_median_m": round(float(np.median(errors_m)), 3), "error_most_m": round(max(errors_m), 3),
+        "frames": len(seen),
+        "matched": len(errors_m),
+        "found_on_base": report["base"]["found"],
+        "error_median_m": round(float(np.median(errors_m)), 3),
+        "error_most_m": round(max(errors_m), 3),
     }
 
 

@@ -69,7 +69,12 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.store.exports.flight_files import video_writer, write_camera, write_photo, write_telemetry
+from sorvolo.store.exports.flight_files import (
+    video_writer,
+    write_camera,
+    write_photo,
+    write_telemetry,
+)
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.frame_rows import FrameRow
 
@@ -77,7 +82,10 @@ HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "real_dates.json"
 HELD_OUT = ("2023-10-14/2024-02-24",)
 DEVELOPMENT = (
-    "2024-02-24/2024-03-01", "2024-03-01/2024-03-12", "2023-09-26/2023-10-14", "2024-02-24/2024-03-12",
+    "2024-02-24/2024-03-01",
+    "2024-03-01/2024-03-12",
+    "2023-09-26/2023-10-14",
+    "2024-02-24/2024-03-12",
 )
 DATES = ("2023-09-26", "2023-10-14", "2024-02-24", "2024-03-01", "2024-03-12")
 PAIRS = tuple(f"{earlier}/{later}" for earlier, later in itertools.combinations(DATES, 2))
@@ -87,8 +95,11 @@ RIGHT_M = 2.0
 _APRON_PX = 700  # grey around the orthophoto: photos that show any of it are left out
 _EDGE_M = 4.0  # nor do photos show the orthophoto's rim
 TAKEN = {
-    "2023-09-26": "2023-09-26T14:08", "2023-10-14": "2023-10-14T10:09", "2024-02-24": "2024-02-24T11:36",
-    "2024-03-01": "2024-03-01T11:43", "2024-03-12": "2024-03-12T11:43",
+    "2023-09-26": "2023-09-26T14:08",
+    "2023-10-14": "2023-10-14T10:09",
+    "2024-02-24": "2024-02-24T11:36",
+    "2024-03-01": "2024-03-01T11:43",
+    "2024-03-12": "2024-03-12T11:43",
 }
 _LEAST_OVERLAP, _MOST_TIMES, _LEAST_COVERED, _FALSE_SHARE = 0.25, 10.0, 0.4, 0.5
 _CELL_M = 0.25  # overlaps are counted in cells of this side
@@ -104,7 +115,9 @@ class Step:
     def a_from_b(self, points_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
         """(N, 2) pixels of the earlier orthophoto of those of the later one, (N, 2)."""
         at = (points_px / (np.array(size_px) - 1) * 8).clip(0, 8).astype(np.float32)
-        moved = cv2.remap(self.moved_px.astype(np.float32), at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0]
+        moved = cv2.remap(
+            self.moved_px.astype(np.float32), at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR
+        )[:, 0]
         return points_px @ self.b_to_a[:, :2].T + self.b_to_a[:, 2] + moved
 
 
@@ -119,10 +132,19 @@ class Pair:
     def of(cls, name: str, stored: dict[str, Any]) -> "Pair":
         """That pair, by the transforms of real_dates.json: its own, or those from date to date."""
         earlier, later = name.split("/")
-        dates = DATES[DATES.index(earlier):DATES.index(later) + 1]
-        names = [name] if name in stored else [f"{one}/{other}" for one, other in itertools.pairwise(dates)]
-        return cls(name, tuple(Step(np.array(stored[each]["b_to_a"]), np.array(stored[each]["moved_px"]))
-                               for each in names))
+        dates = DATES[DATES.index(earlier) : DATES.index(later) + 1]
+        names = (
+            [name]
+            if name in stored
+            else [f"{one}/{other}" for one, other in itertools.pairwise(dates)]
+        )
+        return cls(
+            name,
+            tuple(
+                Step(np.array(stored[each]["b_to_a"]), np.array(stored[each]["moved_px"]))
+                for each in names
+            ),
+        )
 
     def a_from_b(self, points_px: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
         """(N, 2) pixels of the earlier orthophoto of those of the later one, (N, 2)."""
@@ -133,38 +155,74 @@ class Pair:
 
 def main() -> None:
     """Score the pairs that were asked for."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--pairs", nargs="+", choices=PAIRS, default=HELD_OUT)
-    parser.add_argument("--attitude", nargs="+", choices=("none", "known", "wrong"), default=("none", "known"),
-                        help="of the later flight; wrong: the compass is 90 degrees off")
-    parser.add_argument("--taken", choices=("photos", "video"), default="photos", help="the later flight")
-    parser.add_argument("--model", default="none", help="that looks for objects on both dates; none unless given")
+    parser.add_argument(
+        "--attitude",
+        nargs="+",
+        choices=("none", "known", "wrong"),
+        default=("none", "known"),
+        help="of the later flight; wrong: the compass is 90 degrees off",
+    )
+    parser.add_argument(
+        "--taken", choices=("photos", "video"), default="photos", help="the later flight"
+    )
+    parser.add_argument(
+        "--model", default="none", help="that looks for objects on both dates; none unless given"
+    )
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--keep", type=Path, required=True,
-                        help="folder for photos and maps, used again when run again")
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        required=True,
+        help="folder for photos and maps, used again when run again",
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     truth = json.loads((HERE / "real_dates.json").read_text())
     for name in options.pairs:
         pair = Pair.of(name, truth["pairs"])
         for attitude in options.attitude:
-            run = {"pair": name, "attitude": attitude, "taken": options.taken, "seed": options.seed,
-                   "model": options.model, **score(pair, attitude, truth, options)}
+            run = {
+                "pair": name,
+                "attitude": attitude,
+                "taken": options.taken,
+                "seed": options.seed,
+                "model": options.model,
+                **score(pair, attitude, truth, options),
+            }
             append(options.output, run)
-            print(json.dumps({key: value for key, value in run.items() if not isinstance(value, list)}, indent=1))
+            print(
+                json.dumps(
+                    {key: value for key, value in run.items() if not isinstance(value, list)},
+                    indent=1,
+                )
+            )
 
 
 def append(output: Path, run: dict[str, Any]) -> None:
     """Add a run to the results, with its date, commit and machine."""
-    record = json.loads(output.read_text()) if output.is_file() else {"benchmark": "real_dates", "runs": []}
+    record = (
+        json.loads(output.read_text())
+        if output.is_file()
+        else {"benchmark": "real_dates", "runs": []}
+    )
     record = {**record, "held_out": HELD_OUT, "development": DEVELOPMENT, "right_m": RIGHT_M}
-    stamp = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", "commit": commit(), "machine": machine()}
+    stamp = {
+        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}",
+        "commit": commit(),
+        "machine": machine(),
+    }
     record["runs"].append(stamp | run)
     output.write_text(json.dumps(record, indent=1) + "\n")
 
 
-def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Namespace) -> dict[str, Any]:
+def score(
+    pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Namespace
+) -> dict[str, Any]:
     """Map the earlier date, compare the later one, and measure both."""
     earlier, later = pair.name.split("/")
     folder = options.keep / pair.name.replace("/", "_")
@@ -180,14 +238,22 @@ def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Na
     base = options.keep / f"map_{earlier}_{2 * options.seed}_{options.model}"
     if not (base / "mosaic.tif").is_file():
         shutil.rmtree(base, ignore_errors=True)
-        deque(map_flights([mapped], base, MapSettings(model=options.model), camera=options.keep / "camera.xml"), 0)
+        deque(
+            map_flights(
+                [mapped], base, MapSettings(model=options.model), camera=options.keep / "camera.xml"
+            ),
+            0,
+        )
     site = folder / f"{attitude}_{options.model}_{options.taken}"
     shutil.rmtree(site, ignore_errors=True)
     shutil.copytree(base, site)
     started, cpu = time.monotonic(), time.process_time()
     settings = CompareSettings(model=options.model)
     updates = list(compare_flights([flown], site, settings, camera=options.keep / "camera.xml"))
-    took = {"wall_s": round(time.monotonic() - started, 1), "cpu_s": round(time.process_time() - cpu, 1)}
+    took = {
+        "wall_s": round(time.monotonic() - started, 1),
+        "cpu_s": round(time.process_time() - cpu, 1),
+    }
     with Archive.open(site, write=False) as archive:
         frame = archive.site().frame
         rows = map_frames(site, archive.site())
@@ -195,9 +261,15 @@ def score(pair: Pair, attitude: str, truth: dict[str, Any], options: argparse.Na
     map_from_true = map_error(first, shown, rows[mapped.name], frame)
     views = placed_right(pair, second, seen, rows[name], frame, map_from_true, size_px)
     report = json.loads((site / "flights" / name / "report.json").read_text())["comparison"]
-    result = {**took, **views, "statuses": dict(Counter(each.status.value for each in updates if not each.comes_again)),
-              "reasons": report["reasons"], "compared_m2": report["compared_area_m2"],
-              "residual_px": report["residual_px"], "with_flight": report["with_flight"]}
+    result = {
+        **took,
+        **views,
+        "statuses": dict(Counter(each.status.value for each in updates if not each.comes_again)),
+        "reasons": report["reasons"],
+        "compared_m2": report["compared_area_m2"],
+        "residual_px": report["residual_px"],
+        "with_flight": report["with_flight"],
+    }
     drawn_by_hand = drawn_of(truth, pair.name)
     if drawn_by_hand is not None:
         events = site / "flights" / name / "changes.geojson"
@@ -210,24 +282,35 @@ def drawn_of(truth: dict[str, Any], name: str) -> dict[str, Any] | None:
     return truth if name == truth["changes_of"] else truth["others"].get(name)
 
 
-def fly(data: Path, date: str, seed: int, taken: str = "photos") -> tuple[SimulatedFlight, tuple[int, int]]:
+def fly(
+    data: Path, date: str, seed: int, taken: str = "photos"
+) -> tuple[SimulatedFlight, tuple[int, int]]:
     """A flight over one date's orthophoto, and the orthophoto's size; its middle is the site's origin. `taken` as
     "video", it keeps its heading and its turns lie over the orthophoto."""
     picture = cv2.imread(str(data / "building_site" / f"{date}.jpg"), cv2.IMREAD_COLOR)
     if picture is None:
         raise SystemExit(f"{data}/building_site/{date}.jpg is missing")
-    apron = cv2.copyMakeBorder(picture, *[_APRON_PX] * 4, cv2.BORDER_CONSTANT, value=(128, 128, 128))
+    apron = cv2.copyMakeBorder(
+        picture, *[_APRON_PX] * 4, cv2.BORDER_CONSTANT, value=(128, 128, 128)
+    )
     path, output = (228.0, 3, 72.0, 0.0), OutputSettings(photos=True, photo_overlap=0.82)
     if taken == "video":
         path, output = (180.0, 3, 66.0, 0.0, False), OutputSettings(telemetry="srt")
     settings = SimulationSettings(
-        seed=seed, flights=1, scene=SceneSettings("orthophoto", 0, 0, 0, has_scenery=False),
+        seed=seed,
+        flights=1,
+        scene=SceneSettings("orthophoto", 0, 0, 0, has_scenery=False),
         path=PathSettings(HEIGHT_M, 8.0, *path),
-        motion=MotionSettings(tilt_rms_deg=2.0, height_rms_m=1.0, drift_rms_m=1.0), imaging=ImagingSettings(fps=5),
-        sensor=SensorSettings(noise_m=(1.0, 1.0, 1.0)), output=output,
+        motion=MotionSettings(tilt_rms_deg=2.0, height_rms_m=1.0, drift_rms_m=1.0),
+        imaging=ImagingSettings(fps=5),
+        sensor=SensorSettings(noise_m=(1.0, 1.0, 1.0)),
+        output=output,
     )
     rgb = cv2.cvtColor(apron, cv2.COLOR_BGR2RGB)
-    return simulate_flight(settings, orthophoto_ground(rgb, M_PER_PX)), (picture.shape[1], picture.shape[0])
+    return simulate_flight(settings, orthophoto_ground(rgb, M_PER_PX)), (
+        picture.shape[1],
+        picture.shape[0],
+    )
 
 
 def begins_ns(date: str) -> int:
@@ -241,7 +324,8 @@ def write_photos(
     """Write the photos that show the orthophoto alone; their names and indices."""
     limit_m = np.array(size_px) * M_PER_PX / 2 - _EDGE_M
     chosen = {
-        flight.frame_name(index): index for index in range(len(flight))
+        flight.frame_name(index): index
+        for index in range(len(flight))
         if (np.abs(footprint(flight.camera, flight.true_poses[index])) < limit_m).all()
     }
     if folder.is_dir():
@@ -282,7 +366,9 @@ def write_video(
         if attitude == "wrong":
             columns["camera_yaw_deg"] = (columns["camera_yaw_deg"] + 90) % 360
         dialect = "srt-gps" if attitude == "none" else "srt"
-        stated = replace(telemetry, format=dialect, time_ns=telemetry.time_ns + later_ns, columns=columns)
+        stated = replace(
+            telemetry, format=dialect, time_ns=telemetry.time_ns + later_ns, columns=columns
+        )
         write_telemetry(video.with_suffix(".srt"), stated)
         size, fps = (flight.camera.width_px, flight.camera.height_px), flight.settings.imaging.fps
         with video_writer(video, size, fps, began_ns, flight.settings.output.crf) as write:
@@ -308,7 +394,9 @@ def true_outline_m(flight: SimulatedFlight, index: int, frame: LocalFrame) -> np
 
 def moved_frame(points_m: np.ndarray, theirs: LocalFrame, ours: LocalFrame) -> np.ndarray:
     """(N, 2) ground points of one local frame in another."""
-    latitude, longitude, _ = theirs.wgs84_from_site(np.column_stack([points_m, np.zeros(len(points_m))]))
+    latitude, longitude, _ = theirs.wgs84_from_site(
+        np.column_stack([points_m, np.zeros(len(points_m))])
+    )
     return ours.ground_from_lonlat(np.column_stack([longitude, latitude]))
 
 
@@ -317,20 +405,31 @@ def map_error(
 ) -> np.ndarray:
     """The similarity, (3, 3), from true places to where the map has them."""
     pairs = [
-        (row.outline_m, true_outline_m(flight, shown[row.name], frame)) for row in rows
+        (row.outline_m, true_outline_m(flight, shown[row.name], frame))
+        for row in rows
         if row.name in shown and np.isfinite(row.outline_m).all()
     ]
-    return fit_similarity(np.concatenate([mine for mine, _ in pairs]), np.concatenate([true for _, true in pairs]))
+    return fit_similarity(
+        np.concatenate([mine for mine, _ in pairs]), np.concatenate([true for _, true in pairs])
+    )
 
 
 def placed_right(
-    pair: Pair, flight: SimulatedFlight, seen: dict[str, int], rows: list[FrameRow], frame: LocalFrame,
-    map_from_true: np.ndarray, size_px: tuple[int, int],
+    pair: Pair,
+    flight: SimulatedFlight,
+    seen: dict[str, int],
+    rows: list[FrameRow],
+    frame: LocalFrame,
+    map_from_true: np.ndarray,
+    size_px: tuple[int, int],
 ) -> dict[str, Any]:
     """How many views were placed, and how many of them right."""
     errors_m, by_view = [], []
     for row in rows:
-        if row.status in ("rejected", "not-aligned", "outside", "lost") or not np.isfinite(row.outline_m).all():
+        if (
+            row.status in ("rejected", "not-aligned", "outside", "lost")
+            or not np.isfinite(row.outline_m).all()
+        ):
             by_view.append([row.name, None])
             continue
         true_px = pixels(footprint(flight.camera, flight.true_poses[seen[row.name]]), size_px)
@@ -339,29 +438,43 @@ def placed_right(
         errors_m.append(float(np.median(np.linalg.norm(row.outline_m - expected_m, axis=1))))
         by_view.append([row.name, round(errors_m[-1], 2)])
     return {
-        "views": len(by_view), "placed": len(errors_m), "right": sum(error < RIGHT_M for error in errors_m),
-        "error_median_m": round(float(np.median(errors_m)), 2) if errors_m else None, "error_m": by_view,
+        "views": len(by_view),
+        "placed": len(errors_m),
+        "right": sum(error < RIGHT_M for error in errors_m),
+        "error_median_m": round(float(np.median(errors_m)), 2) if errors_m else None,
+        "error_m": by_view,
     }
 
 
 def found(
-    events: Path, frame: LocalFrame, map_from_true: np.ndarray, truth: dict[str, Any], size_px: tuple[int, int]
+    events: Path,
+    frame: LocalFrame,
+    map_from_true: np.ndarray,
+    truth: dict[str, Any],
+    size_px: tuple[int, int],
 ) -> dict[str, Any]:
     """The events of a file against the polygons."""
     rings_m = {
-        feature["properties"]["id"]: frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:, :2])
+        feature["properties"]["id"]: frame.ground_from_lonlat(
+            np.array(feature["geometry"]["coordinates"][0])[:, :2]
+        )
         for feature in json.loads(events.read_text())["features"]
     }
     return found_among(rings_m, frame, map_from_true, truth, size_px)
 
 
 def found_among(
-    rings_m: dict[str, np.ndarray], frame: LocalFrame, map_from_true: np.ndarray, truth: dict[str, Any],
+    rings_m: dict[str, np.ndarray],
+    frame: LocalFrame,
+    map_from_true: np.ndarray,
+    truth: dict[str, Any],
     size_px: tuple[int, int],
 ) -> dict[str, Any]:
     """Events, the outlines (N, 2) in the site's metres by id, against the polygons."""
     reported = drawn_events(rings_m, frame, map_from_true, size_px)
-    everywhere = np.any([np.zeros(drawn_shape(size_px), bool), *(mask for _, mask in reported)], axis=0)
+    everywhere = np.any(
+        [np.zeros(drawn_shape(size_px), bool), *(mask for _, mask in reported)], axis=0
+    )
     cells = [np.nonzero(mask) for _, mask in reported]
     sizes = [len(rows) for rows, _ in cells]
     hits, covered, touching = {}, {}, set()
@@ -372,23 +485,38 @@ def found_among(
         hits[name] = is_hit(each["kind"], int(mask.sum()), overlaps, sizes)
         if each["kind"] == "area":
             covered[name] = round(float((mask & everywhere).sum() / mask.sum()), 2)
-    quiet = np.any([drawn(np.array(ring, float), size_px) for ring in truth["unchanged"].values()], axis=0)
-    false = [name for name, mask in reported if (mask & quiet).sum() >= _FALSE_SHARE * max(1, mask.sum())]
+    quiet = np.any(
+        [drawn(np.array(ring, float), size_px) for ring in truth["unchanged"].values()], axis=0
+    )
+    false = [
+        name for name, mask in reported if (mask & quiet).sum() >= _FALSE_SHARE * max(1, mask.sum())
+    ]
     return {
-        "found": sum(hits.values()), "drawn": len(hits), "by_kind": hits_by_kind(hits, truth), "false": len(false),
-        "unchanged_m2": round(float(quiet.sum()) * _CELL_M**2), "events": len(reported),
-        "elsewhere": len(reported) - len(touching) - len(false), "areas_covered": covered,
-        "missed": [name for name, hit in hits.items() if not hit], "false_ids": false,
+        "found": sum(hits.values()),
+        "drawn": len(hits),
+        "by_kind": hits_by_kind(hits, truth),
+        "false": len(false),
+        "unchanged_m2": round(float(quiet.sum()) * _CELL_M**2),
+        "events": len(reported),
+        "elsewhere": len(reported) - len(touching) - len(false),
+        "areas_covered": covered,
+        "missed": [name for name, hit in hits.items() if not hit],
+        "false_ids": false,
     }
 
 
 def drawn_events(
-    rings_m: dict[str, np.ndarray], frame: LocalFrame, map_from_true: np.ndarray, size_px: tuple[int, int]
+    rings_m: dict[str, np.ndarray],
+    frame: LocalFrame,
+    map_from_true: np.ndarray,
+    size_px: tuple[int, int],
 ) -> list[tuple[str, np.ndarray]]:
     """The cells of each event, by its id, on the ground of the drawn polygons."""
     true_from_map, found = np.linalg.inv(map_from_true), []
     for name, ring_m in rings_m.items():
-        there_m = moved_frame(apply_homography(true_from_map, ring_m), frame, LocalFrame(simulation_origin()))
+        there_m = moved_frame(
+            apply_homography(true_from_map, ring_m), frame, LocalFrame(simulation_origin())
+        )
         found.append((name, drawn(pixels(there_m, size_px), size_px)))
     return found
 

@@ -30,19 +30,33 @@ _GPS_IFD = 0x8825
 
 def main() -> None:
     """Map the flights and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--flights", nargs="+", choices=FLIGHTS, default=FLIGHTS)
     options = parser.parse_args()
     result = json.loads(options.output.read_text()) if options.output.is_file() else {}
-    flights = {name: each if "commit" in each else each | {"commit": result["commit"]}
-               for name, each in result.get("flights", {}).items()}
-    flights |= {name: mapped(options.data / name) | {"commit": commit()} for name in options.flights}
-    result |= {"benchmark": "real_flights", "machine": machine(), "commit": commit(), "flights": flights}
+    flights = {
+        name: each if "commit" in each else each | {"commit": result["commit"]}
+        for name, each in result.get("flights", {}).items()
+    }
+    flights |= {
+        name: mapped(options.data / name) | {"commit": commit()} for name in options.flights
+    }
+    result |= {
+        "benchmark": "real_flights",
+        "machine": machine(),
+        "commit": commit(),
+        "flights": flights,
+    }
     if "brighton_beach" in options.flights:
         withheld = [withheld_rms_m(options.data / "brighton_beach", parity) for parity in (1, 0)]
-        result["brighton_beach_withheld_rms_m"] = {"odd photos": withheld[0], "even photos": withheld[1]}
+        result["brighton_beach_withheld_rms_m"] = {
+            "odd photos": withheld[0],
+            "even photos": withheld[1],
+        }
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
     print(json.dumps(result, indent=1))
@@ -57,7 +71,9 @@ def mapped(folder: Path) -> dict[str, object]:
         report = json.loads(next(Path(site).glob("site/flights/*/report.json")).read_text())
     frames = {key: report["frames"][key] for key in ("selected", "vision", "gps-only", "rejected")}
     return {
-        **frames, "wall_s": round(wall_s, 1), "cpu_s": round(cpu_s, 1),
+        **frames,
+        "wall_s": round(wall_s, 1),
+        "cpu_s": round(cpu_s, 1),
         "peak_memory_mb": round(report["peak_memory_mb"]),
         "pieces": len(report["pieces"]),
         "gps_residual_median_m": report["gps_residual_m"]["median"],
@@ -79,11 +95,20 @@ def withheld_rms_m(folder: Path, parity: int) -> float:
                 (photos / path.name).write_bytes(path.read_bytes())
                 continue
             metadata = read_photo_metadata(path)
-            taken_out[path.name] = (metadata.columns["latitude_deg"], metadata.columns["longitude_deg"])
+            taken_out[path.name] = (
+                metadata.columns["latitude_deg"],
+                metadata.columns["longitude_deg"],
+            )
             with Image.open(path) as picture:
                 exif = picture.getexif()
                 del exif[_GPS_IFD]
-                picture.save(photos / path.name, "JPEG", exif=exif, xmp=picture.info.get("xmp", b""), quality=95)
+                picture.save(
+                    photos / path.name,
+                    "JPEG",
+                    exif=exif,
+                    xmp=picture.info.get("xmp", b""),
+                    quality=95,
+                )
         list(map_flights([photos], Path(scratch) / "site", MapSettings(model="none")))
         found = json.loads(next(Path(scratch).glob("site/flights/*/frames.geojson")).read_text())
     frame = LocalFrame(Geodetic(*next(iter(taken_out.values()))))

@@ -72,14 +72,25 @@ def main() -> None:
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=layout)
     parser.add_argument("data", type=Path, help="folder with flights/ and detection/")
-    parser.add_argument("--keep", type=Path, required=True, help="folder for maps, used again when run again")
+    parser.add_argument(
+        "--keep", type=Path, required=True, help="folder for maps, used again when run again"
+    )
     parser.add_argument("--flights", nargs="+", choices=tuple(FLIGHTS), default=tuple(FLIGHTS))
     parser.add_argument("--planted", nargs="+", choices=("no", "yes"), default=("no", "yes"))
     parser.add_argument("--things", type=int, default=12, help="planted on each pair of strips")
-    parser.add_argument("--seed", type=int, help="of what is planted where; else drawn from the commit, and new")
-    parser.add_argument("--moved", nargs="*", default=[], metavar="FLIGHT/STRIPS/ID",
-                        help="events of an unplanted run that pictures showed to be real: only counted, in RESULTS")
-    parser.add_argument("--pictures", type=Path, help="folder for a picture of each false event: before, after")
+    parser.add_argument(
+        "--seed", type=int, help="of what is planted where; else drawn from the commit, and new"
+    )
+    parser.add_argument(
+        "--moved",
+        nargs="*",
+        default=[],
+        metavar="FLIGHT/STRIPS/ID",
+        help="events of an unplanted run that pictures showed to be real: only counted, in RESULTS",
+    )
+    parser.add_argument(
+        "--pictures", type=Path, help="folder for a picture of each false event: before, after"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     if options.moved:
@@ -91,11 +102,18 @@ def main() -> None:
         whole = map_of(options.data / "flights" / name, options.keep / name / "whole")
         for planted in options.planted:
             scoring = note_scoring(f"real_none, {name}, planted {planted}")
-            pairs = [measured(name, pair, whole, seed if planted == "yes" else None, options)
-                     for pair in FLIGHTS[name].pairs]
+            pairs = [
+                measured(name, pair, whole, seed if planted == "yes" else None, options)
+                for pair in FLIGHTS[name].pairs
+            ]
             run = {
-                "flight": name, "is_development_data": not FLIGHTS[name].is_held_out, "planted": planted,
-                "seed": seed if planted == "yes" else None, **scoring, "summary": pooled(pairs), "pairs": pairs,
+                "flight": name,
+                "is_development_data": not FLIGHTS[name].is_held_out,
+                "planted": planted,
+                "seed": seed if planted == "yes" else None,
+                **scoring,
+                "summary": pooled(pairs),
+                "pairs": pairs,
             }
             append(options.output, run)
             print(name, "planted:", planted, json.dumps(run["summary"], indent=1), flush=True)
@@ -103,8 +121,16 @@ def main() -> None:
 
 def append(output: Path, run: dict[str, Any]) -> None:
     """Add a run to the results, with its date, commit and machine."""
-    document = json.loads(output.read_text()) if output.is_file() else {"benchmark": "real_none", "runs": []}
-    stamp = {"date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}", "commit": commit(), "machine": machine()}
+    document = (
+        json.loads(output.read_text())
+        if output.is_file()
+        else {"benchmark": "real_none", "runs": []}
+    )
+    stamp = {
+        "date": f"{datetime.now(UTC):%Y-%m-%d %H:%M}",
+        "commit": commit(),
+        "machine": machine(),
+    }
     document["runs"].append(stamp | run)
     output.write_text(json.dumps(document, indent=1) + "\n")
 
@@ -113,7 +139,11 @@ def mark_moved(output: Path, moved: list[str]) -> None:
     """Note in the latest unplanted runs which events were seen to be real, and count the false ones again."""
     document = json.loads(output.read_text())
     for name in {each.split("/")[0] for each in moved}:
-        run = next(each for each in reversed(document["runs"]) if each["flight"] == name and each["planted"] == "no")
+        run = next(
+            each
+            for each in reversed(document["runs"])
+            if each["flight"] == name and each["planted"] == "no"
+        )
         for pair in run["pairs"]:
             for event in pair["events"]:
                 event["moved"] = f"{name}/{pair['strips']}/{event['id']}" in moved
@@ -165,11 +195,18 @@ def measured(
     started = time.process_time()
     try:
         deque(map_flights([folder / "earlier"], folder / "site", MapSettings(model="none")), 0)
-        deque(compare_flights([folder / "later"], folder / "site", CompareSettings(model="none")), 0)
+        deque(
+            compare_flights([folder / "later"], folder / "site", CompareSettings(model="none")), 0
+        )
     except InputError as error:
         return {"strips": strips, "failure": str(error)}
     spent_s = round(time.process_time() - started, 1)
-    result = {"strips": strips, "photos": photos, "cpu_s": spent_s, **scored(name, folder, whole, things)}
+    result = {
+        "strips": strips,
+        "photos": photos,
+        "cpu_s": spent_s,
+        **scored(name, folder, whole, things),
+    }
     if options.pictures is not None:
         for event in result["events"]:
             crops = folder / "site" / "flights" / "later" / "changes"
@@ -178,13 +215,22 @@ def measured(
 
 
 def write_photos(
-    name: str, pair: tuple[int, int], whole: WholeMap, seed: int | None, folder: Path, options: argparse.Namespace
+    name: str,
+    pair: tuple[int, int],
+    whole: WholeMap,
+    seed: int | None,
+    folder: Path,
+    options: argparse.Namespace,
 ) -> tuple[list[tuple[Planted, str]], list[int]]:
     """Both strips' photos in their folders; what was planted on them with its fate, and how many photos each has."""
-    strips = [photos_of(options.data / "flights" / name, FLIGHTS[name].strips[number]) for number in pair]
+    strips = [
+        photos_of(options.data / "flights" / name, FLIGHTS[name].strips[number]) for number in pair
+    ]
     things = []
     if seed is not None:
-        planting = Planting(name, whole, strips, np.random.default_rng([seed, *pair]), pool(options.data, seed))
+        planting = Planting(
+            name, whole, strips, np.random.default_rng([seed, *pair]), pool(options.data, seed)
+        )
         things = planting.things(options.things)
     for part, shown, paths in zip(("earlier", "later"), FATES[::-1], strips):
         write_strip(folder / part, paths, [each for each, fate in things if fate == shown], whole)
@@ -195,11 +241,17 @@ class Planting:
     """Draws things for a pair of strips. Only `things` changes it: its random numbers go on."""
 
     def __init__(
-        self, name: str, whole: WholeMap, strips: list[list[Path]], rng: np.random.Generator,
+        self,
+        name: str,
+        whole: WholeMap,
+        strips: list[list[Path]],
+        rng: np.random.Generator,
         sources: dict[str, list[Cutout]],
     ) -> None:
         self._flight, self._whole, self._rng = FLIGHTS[name], whole, rng
-        self._photos = dict(zip(FATES, strips[::-1]))  # what appears is planted into the later strip
+        self._photos = dict(
+            zip(FATES, strips[::-1])
+        )  # what appears is planted into the later strip
         self._shown = {
             fate: [shrunk(whole.outline_m(path.name), _RIM_M) for path in paths]
             for fate, paths in self._photos.items()
@@ -230,9 +282,15 @@ class Planting:
         """One thing somewhere; None where too few photos show the place, in a crown, or of the other contrast."""
         cutout = self._sources[kind][int(self._rng.integers(len(self._sources[kind])))]
         if self._flight.is_grey:
-            cutout = replace(cutout, rgb=np.repeat(cutout.rgb.mean(axis=2, keepdims=True), 3, axis=2))
+            cutout = replace(
+                cutout, rgb=np.repeat(cutout.rgb.mean(axis=2, keepdims=True), 3, axis=2)
+            )
         place = drawn_place(self._shown[fate], self._rng)
-        seen = [path for path, outline in zip(self._photos[fate], self._shown[fate]) if outline.contains(Point(place))]
+        seen = [
+            path
+            for path, outline in zip(self._photos[fate], self._shown[fate])
+            if outline.contains(Point(place))
+        ]
         other = self._shown[FATES[1 - FATES.index(fate)]]
         if len(seen) < LEAST_VIEWS or not any(each.contains(Point(place)) for each in other):
             return None
@@ -244,7 +302,9 @@ class Planting:
         if not low <= contrast(lit, ground) < high:
             return None
         turn = float(self._rng.uniform(0, 360))
-        return Planted(lit, place, turn, self._shadow_deg, 0.6 * cutout.height_m, self._darkness, is_low)
+        return Planted(
+            lit, place, turn, self._shadow_deg, 0.6 * cutout.height_m, self._darkness, is_low
+        )
 
 
 @lru_cache(maxsize=1)
@@ -269,10 +329,22 @@ def ground_colour(path: Path, place_m: Floats, whole: WholeMap, reach_m: float) 
     """(3,) the mean RGB around a place in one photo."""
     photo = read(path)
     x, y = apply_homography(whole.image_from_site(path.name, photo.shape[1::-1]), place_m[None])[0]
-    reach = max(4, round(0.7 * reach_m / whole.m_per_px * photo.shape[1] / whole.keyframes[path.name].camera.width_px))
-    x, y = (int(np.clip(round(each), 0, most - 1)) for each, most in ((x, photo.shape[1]), (y, photo.shape[0])))
+    reach = max(
+        4,
+        round(
+            0.7
+            * reach_m
+            / whole.m_per_px
+            * photo.shape[1]
+            / whole.keyframes[path.name].camera.width_px
+        ),
+    )
+    x, y = (
+        int(np.clip(round(each), 0, most - 1))
+        for each, most in ((x, photo.shape[1]), (y, photo.shape[0]))
+    )
     left, top = max(0, x - reach), max(0, y - reach)
-    mean = photo[top:y + reach + 1, left:x + reach + 1].reshape(-1, 3).mean(axis=0)
+    mean = photo[top : y + reach + 1, left : x + reach + 1].reshape(-1, 3).mean(axis=0)
     return np.asarray(mean)
 
 
@@ -289,7 +361,9 @@ def write_strip(folder: Path, paths: list[Path], things: list[Planted], whole: W
     first: dict[int, Floats] = {}
     for path in paths:
         outline = Polygon(whole.outline_m(path.name)).buffer(2.0)
-        seen = [number for number, each in enumerate(things) if outline.contains(Point(each.place_m))]
+        seen = [
+            number for number, each in enumerate(things) if outline.contains(Point(each.place_m))
+        ]
         if not seen:
             (folder / path.name).symlink_to(path.resolve())
             continue
@@ -301,14 +375,20 @@ def write_strip(folder: Path, paths: list[Path], things: list[Planted], whole: W
             gain = float(np.clip(ground.mean() / first.setdefault(number, ground).mean(), 0.7, 1.4))
             thing.paint(photo, to_image, gain)
         with Image.open(path) as image:
-            kept = {"exif": image.getexif()} | ({"xmp": image.info["xmp"]} if "xmp" in image.info else {})
-        Image.fromarray(np.clip(photo, 0, 255).astype(np.uint8)).save(folder / path.name, quality=95, **kept)
+            kept = {"exif": image.getexif()} | (
+                {"xmp": image.info["xmp"]} if "xmp" in image.info else {}
+            )
+        Image.fromarray(np.clip(photo, 0, 255).astype(np.uint8)).save(
+            folder / path.name, quality=95, **kept
+        )
 
 
 # ---- scoring --------------------------------------------------------------------------------------------------------
 
 
-def scored(name: str, folder: Path, whole: WholeMap, things: list[tuple[Planted, str]]) -> dict[str, Any]:
+def scored(
+    name: str, folder: Path, whole: WholeMap, things: list[tuple[Planted, str]]
+) -> dict[str, Any]:
     """Events against what was planted, in the metres of the whole flight's map."""
     site = folder / "site"
     with Archive.open(site, write=False) as archive:
@@ -316,8 +396,12 @@ def scored(name: str, folder: Path, whole: WholeMap, things: list[tuple[Planted,
     rows = map_frames(site, described)
     whole_from_site = laid_on(whole, rows["earlier"])
     outlines = {
-        part: [row.outline_m for row in rows[part]
-               if row.status not in _UNKNOWN_GROUND and np.isfinite(row.outline_m).all()] for part in rows
+        part: [
+            row.outline_m
+            for row in rows[part]
+            if row.status not in _UNKNOWN_GROUND and np.isfinite(row.outline_m).all()
+        ]
+        for part in rows
     }
     ground = compared_ground(outlines["later"], outlines["earlier"])
     crowns = crowns_m(name, described.frame)
@@ -325,44 +409,71 @@ def scored(name: str, folder: Path, whole: WholeMap, things: list[tuple[Planted,
     events = []
     features = json.loads((site / "flights" / "later" / "changes.geojson").read_text())["features"]
     for feature in features:
-        ring = described.frame.ground_from_lonlat(np.array(feature["geometry"]["coordinates"][0])[:-1, :2])
+        ring = described.frame.ground_from_lonlat(
+            np.array(feature["geometry"]["coordinates"][0])[:-1, :2]
+        )
         keys = ("id", "kind", "score", "views", "area_m2", "length_m", "sigma_m")
-        events.append({
-            **{key: feature["properties"][key] for key in keys},
-            "moved": False, "in_crown": bool(within(crowns, ring.mean(axis=0)[None])[0]),
-            "outline": Polygon(apply_homography(whole_from_site, ring)).buffer(0),
-        })
+        events.append(
+            {
+                **{key: feature["properties"][key] for key in keys},
+                "moved": False,
+                "in_crown": bool(within(crowns, ring.mean(axis=0)[None])[0]),
+                "outline": Polygon(apply_homography(whole_from_site, ring)).buffer(0),
+            }
+        )
     report = json.loads((site / "flights" / "later" / "report.json").read_text())["comparison"]
     planted, events = matched(events, things, ground, np.linalg.inv(whole_from_site))
     return {
-        "views": report["views"], "reasons": report["reasons"], "outside_m2": round(ground.area_m2 - crown_m2),
-        "crowns_m2": round(crown_m2), "things": planted, "events": events,
+        "views": report["views"],
+        "reasons": report["reasons"],
+        "outside_m2": round(ground.area_m2 - crown_m2),
+        "crowns_m2": round(crown_m2),
+        "things": planted,
+        "events": events,
     }
 
 
 def laid_on(whole: WholeMap, rows: list[FrameRow]) -> Floats:
     """(3, 3) from metres of a strip's own map to those of the whole map, by the photos that both hold."""
-    pairs = [(row.outline_m, whole.outline_m(row.name)) for row in rows if np.isfinite(row.outline_m).all()]
-    return fit_similarity(np.concatenate([true for _, true in pairs]), np.concatenate([mine for mine, _ in pairs]))
+    pairs = [
+        (row.outline_m, whole.outline_m(row.name))
+        for row in rows
+        if np.isfinite(row.outline_m).all()
+    ]
+    return fit_similarity(
+        np.concatenate([true for _, true in pairs]), np.concatenate([mine for mine, _ in pairs])
+    )
 
 
 def matched(
-    events: list[dict[str, Any]], things: list[tuple[Planted, str]], ground: ComparedGround, site_from_whole: Floats
+    events: list[dict[str, Any]],
+    things: list[tuple[Planted, str]],
+    ground: ComparedGround,
+    site_from_whole: Floats,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """How each thing fared, and the events that lie on none; those that lie on a thing are counted there."""
     planted, explained = [], set()
     for thing, fate in things:
         own = Polygon(thing.outline_m).buffer(0)
         shaded = own.union(Polygon(thing.shadow_outline_m).buffer(0)).convex_hull
-        touching = {number for number, each in enumerate(events) if each["outline"].intersects(shaded.buffer(0.3))}
+        touching = {
+            number
+            for number, each in enumerate(events)
+            if each["outline"].intersects(shaded.buffer(0.3))
+        }
         explained |= touching
         place = apply_homography(site_from_whole, thing.place_m[None])
-        planted.append({
-            "kind": thing.cutout.kind, "label": thing.cutout.label, "when": fate,
-            "contrast": "low" if thing.is_low else "high", "compared": bool(ground.holds(place)[0]),
-            "place_m": [round(float(value), 1) for value in thing.place_m],
-            **fared([events[number] for number in sorted(touching)], own, shaded.area, fate),
-        })
+        planted.append(
+            {
+                "kind": thing.cutout.kind,
+                "label": thing.cutout.label,
+                "when": fate,
+                "contrast": "low" if thing.is_low else "high",
+                "compared": bool(ground.holds(place)[0]),
+                "place_m": [round(float(value), 1) for value in thing.place_m],
+                **fared([events[number] for number in sorted(touching)], own, shaded.area, fate),
+            }
+        )
     return planted, [listed(each) for number, each in enumerate(events) if number not in explained]
 
 
@@ -371,10 +482,16 @@ def listed(event: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in event.items() if key != "outline"}
 
 
-def fared(touching: list[dict[str, Any]], own: Polygon, shaded_m2: float, fate: str) -> dict[str, Any]:
+def fared(
+    touching: list[dict[str, Any]], own: Polygon, shaded_m2: float, fate: str
+) -> dict[str, Any]:
     """Whether events touch a thing and are not far larger, how many do, and whether one names what became of it."""
     most_m2 = _MOST_TIMES * max(shaded_m2, 0.2)
-    hits = [each["kind"] for each in touching if each["outline"].intersects(own) and each["outline"].area <= most_m2]
+    hits = [
+        each["kind"]
+        for each in touching
+        if each["outline"].intersects(own) and each["outline"].area <= most_m2
+    ]
     return {"found": bool(hits), "times": len(hits), "named_right": fate in hits}
 
 
@@ -384,9 +501,14 @@ def pooled(pairs: list[dict[str, Any]]) -> dict[str, Any]:
     ends = Counter(place_of(event) for pair in good for event in pair["events"])
     outside_m2, crowns_m2 = (sum(pair[key] for pair in good) for key in ("outside_m2", "crowns_m2"))
     return {
-        "pairs": len(pairs), "failed": len(pairs) - len(good), "hectares_outside_crowns": round(outside_m2 / 1e4, 3),
-        "false_outside_crowns": ends["outside"], "false_a_hectare": rate(ends["outside"], outside_m2),
-        "hectares_in_crowns": round(crowns_m2 / 1e4, 3), "false_in_crowns": ends["in_crowns"], "moved": ends["moved"],
+        "pairs": len(pairs),
+        "failed": len(pairs) - len(good),
+        "hectares_outside_crowns": round(outside_m2 / 1e4, 3),
+        "false_outside_crowns": ends["outside"],
+        "false_a_hectare": rate(ends["outside"], outside_m2),
+        "hectares_in_crowns": round(crowns_m2 / 1e4, 3),
+        "false_in_crowns": ends["in_crowns"],
+        "moved": ends["moved"],
         **found_words([each for pair in good for each in pair["things"] if each["compared"]]),
     }
 
@@ -405,7 +527,11 @@ def found_words(things: list[dict[str, Any]]) -> dict[str, Any]:
             hits[group] += each["found"]
     found = {group: f"{hits[group]} of {count}" for group, count in totals.items()}
     named = f"{sum(each['named_right'] for each in things)} of {hits['all']}"
-    return {"found": found, "twice": sum(each["times"] > 1 for each in things), "named_right": named} if things else {}
+    return (
+        {"found": found, "twice": sum(each["times"] > 1 for each in things), "named_right": named}
+        if things
+        else {}
+    )
 
 
 def rate(count: int, area_m2: float) -> float | None:
@@ -416,10 +542,16 @@ def rate(count: int, area_m2: float) -> float | None:
 def side_by_side(crops: Path, change_id: str, folder: Path) -> None:
     """One picture of a change: before, after."""
     folder.mkdir(parents=True, exist_ok=True)
-    pair = [cv2.imread(str(crops / f"{change_id}-{when}.png"), cv2.IMREAD_COLOR) for when in ("before", "after")]
+    pair = [
+        cv2.imread(str(crops / f"{change_id}-{when}.png"), cv2.IMREAD_COLOR)
+        for when in ("before", "after")
+    ]
     if all(picture is not None for picture in pair):
         scale = max(1, 320 // max(pair[0].shape[:2]))
-        pair = [cv2.resize(each, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST) for each in pair]
+        pair = [
+            cv2.resize(each, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
+            for each in pair
+        ]
         cv2.imwrite(str(folder / f"{change_id}.png"), np.hstack(pair))
 
 

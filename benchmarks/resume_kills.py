@@ -33,7 +33,12 @@ from sorvolo.simulation.presets import preset
 from sorvolo.simulation.settings import SimulationSettings
 
 EFFORT = (
-    "seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb", "reading", "latency_s",
+    "seconds",
+    "cpu_s",
+    "registration_cpu_s_per_keyframe",
+    "peak_memory_mb",
+    "reading",
+    "latency_s",
     "frames_per_second",
 )
 """Of report.json: what a run took."""
@@ -48,7 +53,11 @@ def simulated(width_px: int, length_m: float) -> SimulationSettings:
     """Two flights over one small site, the second with changes."""
     demo = preset("demo")
     imaging = replace(demo.imaging, width_px=width_px, height_px=width_px * 9 // 16, fps=6)
-    return replace(demo, path=replace(demo.path, length_m=length_m, strips=2, strip_spacing_m=6), imaging=imaging)
+    return replace(
+        demo,
+        path=replace(demo.path, length_m=length_m, strips=2, strip_spacing_m=6),
+        imaging=imaging,
+    )
 
 
 def content(site: Path) -> dict[str, bytes]:
@@ -61,7 +70,9 @@ def content(site: Path) -> dict[str, bytes]:
         if path.name == "report.json":
             report = json.loads(data)
             report.get("objects", {}).pop("seconds", None)
-            data = json.dumps({key: value for key, value in report.items() if key not in EFFORT}).encode()
+            data = json.dumps(
+                {key: value for key, value in report.items() if key not in EFFORT}
+            ).encode()
         found[str(path.relative_to(site))] = data
     return found
 
@@ -138,7 +149,18 @@ class Trial:
         if mission != "watch":
             return [*command, "--site", str(place), *shared]
         alert = f"{sys.executable} -c \"open('{self._alerts}', 'a').write('{{id}} ')\""
-        return [*command, "--out", str(place), *shared, "--save", "pictures", "--fps", "2", "--alert-command", alert]
+        return [
+            *command,
+            "--out",
+            str(place),
+            *shared,
+            "--save",
+            "pictures",
+            "--fps",
+            "2",
+            "--alert-command",
+            alert,
+        ]
 
 
 def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, object]]:
@@ -156,22 +178,36 @@ def rounds(options: argparse.Namespace, folder: Path) -> Iterator[dict[str, obje
             continue
         again = trial.run(place)
         found = content(place)
-        differing = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
+        differing = sorted(
+            name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name)
+        )
         resumed = re.search(r"continu(?:ing|ed) after (?:all )?(\d+) frame", again.printed)
-        rows.append({
-            "noted_s": round(stopped.noted_s, 2), "kill_s": round(stopped.seconds, 2),
-            "again_s": round(again.seconds, 2), "same": not differing,
-            "frames_taken_over": int(resumed[1]) if resumed else 0, "differing": differing[:10],
-            "alerts_lost": len(announced - trial.alerts()), "alerts_twice": len(trial.alerts() - announced),
-        })
+        rows.append(
+            {
+                "noted_s": round(stopped.noted_s, 2),
+                "kill_s": round(stopped.seconds, 2),
+                "again_s": round(again.seconds, 2),
+                "same": not differing,
+                "frames_taken_over": int(resumed[1]) if resumed else 0,
+                "differing": differing[:10],
+                "alerts_lost": len(announced - trial.alerts()),
+                "alerts_twice": len(trial.alerts() - announced),
+            }
+        )
         print(len(rows), rows[-1], flush=True)
         yield {
-            "mission": options.mission, "seed": options.seed, "width_px": options.width,
-            "length_m": options.length, "model": options.model,
-            "undisturbed_s": round(undisturbed.seconds, 2), "noted_s": round(undisturbed.noted_s, 2),
-            "alerts": announced.total(), "kills": len(rows),
+            "mission": options.mission,
+            "seed": options.seed,
+            "width_px": options.width,
+            "length_m": options.length,
+            "model": options.model,
+            "undisturbed_s": round(undisturbed.seconds, 2),
+            "noted_s": round(undisturbed.noted_s, 2),
+            "alerts": announced.total(),
+            "kills": len(rows),
             "same": sum(bool(each["same"]) for each in rows),
-            "resumed": sum(bool(each["frames_taken_over"]) for each in rows), "rounds": rows,
+            "resumed": sum(bool(each["frames_taken_over"]) for each in rows),
+            "rounds": rows,
         }
 
 
@@ -189,8 +225,12 @@ def main() -> None:
     out = options.out or Path(__file__).parent / "results" / f"resume_kills_{options.mission}.json"
     with tempfile.TemporaryDirectory() as folder:
         for result in rounds(options, Path(folder)):
-            out.write_text(json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n")
-    print(f"{result['same']} of {result['kills']} with the same bytes, {result['resumed']} went on; {out}")
+            out.write_text(
+                json.dumps({"machine": machine(), "commit": commit(), **result}, indent=1) + "\n"
+            )
+    print(
+        f"{result['same']} of {result['kills']} with the same bytes, {result['resumed']} went on; {out}"
+    )
 
 
 if __name__ == "__main__":

@@ -46,8 +46,12 @@ def main() -> None:
     parser.add_argument("--side", type=int, default=256)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--seeds", type=int, nargs="+", default=[301, 302, 303])
-    parser.add_argument("--every", type=int, default=4, help="of the held-out pictures, one in so many")
-    parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "rpn_comparison.json")
+    parser.add_argument(
+        "--every", type=int, default=4, help="of the held-out pictures, one in so many"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path(__file__).parent / "results" / "rpn_comparison.json"
+    )
     wishes = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
@@ -60,20 +64,34 @@ def main() -> None:
             torch.manual_seed(seed)
             model = arm_model(arm)
             model.backbone.load_imagenet(read_weights(wishes.weights).layers)
-            training = JointTraining(model, JointSettings(steps=wishes.steps, batch=wishes.batch, averaging=0.99), seed)
+            training = JointTraining(
+                model, JointSettings(steps=wishes.steps, batch=wishes.batch, averaging=0.99), seed
+            )
             share = Share(parts["train"], 1.0, (0.7, 1.6), thermal=True)
             crops = Augmentation(side_px=wishes.side)
             drawn = batches_from([share], CLASSES, reader(), crops, seed=seed, batch=wishes.batch)
             for batch in islice(drawn, wishes.steps):
                 training.learn(batch)
             trained_s = time.process_time() - started_s
-            row = {"seed": seed, "arm": arm, "cpu_s": round(trained_s), **score(training.average, held_out)}
+            row = {
+                "seed": seed,
+                "arm": arm,
+                "cpu_s": round(trained_s),
+                **score(training.average, held_out),
+            }
             rows.append(row)
             print(row, file=sys.stderr, flush=True)
             document = {
-                "machine": machine(), "commit": commit(), "seeds": wishes.seeds, "steps": wishes.steps,
-                "batch": wishes.batch, "side_px": wishes.side, "pictures": len(held_out),
-                "stem_weights_at_stride_4": stem_weights(), "runs": rows, "differences": differences(rows),
+                "machine": machine(),
+                "commit": commit(),
+                "seeds": wishes.seeds,
+                "steps": wishes.steps,
+                "batch": wishes.batch,
+                "side_px": wishes.side,
+                "pictures": len(held_out),
+                "stem_weights_at_stride_4": stem_weights(),
+                "runs": rows,
+                "differences": differences(rows),
             }
             wishes.out.write_text(json.dumps(document, indent=1) + "\n")
 
@@ -84,13 +102,17 @@ def arm_model(arm: str) -> FasterRCNN:
         return fast(CLASSES, arm)  # type: ignore[arg-type]
     model = fast(CLASSES, "standard")
     for index, wide in enumerate(model.neck.channels):
-        model.proposals.stems[index] = nn.Sequential(*(convolution(wide, wide, 3) for _ in range(plain_layers())))
+        model.proposals.stems[index] = nn.Sequential(
+            *(convolution(wide, wide, 3) for _ in range(plain_layers()))
+        )
     return model
 
 
 def plain_layers() -> int:
     """How many 3x3 convolutions have as many weights as the nine modules at this width."""
-    extended, _ = (weights_of(fast(CLASSES, each).proposals.stems[0]) for each in ("extended", "standard"))
+    extended, _ = (
+        weights_of(fast(CLASSES, each).proposals.stems[0]) for each in ("extended", "standard")
+    )
     return max(1, round(extended / weights_of(convolution(64, 64, 3))))
 
 
@@ -117,11 +139,17 @@ def score(model: FasterRCNN, labelled: LabelledSet) -> dict[str, float]:
 def differences(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Each other arm minus standard, and extended minus its equal in cost: mean and 95 % interval over seeds."""
     out = []
-    for better, base in (("extended", "standard"), ("equal-cost", "standard"), ("extended-residual", "standard"),
-                         ("extended", "equal-cost")):
+    for better, base in (
+        ("extended", "standard"),
+        ("equal-cost", "standard"),
+        ("extended-residual", "standard"),
+        ("extended", "equal-cost"),
+    ):
         for measure in ("person_ap50", "car_ap50"):
             pairs = [
-                (a[measure], b[measure]) for a in rows for b in rows
+                (a[measure], b[measure])
+                for a in rows
+                for b in rows
                 if a["arm"] == better and b["arm"] == base and a["seed"] == b["seed"]
             ]
             if len(pairs) < 2:
@@ -129,10 +157,17 @@ def differences(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             gaps = np.array([a - b for a, b in pairs])
             half = float(stats.t.ppf(0.975, len(gaps) - 1) * gaps.std(ddof=1) / np.sqrt(len(gaps)))
             mean = float(gaps.mean())
-            out.append({
-                "of": better, "against": base, "measure": measure, "mean": round(mean, 4),
-                "low": round(mean - half, 4), "high": round(mean + half, 4), "seeds": len(gaps),
-            })
+            out.append(
+                {
+                    "of": better,
+                    "against": base,
+                    "measure": measure,
+                    "mean": round(mean, 4),
+                    "low": round(mean - half, 4),
+                    "high": round(mean + half, 4),
+                    "seeds": len(gaps),
+                }
+            )
     return out
 
 

@@ -54,21 +54,43 @@ class Need:
 
 def main() -> None:
     """Read, compute, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("values", nargs="*", help="assumptions as NAME=VALUE")
     options = parser.parse_args()
-    given = {name: value for name, (value, _) in ASSUMPTIONS.items()} | changed(parser, options.values)
+    given = {name: value for name, (value, _) in ASSUMPTIONS.items()} | changed(
+        parser, options.values
+    )
     costs = json.loads((RESULTS / "unit_costs.json").read_text())["rows"]
     if f"photo, {given['photo_megapixels']:g} MP: map" not in costs:
-        parser.error(f"photos of {given['photo_megapixels']:g} megapixels were not measured: {', '.join(costs)} were")
+        parser.error(
+            f"photos of {given['photo_megapixels']:g} megapixels were not measured: {', '.join(costs)} were"
+        )
     station = json.loads((RESULTS / "station.json").read_text())
     print("### Assumptions\n")
-    print(table(("name", "value", "what"), ((name, f"{given[name]:g}", ASSUMPTIONS[name][1]) for name in ASSUMPTIONS)))
+    print(
+        table(
+            ("name", "value", "what"),
+            ((name, f"{given[name]:g}", ASSUMPTIONS[name][1]) for name in ASSUMPTIONS),
+        )
+    )
     print("### Unit costs\n")
-    print(table(("mission", "processor s", "start, s", "peak memory, MB", "kept, kB", "files"), unit_rows(costs)))
+    print(
+        table(
+            ("mission", "processor s", "start, s", "peak memory, MB", "kept, kB", "files"),
+            unit_rows(costs),
+        )
+    )
     print(f"### {given['streams']:,.0f} live streams\n")
     names = (
-        "work on each stream", "cores a stream", "cores", "memory, TB", "network, Gbit/s", "machines", "runs out first",
+        "work on each stream",
+        "cores a stream",
+        "cores",
+        "memory, TB",
+        "network, Gbit/s",
+        "machines",
+        "runs out first",
         "EUR a month",
     )
     print(table(names, (stream_row(each, given) for each in stream_needs(costs, station, given))))
@@ -91,17 +113,24 @@ def unit_rows(costs: Mapping[str, Any]) -> Iterable[Sequence[str]]:
     """The measured costs of a frame or a photo."""
     for name, row in costs.items():
         yield (
-            name, f"{row['cpu_s']:.2f}", f"{max(0.0, row['start_cpu_s']):.0f}", f"{row['peak_mb']:,.0f}",
-            f"{row['bytes'] / 1000:,.0f}", f"{row['files']:.1f}",
+            name,
+            f"{row['cpu_s']:.2f}",
+            f"{max(0.0, row['start_cpu_s']):.0f}",
+            f"{row['peak_mb']:,.0f}",
+            f"{row['bytes'] / 1000:,.0f}",
+            f"{row['files']:.1f}",
         )
 
 
-def stream_needs(costs: Mapping[str, Any], station: Mapping[str, Any], given: Mapping[str, float]) -> list[Need]:
+def stream_needs(
+    costs: Mapping[str, Any], station: Mapping[str, Any], given: Mapping[str, float]
+) -> list[Need]:
     """What the station takes for a stream, and each mission beside it, in a process of its own."""
     cores = station["map"]["station_cpu_s"] / station["seconds"]
     taken = Need("taken in, kept, one viewer", cores, 0.0, given["stream_mbit_s"])
     missions = (
-        ("watched", "video: watch", given["searched_hz"]), ("compared", "video: compare", given["compared_hz"]),
+        ("watched", "video: watch", given["searched_hz"]),
+        ("compared", "video: compare", given["compared_hz"]),
         ("mapped", "video: map", given["mapped_hz"]),
     )
     needs = [taken]
@@ -118,7 +147,8 @@ def stream_row(need: Need, given: Mapping[str, float]) -> Sequence[str]:
     cores, memory_gb = streams * need.cores, streams * need.memory_mb / 1000
     gbit_s = streams * need.mbit_s / 1000
     machines = {
-        "cores": cores / (used * given["machine_cores"]), "memory": memory_gb / (used * given["machine_gb"]),
+        "cores": cores / (used * given["machine_cores"]),
+        "memory": memory_gb / (used * given["machine_gb"]),
         "network": gbit_s / (used * given["machine_gbit_s"]),
     }
     most = max(machines, key=lambda name: machines[name])
@@ -126,7 +156,13 @@ def stream_row(need: Need, given: Mapping[str, float]) -> Sequence[str]:
     eur = count * given["machine_cores"] * given["core_hour_eur"] * given["hours_a_month"]
     eur += gbit_s * given["gbit_month_eur"]
     return (
-        need.name, f"{need.cores:.2f}", f"{cores:,.0f}", f"{memory_gb / 1000:.1f}", f"{gbit_s:.0f}", f"{count:,}", most,
+        need.name,
+        f"{need.cores:.2f}",
+        f"{cores:,.0f}",
+        f"{memory_gb / 1000:.1f}",
+        f"{gbit_s:.0f}",
+        f"{count:,}",
+        most,
         f"{eur:,.0f}",
     )
 
@@ -135,14 +171,18 @@ def archive_rows(costs: Mapping[str, Any], given: Mapping[str, float]) -> Iterab
     """An archive's photos mapped once, and kept."""
     photos = given["archive_tb"] * 1e6 / given["photo_mb"]
     prefix = f"photo, {given['photo_megapixels']:g} MP"
-    yield "photos", f"{photos / 1e6:,.0f} million, {photos / given['photos_per_flight'] / 1e6:.2g} million flights"
+    yield (
+        "photos",
+        f"{photos / 1e6:,.0f} million, {photos / given['photos_per_flight'] / 1e6:.2g} million flights",
+    )
     for mission in ("map", "map with objects", "heights", "compare", "watch"):
         row = costs.get(f"{prefix}: {mission}")
         if row is not None:
             hours = photos * row["cpu_s"] / 3600
             machines = hours / (24 * 30 * given["machine_cores"] * given["used_share"])
             yield (
-                f"{mission} once", f"{hours:,.0f} core hours: {ceil(machines):,} machines for 30 days, "
+                f"{mission} once",
+                f"{hours:,.0f} core hours: {ceil(machines):,} machines for 30 days, "
                 f"{hours * given['core_hour_eur']:,.0f} EUR",
             )
     mapped = costs[f"{prefix}: map"]

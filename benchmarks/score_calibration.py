@@ -55,15 +55,33 @@ class Photos:
 
 
 DAYLIGHT = {
-    "tinyperson val": Photos("val"), "tinyperson": Photos(), "aerial_cars": Photos(), "semantic_drone": Photos(),
-    "cats": Photos(step=4), "brighton_beach": Photos(m_per_px=0.034),
-    "caliterra": Photos(first="IMG_9400.jpg", m_per_px=0.07), "fixed_wing": Photos(m_per_px=0.072),
+    "tinyperson val": Photos("val"),
+    "tinyperson": Photos(),
+    "aerial_cars": Photos(),
+    "semantic_drone": Photos(),
+    "cats": Photos(step=4),
+    "brighton_beach": Photos(m_per_px=0.034),
+    "caliterra": Photos(first="IMG_9400.jpg", m_per_px=0.07),
+    "fixed_wing": Photos(m_per_px=0.072),
 }
 THERMAL = {"hituav val": Photos("val", 2), "hituav": Photos(step=6)}
 GROUND = ("brighton_beach", "caliterra", "fixed_wing")
 HITUAV = (
-    "hituav val", "1_60_60_0", "1_60_70_0", "1_70_30_0", "0_60_30_0", "0_60_40_0", "0_60_50_0", "0_60_60_0",
-    "0_70_60_0", "0_70_80_0", "0_70_90_0", "0_80_40_0", "0_80_60_0", "0_80_80_0", "0_80_90_0",
+    "hituav val",
+    "1_60_60_0",
+    "1_60_70_0",
+    "1_70_30_0",
+    "0_60_30_0",
+    "0_60_40_0",
+    "0_60_50_0",
+    "0_60_60_0",
+    "0_70_60_0",
+    "0_70_80_0",
+    "0_70_90_0",
+    "0_80_40_0",
+    "0_80_60_0",
+    "0_80_80_0",
+    "0_80_90_0",
 )
 """Its validation block, and the first and third of four held-out blocks: by night and by day, 60 to 80 m high."""
 
@@ -77,7 +95,9 @@ SECOND_LOOK = ("tinyperson val", *GROUND)
 
 def main() -> None:
     """Search what was not searched yet, fit, judge, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--model", default="default", choices=sorted(FIT))
@@ -91,20 +111,34 @@ def main() -> None:
     session.info = own_scale(stated)
     plan = THERMAL if wishes.model == "thermal" else DAYLIGHT
     reports = [
-        each for name, photos in plan.items()
-        for each in reports_of(name, pictures_of(wishes.data, name, photos), photos, Detector(session), wishes.out)
+        each
+        for name, photos in plan.items()
+        for each in reports_of(
+            name, pictures_of(wishes.data, name, photos), photos, Detector(session), wishes.out
+        )
     ]
     found: dict[str, Any] = {}
     for label in SHOWN:
         own = [each for each in reports if each.label == label]
         names = FIT[wishes.model][label]
-        fit = fit_of([each for each in own if each.is_of(names)]) if wishes.fit else stated.calibration[label]
-        found[label] = {"slope": fit.slope, "shift": fit.shift, "fit_on": names} | judged(own, names, fit)
+        fit = (
+            fit_of([each for each in own if each.is_of(names)])
+            if wishes.fit
+            else stated.calibration[label]
+        )
+        found[label] = {"slope": fit.slope, "shift": fit.shift, "fit_on": names} | judged(
+            own, names, fit
+        )
         print(label, json.dumps(found[label], indent=1), flush=True)
     document = json.loads(wishes.results.read_text()) if wishes.results.is_file() else {}
     document[wishes.model] = {
-        "benchmark": "score_calibration", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-        "version": stated.version, **note_scoring(f"score_calibration, {' '.join(plan)}"), "classes": found,
+        "benchmark": "score_calibration",
+        "machine": machine(),
+        "commit": commit(),
+        "date": time.strftime("%Y-%m-%d"),
+        "version": stated.version,
+        **note_scoring(f"score_calibration, {' '.join(plan)}"),
+        "classes": found,
     }
     wishes.results.write_text(json.dumps(document, indent=1) + "\n")
 
@@ -128,7 +162,9 @@ class Reports:
     def kind(self, names: Sequence[str]) -> str:
         """What it is beside slope and shift that are fitted on the groups of these names."""
         is_known = self.label == SHOWN[0] and self.place in SECOND_LOOK
-        return "fitted on" if self.is_of(names) else "of the second look" if is_known else "held out"
+        return (
+            "fitted on" if self.is_of(names) else "of the second look" if is_known else "held out"
+        )
 
 
 def pictures_of(data: Path, name: str, photos: Photos) -> LabelledSet:
@@ -142,7 +178,10 @@ def pictures_of(data: Path, name: str, photos: Photos) -> LabelledSet:
 
 def flight(data: Path, name: str, first: str) -> LabelledSet:
     """Photos of a flight, with the people and cars that are known to be on them."""
-    known = [json.loads((HERE / each).read_text()) for each in ("brighton_people.json", "flight_cars.json")]
+    known = [
+        json.loads((HERE / each).read_text())
+        for each in ("brighton_people.json", "flight_cars.json")
+    ]
     pictures = []
     for path in sorted((data / "flights" / name).glob("*.[jJ][pP][gG]")):
         if path.name < first:
@@ -152,23 +191,38 @@ def flight(data: Path, name: str, first: str) -> LabelledSet:
             boxes[0] = np.array(known[0]["people"].get(path.stem, []), float).reshape(-1, 4)
             ignored = np.array(known[0]["around"].get(path.stem, []), float).reshape(-1, 4)
         boxes[1] = np.array(known[1]["cars"].get(f"{name}/{path.stem}", []), float).reshape(-1, 4)
-        pictures.append(LabelledPicture(
-            str(path), 1, 1, name, np.concatenate(boxes).astype(np.float32),
-            np.repeat([0, 1], [len(each) for each in boxes]), ignored.astype(np.float32),
-        ))
+        pictures.append(
+            LabelledPicture(
+                str(path),
+                1,
+                1,
+                name,
+                np.concatenate(boxes).astype(np.float32),
+                np.repeat([0, 1], [len(each) for each in boxes]),
+                ignored.astype(np.float32),
+            )
+        )
     return LabelledSet(name, CLASSES, tuple(pictures), frozenset({CLASSES[2]}))
 
 
-def reports_of(name: str, labelled: LabelledSet, photos: Photos, detector: Detector, out: Path) -> Iterator[Reports]:
+def reports_of(
+    name: str, labelled: LabelledSet, photos: Photos, detector: Detector, out: Path
+) -> Iterator[Reports]:
     """What the model reports of each class in each group of the pictures, in each way of looking."""
     path = out / f"{name}.json"
     if not path.is_file():
-        path.write_text(json.dumps([_searched(each.path, photos, name, detector) for each in labelled.pictures]))
+        path.write_text(
+            json.dumps([_searched(each.path, photos, name, detector) for each in labelled.pictures])
+        )
         print(name, len(labelled), "searched", flush=True)
     seen = {each["path"]: each["seen"] for each in json.loads(path.read_text())}
     groups = sorted({each.group for each in labelled.pictures})
-    shown = {labelled.classes[label] for each in labelled.pictures for label in each.labels.tolist()}
-    names = SHOWN if name in GROUND else [each for each in SHOWN if each in shown - labelled.unlabelled]
+    shown = {
+        labelled.classes[label] for each in labelled.pictures for label in each.labels.tolist()
+    }
+    names = (
+        SHOWN if name in GROUND else [each for each in SHOWN if each in shown - labelled.unlabelled]
+    )
     for group, label in ((group, label) for group in groups for label in names):
         pictures = [each for each in labelled.pictures if each.group == group]
         own = labelled.only([_sized(each) for each in pictures])
@@ -177,7 +231,13 @@ def reports_of(name: str, labelled: LabelledSet, photos: Photos, detector: Detec
             (match,), _, _ = match_pictures(own, found, [label])
             counts = ~match.ignored[0]
             yield Reports(
-                label, name, group, way, match.scores[counts], match.right[0][counts], len(match.true_scores)
+                label,
+                name,
+                group,
+                way,
+                match.scores[counts],
+                match.right[0][counts],
+                len(match.true_scores),
             )
 
 
@@ -188,12 +248,16 @@ def _searched(path: str, photos: Photos, name: str, detector: Detector) -> dict[
     if name in GROUND:
         scale = SCALE if name != GROUND[2] else 1.0  # fixed_wing's photos are small
         picture = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-        ways = {"sizes": {}, "known": {"overlapping": True, "from_above": True, "m_per_px": photos.m_per_px}}
+        ways = {
+            "sizes": {},
+            "known": {"overlapping": True, "from_above": True, "m_per_px": photos.m_per_px},
+        }
     seen = {}
     for way, how in ways.items():
         found = detector.detect(picture, tiles="auto", classes=SHOWN, least_score=LEAST, **how)
         seen[way] = {
-            "boxes": (found.boxes_px / scale).tolist(), "scores": found.scores.tolist(),
+            "boxes": (found.boxes_px / scale).tolist(),
+            "scores": found.scores.tolist(),
             "labels": found.labels.tolist(),
         }
     return {"path": Path(path).name, "seen": seen}
@@ -201,8 +265,10 @@ def _searched(path: str, photos: Photos, name: str, detector: Detector) -> dict[
 
 def _detections(seen: Mapping[str, Any]) -> Detections:
     return Detections(
-        np.array(seen["boxes"], np.float32).reshape(-1, 4), np.array(seen["scores"], np.float32),
-        np.array(seen["labels"], np.int64), CLASSES,
+        np.array(seen["boxes"], np.float32).reshape(-1, 4),
+        np.array(seen["scores"], np.float32),
+        np.array(seen["labels"], np.int64),
+        CLASSES,
     )
 
 
@@ -219,7 +285,9 @@ def fit_of(reports: Sequence[Reports]) -> Calibration:
         sizes[each.group] = sizes.get(each.group, 0) + len(each.scores)
     mean = sum(sizes.values()) / len(sizes)
     counts = np.concatenate([np.full(len(each.scores), mean / sizes[each.group]) for each in rows])
-    scores, right = (np.concatenate([getattr(each, key) for each in rows]) for key in ("scores", "right"))
+    scores, right = (
+        np.concatenate([getattr(each, key) for each in rows]) for key in ("scores", "right")
+    )
     fit = platt_fit(scores.astype(float), right, counts)
     assert fit is not None  # of the packaged models right reports score higher
     return Calibration(round(fit.slope, 3), round(fit.shift, 3))
@@ -228,13 +296,28 @@ def fit_of(reports: Sequence[Reports]) -> Calibration:
 def judged(reports: Sequence[Reports], names: Sequence[str], fit: Calibration) -> dict[str, Any]:
     """In tenths of the scaled score, how many, and which share is right: of all that is held out, and set by set."""
     sets = []
-    for place, kind, way in dict.fromkeys((each.place, each.kind(names), each.way) for each in reports):
-        rows = [each for each in reports if (each.place, each.kind(names), each.way) == (place, kind, way)]
-        sets.append({
-            "set": place, "is": kind, "way": way, "groups": len(rows), "labels": sum(each.labels for each in rows),
-            "tenths": tenths(rows, fit),
-        })
-    return {"held out": tenths([each for each in reports if each.kind(names) == "held out"], fit), "sets": sets}
+    for place, kind, way in dict.fromkeys(
+        (each.place, each.kind(names), each.way) for each in reports
+    ):
+        rows = [
+            each
+            for each in reports
+            if (each.place, each.kind(names), each.way) == (place, kind, way)
+        ]
+        sets.append(
+            {
+                "set": place,
+                "is": kind,
+                "way": way,
+                "groups": len(rows),
+                "labels": sum(each.labels for each in rows),
+                "tenths": tenths(rows, fit),
+            }
+        )
+    return {
+        "held out": tenths([each for each in reports if each.kind(names) == "held out"], fit),
+        "sets": sets,
+    }
 
 
 def tenths(reports: Sequence[Reports], fit: Calibration) -> list[dict[str, float | int]]:
@@ -245,8 +328,12 @@ def tenths(reports: Sequence[Reports], fit: Calibration) -> list[dict[str, float
     rows = calibration_bins(scores, np.concatenate([each.right for each in reports]), TENTHS)
     return [
         {
-            "from": each.low, "count": each.count, "score": round(each.stated, 3), "right": round(each.found, 3),
-            "right_low": round(each.found_low, 3), "right_high": round(each.found_high, 3),
+            "from": each.low,
+            "count": each.count,
+            "score": round(each.stated, 3),
+            "right": round(each.found, 3),
+            "right_low": round(each.found_low, 3),
+            "right_high": round(each.found_high, 3),
         }
         for each in rows
     ]

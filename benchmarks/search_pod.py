@@ -75,11 +75,15 @@ HEIGHTS_M = (25.0, 35.0, 45.0)
 
 def main() -> None:
     """Fly, measure, search, count, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--flights", type=int, default=24)
     parser.add_argument("--seeds", type=int, nargs="*", default=[])
     parser.add_argument("--plants", type=int, default=60)
-    parser.add_argument("--minutes", type=float, default=1e9, help="Begin no flight after so many minutes.")
+    parser.add_argument(
+        "--minutes", type=float, default=1e9, help="Begin no flight after so many minutes."
+    )
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--plot", action="store_true", help="Draw the results that are there.")
     wishes = parser.parse_args()
@@ -98,30 +102,52 @@ def main() -> None:
         rows += searched(flight, images, detector, wishes.plants, number)
         done.append(seed)
         document = {
-            "benchmark": "search_pod", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-            "seeds": done, "plants": wishes.plants, "model": detector.info.name, "groups": summarised(rows),
+            "benchmark": "search_pod",
+            "machine": machine(),
+            "commit": commit(),
+            "date": time.strftime("%Y-%m-%d"),
+            "seeds": done,
+            "plants": wishes.plants,
+            "model": detector.info.name,
+            "groups": summarised(rows),
         }
         wishes.results.write_text(json.dumps(document, indent=1) + "\n")
-        print(number, seed, {name: each["bins"] for name, each in summarised(rows).items()}, flush=True)
+        print(
+            number,
+            seed,
+            {name: each["bins"] for name, each in summarised(rows).items()},
+            flush=True,
+        )
     if wishes.results == RESULTS:
         draw(summarised(rows))
 
 
 def draw(groups: dict) -> None:
     """Found over stated of each group, by fifths of what was stated, with what the colours are."""
-    names = [name for name in groups if name not in ("all but plain figures", "people, thermal, plain figures")]
+    names = [
+        name
+        for name in groups
+        if name not in ("all but plain figures", "people, thermal, plain figures")
+    ]
     names = [name for name in names if groups[name]["bins"]]
     rows = [
         (name, each["stated"], each["found"], each["found_low"], each["found_high"], each["count"])
-        for name in names for each in groups[name]["bins_whole"]
+        for name in names
+        for each in groups[name]["bins_whole"]
     ]
     style = STYLE + "".join(f".c{k}{{stroke:{colour}}}" for k, colour in enumerate(COLOURS))
     words = "".join(
         f'<text x="60" y="{32 + 16 * k}" style="font:12px sans-serif;fill:{COLOURS[k]}">{name}</text>'
         for k, name in enumerate(names)
     )
-    drawn = str(stated_and_found(rows)).replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
-    PLOT.write_text(drawn.replace("<title>", f"<style>{style}</style><title>", 1).replace("</svg>", f"{words}</svg>"))
+    drawn = str(stated_and_found(rows)).replace(
+        "<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1
+    )
+    PLOT.write_text(
+        drawn.replace("<title>", f"<style>{style}</style><title>", 1).replace(
+            "</svg>", f"{words}</svg>"
+        )
+    )
 
 
 def flown(seed: int, number: int) -> tuple[SimulatedFlight, list]:
@@ -131,12 +157,25 @@ def flown(seed: int, number: int) -> tuple[SimulatedFlight, list]:
     is_thermal = number % 3 == 2
     length_m = 2.2 * height_m
     settings = SimulationSettings(
-        seed=seed, flights=1,
-        scene=SceneSettings(str(rng.choice(GROUNDS)), people=PEOPLE // 2, cars=CARS, small_objects=0),
-        path=PathSettings(height_m=height_m, speed_m_s=8, length_m=length_m, strips=2, strip_spacing_m=0.5 * height_m),
+        seed=seed,
+        flights=1,
+        scene=SceneSettings(
+            str(rng.choice(GROUNDS)), people=PEOPLE // 2, cars=CARS, small_objects=0
+        ),
+        path=PathSettings(
+            height_m=height_m,
+            speed_m_s=8,
+            length_m=length_m,
+            strips=2,
+            strip_spacing_m=0.5 * height_m,
+        ),
         motion=MotionSettings(camera_pitch_deg=float(rng.choice([-90.0, -90.0, -65.0]))),
         imaging=ImagingSettings(
-            640, 480, fps=6, distortion=(0.0,) * 5, exposure_s=float(rng.choice([1 / 1000, 1 / 1000, 1 / 60])),
+            640,
+            480,
+            fps=6,
+            distortion=(0.0,) * 5,
+            exposure_s=float(rng.choice([1 / 1000, 1 / 1000, 1 / 60])),
         ),
         output=OutputSettings(photos=True, photo_overlap=0.55),
     )
@@ -154,7 +193,9 @@ def hidden_limb_by_limb(flight: SimulatedFlight, rng: np.random.Generator) -> It
     placed = list(flight.day.things)
     for number in range(PEOPLE // 2):
         for _ in range(50):
-            new = new_plant(5000 + number, "person", rng.uniform(low, high), int(rng.integers(2**31)))
+            new = new_plant(
+                5000 + number, "person", rng.uniform(low, high), int(rng.integers(2**31))
+            )
             if is_free(new, placed):
                 placed.append(new)
                 yield new
@@ -165,66 +206,108 @@ def taken(flight: SimulatedFlight, index: int, is_thermal: bool) -> np.ndarray:
     """A frame as recorded; by a thermal camera, the same noise in all frames of a flight."""
     if not is_thermal:
         return flight.frame(index).image
-    day = warm_day(flight.day, flight.world.ground, np.random.default_rng([flight.settings.seed, 2]))
-    picture = render(day, flight.view(index), flight.true_poses[index], float(flight.from_middle_s[index]))
+    day = warm_day(
+        flight.day, flight.world.ground, np.random.default_rng([flight.settings.seed, 2])
+    )
+    picture = render(
+        day, flight.view(index), flight.true_poses[index], float(flight.from_middle_s[index])
+    )
     return heat_picture(picture, np.random.default_rng([flight.settings.seed, 3]))
 
 
 def searched(
-    flight: SimulatedFlight, images: Sequence[np.ndarray], detector: Detector, plants: int, number: int
+    flight: SimulatedFlight,
+    images: Sequence[np.ndarray],
+    detector: Detector,
+    plants: int,
+    number: int,
 ) -> list[dict]:
     """A row for each hidden thing that a frame shows: the chance it was given, and whether it was found."""
-    frames = [SearchFrame(placed(flight, index), lambda image=image: image) for index, image in enumerate(images)]
+    frames = [
+        SearchFrame(placed(flight, index), lambda image=image: image)
+        for index, image in enumerate(images)
+    ]
     origin = flight.settings.scene.origin
     crs = f"EPSG:{utm_epsg(origin.latitude_deg, origin.longitude_deg)}"
     outlines_m = [each.placed.outline_m for each in frames]
     cells = cells_over(outlines_m, SiteGrid.at(origin, cell_side_m(outlines_m), crs), None)
     targets = [thing for thing in flight.day.things if thing.label.is_target]
-    settings = SearchSettings(plants=plants, classes=CLASSES, sun_deg=SUN_DEG, seed=flight.settings.seed + 1)
+    settings = SearchSettings(
+        plants=plants, classes=CLASSES, sun_deg=SUN_DEG, seed=flight.settings.seed + 1
+    )
     *_, measured = measure_flight(
-        flight.name, frames, cells, Site("search", origin, crs, 0.02, height_reference="ellipsoidal"), detector,
-        settings, np.array([thing.place_m(0)[:2] for thing in targets]),
+        flight.name,
+        frames,
+        cells,
+        Site("search", origin, crs, 0.02, height_reference="ellipsoidal"),
+        detector,
+        settings,
+        np.array([thing.place_m(0)[:2] for thing in targets]),
     )
     assert isinstance(measured, MeasuredFlight)
     return rows_of(flight, frames, images, detector, measured, targets, number)
 
 
 def rows_of(
-    flight: SimulatedFlight, frames: Sequence[SearchFrame], images: Sequence[np.ndarray], detector: Detector,
-    measured: MeasuredFlight, targets: Sequence[Thing], number: int,
+    flight: SimulatedFlight,
+    frames: Sequence[SearchFrame],
+    images: Sequence[np.ndarray],
+    detector: Detector,
+    measured: MeasuredFlight,
+    targets: Sequence[Thing],
+    number: int,
 ) -> list[dict]:
     """What was stated and what came true."""
-    laid, boxes, least = seen_by_map(flight, [each.placed for each in frames], images, detector, targets)
+    laid, boxes, least = seen_by_map(
+        flight, [each.placed for each in frames], images, detector, targets
+    )
     labels = [str(each.label) for each in targets]
     reported = reported_plants(laid, [each.placed for each in frames], boxes, labels, least)
     empty = without_targets(flight)
     bare = [taken(empty, index, measured.is_thermal) for index in range(len(images))]
     looks = [
         look_at(
-            image, each.placed.camera, flight.true_poses[k], frame_light(image).blur_px, direction_from_angles(*SUN_DEG)
+            image,
+            each.placed.camera,
+            flight.true_poses[k],
+            frame_light(image).blur_px,
+            direction_from_angles(*SUN_DEG),
         )
         for k, (each, image) in enumerate(zip(frames, bare))
     ]
     rows = []
     for label in measured.classes:
         own = [(k, thing) for k, thing in enumerate(targets) if thing.label == label.label]
-        seen = gather(looks, np.array([thing.place_m(0)[:2] for _, thing in own]), reach_m(label.label))
+        seen = gather(
+            looks, np.array([thing.place_m(0)[:2] for _, thing in own]), reach_m(label.label)
+        )
         if label.recall is None:
             continue
         chances = label.recall.of(seen.columns)
         for row, (k, thing) in enumerate(own):
             if seen.seen[row]:
-                rows.append({
-                    "flight": number, "class": label.label, "kind": thing.kind, "thermal": measured.is_thermal,
-                    "chance": round(float(chances.mean[row]), 4), "low": round(float(chances.low[row]), 4),
-                    "high": round(float(chances.high[row]), 4), "found": k in reported,
-                    "trees": bool(seen.under_trees[row]), "height_m": round(flight.path.height_m, 1),
-                })
+                rows.append(
+                    {
+                        "flight": number,
+                        "class": label.label,
+                        "kind": thing.kind,
+                        "thermal": measured.is_thermal,
+                        "chance": round(float(chances.mean[row]), 4),
+                        "low": round(float(chances.low[row]), 4),
+                        "high": round(float(chances.high[row]), 4),
+                        "found": k in reported,
+                        "trees": bool(seen.under_trees[row]),
+                        "height_m": round(flight.path.height_m, 1),
+                    }
+                )
     return rows
 
 
 def seen_by_map(
-    flight: SimulatedFlight, frames: Sequence[PlacedFrame], images: Sequence[np.ndarray], detector: Detector,
+    flight: SimulatedFlight,
+    frames: Sequence[PlacedFrame],
+    images: Sequence[np.ndarray],
+    detector: Detector,
     targets: Sequence[Thing],
 ) -> tuple[list[LaidSighting], dict[int, np.ndarray], dict[str, float]]:
     """What a map's search sees in the frames, each frame's boxes of the targets (NaN: out of sight), and from which
@@ -237,8 +320,12 @@ def seen_by_map(
         own = detector.thresholds_for(image, from_above=from_above)
         least = {name: max(score, least.get(name, 0.0)) for name, score in own.items()}
         found = detector.detect(
-            image, tiles="auto", m_per_px=float(pose.translation_m[2]) / flight.camera.fx_px, classes=CLASSES,
-            from_above=from_above, least_score=least_seen(own),
+            image,
+            tiles="auto",
+            m_per_px=float(pose.translation_m[2]) / flight.camera.fx_px,
+            classes=CLASSES,
+            from_above=from_above,
+            least_score=least_seen(own),
         ).surest(MOST)
         laid += [one for one in lay_on_ground(found, frame) if one is not None]
         boxes[index] = boxes_px(flight, index, targets)
@@ -249,13 +336,18 @@ def without_targets(flight: SimulatedFlight) -> SimulatedFlight:
     """The same ground bare: the conditions of a place are those of its ground, not of what is hidden there."""
     things = tuple(thing for thing in flight.day.things if not thing.label.is_target)
     world = replace(flight.world, days=(things,))
-    return replace(flight, world=world, day=build_day(world, flight.settings, 1, flight.settings.m_per_px))
+    return replace(
+        flight, world=world, day=build_day(world, flight.settings, 1, flight.settings.m_per_px)
+    )
 
 
 def boxes_px(flight: SimulatedFlight, index: int, targets: Sequence[Thing]) -> np.ndarray:
     """(N, 4) what shows of each target; NaN for one that is out of sight or hidden."""
     labels, _ = render_labels(
-        flight.day.things, flight.day.bodies, flight.view(index), flight.true_poses[index],
+        flight.day.things,
+        flight.day.bodies,
+        flight.view(index),
+        flight.true_poses[index],
         float(flight.from_middle_s[index]),
     )
     boxes = np.full((len(targets), 4), np.nan, np.float32)
@@ -271,8 +363,17 @@ def placed(flight: SimulatedFlight, index: int) -> PlacedFrame:
     """A frame on its true place."""
     camera, pose = flight.camera, flight.true_poses[index]
     return PlacedFrame(
-        flight.frame_name(index), index, int(flight.frame_times_ns[index]), Status.VISION, "", camera, pose,
-        site_from_image_homography(camera, pose), footprint(camera, pose), 0.5, 0.3,
+        flight.frame_name(index),
+        index,
+        int(flight.frame_times_ns[index]),
+        Status.VISION,
+        "",
+        camera,
+        pose,
+        site_from_image_homography(camera, pose),
+        footprint(camera, pose),
+        0.5,
+        0.3,
     )
 
 
@@ -280,11 +381,13 @@ def summarised(rows: Sequence[dict]) -> dict:
     """Stated and found by class, light and rendering, on open ground; and what trees hide."""
     groups = {
         "cars by day": lambda row: row["class"] == "car" and not row["thermal"],
-        "people by day, limb by limb": lambda row: row["class"] == "person" and not row["thermal"]
-        and row["kind"] != "person",
+        "people by day, limb by limb": lambda row: (
+            row["class"] == "person" and not row["thermal"] and row["kind"] != "person"
+        ),
         "people by day, plain figures": lambda row: row["kind"] == "person" and not row["thermal"],
-        "people, thermal, limb by limb": lambda row: row["class"] == "person" and row["thermal"]
-        and row["kind"] != "person",
+        "people, thermal, limb by limb": lambda row: (
+            row["class"] == "person" and row["thermal"] and row["kind"] != "person"
+        ),
         "people, thermal, plain figures": lambda row: row["kind"] == "person" and row["thermal"],
         "cars, thermal": lambda row: row["class"] == "car" and row["thermal"],
         "all but plain figures": lambda row: row["kind"] != "person",
@@ -294,21 +397,31 @@ def summarised(rows: Sequence[dict]) -> dict:
         own = [row for row in rows if belongs(row) and not row["trees"]]
         if not own:
             continue
-        chances, found = np.array([row["chance"] for row in own]), np.array([row["found"] for row in own], bool)
+        chances, found = (
+            np.array([row["chance"] for row in own]),
+            np.array([row["found"] for row in own], bool),
+        )
         flights = sorted({row["flight"] for row in own})
         result[name] = {
-            "things": len(own), "stated": round(float(chances.mean()), 4), "found": round(float(found.mean()), 4),
+            "things": len(own),
+            "stated": round(float(chances.mean()), 4),
+            "found": round(float(found.mean()), 4),
             "difference": round(float(found.mean() - chances.mean()), 4),
-            "difference_90": bootstrapped([[row for row in own if row["flight"] == flight] for flight in flights]),
+            "difference_90": bootstrapped(
+                [[row for row in own if row["flight"] == flight] for flight in flights]
+            ),
             "bins": [
-                [round(each.stated, 3), round(each.found, 3), each.count] for each in calibration_bins(chances, found)
+                [round(each.stated, 3), round(each.found, 3), each.count]
+                for each in calibration_bins(chances, found)
             ],
             "bins_whole": [asdict(each) for each in calibration_bins(chances, found)],
         }
     hidden = [row for row in rows if row["trees"]]
     if hidden:
         result["under trees"] = {
-            "things": len(hidden), "stated": 0.0, "found": round(float(np.mean([row["found"] for row in hidden])), 4),
+            "things": len(hidden),
+            "stated": 0.0,
+            "found": round(float(np.mean([row["found"] for row in hidden])), 4),
             "bins": [],
         }
     return result

@@ -35,7 +35,16 @@ from sorvolo.survey.objects import Detections
 from train_default_model import reader
 
 RESULTS = Path(__file__).parent / "results" / "second_look_people.json"
-SETS = (*FIRST, "semantic_drone", "sdd", "tinyperson", "tinyperson val", "mannequin", "aerial_cars", "cats")
+SETS = (
+    *FIRST,
+    "semantic_drone",
+    "sdd",
+    "tinyperson",
+    "tinyperson val",
+    "mannequin",
+    "aerial_cars",
+    "cats",
+)
 LEAST, EVERY = LEAST_SCORE, {"mannequin": 4}
 BECAME = {(False, False): "", (True, True): "kept", (True, False): "gone", (False, True): "new"}
 SCORES = (0.5, 0.6, 0.7, 0.78, 0.84, 0.9, 0.94, 0.96)
@@ -54,11 +63,17 @@ class Looker:
         self.first_s = self.again_s = 0.0
 
     def looks(
-        self, picture: ImageRGB, classes: tuple[str, ...], m_per_px: float | None = None, least: float = LEAST
+        self,
+        picture: ImageRGB,
+        classes: tuple[str, ...],
+        m_per_px: float | None = None,
+        least: float = LEAST,
     ) -> tuple[Detections, Detections]:
         """What is found at first and after the second look."""
         began_s = time.process_time()
-        found = self.detector.detect(picture, tiles="auto", m_per_px=m_per_px, classes=classes, least_score=least)
+        found = self.detector.detect(
+            picture, tiles="auto", m_per_px=m_per_px, classes=classes, least_score=least
+        )
         looked_s = time.process_time()
         seen = Seen(found.boxes_px, found.scores, found.labels)
         seen = self.whole._seen_again(self.whole._session, picture, seen, classes)
@@ -82,7 +97,9 @@ class Crops:
 
 def main() -> None:
     """Look, count, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--model", default="default")
     parser.add_argument("--sets", nargs="+", default=SETS)
@@ -93,19 +110,41 @@ def main() -> None:
     known = json.loads(wishes.results.read_text())["sets"] if wishes.results.is_file() else {}
     for name in wishes.sets if not wishes.right else ():
         looker = Looker(wishes.model)
-        row = flight(looker, wishes.data, name, wishes.out) if name in FIRST else labelled(looker, wishes.data, name)
-        known[name] = row | note_scoring(f"second_look, {name}") | {
-            "first_look_s": round(looker.first_s, 1), "second_look_s": round(looker.again_s, 1),
-        }
+        row = (
+            flight(looker, wishes.data, name, wishes.out)
+            if name in FIRST
+            else labelled(looker, wishes.data, name)
+        )
+        known[name] = (
+            row
+            | note_scoring(f"second_look, {name}")
+            | {
+                "first_look_s": round(looker.first_s, 1),
+                "second_look_s": round(looker.again_s, 1),
+            }
+        )
         print(name, json.dumps(known[name]), flush=True)
     for each in wishes.right:
         judged(known, each)
-    wishes.results.write_text(json.dumps(plain_json({
-        "benchmark": "second_look", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-        "model": wishes.model, "weights": json.loads(find_model(wishes.model).with_suffix(".json").read_text())[
-            "second_look"
-        ], "sets": known,
-    }), indent=1) + "\n")
+    wishes.results.write_text(
+        json.dumps(
+            plain_json(
+                {
+                    "benchmark": "second_look",
+                    "machine": machine(),
+                    "commit": commit(),
+                    "date": time.strftime("%Y-%m-%d"),
+                    "model": wishes.model,
+                    "weights": json.loads(
+                        find_model(wishes.model).with_suffix(".json").read_text()
+                    )["second_look"],
+                    "sets": known,
+                }
+            ),
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def judged(known: dict, wish: str) -> None:
@@ -122,7 +161,11 @@ def flight(looker: Looker, data: Path, name: str, out: Path | None) -> dict[str,
     """Reports of a flight at full size, before and after."""
     thresholds, crops = looker.whole.info.thresholds, Crops()
     counts = {label: {"threshold": thresholds[label], "before": 0, "after": 0} for label in SHOWN}
-    photos = [path for path in sorted((data / "flights" / name).glob("*.[jJ][pP][gG]")) if path.name >= FIRST[name]]
+    photos = [
+        path
+        for path in sorted((data / "flights" / name).glob("*.[jJ][pP][gG]"))
+        if path.name >= FIRST[name]
+    ]
     for path in photos:
         shown = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
         picture, m_per_px = np.ascontiguousarray(shown[..., ::-1]), M_PER_PX[name] * SCALE
@@ -141,7 +184,9 @@ def flight(looker: Looker, data: Path, name: str, out: Path | None) -> dict[str,
     return {"photos": len(photos), **counts}
 
 
-def followed(first: Detections, after: Detections) -> Iterator[tuple[str, np.ndarray, float, float]]:
+def followed(
+    first: Detections, after: Detections
+) -> Iterator[tuple[str, np.ndarray, float, float]]:
     """Each report's class, box (4,), and its scores before and after."""
     for label, box, score in zip(first.names, first.boxes_px, first.scores):
         same = (after.boxes_px == box).all(axis=1) & (np.array(after.names) == label)
@@ -154,13 +199,16 @@ def labelled(looker: Looker, data: Path, name: str) -> dict[str, object]:
     pairs = [looker.looks(read(each.path), SHOWN) for each in chosen.pictures]
     rows: dict[str, object] = {"pictures": len(chosen)}
     for when, found in zip(("before", "after"), zip(*pairs)):
-        scores = score_set(chosen, list(found), chosen.classes, looker.whole.info.thresholds, draws=20)
+        scores = score_set(
+            chosen, list(found), chosen.classes, looker.whole.info.thresholds, draws=20
+        )
         for row in scores.classes:
             if row.labels and row.label in SHOWN:
                 of_class = rows.setdefault(row.label, {"labels": row.labels})
                 assert isinstance(of_class, dict)
                 of_class[when] = {
-                    "found": round(row.reported.recall, 4), "right": round(row.reported.precision, 4),
+                    "found": round(row.reported.recall, 4),
+                    "right": round(row.reported.precision, 4),
                     "AP50": round(scores.intervals[f"AP50 {row.label}"].value, 4),
                     "found_from_score_on": found_from(row.curve),
                 }
@@ -172,7 +220,11 @@ def found_from(curve: np.ndarray) -> dict[str, tuple[float, float]]:
     rows = {}
     for score in SCORES:
         above = curve[curve[:, 0] >= score]
-        rows[str(score)] = (round(float(above[-1, 2]), 4), round(float(above[-1, 1]), 4)) if len(above) else (0.0, 1.0)
+        rows[str(score)] = (
+            (round(float(above[-1, 2]), 4), round(float(above[-1, 1]), 4))
+            if len(above)
+            else (0.0, 1.0)
+        )
     return rows
 
 
@@ -182,7 +234,9 @@ def held_out(data: Path, name: str) -> LabelledSet:
     parts = getattr(detection_data, kind)(data)
     chosen = parts[part or ("test" if "test" in parts else "train")]
     chosen = chosen.only(chosen.pictures[:: EVERY.get(name, 1)])
-    labels = {chosen.classes[label] for picture in chosen.pictures for label in picture.labels.tolist()}
+    labels = {
+        chosen.classes[label] for picture in chosen.pictures for label in picture.labels.tolist()
+    }
     return replace(chosen, unlabelled=chosen.unlabelled | (set(chosen.classes) - labels))
 
 

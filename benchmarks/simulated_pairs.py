@@ -28,14 +28,25 @@ def simulated_pairs(seed: int, count: int, ground: str | None = None) -> Iterato
     height_m = float(rng.choice(HEIGHTS_M))
     later = replace(settings.later, people=6, cars=4, small_objects=8, removed=6, moved=5)
     settings = replace(
-        settings, seed=seed,
+        settings,
+        seed=seed,
         scene=replace(
-            settings.scene, ground=ground or str(rng.choice(GROUNDS)), people=8, cars=6, small_objects=10,
+            settings.scene,
+            ground=ground or str(rng.choice(GROUNDS)),
+            people=8,
+            cars=6,
+            small_objects=10,
             has_scenery=bool(rng.random() < 0.8),
         ),
-        path=replace(settings.path, height_m=height_m, speed_m_s=height_m / 4, length_m=height_m * 2.2,
-                     strip_spacing_m=height_m * 0.5),
-        imaging=replace(settings.imaging, fps=5.0), later=later,
+        path=replace(
+            settings.path,
+            height_m=height_m,
+            speed_m_s=height_m / 4,
+            length_m=height_m * 2.2,
+            strip_spacing_m=height_m * 0.5,
+        ),
+        imaging=replace(settings.imaging, fps=5.0),
+        later=later,
     )
     first, second = list(simulate_flights(settings))[:2]
     for index in rng.choice(len(second), size=min(count, len(second)), replace=False):
@@ -44,15 +55,22 @@ def simulated_pairs(seed: int, count: int, ground: str | None = None) -> Iterato
             yield pair
 
 
-def _pair(first: SimulatedFlight, second: SimulatedFlight, index: int, rng: np.random.Generator) -> Pair | None:
+def _pair(
+    first: SimulatedFlight, second: SimulatedFlight, index: int, rng: np.random.Generator
+) -> Pair | None:
     camera = second.camera
     lens = Undistorter(camera)
     site_from_query = site_from_image_homography(lens.camera, second.true_poses[index])
     centre = apply_homography(site_from_query, np.array([[camera.cx_px, camera.cy_px]]))[0]
-    places = np.array([
-        apply_homography(site_from_image_homography(first.camera.undistorted(), pose),
-                         np.array([[first.camera.cx_px, first.camera.cy_px]]))[0] for pose in first.true_poses
-    ])
+    places = np.array(
+        [
+            apply_homography(
+                site_from_image_homography(first.camera.undistorted(), pose),
+                np.array([[first.camera.cx_px, first.camera.cy_px]]),
+            )[0]
+            for pose in first.true_poses
+        ]
+    )
     footprint_m = second.true_poses[index].translation_m[2] * camera.height_px / camera.fx_px
     near = np.flatnonzero(np.linalg.norm(places - centre, axis=1) < 0.45 * footprint_m)
     if not len(near):
@@ -79,8 +97,13 @@ def _pair(first: SimulatedFlight, second: SimulatedFlight, index: int, rng: np.r
     # the pixels around a thing are half its own, and its shadow is part of what came
     around = cv2.dilate(truth.view(np.uint8), np.ones((13, 13), np.uint8)) > 0
     return Pair(
-        "simulated", f"simulated {second.settings.seed}", reference[..., ::-1].copy(), query[..., ::-1].copy(), valid,
-        truth & valid, (around & ~truth) | ~valid,
+        "simulated",
+        f"simulated {second.settings.seed}",
+        reference[..., ::-1].copy(),
+        query[..., ::-1].copy(),
+        valid,
+        truth & valid,
+        (around & ~truth) | ~valid,
     )
 
 

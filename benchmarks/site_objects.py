@@ -28,13 +28,21 @@ from sorvolo.survey.objects import Detections
 HERE = Path(__file__).parent
 RESULTS = HERE / "results" / "site_objects.json"
 SHOWN = ("person", "car")
-CAR_PARKS = {"2023-09-26": ("2023-09-26/2023-10-14", "lot car"), "2024-03-01": ("2024-02-24/2024-03-01", "parked car")}
-BESIDE_PX, LONGEST_PX = 9.0, 58.0  # a report's middle from a drawn car's; longer boxes are of more than one car
+CAR_PARKS = {
+    "2023-09-26": ("2023-09-26/2023-10-14", "lot car"),
+    "2024-03-01": ("2024-02-24/2024-03-01", "parked car"),
+}
+BESIDE_PX, LONGEST_PX = (
+    9.0,
+    58.0,
+)  # a report's middle from a drawn car's; longer boxes are of more than one car
 
 
 def main() -> None:
     """Search, count, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("flights", type=Path)
     parser.add_argument("models", nargs="+")
     parser.add_argument("--right", nargs="*", default=[])
@@ -45,17 +53,35 @@ def main() -> None:
     models: dict[str, Any] = {}
     for model in wishes.models:
         detector, name = Detector.load(model, provider="cpu", threads=1), Path(model).stem
-        models[name] = {"version": detector.info.version, "dates": {
-            date: of_date(detector, date, wishes.flights, wishes.out and wishes.out / name) for date in TAKEN
-        }}
+        models[name] = {
+            "version": detector.info.version,
+            "dates": {
+                date: of_date(detector, date, wishes.flights, wishes.out and wishes.out / name)
+                for date in TAKEN
+            },
+        }
         for date, row in models[name]["dates"].items():
             for label in SHOWN:
-                row[label] |= {"right_by_eye": right[key]} if (key := f"{name}:{date}:{label}") in right else {}
+                row[label] |= (
+                    {"right_by_eye": right[key]}
+                    if (key := f"{name}:{date}:{label}") in right
+                    else {}
+                )
         print(name, json.dumps(models[name]), flush=True)
-    wishes.results.write_text(json.dumps({
-        "benchmark": "site_objects", "machine": machine(), "commit": commit(), "date": time.strftime("%Y-%m-%d"),
-        **note_scoring("site_objects, building_site"), "models": models,
-    }, indent=1) + "\n")
+    wishes.results.write_text(
+        json.dumps(
+            {
+                "benchmark": "site_objects",
+                "machine": machine(),
+                "commit": commit(),
+                "date": time.strftime("%Y-%m-%d"),
+                **note_scoring("site_objects, building_site"),
+                "models": models,
+            },
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def of_date(detector: Detector, date: str, flights: Path, out: Path | None) -> dict[str, Any]:
@@ -64,7 +90,11 @@ def of_date(detector: Detector, date: str, flights: Path, out: Path | None) -> d
     thresholds = detector.info.turned or detector.info.thresholds
     half = min(thresholds[label] for label in SHOWN) / 2
     seen = detector.detect(
-        np.ascontiguousarray(shown[..., ::-1]), tiles="auto", m_per_px=M_PER_PX, classes=SHOWN, from_above=True,
+        np.ascontiguousarray(shown[..., ::-1]),
+        tiles="auto",
+        m_per_px=M_PER_PX,
+        classes=SHOWN,
+        from_above=True,
         least_score=half,
     )
     reported = possible(seen, shown, M_PER_PX, thresholds)
@@ -80,8 +110,11 @@ def of_date(detector: Detector, date: str, flights: Path, out: Path | None) -> d
     if date in CAR_PARKS:
         cars_px = cars_of(date)
         row["car_park"] = {
-            "cars": len(cars_px), "found": int(np.count_nonzero(best_scores(reported, cars_px))),
-            "with_half_the_score": int(np.count_nonzero(best_scores(seen, cars_px) >= thresholds["car"] / 2)),
+            "cars": len(cars_px),
+            "found": int(np.count_nonzero(best_scores(reported, cars_px))),
+            "with_half_the_score": int(
+                np.count_nonzero(best_scores(seen, cars_px) >= thresholds["car"] / 2)
+            ),
         }
     return row
 
@@ -91,7 +124,9 @@ def cars_of(date: str) -> np.ndarray:
     pair, begins = CAR_PARKS[date]
     truth = json.loads((HERE / "real_dates.json").read_text())
     changes = truth["changes"] if pair == truth["changes_of"] else truth["others"][pair]["changes"]
-    middles = np.array([np.mean(each["px"], axis=0) for name, each in changes.items() if name.startswith(begins)])
+    middles = np.array(
+        [np.mean(each["px"], axis=0) for name, each in changes.items() if name.startswith(begins)]
+    )
     if pair.startswith(date):
         return middles
     b_to_a = np.array(truth["pairs"][pair]["b_to_a"])

@@ -75,12 +75,18 @@ class Seen:
     zero_ns: int = 0  # UTC of the flight's zero
     pictures: list[tuple[float, float]] = field(default_factory=list)  # taken, delay
     boxes: list[tuple[float, float]] = field(default_factory=list)
-    of_class: dict[str, list[tuple[float, float]]] = field(default_factory=lambda: {each: [] for each in CLASSES})
-    early: dict[int, list[str]] = field(default_factory=dict)  # classes of a picture that came first
+    of_class: dict[str, list[tuple[float, float]]] = field(
+        default_factory=lambda: {each: [] for each in CLASSES}
+    )
+    early: dict[int, list[str]] = field(
+        default_factory=dict
+    )  # classes of a picture that came first
     motion: list[tuple[float, float]] = field(default_factory=list)
     map: list[tuple[float, float]] = field(default_factory=list)
     tiles_s: list[float] = field(default_factory=list)
-    announced: dict[str, float] = field(default_factory=dict)  # when each revision of the map was heard of
+    announced: dict[str, float] = field(
+        default_factory=dict
+    )  # when each revision of the map was heard of
 
 
 class TimedSpool(Spool):
@@ -101,14 +107,18 @@ class TimedSpool(Spool):
 
 def main() -> None:
     """Stream the flight three times and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--fps", type=float, default=30.0)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--viewers", type=int, default=20)
     parser.add_argument("--model", default="default")
     parser.add_argument("--only", choices=("", "map", "watch", "viewers", "soak"), default="")
-    parser.add_argument("--soak", type=int, default=10, help="how many times the flight is sent in the end")
+    parser.add_argument(
+        "--soak", type=int, default=10, help="how many times the flight is sent in the end"
+    )
     parser.add_argument("--flight", type=Path, help="simulated before, or where to keep it")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
@@ -118,14 +128,22 @@ def main() -> None:
         plan = {"map": ("map", 1), "watch": ("watch", 1), "viewers": ("map", options.viewers)}
         runs = {
             name: streamed(flight, Path(scratch) / name, mission, viewers, options)
-            for name, (mission, viewers) in plan.items() if options.only in ("", name)
+            for name, (mission, viewers) in plan.items()
+            if options.only in ("", name)
         }
         if options.only in ("", "soak"):
             runs["soak"] = repeated(flight, Path(scratch) / "soak", options.soak)
     result = {
-        "benchmark": "station", "machine": machine(), "commit": commit(), "size": options.size, "fps": options.fps,
-        "seconds": options.seconds, "model": options.model, "load_before": round(load, 2),
-        "load_after": round(os.getloadavg()[0], 2), **runs,
+        "benchmark": "station",
+        "machine": machine(),
+        "commit": commit(),
+        "size": options.size,
+        "fps": options.fps,
+        "seconds": options.seconds,
+        "model": options.model,
+        "load_before": round(load, 2),
+        "load_after": round(os.getloadavg()[0], 2),
+        **runs,
     }
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
@@ -138,7 +156,9 @@ def simulated(folder: Path, options: Any) -> Path:
     if not (folder / "flight1" / "flight1.mp4").is_file():
         width, height = map(int, options.size.split("x"))
         settings = SimulationSettings(
-            seed=7, flights=1, scene=SceneSettings(people=8, cars=8, small_objects=4),
+            seed=7,
+            flights=1,
+            scene=SceneSettings(people=8, cars=8, small_objects=4),
             path=PathSettings(height_m=40, speed_m_s=8, length_m=8 * options.seconds, strips=1),
             imaging=ImagingSettings(width_px=width, height_px=height, fps=options.fps),
             output=OutputSettings(truth_step=1_000_000),
@@ -156,7 +176,12 @@ def as_sent(video: Path, target: Path) -> None:
         given = source.streams.video[0]
         stream = output.add_stream("libx264", rate=given.average_rate)
         stream.width, stream.height, stream.pix_fmt = given.width, given.height, "yuv420p"
-        stream.options = {"crf": "18", "preset": "veryfast", "bf": "0", "g": str(round(given.average_rate))}
+        stream.options = {
+            "crf": "18",
+            "preset": "veryfast",
+            "bf": "0",
+            "g": str(round(given.average_rate)),
+        }
         for frame in source.decode(given):
             frame.pict_type = av.video.frame.PictureType.NONE
             output.mux(stream.encode(frame))
@@ -164,7 +189,9 @@ def as_sent(video: Path, target: Path) -> None:
     shutil.copy(video.with_suffix(".csv"), target.with_suffix(".csv"))
 
 
-def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: Any) -> dict[str, Any]:
+def streamed(
+    flight: Path, scratch: Path, mission: str, viewers: int, options: Any
+) -> dict[str, Any]:
     """One flight with a mission and viewers; delays, s, and what it cost."""
     root = scratch / "root"
     root.mkdir(parents=True)
@@ -172,10 +199,19 @@ def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: A
     with station(root) as (url, pid):
         stop = threading.Event()
         footage = open_footage(
-            str(flight / "flight1" / "sent.mp4"), None, str(flight / "camera.xml"), LiveSettings(), stop
+            str(flight / "flight1" / "sent.mp4"),
+            None,
+            str(flight / "camera.xml"),
+            LiveSettings(),
+            stop,
         )
         client = StreamClient(
-            footage, TimedSpool(scratch / "spool", seen), stream_url(url, _STREAM), "", StreamSettings(), stop
+            footage,
+            TimedSpool(scratch / "spool", seen),
+            stream_url(url, _STREAM),
+            "",
+            StreamSettings(),
+            stop,
         )
         flying = threading.Thread(target=client.run)
         before_s = cpu_s(pid)
@@ -184,14 +220,25 @@ def streamed(flight: Path, scratch: Path, mission: str, viewers: int, options: A
         report = client.report
         station_s = cpu_s(pid) - before_s
     return {
-        "mission": mission, "viewers": viewers, "frames": report.frames, "dropped": report.late + report.overflowed,
-        "station_cpu_s": round(station_s, 2), "mission_progress": run.get("progress"), "mission_state": run["state"],
-        "frame_to_disk": figures(list(report.delays_s)), "frame_to_viewer": delays(seen.pictures),
-        "frame_to_map_tile": delays(seen.map), "frame_to_map_tile_running": delays(running(seen.map)),
+        "mission": mission,
+        "viewers": viewers,
+        "frames": report.frames,
+        "dropped": report.late + report.overflowed,
+        "station_cpu_s": round(station_s, 2),
+        "mission_progress": run.get("progress"),
+        "mission_state": run["state"],
+        "frame_to_disk": figures(list(report.delays_s)),
+        "frame_to_viewer": delays(seen.pictures),
+        "frame_to_map_tile": delays(seen.map),
+        "frame_to_map_tile_running": delays(running(seen.map)),
         "tile_fetch": figures(seen.tiles_s),
-        "frame_to_boxes": delays(seen.boxes), "frame_to_boxes_running": delays(running(seen.boxes)),
-        "frame_to_boxes_of_running": {name: delays(running(each)) for name, each in seen.of_class.items()},
-        "frame_to_motion": delays(seen.motion), "frame_to_motion_running": delays(running(seen.motion)),
+        "frame_to_boxes": delays(seen.boxes),
+        "frame_to_boxes_running": delays(running(seen.boxes)),
+        "frame_to_boxes_of_running": {
+            name: delays(running(each)) for name, each in seen.of_class.items()
+        },
+        "frame_to_motion": delays(seen.motion),
+        "frame_to_motion_running": delays(running(seen.motion)),
     }
 
 
@@ -203,16 +250,25 @@ def repeated(flight: Path, scratch: Path, flights: int) -> dict[str, Any]:
     with station(scratch / "root") as (url, pid):
         for number in range(flights):
             stop = threading.Event()
-            footage = open_footage(str(flight / "flight1" / "sent.mp4"), None, None, LiveSettings(), stop)
+            footage = open_footage(
+                str(flight / "flight1" / "sent.mp4"), None, None, LiveSettings(), stop
+            )
             spool = Spool(scratch / f"spool{number}", 2_000_000_000)
             settings = StreamSettings(speed=0, latency_s=math.inf)
-            frames += StreamClient(footage, spool, stream_url(url, _STREAM), "", settings, stop).run().frames
+            frames += (
+                StreamClient(footage, spool, stream_url(url, _STREAM), "", settings, stop)
+                .run()
+                .frames
+            )
             shutil.rmtree(scratch / f"spool{number}")
             pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
             memory_mb.append(round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1))
             files.append(len(os.listdir(f"/proc/{pid}/fd")))
     return {
-        "flights": flights, "frames": frames, "seconds": round(time.monotonic() - began_s, 1), "memory_mb": memory_mb,
+        "flights": flights,
+        "frames": frames,
+        "seconds": round(time.monotonic() - began_s, 1),
+        "memory_mb": memory_mb,
         "open_files": files,
     }
 
@@ -226,7 +282,12 @@ async def followed(
     flying.start()
     while not any(each["flights"] for each in await ask(url, "/api/streams")):
         await asyncio.sleep(0.1)
-    wish = {"mission": mission, "site": "field", "input": {"stream": _STREAM}, "options": {"model": options.model}}
+    wish = {
+        "mission": mission,
+        "site": "field",
+        "input": {"stream": _STREAM},
+        "options": {"model": options.model},
+    }
     run = await ask(url, "/api/runs", wish)
     while (run := await ask(url, f"/api/runs/{run['id']}"))["state"] == "running":
         await asyncio.sleep(0.5)
@@ -240,10 +301,15 @@ async def followed(
 async def viewed(url: str, seen: Seen) -> None:
     """A viewer: when each picture, each frame's boxes and its motion came."""
     with suppress(ConnectionClosed):
-        async with connect(f"ws{url[4:]}/api/streams/{_STREAM}/video", max_size=20_000_000, compression=None) as link:
+        async with connect(
+            f"ws{url[4:]}/api/streams/{_STREAM}/video", max_size=20_000_000, compression=None
+        ) as link:
             async for item in link:
                 if isinstance(item, bytes):
-                    note(seen.pictures, seen.taken_s.get(int.from_bytes(item[:8], "big", signed=True)))
+                    note(
+                        seen.pictures,
+                        seen.taken_s.get(int.from_bytes(item[:8], "big", signed=True)),
+                    )
                 elif (words := json.loads(item))["type"] == "motion":
                     note(seen.motion, taken_s_of(seen, words["pts_us"]))
                 elif words["type"] == "boxes":
@@ -272,7 +338,9 @@ async def shown(url: str, seen: Seen, event: dict[str, Any]) -> None:
     later, has it. A page fetches when it hears of the revision, be that before or after it hears of the frame.
     """
     asked_s, placed = time.time(), event["data"]
-    moment_us = (round(datetime.fromisoformat(placed["time"]).timestamp() * 1e9) - seen.zero_ns) // 1000
+    moment_us = (
+        round(datetime.fromisoformat(placed["time"]).timestamp() * 1e9) - seen.zero_ns
+    ) // 1000
     nearest = min(seen.taken_s, key=lambda each: abs(each - moment_us))
     revision = (await ask(url, f"/api/sites/{event['site']}"))["live_revision"]
     while revision not in seen.announced:
@@ -287,7 +355,9 @@ async def shown(url: str, seen: Seen, event: dict[str, Any]) -> None:
     if status == 200:
         fetch_s = time.time() - began_s
         seen.tiles_s.append(fetch_s)
-        seen.map.append((seen.taken_s[nearest], seen.announced[revision] + fetch_s - seen.taken_s[nearest]))
+        seen.map.append(
+            (seen.taken_s[nearest], seen.announced[revision] + fetch_s - seen.taken_s[nearest])
+        )
 
 
 def note_boxes(seen: Seen, pts_us: int, classes: list[str] | None) -> None:
@@ -337,8 +407,10 @@ def figures(delays_s: list[float]) -> dict[str, Any]:
         return {"count": 0}
     values = np.array(delays_s)
     return {
-        "count": len(values), "median_s": round(float(np.median(values)), 3),
-        "p95_s": round(float(np.percentile(values, 95)), 3), "max_s": round(float(values.max()), 3),
+        "count": len(values),
+        "median_s": round(float(np.median(values)), 3),
+        "p95_s": round(float(np.percentile(values, 95)), 3),
+        "max_s": round(float(values.max()), 3),
     }
 
 
@@ -349,7 +421,17 @@ def station(root: Path) -> Iterator[tuple[str, int]]:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     process = subprocess.Popen(
-        [sys.executable, "-m", "sorvolo", "serve", str(root), "--port", str(port), "--free-floor", "0"],
+        [
+            sys.executable,
+            "-m",
+            "sorvolo",
+            "serve",
+            str(root),
+            "--port",
+            str(port),
+            "--free-floor",
+            "0",
+        ],
         stderr=subprocess.DEVNULL,
     )
     url = f"http://127.0.0.1:{port}"

@@ -72,7 +72,9 @@ class Again:
                 later = piece.shifted(number * self._length_us)
                 if piece.kind is Kind.TELEMETRY:
                     sample = sample_from_json(piece.payload)
-                    moved = replace(sample, time_ns=sample.time_ns + 1000 * number * self._length_us)
+                    moved = replace(
+                        sample, time_ns=sample.time_ns + 1000 * number * self._length_us
+                    )
                     later = replace(later, payload=moved.to_json().encode())
                 yield later
 
@@ -83,17 +85,30 @@ class Again:
 
 def main() -> None:
     """Stream, listen, compare, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=120.0, help="of flight")
-    parser.add_argument("--speed", type=float, default=1.0, help="seconds of flight that are sent each second")
+    parser.add_argument(
+        "--speed", type=float, default=1.0, help="seconds of flight that are sent each second"
+    )
     parser.add_argument("--flight", type=Path, help="simulated before, or where to keep it")
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         flight = there_and_back(options.flight or Path(scratch) / "flight")
         hours = asyncio.run(flown(flight, Path(scratch), options))
-    hours = {"machine": machine(), "commit": commit(), **hours, "load_after": round(os.getloadavg()[0], 2)}
-    result = json.loads(options.output.read_text()) if options.output.is_file() else {"benchmark": "station"}
+    hours = {
+        "machine": machine(),
+        "commit": commit(),
+        **hours,
+        "load_after": round(os.getloadavg()[0], 2),
+    }
+    result = (
+        json.loads(options.output.read_text())
+        if options.output.is_file()
+        else {"benchmark": "station"}
+    )
     options.output.write_text(json.dumps({**result, "hours": hours}, indent=1) + "\n")
     print(json.dumps(hours))
 
@@ -103,7 +118,9 @@ def there_and_back(folder: Path) -> Path:
     once, both = folder / "flight1" / "flight1.mp4", folder / "both" / "both.mp4"
     if not once.is_file():
         settings = SimulationSettings(
-            seed=7, flights=1, scene=SceneSettings(people=4, cars=4, small_objects=4),
+            seed=7,
+            flights=1,
+            scene=SceneSettings(people=4, cars=4, small_objects=4),
             path=PathSettings(height_m=30, speed_m_s=0.5, length_m=0.5 * _SIDE_S, strips=1),
             imaging=ImagingSettings(width_px=640, height_px=360, fps=_FPS),
             output=OutputSettings(truth_step=1_000_000),
@@ -119,7 +136,9 @@ def there_and_back(folder: Path) -> Path:
 def mirrored(video: Path, target: Path) -> None:
     """A flight followed by itself backwards, with its telemetry, as a drone's encoder sends it."""
     with av.open(str(video)) as source:
-        pictures = [frame.to_ndarray(format="yuv420p") for frame in source.decode(source.streams.video[0])]
+        pictures = [
+            frame.to_ndarray(format="yuv420p") for frame in source.decode(source.streams.video[0])
+        ]
         size = source.streams.video[0].width, source.streams.video[0].height
     with av.open(str(target), "w") as output:
         stream = output.add_stream("libx264", rate=_FPS)
@@ -137,7 +156,11 @@ def mirrored(video: Path, target: Path) -> None:
         at_s = 2 * length_s - float(row["offsetTime"])
         speeds = {name: str(-float(row[name])) for name in ("velN(M/S)", "velE(M/S)")}
         if length_s <= at_s < 2 * length_s:
-            row |= {"offsetTime": f"{at_s:.3f}", "flightTime(msec)": f"{1000 * at_s:.0f}", "Tick#": f"{600 * at_s:.0f}"}
+            row |= {
+                "offsetTime": f"{at_s:.3f}",
+                "flightTime(msec)": f"{1000 * at_s:.0f}",
+                "Tick#": f"{600 * at_s:.0f}",
+            }
             back.append({**row, **speeds})
     with open(target.with_suffix(".csv"), "w", newline="") as wanted:
         writer = csv.DictWriter(wanted, rows[0])
@@ -149,7 +172,9 @@ async def flown(flight: Path, scratch: Path, options: Any) -> dict[str, Any]:
     """The whole flight with missions and listeners, and what was noted of it."""
     (scratch / "root").mkdir()
     stop = threading.Event()
-    once = open_footage(str(flight / "both" / "both.mp4"), None, str(flight / "camera.xml"), LiveSettings(), stop)
+    once = open_footage(
+        str(flight / "both" / "both.mp4"), None, str(flight / "camera.xml"), LiveSettings(), stop
+    )
     length_us = frames_of(flight / "both" / "both.mp4") * 1_000_000 // _FPS
     footage = Again(once, round(options.minutes * 60e6 / length_us), length_us)
     heard: dict[str, list[int]] = {"page": [], "comes_and_goes": [], "program": []}
@@ -158,7 +183,12 @@ async def flown(flight: Path, scratch: Path, options: Any) -> dict[str, Any]:
     with station(scratch / "root") as (url, pid):
         settings = StreamSettings(speed=options.speed)
         client = StreamClient(
-            footage, Spool(scratch / "spool", 2_000_000_000), stream_url(url, _STREAM), "", settings, stop
+            footage,
+            Spool(scratch / "spool", 2_000_000_000),
+            stream_url(url, _STREAM),
+            "",
+            settings,
+            stop,
         )
         listening = [
             asyncio.create_task(page(url, heard["page"], float("inf"))),
@@ -171,20 +201,37 @@ async def flown(flight: Path, scratch: Path, options: Any) -> dict[str, Any]:
         flying.start()
         while not any(each["flights"] for each in await ask(url, "/api/streams")):
             await asyncio.sleep(0.1)
-        runs = [await ask(url, "/api/runs", wish) for wish in (
-            {"mission": "watch", "site": "watched", "input": {"stream": _STREAM},
-             "options": {"model": _MODEL, "frames_per_second": _LOOKS_PER_S}},
-            {"mission": "map", "site": "mapped", "input": {"stream": _STREAM}, "options": {"model": "none"}},
-        )]
+        runs = [
+            await ask(url, "/api/runs", wish)
+            for wish in (
+                {
+                    "mission": "watch",
+                    "site": "watched",
+                    "input": {"stream": _STREAM},
+                    "options": {"model": _MODEL, "frames_per_second": _LOOKS_PER_S},
+                },
+                {
+                    "mission": "map",
+                    "site": "mapped",
+                    "input": {"stream": _STREAM},
+                    "options": {"model": "none"},
+                },
+            )
+        ]
         while any(run["state"] == "running" for run in runs):
             runs = [await ask(url, f"/api/runs/{run['id']}") for run in runs]
             if time.monotonic() - began_s >= 60 * len(samples):
-                samples.append({
-                    "minute": len(samples), "memory_mb": memory_mb(pid),
-                    "open_files": len(os.listdir(f"/proc/{pid}/fd")), "pictures": client.report.frames,
-                    "events": len(heard["page"]), "load": round(os.getloadavg()[0], 1),
-                    "missions_mb": {run["mission"]: mission_mb(run["id"]) for run in runs},
-                })
+                samples.append(
+                    {
+                        "minute": len(samples),
+                        "memory_mb": memory_mb(pid),
+                        "open_files": len(os.listdir(f"/proc/{pid}/fd")),
+                        "pictures": client.report.frames,
+                        "events": len(heard["page"]),
+                        "load": round(os.getloadavg()[0], 1),
+                        "missions_mb": {run["mission"]: mission_mb(run["id"]) for run in runs},
+                    }
+                )
                 print(json.dumps(samples[-1]), flush=True)
             await asyncio.sleep(1.0)
         flying.join()
@@ -197,20 +244,33 @@ async def flown(flight: Path, scratch: Path, options: Any) -> dict[str, Any]:
         kinds = await all_events(url)
     report = client.report
     return {
-        "minutes_of_flight": options.minutes, "speed": options.speed, "seconds": round(took_s),
+        "minutes_of_flight": options.minutes,
+        "speed": options.speed,
+        "seconds": round(took_s),
         "station_cpu_s": round(station_s, 1),
         "pictures": {
-            "sent": report.frames, "dropped": report.late + report.overflowed, "at_viewer": len(pictures),
-            "doubled": len(pictures) - len(set(pictures)), "in_order": pictures == sorted(pictures),
+            "sent": report.frames,
+            "dropped": report.late + report.overflowed,
+            "at_viewer": len(pictures),
+            "doubled": len(pictures) - len(set(pictures)),
+            "in_order": pictures == sorted(pictures),
         },
         "missions": [
-            {"mission": run["mission"], "state": run["state"], "progress": run["progress"]} for run in runs
+            {"mission": run["mission"], "state": run["state"], "progress": run["progress"]}
+            for run in runs
         ],
-        "events": {"count": len(kinds), "without_gap": sorted(kinds) == list(range(1, len(kinds) + 1)),
-                   "by_type": dict(Counter(kinds.values()))},
+        "events": {
+            "count": len(kinds),
+            "without_gap": sorted(kinds) == list(range(1, len(kinds) + 1)),
+            "by_type": dict(Counter(kinds.values())),
+        },
         "heard": {
-            name: {"count": len(seqs), "lost": len(set(kinds) - set(seqs)), "doubled": len(seqs) - len(set(seqs)),
-                   "in_order": seqs == sorted(seqs)}
+            name: {
+                "count": len(seqs),
+                "lost": len(set(kinds) - set(seqs)),
+                "doubled": len(seqs) - len(set(seqs)),
+                "in_order": seqs == sorted(seqs),
+            }
             for name, seqs in heard.items()
         },
         "each_minute": samples,
@@ -221,7 +281,9 @@ async def page(url: str, seqs: list[int], stay_s: float) -> None:
     """Events by WebSocket from the first on; away for a few seconds after so long, then on from the last."""
     while True:
         with suppress(ConnectionClosed, TimeoutError):
-            async with connect(f"ws{url[4:]}/api/events?after={seqs[-1] if seqs else 0}", max_size=20_000_000) as link:
+            async with connect(
+                f"ws{url[4:]}/api/events?after={seqs[-1] if seqs else 0}", max_size=20_000_000
+            ) as link:
                 async with asyncio.timeout(None if stay_s == float("inf") else stay_s):
                     async for text in link:
                         if (event := json.loads(text))["type"] != "alive":
@@ -231,7 +293,10 @@ async def page(url: str, seqs: list[int], stay_s: float) -> None:
 
 def program(url: str, seqs: list[int]) -> None:
     """Events as Server-Sent Events, on one connection, until the station ends."""
-    with suppress(OSError, HTTPException), urllib.request.urlopen(f"{url}/api/events?after=0") as answer:
+    with (
+        suppress(OSError, HTTPException),
+        urllib.request.urlopen(f"{url}/api/events?after=0") as answer,
+    ):
         for line in answer:
             if line.startswith(b"id: "):
                 seqs.append(int(line[4:]))

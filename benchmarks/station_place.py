@@ -54,10 +54,21 @@ def fly(archive: Archive, number: int) -> None:
     for index in range(_FRAMES):
         at_m = np.array([7.0 * (index % 15) + moved_m[0], 7.0 * (index // 15) + moved_m[1], 20.0])
         pose = Pose(site_from_gimbal_rotation(float(chance.normal(0, 3)), -90.0, 0.0), at_m)
-        placed.append(PlacedFrame(
-            str(index), index, (1_600_000_000 + 86_400 * number + index) * 10**9, Status.VISION, "", _CAMERA, pose,
-            site_from_image_homography(_CAMERA, pose), footprint(_CAMERA, pose), 0.4, 0.05,
-        ))
+        placed.append(
+            PlacedFrame(
+                str(index),
+                index,
+                (1_600_000_000 + 86_400 * number + index) * 10**9,
+                Status.VISION,
+                "",
+                _CAMERA,
+                pose,
+                site_from_image_homography(_CAMERA, pose),
+                footprint(_CAMERA, pose),
+                0.4,
+                0.05,
+            )
+        )
     with archive.begin_flight(f"flight-{number:04d}", f"print-{number}", {}) as writer:
         writer.commit(placed, {}, {}, "")
 
@@ -66,7 +77,10 @@ def asked(client: TestClient, times: int) -> tuple[float, int]:
     """Processor milliseconds of the station for one question, and how many frames it found."""
     begun, found = time.process_time(), 0
     for _ in range(times):
-        answer = client.get("/api/sites/site-000/place", params={"lon": 13.0005, "lat": 46.0001, "most_per_flight": 3})
+        answer = client.get(
+            "/api/sites/site-000/place",
+            params={"lon": 13.0005, "lat": 46.0001, "most_per_flight": 3},
+        )
         found = len(answer.json())
     return 1000 * (time.process_time() - begun) / times, found
 
@@ -98,7 +112,9 @@ def main() -> int:
         root = Path(folder) / "sites"
         for site, count in enumerate(counts):
             with Archive.open(root / f"site-{site:03d}", write=True) as archive:
-                archive.create_site(Site(f"site {site}", Geodetic(46.0 + 0.01 * site, 13.0), "EPSG:32633", 0.05))
+                archive.create_site(
+                    Site(f"site {site}", Geodetic(46.0 + 0.01 * site, 13.0), "EPSG:32633", 0.05)
+                )
                 for number in range(count):
                     fly(archive, number)
         print(f"{sum(counts)} flights", file=sys.stderr, flush=True)
@@ -111,9 +127,14 @@ def main() -> int:
             pass
         indexed_s = time.process_time() - begun
         figures = {
-            "flights": sum(counts), "sites": len(counts), "flights_of_the_site": counts[0],
-            "frames_a_flight": _FRAMES, "index_cpu_s": round(indexed_s, 1), "processor_ms": {
-                "without": without, "with_index": measured(root, 9002),
+            "flights": sum(counts),
+            "sites": len(counts),
+            "flights_of_the_site": counts[0],
+            "frames_a_flight": _FRAMES,
+            "index_cpu_s": round(indexed_s, 1),
+            "processor_ms": {
+                "without": without,
+                "with_index": measured(root, 9002),
             },
         }
     print(json.dumps(figures, indent=1))

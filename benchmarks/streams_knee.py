@@ -51,9 +51,13 @@ FIRST_S = 7.0  # of the flight that is there at once: FFmpeg looks at five secon
 
 def main() -> None:
     """Simulate, watch, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--streams", type=int, nargs="+", default=[1, 2, 4, 8, 16, 24])
-    parser.add_argument("--rate", type=float, default=2.0, help="frames searched a second of each stream")
+    parser.add_argument(
+        "--rate", type=float, default=2.0, help="frames searched a second of each stream"
+    )
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--size", default="640x360")
     parser.add_argument("--share", action="store_true", help="one detector for all")
@@ -74,9 +78,15 @@ def main() -> None:
             rows.append(watched(stream, count, Path(scratch) / f"of{count}", options))
             keeping = [row["streams"] for row in rows if row["share"] >= KEEPS_UP]
             result = {
-                "benchmark": "streams_knee", "machine": machine(), "commit": commit(), "rate_hz": options.rate,
-                "seconds": options.seconds, "size": options.size, "share_detector": options.share,
-                "knee": max(keeping, default=0), "rows": rows,
+                "benchmark": "streams_knee",
+                "machine": machine(),
+                "commit": commit(),
+                "rate_hz": options.rate,
+                "seconds": options.seconds,
+                "size": options.size,
+                "share_detector": options.share,
+                "knee": max(keeping, default=0),
+                "rows": rows,
             }
             options.output.parent.mkdir(exist_ok=True)
             options.output.write_text(json.dumps(result, indent=1) + "\n")
@@ -94,14 +104,20 @@ def make_stream(folder: Path, size: str, seconds: float) -> None:
     """Write a simulated flight as MPEG-TS with a key frame each second, as a drone sends it: flight.ts."""
     width, height = map(int, size.split("x"))
     settings = SimulationSettings(
-        seed=3, flights=1, scene=SceneSettings(people=6, cars=4, small_objects=3),
+        seed=3,
+        flights=1,
+        scene=SceneSettings(people=6, cars=4, small_objects=3),
         path=PathSettings(height_m=20, speed_m_s=4, length_m=4 * seconds, strips=1),
-        imaging=ImagingSettings(width, height, fps=FPS), output=OutputSettings("none", truth_step=1_000_000),
+        imaging=ImagingSettings(width, height, fps=FPS),
+        output=OutputSettings("none", truth_step=1_000_000),
     )
     for _ in simulate_site(folder / "flight", settings):
         pass
     place = folder / "flight.ts"
-    with av.open(str(folder / "flight" / "flight1" / "flight1.mp4")) as video, av.open(str(place), "w") as sent:
+    with (
+        av.open(str(folder / "flight" / "flight1" / "flight1.mp4")) as video,
+        av.open(str(place), "w") as sent,
+    ):
         stream = sent.add_stream("libx264", rate=int(FPS))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         stream.options = {"preset": "ultrafast", "tune": "zerolatency", "g": str(int(FPS))}
@@ -120,13 +136,22 @@ def watched(stream: bytes, count: int, folder: Path, options: Any) -> dict[str, 
         file.write_bytes(stream[:first])
     with SharedDetector() as shared:
         address = shared.address if options.share else ""
-        return fed(stream, first, files, [begun(file, options.rate, address) for file in files], shared, options) | {
-            "streams": count, "load_before": load
-        }
+        return fed(
+            stream,
+            first,
+            files,
+            [begun(file, options.rate, address) for file in files],
+            shared,
+            options,
+        ) | {"streams": count, "load_before": load}
 
 
 def fed(
-    stream: bytes, first: int, files: list[Path], children: list[subprocess.Popen[bytes]], shared: SharedDetector,
+    stream: bytes,
+    first: int,
+    files: list[Path],
+    children: list[subprocess.Popen[bytes]],
+    shared: SharedDetector,
     options: Any,
 ) -> dict[str, Any]:
     """What watches of files do that grow from the first bytes of the stream to all of it."""
@@ -142,15 +167,24 @@ def fed(
         file.with_name(f"{file.name}.ended").touch()
     peaks = [ended(child) for child in children]
     seen = [each for file in files for each in frames_of(file) if each[1] >= FIRST_S * FPS]
-    lags_s = [at_s - (began_s + index / FPS - FIRST_S) for at_s, index in seen if at_s <= began_s + options.seconds]
+    lags_s = [
+        at_s - (began_s + index / FPS - FIRST_S)
+        for at_s, index in seen
+        if at_s <= began_s + options.seconds
+    ]
     count = len(files)
     wanted = options.rate * options.seconds * count
     return {
-        "wanted_frames": wanted, "searched_frames": len(lags_s),
-        "share": round(min(1.0, len(lags_s) / wanted), 3), "cpu_s_per_frame": round(cpu / max(1, len(lags_s)), 4),
-        "cores_used": round(cpu / options.seconds, 2), "cores_of_others": round(others_s / options.seconds, 2),
-        "lag_s": round(median(lags_s), 2) if lags_s else None, "lag_max_s": round(max(lags_s), 2) if lags_s else None,
-        "start_cpu_s": round(started_cpu_s / count, 2), "peak_mb": round(max(peaks)),
+        "wanted_frames": wanted,
+        "searched_frames": len(lags_s),
+        "share": round(min(1.0, len(lags_s) / wanted), 3),
+        "cpu_s_per_frame": round(cpu / max(1, len(lags_s)), 4),
+        "cores_used": round(cpu / options.seconds, 2),
+        "cores_of_others": round(others_s / options.seconds, 2),
+        "lag_s": round(median(lags_s), 2) if lags_s else None,
+        "lag_max_s": round(max(lags_s), 2) if lags_s else None,
+        "start_cpu_s": round(started_cpu_s / count, 2),
+        "peak_mb": round(max(peaks)),
         "detector_mb": round(shared.memory_mb),
     }
 
@@ -159,17 +193,32 @@ def begun(file: Path, rate: float, detector: str) -> subprocess.Popen[bytes]:
     """A process with the watch of one growing file, which writes down when it had searched which frame."""
     with seen_file(file).open("wb") as seen:
         return subprocess.Popen(
-            [sys.executable, __file__, "--rate", str(rate), "--child", str(file), str(file.with_suffix("")), detector],
-            env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=seen, stderr=subprocess.DEVNULL,
+            [
+                sys.executable,
+                __file__,
+                "--rate",
+                str(rate),
+                "--child",
+                str(file),
+                str(file.with_suffix("")),
+                detector,
+            ],
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+            stdout=seen,
+            stderr=subprocess.DEVNULL,
         )
 
 
 def watch_one(file: str, out: str, detector: str, rate: float) -> None:
     """The child: a line for each searched frame, the monotonic clock and the frame's number."""
     settings = WatchSettings(frames_per_second=rate)
-    patient = LiveSettings(silent_s=UP_WITHIN_S, first_s=UP_WITHIN_S, give_up_s=UP_WITHIN_S)  # while others start
+    patient = LiveSettings(
+        silent_s=UP_WITHIN_S, first_s=UP_WITHIN_S, give_up_s=UP_WITHIN_S
+    )  # while others start
     shared = open_detector("default", detector) if detector else None
-    for update in watch(f"follow:{file}", settings, WatchOutputs(folder=Path(out)), live=patient, detector=shared):
+    for update in watch(
+        f"follow:{file}", settings, WatchOutputs(folder=Path(out)), live=patient, detector=shared
+    ):
         print(time.monotonic(), update.frames_read - 1, flush=True)
 
 
@@ -180,7 +229,11 @@ def seen_file(file: Path) -> Path:
 
 def frames_of(file: Path) -> list[tuple[float, int]]:
     """When which frames were searched."""
-    rows = [line.split() for line in seen_file(file).read_text().splitlines(keepends=True) if line.endswith("\n")]
+    rows = [
+        line.split()
+        for line in seen_file(file).read_text().splitlines(keepends=True)
+        if line.endswith("\n")
+    ]
     return [(float(at_s), int(index)) for at_s, index in rows]
 
 
@@ -206,7 +259,9 @@ def cpu_s(pid: int) -> float:
 
 def machine_cpu_s() -> float:
     """Processor seconds that the whole machine has used so far."""
-    user, nice, system, _idle, _wait, *interrupts = map(int, Path("/proc/stat").read_text().split()[1:8])
+    user, nice, system, _idle, _wait, *interrupts = map(
+        int, Path("/proc/stat").read_text().split()[1:8]
+    )
     return (user + nice + system + sum(interrupts)) / os.sysconf("SC_CLK_TCK")
 
 
@@ -223,8 +278,17 @@ def ended(child: "subprocess.Popen[bytes]") -> float:
 def show(rows: list[dict[str, Any]]) -> None:
     """The table."""
     names = (
-        "streams", "share", "lag_s", "lag_max_s", "cpu_s_per_frame", "cores_used", "start_cpu_s", "peak_mb",
-        "detector_mb", "load_before", "cores_of_others",
+        "streams",
+        "share",
+        "lag_s",
+        "lag_max_s",
+        "cpu_s_per_frame",
+        "cores_used",
+        "start_cpu_s",
+        "peak_mb",
+        "detector_mb",
+        "load_before",
+        "cores_of_others",
     )
     table = Table(*names)
     for row in rows:

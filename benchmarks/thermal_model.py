@@ -37,21 +37,29 @@ TIMED, SHOWN_PX = 10, (768, 960)  # frames; (height, width) as which 640x512 is 
 
 def main() -> None:
     """Compare on validation frames, held-out frames and simulated thermal pictures; write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("before")
     parser.add_argument("after")
     parser.add_argument("data", type=Path)
-    parser.add_argument("--sets", nargs="*", default=["hituav val", "pictures_thermal", "hituav test"])
+    parser.add_argument(
+        "--sets", nargs="*", default=["hituav val", "pictures_thermal", "hituav test"]
+    )
     parser.add_argument("--threads", type=int, default=1)
     wishes = parser.parse_args()
-    known = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {"commit": commit(), "sets": {}}
+    known = (
+        json.loads(RESULTS.read_text()) if RESULTS.is_file() else {"commit": commit(), "sets": {}}
+    )
     sets: dict[str, Any] = {}
     with tempfile.TemporaryDirectory() as folder:
         files = {}
         for name in ("before", "after"):
             files[name] = Path(folder) / f"{name}.onnx"
             files[name].write_bytes(by_itself(find_model(getattr(wishes, name)).read_bytes()))
-        detectors = {name: Detector.load(each, threads=wishes.threads) for name, each in files.items()}
+        detectors = {
+            name: Detector.load(each, threads=wishes.threads) for name, each in files.items()
+        }
         measured = {
             "hituav val": lambda: hituav(wishes.data)["val"],
             "hituav test": lambda: held_out("hituav", wishes.data, Path(folder), 1),
@@ -64,16 +72,29 @@ def main() -> None:
                 print(name, json.dumps(plain_json(sets[name])), flush=True)
         seconds = clock_s(files)
     print(seconds)
-    RESULTS.write_text(json.dumps(plain_json({
-        "benchmark": "thermal_model", "machine": machine(), "commit": commit() if sets else known["commit"],
-        "s_a_frame": seconds | {"commit": commit()}, "sets": known["sets"] | sets,
-    }), indent=1) + "\n")
+    RESULTS.write_text(
+        json.dumps(
+            plain_json(
+                {
+                    "benchmark": "thermal_model",
+                    "machine": machine(),
+                    "commit": commit() if sets else known["commit"],
+                    "s_a_frame": seconds | {"commit": commit()},
+                    "sets": known["sets"] | sets,
+                }
+            ),
+            indent=1,
+        )
+        + "\n"
+    )
 
 
 def clock_s(files: dict[str, Path]) -> dict[str, Any]:
     """The median time by the clock, on one thread, in which each model looks at a frame."""
     sessions = {name: Session(each, "cpu", 1) for name, each in files.items()}
-    picture = np.random.default_rng(1).integers(0, 256, (*SHOWN_PX, 1)).astype(np.uint8).repeat(3, 2)
+    picture = (
+        np.random.default_rng(1).integers(0, 256, (*SHOWN_PX, 1)).astype(np.uint8).repeat(3, 2)
+    )
     took: dict[str, list[float]] = {name: [] for name in files}
     for _ in range(TIMED + 1):
         for name, session in sessions.items():
@@ -103,9 +124,16 @@ def compared(labelled: LabelledSet, detectors: dict[str, Detector]) -> dict[str,
         )
         arms.append(Arm(name, CLASSES, (found,), (THRESHOLDS,)))
     compared = compare_arms(labelled, arms)
-    of_class = [f"{kind} {label}" for label in compared.labels if compared.labels[label] for kind in ("AP50", "AP")]
+    of_class = [
+        f"{kind} {label}"
+        for label in compared.labels
+        if compared.labels[label]
+        for kind in ("AP50", "AP")
+    ]
     return {
-        "pictures": compared.pictures, "groups": compared.groups, "labels": compared.labels,
+        "pictures": compared.pictures,
+        "groups": compared.groups,
+        "labels": compared.labels,
         **{arm.name: {key: arm.mean[key] for key in of_class} for arm in compared.arms},
         "difference": {key: asdict(compared.differences[0][key]) for key in of_class},
     }

@@ -23,7 +23,11 @@ from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.missions.reproduce.report import write_reproduction
 from sorvolo.missions.reproduce.rows import Row
 from sorvolo.missions.reproduce.run import reproduce
-from sorvolo.missions.reproduce.settings import DetectorSettings, ReproductionSettings, SimulatedSize
+from sorvolo.missions.reproduce.settings import (
+    DetectorSettings,
+    ReproductionSettings,
+    SimulatedSize,
+)
 from sorvolo.missions.reproduce.simulated import simulated_dataset
 from sorvolo.missions.reproduce.thesis_tables import tables_of
 from sorvolo.store.exports.plain import plain_json
@@ -34,10 +38,14 @@ RESULTS = Path(__file__).parent / "results" / "thesis_tables.json"
 
 def main() -> None:
     """Simulate, reproduce, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("seeds", type=int, nargs="*", help="else one drawn from the commit's hash")
     parser.add_argument("--length", type=float, default=24.0, help="of a path, m")
-    parser.add_argument("--videos", type=int, default=1, help="paths with telemetry, of each environment")
+    parser.add_argument(
+        "--videos", type=int, default=1, help="paths with telemetry, of each environment"
+    )
     parser.add_argument("--train-steps", type=int, default=150, help="of each network of Table 4.6")
     parser.add_argument("--work", type=Path, help="folder that stays, with a page for each seed")
     parser.add_argument("--output", type=Path, default=RESULTS)
@@ -49,14 +57,22 @@ def main() -> None:
         work = options.work or Path(scratch)
         for seed in seeds:
             settings = ReproductionSettings(
-                options.videos, seed=seed, detector=DetectorSettings(options.train_steps, weights="auto")
+                options.videos,
+                seed=seed,
+                detector=DetectorSettings(options.train_steps, weights="auto"),
             )
             rows += reproduced(work / str(seed), settings, size)
     scoring = note_scoring(f"thesis_tables, seeds {' '.join(map(str, seeds))}")
     tables = plain_json(tables_of(rows))
     result = {
-        "benchmark": "thesis_tables", "machine": machine(), "load_1_min": os.getloadavg()[0], "commit": commit(),
-        **scoring, "seeds": seeds, "simulated": asdict(size), "videos": options.videos,
+        "benchmark": "thesis_tables",
+        "machine": machine(),
+        "load_1_min": os.getloadavg()[0],
+        "commit": commit(),
+        **scoring,
+        "seeds": seeds,
+        "simulated": asdict(size),
+        "videos": options.videos,
         "tables": without_outlines(tables),
         "missing": [{"id": row.id, "reason": row.missing} for row in rows if row.missing],
     }
@@ -83,7 +99,9 @@ def reproduced(folder: Path, settings: ReproductionSettings, size: SimulatedSize
 def without_outlines(tables: dict[str, Any]) -> dict[str, Any]:
     """The tables without the outlines that only a drawing needs."""
     figure = tables["figure_3_12"]
-    ours = [{key: value for key, value in row.items() if key != "outlines_m"} for row in figure["ours"]]
+    ours = [
+        {key: value for key, value in row.items() if key != "outlines_m"} for row in figure["ours"]
+    ]
     return {**tables, "figure_3_12": {**figure, "ours": ours}}
 
 

@@ -58,10 +58,13 @@ def make_site(folder: Path, side_px: int, compress: str) -> dict[str, Any]:
             for column in range(-half, half):
                 for row in range(-half, half):
                     x, y = (column % _KINDS) * tile_px, (row % _KINDS) * tile_px
-                    writer.tiles[column, row] = np.ascontiguousarray(ground[y:y + tile_px, x:x + tile_px])
+                    writer.tiles[column, row] = np.ascontiguousarray(
+                        ground[y : y + tile_px, x : x + tile_px]
+                    )
             writer.commit([], {}, {}, "")
     return {
-        "pixels": (2 * half * tile_px) ** 2, "tile_px": tile_px,
+        "pixels": (2 * half * tile_px) ** 2,
+        "tile_px": tile_px,
         "geotiff_megabytes": round((folder / "mosaic.tif").stat().st_size / 1e6, 1),
         "made_cpu_s": round(time.process_time() - started_s, 1),
     }
@@ -71,7 +74,9 @@ def asked(client: TestClient, side_m: float, count: int) -> list[dict[str, Any]]
     """For each zoom what a tile took."""
     corner_deg = side_m / 2 / 111_320.0
     finest = int(np.round(np.log2(40_075_016.7 * np.cos(np.radians(_LATITUDE)) / 256 / _M_PER_PX)))
-    client.get(f"/api/sites/large/tiles/1/{finest}/{column_of(_LONGITUDE, finest)}/{row_of(_LATITUDE, finest)}.webp")
+    client.get(
+        f"/api/sites/large/tiles/1/{finest}/{column_of(_LONGITUDE, finest)}/{row_of(_LATITUDE, finest)}.webp"
+    )
     chance, rows = np.random.default_rng(7), []
     for zoom in range(finest, finest - 8, -1):
         low_x, high_x = (column_of(_LONGITUDE + sign * 1.3 * corner_deg, zoom) for sign in (-1, 1))
@@ -85,14 +90,18 @@ def asked(client: TestClient, side_m: float, count: int) -> list[dict[str, Any]]
             wall_ms.append(1000 * (time.perf_counter() - begun_s))
             cpu_ms.append(1000 * (time.process_time() - begun_cpu_s))
             found += answer.status_code == 200 and len(answer.content) > 0
-        rows.append({
-            "zoom": zoom, "tiles": len(chosen), "found": found,
-            **{
-                f"{name}_{part}": round(float(np.percentile(values, share)), 1)
-                for name, values in (("wall_ms", wall_ms), ("cpu_ms", cpu_ms))
-                for part, share in (("median", 50), ("p95", 95))
-            },
-        })
+        rows.append(
+            {
+                "zoom": zoom,
+                "tiles": len(chosen),
+                "found": found,
+                **{
+                    f"{name}_{part}": round(float(np.percentile(values, share)), 1)
+                    for name, values in (("wall_ms", wall_ms), ("cpu_ms", cpu_ms))
+                    for part, share in (("median", 50), ("p95", 95))
+                },
+            }
+        )
         print(rows[-1], file=sys.stderr, flush=True)
     return rows
 
@@ -109,7 +118,9 @@ def row_of(latitude: float, zoom: int) -> int:
 
 def main() -> int:
     """Make the map, ask for tiles, print and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--side", type=int, default=32_768)
     parser.add_argument("--compress", default="deflate", choices=("deflate", "jpeg"))
     parser.add_argument("--tiles", type=int, default=60)
@@ -117,13 +128,21 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         root = options.root or Path(scratch)
-        made = {} if (root / "large").is_dir() else make_site(root / "large", options.side, options.compress)
+        made = (
+            {}
+            if (root / "large").is_dir()
+            else make_site(root / "large", options.side, options.compress)
+        )
         app = station_app(StationSettings(root))
         with TestClient(app, base_url="http://127.0.0.1:8750", client=("127.0.0.1", 1)) as client:
             zooms = asked(client, options.side * _M_PER_PX, options.tiles)
     figures = {"side_px": options.side, "compress": options.compress, **made, "zooms": zooms}
     known = json.loads(RESULTS.read_text()) if RESULTS.is_file() else {"runs": {}}
-    known["runs"][options.compress] = {"machine": provenance.machine(), "commit": provenance.commit(), **figures}
+    known["runs"][options.compress] = {
+        "machine": provenance.machine(),
+        "commit": provenance.commit(),
+        **figures,
+    }
     RESULTS.write_text(json.dumps(known, indent=1) + "\n")
     return 0
 

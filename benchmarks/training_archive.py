@@ -35,9 +35,13 @@ class TrainingArchive:
             self._file = zipfile.ZipFile(path)
             self._manifest = json.loads(self._file.read(MANIFEST))
         except (zipfile.BadZipFile, KeyError, ValueError) as error:
-            raise InputError(f"{path} is no whole archive of pack_training_data.py ({error}); write it anew") from error
+            raise InputError(
+                f"{path} is no whole archive of pack_training_data.py ({error}); write it anew"
+            ) from error
         if self._manifest["format"] != FORMAT:
-            raise InputError(f"{path} is of format {self._manifest['format']}, not {FORMAT}; write it anew")
+            raise InputError(
+                f"{path} is of format {self._manifest['format']}, not {FORMAT}; write it anew"
+            )
 
     @property
     def shares(self) -> list[Share]:
@@ -52,13 +56,18 @@ class TrainingArchive:
         """ImageNet weights of a backbone. Raises InputError where the archive has none of it."""
         about = self._manifest["weights"].get(net)
         if about is None:
-            raise InputError(f"{self._name} has no weights of {net}; give --weights, or write it anew with them")
+            raise InputError(
+                f"{self._name} has no weights of {net}; give --weights, or write it anew with them"
+            )
         layers = safetensors.torch.load(self._file.read(_weights_path(net)))
         return ImageNetWeights(net, layers, about["original"], about["origin"])
 
 
 def write_archive(
-    path: Path, shares: Sequence[Share], starts: Sequence[ImageNetWeights], licences: Mapping[str, str]
+    path: Path,
+    shares: Sequence[Share],
+    starts: Sequence[ImageNetWeights],
+    licences: Mapping[str, str],
 ) -> None:
     """Write the archive, whole or not at all; `licences` names that of every set.
 
@@ -66,13 +75,21 @@ def write_archive(
     """
     manifest = {
         "format": FORMAT,
-        "shares": [_plain_share(number, each, licences[each.labelled.name]) for number, each in enumerate(shares)],
-        "weights": {each.net: {"original": each.original, "origin": each.origin} for each in starts},
+        "shares": [
+            _plain_share(number, each, licences[each.labelled.name])
+            for number, each in enumerate(shares)
+        ],
+        "weights": {
+            each.net: {"original": each.original, "origin": each.origin} for each in starts
+        },
     }
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     # stored as they are: JPEG and weights hardly get smaller
-    with atomic_path(path) as partial, zipfile.ZipFile(partial, "w", strict_timestamps=False) as file:
+    with (
+        atomic_path(path) as partial,
+        zipfile.ZipFile(partial, "w", strict_timestamps=False) as file,
+    ):
         file.writestr(MANIFEST, json.dumps(manifest), zipfile.ZIP_DEFLATED)
         for number, share in enumerate(shares):
             for row, picture in enumerate(share.labelled.pictures):
@@ -93,14 +110,25 @@ def fingerprint(shares: Sequence[Share]) -> str:
 def _plain_share(number: int, share: Share, licence: str) -> dict[str, Any]:
     labelled = share.labelled
     return {
-        "name": labelled.name, "licence": licence, "weight": share.weight, "scale": list(share.scale),
-        "pastes": share.pastes, "thermal": share.thermal, "aslant": share.aslant,
-        "classes": list(labelled.classes), "unlabelled": sorted(labelled.unlabelled),
+        "name": labelled.name,
+        "licence": licence,
+        "weight": share.weight,
+        "scale": list(share.scale),
+        "pastes": share.pastes,
+        "thermal": share.thermal,
+        "aslant": share.aslant,
+        "classes": list(labelled.classes),
+        "unlabelled": sorted(labelled.unlabelled),
         "pictures": [
             {
-                "path": _picture_path(number, row, each), "width_px": each.width_px, "height_px": each.height_px,
-                "group": each.group, "boxes_px": each.boxes_px.tolist(), "labels": each.labels.tolist(),
-                "ignored_px": each.ignored_px.tolist(), "m_per_px": each.m_per_px if isfinite(each.m_per_px) else None,
+                "path": _picture_path(number, row, each),
+                "width_px": each.width_px,
+                "height_px": each.height_px,
+                "group": each.group,
+                "boxes_px": each.boxes_px.tolist(),
+                "labels": each.labels.tolist(),
+                "ignored_px": each.ignored_px.tolist(),
+                "m_per_px": each.m_per_px if isfinite(each.m_per_px) else None,
             }
             for row, each in enumerate(labelled.pictures)
         ],
@@ -110,15 +138,24 @@ def _plain_share(number: int, share: Share, licence: str) -> dict[str, Any]:
 def _share(plain: Mapping[str, Any]) -> Share:
     pictures = tuple(
         LabelledPicture(
-            each["path"], each["width_px"], each["height_px"], each["group"], np.array(each["boxes_px"], np.float32),
-            np.array(each["labels"], np.int64), np.array(each["ignored_px"], np.float32),
+            each["path"],
+            each["width_px"],
+            each["height_px"],
+            each["group"],
+            np.array(each["boxes_px"], np.float32),
+            np.array(each["labels"], np.int64),
+            np.array(each["ignored_px"], np.float32),
             nan if each["m_per_px"] is None else each["m_per_px"],
         )
         for each in plain["pictures"]
     )
-    labelled = LabelledSet(plain["name"], tuple(plain["classes"]), pictures, frozenset(plain["unlabelled"]))
+    labelled = LabelledSet(
+        plain["name"], tuple(plain["classes"]), pictures, frozenset(plain["unlabelled"])
+    )
     low, high = plain["scale"]
-    return Share(labelled, plain["weight"], (low, high), plain["pastes"], plain["thermal"], plain["aslant"])
+    return Share(
+        labelled, plain["weight"], (low, high), plain["pastes"], plain["thermal"], plain["aslant"]
+    )
 
 
 def _picture_path(share: int, row: int, picture: LabelledPicture) -> str:

@@ -37,8 +37,13 @@ def training_shares(data: Path, simulated: Path) -> list[Share]:
 def thermal_shares(data: Path, simulated: Path) -> list[Share]:
     """What the thermal model learns from; simulated frames show what HIT-UAV does not: other poses, small things."""
     made = _made(simulated)
-    is_thermal = {row["file_name"]: row["thermal"] for row in json.loads((simulated / SIMULATED).read_text())["images"]}
-    heat = made.only([each for each in made.pictures if is_thermal[f"images/{Path(each.path).name}"]])
+    is_thermal = {
+        row["file_name"]: row["thermal"]
+        for row in json.loads((simulated / SIMULATED).read_text())["images"]
+    }
+    heat = made.only(
+        [each for each in made.pictures if is_thermal[f"images/{Path(each.path).name}"]]
+    )
     return [*frames_of_heat(data), Share(heat, 0.6, (0.8, 1.8))]
 
 
@@ -46,15 +51,25 @@ def frames_of_heat(data: Path) -> list[Share]:
     """HIT-UAV's frames: those from aslant have an up and a down."""
     thermal = hituav(data)["train"]
     return [
-        Share(_from(thermal, lambda angle_deg: angle_deg < STEEP_DEG), 3.2, (1.0, 2.3), thermal=True, aslant=True),
-        Share(_from(thermal, lambda angle_deg: angle_deg >= STEEP_DEG), 1.4, (1.0, 2.3), thermal=True),
+        Share(
+            _from(thermal, lambda angle_deg: angle_deg < STEEP_DEG),
+            3.2,
+            (1.0, 2.3),
+            thermal=True,
+            aslant=True,
+        ),
+        Share(
+            _from(thermal, lambda angle_deg: angle_deg >= STEEP_DEG), 1.4, (1.0, 2.3), thermal=True
+        ),
     ]
 
 
 def _made(simulated: Path) -> LabelledSet:
     """The simulated pictures, made at the first time."""
     if not (simulated / SIMULATED).is_file():
-        settings = PictureSettings(pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=0.2)
+        settings = PictureSettings(
+            pictures=SIMULATED_PICTURES, seed=SIMULATED_SEED, thermal_share=0.2
+        )
         for _ in simulate_pictures(simulated, settings):
             pass
     return replace(in_order(read_dataset(simulated)), name="simulated")
@@ -62,16 +77,26 @@ def _made(simulated: Path) -> LabelledSet:
 
 def _from(labelled: LabelledSet, fits: Callable[[float], bool]) -> LabelledSet:
     """HIT-UAV's frames taken at angles below the horizon that `fits`; their names give them, night_height_angle_."""
-    return labelled.only([each for each in labelled.pictures if fits(float(Path(each.path).stem.split("_")[2]))])
+    return labelled.only(
+        [each for each in labelled.pictures if fits(float(Path(each.path).stem.split("_")[2]))]
+    )
 
 
 def _ground(data: Path) -> LabelledSet:
     """Photos without labels as ground for small objects: whether people or cars are in them is not known."""
     pictures = []
     folder = data.parent / "flights"
-    paths = sorted([*folder.glob("brighton_beach/**/*.JPG"), *folder.glob("caliterra/**/*.[jJ][pP]*")])
+    paths = sorted(
+        [*folder.glob("brighton_beach/**/*.JPG"), *folder.glob("caliterra/**/*.[jJ][pP]*")]
+    )
     for path in paths:
-        height, width = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_REDUCED_COLOR_8).shape[:2]
+        height, width = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_REDUCED_COLOR_8).shape[
+            :2
+        ]
         none = np.zeros((0, 4), np.float32)
-        pictures.append(LabelledPicture(str(path), width * 8, height * 8, path.parent.name, none, np.zeros(0), none))
+        pictures.append(
+            LabelledPicture(
+                str(path), width * 8, height * 8, path.parent.name, none, np.zeros(0), none
+            )
+        )
     return LabelledSet("ground", CLASSES, tuple(pictures), frozenset(CLASSES[:2]))

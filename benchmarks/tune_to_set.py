@@ -47,11 +47,24 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--side", type=int, default=384)
     parser.add_argument("--scale", type=float, nargs=2, default=(0.6, 1.5))
-    parser.add_argument("--look", type=float, default=1.0, help="the measured pictures are shown so many times larger")
-    parser.add_argument("--tiles", type=int, help="cut into tiles of so many of the picture's pixels; else whole")
-    parser.add_argument("--on", choices=("val", "test"), default="test", help="which part is measured")
-    parser.add_argument("--tuned", type=Path, help="weights that an earlier run tuned: only measure")
-    parser.add_argument("--results", type=Path, help="the file that is written; else results/tuned_NAME.json")
+    parser.add_argument(
+        "--look",
+        type=float,
+        default=1.0,
+        help="the measured pictures are shown so many times larger",
+    )
+    parser.add_argument(
+        "--tiles", type=int, help="cut into tiles of so many of the picture's pixels; else whole"
+    )
+    parser.add_argument(
+        "--on", choices=("val", "test"), default="test", help="which part is measured"
+    )
+    parser.add_argument(
+        "--tuned", type=Path, help="weights that an earlier run tuned: only measure"
+    )
+    parser.add_argument(
+        "--results", type=Path, help="the file that is written; else results/tuned_NAME.json"
+    )
     parser.add_argument("--seed", type=int, default=1)
     wishes = parser.parse_args()
     torch.set_num_threads(1)
@@ -66,24 +79,43 @@ def main() -> None:
     for learnt, measured in folds(parts, wishes.on):
         model = tuned(LabelledSet(wishes.name, CLASSES, learnt, unlabelled), wishes)
         pictures += measured
-        found += [looked(model, reader()(each.path), wishes.look, wishes.tiles) for each in measured]
+        found += [
+            looked(model, reader()(each.path), wishes.look, wishes.tiles) for each in measured
+        ]
         learnt_from += len(learnt)
     held_out = LabelledSet(wishes.name, CLASSES, tuple(pictures), unlabelled)
     thresholds = dict.fromkeys(CLASSES, 0.5)
     scores = score_set(held_out, found, CLASSES, thresholds)
     centres = people_by_centre(held_out, FoundSet((), tuple(found), thresholds), CLASSES)
     document = {
-        "benchmark": "tune_to_set", "set": wishes.name, "machine": machine(), "commit": commit(), "seed": wishes.seed,
-        "steps": wishes.steps, "scale": wishes.scale, "look": wishes.look, "tiles": wishes.tiles,
-        "pictures": len(held_out), "learnt_from": learnt_from,
+        "benchmark": "tune_to_set",
+        "set": wishes.name,
+        "machine": machine(),
+        "commit": commit(),
+        "seed": wishes.seed,
+        "steps": wishes.steps,
+        "scale": wishes.scale,
+        "look": wishes.look,
+        "tiles": wishes.tiles,
+        "pictures": len(held_out),
+        "learnt_from": learnt_from,
         "labels": {each.label: each.labels for each in scores.classes},
-        "intervals": {name: asdict(each) for name, each in scores.intervals.items()}, "people_by_centre": centres,
+        "intervals": {name: asdict(each) for name, each in scores.intervals.items()},
+        "people_by_centre": centres,
     }
     if wishes.on == "test":
         out = wishes.results or Path(__file__).parent / "results" / f"tuned_{wishes.name}.json"
         out.write_text(json.dumps(document, indent=1) + "\n")
-    print(json.dumps({name: document[name] for name in ("look", "labels", "people_by_centre")}), flush=True)
-    print(json.dumps({name: each for name, each in document["intervals"].items() if name.startswith("AP")}), flush=True)
+    print(
+        json.dumps({name: document[name] for name in ("look", "labels", "people_by_centre")}),
+        flush=True,
+    )
+    print(
+        json.dumps(
+            {name: each for name, each in document["intervals"].items() if name.startswith("AP")}
+        ),
+        flush=True,
+    )
 
 
 def folds(
@@ -94,7 +126,10 @@ def folds(
         return [(parts["train"].pictures, parts[on].pictures)]
     every = parts["test"].pictures
     return [
-        (tuple(each for each in every if each.group != scene), tuple(each for each in every if each.group == scene))
+        (
+            tuple(each for each in every if each.group != scene),
+            tuple(each for each in every if each.group == scene),
+        )
         for scene in sorted({each.group for each in every})
     ]
 
@@ -106,7 +141,9 @@ def tuned(learnt: LabelledSet, wishes: argparse.Namespace) -> FasterRCNN:
         model.load_state_dict(torch.load(wishes.tuned, weights_only=True))
         return model
     model.load_state_dict(torch.load(wishes.weights, weights_only=True))
-    settings = JointSettings(steps=wishes.steps, rate=5e-4, backbone_rate=1e-4, averaging=0.99, warm_steps=50)
+    settings = JointSettings(
+        steps=wishes.steps, rate=5e-4, backbone_rate=1e-4, averaging=0.99, warm_steps=50
+    )
     training = JointTraining(model.to(memory_format=torch.channels_last), settings, wishes.seed)
     aslant = wishes.name in ("hituav", "tinyperson", "sdd")
     share = Share(learnt, 1.0, tuple(wishes.scale), thermal=wishes.name == "hituav", aslant=aslant)
@@ -121,13 +158,17 @@ def tuned(learnt: LabelledSet, wishes: argparse.Namespace) -> FasterRCNN:
 
 def looked(model: FasterRCNN, picture: ImageRGB, look: float, tiles: int | None) -> Detections:
     """What the network finds in a picture (H, W, 3) shown `look` times larger; boxes in the picture's pixels."""
-    info = ModelInfo("tuned", CLASSES, dict.fromkeys(CLASSES, 0.5), {name: (10.0, 40.0) for name in CLASSES})
+    info = ModelInfo(
+        "tuned", CLASSES, dict.fromkeys(CLASSES, 0.5), {name: (10.0, 40.0) for name in CLASSES}
+    )
     plan = plan_tiles(picture.shape[:2], info, CLASSES, tiles=tiles)
     seen = []
     for place in plan.places_px:
         left, top, right, bottom = place
         part = picture[top:bottom, left:right]
-        shown = np.asarray(cv2.resize(part, None, fx=look, fy=look, interpolation=cv2.INTER_CUBIC), np.uint8)
+        shown = np.asarray(
+            cv2.resize(part, None, fx=look, fy=look, interpolation=cv2.INTER_CUBIC), np.uint8
+        )
         found = see(model, CLASSES, part if look == 1 else shown)
         boxes = found.boxes_px / np.float32(look) + np.array([left, top, left, top], np.float32)
         seen.append(SeenTile(place, Seen(boxes, found.scores, found.labels)))

@@ -85,18 +85,26 @@ PHOTO_JOBS = (
 
 
 REAL_JOBS = (
-    VIDEO_JOBS[1], Job("watch", ("watch", "{flight1}", "--out", "{out}"), "{out}"), VIDEO_JOBS[3],
+    VIDEO_JOBS[1],
+    Job("watch", ("watch", "{flight1}", "--out", "{out}"), "{out}"),
+    VIDEO_JOBS[3],
 )
 
 
 def main() -> None:
     """Simulate, run, account, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--only", nargs="*", help="rows such as 'video: watch'")
     parser.add_argument("--megapixels", type=float, default=12.0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--photos", type=Path, help="a folder of real photos instead of simulated ones")
-    parser.add_argument("--flights", type=Path, help="where the simulated flights are, or are to be kept")
+    parser.add_argument(
+        "--photos", type=Path, help="a folder of real photos instead of simulated ones"
+    )
+    parser.add_argument(
+        "--flights", type=Path, help="where the simulated flights are, or are to be kept"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     parser.add_argument("--simulate", nargs=3, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -104,20 +112,33 @@ def main() -> None:
         folder, kind, size = options.simulate
         simulate(Path(folder), kind, int(size), options.seed, options.megapixels)
         return
-    known = json.loads(options.output.read_text()) if options.only and options.output.is_file() else {"rows": {}}
+    known = (
+        json.loads(options.output.read_text())
+        if options.only and options.output.is_file()
+        else {"rows": {}}
+    )
     rows = known["rows"]
     photos = f"photo, {options.megapixels:g} MP"
     photo_jobs = PHOTO_JOBS if options.photos is None else REAL_JOBS
     with tempfile.TemporaryDirectory() as scratch:
         for kind, jobs in (("video", VIDEO_JOBS), (photos, photo_jobs)):
-            wanted = [job for job in jobs if options.only is None or f"{kind}: {job.name}" in options.only]
+            wanted = [
+                job for job in jobs if options.only is None or f"{kind}: {job.name}" in options.only
+            ]
             if not wanted:
                 continue
-            flights = [simulated(options.flights or Path(scratch), kind, size, options) for size in (0, 1)]
+            flights = [
+                simulated(options.flights or Path(scratch), kind, size, options) for size in (0, 1)
+            ]
             for job in wanted:
-                decode_s = rows.get("video: decode", {}).get("cpu_s", 0.0) if kind == "video" else 0.0
-                rows[f"{kind}: {job.name}"] = unit_cost(job, flights, Path(scratch) / "work", decode_s) | {
-                    "commit": commit(), "load_1_min": os.getloadavg()[0],
+                decode_s = (
+                    rows.get("video: decode", {}).get("cpu_s", 0.0) if kind == "video" else 0.0
+                )
+                rows[f"{kind}: {job.name}"] = unit_cost(
+                    job, flights, Path(scratch) / "work", decode_s
+                ) | {
+                    "commit": commit(),
+                    "load_1_min": os.getloadavg()[0],
                 }
                 written(options.output, rows)
     show(rows)
@@ -141,8 +162,18 @@ def simulated(place: Path, kind: str, size: int, options: Any) -> Path:
     if not folder.is_dir():
         place.mkdir(parents=True, exist_ok=True)
         subprocess.run(
-            [sys.executable, __file__, "--seed", str(options.seed), "--megapixels", str(options.megapixels),
-             "--simulate", str(folder), kind, str(size)],
+            [
+                sys.executable,
+                __file__,
+                "--seed",
+                str(options.seed),
+                "--megapixels",
+                str(options.megapixels),
+                "--simulate",
+                str(folder),
+                kind,
+                str(size),
+            ],
             check=True,
         )
     return folder
@@ -169,7 +200,9 @@ def copy_photo(path: Path, copy: Path, megapixels: float, light: float) -> None:
         if abs(scale - 1) < 0.02 and light == 1.0:
             shutil.copy(path, copy)
             return
-        resized = photo.resize((round(photo.width * scale), round(photo.height * scale)), Image.Resampling.BICUBIC)
+        resized = photo.resize(
+            (round(photo.width * scale), round(photo.height * scale)), Image.Resampling.BICUBIC
+        )
         lit = ImageEnhance.Brightness(resized).enhance(light)
         lit.save(copy, quality=92, exif=photo.info["exif"], xmp=photo.info.get("xmp", b""))
 
@@ -184,7 +217,10 @@ def simulate(folder: Path, kind: str, size: int, seed: int, megapixels: float) -
         imaging = ImagingSettings(width_px, 2 * round(width_px * 3 / 8), fps=5.0)
         path = PathSettings(40.0, SPEED_M_S, 22.0, strips=PHOTO_STRIPS[size], strip_spacing_m=16.0)
     settings = SimulationSettings(
-        seed=seed, scene=SceneSettings(people=4, cars=2, small_objects=3), path=path, imaging=imaging,
+        seed=seed,
+        scene=SceneSettings(people=4, cars=2, small_objects=3),
+        path=path,
+        imaging=imaging,
         later=LaterSettings(removed=1, moved=1),
         output=OutputSettings(photos=kind != "video", photo_overlap=0.7, truth_step=1_000_000),
     )
@@ -196,13 +232,19 @@ def unit_cost(job: Job, flights: Sequence[Path], work: Path, decode_s: float) ->
     """The job on both sizes, and what a unit costs besides decoding its frames."""
     runs = [run(job, simulation, work) for simulation in flights]
     short, long = runs
-    more = {name: long[name] - short[name] for name in ("units", "frames", "cpu_s", "bytes", "files")}
+    more = {
+        name: long[name] - short[name] for name in ("units", "frames", "cpu_s", "bytes", "files")
+    }
     decode_s = 0.0 if job == DECODE else decode_s
     cpu_s = (more["cpu_s"] - decode_s * more["frames"]) / more["units"]
     start_s = short["cpu_s"] - cpu_s * short["units"] - decode_s * short["frames"]
     return {
-        "cpu_s": round(cpu_s, 4), "start_cpu_s": round(start_s, 2), "peak_mb": round(long["peak_mb"]),
-        "bytes": round(more["bytes"] / more["units"]), "files": round(more["files"] / more["units"], 1), "runs": runs,
+        "cpu_s": round(cpu_s, 4),
+        "start_cpu_s": round(start_s, 2),
+        "peak_mb": round(long["peak_mb"]),
+        "bytes": round(more["bytes"] / more["units"]),
+        "files": round(more["files"] / more["units"], 1),
+        "runs": runs,
     }
 
 
@@ -212,14 +254,28 @@ def run(job: Job, simulation: Path, work: Path) -> dict[str, Any]:
     work.mkdir()
     places = {
         **{f"flight{number}": str(pictures(simulation, number)) for number in (1, 2)},
-        "site": str(work / "site"), "mapped": str(work / "mapped"), "out": str(work / "out"),
+        "site": str(work / "site"),
+        "mapped": str(work / "mapped"),
+        "out": str(work / "out"),
     }
     stated = simulation / "camera.xml"
     camera = ("--camera", str(stated)) if stated.is_file() else ()
     if any("{mapped}" in each for each in job.arguments):
         kept = simulation / "mapped"
         if not kept.is_dir():
-            run_python(["-m", "sorvolo", "map", places["flight1"], "--site", str(kept), "--model", "none", *camera])
+            run_python(
+                [
+                    "-m",
+                    "sorvolo",
+                    "map",
+                    places["flight1"],
+                    "--site",
+                    str(kept),
+                    "--model",
+                    "none",
+                    *camera,
+                ]
+            )
         shutil.copytree(kept, places["mapped"])
     number = 2 if any("{flight2}" in each for each in job.arguments) else 1
     grown = Path(job.grows.format(**places))
@@ -227,7 +283,9 @@ def run(job: Job, simulation: Path, work: Path) -> dict[str, Any]:
     is_ours = job != DECODE
     takes_camera = is_ours and any("{flight" in each for each in job.arguments)
     arguments = [each if each == _DECODE else each.format(**places) for each in job.arguments]
-    used = run_python([*(("-m", "sorvolo") if is_ours else ()), *arguments, *(camera if takes_camera else ())])
+    used = run_python(
+        [*(("-m", "sorvolo") if is_ours else ()), *arguments, *(camera if takes_camera else ())]
+    )
     frames = frames_of(simulation, number)
     size, files = below(grown)
     kept = {"bytes": size - before_bytes, "files": files - before_files}
@@ -264,29 +322,42 @@ def run_python(arguments: Sequence[str]) -> dict[str, float]:
     """Run a program to its end; its processor seconds and peak memory, MB. Exit codes 0 and 3 are results."""
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     child = subprocess.Popen(
-        ["timeout", str(LIMIT_S), sys.executable, *arguments], env=environment,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        ["timeout", str(LIMIT_S), sys.executable, *arguments],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert child.stderr is not None
     errors = child.stderr.read()
     _, status, used = os.wait4(child.pid, 0)
     code = child.returncode = os.waitstatus_to_exitcode(status)
     if code not in (0, 3):
-        raise SystemExit(f"{' '.join(arguments)} ended with {code}: {errors.strip().splitlines()[-1:]}")
+        raise SystemExit(
+            f"{' '.join(arguments)} ended with {code}: {errors.strip().splitlines()[-1:]}"
+        )
     return {"cpu_s": used.ru_utime + used.ru_stime, "peak_mb": used.ru_maxrss / 1024}
 
 
 def below(folder: Path) -> tuple[int, int]:
     """The bytes and the number of all files below a folder."""
-    sizes = [path.stat().st_size for path in folder.rglob("*") if path.is_file()] if folder.is_dir() else []
+    sizes = (
+        [path.stat().st_size for path in folder.rglob("*") if path.is_file()]
+        if folder.is_dir()
+        else []
+    )
     return sum(sizes), len(sizes)
 
 
 def show(rows: dict[str, Any]) -> None:
     """The table."""
-    table = Table("mission", "CPU s a unit", "start, CPU s", "peak MB", "bytes a unit", "files a unit")
+    table = Table(
+        "mission", "CPU s a unit", "start, CPU s", "peak MB", "bytes a unit", "files a unit"
+    )
     for name, row in rows.items():
-        table.add_row(name, *(str(row[key]) for key in ("cpu_s", "start_cpu_s", "peak_mb", "bytes", "files")))
+        table.add_row(
+            name, *(str(row[key]) for key in ("cpu_s", "start_cpu_s", "peak_mb", "bytes", "files"))
+        )
     Console().print(table)
 
 

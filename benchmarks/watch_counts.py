@@ -48,8 +48,12 @@ _REACH_M = 8.0
 
 def main() -> None:
     """Fly the patrols and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="else twelve drawn from the commit's hash")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[], help="else twelve drawn from the commit's hash"
+    )
     parser.add_argument("--height", type=float, default=60.0)
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
@@ -61,14 +65,25 @@ def main() -> None:
     standing_m = np.array([error for each in patrols for error in each["standing_errors_m"]])
     inside = [each for one in patrols for each in one["inside"]]
     result: dict[str, Any] = {
-        "benchmark": "watch_counts", "machine": machine(), "commit": commit(), "height_m": options.height, **scoring,
-        "seen": seen, "counted": counted, "count_error": abs(counted - seen) / seen,
-        "mean_count_error_of_a_patrol": float(np.mean([
-            abs(one["counted"] - one["seen"]) / one["seen"] for one in patrols
-        ])),
-        "missed": sum(each["missed"] for each in patrols), "extra": sum(each["extra"] for each in patrols),
-        "rms_m": _rms(errors_m), "standing_rms_m": _rms(standing_m), "inside_95": float(np.mean(inside)),
-        "patrols": [{key: value for key, value in each.items() if key in _OF_A_PATROL} for each in patrols],
+        "benchmark": "watch_counts",
+        "machine": machine(),
+        "commit": commit(),
+        "height_m": options.height,
+        **scoring,
+        "seen": seen,
+        "counted": counted,
+        "count_error": abs(counted - seen) / seen,
+        "mean_count_error_of_a_patrol": float(
+            np.mean([abs(one["counted"] - one["seen"]) / one["seen"] for one in patrols])
+        ),
+        "missed": sum(each["missed"] for each in patrols),
+        "extra": sum(each["extra"] for each in patrols),
+        "rms_m": _rms(errors_m),
+        "standing_rms_m": _rms(standing_m),
+        "inside_95": float(np.mean(inside)),
+        "patrols": [
+            {key: value for key, value in each.items() if key in _OF_A_PATROL} for each in patrols
+        ],
     }
     options.output.parent.mkdir(exist_ok=True)
     options.output.write_text(json.dumps(result, indent=1) + "\n")
@@ -81,9 +96,12 @@ _OF_A_PATROL = ("seed", "seen", "counted", "missed", "extra", "rms_m")
 def patrol(seed: int, height_m: float) -> dict[str, Any]:
     """One simulated patrol: what was seen, what was counted, and how far off each right track lies."""
     settings = SimulationSettings(
-        seed=seed, flights=2,
+        seed=seed,
+        flights=2,
         scene=SceneSettings(people=10, cars=6, small_objects=4, has_scenery=False),
-        path=PathSettings(height_m=height_m, speed_m_s=8, length_m=150, strips=3, strip_spacing_m=0.35 * height_m),
+        path=PathSettings(
+            height_m=height_m, speed_m_s=8, length_m=150, strips=3, strip_spacing_m=0.35 * height_m
+        ),
         imaging=ImagingSettings(width_px=960, height_px=540, fps=5),
         sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5), wander_m=1.4),
         later=replace(LaterSettings(), removed=0, moved=0),
@@ -96,16 +114,23 @@ def patrol(seed: int, height_m: float) -> dict[str, Any]:
         detector = TruthDetector(simulated, _FLIGHT, misses=0.2, false_alarms=0.2, seed=seed)
         folder = Path(scratch) / "watch"
         for _ in watch(
-            simulated / _FLIGHT / f"{_FLIGHT}.mp4", outputs=WatchOutputs(folder=folder),
-            camera=simulated / "camera.xml", detector=detector,
+            simulated / _FLIGHT / f"{_FLIGHT}.mp4",
+            outputs=WatchOutputs(folder=folder),
+            camera=simulated / "camera.xml",
+            detector=detector,
         ):
             pass
-        tracks = [each["properties"] for each in json.loads((folder / "tracks.geojson").read_text())["features"]]
+        tracks = [
+            each["properties"]
+            for each in json.loads((folder / "tracks.geojson").read_text())["features"]
+        ]
         report = json.loads((folder / "report.json").read_text())
         return {"seed": seed, **_compared(tracks, simulated, report)}
 
 
-def _compared(tracks: list[dict[str, Any]], simulated: Path, report: dict[str, Any]) -> dict[str, Any]:
+def _compared(
+    tracks: list[dict[str, Any]], simulated: Path, report: dict[str, Any]
+) -> dict[str, Any]:
     boxes = json.loads((simulated / "truth" / _FLIGHT / "boxes.json").read_text())
     frames: dict[int, list[int]] = {}
     for each in boxes["annotations"]:
@@ -113,7 +138,8 @@ def _compared(tracks: list[dict[str, Any]], simulated: Path, report: dict[str, A
             frames.setdefault(each["object_id"], []).append(each["image_id"])
     fps, count = 5.0, len(boxes["images"])
     objects = [
-        each["properties"] for each in json.loads((simulated / "truth" / "objects.geojson").read_text())["features"]
+        each["properties"]
+        for each in json.loads((simulated / "truth" / "objects.geojson").read_text())["features"]
         if 2 in each["properties"]["flights"] and each["properties"]["id"] in frames
     ]
     often = [len(frames[each["id"]]) >= 5 for each in objects]
@@ -121,12 +147,16 @@ def _compared(tracks: list[dict[str, Any]], simulated: Path, report: dict[str, A
     cost = np.full((len(tracks), len(objects)), 1e6)
     for row, track in enumerate(tracks):
         place = site.site_from_wgs84(
-            np.array([track["latitude"]]), np.array([track["longitude"]]), np.array([DEFAULT_ORIGIN.height_m])
+            np.array([track["latitude"]]),
+            np.array([track["longitude"]]),
+            np.array([DEFAULT_ORIGIN.height_m]),
         )[0][:2]
         for column, thing in enumerate(objects):
             # a track's place is where the object was when it was last seen
             last_s = frames[thing["id"]][-1] / fps - (count - 1) / fps / 2
-            there = np.array([thing["east_m"], thing["north_m"]]) + last_s * np.array(thing["velocity_m_s"])
+            there = np.array([thing["east_m"], thing["north_m"]]) + last_s * np.array(
+                thing["velocity_m_s"]
+            )
             if thing["class"] == track["class"]:
                 cost[row, column] = np.linalg.norm(place - there)
     rows, columns = linear_sum_assignment(cost)
@@ -134,10 +164,18 @@ def _compared(tracks: list[dict[str, Any]], simulated: Path, report: dict[str, A
     errors = np.array([cost[pair] for pair in right])
     found, extra = sum(often[column] for _, column in right), len(tracks) - len(right)
     return {
-        "seen": sum(often), "counted": found + extra, "missed": sum(often) - found, "extra": extra,
-        "errors_m": errors.tolist(), "rms_m": _rms(errors),
-        "standing_errors_m": [float(cost[pair]) for pair in right if not objects[pair[1]]["moving"]],
-        "inside": [bool(cost[row, column] < 2.45 * tracks[row]["sigma_m"]) for row, column in right],
+        "seen": sum(often),
+        "counted": found + extra,
+        "missed": sum(often) - found,
+        "extra": extra,
+        "errors_m": errors.tolist(),
+        "rms_m": _rms(errors),
+        "standing_errors_m": [
+            float(cost[pair]) for pair in right if not objects[pair[1]]["moving"]
+        ],
+        "inside": [
+            bool(cost[row, column] < 2.45 * tracks[row]["sigma_m"]) for row, column in right
+        ],
         "frames": report["frames"]["detected"],
     }
 

@@ -86,24 +86,42 @@ class Truth:
 
 def main() -> None:
     """Fly and watch the patrols, watch the real videos, and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[], help="else drawn from the commit's hash")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[], help="else drawn from the commit's hash"
+    )
     parser.add_argument("--patrols", type=int, default=3)
     parser.add_argument("--height", type=float, default=25.0)
     parser.add_argument("--model", default="default")
-    parser.add_argument("--data", type=Path, help="the folder of labelled sets; without it no real video is watched")
+    parser.add_argument(
+        "--data", type=Path, help="the folder of labelled sets; without it no real video is watched"
+    )
     parser.add_argument("--output", type=Path, default=RESULTS)
     options = parser.parse_args()
-    seeds = seeds_or_drawn("watch_counts_detector", options.seeds, options.patrols) if options.patrols else []
-    scoring = note_scoring(f"watch_counts_detector, seeds {' '.join(map(str, seeds))}") if seeds else {}
+    seeds = (
+        seeds_or_drawn("watch_counts_detector", options.seeds, options.patrols)
+        if options.patrols
+        else []
+    )
+    scoring = (
+        note_scoring(f"watch_counts_detector, seeds {' '.join(map(str, seeds))}") if seeds else {}
+    )
     detector = Detector.load(options.model)
     result: dict[str, Any] = {
-        "benchmark": "watch_counts_detector", "machine": machine(), "commit": commit(),
-        "date": f"{datetime.now(UTC):%Y-%m-%d}", "model": f"{detector.info.name} {detector.info.version}",
-        "height_m": options.height, **scoring, "seeds": seeds,
+        "benchmark": "watch_counts_detector",
+        "machine": machine(),
+        "commit": commit(),
+        "date": f"{datetime.now(UTC):%Y-%m-%d}",
+        "model": f"{detector.info.name} {detector.info.version}",
+        "height_m": options.height,
+        **scoring,
+        "seeds": seeds,
     }
     patrols = [
-        row for number, seed in enumerate(seeds, start=1)
+        row
+        for number, seed in enumerate(seeds, start=1)
         for row in patrol(seed, options.height, detector, has_scenery=number % 3 == 0)
     ]
     for way in ("with telemetry", "without telemetry"):
@@ -112,7 +130,9 @@ def main() -> None:
             result[f"simulated, {way}"] = _summed(rows)
     if options.data is not None:
         real = [real_video(options.data, name, detector) for name in REAL]
-        result["real, without telemetry"] = _summed(real) | note_scoring("watch_counts_detector, hituav test videos")
+        result["real, without telemetry"] = _summed(real) | note_scoring(
+            "watch_counts_detector, hituav test videos"
+        )
         patrols += real
     result["videos"] = patrols
     options.output.parent.mkdir(exist_ok=True)
@@ -120,13 +140,21 @@ def main() -> None:
     print(json.dumps(result, indent=1))
 
 
-def patrol(seed: int, height_m: float, detector: Detector, *, has_scenery: bool) -> list[dict[str, Any]]:
+def patrol(
+    seed: int, height_m: float, detector: Detector, *, has_scenery: bool
+) -> list[dict[str, Any]]:
     """One simulated patrol, watched with its telemetry and without."""
     settings = SimulationSettings(
-        seed=seed, flights=2, scene=SceneSettings(people=10, cars=6, small_objects=0, has_scenery=has_scenery),
-        path=PathSettings(height_m=height_m, speed_m_s=6, length_m=40, strips=3, strip_spacing_m=0.35 * height_m),
-        imaging=ImagingSettings(fps=5), sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5), wander_m=1.4),
-        later=replace(LaterSettings(), removed=0, moved=0), output=OutputSettings(truth_step=1),
+        seed=seed,
+        flights=2,
+        scene=SceneSettings(people=10, cars=6, small_objects=0, has_scenery=has_scenery),
+        path=PathSettings(
+            height_m=height_m, speed_m_s=6, length_m=40, strips=3, strip_spacing_m=0.35 * height_m
+        ),
+        imaging=ImagingSettings(fps=5),
+        sensor=SensorSettings(noise_m=(0.5, 0.5, 0.5), wander_m=1.4),
+        later=replace(LaterSettings(), removed=0, moved=0),
+        output=OutputSettings(truth_step=1),
     )
     with tempfile.TemporaryDirectory() as scratch:
         simulated = Path(scratch) / "simulated"
@@ -138,9 +166,16 @@ def patrol(seed: int, height_m: float, detector: Detector, *, has_scenery: bool)
         shutil.copy(simulated / _FLIGHT / f"{_FLIGHT}.mp4", alone)
         camera = simulated / "camera.xml"
         kind = "trees and houses" if has_scenery else "open ground"
-        ways = {"with telemetry": simulated / _FLIGHT / f"{_FLIGHT}.mp4", "without telemetry": alone}
+        ways = {
+            "with telemetry": simulated / _FLIGHT / f"{_FLIGHT}.mp4",
+            "without telemetry": alone,
+        }
         return [
-            {"video": f"simulated, seed {seed}, {kind}", "way": way, **watched(video, truth, detector, camera)}
+            {
+                "video": f"simulated, seed {seed}, {kind}",
+                "way": way,
+                **watched(video, truth, detector, camera),
+            }
             for way, video in ways.items()
         ]
 
@@ -152,7 +187,10 @@ def real_video(data: Path, name: str, detector: Detector) -> dict[str, Any]:
         video = Path(scratch) / "real.avi"
         images = [cv2.imread(each.path) for each in pictures]
         writer = cv2.VideoWriter(
-            str(video), cv2.VideoWriter.fourcc(*"FFV1"), _REAL_FPS, (images[0].shape[1], images[0].shape[0])
+            str(video),
+            cv2.VideoWriter.fourcc(*"FFV1"),
+            _REAL_FPS,
+            (images[0].shape[1], images[0].shape[0]),
         )
         for image in images:
             writer.write(image)
@@ -164,8 +202,13 @@ def real_video(data: Path, name: str, detector: Detector) -> dict[str, Any]:
 def real_pictures(data: Path, name: str) -> list[LabelledPicture]:
     """The frames of a real video in their order in time, none left out between them."""
     first, frames, start = REAL[name]
-    by_number = {int(re.findall(r"\d+", Path(each.path).stem)[-1]): each for each in hituav(data)["test"].pictures}
-    numbers = {frame: first + rank for rank, frame in enumerate(sorted(frames, key=str))}  # as the publisher has them
+    by_number = {
+        int(re.findall(r"\d+", Path(each.path).stem)[-1]): each
+        for each in hituav(data)["test"].pictures
+    }
+    numbers = {
+        frame: first + rank for rank, frame in enumerate(sorted(frames, key=str))
+    }  # as the publisher has them
     return [by_number[numbers[frame]] for frame in frames if frame >= start]
 
 
@@ -179,16 +222,23 @@ def watched(video: Path, truth: Truth, detector: Detector, camera: Path | None) 
             pass
         kind = ".geojson" if (out / "tracks.geojson").is_file() else ".json"
         tracks, rows = (
-            [each["properties"] for each in json.loads((out / f"{name}{kind}").read_text())["features"]]
+            [
+                each["properties"]
+                for each in json.loads((out / f"{name}{kind}").read_text())["features"]
+            ]
             for name in ("tracks", "detections")
         )
         report = json.loads((out / "report.json").read_text())
     searched = report["frames"]["detected"]
     if any(each["views"] > searched for each in tracks):
-        raise SystemExit(f"{video}: a track has more views than the {searched} frames that were searched")
+        raise SystemExit(
+            f"{video}: a track has more views than the {searched} frames that were searched"
+        )
     figures = {
-        "frames": searched, "most_views": max((each["views"] for each in tracks), default=0),
-        "placed": kind == ".geojson", **compared(tracks, rows, truth),
+        "frames": searched,
+        "most_views": max((each["views"] for each in tracks), default=0),
+        "placed": kind == ".geojson",
+        **compared(tracks, rows, truth),
         "processor_s": round(time.process_time() - began_s, 1),
     }
     print(video.name, figures, flush=True)
@@ -209,22 +259,31 @@ def compared(
     for track in tracks:
         views = boxes[track["id"]]
         votes = Counter(
-            best for frame, box in views if (best := _object_at(frame, box, truth, track["class"])) is not None
+            best
+            for frame, box in views
+            if (best := _object_at(frame, box, truth, track["class"])) is not None
         )
-        ignored = sum(bool(np.any(_overlaps(truth.ignored.get(frame, np.zeros((0, 4))), box))) for frame, box in views)
+        ignored = sum(
+            bool(np.any(_overlaps(truth.ignored.get(frame, np.zeros((0, 4))), box)))
+            for frame, box in views
+        )
         if votes and votes.total() >= len(views) / 2:
             votes_of[track["id"]] = votes
         elif ignored < len(views) / 2:
             false[track["class"]] += 1
     partners = _paired(votes_of, {each: len(boxes[each]) for each in votes_of})
     found = set(partners.values())
-    again = [votes.most_common(1)[0][0] for track, votes in votes_of.items() if track not in partners]
+    again = [
+        votes.most_common(1)[0][0] for track, votes in votes_of.items() if track not in partners
+    ]
     groups = {name: [each for each in seen if truth.labels[each] == name] for name in COUNTED}
     groups["moving car"] = [each for each in groups["car"] if truth.moving[each]]
     figures = {
         name: {
-            "true": len(members), "found": len(found.intersection(members)),
-            "missed": len(set(members) - found), "twice": sum(each in members for each in again),
+            "true": len(members),
+            "found": len(found.intersection(members)),
+            "missed": len(set(members) - found),
+            "twice": sum(each in members for each in again),
             "appearances": sum(_appearances(truth.clear[each]) for each in members),
             **({"false": false[name]} if name in COUNTED else {}),
         }
@@ -237,12 +296,18 @@ def compared(
 
 def _paired(votes_of: Mapping[int, Counter[int]], views: Mapping[int, int]) -> dict[int, int]:
     """The object of each track that has one for itself: so that most boxes lie on their track's object."""
-    tracks, objects = list(votes_of), sorted({each for votes in votes_of.values() for each in votes})
-    votes = np.array([[votes_of[track][each] for each in objects] for track in tracks]).reshape(-1, len(objects))
+    tracks, objects = (
+        list(votes_of),
+        sorted({each for votes in votes_of.values() for each in votes}),
+    )
+    votes = np.array([[votes_of[track][each] for each in objects] for track in tracks]).reshape(
+        -1, len(objects)
+    )
     if not votes.size:
         return {}
     return {
-        tracks[row]: objects[column] for row, column in zip(*linear_sum_assignment(votes, maximize=True))
+        tracks[row]: objects[column]
+        for row, column in zip(*linear_sum_assignment(votes, maximize=True))
         if votes[row, column] >= max(1, views[tracks[row]] / 4)
     }
 
@@ -250,11 +315,17 @@ def _paired(votes_of: Mapping[int, Counter[int]], views: Mapping[int, int]) -> d
 def _summed(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The figures of several videos together."""
     names = [
-        name for name in (*COUNTED, "moving car") if any(row[name]["true"] or row[name].get("false") for row in rows)
+        name
+        for name in (*COUNTED, "moving car")
+        if any(row[name]["true"] or row[name].get("false") for row in rows)
     ]
     return {
-        "videos": len(rows), "frames": sum(row["frames"] for row in rows),
-        **{name: {key: sum(row[name][key] for row in rows) for key in rows[0][name]} for name in names},
+        "videos": len(rows),
+        "frames": sum(row["frames"] for row in rows),
+        **{
+            name: {key: sum(row[name][key] for row in rows) for key in rows[0][name]}
+            for name in names
+        },
     }
 
 
@@ -271,7 +342,9 @@ def _object_at(frame: int, box: np.ndarray, truth: Truth, label: str) -> int | N
 def _ious(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
     sides = np.minimum(boxes[:, 2:], box[2:]) - np.maximum(boxes[:, :2], box[:2])
     common = np.prod(np.maximum(sides, 0), axis=1)
-    return common / (np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) + np.prod(box[2:] - box[:2]) - common)
+    return common / (
+        np.prod(boxes[:, 2:] - boxes[:, :2], axis=1) + np.prod(box[2:] - box[:2]) - common
+    )
 
 
 def _overlaps(boxes: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -298,8 +371,12 @@ def _simulated_truth(simulated: Path) -> Truth:
         if each["visibility"] > 0.5:
             clear[each["object_id"]].append(each["image_id"])
     return Truth(
-        {name: each["class"] for name, each in about.items()}, {name: each["moving"] for name, each in about.items()},
-        boxes, clear, {}, least=5,
+        {name: each["class"] for name, each in about.items()},
+        {name: each["moving"] for name, each in about.items()},
+        boxes,
+        clear,
+        {},
+        least=5,
     )
 
 
@@ -317,17 +394,25 @@ def _linked(pictures: Sequence[LabelledPicture], images: Sequence[np.ndarray]) -
         motion = _motion(images[frame - 1], images[frame]) if frame else np.eye(2, 3)
         live = {
             each: (last, label, motion[:, :2] @ (place + step) + motion[:, 2], motion[:, :2] @ step)
-            for each, (last, label, place, step) in live.items() if frame - last <= 3
+            for each, (last, label, place, step) in live.items()
+            if frame - last <= 3
         }
         found = [(CLASSES[label], box) for label, box in zip(picture.labels, picture.boxes_px)]
         middles = [(box[:2] + box[2:]) / 2 for _, box in found]
         known = list(live)
-        cost = np.array([
-            [np.linalg.norm(live[each][2] - middle) if live[each][1] == label else 1e6 for (label, _), middle in
-             zip(found, middles)] for each in known
-        ]).reshape(len(known), len(found))
+        cost = np.array(
+            [
+                [
+                    np.linalg.norm(live[each][2] - middle) if live[each][1] == label else 1e6
+                    for (label, _), middle in zip(found, middles)
+                ]
+                for each in known
+            ]
+        ).reshape(len(known), len(found))
         matched = {
-            column: known[row] for row, column in zip(*linear_sum_assignment(cost)) if cost[row, column] < _STEP_PX
+            column: known[row]
+            for row, column in zip(*linear_sum_assignment(cost))
+            if cost[row, column] < _STEP_PX
         }
         for column, (label, box) in enumerate(found):
             each = matched.get(column, len(labels) + 1)
@@ -346,13 +431,19 @@ def _linked(pictures: Sequence[LabelledPicture], images: Sequence[np.ndarray]) -
 def _motion(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     """(2, 3) how the ground moved in the picture; no motion where too little is recognised."""
     features = cv2.ORB.create(1500)
-    (points, theirs), (others, ours) = (features.detectAndCompute(each, None) for each in (before, after))
+    (points, theirs), (others, ours) = (
+        features.detectAndCompute(each, None) for each in (before, after)
+    )
     pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(theirs, ours)
     if len(pairs) < 20:
         return np.eye(2, 3)
-    old, new = (np.array([of[key].pt for key in keys]) for of, keys in (
-        (points, [each.queryIdx for each in pairs]), (others, [each.trainIdx for each in pairs])
-    ))
+    old, new = (
+        np.array([of[key].pt for key in keys])
+        for of, keys in (
+            (points, [each.queryIdx for each in pairs]),
+            (others, [each.trainIdx for each in pairs]),
+        )
+    )
     found, _ = cv2.estimateAffinePartial2D(old, new, ransacReprojThreshold=3.0)
     return np.eye(2, 3) if found is None else found
 

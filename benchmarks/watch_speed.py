@@ -34,7 +34,9 @@ _RUNS = 3
 
 def main() -> None:
     """Watch both flights and write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--model", default="default")
     parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--save", choices=("none", "video", "pictures"), default="none")
@@ -42,8 +44,13 @@ def main() -> None:
     options = parser.parse_args()
     detector = Detector.load(options.model)
     result: dict[str, Any] = {
-        "benchmark": "watch_speed", "machine": machine(), "commit": commit(), "model": detector.info.name,
-        "model_version": detector.info.version, "runs_on": detector.provider, "save": options.save,
+        "benchmark": "watch_speed",
+        "machine": machine(),
+        "commit": commit(),
+        "model": detector.info.name,
+        "model_version": detector.info.version,
+        "runs_on": detector.provider,
+        "save": options.save,
         "sizes": {
             f"{width}x{height}": measured(width, height, detector, options.frames, options.save)
             for width, height in _SIZES
@@ -58,7 +65,9 @@ def measured(width: int, height: int, detector: Detector, frames: int, save: Any
     """Frames a second over all, and the last run's stages."""
     fps = 25.0
     settings = SimulationSettings(
-        seed=5, flights=1, scene=SceneSettings(people=6, cars=4, small_objects=4),
+        seed=5,
+        flights=1,
+        scene=SceneSettings(people=6, cars=4, small_objects=4),
         path=PathSettings(height_m=30, speed_m_s=6, length_m=6 * frames / fps, strips=1),
         imaging=ImagingSettings(width_px=width, height_px=height, fps=fps),
         output=OutputSettings(truth_step=1_000_000),
@@ -71,17 +80,24 @@ def measured(width: int, height: int, detector: Detector, frames: int, save: Any
         for _ in range(_RUNS):
             folder = Path(scratch) / "watch"
             watching = watch(
-                simulated / "flight1" / "flight1.mp4", WatchSettings(every=1), WatchOutputs(folder=folder, save=save),
-                camera=simulated / "camera.xml", detector=detector,
+                simulated / "flight1" / "flight1.mp4",
+                WatchSettings(every=1),
+                WatchOutputs(folder=folder, save=save),
+                camera=simulated / "camera.xml",
+                detector=detector,
             )
             for _ in watching:
                 pass
             report = json.loads((folder / "report.json").read_text())
             rates.append(report["frames_per_second"])
     return {
-        "frames": report["frames"]["detected"], "frames_per_second": float(np.median(rates)),
-        "spread": [min(rates), max(rates)], "latency_s": report["latency_s"], "seconds": report["seconds"],
-        "peak_memory_mb": report["peak_memory_mb"], "objects": report["objects"]["by_class"],
+        "frames": report["frames"]["detected"],
+        "frames_per_second": float(np.median(rates)),
+        "spread": [min(rates), max(rates)],
+        "latency_s": report["latency_s"],
+        "seconds": report["seconds"],
+        "peak_memory_mb": report["peak_memory_mb"],
+        "objects": report["objects"]["by_class"],
     }
 
 

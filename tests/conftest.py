@@ -22,7 +22,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 # how long an example takes depends on what else the machine does: no test is judged by it. Continuous integration (CI
 # is set) draws the same examples every time, others new ones.
 settings.register_profile("anywhere", deadline=None)
-settings.register_profile("every time the same", deadline=None, derandomize=True, database=None, print_blob=True)
+settings.register_profile(
+    "every time the same", deadline=None, derandomize=True, database=None, print_blob=True
+)
 settings.load_profile("every time the same" if "CI" in os.environ else "anywhere")
 
 

@@ -23,7 +23,10 @@ class FaultyLink:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.cut()
 
@@ -70,7 +73,10 @@ class FaultyLink:
             while data := source.recv(65_536):
                 self._passes.wait()
                 target.sendall(data)
-        for each in (source, target):  # one direction's end is the connection's: neither protocol half-closes
+        for each in (
+            source,
+            target,
+        ):  # one direction's end is the connection's: neither protocol half-closes
             with suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
             each.close()

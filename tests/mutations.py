@@ -14,7 +14,7 @@ def mutated(data: st.DataObject, valid: bytes, most: int = 12) -> bytes:
         if action == 0:
             changed[place] = data.draw(st.integers(0, 255))
         elif action == 1:
-            del changed[place:place + data.draw(st.integers(1, 40))]
+            del changed[place : place + data.draw(st.integers(1, 40))]
         else:
-            changed[place:place] = changed[place:place + data.draw(st.integers(1, 40))]
+            changed[place:place] = changed[place : place + data.draw(st.integers(1, 40))]
     return bytes(changed)

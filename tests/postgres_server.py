@@ -9,8 +9,13 @@ import tempfile
 from pathlib import Path
 
 _SETTINGS = {  # nothing here outlives the tests
-    "listen_addresses": "127.0.0.1", "unix_socket_directories": "", "fsync": "off", "full_page_writes": "off",
-    "shared_buffers": "16MB", "max_connections": "60", "log_min_messages": "error",
+    "listen_addresses": "127.0.0.1",
+    "unix_socket_directories": "",
+    "fsync": "off",
+    "full_page_writes": "off",
+    "shared_buffers": "16MB",
+    "max_connections": "60",
+    "log_min_messages": "error",
 }
 _HBA = """host all guarded 127.0.0.1/32 scram-sha-256
 host all kept_out 127.0.0.1/32 reject
@@ -21,7 +26,9 @@ host all all 127.0.0.1/32 trust
 def program(name: str) -> str | None:
     """Debian keeps the server's programs out of the path."""
     found = shutil.which(name)
-    beside = sorted(Path("/usr/lib/postgresql").glob(f"*/bin/{name}"), key=lambda path: int(path.parts[-3]))
+    beside = sorted(
+        Path("/usr/lib/postgresql").glob(f"*/bin/{name}"), key=lambda path: int(path.parts[-3])
+    )
     return str(beside[-1]) if beside else found
 
 
@@ -42,7 +49,18 @@ class PostgresServer:
         if os.getuid() == 0:
             self._user = "postgres" if _is_known("postgres") else "nobody"
             shutil.chown(self.folder, self._user)
-        initdb = [program("initdb"), "-D", str(self._data), "-U", "sorvolo", "-A", "trust", "-E", "UTF8", "-N"]
+        initdb = [
+            program("initdb"),
+            "-D",
+            str(self._data),
+            "-U",
+            "sorvolo",
+            "-A",
+            "trust",
+            "-E",
+            "UTF8",
+            "-N",
+        ]
         self._run([*initdb, "--locale=C"])
         (self._data / "pg_hba.conf").write_text(_HBA)
         self.start()
@@ -61,8 +79,21 @@ class PostgresServer:
         standby.touch() if only_reads else standby.unlink(missing_ok=True)
         settings = _SETTINGS | {"port": str(self.port), "lc_messages": self._language}
         options = " ".join(f"-c {name}='{value}'" for name, value in settings.items())
-        self._run([program("pg_ctl"), "-D", str(self._data), "-w", "-t", "60", "-l", str(self.folder / "log"), "-o",
-                   options, "start"])
+        self._run(
+            [
+                program("pg_ctl"),
+                "-D",
+                str(self._data),
+                "-w",
+                "-t",
+                "60",
+                "-l",
+                str(self.folder / "log"),
+                "-o",
+                options,
+                "start",
+            ]
+        )
 
     def stop(self) -> None:
         """As good as a crash: connections are cut."""
@@ -76,7 +107,9 @@ class PostgresServer:
         """Run statements, each in a transaction of its own; the rows of the last one."""
         import psycopg  # an extra, as the server is
 
-        with psycopg.connect(self.url.replace("/postgres", f"/{database}"), autocommit=True) as connection:
+        with psycopg.connect(
+            self.url.replace("/postgres", f"/{database}"), autocommit=True
+        ) as connection:
             for each in statements:
                 cursor = connection.execute(each)
             return cursor.fetchall() if cursor.description else []
@@ -88,8 +121,13 @@ class PostgresServer:
             environment["LOCPATH"] = str(self._locales)
         with open(self.folder / "output", "w+") as output:  # no pipe: the server would keep it open
             done = subprocess.run(
-                [str(each) for each in command], user=self._user, cwd=self.folder, env=environment, stdout=output,
-                stderr=output, timeout=120,
+                [str(each) for each in command],
+                user=self._user,
+                cwd=self.folder,
+                env=environment,
+                stdout=output,
+                stderr=output,
+                timeout=120,
             )
             output.seek(0)
             assert done.returncode == 0, output.read()
@@ -101,4 +139,3 @@ def _is_known(user: str) -> bool:
     except KeyError:
         return False
     return True
-

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-_DATA = Path(os.environ.get("SORVOLO_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+_DATA = Path(
+    os.environ.get("SORVOLO_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data"
+)
 
 
 def real_data(name: str) -> Path:

@@ -14,7 +14,9 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 PAGES = {
-    "README.md": "index.md", "ARCHITECTURE.md": "architecture.md", "CONTRIBUTING.md": "contributing.md",
+    "README.md": "index.md",
+    "ARCHITECTURE.md": "architecture.md",
+    "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }
 _LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
@@ -23,7 +25,9 @@ _log = logging.getLogger("mkdocs.hooks")
 
 def on_config(config: Any) -> Any:
     """Name every decision in the navigation, in the order of their numbers."""
-    decisions = sorted(f"decisions/{path.name}" for path in (ROOT / "docs" / "decisions").glob("*.md"))
+    decisions = sorted(
+        f"decisions/{path.name}" for path in (ROOT / "docs" / "decisions").glob("*.md")
+    )
     for section in config["nav"]:
         if "Decisions" in section:
             section["Decisions"] = decisions
@@ -42,7 +46,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Links of a page of docs/, as the site needs them."""
     if page.file.src_uri in PAGES.values():
         return markdown
-    return _relinked(markdown, posixpath.join("docs", posixpath.dirname(page.file.src_uri)), page.file.src_uri)
+    return _relinked(
+        markdown, posixpath.join("docs", posixpath.dirname(page.file.src_uri)), page.file.src_uri
+    )
 
 
 def _relinked(markdown: str, folder: str, page: str) -> str:
@@ -64,4 +70,6 @@ def _relinked(markdown: str, folder: str, page: str) -> str:
         return text
 
     parts = re.split(r"(```.*?```)", markdown, flags=re.S)  # every other one is code
-    return "".join(part if number % 2 else _LINK.sub(relink, part) for number, part in enumerate(parts))
+    return "".join(
+        part if number % 2 else _LINK.sub(relink, part) for number, part in enumerate(parts)
+    )

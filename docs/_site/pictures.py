@@ -22,20 +22,46 @@ FLIGHT = "demo-site/simulation/flight{0}/flight{0}.mp4"
 CAMERA = ["--camera", "demo-site/simulation/camera.xml"]
 COMMANDS = {
     "inspect": ["inspect", FLIGHT.format(1), *CAMERA],
-    "plan": ["plan", "--camera", "Mavic 2 Pro", "--area", "area.geojson", "--out", "field.plan", "--out", "field.kmz"],
+    "plan": [
+        "plan",
+        "--camera",
+        "Mavic 2 Pro",
+        "--area",
+        "area.geojson",
+        "--out",
+        "field.plan",
+        "--out",
+        "field.kmz",
+    ],
     "map": ["map", FLIGHT.format(1), *CAMERA, "--site", "field"],
     "compare": ["compare", FLIGHT.format(2), *CAMERA, "--site", "field"],
     "watch": ["watch", FLIGHT.format(2), *CAMERA, "--out", "search"],
     "review": ["review", "field"],
     "search": ["search", "field", "--out", "found"],
     "labelled": ["simulate", "labelled", "--pictures", "60", "--seed", "7"],
-    "train": ["train", "labelled", "--out", "model", "--weights", "default", "--steps", "60", "--device", "cpu"],
+    "train": [
+        "train",
+        "labelled",
+        "--out",
+        "model",
+        "--weights",
+        "default",
+        "--steps",
+        "60",
+        "--device",
+        "cpu",
+    ],
     "detector": ["evaluate", "detector", "default", "labelled", "--out", "measured"],
     "reproduce": ["reproduce", "--simulated", "--quick", "--train-steps", "0", "--out", "chapter4"],
 }
 MAKES = {  # the folder that a command makes
-    "map": "field", "watch": "search", "search": "found", "labelled": "labelled", "train": "model",
-    "detector": "measured", "reproduce": "chapter4",
+    "map": "field",
+    "watch": "search",
+    "search": "found",
+    "labelled": "labelled",
+    "train": "model",
+    "detector": "measured",
+    "reproduce": "chapter4",
 }
 PRINTED = ("inspect", "plan", "map", "compare", "review")  # of these also what they print
 PAGES = {  # name: page, width and height of the window, px
@@ -47,18 +73,30 @@ PAGES = {  # name: page, width and height of the window, px
     "detector": ("measured/detector.html", 1100, 900),
     "reproduce": ("chapter4/reproduction.html", 1100, 1100),
 }
-PAGE_OF = {"report": "map", "changes": "compare"}  # the command that makes a page, where it is named otherwise
+PAGE_OF = {
+    "report": "map",
+    "changes": "compare",
+}  # the command that makes a page, where it is named otherwise
 AREA = """{"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [[[12.6030, 41.8920],
 [12.6050, 41.8920], [12.6050, 41.8932], [12.6030, 41.8932], [12.6030, 41.8920]]]}}"""
 
 
 def main() -> None:
     """Run the commands, picture what they print and the pages that they write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("demo", type=Path)
-    parser.add_argument("--keep", type=Path, help="folder to run in, and to use again, instead of a temporary one")
-    parser.add_argument("--only", nargs="+", choices=COMMANDS, default=list(COMMANDS),
-                        help="these alone, in a folder kept from a whole run")
+    parser.add_argument(
+        "--keep", type=Path, help="folder to run in, and to use again, instead of a temporary one"
+    )
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=COMMANDS,
+        default=list(COMMANDS),
+        help="these alone, in a folder kept from a whole run",
+    )
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.keep or Path(scratch)
@@ -77,9 +115,18 @@ def main() -> None:
 
 def printed(name: str, words: list[str], folder: Path) -> None:
     """What a command prints, as SVG without fonts from elsewhere."""
-    environment = {**os.environ, "COLUMNS": str(COLUMNS), "FORCE_COLOR": "1", "TERM": "xterm-256color"}
+    environment = {
+        **os.environ,
+        "COLUMNS": str(COLUMNS),
+        "FORCE_COLOR": "1",
+        "TERM": "xterm-256color",
+    }
     done = subprocess.run(
-        [sys.executable, "-m", "sorvolo", *words], cwd=folder, env=environment, capture_output=True, text=True,
+        [sys.executable, "-m", "sorvolo", *words],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
         check=False,
     )
     if done.returncode not in (0, 3):  # 3: done, and to be checked
@@ -94,7 +141,9 @@ def printed(name: str, words: list[str], folder: Path) -> None:
     while "@font-face" in drawn:
         begin = drawn.index("@font-face")
         drawn = drawn[:begin] + drawn[drawn.index("}", begin) + 1 :]
-    (IMAGES / f"{name}.svg").write_text(drawn.replace("Fira Code", "DejaVu Sans Mono"), encoding="utf-8")
+    (IMAGES / f"{name}.svg").write_text(
+        drawn.replace("Fira Code", "DejaVu Sans Mono"), encoding="utf-8"
+    )
 
 
 def pictured(name: str, page: Path, width: int, height: int) -> None:
@@ -102,9 +151,15 @@ def pictured(name: str, page: Path, width: int, height: int) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         shot = Path(scratch) / "page.png"
         command = ["chromium", "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
-        command += [f"--window-size={width},{height}", f"--screenshot={shot}", page.resolve().as_uri()]
+        command += [
+            f"--window-size={width},{height}",
+            f"--screenshot={shot}",
+            page.resolve().as_uri(),
+        ]
         subprocess.run(command, check=True, capture_output=True, timeout=120)
-        Image.open(shot).convert("RGB").save(IMAGES / f"{name}.jpg", quality=72, optimize=True, progressive=True)
+        Image.open(shot).convert("RGB").save(
+            IMAGES / f"{name}.jpg", quality=72, optimize=True, progressive=True
+        )
 
 
 if __name__ == "__main__":

@@ -22,7 +22,12 @@ if TYPE_CHECKING:
     )
     from sorvolo.missions.compare.flights import compare_flights
     from sorvolo.missions.evaluate.changes import evaluate_changes
-    from sorvolo.missions.evaluate.detector import EvaluationSettings, evaluate_detector, read_sets, write_evaluation
+    from sorvolo.missions.evaluate.detector import (
+        EvaluationSettings,
+        evaluate_detector,
+        read_sets,
+        write_evaluation,
+    )
     from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
     from sorvolo.missions.evaluate.objects import evaluate_objects
     from sorvolo.missions.flight.settings import CompareSettings, MapSettings
@@ -126,17 +131,31 @@ _HOMES = {
     "change.pair.thesis": ("ThesisSettings", "prepare_reference", "thesis_steps"),
     "detection.detector": ("Detector",),
     "errors": ("GeometryError", "InputError", "SettingsError", "SorvoloError", "StoreError"),
-    "missions.calibrate_camera": ("calibrate_camera", "find_views", "parse_board", "write_calibration"),
+    "missions.calibrate_camera": (
+        "calibrate_camera",
+        "find_views",
+        "parse_board",
+        "write_calibration",
+    ),
     "missions.compare.flights": ("compare_flights",),
     "missions.evaluate.changes": ("evaluate_changes",),
-    "missions.evaluate.detector": ("EvaluationSettings", "evaluate_detector", "read_sets", "write_evaluation"),
+    "missions.evaluate.detector": (
+        "EvaluationSettings",
+        "evaluate_detector",
+        "read_sets",
+        "write_evaluation",
+    ),
     "missions.evaluate.mosaic": ("evaluate_mosaic",),
     "missions.evaluate.objects": ("evaluate_objects",),
     "missions.heights.run": ("HeightSettings", "make_heights"),
     "missions.inspect": ("inspect_input",),
     "missions.map.flights": ("map_flights",),
     "missions.plan_flight": (
-        "PlanSettings", "answer_questions", "camera_to_plan_with", "plan_over", "write_plan",
+        "PlanSettings",
+        "answer_questions",
+        "camera_to_plan_with",
+        "plan_over",
+        "write_plan",
     ),
     "missions.flight.settings": ("CompareSettings", "MapSettings"),
     "missions.search.flights": ("search_site",),

@@ -41,7 +41,7 @@ def picture(index: int, size: tuple[int, int] = (160, 96)) -> Any:
     """A frame whose number can be read from it: a bright column moves right, four pixels a frame."""
     image = np.full((size[1], size[0], 3), 40, np.uint8)
     start = 4 * index % (size[0] - 8)
-    image[:, start: start + 8] = 220
+    image[:, start : start + 8] = 220
     return image
 
 
@@ -52,22 +52,42 @@ def number_of(image: Any) -> int:
 
 def packet_of(index: int) -> bytes:
     """The metadata of frame `index`: flying north at 60 m above ground at 100 m."""
-    return encode(EPOCH_NS + index * 10**9 // RATE, {
-        "platform_heading_deg": 0.0, "platform_pitch_deg": 0.0, "platform_roll_deg": 0.0,
-        "sensor_relative_azimuth_deg": 0.0, "sensor_relative_elevation_deg": -90.0, "sensor_relative_roll_deg": 0.0,
-        "sensor_latitude_deg": 46.5 + 5.0 * index / RATE / 111_320, "sensor_longitude_deg": 11.3,
-        "sensor_true_altitude_m": 160.0, "frame_center_elevation_m": 100.0,
-        "sensor_horizontal_fov_deg": 62.0, "sensor_vertical_fov_deg": 39.6,
-    })
+    return encode(
+        EPOCH_NS + index * 10**9 // RATE,
+        {
+            "platform_heading_deg": 0.0,
+            "platform_pitch_deg": 0.0,
+            "platform_roll_deg": 0.0,
+            "sensor_relative_azimuth_deg": 0.0,
+            "sensor_relative_elevation_deg": -90.0,
+            "sensor_relative_roll_deg": 0.0,
+            "sensor_latitude_deg": 46.5 + 5.0 * index / RATE / 111_320,
+            "sensor_longitude_deg": 11.3,
+            "sensor_true_altitude_m": 160.0,
+            "frame_center_elevation_m": 100.0,
+            "sensor_horizontal_fov_deg": 62.0,
+            "sensor_vertical_fov_deg": 39.6,
+        },
+    )
 
 
 class Sender(threading.Thread):
     """Sends frames in real time until asked to stop or `count` are sent; `open_url` may wait for a listener."""
 
     def __init__(
-        self, url: str, *, count: int = 10_000, size: tuple[int, int] = (160, 96), klv: bool = False, first: int = 0,
-        container: str = "mpegts", options: Mapping[str, str] | None = None, speed: float = 1.0,
-        image: Callable[[int], Any] | None = None, klv_of: Callable[[int], bytes] = packet_of, rate: int = RATE,
+        self,
+        url: str,
+        *,
+        count: int = 10_000,
+        size: tuple[int, int] = (160, 96),
+        klv: bool = False,
+        first: int = 0,
+        container: str = "mpegts",
+        options: Mapping[str, str] | None = None,
+        speed: float = 1.0,
+        image: Callable[[int], Any] | None = None,
+        klv_of: Callable[[int], bytes] = packet_of,
+        rate: int = RATE,
         codec: str = "libx264",
     ) -> None:
         super().__init__(daemon=True)
@@ -90,16 +110,28 @@ class Sender(threading.Thread):
             stream = output.add_stream(self._codec, rate=self._rate)
             stream.width, stream.height, stream.pix_fmt = *self._size, "yuv420p"
             if self._codec == "libx264":
-                stream.options = {"preset": "ultrafast", "tune": "zerolatency", "g": "10", "crf": "12"}
+                stream.options = {
+                    "preset": "ultrafast",
+                    "tune": "zerolatency",
+                    "g": "10",
+                    "crf": "12",
+                }
             data = output.add_data_stream("klv") if self._klv else None
             began_s = time.monotonic()
             for step in range(self._count):
                 index = self._first + step
-                if self._stopped.wait(max(0.0, began_s + step / self._rate / self._speed - time.monotonic())):
+                if self._stopped.wait(
+                    max(0.0, began_s + step / self._rate / self._speed - time.monotonic())
+                ):
                     break
                 if data is not None:
                     packet = av.Packet(self._klv_of(index))
-                    packet.stream, packet.time_base, packet.pts, packet.dts = data, Fraction(1, self._rate), step, step
+                    packet.stream, packet.time_base, packet.pts, packet.dts = (
+                        data,
+                        Fraction(1, self._rate),
+                        step,
+                        step,
+                    )
                     output.mux(packet)
                 frame = av.VideoFrame.from_ndarray(self._image(index), format="rgb24")
                 frame.pts, frame.time_base = step, Fraction(1, self._rate)

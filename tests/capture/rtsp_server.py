@@ -6,8 +6,10 @@ from contextlib import closing, suppress
 
 from live_sender import free_port, sending_apart
 
-_SDP = "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=drone\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n" \
-       "a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:track1\r\n"
+_SDP = (
+    "v=0\r\no=- 0 0 IN IP4 127.0.0.1\r\ns=drone\r\nt=0 0\r\nm=video 0 RTP/AVP 96\r\n"
+    "a=rtpmap:96 H264/90000\r\na=fmtp:96 packetization-mode=1\r\na=control:track1\r\n"
+)
 
 
 class RtspServer(threading.Thread):
@@ -48,7 +50,7 @@ class RtspServer(threading.Thread):
             while line := lines.readline():
                 method = line.split()[0].decode()
                 headers: dict[str, str] = {}
-                while (header := lines.readline().strip()):
+                while header := lines.readline().strip():
                     name, _, value = header.decode().partition(":")
                     headers[name.lower()] = value.strip()
                 self.methods.append(method)
@@ -77,7 +79,9 @@ class RtspServer(threading.Thread):
             extra = "Transport: RTP/AVP/TCP;unicast;interleaved=0-1\r\nSession: 1\r\n"
         elif method == "PLAY":
             extra = "Session: 1\r\n"
-        connection.sendall(f"RTSP/1.0 {status}\r\nCSeq: {headers['cseq']}\r\n{extra}\r\n{body}".encode())
+        connection.sendall(
+            f"RTSP/1.0 {status}\r\nCSeq: {headers['cseq']}\r\n{extra}\r\n{body}".encode()
+        )
 
     def _play(self, connection: socket.socket) -> None:
         """What FFmpeg's RTP writer sends by UDP goes on over the connection: `$`, channel, length."""
@@ -85,7 +89,9 @@ class RtspServer(threading.Thread):
         with closing(_bound(port)) as media, closing(_bound(port + 1)) as reports:
             url = f"rtp://127.0.0.1:{port}?pkt_size=1200"
             with sending_apart(url, container="rtp", count=100_000):
-                threading.Thread(target=_pass_on, args=(reports, connection, 1), daemon=True).start()
+                threading.Thread(
+                    target=_pass_on, args=(reports, connection, 1), daemon=True
+                ).start()
                 _pass_on(media, connection, 0)
 
 

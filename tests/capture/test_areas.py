@@ -50,20 +50,30 @@ def kml(*rings, tag="Polygon"):
     )
 
 
-@pytest.mark.parametrize("text", [
-    polygon(FIELD, POND),
-    {"type": "Feature", "properties": None, "geometry": polygon(FIELD, POND)},
-    {"type": "FeatureCollection", "features": [
-        {"type": "Feature", "properties": {}, "geometry": None},
-        {"type": "Feature", "properties": {}, "geometry": {"type": "Point", "coordinates": [0, 0]}},
-        {"type": "Feature", "properties": {}, "geometry": polygon(FIELD, POND)},
-    ]},
-    {"type": "MultiPolygon", "coordinates": [[FIELD, POND]]},
-    {"type": "GeometryCollection", "geometries": [polygon(FIELD, POND)]},
-    polygon([[*point, 300.0] for point in FIELD], POND[::-1]),
-    kml(FIELD, POND),
-    "\ufeff" + json.dumps(polygon(FIELD, POND)),
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        polygon(FIELD, POND),
+        {"type": "Feature", "properties": None, "geometry": polygon(FIELD, POND)},
+        {
+            "type": "FeatureCollection",
+            "features": [
+                {"type": "Feature", "properties": {}, "geometry": None},
+                {
+                    "type": "Feature",
+                    "properties": {},
+                    "geometry": {"type": "Point", "coordinates": [0, 0]},
+                },
+                {"type": "Feature", "properties": {}, "geometry": polygon(FIELD, POND)},
+            ],
+        },
+        {"type": "MultiPolygon", "coordinates": [[FIELD, POND]]},
+        {"type": "GeometryCollection", "geometries": [polygon(FIELD, POND)]},
+        polygon([[*point, 300.0] for point in FIELD], POND[::-1]),
+        kml(FIELD, POND),
+        "\ufeff" + json.dumps(polygon(FIELD, POND)),
+    ],
+)
 def test_a_field_with_a_pond(read, text):
     area = read(text)
     assert area.name == "field"
@@ -91,13 +101,16 @@ def test_overlapping_polygons_are_a_union(read):
     assert area.contains(np.array([[12.007, 45.005], [12.012, 45.005], [12.002, 45.005]])).all()
 
 
-@pytest.mark.parametrize("text", [
-    "45.0, 12.0\n45.0, 12.01\n45.01, 12.01\n45.01, 12.0\n45.0, 12.0\n",
-    "45.0 12.0\n45.0 12.01\n45.01 12.01\n45.01 12.0",
-    "# my field\n45.0;12.0\n45.0;12.01 # a corner\n45.01;12.01\n45.01;12.0\n",
-    "name,longitude,latitude\na,12.0,45.0\nb,12.01,45.0\nc,12.01,45.01\nd,12.0,45.01\n",
-    "Lat\tLng\theight\n45.0\t12.0\t3\n45.0\t12.01\t3\n45.01\t12.01\t3\n45.01\t12.0\t3\n",
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "45.0, 12.0\n45.0, 12.01\n45.01, 12.01\n45.01, 12.0\n45.0, 12.0\n",
+        "45.0 12.0\n45.0 12.01\n45.01 12.01\n45.01 12.0",
+        "# my field\n45.0;12.0\n45.0;12.01 # a corner\n45.01;12.01\n45.01;12.0\n",
+        "name,longitude,latitude\na,12.0,45.0\nb,12.01,45.0\nc,12.01,45.01\nd,12.0,45.01\n",
+        "Lat\tLng\theight\n45.0\t12.0\t3\n45.0\t12.01\t3\n45.01\t12.01\t3\n45.01\t12.0\t3\n",
+    ],
+)
 def test_lists_that_close_are_polygons(read, text):
     area = read(text, "field.txt")
     assert area.contains(np.array([INSIDE, IN_POND, OUTSIDE])).tolist() == [True, True, False]
@@ -106,19 +119,33 @@ def test_lists_that_close_are_polygons(read, text):
 def test_lists_of_several_areas(read):
     area = read("45 12\n45 12.01\n45.01 12.01\n\n\n46 12\n46 12.01\n46.01 12.01\n", "two.txt")
     assert len(area.polygons_lonlat) == 2
-    assert area.contains(np.array([[12.009, 45.001], [12.009, 46.001], [12.009, 45.5]])).tolist() == [
-        True, True, False,
+    assert area.contains(
+        np.array([[12.009, 45.001], [12.009, 46.001], [12.009, 45.5]])
+    ).tolist() == [
+        True,
+        True,
+        False,
     ]
 
 
-PATH = [[12.0, 45.0], [12.003, 45.0], [12.003, 45.001], [12.0, 45.001], [12.0, 45.002], [12.003, 45.002]]
+PATH = [
+    [12.0, 45.0],
+    [12.003, 45.0],
+    [12.003, 45.001],
+    [12.0, 45.001],
+    [12.0, 45.002],
+    [12.003, 45.002],
+]
 
 
-@pytest.mark.parametrize(("text", "name"), [
-    ("\n".join(f"{lat}, {lon}" for lon, lat in PATH), "path.csv"),
-    (json.dumps({"type": "LineString", "coordinates": PATH}), "path.geojson"),
-    (kml(PATH, tag="LineString"), "path.kml"),
-])
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("\n".join(f"{lat}, {lon}" for lon, lat in PATH), "path.csv"),
+        (json.dumps({"type": "LineString", "coordinates": PATH}), "path.geojson"),
+        (kml(PATH, tag="LineString"), "path.kml"),
+    ],
+)
 def test_a_path_is_the_corridor_about_it(read, text, name):
     area = read(text, name)
     frame = LocalFrame(Geodetic(45.0, 12.0))
@@ -127,7 +154,9 @@ def test_a_path_is_the_corridor_about_it(read, text, name):
     distance_m = np.full(len(points_m), np.inf)
     for a, b in pairwise(corners_m):
         along = np.clip((points_m - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-        distance_m = np.minimum(distance_m, np.linalg.norm(points_m - a - along[:, None] * (b - a), axis=1))
+        distance_m = np.minimum(
+            distance_m, np.linalg.norm(points_m - a - along[:, None] * (b - a), axis=1)
+        )
     latitude, longitude, _ = frame.wgs84_from_site(points_m)
     inside = area.contains(np.column_stack([longitude, latitude]))
     assert inside[distance_m < CORRIDOR_M - 0.1].all()
@@ -139,16 +168,30 @@ def test_an_area_across_the_antimeridian(read):
     continued = [[lon % 360, lat] for lon, lat in ring]
     for text in (polygon(ring), polygon(continued)):
         area = read(text)
-        points = np.array([[180.0, -16.995], [-180.0, -16.995], [179.995, -16.995], [-179.995, -16.995],
-                           [179.98, -16.995], [0.0, -16.995], [180.0, 17.0]])
+        points = np.array(
+            [
+                [180.0, -16.995],
+                [-180.0, -16.995],
+                [179.995, -16.995],
+                [-179.995, -16.995],
+                [179.98, -16.995],
+                [0.0, -16.995],
+                [180.0, 17.0],
+            ]
+        )
         assert area.contains(points).tolist() == [True, True, True, True, False, False, False]
         assert 1e6 < area.area_m2 < 3e6
 
 
 def test_an_area_around_the_pole():
     area = Area(((np.array([[0, 89.9], [90, 89.9], [180, 89.9], [-90, 89.9]]),),))
-    assert area.contains(np.array([[17.0, 89.99], [200.0, 89.95], [0.0, 89.8], [0.0, -90.0]])).tolist() == [
-        True, True, False, False,
+    assert area.contains(
+        np.array([[17.0, 89.99], [200.0, 89.95], [0.0, 89.8], [0.0, -90.0]])
+    ).tolist() == [
+        True,
+        True,
+        False,
+        False,
     ]
 
 
@@ -157,7 +200,9 @@ def test_an_area_around_the_pole():
 def test_contains_does_not_depend_on_where_on_earth(latitude, longitude, corners, seed):
     rng = np.random.default_rng(seed)
     angles = 2 * np.pi * (np.arange(corners) + rng.uniform(0, 0.8, corners)) / corners
-    ring_m = rng.uniform(50, 300, corners)[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
+    ring_m = rng.uniform(50, 300, corners)[:, None] * np.column_stack(
+        [np.cos(angles), np.sin(angles)]
+    )
     frame = LocalFrame(Geodetic(latitude, longitude))
 
     def lonlat(points_m):
@@ -170,39 +215,42 @@ def test_contains_does_not_depend_on_where_on_earth(latitude, longitude, corners
     np.testing.assert_allclose(area.polygons_m(frame)[0][0], ring_m, atol=0.01)
 
 
-@pytest.mark.parametrize(("text", "message"), [
-    ("", "empty"),
-    ("{", "broken GeoJSON"),
-    ("[" * 3000, "latitude and a longitude"),
-    ('{"type":' * 3000, "broken GeoJSON"),
-    ("{\"a\": 1}", "expected member"),
-    ('{"type": "FeatureCollection", "features": []}', "neither a polygon nor a path"),
-    (json.dumps({"type": "Point", "coordinates": [1, 2]}), "neither a polygon nor a path"),
-    (json.dumps(polygon()), "at least one polygon"),
-    (json.dumps(polygon(FIELD[:2])), "3 different points"),
-    (json.dumps(polygon([FIELD[0]] * 5)), "3 different points"),
-    (json.dumps(polygon([[12, 45], [13, "x"], [13, 46]])), "pair of numbers"),
-    (json.dumps(polygon([[12], [13], [14]])), "pair of numbers"),
-    (json.dumps(polygon([FIELD[0], FIELD[2], FIELD[1], FIELD[3]])), "crosses itself"),
-    (json.dumps(polygon([[12, 45], [12.1, 45], [12.2, 45]])), "one line"),
-    (json.dumps(polygon([[45, 120], [46, 120], [46, 121]])), "swapped"),
-    (json.dumps(polygon([[500000, 4600000], [500100, 4600000], [500100, 4600100]])), "metres"),
-    (json.dumps(polygon(FIELD, FIELD)), "leave nothing"),
-    (json.dumps(polygon([[0, 0], [20, 0], [20, 20]])), "500 km"),
-    ("<kml><Document>", "broken KML"),
-    ("<kml><Document/></kml>", "neither a polygon nor a path"),
-    ("<kml><Polygon/></kml>", "outerBoundaryIs"),
-    ('<!DOCTYPE a [<!ENTITY b "c">]><kml>&b;</kml>', "broken KML"),
-    ("45.0", "latitude and a longitude"),
-    ("45.0 12.0", "single point"),
-    ("45 12\n46 north\n", "line 2"),
-    ("120 45\n120 46\n121 46\n", "swapped"),
-    ("nan nan\n45 12\n45 13", "no place"),
-    ("latitude height\n45 12\n", "names no latitude and longitude"),
-    ("lat lon\n", "no coordinates"),
-    ("# nothing\n", "no coordinates"),
-    ("45.0 12.0\n45.01 12.01\n45.0 12.01\n45.01 12.0\n45.0 12.0", "crosses itself"),
-])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty"),
+        ("{", "broken GeoJSON"),
+        ("[" * 3000, "latitude and a longitude"),
+        ('{"type":' * 3000, "broken GeoJSON"),
+        ('{"a": 1}', "expected member"),
+        ('{"type": "FeatureCollection", "features": []}', "neither a polygon nor a path"),
+        (json.dumps({"type": "Point", "coordinates": [1, 2]}), "neither a polygon nor a path"),
+        (json.dumps(polygon()), "at least one polygon"),
+        (json.dumps(polygon(FIELD[:2])), "3 different points"),
+        (json.dumps(polygon([FIELD[0]] * 5)), "3 different points"),
+        (json.dumps(polygon([[12, 45], [13, "x"], [13, 46]])), "pair of numbers"),
+        (json.dumps(polygon([[12], [13], [14]])), "pair of numbers"),
+        (json.dumps(polygon([FIELD[0], FIELD[2], FIELD[1], FIELD[3]])), "crosses itself"),
+        (json.dumps(polygon([[12, 45], [12.1, 45], [12.2, 45]])), "one line"),
+        (json.dumps(polygon([[45, 120], [46, 120], [46, 121]])), "swapped"),
+        (json.dumps(polygon([[500000, 4600000], [500100, 4600000], [500100, 4600100]])), "metres"),
+        (json.dumps(polygon(FIELD, FIELD)), "leave nothing"),
+        (json.dumps(polygon([[0, 0], [20, 0], [20, 20]])), "500 km"),
+        ("<kml><Document>", "broken KML"),
+        ("<kml><Document/></kml>", "neither a polygon nor a path"),
+        ("<kml><Polygon/></kml>", "outerBoundaryIs"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><kml>&b;</kml>', "broken KML"),
+        ("45.0", "latitude and a longitude"),
+        ("45.0 12.0", "single point"),
+        ("45 12\n46 north\n", "line 2"),
+        ("120 45\n120 46\n121 46\n", "swapped"),
+        ("nan nan\n45 12\n45 13", "no place"),
+        ("latitude height\n45 12\n", "names no latitude and longitude"),
+        ("lat lon\n", "no coordinates"),
+        ("# nothing\n", "no coordinates"),
+        ("45.0 12.0\n45.01 12.01\n45.0 12.01\n45.01 12.0\n45.0 12.0", "crosses itself"),
+    ],
+)
 def test_files_that_are_no_area_name_the_reason(read, text, message):
     with pytest.raises(InputError, match=message):
         read(text, "bad.txt")
@@ -225,7 +273,9 @@ def test_files_that_cannot_be_read(tmp_path):
 
 @settings(max_examples=200, deadline=None)
 @given(
-    st.sampled_from([json.dumps(polygon(FIELD, POND)), kml(FIELD, POND), "45 12\n45 12.01\n45.01 12.01\n"]),
+    st.sampled_from(
+        [json.dumps(polygon(FIELD, POND)), kml(FIELD, POND), "45 12\n45 12.01\n45.01 12.01\n"]
+    ),
     st.data(),
 )
 def test_damaged_files_are_read_or_refused_never_worse(tmp_path_factory, text, data):

@@ -44,14 +44,19 @@ from sorvolo.store.datasets.picture_files import shown_size_px
 
 def png_of(width_px: int, height_px: int) -> bytes:
     """A PNG of one colour: some hundred kilobytes for hundreds of megapixels."""
+
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        return (
+            struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        )
 
     deflate = zlib.compressobj(9)
     row = bytes(1 + (width_px + 7) // 8)
     rows = b"".join(deflate.compress(row) for _ in range(height_px)) + deflate.flush()
     header = struct.pack(">IIBBBBB", width_px, height_px, 1, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    )
 
 
 def test_a_small_png_of_many_pixels_is_refused_before_it_is_decoded(tmp_path: Path) -> None:
@@ -64,8 +69,11 @@ def test_a_small_png_of_many_pixels_is_refused_before_it_is_decoded(tmp_path: Pa
         decode_photo(bomb.read_bytes(), bomb.name)
 
 
-def test_the_size_of_a_png_is_read_without_its_pixels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_a_png_is_read_without_its_pixels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Pillow decodes a PNG that has no EXIF before its pixels to look for it behind them: 1.2 GB for a small file."""
+
     def decoded(_: PngImagePlugin.PngImageFile) -> None:
         pytest.fail("the pixels were decoded")
 
@@ -76,7 +84,9 @@ def test_the_size_of_a_png_is_read_without_its_pixels(tmp_path: Path, monkeypatc
     assert shown_size_px(tmp_path / "bomb.png") == (17_000, 17_000, 1)
 
 
-def test_the_largest_photos_are_decoded_at_half_their_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_largest_photos_are_decoded_at_half_their_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(decoding, "LARGEST_FRAME_PX", 200_000)
     small = np.random.default_rng(3).integers(0, 255, (5, 6, 3), dtype=np.uint8)
     large = cv2.resize(small, (501, 400), interpolation=cv2.INTER_LINEAR)
@@ -149,12 +159,17 @@ def test_a_kmz_with_a_negative_offset_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("digits", [400, 5000])
-@pytest.mark.parametrize("text", [
-    '{{"fx": {0}, "fy": 1000, "cx": 500, "cy": 400, "width": 1000, "height": 800}}',
-    '{{"camera_matrix": [[{0}, 0, 500], [0, 1000, 400], [0, 0, 1]]}}',
-    '{{"camera_matrix": {{"rows": {0}, "cols": 3, "data": [1000, 0, 500, 0, 1000, 400, 0, 0, 1]}}}}',
-])
-def test_a_camera_file_with_a_number_of_hundreds_of_digits_is_refused(tmp_path: Path, text: str, digits: int) -> None:
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{{"fx": {0}, "fy": 1000, "cx": 500, "cy": 400, "width": 1000, "height": 800}}',
+        '{{"camera_matrix": [[{0}, 0, 500], [0, 1000, 400], [0, 0, 1]]}}',
+        '{{"camera_matrix": {{"rows": {0}, "cols": 3, "data": [1000, 0, 500, 0, 1000, 400, 0, 0, 1]}}}}',
+    ],
+)
+def test_a_camera_file_with_a_number_of_hundreds_of_digits_is_refused(
+    tmp_path: Path, text: str, digits: int
+) -> None:
     path = tmp_path / "camera.json"
     path.write_text(text.format("9" * digits))
     with pytest.raises(InputError):
@@ -163,7 +178,9 @@ def test_a_camera_file_with_a_number_of_hundreds_of_digits_is_refused(tmp_path: 
 
 def test_a_camera_file_with_a_truth_value_is_read(tmp_path: Path) -> None:
     path = tmp_path / "camera.json"
-    path.write_text('{"fx": 900, "fy": 900, "cx": 500, "cy": 400, "width": 1000, "height": 800, "fisheye": false}')
+    path.write_text(
+        '{"fx": 900, "fy": 900, "cx": 500, "cy": 400, "width": 1000, "height": 800, "fisheye": false}'
+    )
     assert read_camera(path, 1000, 800).camera.fx_px == 900
     path.write_text(path.read_text().replace("false", "true"))
     with pytest.raises(InputError, match="fisheye"):
@@ -173,7 +190,9 @@ def test_a_camera_file_with_a_truth_value_is_read(tmp_path: Path) -> None:
 def test_an_area_with_a_number_of_hundreds_of_digits_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "area.geojson"
     for digits in (400, 5000):
-        path.write_text('{"type": "Polygon", "coordinates": [[[%s, 45], [12, 45], [12, 46]]]}' % ("9" * digits))
+        path.write_text(
+            '{"type": "Polygon", "coordinates": [[[%s, 45], [12, 45], [12, 46]]]}' % ("9" * digits)
+        )
         with pytest.raises(InputError):
             read_area(path)
 
@@ -251,10 +270,22 @@ def dng_of(image: np.ndarray) -> bytes:
     camera = b"DJI\0"
     model = b"FC3582\0\0"
     entries = {
-        254: (4, 1, 0), 256: (4, 1, width_px), 257: (4, 1, height_px), 258: (3, 1, 16), 259: (3, 1, 1),
-        262: (3, 1, 32803), 271: (2, 4, camera), 272: (2, 7, model), 273: (4, 1, None), 277: (3, 1, 1),
-        278: (4, 1, height_px), 279: (4, 1, mosaic.nbytes), 33421: (3, 2, struct.pack("<HH", 2, 2)),
-        33422: (1, 4, bytes([0, 1, 1, 2])), 50706: (1, 4, bytes([1, 4, 0, 0])), 50708: (2, 7, model),
+        254: (4, 1, 0),
+        256: (4, 1, width_px),
+        257: (4, 1, height_px),
+        258: (3, 1, 16),
+        259: (3, 1, 1),
+        262: (3, 1, 32803),
+        271: (2, 4, camera),
+        272: (2, 7, model),
+        273: (4, 1, None),
+        277: (3, 1, 1),
+        278: (4, 1, height_px),
+        279: (4, 1, mosaic.nbytes),
+        33421: (3, 2, struct.pack("<HH", 2, 2)),
+        33422: (1, 4, bytes([0, 1, 1, 2])),
+        50706: (1, 4, bytes([1, 4, 0, 0])),
+        50708: (2, 7, model),
         50721: (10, 9, identity),
     }
     directory_bytes = 2 + 12 * len(entries) + 4
@@ -292,7 +323,9 @@ def test_dng_pictures_are_photos(tmp_path: Path) -> None:
         pass
 
 
-def test_dng_without_its_extra_states_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_dng_without_its_extra_states_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "a.dng"
     path.write_bytes(dng_of(np.zeros((64, 64, 3), np.uint8)))
     monkeypatch.setitem(__import__("sys").modules, "rawpy", None)
@@ -300,10 +333,13 @@ def test_dng_without_its_extra_states_what_to_install(tmp_path: Path, monkeypatc
         open_sources([path])
 
 
-@pytest.mark.parametrize(("data", "words"), [
-    (b"no picture at all", "no JPEG, TIFF, PNG, HEIC or DNG picture"),
-    (b"", "no JPEG, TIFF, PNG, HEIC or DNG picture"),
-])
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"no picture at all", "no JPEG, TIFF, PNG, HEIC or DNG picture"),
+        (b"", "no JPEG, TIFF, PNG, HEIC or DNG picture"),
+    ],
+)
 def test_why_a_picture_cannot_be_read_is_plain(tmp_path: Path, data: bytes, words: str) -> None:
     path = tmp_path / "a.jpg"
     path.write_bytes(data)
@@ -327,7 +363,9 @@ KML = (
 
 @settings(max_examples=200, deadline=None)
 @given(st.data())
-def test_any_kmz_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_any_kmz_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
     buffer = io.BytesIO()
     method = data.draw(st.sampled_from([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED]))
     with zipfile.ZipFile(buffer, "w", method) as archive:
@@ -347,14 +385,18 @@ XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.o
 <Camera:Roll>2</Camera:Roll><s:CameraOrientationNED xmlns:s="https://www.skydio.com/drone-skydio/1.0/" s:Yaw="1"
  s:Pitch="-90"/></rdf:Description></rdf:RDF></x:xmpmeta>"""
 NUMBERS = st.one_of(
-    st.floats().map(str), st.integers().map(str), st.text(max_size=8),
+    st.floats().map(str),
+    st.integers().map(str),
+    st.text(max_size=8),
     st.sampled_from(["1e999", "-0", "1/0", "9" * 400]),
 )
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.data())
-def test_any_xmp_is_read_or_named_as_damaged(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_any_xmp_is_read_or_named_as_damaged(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
     text = XMP
     for _ in range(data.draw(st.integers(0, 6))):
         number = escape(data.draw(NUMBERS), {'"': "&quot;"})
@@ -372,7 +414,9 @@ def test_any_xmp_is_read_or_named_as_damaged(tmp_path_factory: pytest.TempPathFa
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_any_heic_and_dng_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_any_heic_and_dng_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
     pytest.importorskip("rawpy")
     kind = data.draw(st.sampled_from([".heic", ".dng"]))
     picture = np.kron(np.arange(48, dtype=np.uint8).reshape(6, 8), np.ones((8, 8), np.uint8))
@@ -392,17 +436,35 @@ CONTROL = (
     "678001.25 5032001.5 101.25 1024.5 768.25 one.jpg gcp1\n678101.25 5032101.5 102.5 200 300 two.jpg gcp2\n"
 )
 CRS_LINES = st.one_of(
-    st.text(max_size=30), st.builds("EPSG:{}".format, st.integers(0, 10**9)),
-    st.sampled_from(["WGS84", "EPSG:4326", "EPSG:4978", "EPSG:2263", "+proj=utm +zone=32", "+proj=tmerc +k=nan +a=0"]),
+    st.text(max_size=30),
+    st.builds("EPSG:{}".format, st.integers(0, 10**9)),
+    st.sampled_from(
+        [
+            "WGS84",
+            "EPSG:4326",
+            "EPSG:4978",
+            "EPSG:2263",
+            "+proj=utm +zone=32",
+            "+proj=tmerc +k=nan +a=0",
+        ]
+    ),
 )
 
 
 @settings(max_examples=200, deadline=None)
 @given(st.data())
-def test_any_control_points_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    text = CONTROL if data.draw(st.booleans()) else CONTROL.replace("WGS84 UTM 32N", data.draw(CRS_LINES), 1)
+def test_any_control_points_are_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    text = (
+        CONTROL
+        if data.draw(st.booleans())
+        else CONTROL.replace("WGS84 UTM 32N", data.draw(CRS_LINES), 1)
+    )
     for _ in range(data.draw(st.integers(0, 3))):
-        text = text.replace(data.draw(st.sampled_from(re.findall(r"[0-9.]+", CONTROL))), data.draw(NUMBERS), 1)
+        text = text.replace(
+            data.draw(st.sampled_from(re.findall(r"[0-9.]+", CONTROL))), data.draw(NUMBERS), 1
+        )
     packet = text.encode("utf-8", "replace")
     path = tmp_path_factory.getbasetemp() / "gcp_list.txt"
     path.write_bytes(mutated(data, packet, 3) if data.draw(st.booleans()) else packet)
@@ -426,12 +488,15 @@ def test_any_bytes_from_a_receiver_are_counted(parts: list[bytes], now_ns: int) 
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.one_of(
-    st.text(max_size=40),
-    st.tuples(st.sampled_from(["rtsp", "udp", "tcp", "rtmp", "http", "webcam", "follow"]), st.text(max_size=30)).map(
-        lambda parts: "://".join(parts)
-    ),
-))
+@given(
+    st.one_of(
+        st.text(max_size=40),
+        st.tuples(
+            st.sampled_from(["rtsp", "udp", "tcp", "rtmp", "http", "webcam", "follow"]),
+            st.text(max_size=30),
+        ).map(lambda parts: "://".join(parts)),
+    )
+)
 def test_any_address_is_understood_or_refused(text: str) -> None:
     if is_live_address(text):
         try:

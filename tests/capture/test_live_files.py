@@ -44,13 +44,19 @@ def test_a_recorded_video_with_metadata_needs_no_other_telemetry(tmp_path: Path)
     (source,) = open_sources([write_ts(tmp_path / "film.ts", klv=True)])
     telemetry = source.telemetry
     assert telemetry.format == "klv" and len(telemetry) == 30
-    assert telemetry.video_time_ns[0] == 0 and telemetry.video_time_ns[-1] == pytest.approx(29 * S // RATE, abs=S // 50)
-    assert telemetry.time_ns[0] == EPOCH_NS and telemetry["camera_pitch_deg"][3] == pytest.approx(-90, abs=1e-3)
+    assert telemetry.video_time_ns[0] == 0 and telemetry.video_time_ns[-1] == pytest.approx(
+        29 * S // RATE, abs=S // 50
+    )
+    assert telemetry.time_ns[0] == EPOCH_NS and telemetry["camera_pitch_deg"][3] == pytest.approx(
+        -90, abs=1e-3
+    )
     assert source.camera.camera.angle_of_view_deg[0] == pytest.approx(62, abs=0.01)
     assert source.ground_elevation_m == pytest.approx(100, abs=0.2)
     setup = prepare(source, MapSettings(), None, telemetry_named=False)
     assert setup.track is not None and setup.track.attitude == "gimbal"
-    assert setup.track.up_m[0] == pytest.approx(60, abs=0.4) and np.isfinite(setup.track.altitude_offset_sigma_m)
+    assert setup.track.up_m[0] == pytest.approx(60, abs=0.4) and np.isfinite(
+        setup.track.altitude_offset_sigma_m
+    )
     assert setup.clock is not None and setup.clock.first_frame_utc_ns == EPOCH_NS
 
 
@@ -58,15 +64,15 @@ def as_synchronous(data: bytes) -> bytes:
     """The transport stream with its metadata declared as synchronous: stream type 0x15 in every program map."""
     changed = bytearray(data)
     for at in range(0, len(changed), 188):
-        head = changed[at: at + 8]
+        head = changed[at : at + 8]
         if head[1] & 0x40 and head[3] >> 4 == 1 and head[4] == 0 and head[5] == 2:
-            section = changed[at + 5: at + 8 + ((head[6] & 15) << 8 | head[7])]
+            section = changed[at + 5 : at + 8 + ((head[6] & 15) << 8 | head[7])]
             entry = 12 + ((section[10] & 15) << 8 | section[11])
             while entry < len(section) - 4:
                 section[entry] = 0x15 if section[entry] == 0x06 else section[entry]
                 entry += 5 + ((section[entry + 3] & 15) << 8 | section[entry + 4])
             section[-4:] = _crc32_mpeg(section[:-4]).to_bytes(4, "big")
-            changed[at + 5: at + 5 + len(section)] = section
+            changed[at + 5 : at + 5 + len(section)] = section
     return bytes(changed)
 
 
@@ -81,6 +87,7 @@ def _crc32_mpeg(data: bytes) -> int:
 
 def test_synchronous_metadata(tmp_path: Path) -> None:
     """ST 1402: an access unit header before each set, in a stream of type 0x15."""
+
     def klv_of(index: int) -> bytes:
         packet = packet_of(index)
         return b"\0" + bytes([index]) + b"\xdf" + len(packet).to_bytes(2, "big") + packet
@@ -112,15 +119,23 @@ def test_a_transport_stream_without_metadata_is_a_video_as_ever(tmp_path: Path) 
     assert len(list(source.frames(every_frame))) == 30
 
 
-@pytest.mark.parametrize(("name", "container", "options"), [
-    ("film.ts", "mpegts", {}), ("film.mp4", "mp4", {"movflags": "frag_keyframe+empty_moov+default_base_moof"}),
-])
+@pytest.mark.parametrize(
+    ("name", "container", "options"),
+    [
+        ("film.ts", "mpegts", {}),
+        ("film.mp4", "mp4", {"movflags": "frag_keyframe+empty_moov+default_base_moof"}),
+    ],
+)
 def test_a_video_is_read_while_it_is_written(
     tmp_path: Path, name: str, container: str, options: dict[str, str]
 ) -> None:
     has_metadata = container == "mpegts"
     whole = Sender(
-        str(tmp_path / f"whole_{name}"), count=100, speed=1000.0, container=container, options=options,
+        str(tmp_path / f"whole_{name}"),
+        count=100,
+        speed=1000.0,
+        container=container,
+        options=options,
         klv=has_metadata,
     )
     whole.run()
@@ -133,7 +148,7 @@ def test_a_video_is_read_while_it_is_written(
         with growing.open("ab") as file:
             for at in range(len(data) // 2, len(data), 3000):
                 time.sleep(0.03)
-                file.write(data[at: at + 3000])
+                file.write(data[at : at + 3000])
                 file.flush()
 
     threading.Thread(target=grow, daemon=True).start()
@@ -167,13 +182,19 @@ def test_of_a_file_that_waits_itself_few_decoded_frames_do(tmp_path: Path) -> No
     assert [each.index for each in frames] == list(range(1, 40)) and source.skipped == 0
 
 
-def test_the_newest_telemetry_places_frames_as_all_of_it_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_newest_telemetry_places_frames_as_all_of_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     film = write_ts(tmp_path / "film.ts", count=60, klv=True)
 
     def flown() -> tuple[FlightTelemetry, list[Any]]:
         (source,) = open_sources([f"follow:{film}"], live=ALL)
         setup = prepare(source, MapSettings(), None, telemetry_named=False)
-        priors = [setup.prior(each, first=False) for each in source.frames(every_frame) if isinstance(each, Frame)]
+        priors = [
+            setup.prior(each, first=False)
+            for each in source.frames(every_frame)
+            if isinstance(each, Frame)
+        ]
         assert setup.telemetry is not None and len(source.telemetry) == 60
         return setup.telemetry, priors
 
@@ -185,10 +206,14 @@ def test_the_newest_telemetry_places_frames_as_all_of_it_does(tmp_path: Path, mo
     for each, other in zip(found, wanted, strict=True):
         assert each.position_m == pytest.approx(other.position_m, abs=0.02)
         assert each.rotation == pytest.approx(other.rotation, abs=1e-3)
-    seconds = [index / RATE for index in range(60)]  # long past: a map asks anew once it knows the clocks' offset
+    seconds = [
+        index / RATE for index in range(60)
+    ]  # long past: a map asks anew once it knows the clocks' offset
     for index, each in enumerate(telemetry.priors(seconds, 0.0, 0.0)):
         assert each.position_m == pytest.approx(wanted[index].position_m, abs=0.02)
-        assert telemetry.prior(seconds[index], 0.0).position_m == pytest.approx(each.position_m, abs=0.02)
+        assert telemetry.prior(seconds[index], 0.0).position_m == pytest.approx(
+            each.position_m, abs=0.02
+        )
 
 
 def test_a_film_that_is_no_film_is_refused(tmp_path: Path) -> None:
@@ -216,7 +241,7 @@ def write_photo(path: Path, index: int, size: tuple[int, int] = (160, 96)) -> No
         file.write(data[: len(data) // 2])
         file.flush()
         time.sleep(0.1)
-        file.write(data[len(data) // 2:])
+        file.write(data[len(data) // 2 :])
 
 
 def test_photos_are_taken_as_they_are_copied_in(tmp_path: Path) -> None:
@@ -225,7 +250,9 @@ def test_photos_are_taken_as_they_are_copied_in(tmp_path: Path) -> None:
 
     def copy() -> None:
         for index in range(5):
-            write_photo(folder / f"DJI_{index:04d}.JPG", index, (96, 160) if index == 3 else (160, 96))
+            write_photo(
+                folder / f"DJI_{index:04d}.JPG", index, (96, 160) if index == 3 else (160, 96)
+            )
         (folder / "DJI_0005.JPG").write_bytes(b"\xff\xd8\xff no picture\xff\xd9")
         shutil.copy(folder / "DJI_0004.JPG", folder / ".hidden.jpg")
 
@@ -240,11 +267,20 @@ def test_photos_are_taken_as_they_are_copied_in(tmp_path: Path) -> None:
         if isinstance(each, Frame):
             prior = setup.prior(each, first=False)
             assert prior.knows_place
-            assert prior.position_m[1] == pytest.approx(0.1 / 3600 * 111_150 * int(each.name[4:8]), abs=0.2)
+            assert prior.position_m[1] == pytest.approx(
+                0.1 / 3600 * 111_150 * int(each.name[4:8]), abs=0.2
+            )
         known_when_seen.append(source.telemetry_version)
     copier.join()
     assert [frame.name for frame in frames] == [f"DJI_{index:04d}.JPG" for index in range(6)]
-    assert [isinstance(frame, LostFrame) for frame in frames] == [False, False, False, True, False, True]
+    assert [isinstance(frame, LostFrame) for frame in frames] == [
+        False,
+        False,
+        False,
+        True,
+        False,
+        True,
+    ]
     assert known_when_seen == [1, 2, 3, 4, 5, 5]  # a photo's fix is known when the photo is
     assert [(frame.time_ns - source.start_ns) / S for frame in frames[:5]] == [0, 1, 2, 3, 4]
     assert source.telemetry["latitude_deg"][2] == pytest.approx(46.5 + 0.2 / 3600)
@@ -259,20 +295,29 @@ def test_a_folder_into_which_nothing_comes(tmp_path: Path) -> None:
         open_sources([f"follow:{tmp_path}"], telemetry="udp://:10110")
 
 
-@pytest.mark.parametrize(("keeps_all", "tables", "packet"), [
-    (True, (0, 50_000), 0), (False, (0, 9_000, 21_276, 50_000), 21_276), (False, (0, 9_000, 21_277), 9_000),
-    (False, (0,), 0),
-])
+@pytest.mark.parametrize(
+    ("keeps_all", "tables", "packet"),
+    [
+        (True, (0, 50_000), 0),
+        (False, (0, 9_000, 21_276, 50_000), 21_276),
+        (False, (0, 9_000, 21_277), 9_000),
+        (False, (0,), 0),
+    ],
+)
 def test_who_wants_the_newest_frames_begins_near_the_end(
     tmp_path: Path, keeps_all: bool, tables: tuple[int, ...], packet: int
 ) -> None:
     """20 MB of a transport stream: a map reads all of it, a watch its last 16 MB, from where it is described."""
     path = tmp_path / "long.ts"
-    path.write_bytes(b"".join(
-        (b"\x47\x40\x00" if number in tables else b"\x47\x01\x00") + number.to_bytes(185, "big")
-        for number in range(106_383)
-    ))
-    file = GrowingFile(path, LiveSettings(keeps_all=keeps_all), Outages("long.ts"), threading.Event())
+    path.write_bytes(
+        b"".join(
+            (b"\x47\x40\x00" if number in tables else b"\x47\x01\x00") + number.to_bytes(185, "big")
+            for number in range(106_383)
+        )
+    )
+    file = GrowingFile(
+        path, LiveSettings(keeps_all=keeps_all), Outages("long.ts"), threading.Event()
+    )
     data = file.read(188)
     file.close()
     assert data[0] == 0x47 and int.from_bytes(data[3:], "big") == packet

@@ -84,8 +84,10 @@ class Ear:
 
     def is_right(self) -> bool:
         return all(
-            0 <= arrived_ns - epoch.time_ns < 2 * S and epoch.values["orthometric_height_m"] == 160.0
-            and abs(epoch.values["speed_m_s"] - 5) < 0.01 for arrived_ns, epoch in self.epochs
+            0 <= arrived_ns - epoch.time_ns < 2 * S
+            and epoch.values["orthometric_height_m"] == 160.0
+            and abs(epoch.values["speed_m_s"] - 5) < 0.01
+            for arrived_ns, epoch in self.epochs
         )
 
 
@@ -143,7 +145,7 @@ def test_a_serial_port() -> None:
 
     def send_in_pieces(data: bytes) -> None:
         for at in range(0, len(data), 50):
-            os.write(receiver, data[at: at + 50])
+            os.write(receiver, data[at : at + 50])
 
     with speaking(send_in_pieces):
         assert ear.wait(4)
@@ -153,11 +155,17 @@ def test_a_serial_port() -> None:
     assert ear.is_right()
 
 
-@pytest.mark.parametrize(("address", "words"), [
-    ("tcp://:5", "no link; give serial:"), ("udp://host", "no link"), ("follow:/no/such", "no such file"),
-    ("serial:/dev/no_such", "no such serial port"), ("serial:/dev/null?baud=fast", "baud=fast is no number"),
-    ("serial:/dev/null?speed=1", "unknown option speed"),
-])
+@pytest.mark.parametrize(
+    ("address", "words"),
+    [
+        ("tcp://:5", "no link; give serial:"),
+        ("udp://host", "no link"),
+        ("follow:/no/such", "no such file"),
+        ("serial:/dev/no_such", "no such serial port"),
+        ("serial:/dev/null?baud=fast", "baud=fast is no number"),
+        ("serial:/dev/null?speed=1", "unknown option speed"),
+    ],
+)
 def test_links_that_cannot_be(address: str, words: str) -> None:
     if address.startswith("serial"):
         pytest.importorskip("serial", reason="pyserial is not installed")
@@ -175,7 +183,9 @@ def test_a_receiver_beside_a_stream_gives_where_each_frame_was_taken(has_metadat
         sending(udp_url(video), klv=has_metadata),
     ):
         (source,) = open_sources(
-            [f"udp://:{video}"], telemetry=f"udp://:{gps}", live=LiveSettings(keeps_all=True, silent_s=2.0)
+            [f"udp://:{video}"],
+            telemetry=f"udp://:{gps}",
+            live=LiveSettings(keeps_all=True, silent_s=2.0),
         )
         assert isinstance(source, LiveStream)
         setup = prepare(source, MapSettings(), None, telemetry_named=True)
@@ -192,8 +202,13 @@ def test_a_receiver_beside_a_stream_gives_where_each_frame_was_taken(has_metadat
     assert all(prior.knows_place for prior in priors)
     north_m = [prior.position_m[1] for prior in priors]
     steps_m = [b - a for a, b in pairwise(north_m)]
-    assert all(abs(step_m - 5.0 * 5 / RATE) < 0.4 for step_m in steps_m)  # 5 m/s north, a frame in 5
+    assert all(
+        abs(step_m - 5.0 * 5 / RATE) < 0.4 for step_m in steps_m
+    )  # 5 m/s north, a frame in 5
     # heights keep their zero while the telemetry grows, and no metadata came in between
     assert len({round(float(prior.position_m[2]), 3) for prior in priors}) == 1
     expected = "arrived" if not has_metadata else "ST 0601"
-    assert expected in source.start_origin and (source.start_ns > EPOCH_NS + 1000 * S) is not has_metadata
+    assert (
+        expected in source.start_origin
+        and (source.start_ns > EPOCH_NS + 1000 * S) is not has_metadata
+    )

@@ -11,7 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sorvolo.capture.live.addresses import FollowedPath, StreamAddress, is_live_address, live_address
+from sorvolo.capture.live.addresses import (
+    FollowedPath,
+    StreamAddress,
+    is_live_address,
+    live_address,
+)
 from sorvolo.capture.live.backlog import Backlog
 from sorvolo.capture.live.clock import StreamClock, Tie
 from sorvolo.capture.live.frame_queue import Arrived, FrameQueue
@@ -91,7 +96,9 @@ def test_every_frame_waits_until_memory_ends() -> None:
 
 def test_a_file_waits_for_its_reader() -> None:
     queue = FrameQueue(holds_all=True, most_bytes=30_000, blocks=True)
-    writer = threading.Thread(target=lambda: [queue.put(arrived(index)) for index in range(6)], daemon=True)
+    writer = threading.Thread(
+        target=lambda: [queue.put(arrived(index)) for index in range(6)], daemon=True
+    )
     writer.start()
     taken = []
     while len(taken) < 6 and (each := queue.take(2)) is not None:
@@ -103,10 +110,16 @@ def test_a_file_waits_for_its_reader() -> None:
 def test_of_long_telemetry_the_newest_samples_are_given_alone() -> None:
     log = TelemetryLog("klv", "udp://:1")
     for second in range(3000):  # more than there is room for at first
-        log.add(UTC + second * S, {"latitude_deg": 46.5, "longitude_deg": 11.3, "speed_m_s": second % 100})
+        log.add(
+            UTC + second * S,
+            {"latitude_deg": 46.5, "longitude_deg": 11.3, "speed_m_s": second % 100},
+        )
     newest = log.telemetry(newest=10)
     assert newest.time_ns.tolist() == [UTC + second * S for second in range(2990, 3000)]
-    assert newest["speed_m_s"].tolist() == list(range(90, 100)) and np.isnan(newest["course_deg"]).all()
+    assert (
+        newest["speed_m_s"].tolist() == list(range(90, 100))
+        and np.isnan(newest["course_deg"]).all()
+    )
     assert len(log.telemetry()) == log.version == 3000 and len(log.telemetry(newest=5000)) == 3000
     times_ns, samples = log.samples(2998)
     assert times_ns.tolist() == newest.time_ns[-2:].tolist() and len(samples) == 2
@@ -117,12 +130,16 @@ def test_telemetry_grows_and_is_waited_for() -> None:
     assert not len(log.telemetry()) and not log.wait_for_fixes(1, time.monotonic() + 0.01)
     log.add(UTC, {"latitude_deg": 46.5, "longitude_deg": 11.3})
     before = log.telemetry()
-    threading.Timer(0.05, lambda: log.add(UTC + S, {"latitude_deg": 46.50001, "longitude_deg": 11.3})).start()
+    threading.Timer(
+        0.05, lambda: log.add(UTC + S, {"latitude_deg": 46.50001, "longitude_deg": 11.3})
+    ).start()
     assert log.wait_past(UTC + 1, time.monotonic() + 5) and log.version == 2
     assert len(before) == 1 and len(log.telemetry()) == 2
     assert not log.wait_past(UTC + 2 * S, time.monotonic() + 0.01)
     log.add(UTC + S, {"latitude_deg": 0.0})  # late: it comes too late to be put in order
-    log.add(UTC + 2 * S, {"latitude_deg": 60.0, "longitude_deg": 11.3})  # a jump is cleaned away as in a file
+    log.add(
+        UTC + 2 * S, {"latitude_deg": 60.0, "longitude_deg": 11.3}
+    )  # a jump is cleaned away as in a file
     found = log.telemetry()
     assert [notice.code for notice in found.notices] == ["backward_time", "jump"]
     assert np.isfinite(found["latitude_deg"]).sum() == 2
@@ -137,10 +154,18 @@ def test_much_telemetry_is_kept() -> None:
 
 
 def test_addresses(tmp_path: Path) -> None:
-    assert is_live_address("rtsp://h/x") and is_live_address("webcam:0") and is_live_address("follow:x")
+    assert (
+        is_live_address("rtsp://h/x")
+        and is_live_address("webcam:0")
+        and is_live_address("follow:x")
+    )
     assert not is_live_address("film.mp4") and not is_live_address("C:film.mp4")
     secret = live_address("rtsp://me:pa55@192.168.1.10:554/live")
-    assert isinstance(secret, StreamAddress) and "pa55" in secret.url and secret.shown == "rtsp://192.168.1.10:554/live"
+    assert (
+        isinstance(secret, StreamAddress)
+        and "pa55" in secret.url
+        and secret.shown == "rtsp://192.168.1.10:554/live"
+    )
     heard = live_address("udp://:5000")
     assert isinstance(heard, StreamAddress) and heard.url == "udp://0.0.0.0:5000" and heard.waits
     group = live_address("udp://@239.1.2.3:5000")
@@ -152,10 +177,17 @@ def test_addresses(tmp_path: Path) -> None:
     assert live_address(f"follow:{film}") == FollowedPath(film)
 
 
-@pytest.mark.parametrize(("text", "words"), [
-    ("udp://host", "no port"), ("http:///x", "no host"), ("follow:/no/such", "no such file"), ("follow:", "nothing"),
-    ("webcam:77", "no such file or folder: /dev/video77"), ("rtsp://h:99999/x", "no address"),
-])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("udp://host", "no port"),
+        ("http:///x", "no host"),
+        ("follow:/no/such", "no such file"),
+        ("follow:", "nothing"),
+        ("webcam:77", "no such file or folder: /dev/video77"),
+        ("rtsp://h:99999/x", "no address"),
+    ],
+)
 def test_addresses_that_cannot_be(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         live_address(text)
@@ -177,7 +209,11 @@ def test_outages_are_counted_once_with_their_length(caplog: pytest.LogCaptureFix
     assert outages.silent_s > 1.9
     outages.back()
     outages.back()
-    assert outages.silent_s == 0 and len(outages.lengths_s) == 1 and outages.lengths_s[0] == pytest.approx(2, abs=0.2)
+    assert (
+        outages.silent_s == 0
+        and len(outages.lengths_s) == 1
+        and outages.lengths_s[0] == pytest.approx(2, abs=0.2)
+    )
     assert caplog.records[0].message == "udp://:5: silent for 2.0 s; trying again"
     assert outages.notices()[0].count == 1
 
@@ -201,11 +237,17 @@ def sentence(body: bytes, moment: str = "120000.00") -> bytes:
 
 def test_sentences_make_moments_however_they_are_cut() -> None:
     noon_ns = UTC - UTC % (86_400 * S) + 43_200 * S
-    data = b"".join(sentence(body, moment) for moment in ("120000.00", "120001.00") for body in (GGA, RMC))
+    data = b"".join(
+        sentence(body, moment) for moment in ("120000.00", "120001.00") for body in (GGA, RMC)
+    )
     for cut in (1, 7, 40, 1000):
         counts: Counter[str] = Counter()
         buffer = SentenceBuffer(counts)
-        found = [each for at in range(0, len(data), cut) for each in buffer.take(data[at: at + cut], noon_ns + 5 * S)]
+        found = [
+            each
+            for at in range(0, len(data), cut)
+            for each in buffer.take(data[at : at + cut], noon_ns + 5 * S)
+        ]
         found += buffer.take(b"", noon_ns + 5 * S)  # silence ends the last moment
         # the day is this computer's, whatever date the receiver invents
         assert [each.time_ns for each in found] == [noon_ns, noon_ns + S]
@@ -228,10 +270,17 @@ def test_bad_sentences_are_counted_and_noise_is_not_kept() -> None:
     for _ in range(10):
         buffer.take(b"\xff\x00" * 500, UTC)
     assert +counts == {"bad_checksum": 1, "unreadable_line": 2}
-    assert [is_link(text) for text in ("serial:/dev/x", "udp://:1", "log.nmea", "a/tcp")] == [True, True, False, False]
+    assert [is_link(text) for text in ("serial:/dev/x", "udp://:1", "log.nmea", "a/tcp")] == [
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
-def decoded_of(step_s: float, jumps: Callable[[float], float] = lambda sent_s: 0.0) -> list[tuple[float, float, bool]]:
+def decoded_of(
+    step_s: float, jumps: Callable[[float], float] = lambda sent_s: 0.0
+) -> list[tuple[float, float, bool]]:
     """Of 60 s of 30 packets a second, a key frame each second, when each was sent, its delay, and if it was decoded,
     which takes `step_s`; `jumps` is what the way takes longer by when it is sent."""
     backlog, now_s, found = Backlog(), 0.0, []
@@ -249,14 +298,20 @@ def test_a_computer_too_slow_for_a_stream_shows_what_is_new() -> None:
     decoded = [each for each in found if each[2]]
     assert max(delay_s for _, delay_s, _ in decoded) < 2.0, "24 s without leaving anything out"
     assert len(decoded) > 0.4 * len(found)
-    taken_up = [sent_s for (sent_s, _, now), (_, _, before) in zip(found[1:], found[:-1], strict=True) if now > before]
+    taken_up = [
+        sent_s
+        for (sent_s, _, now), (_, _, before) in zip(found[1:], found[:-1], strict=True)
+        if now > before
+    ]
     assert taken_up and all(sent_s % 1 == 0 for sent_s in taken_up), "with key frames"
 
 
 def test_a_computer_that_is_fast_enough_decodes_everything() -> None:
     assert all(is_decoded for _, _, is_decoded in decoded_of(step_s=0.02))
     # the link stands still for 8 s, then all that waited comes at once
-    after_outage = decoded_of(step_s=0.02, jumps=lambda sent_s: max(0.0, 28.0 - sent_s) if sent_s >= 20 else 0.0)
+    after_outage = decoded_of(
+        step_s=0.02, jumps=lambda sent_s: max(0.0, 28.0 - sent_s) if sent_s >= 20 else 0.0
+    )
     assert all(is_decoded for sent_s, _, is_decoded in after_outage if sent_s < 20 or sent_s > 31)
     # a way that takes 3 s longer from now on is no backlog
     longer = decoded_of(step_s=0.02, jumps=lambda sent_s: 3.0 if sent_s >= 20 else 0.0)

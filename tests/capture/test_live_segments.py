@@ -22,8 +22,14 @@ def photos(folder: Path, names: str) -> None:
 
 def so_far(camera: CameraModel, **others: object) -> FlightSoFar:
     values: dict = {
-        "name": "flight", "fingerprint": "f", "start_ns": 5, "start_origin": "", "next_index": 2, "last_ns": 10**18,
-        "names": frozenset({"a.jpg", "b.jpg"}), "times_ns": np.zeros(0, np.int64),
+        "name": "flight",
+        "fingerprint": "f",
+        "start_ns": 5,
+        "start_origin": "",
+        "next_index": 2,
+        "last_ns": 10**18,
+        "names": frozenset({"a.jpg", "b.jpg"}),
+        "times_ns": np.zeros(0, np.int64),
         "samples": np.zeros((0, len(TELEMETRY_COLUMNS))),
     }
     return FlightSoFar(camera=camera, **{**values, **others})
@@ -60,7 +66,9 @@ def test_earlier_telemetry_precedes_what_came_since() -> None:
 
 def test_what_was_noted_in_parts_is_joined() -> None:
     columns = len(TELEMETRY_COLUMNS)
-    times_ns, samples = joined_samples([(np.array([1, 2]), np.ones((2, columns))), (np.array([3]), np.ones(columns))])
+    times_ns, samples = joined_samples(
+        [(np.array([1, 2]), np.ones((2, columns))), (np.array([3]), np.ones(columns))]
+    )
     assert times_ns.tolist() == [1, 2, 3] and samples.shape == (3, columns)
     assert joined_samples([])[1].shape == (0, columns)
 

@@ -10,7 +10,16 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from live_sender import EPOCH_NS, RATE, dialling, free_port, number_of, sending, sending_apart, udp_url
+from live_sender import (
+    EPOCH_NS,
+    RATE,
+    dialling,
+    free_port,
+    number_of,
+    sending,
+    sending_apart,
+    udp_url,
+)
 from rtsp_server import RtspServer
 
 from sorvolo.capture.live.addresses import StreamAddress, live_address
@@ -60,7 +69,11 @@ def test_frames_come_in_order_with_the_times_of_their_metadata() -> None:
         assert abs(frame.time_ns - EPOCH_NS - sent * S // RATE) < 0.01 * S
     assert "ST 0601" in source.start_origin and source.kind == "video" and source.is_live
     telemetry = source.telemetry
-    assert telemetry.format == "klv" and len(telemetry) >= 25 and source.telemetry_version == len(telemetry)
+    assert (
+        telemetry.format == "klv"
+        and len(telemetry) >= 25
+        and source.telemetry_version == len(telemetry)
+    )
     assert telemetry.time_ns[0] <= source.start_ns
     last = int(np.searchsorted(telemetry.time_ns, frames[-1].time_ns - 1000))
     assert telemetry["camera_pitch_deg"][last] == pytest.approx(-90, abs=1e-3)
@@ -97,7 +110,9 @@ def test_a_stream_of_few_frames_a_second_is_opened_after_a_few() -> None:
     options, timeout_s = dict(address.options), (10, 5)
     with (
         sending(udp_url(port), rate=4) as sender,
-        av.open(address.url, format=address.container, options=options, timeout=timeout_s) as container,
+        av.open(
+            address.url, format=address.container, options=options, timeout=timeout_s
+        ) as container,
     ):
         sent = len(sender.sent_s)
         rate = container.streams.video[0].average_rate
@@ -114,14 +129,20 @@ def test_without_metadata_frames_are_timed_by_when_they_came() -> None:
     steps = {round((b.time_ns - a.time_ns) / S * RATE, 1) for (_, a), (_, b) in pairwise(frames)}
     assert steps == {1.0}
     for _, frame in frames:
-        sent_s = min((s for index, s in sender.sent_s.items() if index % 38 == number_of(frame.image)),
-                     key=lambda s: abs(s + ahead_s - frame.time_ns / S))
+        sent_s = min(
+            (s for index, s in sender.sent_s.items() if index % 38 == number_of(frame.image)),
+            key=lambda s: abs(s + ahead_s - frame.time_ns / S),
+        )
         assert abs(frame.time_ns / S - (sent_s + ahead_s)) < 0.5
     assert [notice.code for notice in source.notices()] == ["arrival_times"]
-    assert "arrived" in source.start_origin and source.ground_elevation_m != source.ground_elevation_m
+    assert (
+        "arrived" in source.start_origin and source.ground_elevation_m != source.ground_elevation_m
+    )
 
 
-def test_a_sender_that_dies_and_comes_back_is_one_flight_with_an_outage(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_sender_that_dies_and_comes_back_is_one_flight_with_an_outage(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     port = free_port()
     frames: list[Frame] = []
     with sending(udp_url(port), klv=True):
@@ -160,7 +181,9 @@ def test_a_sender_that_dies_and_comes_back_is_one_flight_with_an_outage(caplog: 
 def test_a_source_that_stays_silent_has_ended() -> None:
     port = free_port()
     with sending(udp_url(port), count=40):
-        source = open_live(f"udp://:{port}", LiveSettings(keeps_all=True, silent_s=0.5, give_up_s=1.0))
+        source = open_live(
+            f"udp://:{port}", LiveSettings(keeps_all=True, silent_s=0.5, give_up_s=1.0)
+        )
         began_s = time.monotonic()
         frames = list(source.frames(every_frame))
     assert frames and time.monotonic() - began_s < 10
@@ -180,12 +203,18 @@ def test_the_newest_frame_wins_where_the_flight_is_watched() -> None:
                 break
         source.close()
     assert frame.index >= 15 and source.skipped >= 15
-    assert source.skipped >= frame.index + 1 - len(late_s)  # every frame that was not given on is counted
-    assert np.median(late_s) < 0.3  # however slow the detector: it is given what came last, not what waited meanwhile
+    assert source.skipped >= frame.index + 1 - len(
+        late_s
+    )  # every frame that was not given on is counted
+    assert (
+        np.median(late_s) < 0.3
+    )  # however slow the detector: it is given what came last, not what waited meanwhile
     assert "skipped_frame" in [notice.code for notice in source.notices()]
 
 
-def test_a_stream_that_is_decoded_too_slowly_is_shown_as_it_is_now(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_that_is_decoded_too_slowly_is_shown_as_it_is_now(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Half the rate can be decoded: after ten seconds what is seen would be five seconds old, and ever older."""
     take, port = StreamReader._take, free_port()
 
@@ -224,20 +253,32 @@ def test_frames_of_another_size_are_fitted_and_of_another_shape_lost() -> None:
                     break
     assert source is not None
     source.close()
-    by_sender = [[each for each in results if (each.time_ns - EPOCH_NS) // (400 * S // RATE) == k] for k in range(3)]
-    assert all(isinstance(each, Frame) and each.image.shape == (96, 160, 3) for each in by_sender[0] + by_sender[1])
+    by_sender = [
+        [each for each in results if (each.time_ns - EPOCH_NS) // (400 * S // RATE) == k]
+        for k in range(3)
+    ]
+    assert all(
+        isinstance(each, Frame) and each.image.shape == (96, 160, 3)
+        for each in by_sender[0] + by_sender[1]
+    )
     assert number_of(by_sender[1][-1].image) >= 0 and len(by_sender[1]) >= 2  # type: ignore[union-attr]
     assert by_sender[2] and all(
-        isinstance(each, LostFrame) and each.reason == "size 96x160 differs from the flight's 160x96"
+        isinstance(each, LostFrame)
+        and each.reason == "size 96x160 differs from the flight's 160x96"
         for each in by_sender[2]
     )
     counts = {notice.code: notice.count for notice in source.notices()}
-    assert counts["size_changed"] == len(by_sender[1]) and counts["other_shape"] == len(by_sender[2])
+    assert counts["size_changed"] == len(by_sender[1]) and counts["other_shape"] == len(
+        by_sender[2]
+    )
 
 
 def test_a_flight_ends_when_it_is_stopped() -> None:
     port, until = free_port(), threading.Event()
-    with sending(udp_url(port)), opened_sources([f"udp://:{port}"], live=ALL, until=until) as (source,):
+    with (
+        sending(udp_url(port)),
+        opened_sources([f"udp://:{port}"], live=ALL, until=until) as (source,),
+    ):
         frames = source.frames(every_frame)
         next(frames)
         until.set()
@@ -273,19 +314,30 @@ def test_a_server_that_refuses_is_an_error_at_once() -> None:
     server = RtspServer(password=True)
     server.start()
     began_s = time.monotonic()
-    with pytest.raises(InputError, match=r"401.*check the address, the name and the password") as refused:
+    with pytest.raises(
+        InputError, match=r"401.*check the address, the name and the password"
+    ) as refused:
         open_live(server.address.replace("//", "//me:secret@"))
     server.close()
     assert time.monotonic() - began_s < 10 and "secret" not in str(refused.value)
 
 
-@pytest.mark.parametrize("dialled_s", [
-    pytest.param(0.5, id="at once"),
-    pytest.param(2.8, id="just before nobody calling would be noticed"),  # once it was hung up on at 3 s
-])
-@pytest.mark.parametrize(("here", "there", "container"), [
-    ("rtmp://:{}/live/x", "rtmp://127.0.0.1:{}/live/x", "flv"), ("tcp://:{}", "tcp://127.0.0.1:{}", "mpegts"),
-])
+@pytest.mark.parametrize(
+    "dialled_s",
+    [
+        pytest.param(0.5, id="at once"),
+        pytest.param(
+            2.8, id="just before nobody calling would be noticed"
+        ),  # once it was hung up on at 3 s
+    ],
+)
+@pytest.mark.parametrize(
+    ("here", "there", "container"),
+    [
+        ("rtmp://:{}/live/x", "rtmp://127.0.0.1:{}/live/x", "flv"),
+        ("tcp://:{}", "tcp://127.0.0.1:{}", "mpegts"),
+    ],
+)
 def test_streams_that_are_pushed(here: str, there: str, container: str, dialled_s: float) -> None:
     port = free_port(socket.SOCK_STREAM)
     with (
@@ -302,7 +354,9 @@ def test_streams_that_are_pushed(here: str, there: str, container: str, dialled_
 def test_nothing_there_is_an_error_with_a_reason() -> None:
     port = free_port()
     short = LiveSettings(first_s=0.5)
-    with pytest.raises(InputError, match=rf"udp://:{port}: no picture within 0 s .*is the drone sending"):
+    with pytest.raises(
+        InputError, match=rf"udp://:{port}: no picture within 0 s .*is the drone sending"
+    ):
         open_live(f"udp://:{port}", short)
     with pytest.raises(InputError, match="Connection refused"):
         open_live(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}", short)

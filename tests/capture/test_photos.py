@@ -40,8 +40,12 @@ SENSEFLY = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www
 
 def picture(width: int = 80, height: int = 60, seed: int = 0) -> Image.Image:
     """Smooth random colours with a red top-left and a blue top-right corner."""
-    rough = np.random.default_rng(seed).integers(60, 180, (height // 10 + 1, width // 10 + 1, 3), np.uint8)
-    pixels = np.asarray(Image.fromarray(rough).resize((width, height), Image.Resampling.BICUBIC)).copy()
+    rough = np.random.default_rng(seed).integers(
+        60, 180, (height // 10 + 1, width // 10 + 1, 3), np.uint8
+    )
+    pixels = np.asarray(
+        Image.fromarray(rough).resize((width, height), Image.Resampling.BICUBIC)
+    ).copy()
     pixels[:20, :20], pixels[:20, -20:] = (220, 30, 30), (30, 30, 220)
     return Image.fromarray(pixels)
 
@@ -50,13 +54,25 @@ def dms(degrees: float) -> tuple[IFDRational, IFDRational, IFDRational]:
     degrees = abs(degrees)
     whole, minutes = int(degrees), int(degrees % 1 * 60)
     seconds = (degrees - whole - minutes / 60) * 3600
-    return IFDRational(whole, 1), IFDRational(minutes, 1), IFDRational(round(seconds * 100_000), 100_000)
+    return (
+        IFDRational(whole, 1),
+        IFDRational(minutes, 1),
+        IFDRational(round(seconds * 100_000), 100_000),
+    )
 
 
 def write_photo(
-    path: Path, place: Sequence[float] | None = (46.5, -92.25, 198.5), local: str = "", utc: str = "",
-    xmp: str = "", image: Image.Image | None = None, orientation: int = 1, seed: int = 0,
-    extra: dict[int, object] | None = None, gps_extra: dict[int, object] | None = None, zone: str = "",
+    path: Path,
+    place: Sequence[float] | None = (46.5, -92.25, 198.5),
+    local: str = "",
+    utc: str = "",
+    xmp: str = "",
+    image: Image.Image | None = None,
+    orientation: int = 1,
+    seed: int = 0,
+    extra: dict[int, object] | None = None,
+    gps_extra: dict[int, object] | None = None,
+    zone: str = "",
 ) -> Path:
     exif = Image.Exif()
     exif[Base.Make], exif[Base.Model] = "DJI\0\0\0\0", "FC300S\0\0"
@@ -74,7 +90,10 @@ def write_photo(
     if place is not None:
         latitude, longitude, altitude = place
         gps[GPS.GPSLatitudeRef], gps[GPS.GPSLatitude] = "S" if latitude < 0 else "N", dms(latitude)
-        gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = "W" if longitude < 0 else "E", dms(longitude)
+        gps[GPS.GPSLongitudeRef], gps[GPS.GPSLongitude] = (
+            "W" if longitude < 0 else "E",
+            dms(longitude),
+        )
         gps[GPS.GPSAltitudeRef] = b"\1" if altitude < 0 else b"\0"
         gps[GPS.GPSAltitude] = IFDRational(round(abs(altitude) * 1000), 1000)
     if utc:
@@ -92,8 +111,11 @@ def flight(folder: Path, count: int = 4, **options: object) -> list[Path]:
     """Photos 2 s and about 11 m apart, flown north."""
     return [
         write_photo(
-            folder / f"IMG_{index + 8}.jpg", (46.5 + 1e-4 * index, -92.25, 198.5),
-            utc=f"2021:06:01 10:00:{2 * index:02d}", seed=index, **options,  # type: ignore[arg-type]
+            folder / f"IMG_{index + 8}.jpg",
+            (46.5 + 1e-4 * index, -92.25, 198.5),
+            utc=f"2021:06:01 10:00:{2 * index:02d}",
+            seed=index,
+            **options,  # type: ignore[arg-type]
         )
         for index in range(count)
     ]
@@ -115,9 +137,17 @@ def codes(source: PhotoSource) -> dict[str, int]:
     return {notice.code: notice.count for notice in notices if notice.code != "repeated_fix"}
 
 
-@given(latitude=st.floats(-89.9, 89.9), longitude=st.floats(-179.9, 179.9), altitude=st.floats(-400, 9000))
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_places_come_back(tmp_path: Path, latitude: float, longitude: float, altitude: float) -> None:
+@given(
+    latitude=st.floats(-89.9, 89.9),
+    longitude=st.floats(-179.9, 179.9),
+    altitude=st.floats(-400, 9000),
+)
+@settings(
+    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+def test_places_come_back(
+    tmp_path: Path, latitude: float, longitude: float, altitude: float
+) -> None:
     path = write_photo(tmp_path / "a.jpg", (latitude, longitude, altitude))
     columns = read_photo_metadata(path).columns
     assert columns["latitude_deg"] == pytest.approx(latitude, abs=1e-8)
@@ -126,57 +156,88 @@ def test_places_come_back(tmp_path: Path, latitude: float, longitude: float, alt
 
 
 def test_padded_texts_and_focal_lengths(tmp_path: Path) -> None:
-    metadata = read_photo_metadata(write_photo(tmp_path / "a.jpg", extra={
-        Base.FocalPlaneXResolution: IFDRational(254_000, 10), Base.FocalPlaneResolutionUnit: 2,
-        Base.FocalLengthIn35mmFilm: 20, Base.ExifImageWidth: 4000,
-    }))
+    metadata = read_photo_metadata(
+        write_photo(
+            tmp_path / "a.jpg",
+            extra={
+                Base.FocalPlaneXResolution: IFDRational(254_000, 10),
+                Base.FocalPlaneResolutionUnit: 2,
+                Base.FocalLengthIn35mmFilm: 20,
+                Base.ExifImageWidth: 4000,
+            },
+        )
+    )
     assert (metadata.make, metadata.model) == ("DJI", "FC300S")
     assert metadata.focal_length_mm == pytest.approx(3.61) and metadata.focal_length_35mm == 20
     assert metadata.focal_plane_px_per_mm == pytest.approx(1000) and metadata.full_width_px == 4000
 
 
-@pytest.mark.parametrize("broken", [
-    {GPS.GPSLatitude: (IFDRational(0, 0), IFDRational(0, 0), IFDRational(0, 0))},
-    {GPS.GPSLatitude: (IFDRational(46, 1), IFDRational(30, 0), IFDRational(1, 1))},
-    {GPS.GPSLatitude: (IFDRational(146, 1), IFDRational(0, 1), IFDRational(0, 1))},
-])
+@pytest.mark.parametrize(
+    "broken",
+    [
+        {GPS.GPSLatitude: (IFDRational(0, 0), IFDRational(0, 0), IFDRational(0, 0))},
+        {GPS.GPSLatitude: (IFDRational(46, 1), IFDRational(30, 0), IFDRational(1, 1))},
+        {GPS.GPSLatitude: (IFDRational(146, 1), IFDRational(0, 1), IFDRational(0, 1))},
+    ],
+)
 def test_zero_denominators_and_impossible_places_are_no_place(
     tmp_path: Path, broken: dict[int, object]
 ) -> None:
     metadata = read_photo_metadata(write_photo(tmp_path / "a.jpg", gps_extra=broken))
     assert "latitude_deg" not in metadata.columns and "longitude_deg" not in metadata.columns
-    assert math.isnan(read_photo_metadata(write_photo(
-        tmp_path / "b.jpg", extra={Base.FocalLength: IFDRational(0, 0)}
-    )).focal_length_mm)
+    assert math.isnan(
+        read_photo_metadata(
+            write_photo(tmp_path / "b.jpg", extra={Base.FocalLength: IFDRational(0, 0)})
+        ).focal_length_mm
+    )
 
 
 @pytest.mark.parametrize("as_elements", [False, True])
 def test_dji_words_as_attributes_and_elements(tmp_path: Path, as_elements: bool) -> None:
     words = {
-        "RelativeAltitude": "+39.80", "GimbalYawDegree": "-135.00", "GimbalPitchDegree": "-89.90",
-        "GimbalRollDegree": "+180.00", "FlightYawDegree": "+46.00", "FlightPitchDegree": "+1.80",
-        "FlightRollDegree": "-3.00", "FlightXSpeed": "+3.0", "FlightYSpeed": "-4.0",
+        "RelativeAltitude": "+39.80",
+        "GimbalYawDegree": "-135.00",
+        "GimbalPitchDegree": "-89.90",
+        "GimbalRollDegree": "+180.00",
+        "FlightYawDegree": "+46.00",
+        "FlightPitchDegree": "+1.80",
+        "FlightRollDegree": "-3.00",
+        "FlightXSpeed": "+3.0",
+        "FlightYSpeed": "-4.0",
     }
-    attributes = "" if as_elements else " ".join(f'drone-dji:{key}="{text}"' for key, text in words.items())
-    elements = "".join(
-        f"<drone-dji:{key}>{text}</drone-dji:{key}>" for key, text in words.items()
-    ) if as_elements else ""
+    attributes = (
+        "" if as_elements else " ".join(f'drone-dji:{key}="{text}"' for key, text in words.items())
+    )
+    elements = (
+        "".join(f"<drone-dji:{key}>{text}</drone-dji:{key}>" for key, text in words.items())
+        if as_elements
+        else ""
+    )
     xmp = DJI.format(attributes=attributes, elements=elements)
     columns = read_photo_metadata(write_photo(tmp_path / "a.jpg", xmp=xmp)).columns
     assert columns["height_above_takeoff_m"] == 39.8 and columns["orthometric_height_m"] == 198.5
-    assert [columns[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [-135, -89.9, 180]
+    assert [columns[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [
+        -135,
+        -89.9,
+        180,
+    ]
     assert [columns[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [46, 1.8, -3]
     assert columns["speed_m_s"] == 5 and columns["course_deg"] == pytest.approx(306.87, abs=0.01)
 
 
 def test_an_rtk_height_is_ellipsoidal(tmp_path: Path) -> None:
-    xmp = DJI.format(elements="", attributes=(
-        'drone-dji:AltitudeType="RtkAlt" drone-dji:RtkStdLon="0.03" drone-dji:RtkStdLat="0.03" '
-        'drone-dji:RtkStdHgt="0.05"'
-    ))
+    xmp = DJI.format(
+        elements="",
+        attributes=(
+            'drone-dji:AltitudeType="RtkAlt" drone-dji:RtkStdLon="0.03" drone-dji:RtkStdLat="0.03" '
+            'drone-dji:RtkStdHgt="0.05"'
+        ),
+    )
     columns = read_photo_metadata(write_photo(tmp_path / "a.jpg", xmp=xmp)).columns
     assert columns["ellipsoidal_height_m"] == 198.5 and "orthometric_height_m" not in columns
-    assert columns["horizontal_sigma_m"] == pytest.approx(0.03) and columns["vertical_sigma_m"] == 0.05
+    assert (
+        columns["horizontal_sigma_m"] == pytest.approx(0.03) and columns["vertical_sigma_m"] == 0.05
+    )
 
 
 XMP = """<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -189,15 +250,30 @@ def xmp_of(prefix: str, address: str, values: dict[str, str]) -> str:
 
 
 def test_sensefly_photos_state_three_heights_and_the_bodys_attitude(tmp_path: Path) -> None:
-    xmp = xmp_of("sensefly", "http://ns.sensefly.com/sensefly/1.0/", {
-        "AltitudeAMSL": "313.379", "AltitudeWGS84": "277.870", "Course": "0.0", "GroundSpeed": "6.7",
-        "Heading": "43.89", "Height": "65.5", "PitchAngle": "2.86", "RollAngle": "-3.84",
-        "UTCTime": "2013-06-04T17:50:31",
-    })
-    metadata = read_photo_metadata(write_photo(
-        tmp_path / "a.jpg", (41.0, -83.3, 277.87), local="2013:06:04 13:49:57", xmp=xmp,
-        gps_extra={GPS.GPSTrack: IFDRational(4389, 100)},
-    ))
+    xmp = xmp_of(
+        "sensefly",
+        "http://ns.sensefly.com/sensefly/1.0/",
+        {
+            "AltitudeAMSL": "313.379",
+            "AltitudeWGS84": "277.870",
+            "Course": "0.0",
+            "GroundSpeed": "6.7",
+            "Heading": "43.89",
+            "Height": "65.5",
+            "PitchAngle": "2.86",
+            "RollAngle": "-3.84",
+            "UTCTime": "2013-06-04T17:50:31",
+        },
+    )
+    metadata = read_photo_metadata(
+        write_photo(
+            tmp_path / "a.jpg",
+            (41.0, -83.3, 277.87),
+            local="2013:06:04 13:49:57",
+            xmp=xmp,
+            gps_extra={GPS.GPSTrack: IFDRational(4389, 100)},
+        )
+    )
     found = metadata.columns
     assert found["ellipsoidal_height_m"] == 277.87 and found["orthometric_height_m"] == 313.379
     assert found["height_above_takeoff_m"] == 65.5 and found["speed_m_s"] == 6.7
@@ -210,30 +286,58 @@ def test_sensefly_photos_state_three_heights_and_the_bodys_attitude(tmp_path: Pa
 def test_skydio_photos_state_the_cameras_attitude_as_a_structure(tmp_path: Path, form: str) -> None:
     angles = {"Roll": "0.5", "Pitch": "-89.5", "Yaw": "120.25"}
     structures = ""
-    for name, shift in (("CameraOrientationFLU", 7.0), ("CameraOrientationNED", 0.0), ("VehicleOrientationNED", 3.0)):
+    for name, shift in (
+        ("CameraOrientationFLU", 7.0),
+        ("CameraOrientationNED", 0.0),
+        ("VehicleOrientationNED", 3.0),
+    ):
         moved = {axis: str(float(text) + shift) for axis, text in angles.items()}
-        inside = "".join(f"<drone-skydio:{axis}>{text}</drone-skydio:{axis}>" for axis, text in moved.items())
+        inside = "".join(
+            f"<drone-skydio:{axis}>{text}</drone-skydio:{axis}>" for axis, text in moved.items()
+        )
         attributes = " ".join(f'drone-skydio:{axis}="{text}"' for axis, text in moved.items())
         structures += (
-            f'<drone-skydio:{name} rdf:parseType="Resource">{inside}</drone-skydio:{name}>' if form == "resource"
+            f'<drone-skydio:{name} rdf:parseType="Resource">{inside}</drone-skydio:{name}>'
+            if form == "resource"
             else f"<drone-skydio:{name} {attributes}/>"
         )
     body = "<drone-skydio:AbsoluteAltitude>310.5</drone-skydio:AbsoluteAltitude>" + structures
     body += "<drone-skydio:RelativeAltitude>42.25</drone-skydio:RelativeAltitude>"
-    xmp = XMP.format(prefix="drone-skydio", address="https://www.skydio.com/drone-skydio/1.0/", body=body)
-    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", (46.5, 11.2, 355.0), xmp=xmp)).columns
-    assert [found[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [120.25, -89.5, 0.5]
+    xmp = XMP.format(
+        prefix="drone-skydio", address="https://www.skydio.com/drone-skydio/1.0/", body=body
+    )
+    found = read_photo_metadata(
+        write_photo(tmp_path / "a.jpg", (46.5, 11.2, 355.0), xmp=xmp)
+    ).columns
+    assert [found[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [
+        120.25,
+        -89.5,
+        0.5,
+    ]
     assert [found[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [123.25, -86.5, 3.5]
     assert found["height_above_takeoff_m"] == 42.25 and found["orthometric_height_m"] == 310.5
 
 
-@pytest.mark.parametrize(("flag", "column"), [("50", "ellipsoidal_height_m"), ("16", "orthometric_height_m")])
+@pytest.mark.parametrize(
+    ("flag", "column"), [("50", "ellipsoidal_height_m"), ("16", "orthometric_height_m")]
+)
 def test_autel_photos_by_their_rtk_flag(tmp_path: Path, flag: str, column: str) -> None:
-    xmp = xmp_of("drone", "http://www.example.org/1.0/", {
-        "AbsoluteAltitude": "250.0", "RelativeAltitude": "60.0", "GimbalYawDegree": "10", "GimbalPitchDegree": "-90",
-        "GimbalRollDegree": "0", "FlightYawDegree": "12", "RtkFlag": flag,
-    })
-    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", (46.5, 11.2, 250.0), xmp=xmp)).columns
+    xmp = xmp_of(
+        "drone",
+        "http://www.example.org/1.0/",
+        {
+            "AbsoluteAltitude": "250.0",
+            "RelativeAltitude": "60.0",
+            "GimbalYawDegree": "10",
+            "GimbalPitchDegree": "-90",
+            "GimbalRollDegree": "0",
+            "FlightYawDegree": "12",
+            "RtkFlag": flag,
+        },
+    )
+    found = read_photo_metadata(
+        write_photo(tmp_path / "a.jpg", (46.5, 11.2, 250.0), xmp=xmp)
+    ).columns
     assert found[column] == 250.0 and found["height_above_takeoff_m"] == 60.0
     assert found["camera_pitch_deg"] == -90 and found["body_yaw_deg"] == 12
     assert len({"ellipsoidal_height_m", "orthometric_height_m"} & set(found)) == 1
@@ -241,14 +345,25 @@ def test_autel_photos_by_their_rtk_flag(tmp_path: Path, flag: str, column: str) 
 
 def test_parrot_photos_state_angles_and_the_height_above_takeoff(tmp_path: Path) -> None:
     body = "".join(
-        f"<drone-parrot:{name}>{text}</drone-parrot:{name}>" for name, text in {
-            "CameraYawDegree": "80", "CameraPitchDegree": "-88", "CameraRollDegree": "1", "DroneYawDegree": "81",
-            "DronePitchDegree": "4", "DroneRollDegree": "-2",
+        f"<drone-parrot:{name}>{text}</drone-parrot:{name}>"
+        for name, text in {
+            "CameraYawDegree": "80",
+            "CameraPitchDegree": "-88",
+            "CameraRollDegree": "1",
+            "DroneYawDegree": "81",
+            "DronePitchDegree": "4",
+            "DroneRollDegree": "-2",
         }.items()
-    ) + ('<Camera:AboveGroundAltitude xmlns:Camera="http://pix4d.com/camera/1.0/">33.5</Camera:AboveGroundAltitude>'
-         '<Camera:VertCS xmlns:Camera="http://pix4d.com/camera/1.0/">ellipsoidal</Camera:VertCS>')
-    xmp = XMP.format(prefix="drone-parrot", address="http://www.parrot.com/drone-parrot/1.0/", body=body)
-    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", (46.5, 11.2, 250.0), xmp=xmp)).columns
+    ) + (
+        '<Camera:AboveGroundAltitude xmlns:Camera="http://pix4d.com/camera/1.0/">33.5</Camera:AboveGroundAltitude>'
+        '<Camera:VertCS xmlns:Camera="http://pix4d.com/camera/1.0/">ellipsoidal</Camera:VertCS>'
+    )
+    xmp = XMP.format(
+        prefix="drone-parrot", address="http://www.parrot.com/drone-parrot/1.0/", body=body
+    )
+    found = read_photo_metadata(
+        write_photo(tmp_path / "a.jpg", (46.5, 11.2, 250.0), xmp=xmp)
+    ).columns
     assert [found[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [80, -88, 1]
     assert [found[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll")] == [81, 4, -2]
     assert found["height_above_takeoff_m"] == 33.5 and found["ellipsoidal_height_m"] == 250.0
@@ -256,55 +371,90 @@ def test_parrot_photos_state_angles_and_the_height_above_takeoff(tmp_path: Path)
 
 def test_djis_calibration_in_xmp_becomes_the_camera(tmp_path: Path) -> None:
     data = "2021-01-01;3713.29,3712.5,5.84,-16.9,-0.1123,0.0149,-0.0002,0.0001,-0.0272"
-    xmp = DJI.format(elements="", attributes=f'drone-dji:DewarpFlag="0" drone-dji:DewarpData="{data}"')
-    photo = write_photo(tmp_path / "a.jpg", xmp=xmp, image=picture(548, 364), extra={Base.ExifImageWidth: 5480})
+    xmp = DJI.format(
+        elements="", attributes=f'drone-dji:DewarpFlag="0" drone-dji:DewarpData="{data}"'
+    )
+    photo = write_photo(
+        tmp_path / "a.jpg", xmp=xmp, image=picture(548, 364), extra={Base.ExifImageWidth: 5480}
+    )
     found = open_photos(photo).camera
     assert found.focal_sigma == 0.005 and "XMP: calibrated" in found.origin
-    assert found.camera.fx_px == pytest.approx(371.329) and found.camera.cx_px == pytest.approx(273.5 + 0.584)
+    assert found.camera.fx_px == pytest.approx(371.329) and found.camera.cx_px == pytest.approx(
+        273.5 + 0.584
+    )
     assert found.camera.distortion.tolist() == [-0.1123, 0.0149, -0.0002, 0.0001, -0.0272]
     taken_out = xmp.replace('DewarpFlag="0"', 'DewarpFlag="1"')
-    assert not open_photos(write_photo(tmp_path / "b.jpg", xmp=taken_out, image=picture(548, 364))).camera \
-        .camera.distortion.any()
+    assert not open_photos(
+        write_photo(tmp_path / "b.jpg", xmp=taken_out, image=picture(548, 364))
+    ).camera.camera.distortion.any()
 
 
 @pytest.mark.parametrize("maker", ["dji", "skydio"])
 def test_the_lenss_design_in_xmp_becomes_the_camera(tmp_path: Path, maker: str) -> None:
     if maker == "dji":
-        xmp = DJI.format(elements="", attributes=(
-            'drone-dji:CalibratedFocalLength="366.67" drone-dji:CalibratedOpticalCenterX="276.0" '
-            'drone-dji:CalibratedOpticalCenterY="182.0"'
-        ))
+        xmp = DJI.format(
+            elements="",
+            attributes=(
+                'drone-dji:CalibratedFocalLength="366.67" drone-dji:CalibratedOpticalCenterX="276.0" '
+                'drone-dji:CalibratedOpticalCenterY="182.0"'
+            ),
+        )
     else:
         body = "".join(
             f'<drone-skydio:{name} rdf:parseType="Resource"><drone-skydio:X>{x}</drone-skydio:X>'
             f"<drone-skydio:Y>{y}</drone-skydio:Y></drone-skydio:{name}>"
-            for name, x, y in (("CalibratedFocalLength", 366.67, 366.67), ("CalibratedOpticalCenter", 276, 182))
+            for name, x, y in (
+                ("CalibratedFocalLength", 366.67, 366.67),
+                ("CalibratedOpticalCenter", 276, 182),
+            )
         )
-        xmp = XMP.format(prefix="drone-skydio", address="https://www.skydio.com/drone-skydio/1.0/", body=body)
+        xmp = XMP.format(
+            prefix="drone-skydio", address="https://www.skydio.com/drone-skydio/1.0/", body=body
+        )
     found = open_photos(write_photo(tmp_path / "a.jpg", xmp=xmp, image=picture(548, 364))).camera
     assert found.focal_sigma == 0.01 and found.camera.fx_px == pytest.approx(366.67)
     assert found.camera.cx_px == pytest.approx(275.5) and found.camera.cy_px == pytest.approx(181.5)
 
 
-@pytest.mark.parametrize("attributes", [
-    'drone-dji:CalibratedFocalLength="0"', 'drone-dji:CalibratedFocalLength="nan"', 'drone-dji:DewarpData="1,2"',
-    'drone-dji:DewarpData="x;1,1,0,0,0,0,0,0,0"', 'drone-dji:DewarpData="x;300,300,0,0,-9,0,0,0,0"',
-])
+@pytest.mark.parametrize(
+    "attributes",
+    [
+        'drone-dji:CalibratedFocalLength="0"',
+        'drone-dji:CalibratedFocalLength="nan"',
+        'drone-dji:DewarpData="1,2"',
+        'drone-dji:DewarpData="x;1,1,0,0,0,0,0,0,0"',
+        'drone-dji:DewarpData="x;300,300,0,0,-9,0,0,0,0"',
+    ],
+)
 def test_a_lens_in_xmp_that_cannot_be_is_passed_over(tmp_path: Path, attributes: str) -> None:
     xmp = DJI.format(elements="", attributes=attributes)
     assert "preset Phantom 3" in open_photos(write_photo(tmp_path / "a.jpg", xmp=xmp)).camera.origin
 
 
 def test_stated_errors_become_the_priors_own(tmp_path: Path) -> None:
-    body = "".join(f"<Camera:{name}>{text}</Camera:{name}>" for name, text in {
-        "Yaw": "30", "Pitch": "1", "Roll": "2", "IMUYawAccuracy": "1.5", "IMUPitchAccuracy": "0.4",
-        "IMURollAccuracy": "0.4", "GPSXYAccuracy": "0.04", "GPSZAccuracy": "0.06",
-    }.items())
+    body = "".join(
+        f"<Camera:{name}>{text}</Camera:{name}>"
+        for name, text in {
+            "Yaw": "30",
+            "Pitch": "1",
+            "Roll": "2",
+            "IMUYawAccuracy": "1.5",
+            "IMUPitchAccuracy": "0.4",
+            "IMURollAccuracy": "0.4",
+            "GPSXYAccuracy": "0.04",
+            "GPSZAccuracy": "0.06",
+        }.items()
+    )
     xmp = XMP.format(prefix="Camera", address="http://pix4d.com/camera/1.0", body=body)
     write_photo(tmp_path / "a.jpg", xmp=xmp, utc="2021:06:01 10:00:00")
     source = open_photos(tmp_path / "a.jpg")
     clock = tie_clocks(
-        source.telemetry, kind="photos", start_ns=source.start_ns, duration_s=0, offset_given=False, strict=False
+        source.telemetry,
+        kind="photos",
+        start_ns=source.start_ns,
+        duration_s=0,
+        offset_given=False,
+        strict=False,
     )
     frame = LocalFrame(Geodetic(46.5, -92.25))
     prior = track_from_telemetry(source.telemetry, clock, frame)[0].prior(0.0)
@@ -312,16 +462,25 @@ def test_stated_errors_become_the_priors_own(tmp_path: Path) -> None:
     assert prior.position_sigma_m == pytest.approx([0.04, 0.04, 0.06])
 
 
-@pytest.mark.parametrize(("tags", "sigma_m"), [
-    ({GPS.GPSDOP: IFDRational(12, 10)}, 1.8), ({GPS.GPSHPositioningError: IFDRational(7, 10)}, 0.7), ({}, None),
-])
-def test_exif_states_the_positions_error(tmp_path: Path, tags: dict[int, object], sigma_m: float | None) -> None:
+@pytest.mark.parametrize(
+    ("tags", "sigma_m"),
+    [
+        ({GPS.GPSDOP: IFDRational(12, 10)}, 1.8),
+        ({GPS.GPSHPositioningError: IFDRational(7, 10)}, 0.7),
+        ({}, None),
+    ],
+)
+def test_exif_states_the_positions_error(
+    tmp_path: Path, tags: dict[int, object], sigma_m: float | None
+) -> None:
     found = read_photo_metadata(write_photo(tmp_path / "a.jpg", gps_extra=tags)).columns
     assert found.get("horizontal_sigma_m") == (None if sigma_m is None else pytest.approx(sigma_m))
 
 
 def test_a_void_fix_is_no_place(tmp_path: Path) -> None:
-    found = read_photo_metadata(write_photo(tmp_path / "a.jpg", gps_extra={GPS.GPSStatus: "V"})).columns
+    found = read_photo_metadata(
+        write_photo(tmp_path / "a.jpg", gps_extra={GPS.GPSStatus: "V"})
+    ).columns
     assert "latitude_deg" not in found
 
 
@@ -331,12 +490,16 @@ def test_a_real_fixed_wing_flight_states_heights_and_attitude() -> None:
     ground_m = telemetry["orthometric_height_m"] - telemetry["height_above_takeoff_m"]
     assert np.ptp(ground_m) < 0.5 and np.isfinite(telemetry["body_roll_deg"]).all()
     # the geoid lies 33 to 36 m below the ellipsoid there
-    assert np.median(telemetry["ellipsoidal_height_m"] - telemetry["orthometric_height_m"]) == pytest.approx(-35, abs=2)
+    assert np.median(
+        telemetry["ellipsoidal_height_m"] - telemetry["orthometric_height_m"]
+    ) == pytest.approx(-35, abs=2)
     assert source.start_origin == "UTC in the photos' EXIF"
 
 
 @pytest.mark.parametrize("angles", [(30.0, 5.0, -8.0), (200.0, 0.0, 0.0), (10.0, 60.0, 20.0)])
-def test_sensefly_angles_count_from_the_nadir(tmp_path: Path, angles: tuple[float, float, float]) -> None:
+def test_sensefly_angles_count_from_the_nadir(
+    tmp_path: Path, angles: tuple[float, float, float]
+) -> None:
     path = write_photo(tmp_path / "a.jpg", xmp=SENSEFLY.format(*angles))
     columns = read_photo_metadata(path).columns
     gimbal = [columns[f"camera_{axis}_deg"] for axis in ("yaw", "pitch", "roll")]
@@ -347,13 +510,13 @@ def test_sensefly_angles_count_from_the_nadir(tmp_path: Path, angles: tuple[floa
 
 def test_times_are_utc_where_something_states_it(tmp_path: Path) -> None:
     ten_ns = 1_622_541_600 * 1_000_000_000
-    gps = read_photo_metadata(write_photo(
-        tmp_path / "a.jpg", utc="2021:06:01 10:00:00.5", local="2021:06:01 03:00:00"
-    ))
+    gps = read_photo_metadata(
+        write_photo(tmp_path / "a.jpg", utc="2021:06:01 10:00:00.5", local="2021:06:01 03:00:00")
+    )
     assert gps.utc_ns == ten_ns + 500_000_000
-    zoned = read_photo_metadata(write_photo(
-        tmp_path / "b.jpg", local="2021:06:01 12:00:00.25", zone="+02:00"
-    ))
+    zoned = read_photo_metadata(
+        write_photo(tmp_path / "b.jpg", local="2021:06:01 12:00:00.25", zone="+02:00")
+    )
     assert zoned.utc_ns == ten_ns + 250_000_000
     local = read_photo_metadata(write_photo(tmp_path / "c.jpg", local="2021:06:01 12:00:00"))
     assert local.utc_ns == 0 and local.local_ns == ten_ns + 7200 * 1_000_000_000
@@ -363,12 +526,22 @@ def test_times_are_utc_where_something_states_it(tmp_path: Path) -> None:
 
 def test_a_flight_is_sorted_by_time_then_by_name(tmp_path: Path) -> None:
     for number, second in ((10, 4), (9, 4), (2, 6), (30, 2)):
-        write_photo(tmp_path / f"IMG_{number}.jpg", utc=f"2021:06:01 10:00:{second:02d}", seed=number)
+        write_photo(
+            tmp_path / f"IMG_{number}.jpg", utc=f"2021:06:01 10:00:{second:02d}", seed=number
+        )
     source = open_photos(tmp_path)
     frames = all_frames(source)
-    assert [frame.name for frame in frames] == ["IMG_30.jpg", "IMG_9.jpg", "IMG_10.jpg", "IMG_2.jpg"]
+    assert [frame.name for frame in frames] == [
+        "IMG_30.jpg",
+        "IMG_9.jpg",
+        "IMG_10.jpg",
+        "IMG_2.jpg",
+    ]
     assert [frame.time_ns - source.start_ns for frame in frames] == [
-        0, 2_000_000_000, 2_001_000_000, 4_000_000_000
+        0,
+        2_000_000_000,
+        2_001_000_000,
+        4_000_000_000,
     ]
     assert source.telemetry.time_ns.tolist() == [frame.time_ns for frame in frames]
     assert source.kind == "photos" and source.frame_count == 4 and math.isnan(source.frame_rate_hz)
@@ -377,7 +550,9 @@ def test_a_flight_is_sorted_by_time_then_by_name(tmp_path: Path) -> None:
 def test_an_unknown_zone_is_reported_and_no_time_too(tmp_path: Path) -> None:
     (tmp_path / "local").mkdir()
     for index in range(3):
-        write_photo(tmp_path / "local" / f"{index}.jpg", local=f"2021:06:01 12:00:0{index}", seed=index)
+        write_photo(
+            tmp_path / "local" / f"{index}.jpg", local=f"2021:06:01 12:00:0{index}", seed=index
+        )
     assert codes(open_photos(tmp_path / "local")) == {"time_zone_unknown": 3}
     (tmp_path / "none").mkdir()
     for index in range(3):
@@ -389,8 +564,12 @@ def test_an_unknown_zone_is_reported_and_no_time_too(tmp_path: Path) -> None:
 
 def test_a_gps_clock_that_stands_still_is_replaced_by_the_cameras(tmp_path: Path) -> None:
     for index, gps_second in enumerate((0, 2, 2, 6)):
-        write_photo(tmp_path / f"{index}.jpg", utc=f"2021:06:01 10:00:0{gps_second}",
-                    local=f"2021:06:01 05:00:0{2 * index}", seed=index)
+        write_photo(
+            tmp_path / f"{index}.jpg",
+            utc=f"2021:06:01 10:00:0{gps_second}",
+            local=f"2021:06:01 05:00:0{2 * index}",
+            seed=index,
+        )
     source = open_photos(tmp_path)
     assert np.diff(source.telemetry.time_ns).tolist() == [2_000_000_000] * 3
     assert source.start_ns == 1_622_541_600 * 1_000_000_000
@@ -428,13 +607,23 @@ def test_corrupt_duplicate_empty_and_foreign_files(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("windy")
     (tmp_path / "._IMG_8.jpg").write_bytes(b"a resource fork")
     source = open_photos(tmp_path)
-    lost = {frame.name: frame.reason for frame in all_frames(source) if isinstance(frame, LostFrame)}
+    lost = {
+        frame.name: frame.reason for frame in all_frames(source) if isinstance(frame, LostFrame)
+    }
     assert sorted(lost) == ["IMG_20.jpg", "IMG_21.jpg", "IMG_22.jpg", "IMG_8 copy.jpg"]
     assert lost["IMG_8 copy.jpg"] == "duplicate of IMG_8.jpg"
-    assert all(reason.startswith("corrupt: ") for name, reason in lost.items() if name != "IMG_8 copy.jpg")
+    assert all(
+        reason.startswith("corrupt: ") for name, reason in lost.items() if name != "IMG_8 copy.jpg"
+    )
     found = codes(source)
-    assert found == {"duplicate_photo": 1, "unreadable_photo": 2, "corrupt_photo": 1, "ignored_file": 1,
-                     "photo_without_time": 2, "gap": 1}
+    assert found == {
+        "duplicate_photo": 1,
+        "unreadable_photo": 2,
+        "corrupt_photo": 1,
+        "ignored_file": 1,
+        "photo_without_time": 2,
+        "gap": 1,
+    }
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -538,18 +727,29 @@ def test_huge_and_float_pictures_are_refused_before_decoding(tmp_path: Path) -> 
         read_photo_metadata(heights)
 
 
-@settings(max_examples=150, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(seed=st.integers(0, 2**32), flips=st.integers(0, 40), keep=st.floats(0.001, 1.0),
-       suffix=st.sampled_from([".jpg", ".tif", ".png"]), in_header=st.booleans())
+@settings(
+    max_examples=150, deadline=5000, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    seed=st.integers(0, 2**32),
+    flips=st.integers(0, 40),
+    keep=st.floats(0.001, 1.0),
+    suffix=st.sampled_from([".jpg", ".tif", ".png"]),
+    in_header=st.booleans(),
+)
 def test_damaged_photos_are_lost_not_errors(
     tmp_path: Path, seed: int, flips: int, keep: float, suffix: str, in_header: bool
 ) -> None:
     chance = random.Random(seed)
     path = tmp_path / f"a{suffix}"
-    write_photo(path, utc="2021:06:01 10:00:00", xmp=SENSEFLY.format(1, 2, 3) if suffix == ".jpg" else "")
+    write_photo(
+        path, utc="2021:06:01 10:00:00", xmp=SENSEFLY.format(1, 2, 3) if suffix == ".jpg" else ""
+    )
     data = bytearray(path.read_bytes())
     for _ in range(flips):
-        data[chance.randrange(min(len(data), 700) if in_header else len(data))] ^= 1 << chance.randrange(8)
+        data[chance.randrange(min(len(data), 700) if in_header else len(data))] ^= (
+            1 << chance.randrange(8)
+        )
     path.write_bytes(bytes(data[: max(1, int(keep * len(data)))]))
     try:
         source = open_photos(path)

@@ -61,7 +61,9 @@ def test_videos_folders_and_single_photos_become_flights(tmp_path: Path) -> None
     single = sorted(write_photos(tmp_path / "more", 2).iterdir())
     found = open_sources([video, folder, *single])
     assert [(source.name, source.kind, source.frame_count) for source in found] == [
-        ("DJI_0001", "video", 10), ("beach", "photos", 3), ("more", "photos", 2)
+        ("DJI_0001", "video", 10),
+        ("beach", "photos", 3),
+        ("more", "photos", 2),
     ]
     assert found[1].inputs == ("IMG_0.jpg", "IMG_1.jpg", "IMG_2.jpg")
     assert len(found[0].telemetry) == len(found[1].telemetry) == 0
@@ -124,7 +126,9 @@ def test_another_flight_of_a_known_name_gets_its_own(tmp_path: Path) -> None:
     assert again.name == "DJI_0001"
     friday = open_sources([video], known={"DJI_0001": "another", "DJI_0001-2": "and another"})[0]
     assert friday.name == "DJI_0001-3"
-    once_more = open_sources([video], known={"DJI_0001": "another", "DJI_0001-2": monday.fingerprint})[0]
+    once_more = open_sources(
+        [video], known={"DJI_0001": "another", "DJI_0001-2": monday.fingerprint}
+    )[0]
     assert once_more.name == "DJI_0001-2"
 
 
@@ -141,9 +145,13 @@ def test_the_camera_fits_the_frames_as_delivered(tmp_path: Path) -> None:
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no input"):
         open_sources([])
-    with pytest.raises(InputError, match=r"no such file or folder: .*nowhere; a video, a folder of photos.*rtsp://"):
+    with pytest.raises(
+        InputError, match=r"no such file or folder: .*nowhere; a video, a folder of photos.*rtsp://"
+    ):
         open_sources([tmp_path / "nowhere"])
-    with pytest.raises(InputError, match=r"^foo://x: no such file, and no address that is known; give rtsp://"):
+    with pytest.raises(
+        InputError, match=r"^foo://x: no such file, and no address that is known; give rtsp://"
+    ):
         open_sources(["foo://me:secret@x"])
     with pytest.raises(InputError, match="serial:/dev/x: a receiver gives telemetry"):
         open_sources(["serial:/dev/x"])
@@ -159,12 +167,16 @@ def test_a_site_folder_is_no_flight(tmp_path: Path) -> None:
     """It holds mosaic.tif and preview.png, which are pictures by their endings."""
     site = write_photos(tmp_path / "site", 1)
     (site / "site.db").touch()
-    with pytest.raises(InputError, match=r"a site folder \(it has site\.db\), no flight; give .*--site"):
+    with pytest.raises(
+        InputError, match=r"a site folder \(it has site\.db\), no flight; give .*--site"
+    ):
         open_sources([site])
 
 
 @pytest.mark.parametrize("name", ["log.srt", "log.csv", "log.mp4"])
-def test_telemetry_given_as_input_is_refused_with_where_it_belongs(tmp_path: Path, name: str) -> None:
+def test_telemetry_given_as_input_is_refused_with_where_it_belongs(
+    tmp_path: Path, name: str
+) -> None:
     (tmp_path / name).write_text(SRT)
     with pytest.raises(InputError, match=r"a telemetry file, no video or photo; .* --telemetry"):
         open_sources([tmp_path / name])
@@ -190,7 +202,9 @@ def test_real_phantom_photos() -> None:
     assert source.telemetry["latitude_deg"][0] == pytest.approx(46.8426071, abs=1e-7)
     frames = list(source.frames(lambda index, time_ns: index in (0, 17)))
     assert [frame.name for frame in frames] == ["DJI_0018.JPG", "DJI_0035.JPG"]
-    assert all(isinstance(frame, Frame) and frame.image.shape == (2250, 4000, 3) for frame in frames)
+    assert all(
+        isinstance(frame, Frame) and frame.image.shape == (2250, 4000, 3) for frame in frames
+    )
 
 
 def test_real_canon_photos_are_timed_evenly() -> None:
@@ -213,7 +227,10 @@ def test_a_table_beside_the_video_that_nobody_can_read_is_named(tmp_path: Path) 
     (tmp_path / "DJI_0001.csv").write_text("when,here,there\n1,2,3\n")
     (source,) = open_sources([tmp_path / "DJI_0001.mp4"])
     found = {notice.code: notice.text for notice in source.notices()}
-    assert "DJI_0001.csv" in found["unknown_telemetry"] and "no known telemetry format" in found["unknown_telemetry"]
+    assert (
+        "DJI_0001.csv" in found["unknown_telemetry"]
+        and "no known telemetry format" in found["unknown_telemetry"]
+    )
 
 
 def test_an_empty_telemetry_file_beside_the_video_is_named(tmp_path: Path) -> None:

@@ -32,13 +32,19 @@ def telemetry(times_s, east_north_m, *, start_ns=START_NS, video=False, **column
     time_ns = start_ns + np.round(times_s * 1e9).astype(np.int64)
     made = {"latitude_deg": latitude, "longitude_deg": longitude, **columns}
     video_time_ns = np.round(times_s * 1e9).astype(np.int64) if video else None
-    return Telemetry("test", time_ns, {name: np.broadcast_to(each, len(times_s)) for name, each in made.items()},
-                     video_time_ns)
+    return Telemetry(
+        "test",
+        time_ns,
+        {name: np.broadcast_to(each, len(times_s)) for name, each in made.items()},
+        video_time_ns,
+    )
 
 
 def straight(times_s, **columns) -> Telemetry:
     """4 m/s east, 1 m/s north."""
-    return telemetry(times_s, np.column_stack([4.0 * np.asarray(times_s), 1.0 * np.asarray(times_s)]), **columns)
+    return telemetry(
+        times_s, np.column_stack([4.0 * np.asarray(times_s), 1.0 * np.asarray(times_s)]), **columns
+    )
 
 
 def clock_of(times_s, sigma_s=2.0) -> Clock:
@@ -110,7 +116,12 @@ def test_a_sample_without_a_fix_is_no_fix():
 def test_photos_carry_their_own_fixes():
     times_s = np.array([0.0, 4.0, 60.0, 300.0])
     clock = tie_clocks(
-        straight(times_s), kind="photos", start_ns=START_NS, duration_s=300, offset_given=False, strict=True
+        straight(times_s),
+        kind="photos",
+        start_ns=START_NS,
+        duration_s=300,
+        offset_given=False,
+        strict=True,
     )
     assert clock.is_per_photo
     track, _ = track_from_telemetry(straight(times_s), clock, FRAME)
@@ -121,7 +132,9 @@ def test_photos_carry_their_own_fixes():
 def test_a_lag_moves_a_photos_fix_along_its_velocity_and_doubts_it_in_a_turn():
     times_s = np.arange(0, 50, 10.0)
     turning = straight(times_s)
-    clock = tie_clocks(turning, kind="photos", start_ns=START_NS, duration_s=40, offset_given=False, strict=True)
+    clock = tie_clocks(
+        turning, kind="photos", start_ns=START_NS, duration_s=40, offset_given=False, strict=True
+    )
     track, _ = track_from_telemetry(turning, clock, FRAME)
     east_m = track.east_north_m.copy()
     east_m[3:, 0] = east_m[2, 0]  # 4 m/s east until the third photo, none after it
@@ -129,7 +142,9 @@ def test_a_lag_moves_a_photos_fix_along_its_velocity_and_doubts_it_in_a_turn():
     assert np.allclose((moved.east_north_m - east_m)[:, 0], [2, 2, 1, 0, 0], atol=1e-3)
     assert np.allclose((moved.east_north_m - east_m)[:, 1], 0.5, atol=1e-3)
     assert np.allclose(moved.horizontal_sigma_m[[0, 1, 3, 4]], track.horizontal_sigma_m[0])
-    assert moved.horizontal_sigma_m[2] == pytest.approx(np.hypot(track.horizontal_sigma_m[0], 1.0), abs=1e-3)
+    assert moved.horizontal_sigma_m[2] == pytest.approx(
+        np.hypot(track.horizontal_sigma_m[0], 1.0), abs=1e-3
+    )
 
 
 def test_a_slow_fix_repeated_at_frame_rate_is_a_slow_fix():
@@ -145,7 +160,12 @@ def test_a_slow_fix_repeated_at_frame_rate_is_a_slow_fix():
 
 def tied(samples: Telemetry, start_ns: int, *, strict=True, offset_given=False) -> Clock:
     return tie_clocks(
-        samples, kind="video", start_ns=start_ns, duration_s=20.0, offset_given=offset_given, strict=strict
+        samples,
+        kind="video",
+        start_ns=start_ns,
+        duration_s=20.0,
+        offset_given=offset_given,
+        strict=strict,
     )
 
 
@@ -178,7 +198,10 @@ def test_a_video_that_does_not_know_its_time_is_tied_by_starts():
 
 @pytest.mark.parametrize("counts_from_first_frame", [False, True])
 def test_a_log_without_a_date_is_dated_by_the_video(counts_from_first_frame):
-    undated = replace(straight(ONE_HZ, video=counts_from_first_frame), time_ns=np.round(ONE_HZ * 1e9).astype(np.int64))
+    undated = replace(
+        straight(ONE_HZ, video=counts_from_first_frame),
+        time_ns=np.round(ONE_HZ * 1e9).astype(np.int64),
+    )
     assert tied(undated, START_NS).first_frame_utc_ns == START_NS
 
 
@@ -220,7 +243,9 @@ def test_an_offset_is_seen_on_a_curved_path(offset_s, seed):
     assert 0.005 < found.sigma_s < 0.2
     assert found.is_significant == (offset_s != 0)
     corrected = shifted(track, found.offset_s)
-    again = estimate_offset(corrected, frames_s, seen_path(curved, frames_s + offset_s), reach_s=4.0)
+    again = estimate_offset(
+        corrected, frames_s, seen_path(curved, frames_s + offset_s), reach_s=4.0
+    )
     assert abs(again.offset_s) < 0.05
 
 
@@ -247,8 +272,12 @@ def test_too_little_shows_nothing():
 def strips(times_s) -> np.ndarray:
     """Four strips of 50 m, 12 m apart, at 5 m/s."""
     along = np.asarray(times_s) * 5.0
-    corners_m = np.array([[0, 0], [50, 0], [50, 12], [0, 12], [0, 24], [50, 24], [50, 36], [0, 36.0]])
-    passed_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners_m, axis=0), axis=1))])
+    corners_m = np.array(
+        [[0, 0], [50, 0], [50, 12], [0, 12], [0, 24], [50, 24], [50, 36], [0, 36.0]]
+    )
+    passed_m = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(corners_m, axis=0), axis=1))]
+    )
     return np.column_stack([np.interp(along, passed_m, corners_m[:, k]) for k in range(2)])
 
 
@@ -258,7 +287,9 @@ def offsets_found(seeds, error_m, *, offset_s) -> tuple[np.ndarray, np.ndarray]:
     for seed in seeds:
         rng = np.random.default_rng(seed)
         sample_s = np.arange(0, 47.0, 0.1)
-        track, _ = track_of(telemetry(sample_s, strips(sample_s - offset_s) + error_m(rng, sample_s)))
+        track, _ = track_of(
+            telemetry(sample_s, strips(sample_s - offset_s) + error_m(rng, sample_s))
+        )
         frames_s = np.round(np.cumsum(rng.choice([0.9, 1.0, 1.1, 1.2], 38)), 1)
         found = estimate_offset(track, frames_s, 1.3 * strips(frames_s), reach_s=2.0)
         errors_s.append(found.offset_s - offset_s)
@@ -296,7 +327,9 @@ def test_an_offset_by_fixes_that_wander_is_known_less_well():
 
 
 def test_height_above_take_off_is_taken_as_height_above_ground():
-    track, notices = track_of(straight(ONE_HZ, height_above_takeoff_m=25.0, ellipsoidal_height_m=110.0))
+    track, notices = track_of(
+        straight(ONE_HZ, height_above_takeoff_m=25.0, ellipsoidal_height_m=110.0)
+    )
     assert (track.up_m == 25.0).all() and notices == ()
     assert "take-off" in track.height_words and np.isfinite(track.altitude_offset_sigma_m)
 
@@ -315,7 +348,9 @@ def test_a_height_that_would_be_below_unknown_ground_counts_as_unknown():
     track, _ = track_of(straight(ONE_HZ, orthometric_height_m=heights))
     below, above = track.prior(1.0), track.prior(10.0)
     assert np.isinf(below.position_sigma_m[2]) and np.isfinite(below.position_sigma_m[:2]).all()
-    assert below.position_m[2] == pytest.approx(40.0) and np.allclose(below.position_m[:2], [4.0, 1.0], atol=1e-3)
+    assert below.position_m[2] == pytest.approx(40.0) and np.allclose(
+        below.position_m[:2], [4.0, 1.0], atol=1e-3
+    )
     assert above.position_m[2] == pytest.approx(40.0) and np.isfinite(above.position_sigma_m).all()
 
 
@@ -352,7 +387,9 @@ def test_a_height_of_zero_is_not_believed():
 
 def test_yaw_turns_across_north_the_short_way():
     yaw = np.array([350.0, 10.0, 30.0])
-    track, _ = track_of(straight([0.0, 1, 2], camera_yaw_deg=yaw, camera_pitch_deg=-89.0, camera_roll_deg=0.0))
+    track, _ = track_of(
+        straight([0.0, 1, 2], camera_yaw_deg=yaw, camera_pitch_deg=-89.0, camera_roll_deg=0.0)
+    )
     for time_s, expected in ((0.25, 355.0), (0.5, 0.0), (1.5, 20.0)):
         found = gimbal_angles_from_rotation(track.prior(time_s).rotation)[0]
         assert abs((found - expected + 180) % 360 - 180) < 1e-6
@@ -361,7 +398,9 @@ def test_yaw_turns_across_north_the_short_way():
 def test_roll_turns_across_180_degrees_the_short_way():
     """As a gimbal near straight down states it: yaw and roll are wild, and their sum is calm."""
     yaw, roll = np.array([228.0, 282.0]), np.array([-139.0, 167.0])
-    track, _ = track_of(straight([0.0, 1], camera_yaw_deg=yaw, camera_pitch_deg=-89.5, camera_roll_deg=roll))
+    track, _ = track_of(
+        straight([0.0, 1], camera_yaw_deg=yaw, camera_pitch_deg=-89.5, camera_roll_deg=roll)
+    )
     turned = track.prior(0.0).rotation.T @ track.prior(0.5).rotation
     assert np.degrees(np.arccos((np.trace(turned) - 1) / 2)) < 3.0
 
@@ -373,7 +412,9 @@ def test_a_camera_that_sways_across_straight_down_is_not_turned_between_samples(
     still = site_from_gimbal_rotation(90.0, -90.0, 0.0)
     sways = Rotation.from_rotvec(np.radians(sways_deg)).as_matrix()
     yaw, pitch, roll = np.array([gimbal_angles_from_rotation(each @ still) for each in sways]).T
-    track, _ = track_of(straight(ONE_HZ, camera_yaw_deg=yaw, camera_pitch_deg=pitch, camera_roll_deg=roll))
+    track, _ = track_of(
+        straight(ONE_HZ, camera_yaw_deg=yaw, camera_pitch_deg=pitch, camera_roll_deg=roll)
+    )
     for time_s in np.arange(0, 20.01, 0.25):
         turn = Rotation.from_matrix(track.prior(time_s).rotation @ still.T)
         assert np.degrees(turn.magnitude()) < 1.0
@@ -390,7 +431,9 @@ def test_a_sample_without_angles_is_bridged_by_its_neighbours():
 def test_a_gimbal_is_asked_before_the_body():
     angles = {"body_yaw_deg": 10.0, "body_pitch_deg": 5.0, "body_roll_deg": 0.0}
     body, _ = track_of(straight(ONE_HZ, **angles))
-    gimbal, _ = track_of(straight(ONE_HZ, **angles, camera_yaw_deg=50.0, camera_pitch_deg=-90.0, camera_roll_deg=0.0))
+    gimbal, _ = track_of(
+        straight(ONE_HZ, **angles, camera_yaw_deg=50.0, camera_pitch_deg=-90.0, camera_roll_deg=0.0)
+    )
     assert (body.attitude, gimbal.attitude) == ("body", "gimbal")
     # nose up by 5 deg tilts a camera fixed below the body 5 deg forward of the vertical
     looks = body.prior(3.0).rotation[:, 2]

@@ -27,7 +27,9 @@ def track(count: int, speed_m_s: float = 10.0, step_s: float = 1.0):
 
 
 def cleaned(times, latitude, longitude, **columns):
-    return clean("nmea", "a.log", times, {"latitude_deg": latitude, "longitude_deg": longitude, **columns})
+    return clean(
+        "nmea", "a.log", times, {"latitude_deg": latitude, "longitude_deg": longitude, **columns}
+    )
 
 
 def codes(telemetry) -> dict[str, int]:
@@ -48,14 +50,24 @@ def test_a_good_flight_stays_as_it_is():
 
 @settings(max_examples=60, deadline=None)
 @given(
-    start=st.integers(0, 40), length=st.integers(1, 8), step_s=st.sampled_from([0.1, 0.2, 1.0]),
-    away_m=st.floats(900, 1e6), scattered=st.booleans(), seed=st.integers(0, 1000),
+    start=st.integers(0, 40),
+    length=st.integers(1, 8),
+    step_s=st.sampled_from([0.1, 0.2, 1.0]),
+    away_m=st.floats(900, 1e6),
+    scattered=st.booleans(),
+    seed=st.integers(0, 1000),
 )
-def test_runs_of_teleported_fixes_are_taken_out_exactly(start, length, step_s, away_m, scattered, seed):
+def test_runs_of_teleported_fixes_are_taken_out_exactly(
+    start, length, step_s, away_m, scattered, seed
+):
     times, latitude, longitude = track(60, step_s=step_s)
     bad = np.arange(start, min(start + length, 60))
     rng = np.random.default_rng(seed)
-    angle = rng.uniform(0, 2 * np.pi, len(bad)) if scattered else np.full(len(bad), rng.uniform(0, 2 * np.pi))
+    angle = (
+        rng.uniform(0, 2 * np.pi, len(bad))
+        if scattered
+        else np.full(len(bad), rng.uniform(0, 2 * np.pi))
+    )
     latitude[bad] += away_m * np.cos(angle) / M_PER_DEG
     longitude[bad] += away_m * np.sin(angle) / M_PER_DEG / np.cos(np.radians(48))
     telemetry = cleaned(times, latitude, longitude)
@@ -171,10 +183,14 @@ def test_nothing_usable_is_an_input_error():
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(
-    st.tuples(st.integers(-10**15, 10**15), *[st.floats(allow_nan=True, allow_infinity=True)] * 3),
-    max_size=25,
-))
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(-(10**15), 10**15), *[st.floats(allow_nan=True, allow_infinity=True)] * 3
+        ),
+        max_size=25,
+    )
+)
 def test_any_numbers_become_clean_telemetry(rows):
     times, latitude, longitude, yaw = ([row[column] for row in rows] for column in range(4))
     try:
@@ -194,29 +210,41 @@ def test_many_random_positions_take_bounded_time():
     assert codes(telemetry)["jump"] > 19_000
 
 
-@pytest.mark.parametrize("text, expected, zoned", [
-    ("2021-12-25 12:27:52.373", "2021-12-25T12:27:52.373", False),
-    ("2019-09-27 10:28:08,438,904", "2019-09-27T10:28:08.438904", False),
-    ("HOME(1,2) 2017.8.5 14:11:51", "2017-08-05T14:11:51", False),
-    ("2016/05/04 10:00:00", "2016-05-04T10:00:00", False),
-    ("2016-05-04T10:00:00.123456789Z", "2016-05-04T10:00:00.123456789", True),
-    ("2016-05-04T10:00:00+02:00", "2016-05-04T08:00:00", True),
-    ("2016-05-04T10:00:00-0230", "2016-05-04T12:30:00", True),
-])
+@pytest.mark.parametrize(
+    "text, expected, zoned",
+    [
+        ("2021-12-25 12:27:52.373", "2021-12-25T12:27:52.373", False),
+        ("2019-09-27 10:28:08,438,904", "2019-09-27T10:28:08.438904", False),
+        ("HOME(1,2) 2017.8.5 14:11:51", "2017-08-05T14:11:51", False),
+        ("2016/05/04 10:00:00", "2016-05-04T10:00:00", False),
+        ("2016-05-04T10:00:00.123456789Z", "2016-05-04T10:00:00.123456789", True),
+        ("2016-05-04T10:00:00+02:00", "2016-05-04T08:00:00", True),
+        ("2016-05-04T10:00:00-0230", "2016-05-04T12:30:00", True),
+    ],
+)
 def test_dates_in_every_dress(text, expected, zoned):
     assert time_ns_from_text(text) == (int(np.datetime64(expected, "ns").astype(np.int64)), zoned)
 
 
-@pytest.mark.parametrize("text", [
-    "", "12:27:52", "2021-13-25 12:27:52", "1905-01-01 00:00:00", "2021-02-30 00:00:00",
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "12:27:52",
+        "2021-13-25 12:27:52",
+        "1905-01-01 00:00:00",
+        "2021-02-30 00:00:00",
+    ],
+)
 def test_no_dates(text):
     assert time_ns_from_text(text) is None
 
 
 def test_missing_stamps_are_filled_and_coarse_ones_refined():
     counter = np.arange(6) * SECOND_NS // 2
-    stamps = np.array([NO_TIME_NS, 100 * SECOND_NS, NO_TIME_NS, 101 * SECOND_NS, 101 * SECOND_NS, NO_TIME_NS])
+    stamps = np.array(
+        [NO_TIME_NS, 100 * SECOND_NS, NO_TIME_NS, 101 * SECOND_NS, 101 * SECOND_NS, NO_TIME_NS]
+    )
     filled = fill_stamps(stamps, counter)
     assert filled[0] == 100 * SECOND_NS - SECOND_NS // 2
     assert filled[5] == 101 * SECOND_NS + SECOND_NS // 2

@@ -11,10 +11,12 @@ from sorvolo.capture.telemetry import TELEMETRY_READERS, find_telemetry_beside, 
 from sorvolo.errors import InputError
 
 NMEA = b"$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47\r\n"
-SRT = (b"1\n00:00:00,000 --> 00:00:01,000\nGPS(-58.4563,-34.7386,19) BAROMETER:20.1\n\n")
-GPX = (b'<gpx version="1.1"><trk><trkseg><trkpt lat="48.1" lon="11.5">'
-       b"<time>2016-05-04T10:00:00Z</time></trkpt>"
-       b"</trkseg></trk></gpx>")
+SRT = b"1\n00:00:00,000 --> 00:00:01,000\nGPS(-58.4563,-34.7386,19) BAROMETER:20.1\n\n"
+GPX = (
+    b'<gpx version="1.1"><trk><trkseg><trkpt lat="48.1" lon="11.5">'
+    b"<time>2016-05-04T10:00:00Z</time></trkpt>"
+    b"</trkseg></trk></gpx>"
+)
 UMCD = b"offsetTime,Longitude,Latitude\n0.0,11.5,48.1\n0.1,11.5,48.1\n"
 SAMPLES = {"nmea": NMEA, "dji_srt": SRT, "gpx": GPX, "table": UMCD}
 
@@ -35,20 +37,34 @@ def test_the_content_decides_not_the_suffix(tmp_path, name, suffix):
 def test_every_reader_is_listed_by_its_own_name():
     assert set(TELEMETRY_READERS) == set(SAMPLES)
     for name, data in SAMPLES.items():
-        assert [other for other, reader in TELEMETRY_READERS.items() if reader.recognises(data)] == [name]
+        assert [
+            other for other, reader in TELEMETRY_READERS.items() if reader.recognises(data)
+        ] == [name]
 
 
-@pytest.mark.parametrize("data, words", [
-    (b"", "empty file"),
-    (bytes(range(256)) * 10, "binary"),
-    (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "a binary file, not a log in text; read are DJI subtitles"),
-    (b"\0\0\0\x14ftypmp41\x13\x10\x18mp41\0", r"a video, no log \(telemetry inside a GoPro video"),
-    (b"dear diary, today I flew\nand back\n", "no known telemetry format, it begins with 'dear diary, today I flew';"),
-    (b"a,b,c\n1,2,3\n", "no known telemetry format"),
-    (b"offsetTime,Longitude,Latitude\n", "no usable table"),
-    (b"offsetTime,Longitude,Latitude\n0,0,0\n", "0/0"),
-    (NMEA.replace(b"545", b"546"), "bad checksum"),
-])
+@pytest.mark.parametrize(
+    "data, words",
+    [
+        (b"", "empty file"),
+        (bytes(range(256)) * 10, "binary"),
+        (
+            b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
+            "a binary file, not a log in text; read are DJI subtitles",
+        ),
+        (
+            b"\0\0\0\x14ftypmp41\x13\x10\x18mp41\0",
+            r"a video, no log \(telemetry inside a GoPro video",
+        ),
+        (
+            b"dear diary, today I flew\nand back\n",
+            "no known telemetry format, it begins with 'dear diary, today I flew';",
+        ),
+        (b"a,b,c\n1,2,3\n", "no known telemetry format"),
+        (b"offsetTime,Longitude,Latitude\n", "no usable table"),
+        (b"offsetTime,Longitude,Latitude\n0,0,0\n", "0/0"),
+        (NMEA.replace(b"545", b"546"), "bad checksum"),
+    ],
+)
 def test_unusable_files_state_what_was_found(tmp_path, data, words):
     path = write(tmp_path / "flight.csv", data)
     with pytest.raises(InputError, match=words) as caught:
@@ -114,13 +130,37 @@ def test_a_folder_of_photos(tmp_path):
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.one_of(
-    st.binary(max_size=200),
-    st.lists(st.sampled_from([
-        b"$GPGGA,", b"<gpx", b">", b"latitude", b",", b"longitude", b"\n", b"GPS(", b"1", b"-->",
-        b"00:00:00,000", b")", b"*", b"4F", b"\xff\xfe", b"\0", b'"', b"<!DOCTYPE", b"<trkpt",
-    ]), max_size=30).map(b"".join),
-))
+@given(
+    st.one_of(
+        st.binary(max_size=200),
+        st.lists(
+            st.sampled_from(
+                [
+                    b"$GPGGA,",
+                    b"<gpx",
+                    b">",
+                    b"latitude",
+                    b",",
+                    b"longitude",
+                    b"\n",
+                    b"GPS(",
+                    b"1",
+                    b"-->",
+                    b"00:00:00,000",
+                    b")",
+                    b"*",
+                    b"4F",
+                    b"\xff\xfe",
+                    b"\0",
+                    b'"',
+                    b"<!DOCTYPE",
+                    b"<trkpt",
+                ]
+            ),
+            max_size=30,
+        ).map(b"".join),
+    )
+)
 def test_random_bytes_raise_only_input_errors(data):
     for reader in TELEMETRY_READERS.values():
         assert reader.recognises(data) in (True, False)

@@ -34,29 +34,59 @@ def text(key: str, value: str) -> bytes:
 def gps5(second: int, fix: int = 3, datum: str = "") -> bytes:
     """Ten samples of one second, flying north at 5 m/s."""
     rows = b"".join(
-        struct.pack(">5i", round((46.5 + (10 * second + i) * 4.5e-6) * 1e7), round(11.2e7), 250_500, 5000, 510)
+        struct.pack(
+            ">5i",
+            round((46.5 + (10 * second + i) * 4.5e-6) * 1e7),
+            round(11.2e7),
+            250_500,
+            5000,
+            510,
+        )
         for i in range(10)
     )
     clock = datetime.fromtimestamp(NOON_NS / 1e9 + second, UTC).strftime("%y%m%d%H%M%S.%f")[:16]
     stream = container(
-        "STRM", item("GPSF", "L", 4, struct.pack(">I", fix)), item("GPSU", "U", 16, clock.encode()),
-        item("GPSP", "S", 2, struct.pack(">H", 120)), *([text("GPSA", datum)] if datum else []),
-        item("SCAL", "l", 4, struct.pack(">5i", 10**7, 10**7, 1000, 1000, 100)), item("GPS5", "l", 20, rows),
+        "STRM",
+        item("GPSF", "L", 4, struct.pack(">I", fix)),
+        item("GPSU", "U", 16, clock.encode()),
+        item("GPSP", "S", 2, struct.pack(">H", 120)),
+        *([text("GPSA", datum)] if datum else []),
+        item("SCAL", "l", 4, struct.pack(">5i", 10**7, 10**7, 1000, 1000, 100)),
+        item("GPS5", "l", 20, rows),
     )
-    other = container("STRM", item("SCAL", "s", 2, struct.pack(">h", 418)), item("ACCL", "s", 6, bytes(60)))
+    other = container(
+        "STRM", item("SCAL", "s", 2, struct.pack(">h", 418)), item("ACCL", "s", 6, bytes(60))
+    )
     return container("DEVC", text("DVNM", "Hero7 Black"), other, stream)
 
 
 def gps9(second: int) -> bytes:
     days = (NOON_NS // S - 946_684_800) // 86_400
     rows = b"".join(
-        struct.pack(">7i2H", round(46.5e7), round(11.2e7), 250_500, 5000, 510, days, (43_200 + second) * 1000 + 100 * i,
-                    120, 3)
+        struct.pack(
+            ">7i2H",
+            round(46.5e7),
+            round(11.2e7),
+            250_500,
+            5000,
+            510,
+            days,
+            (43_200 + second) * 1000 + 100 * i,
+            120,
+            3,
+        )
         for i in range(10)
     )
     scales = struct.pack(">9i", 10**7, 10**7, 1000, 1000, 100, 1, 1000, 100, 1)
-    return container("DEVC", container("STRM", text("TYPE", "lllllllSS"), item("SCAL", "l", 4, scales),
-                                       item("GPS9", "?", 32, rows)))
+    return container(
+        "DEVC",
+        container(
+            "STRM",
+            text("TYPE", "lllllllSS"),
+            item("SCAL", "l", 4, scales),
+            item("GPS9", "?", 32, rows),
+        ),
+    )
 
 
 def payloads(make, count: int = 6) -> list[Payload]:
@@ -68,14 +98,25 @@ def test_a_cameras_gps5() -> None:
     assert telemetry.format == "gpmf" and len(telemetry) == 60
     assert list(telemetry.video_time_ns[:3]) == [0, S // 10, S // 5]
     assert telemetry.time_ns[0] == NOON_NS and (np.diff(telemetry.time_ns) == S // 10).all()
-    assert telemetry["latitude_deg"][59] == pytest.approx(46.5 + 59 * 4.5e-6) and telemetry["longitude_deg"][0] == 11.2
-    assert telemetry["ellipsoidal_height_m"][0] == 250.5 and np.isnan(telemetry["orthometric_height_m"]).all()
-    assert telemetry["speed_m_s"][0] == 5 and telemetry["horizontal_sigma_m"][0] == pytest.approx(1.8)
+    assert (
+        telemetry["latitude_deg"][59] == pytest.approx(46.5 + 59 * 4.5e-6)
+        and telemetry["longitude_deg"][0] == 11.2
+    )
+    assert (
+        telemetry["ellipsoidal_height_m"][0] == 250.5
+        and np.isnan(telemetry["orthometric_height_m"]).all()
+    )
+    assert telemetry["speed_m_s"][0] == 5 and telemetry["horizontal_sigma_m"][0] == pytest.approx(
+        1.8
+    )
 
 
 def test_heights_above_the_sea_and_fixes_in_the_plane() -> None:
     telemetry = read_payloads(payloads(lambda second: gps5(second, datum="MSLV")), "a")
-    assert telemetry["orthometric_height_m"][0] == 250.5 and np.isnan(telemetry["ellipsoidal_height_m"]).all()
+    assert (
+        telemetry["orthometric_height_m"][0] == 250.5
+        and np.isnan(telemetry["ellipsoidal_height_m"]).all()
+    )
     flat = read_payloads(payloads(lambda second: gps5(second, fix=2)), "a")
     assert flat.has_fixes and np.isnan(flat["ellipsoidal_height_m"]).all()
     with pytest.raises(InputError, match="no usable gpmf"):
@@ -106,7 +147,7 @@ def test_mutated_payloads_raise_only_input_errors(data: st.DataObject) -> None:
         if data.draw(st.booleans()):
             valid[place] = data.draw(st.integers(0, 255))
         else:
-            del valid[place: place + data.draw(st.integers(1, 20))]
+            del valid[place : place + data.draw(st.integers(1, 20))]
         if not valid:
             return
     try:
@@ -136,7 +177,10 @@ def test_a_real_karma_video() -> None:
     assert np.ptp(telemetry["latitude_deg"]) * 111_000 == pytest.approx(71, abs=3)
     assert telemetry["longitude_deg"] == pytest.approx(-117.331, abs=0.001)
     assert np.nanmedian(telemetry["orthometric_height_m"]) == pytest.approx(16, abs=4)
-    assert np.isfinite(telemetry["height_above_takeoff_m"]).all() and np.isfinite(telemetry["body_roll_deg"]).all()
+    assert (
+        np.isfinite(telemetry["height_above_takeoff_m"]).all()
+        and np.isfinite(telemetry["body_roll_deg"]).all()
+    )
     # it flies forward, in the direction of its nose
     turn = (telemetry["body_yaw_deg"] - telemetry["course_deg"] + 180) % 360 - 180
     assert np.median(np.abs(turn)) < 10 and np.median(telemetry["body_pitch_deg"]) < -5

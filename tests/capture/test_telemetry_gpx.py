@@ -20,10 +20,16 @@ def track(places, step_s: float = 1.0, version: str = "1.1") -> str:
     document.tracks.append(gpxpy.gpx.GPXTrack())
     document.tracks[0].segments.append(gpxpy.gpx.GPXTrackSegment())
     for index, (latitude, longitude, height_m) in enumerate(places):
-        document.tracks[0].segments[0].points.append(gpxpy.gpx.GPXTrackPoint(
-            latitude, longitude, elevation=height_m, time=START + timedelta(seconds=step_s * index),
-            horizontal_dilution=0.8, speed=3.5,
-        ))
+        document.tracks[0].segments[0].points.append(
+            gpxpy.gpx.GPXTrackPoint(
+                latitude,
+                longitude,
+                elevation=height_m,
+                time=START + timedelta(seconds=step_s * index),
+                horizontal_dilution=0.8,
+                speed=3.5,
+            )
+        )
     return document.to_xml(version=version)
 
 
@@ -36,13 +42,17 @@ def codes(telemetry) -> dict[str, int]:
 
 @settings(max_examples=40, deadline=None)
 @given(
-    latitude=st.floats(-89, 89), longitude=st.floats(-179.99, 179.99), height_m=st.floats(-400, 8000),
+    latitude=st.floats(-89, 89),
+    longitude=st.floats(-179.99, 179.99),
+    height_m=st.floats(-400, 8000),
     version=st.sampled_from(["1.0", "1.1"]),
 )
 def test_tracks_come_back(latitude, longitude, height_m, version):
     if abs(latitude) < 1e-3 and abs(longitude) < 1e-3:
         return
-    places = [(round(latitude, 7) + 1e-6 * i, round(longitude, 7), round(height_m, 3)) for i in range(4)]
+    places = [
+        (round(latitude, 7) + 1e-6 * i, round(longitude, 7), round(height_m, 3)) for i in range(4)
+    ]
     data = track(places, 0.2, version).encode()
     assert gpx.recognises(data)
     telemetry = gpx.read(data, "a.gpx")
@@ -100,7 +110,9 @@ def test_one_bad_point_does_not_cost_the_file():
 
 
 def test_bombs_and_external_entities_are_refused():
-    bomb = '<!DOCTYPE gpx [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]><gpx><trk>&b;</trk></gpx>'
+    bomb = (
+        '<!DOCTYPE gpx [<!ENTITY a "aaaaaaaaaa"><!ENTITY b "&a;&a;&a;">]><gpx><trk>&b;</trk></gpx>'
+    )
     external = '<?xml version="1.0"?><!DOCTYPE gpx SYSTEM "file:///etc/hostname"><gpx></gpx>'
     for text in (bomb, external):
         with pytest.raises(InputError, match="document type"):
@@ -118,7 +130,12 @@ def test_a_cut_file_keeps_its_whole_points(cut):
 
 
 def test_what_cannot_be_read():
-    for data in (b"<gpx", b"<gpx><trk></gpx>", b'<?xml version="1.0" encoding="klingon"?><gpx></gpx>', b""):
+    for data in (
+        b"<gpx",
+        b"<gpx><trk></gpx>",
+        b'<?xml version="1.0" encoding="klingon"?><gpx></gpx>',
+        b"",
+    ):
         with pytest.raises(InputError):
             gpx.read(data, "a.gpx")
 
@@ -130,9 +147,11 @@ def test_mutated_files_raise_only_input_errors(data):
     for _ in range(data.draw(st.integers(1, 5))):
         place = data.draw(st.integers(0, len(valid) - 1))
         if data.draw(st.booleans()):
-            valid[place] = data.draw(st.one_of(st.integers(0, 255), st.sampled_from(b"0123456789.-<>/\"")))
+            valid[place] = data.draw(
+                st.one_of(st.integers(0, 255), st.sampled_from(b'0123456789.-<>/"'))
+            )
         else:
-            del valid[place: place + data.draw(st.integers(1, 30))]
+            del valid[place : place + data.draw(st.integers(1, 30))]
     try:
         telemetry = gpx.read(bytes(valid), "a.gpx")
     except InputError:

@@ -25,8 +25,16 @@ def degrees_minutes(value: float, digits: int) -> str:
     return f"{int(minutes // 60):0{digits}d}{minutes % 60:08.5f}"
 
 
-def gga(clock: str, latitude: float, longitude: float, altitude: str = "545.4", separation: str = "46.9",
-        quality: int = 1, hdop: str = "0.9", talker: str = "GP") -> str:
+def gga(
+    clock: str,
+    latitude: float,
+    longitude: float,
+    altitude: str = "545.4",
+    separation: str = "46.9",
+    quality: int = 1,
+    hdop: str = "0.9",
+    talker: str = "GP",
+) -> str:
     return sentence(
         f"{talker}GGA,{clock},{degrees_minutes(latitude, 2)},{'NS'[latitude < 0]},"
         f"{degrees_minutes(longitude, 3)},{'EW'[longitude < 0]},{quality},08,"
@@ -34,8 +42,16 @@ def gga(clock: str, latitude: float, longitude: float, altitude: str = "545.4", 
     )
 
 
-def rmc(clock: str, day: str, latitude: float, longitude: float, status: str = "A", speed: str = "10.0",
-        course: str = "84.4", talker: str = "GP") -> str:
+def rmc(
+    clock: str,
+    day: str,
+    latitude: float,
+    longitude: float,
+    status: str = "A",
+    speed: str = "10.0",
+    course: str = "84.4",
+    talker: str = "GP",
+) -> str:
     return sentence(
         f"{talker}RMC,{clock},{status},{degrees_minutes(latitude, 2)},{'NS'[latitude < 0]},"
         f"{degrees_minutes(longitude, 3)},{'EW'[longitude < 0]},{speed},{course},{day},,"
@@ -85,23 +101,36 @@ def test_no_separation_means_no_ellipsoidal_height():
 
 @settings(max_examples=60, deadline=None)
 @given(
-    latitude=st.floats(-89.9, 89.9), longitude=st.floats(-180, 180),
+    latitude=st.floats(-89.9, 89.9),
+    longitude=st.floats(-180, 180),
     talker=st.sampled_from(["GP", "GN", "GL", "GA", "GB", "QZ"]),
 )
 def test_positions_come_back_with_their_signs(latitude, longitude, talker):
     if abs(latitude) < 1e-5 and abs(longitude) < 1e-5:
         return
-    for text in (gga("120000", latitude, longitude, talker=talker),
-                 rmc("120000", "040516", latitude, longitude, talker=talker)):
+    for text in (
+        gga("120000", latitude, longitude, talker=talker),
+        rmc("120000", "040516", latitude, longitude, talker=talker),
+    ):
         telemetry = nmea.read(text.encode(), "a.log")
         assert telemetry["latitude_deg"][0] == pytest.approx(latitude, abs=2e-7)
         assert telemetry["longitude_deg"][0] == pytest.approx(longitude, abs=2e-7)
 
 
-@pytest.mark.parametrize("latitude, longitude", [(48.1, 11.5), (-33.9, 151.2), (40.7, -74.0), (-22.9, -43.2)])
+@pytest.mark.parametrize(
+    "latitude, longitude", [(48.1, 11.5), (-33.9, 151.2), (40.7, -74.0), (-22.9, -43.2)]
+)
 def test_agrees_with_sentences_of_the_library(latitude, longitude):
     message = NMEAMessage(
-        "GN", "GGA", GET, lat=latitude, lon=longitude, quality=1, alt=100.0, HDOP=1.0, time="120000.00"
+        "GN",
+        "GGA",
+        GET,
+        lat=latitude,
+        lon=longitude,
+        quality=1,
+        alt=100.0,
+        HDOP=1.0,
+        time="120000.00",
     )
     telemetry = nmea.read(message.serialize(), "a.log")
     assert telemetry["latitude_deg"][0] == pytest.approx(latitude, abs=1e-6)
@@ -127,8 +156,13 @@ def test_bad_and_missing_checksums_are_counted_and_dropped():
 
 
 def test_midnight():
-    text = (gga("235958", 48.1, 11.5) + rmc("235959", "311215", 48.1, 11.5)
-            + gga("000000", 48.1, 11.5) + gga("000001", 48.1, 11.5) + rmc("000002", "010116", 48.1, 11.5))
+    text = (
+        gga("235958", 48.1, 11.5)
+        + rmc("235959", "311215", 48.1, 11.5)
+        + gga("000000", 48.1, 11.5)
+        + gga("000001", 48.1, 11.5)
+        + rmc("000002", "010116", 48.1, 11.5)
+    )
     telemetry = nmea.read(text.encode(), "a.log")
     first = int(np.datetime64("2015-12-31T23:59:58", "ns").astype(np.int64))
     assert list(telemetry.time_ns) == [first + second * SECOND_NS for second in range(5)]
@@ -172,7 +206,9 @@ def test_sentences_within_another_log():
     assert nmea.recognises(noisy.encode())
     telemetry = nmea.read(noisy.encode(), "a.log")
     assert len(telemetry) == 3
-    assert telemetry["latitude_deg"] == pytest.approx(nmea.read(flight(3).encode(), "b")["latitude_deg"])
+    assert telemetry["latitude_deg"] == pytest.approx(
+        nmea.read(flight(3).encode(), "b")["latitude_deg"]
+    )
 
 
 @pytest.mark.parametrize("cut", range(1, 66))
@@ -192,7 +228,12 @@ def test_coarse_minutes_widen_the_uncertainty():
 
 
 def test_a_moment_twice_and_a_backward_clock():
-    text = flight(5) + gga("120004", 48.1, 11.5) + gga("115900", 48.1, 11.5) + gga("120005", 48.1, 11.5)
+    text = (
+        flight(5)
+        + gga("120004", 48.1, 11.5)
+        + gga("115900", 48.1, 11.5)
+        + gga("120005", 48.1, 11.5)
+    )
     telemetry = nmea.read(text.encode(), "a.log")
     assert len(telemetry) == 6
     assert codes(telemetry)["duplicate_time"] == 1
@@ -209,9 +250,9 @@ def test_mutated_files_raise_only_input_errors(data):
         if what == "flip":
             valid[place] = data.draw(st.integers(0, 255))
         elif what == "cut" and len(valid) > 10:
-            del valid[place: place + data.draw(st.integers(1, 5))]
+            del valid[place : place + data.draw(st.integers(1, 5))]
         else:
-            valid[place:place] = valid[max(0, place - 20): place]
+            valid[place:place] = valid[max(0, place - 20) : place]
     try:
         telemetry = nmea.read(bytes(valid), "a.log")
     except InputError:
@@ -228,7 +269,9 @@ def test_sentences_with_a_right_checksum_and_nonsense_fields(body, kind):
     text = sentence(f"GP{kind},{body}") + flight(2)
     telemetry = nmea.read(text.encode(), "a.log")
     assert len(telemetry) >= 2
-    assert all(np.isfinite(column[~np.isnan(column)]).all() for column in telemetry.columns.values())
+    assert all(
+        np.isfinite(column[~np.isnan(column)]).all() for column in telemetry.columns.values()
+    )
 
 
 @pytest.mark.parametrize("kind", ["GGA", "RMC"])

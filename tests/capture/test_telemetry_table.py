@@ -13,33 +13,104 @@ from sorvolo.errors import InputError
 
 # thesis, Table 2.2, columns 1 to 60
 COLUMNS = (
-    "Tick#", "offsetTime", "flightTime(msec)", "Longitude", "Latitude", "numSats", "gpsAltitude(meters)",
-    "baroAlt(meters)", "vpsHeight(M)", "relativeHeight", "accelX(M/S²)", "accelY(M/S²)", "accelZ(M/S²)",
-    "gyroX(degrees/s)", "gyroY(degrees/s)", "gyroZ(degrees/s)", "magX", "magY", "magZ", "magMod",
-    "velN(M/S)", "velE(M/S)", "velD(M/S)", "vel(M/S)", "quatW", "quatX", "quatY", "quatZ", "Roll",
-    "Pitch", "Yaw", "errorX", "errorY", "errorZ", "error", "accel(M/S²)", "gyro(degrees/s)",
-    "distancHP(M)", "distanceTravelled(M)", "directionOfTravel", "IMUTemp(C)", "batteryTemp(C)",
-    "ratedCapacity", "remaingCapacity", "batteryCycleCount", "batteryLifePercentage", "Gimbal:roll",
-    "Gimbal:pitch", "Gimbal:yaw", "Gimbal:Xroll", "Gimbal:Xpitch", "Gimbal:Yyaw", "MotorSpeed:RFront",
-    "MotorSpeed:LFront", "MotorSpeed:LBack", "MotorSpeed:RBack", "MotorLoad:RFront", "MotorLoad:LFront",
-    "MotorLoad:LBack", "MotorLoad:RBack",
+    "Tick#",
+    "offsetTime",
+    "flightTime(msec)",
+    "Longitude",
+    "Latitude",
+    "numSats",
+    "gpsAltitude(meters)",
+    "baroAlt(meters)",
+    "vpsHeight(M)",
+    "relativeHeight",
+    "accelX(M/S²)",
+    "accelY(M/S²)",
+    "accelZ(M/S²)",
+    "gyroX(degrees/s)",
+    "gyroY(degrees/s)",
+    "gyroZ(degrees/s)",
+    "magX",
+    "magY",
+    "magZ",
+    "magMod",
+    "velN(M/S)",
+    "velE(M/S)",
+    "velD(M/S)",
+    "vel(M/S)",
+    "quatW",
+    "quatX",
+    "quatY",
+    "quatZ",
+    "Roll",
+    "Pitch",
+    "Yaw",
+    "errorX",
+    "errorY",
+    "errorZ",
+    "error",
+    "accel(M/S²)",
+    "gyro(degrees/s)",
+    "distancHP(M)",
+    "distanceTravelled(M)",
+    "directionOfTravel",
+    "IMUTemp(C)",
+    "batteryTemp(C)",
+    "ratedCapacity",
+    "remaingCapacity",
+    "batteryCycleCount",
+    "batteryLifePercentage",
+    "Gimbal:roll",
+    "Gimbal:pitch",
+    "Gimbal:yaw",
+    "Gimbal:Xroll",
+    "Gimbal:Xpitch",
+    "Gimbal:Yyaw",
+    "MotorSpeed:RFront",
+    "MotorSpeed:LFront",
+    "MotorSpeed:LBack",
+    "MotorSpeed:RBack",
+    "MotorLoad:RFront",
+    "MotorLoad:LFront",
+    "MotorLoad:LBack",
+    "MotorLoad:RBack",
 )
 SECOND_NS = 1_000_000_000
 
 
 def row(index: int) -> dict[str, float]:
     reported = {
-        "Tick#": 1000 + 60 * index, "offsetTime": 12.5 + 0.1 * index, "flightTime(msec)": 5000 + 100 * index,
-        "Longitude": 12.4964 + 1e-6 * index, "Latitude": 41.9028 + 2e-6 * index, "gpsAltitude(meters)": 85.5,
-        "baroAlt(meters)": 90.25 + index, "vpsHeight(M)": 9.0, "relativeHeight": 10.5, "velN(M/S)": 3.0,
-        "velE(M/S)": 4.0, "vel(M/S)": 5.0, "Roll": 1.0, "Pitch": -2.0, "Yaw": 30.0, "quatW": 1.0,
-        "quatX": 0.0, "quatY": 0.0, "quatZ": 0.0, "Gimbal:roll": 0.5, "Gimbal:pitch": -90.0,
-        "Gimbal:yaw": 31.0, "Gimbal:Xroll": 99.0, "Gimbal:Yyaw": 99.0, "directionOfTravel": 7.0,
+        "Tick#": 1000 + 60 * index,
+        "offsetTime": 12.5 + 0.1 * index,
+        "flightTime(msec)": 5000 + 100 * index,
+        "Longitude": 12.4964 + 1e-6 * index,
+        "Latitude": 41.9028 + 2e-6 * index,
+        "gpsAltitude(meters)": 85.5,
+        "baroAlt(meters)": 90.25 + index,
+        "vpsHeight(M)": 9.0,
+        "relativeHeight": 10.5,
+        "velN(M/S)": 3.0,
+        "velE(M/S)": 4.0,
+        "vel(M/S)": 5.0,
+        "Roll": 1.0,
+        "Pitch": -2.0,
+        "Yaw": 30.0,
+        "quatW": 1.0,
+        "quatX": 0.0,
+        "quatY": 0.0,
+        "quatZ": 0.0,
+        "Gimbal:roll": 0.5,
+        "Gimbal:pitch": -90.0,
+        "Gimbal:yaw": 31.0,
+        "Gimbal:Xroll": 99.0,
+        "Gimbal:Yyaw": 99.0,
+        "directionOfTravel": 7.0,
     }
     return {name: reported.get(name, 1.0) for name in COLUMNS}
 
 
-def table(columns=COLUMNS, count: int = 20, delimiter: str = ",", newline: str = "\n", changes=()) -> str:
+def table(
+    columns=COLUMNS, count: int = 20, delimiter: str = ",", newline: str = "\n", changes=()
+) -> str:
     rows = [row(index) for index in range(count)]
     for index, name, value in changes:
         rows[index][name] = value
@@ -54,8 +125,12 @@ def codes(telemetry) -> dict[str, int]:
 
 def assert_is_the_flight(telemetry, count: int = 20) -> None:
     assert len(telemetry) == count
-    assert telemetry["latitude_deg"] == pytest.approx([41.9028 + 2e-6 * i for i in range(count)], abs=1e-9)
-    assert telemetry["longitude_deg"] == pytest.approx([12.4964 + 1e-6 * i for i in range(count)], abs=1e-9)
+    assert telemetry["latitude_deg"] == pytest.approx(
+        [41.9028 + 2e-6 * i for i in range(count)], abs=1e-9
+    )
+    assert telemetry["longitude_deg"] == pytest.approx(
+        [12.4964 + 1e-6 * i for i in range(count)], abs=1e-9
+    )
     assert telemetry["orthometric_height_m"] == pytest.approx([85.5] * count)
     assert telemetry["height_above_takeoff_m"] == pytest.approx([10.5] * count)
     assert np.isnan(telemetry["ellipsoidal_height_m"]).all()
@@ -80,11 +155,17 @@ def test_the_sixty_columns_of_the_thesis():
 
 @settings(max_examples=30, deadline=None)
 @given(
-    order=st.permutations(COLUMNS), delimiter=st.sampled_from(",;\t"),
-    newline=st.sampled_from(["\n", "\r\n", "\r"]), bom=st.booleans(),
-    upper=st.booleans(), spaced=st.booleans(), quoted=st.booleans(),
+    order=st.permutations(COLUMNS),
+    delimiter=st.sampled_from(",;\t"),
+    newline=st.sampled_from(["\n", "\r\n", "\r"]),
+    bom=st.booleans(),
+    upper=st.booleans(),
+    spaced=st.booleans(),
+    quoted=st.booleans(),
 )
-def test_neither_order_nor_dress_of_columns_matters(order, delimiter, newline, bom, upper, spaced, quoted):
+def test_neither_order_nor_dress_of_columns_matters(
+    order, delimiter, newline, bom, upper, spaced, quoted
+):
     text = table(tuple(order), delimiter=delimiter, newline=newline)
     header, _, rest = text.partition(newline)
     cells = header.upper().split(delimiter) if upper else header.split(delimiter)
@@ -105,32 +186,44 @@ def test_other_encodings(encoding):
 
 
 def test_decimal_commas():
-    assert_is_the_flight(flight_table.read(table(delimiter=";").replace(".", ",").encode(), "a.csv"))
+    assert_is_the_flight(
+        flight_table.read(table(delimiter=";").replace(".", ",").encode(), "a.csv")
+    )
 
 
-@pytest.mark.parametrize("old, new, factor, column, expected", [
-    ("relativeHeight", "relativeHeight(feet)", 1, "height_above_takeoff_m", 10.5 * 0.3048),
-    ("gpsAltitude(meters)", "gpsAltitude[ft]", 1, "orthometric_height_m", 85.5 * 0.3048),
-    ("velN(M/S)", "velN(km/h)", 3.6, "speed_m_s", 5.0),
-    ("Yaw", "Yaw(radians)", 1, "body_yaw_deg", 30.0),
-    ("offsetTime", "offsetTime(seconds)", 1, "speed_m_s", 5.0),
-])
+@pytest.mark.parametrize(
+    "old, new, factor, column, expected",
+    [
+        ("relativeHeight", "relativeHeight(feet)", 1, "height_above_takeoff_m", 10.5 * 0.3048),
+        ("gpsAltitude(meters)", "gpsAltitude[ft]", 1, "orthometric_height_m", 85.5 * 0.3048),
+        ("velN(M/S)", "velN(km/h)", 3.6, "speed_m_s", 5.0),
+        ("Yaw", "Yaw(radians)", 1, "body_yaw_deg", 30.0),
+        ("offsetTime", "offsetTime(seconds)", 1, "speed_m_s", 5.0),
+    ],
+)
 def test_units_of_the_header_are_converted(old, new, factor, column, expected):
     rows = [row(index) for index in range(5)]
     names = [new if name == old else name for name in COLUMNS]
     if old == "Yaw":
         rows = [{**each, "Yaw": math.radians(30.0)} for each in rows]
     lines = [",".join(names)]
-    lines += [",".join(str(each[name] * (factor if name == old else 1)) for name in COLUMNS) for each in rows]
+    lines += [
+        ",".join(str(each[name] * (factor if name == old else 1)) for name in COLUMNS)
+        for each in rows
+    ]
     telemetry = flight_table.read("\n".join(lines).encode(), "a.csv")
     assert telemetry[column] == pytest.approx([expected] * 5)
     assert telemetry.time_ns[1] == pytest.approx(SECOND_NS / 10, abs=1000)
 
 
 def test_an_unknown_unit_is_reported_and_not_guessed():
-    telemetry = flight_table.read(table().replace("relativeHeight", "relativeHeight(furlongs)").encode(), "a.csv")
+    telemetry = flight_table.read(
+        table().replace("relativeHeight", "relativeHeight(furlongs)").encode(), "a.csv"
+    )
     assert "unknown_unit" in codes(telemetry)
-    assert "furlongs" in next(notice.text for notice in telemetry.notices if notice.code == "unknown_unit")
+    assert "furlongs" in next(
+        notice.text for notice in telemetry.notices if notice.code == "unknown_unit"
+    )
     assert not (telemetry["height_above_takeoff_m"] == 10.5).any()
     with pytest.raises(InputError, match="degrees or radians"):
         flight_table.read(table().replace("Latitude", "Latitude(furlongs)").encode(), "a.csv")
@@ -140,10 +233,14 @@ def test_an_unknown_unit_is_reported_and_not_guessed():
 @given(yaw=st.floats(0, 359.9), pitch=st.floats(-89, 89), roll=st.floats(-179, 179))
 def test_the_quaternion_stands_in_for_missing_angles(yaw, pitch, roll):
     half = [math.radians(angle) / 2 for angle in (yaw, pitch, roll)]
-    cy, sy, cp, sp, cr, sr = (function(angle) for angle in half for function in (math.cos, math.sin))
+    cy, sy, cp, sp, cr, sr = (
+        function(angle) for angle in half for function in (math.cos, math.sin)
+    )
     quaternion = {
-        "quatW": cr * cp * cy + sr * sp * sy, "quatX": sr * cp * cy - cr * sp * sy,
-        "quatY": cr * sp * cy + sr * cp * sy, "quatZ": cr * cp * sy - sr * sp * cy,
+        "quatW": cr * cp * cy + sr * sp * sy,
+        "quatX": sr * cp * cy - cr * sp * sy,
+        "quatY": cr * sp * cy + sr * cp * sy,
+        "quatZ": cr * cp * sy - sr * sp * cy,
     }
     columns = tuple(name for name in COLUMNS if name not in ("Roll", "Pitch", "Yaw"))
     changes = [(0, name, value) for name, value in quaternion.items()]
@@ -153,12 +250,19 @@ def test_the_quaternion_stands_in_for_missing_angles(yaw, pitch, roll):
     assert telemetry["body_roll_deg"][0] == pytest.approx(roll, abs=1e-5)
 
 
-@pytest.mark.parametrize("missing, rate_is_reported", [
-    ((), False), (("offsetTime",), False), (("offsetTime", "flightTime(msec)"), False),
-    (("offsetTime", "flightTime(msec)", "Tick#"), True),
-])
+@pytest.mark.parametrize(
+    "missing, rate_is_reported",
+    [
+        ((), False),
+        (("offsetTime",), False),
+        (("offsetTime", "flightTime(msec)"), False),
+        (("offsetTime", "flightTime(msec)", "Tick#"), True),
+    ],
+)
 def test_each_column_of_time_stands_in_for_the_next(missing, rate_is_reported):
-    telemetry = flight_table.read(table(tuple(name for name in COLUMNS if name not in missing)).encode(), "a.csv")
+    telemetry = flight_table.read(
+        table(tuple(name for name in COLUMNS if name not in missing)).encode(), "a.csv"
+    )
     assert_is_the_flight(telemetry)
     assert ("assumed_rate" in codes(telemetry)) is rate_is_reported
 
@@ -178,21 +282,64 @@ def test_datcons_table_with_empty_cells_and_trailing_ones():
         "Pitch,Yaw,Yaw360,distancHP(M),Gimbal:roll,Gimbal:pitch,Gimbal:yaw,Gimbal:Xroll,MotorSpeed:RFront,Attribute|Value"
     )
     lines = [header + ",V2.8.0"]
-    for index in range(100):  # 50 rows a second; the receiver finds its satellites after half a second
-        place = (f"{9.19 + 1e-6 * index:.7f}", f"{45.46 + 2e-6 * index:.7f}") if index >= 25 else ("", "")
+    for index in range(
+        100
+    ):  # 50 rows a second; the receiver finds its satellites after half a second
+        place = (
+            (f"{9.19 + 1e-6 * index:.7f}", f"{45.46 + 2e-6 * index:.7f}")
+            if index >= 25
+            else ("", "")
+        )
         distance = f"{0.2 * index:.1f}" if index >= 30 else ""
-        lines.append(",".join([
-            str(240_000 + 12 * index), f"{5 + 0.02 * index:.3f}", str(20 * index), *place, "12", "4", "121.5", "119.9",
-            "", f"{30 + 0.01 * index:.2f}", "0.1", "3", "4", "0", "5", "1", "0", "0", "0", "1.5", "-2", "-90", "270",
-            distance, "0.1", "-90", "-91", "7", "", "ACType|P3", "more",
-        ]))
+        lines.append(
+            ",".join(
+                [
+                    str(240_000 + 12 * index),
+                    f"{5 + 0.02 * index:.3f}",
+                    str(20 * index),
+                    *place,
+                    "12",
+                    "4",
+                    "121.5",
+                    "119.9",
+                    "",
+                    f"{30 + 0.01 * index:.2f}",
+                    "0.1",
+                    "3",
+                    "4",
+                    "0",
+                    "5",
+                    "1",
+                    "0",
+                    "0",
+                    "0",
+                    "1.5",
+                    "-2",
+                    "-90",
+                    "270",
+                    distance,
+                    "0.1",
+                    "-90",
+                    "-91",
+                    "7",
+                    "",
+                    "ACType|P3",
+                    "more",
+                ]
+            )
+        )
     data = "\r\n".join(lines).encode()
     assert flight_table.recognises(data[:4000])
     telemetry = flight_table.read(data, "FLY123.csv")
     assert len(telemetry) == 100 and codes(telemetry)["no_fix"] == 25
     assert np.diff(telemetry.time_ns) == pytest.approx([0.02 * SECOND_NS] * 99, abs=1000)
-    assert telemetry["longitude_deg"][50] == pytest.approx(9.19005) and np.isnan(telemetry["latitude_deg"][24])
-    assert telemetry["orthometric_height_m"][0] == 121.5 and telemetry["height_above_takeoff_m"][99] == 30.99
+    assert telemetry["longitude_deg"][50] == pytest.approx(9.19005) and np.isnan(
+        telemetry["latitude_deg"][24]
+    )
+    assert (
+        telemetry["orthometric_height_m"][0] == 121.5
+        and telemetry["height_above_takeoff_m"][99] == 30.99
+    )
     assert telemetry["camera_pitch_deg"][0] == -90 and telemetry["camera_yaw_deg"][0] == -91
     assert telemetry["body_yaw_deg"][0] == -90 and telemetry["speed_m_s"][0] == 5
     assert "unreadable_line" not in codes(telemetry)
@@ -206,10 +353,14 @@ def test_airdatas_table():
     )
     rows = [
         f"{100 * i},2023-05-04 10:00:{i // 10:02d},46.{500000 + i},11.2,{100 + i},{1100 + i},10,1,14,1,6,8,0,"
-        f"45,2.5,-1.5,46,-89.9,0.1,\"Home, sweet home\"" for i in range(40)
+        f'45,2.5,-1.5,46,-89.9,0.1,"Home, sweet home"'
+        for i in range(40)
     ]
     telemetry = flight_table.read("\n".join([header, *rows]).encode(), "airdata.csv")
-    assert len(telemetry) == 40 and abs(int(telemetry.time_ns[0]) - 1_683_194_400 * SECOND_NS) < SECOND_NS
+    assert (
+        len(telemetry) == 40
+        and abs(int(telemetry.time_ns[0]) - 1_683_194_400 * SECOND_NS) < SECOND_NS
+    )
     assert np.diff(telemetry.time_ns) == pytest.approx([SECOND_NS / 10] * 39, abs=1000)
     assert telemetry["height_above_takeoff_m"][0] == pytest.approx(30.48)
     assert telemetry["orthometric_height_m"][0] == pytest.approx(1100 * 0.3048)
@@ -227,7 +378,8 @@ def test_a_dji_log_with_date_and_time_of_columns_of_their_own():
     )
     rows = [
         f"7/14/2023,{12 - (i < 10)}:{'59' if i < 10 else '00'}:{(50 + i) % 60:02d}.25 {'AM' if i < 10 else 'PM'},"
-        f"{i}.1,46.{500000 + 10 * i},11.2,100,900,3,3,4,1,2,30,-90,0,31,45,10" for i in range(20)
+        f"{i}.1,46.{500000 + 10 * i},11.2,100,900,3,3,4,1,2,30,-90,0,31,45,10"
+        for i in range(20)
     ]
     telemetry = flight_table.read("\n".join([header, *rows]).encode(), "DJIFlightRecord.csv")
     noon_ns = int(np.datetime64("2023-07-14T12:00:00", "ns").astype(np.int64))
@@ -241,7 +393,10 @@ def test_a_real_phantom_4_log():
     assert telemetry.format == "table" and len(telemetry) > 700
     found = codes(telemetry)
     assert found["time_zone_unknown"] > 700 and "unreadable_line" not in found
-    assert telemetry["latitude_deg"][0] == pytest.approx(55.507158) and telemetry["longitude_deg"][0] == 10.717078
+    assert (
+        telemetry["latitude_deg"][0] == pytest.approx(55.507158)
+        and telemetry["longitude_deg"][0] == 10.717078
+    )
     assert np.nanmax(telemetry["height_above_takeoff_m"]) == pytest.approx(64.5, abs=0.3)
     # its column of altitudes repeats the heights; the ground lies 21 m above the sea
     assert np.isnan(telemetry["orthometric_height_m"]).all()
@@ -275,13 +430,17 @@ def test_a_column_of_dates_gives_utc():
         "timestamp(ms)": [str(start / 1e6 + i * 100) for i in range(30)],
     }.items():
         lines = table(count=30).splitlines()
-        text = "\n".join([f"{lines[0]},{name}", *(f"{line},{each}" for line, each in zip(lines[1:], texts))])
+        text = "\n".join(
+            [f"{lines[0]},{name}", *(f"{line},{each}" for line, each in zip(lines[1:], texts))]
+        )
         telemetry = flight_table.read(text.encode(), "a.csv")
         assert len(telemetry) == 30, name
         assert abs(int(telemetry.time_ns[0]) - start) < SECOND_NS, name
         assert np.diff(telemetry.time_ns) == pytest.approx([SECOND_NS / 10] * 29, abs=1000), name
         assert (telemetry.video_time_ns == -1).all(), name
-        assert "no_date" not in codes(telemetry) and "time_zone_unknown" not in codes(telemetry), name
+        assert "no_date" not in codes(telemetry) and "time_zone_unknown" not in codes(telemetry), (
+            name
+        )
 
 
 def test_a_date_without_its_zone_is_reported():
@@ -301,7 +460,9 @@ def test_the_barometer_stands_in_for_the_relative_height_and_reports_it():
 def test_sentences_in_a_61st_column_do_not_disturb():
     lines = table(count=4).splitlines()
     nmea = "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47"
-    text = "\n".join([lines[0] + ",NMEA GGA/RMC Strings", *(f"{line},{nmea}" for line in lines[1:])])
+    text = "\n".join(
+        [lines[0] + ",NMEA GGA/RMC Strings", *(f"{line},{nmea}" for line in lines[1:])]
+    )
     assert_is_the_flight(flight_table.read(text.encode(), "a.csv"), 4)
 
 
@@ -340,9 +501,11 @@ def test_mutated_files_raise_only_input_errors(data):
     for _ in range(data.draw(st.integers(1, 8))):
         place = data.draw(st.integers(0, len(valid) - 1))
         if data.draw(st.booleans()):
-            valid[place] = data.draw(st.one_of(st.integers(0, 255), st.sampled_from(b"\"e-.,;\x00\n9")))
+            valid[place] = data.draw(
+                st.one_of(st.integers(0, 255), st.sampled_from(b'"e-.,;\x00\n9'))
+            )
         else:
-            del valid[place: place + data.draw(st.integers(1, 20))]
+            del valid[place : place + data.draw(st.integers(1, 20))]
         if not valid:
             return
     try:
@@ -354,10 +517,20 @@ def test_mutated_files_raise_only_input_errors(data):
 
 
 @settings(max_examples=100, deadline=None)
-@given(cells=st.lists(
-    st.tuples(*[st.one_of(st.floats(allow_nan=True, allow_infinity=True).map(str), st.text(max_size=6))] * 4),
-    min_size=1, max_size=12,
-))
+@given(
+    cells=st.lists(
+        st.tuples(
+            *[
+                st.one_of(
+                    st.floats(allow_nan=True, allow_infinity=True).map(str), st.text(max_size=6)
+                )
+            ]
+            * 4
+        ),
+        min_size=1,
+        max_size=12,
+    )
+)
 def test_any_cells_raise_only_input_errors(cells):
     text = "offsetTime,Latitude,Longitude,time\n" + "\n".join(",".join(each) for each in cells)
     try:

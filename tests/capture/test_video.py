@@ -27,18 +27,24 @@ def textured(width: int, height: int, count: int) -> list[np.ndarray]:
     ground = np.kron(squares, np.ones((8, 8), int)).astype(np.uint8)
     frames = []
     for index in range(count):
-        window = ground[index: index + height, 2 * index: 2 * index + width]
+        window = ground[index : index + height, 2 * index : 2 * index + width]
         image = np.repeat(window[:, :, None], 3, axis=2)
         image[: height // 4, : width // 2] = (220, 30, 30)
-        image[: height // 4, width // 2:] = (30, 30, 220)
+        image[: height // 4, width // 2 :] = (30, 30, 220)
         frames.append(image)
     return frames
 
 
 def write_video(
-    path: Path, count: int = 30, size: tuple[int, int] = (160, 120), pix_fmt: str = "yuv420p",
-    codec: str = "libx264", pts: list[int] | None = None, container_options: dict[str, str] | None = None,
-    metadata: dict[str, str] | None = None, rotation: int | None = None,
+    path: Path,
+    count: int = 30,
+    size: tuple[int, int] = (160, 120),
+    pix_fmt: str = "yuv420p",
+    codec: str = "libx264",
+    pts: list[int] | None = None,
+    container_options: dict[str, str] | None = None,
+    metadata: dict[str, str] | None = None,
+    rotation: int | None = None,
     options: dict[str, str] | None = None,
 ) -> Path:
     with av.open(str(path), "w", options=container_options or {}) as container:
@@ -91,9 +97,14 @@ def test_every_container_gives_every_frame(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("pix_fmt", "codec", "size"),
-    [("yuv420p", "libx264", (158, 118)), ("yuv444p", "libx264", (159, 117)),
-     ("yuvj420p", "mjpeg", (160, 120)), ("yuv420p10le", "libx265", (160, 120)),
-     ("gray", "libx264", (160, 120)), ("bgr0", "ffv1", (31, 17))],
+    [
+        ("yuv420p", "libx264", (158, 118)),
+        ("yuv444p", "libx264", (159, 117)),
+        ("yuvj420p", "mjpeg", (160, 120)),
+        ("yuv420p10le", "libx265", (160, 120)),
+        ("gray", "libx264", (160, 120)),
+        ("bgr0", "ffv1", (31, 17)),
+    ],
 )
 def test_odd_sizes_and_pixel_formats(
     tmp_path: Path, pix_fmt: str, codec: str, size: tuple[int, int]
@@ -128,12 +139,19 @@ def test_rotation_is_applied_as_players_do(tmp_path: Path, rotation: int) -> Non
 
 def test_a_variable_rate_and_a_late_first_frame_keep_the_true_times(tmp_path: Path) -> None:
     pts = [5000, 5040, 5080, 5300, 5340, 5345, 6000]
-    source = open_video(write_video(
-        tmp_path / "a.mkv", 7, pts=pts, metadata={"creation_time": "2021-06-01T10:00:00.500000Z"}
-    ))
+    source = open_video(
+        write_video(
+            tmp_path / "a.mkv",
+            7,
+            pts=pts,
+            metadata={"creation_time": "2021-06-01T10:00:00.500000Z"},
+        )
+    )
     frames = all_frames(source)
     assert source.start_ns == 1_622_541_600_500_000_000 and "creation_time" in source.start_origin
-    assert [(frame.time_ns - source.start_ns) // 1_000_000 for frame in frames] == [p - 5000 for p in pts]
+    assert [(frame.time_ns - source.start_ns) // 1_000_000 for frame in frames] == [
+        p - 5000 for p in pts
+    ]
 
 
 def test_a_clock_that_was_never_set_is_unknown(tmp_path: Path) -> None:
@@ -172,7 +190,8 @@ def test_a_raw_stream_without_stamps_is_timed_by_its_rate(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("name", "container_options"), [("a.ts", {}), ("a.mkv", {}), ("a.mp4", FRAGMENTED)],
+    ("name", "container_options"),
+    [("a.ts", {}), ("a.mkv", {}), ("a.mp4", FRAGMENTED)],
     ids=["ts", "mkv", "fragmented"],
 )
 def test_a_cut_file_delivers_what_is_there_and_reports_it(
@@ -189,7 +208,9 @@ def test_a_cut_file_delivers_what_is_there_and_reports_it(
 
 def test_a_whole_file_is_not_called_cut(tmp_path: Path) -> None:
     for name, options in (("a.ts", {}), ("a.mkv", {}), ("a.mp4", FRAGMENTED), ("b.mp4", {})):
-        assert not read_video_info(write_video(tmp_path / name, 5, container_options=options)).is_cut
+        assert not read_video_info(
+            write_video(tmp_path / name, 5, container_options=options)
+        ).is_cut
 
 
 def test_a_cut_mp4_states_that_its_index_is_missing(tmp_path: Path) -> None:
@@ -205,17 +226,23 @@ def test_damage_in_the_middle_does_not_end_the_video(tmp_path: Path) -> None:
     path = write_video(tmp_path / "a.ts", 60)
     data = bytearray(path.read_bytes())
     middle = len(data) // 2
-    data[middle: middle + 188 * 6] = random.Random(3).randbytes(188 * 6)
+    data[middle : middle + 188 * 6] = random.Random(3).randbytes(188 * 6)
     path.write_bytes(bytes(data))
     source = open_video(path)
     frames = all_frames(source)
     assert len(frames) > 40 and frames[-1].time_ns > 2.2e9
-    assert codes(source) & {"decode_error", "damaged_frame", "backward_pts"}  # whichever of them the damage hit
+    assert codes(source) & {
+        "decode_error",
+        "damaged_frame",
+        "backward_pts",
+    }  # whichever of them the damage hit
 
 
 def _joined(folder: Path, *size_px: tuple[int, int]) -> Path:
     """Twenty frames of each size, one after another in one file."""
-    parts = [write_video(folder / f"{number}.ts", 20, size=size) for number, size in enumerate(size_px)]
+    parts = [
+        write_video(folder / f"{number}.ts", 20, size=size) for number, size in enumerate(size_px)
+    ]
     joined = folder / "joined.ts"
     joined.write_bytes(b"".join(part.read_bytes() for part in parts))
     return joined
@@ -228,13 +255,17 @@ def test_a_frame_of_another_shape_is_lost_with_its_reason(tmp_path: Path) -> Non
     assert {each.code: each.count for each in source.notices()}["other_shape"] == len(lost)
 
 
-def test_frames_of_another_size_but_the_same_shape_are_brought_to_the_first_one_s(tmp_path: Path) -> None:
+def test_frames_of_another_size_but_the_same_shape_are_brought_to_the_first_one_s(
+    tmp_path: Path,
+) -> None:
     source = open_video(_joined(tmp_path, (160, 120), (128, 96)))
     frames = all_frames(source)
     assert len(frames) >= 35 and not any(isinstance(frame, LostFrame) for frame in frames)
     last = frames[-1]
     assert isinstance(last, Frame) and last.image.shape == (120, 160, 3)
-    assert last.image[10, 20, 0] > 180 and last.image[10, 140, 2] > 180  # red left, blue right, as in all frames
+    assert (
+        last.image[10, 20, 0] > 180 and last.image[10, 140, 2] > 180
+    )  # red left, blue right, as in all frames
     assert {each.code: each.count for each in source.notices()}["size_changed"] >= 15
 
 
@@ -252,7 +283,9 @@ def test_what_is_no_video_is_refused_by_name(tmp_path: Path) -> None:
     sound = tmp_path / "sound.wav"
     with av.open(str(sound), "w") as container:
         stream = container.add_stream("pcm_s16le", rate=8000)
-        audio = av.AudioFrame.from_ndarray(np.zeros((1, 8000), np.int16), format="s16", layout="mono")
+        audio = av.AudioFrame.from_ndarray(
+            np.zeros((1, 8000), np.int16), format="s16", layout="mono"
+        )
         audio.sample_rate = 8000
         container.mux(stream.encode(audio))
     with pytest.raises(InputError, match="no video in it, only audio"):
@@ -274,11 +307,24 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@settings(max_examples=60, deadline=10_000, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(name=st.sampled_from(["a.mp4", "a.ts", "a.mkv"]), seed=st.integers(0, 2**32),
-       flips=st.integers(0, 200), keep=st.floats(0.02, 1.0), sparse=st.sampled_from([None, 0.04, 0.4]))
+@settings(
+    max_examples=60, deadline=10_000, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    name=st.sampled_from(["a.mp4", "a.ts", "a.mkv"]),
+    seed=st.integers(0, 2**32),
+    flips=st.integers(0, 200),
+    keep=st.floats(0.02, 1.0),
+    sparse=st.sampled_from([None, 0.04, 0.4]),
+)
 def test_damaged_files_raise_nothing_but_input_errors(
-    tmp_path: Path, originals: Path, name: str, seed: int, flips: int, keep: float, sparse: float | None
+    tmp_path: Path,
+    originals: Path,
+    name: str,
+    seed: int,
+    flips: int,
+    keep: float,
+    sparse: float | None,
 ) -> None:
     chance = random.Random(seed)
     data = bytearray((originals / name).read_bytes())
@@ -288,7 +334,11 @@ def test_damaged_files_raise_nothing_but_input_errors(
     path.write_bytes(bytes(data[: max(1, int(keep * len(data)))]))
     try:
         source = open_video(path)
-        reading = None if sparse is None else SparseReading(sparse, lambda *_: True, lambda *_: seed % 2 == 0)
+        reading = (
+            None
+            if sparse is None
+            else SparseReading(sparse, lambda *_: True, lambda *_: seed % 2 == 0)
+        )
         times = [frame.time_ns for frame in source.frames(lambda index, time_ns: True, reading)]
     except InputError:
         return

@@ -38,7 +38,9 @@ def ground(seed: int = 1) -> np.ndarray:
     """60 x 60 m of soft texture around the origin at 0.05 m."""
     rng = np.random.default_rng(seed)
     small = rng.normal(0, 1, (150, 150, 3)).astype(np.float32)
-    return np.clip(110 + 18 * cv2.resize(small, (1200, 1200), interpolation=cv2.INTER_CUBIC), 0, 255).astype(np.uint8)
+    return np.clip(
+        110 + 18 * cv2.resize(small, (1200, 1200), interpolation=cv2.INTER_CUBIC), 0, 255
+    ).astype(np.uint8)
 
 
 GROUND = ground()
@@ -47,13 +49,20 @@ SITE_FROM_GROUND = np.array([[0.05, 0, -30.0], [0, -0.05, 30.0], [0, 0, 1]])
 
 def site_from_image(camera_m: Sequence[float]) -> np.ndarray:
     s = M_PER_PX * camera_m[2] / CAMERA_HEIGHT_M
-    return np.array([
-        [s, 0, camera_m[0] - s * (WIDTH - 1) / 2], [0, -s, camera_m[1] + s * (HEIGHT - 1) / 2], [0, 0, 1.0]
-    ])
+    return np.array(
+        [
+            [s, 0, camera_m[0] - s * (WIDTH - 1) / 2],
+            [0, -s, camera_m[1] + s * (HEIGHT - 1) / 2],
+            [0, 0, 1.0],
+        ]
+    )
 
 
 def picture(
-    camera_m: Sequence[float], things: Sequence[Thing], time_s: float, seen_from_m: Sequence[float] | None = None
+    camera_m: Sequence[float],
+    things: Sequence[Thing],
+    time_s: float,
+    seen_from_m: Sequence[float] | None = None,
 ) -> np.ndarray:
     """What the camera sees; the things lean as seen from `seen_from_m` (default: the camera itself)."""
     image_from_site = np.linalg.inv(site_from_image(camera_m))
@@ -71,9 +80,15 @@ def picture(
 
 
 def view_of(
-    index: int, time_s: float, camera_m: Sequence[float], things: Sequence[Thing],
-    map_eye_m: Sequence[float] = (0, 4, CAMERA_HEIGHT_M), hole_m: tuple[float, float, float, float] | None = None,
-    all_changed: bool = False, seed: int = 0, score: float = 0.95,
+    index: int,
+    time_s: float,
+    camera_m: Sequence[float],
+    things: Sequence[Thing],
+    map_eye_m: Sequence[float] = (0, 4, CAMERA_HEIGHT_M),
+    hole_m: tuple[float, float, float, float] | None = None,
+    all_changed: bool = False,
+    seed: int = 0,
+    score: float = 0.95,
 ) -> ComparedView:
     """One compared view; `hole_m` is a box (west, south, east, north) of ground that the map does not know."""
     rng = np.random.default_rng([seed, index])
@@ -86,22 +101,44 @@ def view_of(
     valid = np.ones((HEIGHT, WIDTH), bool)
     matrix = site_from_image(camera_m)
     if hole_m:
-        corners = np.array([[hole_m[0], hole_m[1], 1], [hole_m[2], hole_m[3], 1.0]]) @ np.linalg.inv(matrix).T
-        (x0, x1), (y0, y1) = (np.clip(np.sort(corners[:, axis]), 0, 1e4).astype(int) for axis in (0, 1))
+        corners = (
+            np.array([[hole_m[0], hole_m[1], 1], [hole_m[2], hole_m[3], 1.0]])
+            @ np.linalg.inv(matrix).T
+        )
+        (x0, x1), (y0, y1) = (
+            np.clip(np.sort(corners[:, axis]), 0, 1e4).astype(int) for axis in (0, 1)
+        )
         valid[y0:y1, x0:x1] = False
     difference = np.abs(image.astype(int) - reference).max(axis=2) > 25
-    changed = cv2.morphologyEx((difference & valid).astype(np.uint8) * 255, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    changed = cv2.morphologyEx(
+        (difference & valid).astype(np.uint8) * 255, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+    )
     count, _, stats, _ = cv2.connectedComponentsWithStats(changed, connectivity=8)
     noisy = np.clip(image + rng.normal(0, 2, image.shape), 0, 255).astype(np.uint8)
     return ComparedView(
-        index, f"frame {index}", START_NS + round(time_s * 1e9), matrix, np.array(camera_m, float), noisy, reference,
-        valid, changed, stats[1:, :4].astype(np.int64), np.full(count - 1, score), 0.5, shade_between(reference, noisy),
+        index,
+        f"frame {index}",
+        START_NS + round(time_s * 1e9),
+        matrix,
+        np.array(camera_m, float),
+        noisy,
+        reference,
+        valid,
+        changed,
+        stats[1:, :4].astype(np.int64),
+        np.full(count - 1, score),
+        0.5,
+        shade_between(reference, noisy),
     )
 
 
 def flight(
-    things: Sequence[Thing], seconds: float = 5.0, fps: float = 5.0, speed_m_s: float = 3.0,
-    start_m: tuple[float, float] = (-8.0, 0.0), **how: object,
+    things: Sequence[Thing],
+    seconds: float = 5.0,
+    fps: float = 5.0,
+    speed_m_s: float = 3.0,
+    start_m: tuple[float, float] = (-8.0, 0.0),
+    **how: object,
 ) -> Iterator[ComparedView]:
     """Views of a drone that flies east."""
     for index in range(round(seconds * fps)):

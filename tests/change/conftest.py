@@ -10,5 +10,7 @@ from sorvolo.simulation.ground_painting import Area
 @pytest.fixture(scope="module")
 def ground() -> np.ndarray:
     """A piece of dirt road, 480 x 360 px, BGR."""
-    raster = paint_ground(GroundKind.DIRT, Area(-12.0, -9.0, 12.0, 9.0), 0.05, np.random.default_rng(3)).raster
+    raster = paint_ground(
+        GroundKind.DIRT, Area(-12.0, -9.0, 12.0, 9.0), 0.05, np.random.default_rng(3)
+    ).raster
     return np.ascontiguousarray(raster.rgb[..., ::-1])

@@ -43,7 +43,9 @@ def tiles() -> dict:
     found = {}
     for row in range(8):
         for column in range(8):
-            rgb = GROUND[row * TILE_PX:(row + 1) * TILE_PX, column * TILE_PX:(column + 1) * TILE_PX]
+            rgb = GROUND[
+                row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX
+            ]
             found[column - 4, row - 4] = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
     del found[3, -4]
     return found
@@ -70,15 +72,25 @@ def turned(yaw_deg: float, tilt_deg: float = 0.0) -> np.ndarray:
 def photographed(pose: Pose, ground: np.ndarray = GROUND, gain: float = 1.0) -> np.ndarray:
     image_from_ground = np.linalg.inv(site_from_image_homography(CAMERA, pose)) @ site_from_ground()
     image = cv2.warpPerspective(
-        ground, image_from_ground, (CAMERA.width_px, CAMERA.height_px), flags=cv2.INTER_AREA,
+        ground,
+        image_from_ground,
+        (CAMERA.width_px, CAMERA.height_px),
+        flags=cv2.INTER_AREA,
         borderMode=cv2.BORDER_REFLECT,
     )
-    return np.clip(image * gain + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255).astype(np.uint8)
+    return np.clip(
+        image * gain + np.random.default_rng(0).normal(0, 2, image.shape), 0, 255
+    ).astype(np.uint8)
 
 
-def prior_at(pose: Pose, off_m=(0.0, 0.0, 0.0), sigma_m: float = 2.0, attitude_deg: float = 1.0) -> CameraPrior:
+def prior_at(
+    pose: Pose, off_m=(0.0, 0.0, 0.0), sigma_m: float = 2.0, attitude_deg: float = 1.0
+) -> CameraPrior:
     return CameraPrior(
-        pose.translation_m + np.array(off_m), np.full(3, sigma_m), pose.rotation, np.full(3, attitude_deg)
+        pose.translation_m + np.array(off_m),
+        np.full(3, sigma_m),
+        pose.rotation,
+        np.full(3, attitude_deg),
     )
 
 
@@ -97,7 +109,9 @@ def aligner(reference) -> Aligner:
 @pytest.mark.parametrize("yaw_deg", [0, 90, 200])
 def test_telemetry_may_be_metres_off(reference, off_m, yaw_deg):
     pose = Pose(turned(yaw_deg, 3.0), np.array([4.0, -7.0, 30.0]))
-    found = aligner(reference).align(photographed(pose, gain=0.7), CAMERA, prior_at(pose, off_m, 4.0), 0)
+    found = aligner(reference).align(
+        photographed(pose, gain=0.7), CAMERA, prior_at(pose, off_m, 4.0), 0
+    )
     assert isinstance(found, Aligned)
     assert not found.followed
     assert error_px(found, pose) < 1.0
@@ -110,8 +124,12 @@ def test_each_fit_foretells_the_next_although_fixes_jump(reference):
     rng = np.random.default_rng(1)
     followed = []
     for k in range(8):
-        pose = Pose(turned(80.0 + 0.3 * k, rng.normal(0, 0.3)), np.array([-15.0 + 1.5 * k, 2.0, 30.0]))
-        found = along.align(photographed(pose), CAMERA, prior_at(pose, rng.normal(0, 3, 3), 3.0), k * 200_000_000)
+        pose = Pose(
+            turned(80.0 + 0.3 * k, rng.normal(0, 0.3)), np.array([-15.0 + 1.5 * k, 2.0, 30.0])
+        )
+        found = along.align(
+            photographed(pose), CAMERA, prior_at(pose, rng.normal(0, 3, 3), 3.0), k * 200_000_000
+        )
         assert isinstance(found, Aligned)
         assert error_px(found, pose) < 1.0
         followed.append(found.followed)
@@ -135,7 +153,9 @@ def test_a_frame_without_telemetry_is_found_in_the_whole_map(reference):
 
 def test_other_ground_does_not_fit_and_reports_it(reference):
     pose = Pose(turned(0.0), np.array([0.0, 0.0, 30.0]))
-    found = aligner(reference).align(photographed(pose, textured(8 * TILE_PX, 77)), CAMERA, prior_at(pose), 0)
+    found = aligner(reference).align(
+        photographed(pose, textured(8 * TILE_PX, 77)), CAMERA, prior_at(pose), 0
+    )
     assert isinstance(found, NotAligned)
     assert not found.is_outside
     assert found.reason
@@ -162,26 +182,44 @@ def rebuilt(share: float) -> np.ndarray:
     side = GROUND.shape[0]
     blocks = (rng.random((20, 20)) < share).astype(np.uint8)
     new = cv2.resize(blocks, (side, side), interpolation=cv2.INTER_NEAREST)[..., None] > 0
-    waves = [cv2.resize(rng.normal(0, 3.0, (12, 12)).astype(np.float32), (side, side)) for _ in range(2)]
+    waves = [
+        cv2.resize(rng.normal(0, 3.0, (12, 12)).astype(np.float32), (side, side)) for _ in range(2)
+    ]
     x, y = np.meshgrid(np.arange(side, dtype=np.float32), np.arange(side, dtype=np.float32))
     moved = cv2.remap(GROUND, x + waves[0], y + waves[1], cv2.INTER_LINEAR)
     other = textured(side, 77)
     fine = other - cv2.GaussianBlur(other, (0, 0), 5).astype(np.float32)
-    worn = np.clip(cv2.GaussianBlur(moved, (0, 0), 2.5) + fine, 0, 255)  # what is small has changed everywhere
+    worn = np.clip(
+        cv2.GaussianBlur(moved, (0, 0), 2.5) + fine, 0, 255
+    )  # what is small has changed everywhere
     later = np.where(new, other, worn)
     return (255 * (later / 255.0) ** 1.5).astype(np.uint8)
 
 
-@pytest.mark.parametrize("yaw_off_deg,height_factor", [
-    (0.0, 1.0), pytest.param(90.0, 1.0, marks=pytest.mark.long), pytest.param(0.0, 1.18, marks=pytest.mark.long),
-])
-def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(reference, yaw_off_deg, height_factor):
+@pytest.mark.parametrize(
+    "yaw_off_deg,height_factor",
+    [
+        (0.0, 1.0),
+        pytest.param(90.0, 1.0, marks=pytest.mark.long),
+        pytest.param(0.0, 1.18, marks=pytest.mark.long),
+    ],
+)
+def test_ground_that_is_mostly_rebuilt_is_found_by_learned_features(
+    reference, yaw_off_deg, height_factor
+):
     pose = Pose(turned(10.0, 1.0), np.array([3.0, -2.0, 30.0]))
     image = photographed(pose, rebuilt(0.6))
-    prior = prior_at(Pose(turned(10.0 + yaw_off_deg), pose.translation_m * [1, 1, height_factor]), (1.0, -0.5, 0.0))
+    prior = prior_at(
+        Pose(turned(10.0 + yaw_off_deg), pose.translation_m * [1, 1, height_factor]),
+        (1.0, -0.5, 0.0),
+    )
     if height_factor > 1:
-        prior = CameraPrior(prior.position_m, np.array([2.0, 2.0, 6.0]), prior.rotation, prior.attitude_sigma_deg)
-    without = Aligner(reference, SITE_GRID, AlignmentSettings(search=NO_SEARCH)).align(image, CAMERA, prior, 0)
+        prior = CameraPrior(
+            prior.position_m, np.array([2.0, 2.0, 6.0]), prior.rotation, prior.attitude_sigma_deg
+        )
+    without = Aligner(reference, SITE_GRID, AlignmentSettings(search=NO_SEARCH)).align(
+        image, CAMERA, prior, 0
+    )
     assert isinstance(without, NotAligned)
     found = Aligner(reference, SITE_GRID).align(image, CAMERA, prior, 0)
     assert isinstance(found, Aligned)
@@ -214,7 +252,9 @@ def test_beyond_the_map_is_outside(reference):
 
 def test_the_map_is_seen_as_the_camera_saw_it_and_holes_are_unknown(reference):
     pose = Pose(turned(10.0), np.array([38.0, 38.0, 30.0]))
-    grid_from_image = SITE_GRID.grid_from_site_affine(np.zeros(2), 50.0) @ site_from_image_homography(CAMERA, pose)
+    grid_from_image = SITE_GRID.grid_from_site_affine(
+        np.zeros(2), 50.0
+    ) @ site_from_image_homography(CAMERA, pose)
     seen, known = reference.seen_from(grid_from_image, CAMERA.width_px, CAMERA.height_px)
     corner = apply_homography(grid_from_image, np.array([[0.0, 0.0], [320.0, 180.0]]))
     assert 0.05 < known.mean() < 0.95
@@ -222,7 +262,9 @@ def test_the_map_is_seen_as_the_camera_saw_it_and_holes_are_unknown(reference):
     inside = (corner[1] >= -4 * TILE_PX).all()
     assert inside
     image = photographed(pose)
-    difference = np.abs(seen.astype(int) - image)[cv2.erode(known.view(np.uint8), np.ones((5, 5))) > 0]
+    difference = np.abs(seen.astype(int) - image)[
+        cv2.erode(known.view(np.uint8), np.ones((5, 5))) > 0
+    ]
     assert difference.mean() < 6
 
 
@@ -255,13 +297,17 @@ def test_a_small_view_beside_a_large_one_shows_the_same_and_reads_no_tile(tiles)
     counted = _Counted(tiles)
     reference = ReferenceMap(counted, SITE_GRID.grid)
     pose = Pose(turned(10.0, 4.0), np.array([38.0, 38.0, 30.0]))
-    grid_from_image = SITE_GRID.grid_from_site_affine(np.zeros(2), 50.0) @ site_from_image_homography(CAMERA, pose)
+    grid_from_image = SITE_GRID.grid_from_site_affine(
+        np.zeros(2), 50.0
+    ) @ site_from_image_homography(CAMERA, pose)
     large, large_known = reference.seen_from(grid_from_image, CAMERA.width_px, CAMERA.height_px)
     reads = counted.reads
     small, known = reference.seen_from(grid_from_image, CAMERA.width_px, CAMERA.height_px, shrink=4)
     assert counted.reads == reads
     assert small.shape == (90, 160, 3)
-    whole = cv2.resize(large_known.view(np.uint8) * 255, (160, 90), interpolation=cv2.INTER_AREA) == 255
+    whole = (
+        cv2.resize(large_known.view(np.uint8) * 255, (160, 90), interpolation=cv2.INTER_AREA) == 255
+    )
     assert not known[~cv2.dilate(whole.view(np.uint8), np.ones((3, 3))).astype(bool)].any()
     assert known.sum() > 0.95 * whole.sum()
     expected = cv2.resize(large, (160, 90), interpolation=cv2.INTER_AREA).astype(int)
@@ -275,7 +321,9 @@ def test_a_small_view_beside_a_large_one_shows_the_same_and_reads_no_tile(tiles)
 def test_a_map_that_differs_locally_is_met_by_a_local_fit(reference):
     """Waves of 0.2 m over ground that changed: the camera's fit alone leaves them."""
     pose = Pose(turned(10.0, 1.0), np.array([3.0, -2.0, 30.0]))
-    found = aligner(reference).align(photographed(pose, rebuilt(0.4)), CAMERA, prior_at(pose, (1.0, -0.5, 0.0)), 0)
+    found = aligner(reference).align(
+        photographed(pose, rebuilt(0.4)), CAMERA, prior_at(pose, (1.0, -0.5, 0.0)), 0
+    )
     assert isinstance(found, Aligned) and found.local is not None
     assert found.local_m > 0.03
     places = found.local.places_px(CAMERA.width_px, CAMERA.height_px)
@@ -283,13 +331,17 @@ def test_a_map_that_differs_locally_is_met_by_a_local_fit(reference):
     rng = np.random.default_rng(8)
     rng.random((20, 20))
     waves = [
-        cv2.resize(rng.normal(0, 3.0, (12, 12)).astype(np.float32), GROUND.shape[1::-1]) for _ in range(2)
+        cv2.resize(rng.normal(0, 3.0, (12, 12)).astype(np.float32), GROUND.shape[1::-1])
+        for _ in range(2)
     ]
     shown = np.linalg.inv(site_from_ground()) @ site_from_image_homography(CAMERA, pose)
 
     def missed(by_px):
         at = apply_homography(shown, places + by_px).astype(np.float32)
-        moved = [cv2.remap(each, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0] for each in waves]
+        moved = [
+            cv2.remap(each, at[:, None, 0], at[:, None, 1], cv2.INTER_LINEAR)[:, 0]
+            for each in waves
+        ]
         return float(np.median(np.linalg.norm(at + np.column_stack(moved) - seen, axis=1)))
 
     assert missed(found.local.moved_px.reshape(-1, 2)) < 0.85 * missed(0.0)
@@ -320,7 +372,10 @@ def test_one_strip_that_is_not_found_does_not_lose_the_flight(reference):
         pose = Pose(turned(0.0), np.array([-6.0 + number, 0.0, 30.0]))
         lost = 2 <= number < 12
         found = along.align(
-            photographed(pose, other if lost else ground), CAMERA, prior_at(pose, (1.0, 1.0, 0.0)), number * 3 * 10**9
+            photographed(pose, other if lost else ground),
+            CAMERA,
+            prior_at(pose, (1.0, 1.0, 0.0)),
+            number * 3 * 10**9,
         )
         assert isinstance(found, NotAligned) == lost
         assert lost or error_px(found, pose) * 30 / CAMERA.fx_px < 0.6
@@ -331,7 +386,9 @@ def test_a_frame_tried_again_is_placed_beside_its_neighbours(reference):
     """Ground that stayed in its west third only: nothing there places the frame until those beside it have been."""
     along = aligner(reference)
     ground = np.concatenate([rebuilt(0.3)[:, :1000], textured(8 * TILE_PX, 31)[:, 1000:]], axis=1)
-    poses = [Pose(turned(0.0), np.array([east_m, 0.0, 30.0])) for east_m in (10.0, -12.0, -6.0, 0.0, 5.0)]
+    poses = [
+        Pose(turned(0.0), np.array([east_m, 0.0, 30.0])) for east_m in (10.0, -12.0, -6.0, 0.0, 5.0)
+    ]
 
     def tried(number: int) -> Aligned | NotAligned:
         prior = prior_at(poses[number], (1.0, 1.0, 0.0))

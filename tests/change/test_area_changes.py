@@ -26,7 +26,9 @@ Rgb = np.ndarray
 
 def painted(kind: GroundKind, seed: int) -> Rgb:
     """64 x 48 m of ground, north up, its north west corner at the site's origin."""
-    return paint_ground(kind, Area(0.0, -48.0, 64.0, 0.0), M_PER_PX, np.random.default_rng(seed)).raster.rgb.copy()
+    return paint_ground(
+        kind, Area(0.0, -48.0, 64.0, 0.0), M_PER_PX, np.random.default_rng(seed)
+    ).raster.rgb.copy()
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +41,10 @@ def same_light(image: Rgb, index: int) -> Rgb:
 
 
 def changes_of(
-    before: Rgb, after: Rgb, light: Callable[[Rgb, int], Rgb] = same_light, settings: AreaSettings = AreaSettings(),  # noqa: B008 (frozen)
+    before: Rgb,
+    after: Rgb,
+    light: Callable[[Rgb, int], Rgb] = same_light,
+    settings: AreaSettings = AreaSettings(),
 ) -> tuple[Change, ...]:
     """The areas that a flight of nine views finds; `light` gives a view's picture its light."""
     areas, rng = AreaMap(AreaMapSettings(segments=settings)), np.random.default_rng(3)
@@ -47,17 +52,32 @@ def changes_of(
         x, y = 300 * (index % 3), 220 * (index // 3)
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
         seen = light(after[part], index).astype(float) + rng.normal(0, 2.0, (*VIEW_PX[::-1], 3))
-        areas.add(view_of(before[part].copy(), np.clip(np.rint(seen), 0, 255).astype(np.uint8), index, x, y))
+        areas.add(
+            view_of(
+                before[part].copy(), np.clip(np.rint(seen), 0, 255).astype(np.uint8), index, x, y
+            )
+        )
     return areas.conclude("b", 7)
 
 
 def view_of(before: Rgb, after: Rgb, index: int = 0, x: int = 0, y: int = 0) -> ComparedView:
     """A view whose top left pixel is pixel (x, y) of the ground."""
-    site_from_image = np.array([[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]])
+    site_from_image = np.array(
+        [[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]]
+    )
     return ComparedView(
-        index, f"{index}", index * 10**9, site_from_image, np.array([x * M_PER_PX + 16, -y * M_PER_PX - 12, 40.0]),
-        after, before, np.ones(VIEW_PX[::-1], bool),
-        np.zeros(VIEW_PX[::-1], np.uint8), np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
+        index,
+        f"{index}",
+        index * 10**9,
+        site_from_image,
+        np.array([x * M_PER_PX + 16, -y * M_PER_PX - 12, 40.0]),
+        after,
+        before,
+        np.ones(VIEW_PX[::-1], bool),
+        np.zeros(VIEW_PX[::-1], np.uint8),
+        np.zeros((0, 4), np.int64),
+        np.zeros(0),
+        0.4,
         np.zeros(VIEW_PX[::-1], np.uint8),
     )
 
@@ -79,7 +99,8 @@ def test_an_area_keeps_its_inside_however_far_from_unchanged_ground(deep):
     colour = rng.normal(0, 0.02, (*shape, 2)) + np.array([0.5, -0.4]) * is_wet[..., None]
     detail = rng.normal(0, 0.1, shape) - 2.0 * is_wet
     signs = GroundSigns(
-        *(each.astype(np.float32) for each in (likeness, colour, detail, colour)), known=np.ones(shape, bool)
+        *(each.astype(np.float32) for each in (likeness, colour, detail, colour)),
+        known=np.ones(shape, bool),
     )
     found = np.any([cells for cells, _ in segments(signs, settings)], axis=0)
     assert found[is_wet].mean() > 0.97 and found[~is_wet].mean() < 0.05
@@ -91,10 +112,18 @@ def test_a_repaved_area_is_one_change_with_its_outline(grass, kind):
     assert found.kind is ChangeKind.AREA and found.id == "b-7" and found.score > 0.5
     union, _ = overlap(found.outline_m, REPAVED_M)
     assert union > 0.75
-    assert found.area_m2 == pytest.approx(200, rel=0.25) and found.length_m == pytest.approx(20, rel=0.15)
+    assert found.area_m2 == pytest.approx(200, rel=0.25) and found.length_m == pytest.approx(
+        20, rel=0.15
+    )
     middle = found.patch.changed.shape[0] // 2, found.patch.changed.shape[1] // 2
-    assert found.patch.changed[middle] and found.patch.before[middle][3] == found.patch.after[middle][3] == 255
-    assert np.abs(found.patch.before[middle][:3].astype(int) - found.patch.after[middle][:3]).max() > 15
+    assert (
+        found.patch.changed[middle]
+        and found.patch.before[middle][3] == found.patch.after[middle][3] == 255
+    )
+    assert (
+        np.abs(found.patch.before[middle][:3].astype(int) - found.patch.after[middle][:3]).max()
+        > 15
+    )
 
 
 def test_what_is_no_larger_than_things_are_is_no_area(grass):
@@ -116,16 +145,25 @@ def test_the_pictures_of_an_area_show_its_ground_where_it_lies(grass, most_px, c
     view = view_of(grass[:480, :640].copy(), painted(GroundKind.SAND, 2)[:480, :640].copy())
     pictures = GroundPictures(0.1, GroundPictureSettings(side_px=32, most_patch_px=most_px))
     west, south, east, north = 3.3, -20.7, 28.1, -2.9
-    squares_m = np.stack(np.meshgrid(np.arange(1.6, 32, 3.2), np.arange(-1.6, -27, -3.2)), axis=-1).reshape(-1, 2)
+    squares_m = np.stack(
+        np.meshgrid(np.arange(1.6, 32, 3.2), np.arange(-1.6, -27, -3.2)), axis=-1
+    ).reshape(-1, 2)
     pictures.show(view, squares_m[3:])  # all but three in the north west
     patch = pictures.patch(np.array([[west, south], [east, south], [east, north], [west, north]]))
     rows, columns = patch.after.shape[:2]
     assert patch.m_per_px == pytest.approx(0.1 * coarser) and max(rows, columns) <= most_px
     fine = cut(view, PatchWindow(0.0, 0.0, 0.1, 320, 240))
-    x, y = patch.west_m + np.arange(columns) * patch.m_per_px, -patch.north_m + np.arange(rows) * patch.m_per_px
+    x, y = (
+        patch.west_m + np.arange(columns) * patch.m_per_px,
+        -patch.north_m + np.arange(rows) * patch.m_per_px,
+    )
     near = [  # what the view shows there; a coarser pixel is one of those it covers
-        np.ix_(np.rint(y / 0.1 + down).clip(0, 239).astype(int), np.rint(x / 0.1 + right).clip(0, 319).astype(int))
-        for down in range(coarser) for right in range(coarser)
+        np.ix_(
+            np.rint(y / 0.1 + down).clip(0, 239).astype(int),
+            np.rint(x / 0.1 + right).clip(0, 319).astype(int),
+        )
+        for down in range(coarser)
+        for right in range(coarser)
     ]
     for found, wanted in ((patch.before, fine.before), (patch.after, fine.after)):
         known = found[..., 3] > 0
@@ -191,10 +229,17 @@ def test_what_is_part_of_an_area_is_not_reported_beside_it(grass):
     outline_m = np.array([[30.0, -22.0], [31.0, -22.0], [31.0, -23.0], [30.0, -23.0]])
     part = replace(area, id="b-1", kind=ChangeKind.REPLACED, outline_m=outline_m, patch=plain)
     car = replace(part, id="b-2", patch=replace(plain, after=thing))
-    beside = replace(part, id="b-3", outline_m=outline_m + np.array([20.0, 0.0]), patch=replace(plain, west_m=49.0))
+    beside = replace(
+        part,
+        id="b-3",
+        outline_m=outline_m + np.array([20.0, 0.0]),
+        patch=replace(plain, west_m=49.0),
+    )
     assert [each.id for each in with_areas([part, car, beside], [area])] == ["b-2", "b-3", "b-7"]
     asked = []
-    found = with_areas([part, car, beside], [area], lies_apart=lambda each: asked.append(each) or True)
+    found = with_areas(
+        [part, car, beside], [area], lies_apart=lambda each: asked.append(each) or True
+    )
     assert [each.id for each in found] == ["b-2", "b-3", "b-1", "b-7"] and len(asked) == 1
     assert asked[0] is part.outline_m
     stack = replace(car, id="b-4", outline_m=area.outline_m)
@@ -204,7 +249,11 @@ def test_what_is_part_of_an_area_is_not_reported_beside_it(grass):
 def test_ground_that_leans_in_pictures_of_one_date_is_no_area(grass):
     """A crown that another photo of the same date shows elsewhere: the map shows one side of it, and no ground."""
     rng = np.random.default_rng(4)
-    crown = cv2.GaussianBlur(rng.normal(90, 60, (200, 200, 3)), (0, 0), 1.5).clip(0, 255).astype(np.uint8)
+    crown = (
+        cv2.GaussianBlur(rng.normal(90, 60, (200, 200, 3)), (0, 0), 1.5)
+        .clip(0, 255)
+        .astype(np.uint8)
+    )
     shown, other = (grass[:480, :640].copy() for _ in range(2))
     shown[100:300, 200:400] = crown
     other[100:300, 200:400] = crown[::-1]

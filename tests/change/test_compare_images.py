@@ -55,7 +55,9 @@ PICTURE = np.zeros((40, 50, 3), np.uint8)
         (PICTURE, PICTURE, "yes", "valid is a str"),
     ],
 )
-def test_input_that_cannot_be_used_is_named(method: str, reference: Any, query: Any, valid: Any, message: str) -> None:
+def test_input_that_cannot_be_used_is_named(
+    method: str, reference: Any, query: Any, valid: Any, message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         sorvolo.compare_images(reference, query, valid, method=method)
 
@@ -64,7 +66,10 @@ def test_input_that_cannot_be_used_is_named(method: str, reference: Any, query: 
     ("options", "message"),
     [
         ({"method": "best"}, "method is 'best'; give one of thesis, robust"),
-        ({"settings": RobustSettings()}, "settings are RobustSettings; method 'thesis' needs ThesisSettings"),
+        (
+            {"settings": RobustSettings()},
+            "settings are RobustSettings; method 'thesis' needs ThesisSettings",
+        ),
         ({"settings": sorvolo.ThesisSettings(), "method": "robust"}, "needs RobustSettings"),
         ({"settings": {"T_B": 0.3}}, "settings are dict"),
         ({"threads": 0}, "threads is 0"),

@@ -6,8 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.coverage.ground_coverage import CoverageSettings, GroundCoverage, coverage_summary
-from sorvolo.change.coverage.planting import Planted, PlantingSettings, planted_in, recall_curve, sensitivities
+from sorvolo.change.coverage.ground_coverage import (
+    CoverageSettings,
+    GroundCoverage,
+    coverage_summary,
+)
+from sorvolo.change.coverage.planting import (
+    Planted,
+    PlantingSettings,
+    planted_in,
+    recall_curve,
+    sensitivities,
+)
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import ComparedView
@@ -16,14 +26,26 @@ M_PER_PX = 0.05
 SIZE = 640, 480  # 32 x 24 m
 
 
-def view_of(ground: np.ndarray, index: int = 0, west_m: float = 0.0, north_m: float = 0.0) -> ComparedView:
+def view_of(
+    ground: np.ndarray, index: int = 0, west_m: float = 0.0, north_m: float = 0.0
+) -> ComparedView:
     """A view from straight above that shows the ground as the map has it; its top left corner is at a place."""
     picture = cv2.cvtColor(ground, cv2.COLOR_BGR2RGB)
     site_from_image = np.array([[M_PER_PX, 0, west_m], [0, -M_PER_PX, north_m], [0, 0, 1.0]])
     return ComparedView(
-        index, f"{index}", index * 10**9, site_from_image, np.array([16.0 + west_m, -12.0 + north_m, 40.0]), picture,
-        picture, np.ones(picture.shape[:2], bool), np.zeros(picture.shape[:2], np.uint8), np.zeros((0, 4), np.int64),
-        np.zeros(0), 0.3, np.zeros(picture.shape[:2], np.uint8),
+        index,
+        f"{index}",
+        index * 10**9,
+        site_from_image,
+        np.array([16.0 + west_m, -12.0 + north_m, 40.0]),
+        picture,
+        picture,
+        np.ones(picture.shape[:2], bool),
+        np.zeros(picture.shape[:2], np.uint8),
+        np.zeros((0, 4), np.int64),
+        np.zeros(0),
+        0.3,
+        np.zeros(picture.shape[:2], np.uint8),
     )
 
 
@@ -44,7 +66,9 @@ def plain_things(count: int = 60) -> tuple[Planted, ...]:
     """Things of 10 px and more were found, smaller ones not."""
     settings = PlantingSettings()
     return tuple(
-        Planted(size, contrast, 0.1, size >= 10.0) for size in settings.sizes_px for contrast in settings.contrasts
+        Planted(size, contrast, 0.1, size >= 10.0)
+        for size in settings.sizes_px
+        for contrast in settings.contrasts
         for _ in range(count // 10)
     )
 
@@ -67,7 +91,9 @@ def test_each_gap_is_named_where_it_is(large_ground):
         valid, doubted = view.valid.copy(), np.zeros(view.valid.shape, bool)
         valid[:, 480:], doubted[:240, 160:320] = False, True
         coverage.compare(replace(view, valid=valid), doubted=doubted, planted=plain_things())
-    coverage.reject(np.array([[40.0, 0], [50, 0], [50, -10], [40, -10]]), Gap.REJECTED, "no single plane fits")
+    coverage.reject(
+        np.array([[40.0, 0], [50, 0], [50, -10], [40, -10]]), Gap.REJECTED, "no single plane fits"
+    )
     found = areas(coverage.parts())
     assert found["dark"] == pytest.approx(8 * 24, rel=0.1)
     assert found["leaning"] == pytest.approx(8 * 12, rel=0.1)
@@ -111,9 +137,15 @@ def test_most_of_the_ground_must_be_compared(large_ground):
     for index in range(2):
         coverage.compare(view_of(large_ground, index), planted=plain_things())
     assert coverage_summary(coverage.parts(), 0)["is_enough"]
-    coverage.reject(np.array([[50.0, 0], [100, 0], [100, -30], [50, -30]]), Gap.NO_MAP, "beside the map")
+    coverage.reject(
+        np.array([[50.0, 0], [100, 0], [100, -30], [50, -30]]), Gap.NO_MAP, "beside the map"
+    )
     assert coverage_summary(coverage.parts(), 0)["is_enough"]  # new ground extends the map
-    coverage.reject(np.array([[50.0, 50], [100, 50], [100, 80], [50, 80]]), Gap.REJECTED, "its features are nowhere")
+    coverage.reject(
+        np.array([[50.0, 50], [100, 50], [100, 80], [50, 80]]),
+        Gap.REJECTED,
+        "its features are nowhere",
+    )
     assert not coverage_summary(coverage.parts(), 0)["is_enough"]
     assert not coverage_summary(GroundCoverage().parts(), 3)["is_enough"]
 
@@ -144,14 +176,21 @@ def test_ground_that_differs_and_that_no_change_explains_is_not_compared(large_g
     assert areas(coverage.parts())["unexplained"] == pytest.approx(100, abs=21)
     square_m = np.array([[5.0, -5.0], [15, -5], [15, -15], [5, -15]])
     assert "unexplained" not in areas(coverage.parts([square_m]))
-    assert areas(coverage.parts([square_m + np.array([40.0, 0.0])]))["unexplained"] == pytest.approx(100, abs=21)
+    assert areas(coverage.parts([square_m + np.array([40.0, 0.0])]))[
+        "unexplained"
+    ] == pytest.approx(100, abs=21)
 
 
 def test_too_few_planted_things_prove_nothing(large_ground):
-    coverage, few = GroundCoverage(), [each for each in plain_things(60) if each.contrast == 1.0][:30]
+    coverage, few = (
+        GroundCoverage(),
+        [each for each in plain_things(60) if each.contrast == 1.0][:30],
+    )
     lost_faint = [replace(few[0], contrast=0.35, found=False)]
     for index in range(2):
-        coverage.compare(view_of(large_ground, index), planted=tuple([*few, *lost_faint]) if index else ())
+        coverage.compare(
+            view_of(large_ground, index), planted=tuple([*few, *lost_faint]) if index else ()
+        )
     summary = coverage_summary(coverage.parts(), 0, coverage.planted)
     assert summary["smallest_m"] is not None and summary["large_found"] is not None
     assert not summary["faint_known"] and summary["faint_m"] is None
@@ -178,17 +217,25 @@ def test_large_plain_things_are_found_on_real_ground_and_small_faint_ones_are_no
 
     def find(picture: np.ndarray) -> np.ndarray:
         query = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-        return compare_robust(reference, query, view.valid, RobustSettings(least_score=0.5)).mask > 0
+        return (
+            compare_robust(reference, query, view.valid, RobustSettings(least_score=0.5)).mask > 0
+        )
 
     planted = [
-        each for seed in range(3) for each in planted_in(view, find, settings, np.random.default_rng(seed))
+        each
+        for seed in range(3)
+        for each in planted_in(view, find, settings, np.random.default_rng(seed))
     ]
     curve = {(each["contrast"], each["size_px"]): each for each in recall_curve(planted, settings)}
     assert sum(each["planted"] for each in curve.values()) == len(planted) >= 50
     plain = [curve[1.0, size] for size in settings.sizes_px]
-    assert sum(each["found"] for each in plain[-3:]) >= 0.8 * sum(each["planted"] for each in plain[-3:])
+    assert sum(each["found"] for each in plain[-3:]) >= 0.8 * sum(
+        each["planted"] for each in plain[-3:]
+    )
     faint = [curve[0.35, size] for size in settings.sizes_px]
-    assert sum(each["found"] for each in faint[:2]) <= 0.5 * sum(each["planted"] for each in faint[:2])
+    assert sum(each["found"] for each in faint[:2]) <= 0.5 * sum(
+        each["planted"] for each in faint[:2]
+    )
     smallest = [each.smallest_px(np.array([0.1]))[0] for each in sensitivities(planted, settings)]
     assert smallest[0] < 28 and not smallest[1] < smallest[0]
 
@@ -198,5 +245,11 @@ def test_a_view_in_its_turn_is_planted(large_ground):
 
     planting, taken = Planting(), []
     for index in range(60):
-        taken.append(bool(planting.plant(view_of(large_ground, index), lambda each: np.zeros(each.shape[:2], bool))))
+        taken.append(
+            bool(
+                planting.plant(
+                    view_of(large_ground, index), lambda each: np.zeros(each.shape[:2], bool)
+                )
+            )
+        )
     assert taken[0] and 8 <= sum(taken) <= 12

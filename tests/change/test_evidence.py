@@ -45,8 +45,12 @@ def earlier_pictures(eyes, things):
     )
 
 
-def collect(views, rules: AnnounceSettings | None = None, **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
-    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(announcing=rules or AnnounceSettings(), **how), "f")
+def collect(
+    views, rules: AnnounceSettings | None = None, **how
+) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
+    evidence = EvidenceMap(
+        M_PER_PX, EvidenceSettings(announcing=rules or AnnounceSettings(), **how), "f"
+    )
     return evidence, [(view.index, change) for view in views for change in evidence.add(view)]
 
 
@@ -55,7 +59,10 @@ def centre(change: Change) -> np.ndarray:
 
 
 def test_what_came_and_what_left_is_announced_once_with_its_place_size_and_time():
-    came, left = Thing(0, 0), Thing(3, 2, (1.4, 0.8), colour=(40, 40, 200), on_map=True, in_flight=False)
+    came, left = (
+        Thing(0, 0),
+        Thing(3, 2, (1.4, 0.8), colour=(40, 40, 200), on_map=True, in_flight=False),
+    )
     stays = Thing(-2, -2, on_map=True)
     evidence, reported = collect(flight([came, left, stays]))
     assert [each.id for _, each in reported] == ["f-1", "f-2"]
@@ -75,8 +82,10 @@ def test_what_came_and_what_left_is_announced_once_with_its_place_size_and_time(
 def test_it_is_announced_within_a_second_of_being_in_view_whatever_the_frame_rate():
     for fps in (5.0, 30.0):
         _, reported = collect(flight([Thing(2, 0)], fps=fps))
-        (index, change), = reported
-        whole_in_view_s = (2 + 0.5 + 8 - 8) / 3  # the view reaches 8 m ahead of a drone that starts at -8 m
+        ((index, change),) = reported
+        whole_in_view_s = (
+            2 + 0.5 + 8 - 8
+        ) / 3  # the view reaches 8 m ahead of a drone that starts at -8 m
         assert index / fps < whole_in_view_s + 1.0
         assert change.announced_ns == START_NS + round(index / fps * 1e9)
 
@@ -88,10 +97,24 @@ def candidate(number: int, shown: int, missed: int) -> Candidate:
     one, no = np.ones((1, 1), bool), np.zeros((1, 1), bool)
     for each in range(shown + missed):
         flagged = one if each < shown else no
-        laid = LaidView(cell.grown(2), np.pad(flagged, 2), np.ones((5, 5), bool), np.full((5, 5), 230, np.uint8),
-                        *(np.zeros((5, 5), bool),) * 2, np.zeros((5, 5), np.int32))
-        view = KeptView(START_NS + each, laid, np.array([each, 0.0, CAMERA_HEIGHT_M]), np.eye(3),
-                        np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), 0.1, True)
+        laid = LaidView(
+            cell.grown(2),
+            np.pad(flagged, 2),
+            np.ones((5, 5), bool),
+            np.full((5, 5), 230, np.uint8),
+            *(np.zeros((5, 5), bool),) * 2,
+            np.zeros((5, 5), np.int32),
+        )
+        view = KeptView(
+            START_NS + each,
+            laid,
+            np.array([each, 0.0, CAMERA_HEIGHT_M]),
+            np.eye(3),
+            np.zeros((4, 4), np.uint8),
+            np.ones((4, 4), bool),
+            0.1,
+            True,
+        )
         assert result.see(view, one, 0.1) == flagged.any()
     return result
 
@@ -101,14 +124,19 @@ def test_of_two_candidates_that_join_one_record_and_both_times_count():
     before = stands.tally
     joined = stands.joined(flickers, 1)
     assert joined.number == 1 and (joined.tally.views, joined.tally.asked) == (12, 12)
-    assert joined.tally.score_sum == before.score_sum and joined.tally.last_seen_ns == before.last_seen_ns
+    assert (
+        joined.tally.score_sum == before.score_sum
+        and joined.tally.last_seen_ns == before.last_seen_ns
+    )
 
 
 def test_the_patch_shows_both_dates_north_up():
     evidence, _ = collect(flight([Thing(0, 0, (1, 1), colour=(220, 30, 30))]))
     patch = evidence.conclude()[0].patch
     inside = patch.changed
-    assert np.median(patch.after[inside][:, 0]) > 200 and np.median(patch.before[inside][:, 0]) < 170
+    assert (
+        np.median(patch.after[inside][:, 0]) > 200 and np.median(patch.before[inside][:, 0]) < 170
+    )
     rows, columns = np.nonzero(inside)
     middle = patch.site_from_patch @ [columns.mean(), rows.mean(), 1]
     assert np.hypot(*middle[:2]) < 0.1
@@ -128,18 +156,29 @@ def test_changes_that_grow_together_keep_the_older_id():
     left, right, bridge = Thing(0, 0), Thing(3, 0), Thing(1.5, 0, (2.2, 1.0))
     views = list(flight([left, right], seconds=2.8))
     last_m = float(views[-1].camera_m[0])
-    more = [view_of(14 + i, 2.8 + i / 5, (last_m + 0.6 * (i + 1), 0, CAMERA_HEIGHT_M), [left, right, bridge])
-            for i in range(12)]
+    more = [
+        view_of(
+            14 + i, 2.8 + i / 5, (last_m + 0.6 * (i + 1), 0, CAMERA_HEIGHT_M), [left, right, bridge]
+        )
+        for i in range(12)
+    ]
     evidence, reported = collect(views + more)
     assert [each.id for _, each in reported] == ["f-1", "f-2"]
     assert [each.id for each in evidence.changes()] == ["f-1"]
 
 
-@pytest.mark.parametrize("first, last, count", [(2, 7, 22), (0, 6, 22), (14, 20, 26), (17, 22, 22), (15, 20, 22)])
+@pytest.mark.parametrize(
+    "first, last, count", [(2, 7, 22), (0, 6, 22), (14, 20, 26), (17, 22, 22), (15, 20, 22)]
+)
 def test_what_leans_over_a_thing_for_some_views_is_no_part_of_it(first, last, count):
     thing, lean = Thing(0, 0, (0.6, 0.6)), Thing(1.9, 0, (3.0, 2.4))
     views = [
-        view_of(i, i / 5, (-6 + 0.6 * i, 0, CAMERA_HEIGHT_M), [thing, lean] if first <= i < last else [thing])
+        view_of(
+            i,
+            i / 5,
+            (-6 + 0.6 * i, 0, CAMERA_HEIGHT_M),
+            [thing, lean] if first <= i < last else [thing],
+        )
         for i in range(count)
     ]
     evidence, _ = collect(views)
@@ -155,7 +194,13 @@ def test_what_leans_over_a_thing_for_some_views_is_no_part_of_it(first, last, co
 def test_a_small_dark_thing_is_announced_as_a_bright_one_is(colour, score):
     """Decision 0045 took out the rule for specks of shade: whether it is a moved shadow is decided by the sun."""
     views = [
-        view_of(i, i / 5, (-6 + 0.6 * i, 0, CAMERA_HEIGHT_M), [Thing(0, 0, (0.4, 0.4), colour=colour)], score=score)
+        view_of(
+            i,
+            i / 5,
+            (-6 + 0.6 * i, 0, CAMERA_HEIGHT_M),
+            [Thing(0, 0, (0.4, 0.4), colour=colour)],
+            score=score,
+        )
         for i in range(20)
     ]
     assert len(collect(views)[0].conclude()) == 1
@@ -192,7 +237,9 @@ def test_a_drone_that_hovers_announces_a_ghost_only_with_half_the_score_and_with
     ghosts = len(evidence.changes())
     for i in range(10, 40):
         camera_m = (-5 + 0.5 * (i - 10), 0, CAMERA_HEIGHT_M)
-        evidence.add(view_of(i, i / 5, camera_m, [pole], map_eye_m=camera_m))  # from here it looks as in the map
+        evidence.add(
+            view_of(i, i / 5, camera_m, [pole], map_eye_m=camera_m)
+        )  # from here it looks as in the map
     assert ghosts > 0 and evidence.conclude() == ()
 
 
@@ -229,7 +276,10 @@ def test_unknown_ground_shows_nothing():
 
 def test_a_hole_does_not_wipe_out_what_was_seen():
     views = list(flight([Thing(0, 0)]))
-    blind = [view_of(v.index, v.index / 5, v.camera_m, [Thing(0, 0)], hole_m=(-3, -3, 3, 3)) for v in views]
+    blind = [
+        view_of(v.index, v.index / 5, v.camera_m, [Thing(0, 0)], hole_m=(-3, -3, 3, 3))
+        for v in views
+    ]
     mixed = [blind[i] if i % 2 else views[i] for i in range(len(views))]
     evidence, reported = collect(mixed)
     assert len(reported) == 1
@@ -291,7 +341,9 @@ def test_what_one_view_alone_shows_must_be_very_sure_and_confirmed_by_other_evid
     assert np.hypot(*((asked[0].min(axis=0) + asked[0].max(axis=0)) / 2)) < 0.15
     assert single(Thing(0, 0), score=0.7).conclude(confirms) == ()
     assert single(Thing(0, 0)).conclude(lambda _: False) == ()
-    assert single(Thing(0, 0)).conclude() == ()  # where nothing else was measured, one view announces nothing
+    assert (
+        single(Thing(0, 0)).conclude() == ()
+    )  # where nothing else was measured, one view announces nothing
 
 
 def test_what_one_view_alone_shows_at_its_rim_is_not_announced():
@@ -304,7 +356,9 @@ def test_low_scores_are_kept_but_not_announced():
     assert reported == [] and evidence.conclude() == ()
 
 
-@pytest.mark.parametrize(("side_m", "score", "is_announced"), [(2.0, 0.45, False), (2.0, 0.7, True), (1.0, 0.45, True)])
+@pytest.mark.parametrize(
+    ("side_m", "score", "is_announced"), [(2.0, 0.45, False), (2.0, 0.7, True), (1.0, 0.45, True)]
+)
 def test_what_is_large_must_be_surer_than_what_is_small(side_m, score, is_announced):
     """Walls that lean into view are large and unsure."""
     evidence, _ = collect(flight([Thing(0, 0, (side_m, side_m))], score=score))
@@ -314,18 +368,24 @@ def test_what_is_large_must_be_surer_than_what_is_small(side_m, score, is_announ
 def test_what_became_of_the_candidates_is_counted():
     stays, goes = Thing(-3, 1), Thing(-4, -1)
     views = [
-        view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [stays, goes] if i < 6 else [stays]) for i in range(30)
+        view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [stays, goes] if i < 6 else [stays])
+        for i in range(30)
     ]
     evidence, announced = collect(views)
     assert len(announced) == 2 and len(evidence.conclude()) == 1
     assert evidence.outcomes() == {
-        "announced": {"still": 1, "moving": 0}, "withdrawn": {Reason.UNSURE.value: 1}, "never_announced": {},
+        "announced": {"still": 1, "moving": 0},
+        "withdrawn": {Reason.UNSURE.value: 1},
+        "never_announced": {},
     }
 
 
 def test_something_seen_for_a_while_only_is_withdrawn():
     thing = Thing(-4, 0)
-    views = [view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < 6 else []) for i in range(30)]
+    views = [
+        view_of(i, i / 5, (-6 + 0.2 * i, 0, CAMERA_HEIGHT_M), [thing] if i < 6 else [])
+        for i in range(30)
+    ]
     evidence, reported = collect(views)
     assert len(reported) == 1
     assert evidence.conclude() == ()
@@ -337,15 +397,23 @@ def test_every_well_seen_thing_is_found_once_and_nothing_else(seed):
     rng = np.random.default_rng(seed)
     spots = [np.array([x, y]) for x in (-4, 0, 4) for y in (-2.5, 2.5)]
     things = [
-        Thing(*(spot + rng.uniform(-0.5, 0.5, 2)), tuple(rng.uniform(0.6, 1.8, 2)), colour=(230, 60, 40),
-              on_map=bool(flip), in_flight=not flip)
-        for spot, flip in zip(spots, rng.integers(0, 2, 6)) if rng.random() < 0.7
+        Thing(
+            *(spot + rng.uniform(-0.5, 0.5, 2)),
+            tuple(rng.uniform(0.6, 1.8, 2)),
+            colour=(230, 60, 40),
+            on_map=bool(flip),
+            in_flight=not flip,
+        )
+        for spot, flip in zip(spots, rng.integers(0, 2, 6))
+        if rng.random() < 0.7
     ]
     evidence, reported = collect(flight(things, seconds=6))
     final = evidence.conclude()
     assert len(final) == len(things) == len({each.id for _, each in reported})
     for thing in things:
-        distances = [float(np.hypot(*(centre(each) - [thing.east_m, thing.north_m]))) for each in final]
+        distances = [
+            float(np.hypot(*(centre(each) - [thing.east_m, thing.north_m]))) for each in final
+        ]
         assert min(distances) < 0.3
         kind = final[int(np.argmin(distances))].kind
         assert kind == (ChangeKind.APPEARED if thing.in_flight else ChangeKind.DISAPPEARED)
@@ -376,7 +444,9 @@ def seldom(thing: Thing, others: int) -> list:
     """Two photos of a thing, then one of each of so many others."""
     places = [(0.0, 0.0), (4.0, 0.0), *((100.0 + 40 * number, 0.0) for number in range(others))]
     return [
-        view_of(number, 2 * number, (*place, CAMERA_HEIGHT_M), [thing if number < 2 else Thing(*place)])
+        view_of(
+            number, 2 * number, (*place, CAMERA_HEIGHT_M), [thing if number < 2 else Thing(*place)]
+        )
         for number, place in enumerate(places)
     ]
 
@@ -394,14 +464,21 @@ WALL = Thing(0, 2.0, (2.0, 0.4), 3.0, (90, 90, 140), on_map=True)
 STANDING = Thing(0, 1.5, height_m=2.5)
 
 
-@pytest.mark.parametrize(("thing", "eyes", "is_reported"), [
-    (WALL, [(0.0, 0.3)], True),  # an earlier picture from near: nothing is asked for
-    (WALL, [(0.0, 3.0)], False),
-    (WALL, [(0.0, 3.0), (0.0, 4.5)], False),
-    (Thing(0, 1.5), [(0.0, 3.0)], True),  # later pictures show that it lies flat
-    (STANDING, [(0.0, 3.0)], False),
-    (STANDING, [(0.0, 3.0), (3.0, 3.0)], True),  # earlier pictures show that the ground was level
-])
+@pytest.mark.parametrize(
+    ("thing", "eyes", "is_reported"),
+    [
+        (WALL, [(0.0, 0.3)], True),  # an earlier picture from near: nothing is asked for
+        (WALL, [(0.0, 3.0)], False),
+        (WALL, [(0.0, 3.0), (0.0, 4.5)], False),
+        (Thing(0, 1.5), [(0.0, 3.0)], True),  # later pictures show that it lies flat
+        (STANDING, [(0.0, 3.0)], False),
+        (
+            STANDING,
+            [(0.0, 3.0), (3.0, 3.0)],
+            True,
+        ),  # earlier pictures show that the ground was level
+    ],
+)
 def test_what_differs_where_earlier_pictures_look_from_aside_is_a_change_if_the_ground_is_level(
     thing, eyes, is_reported
 ):
@@ -426,7 +503,9 @@ def test_sigma_knows_that_a_thin_outline_holds_a_part_of_a_shadow():
 def test_what_an_outline_errs_by_is_that_of_the_one_that_is_reported():
     """Not of a whole that it was parted from, nor of the one with its shadow."""
     for size_m, least_m, most_m in (((1.0, 1.0), 0.0, 0.02), ((0.3, 1.9), 0.3, 0.6)):
-        found, = collect(flight([Thing(0, 0, size_m)]))[0].conclude()
-        change, = reported([found], 0.5, [])
-        assert found.sigma_m < 0.1 and change.sigma_m == pytest.approx(np.hypot(change.sigma_in_map_m, 0.5))
+        (found,) = collect(flight([Thing(0, 0, size_m)]))[0].conclude()
+        (change,) = reported([found], 0.5, [])
+        assert found.sigma_m < 0.1 and change.sigma_m == pytest.approx(
+            np.hypot(change.sigma_in_map_m, 0.5)
+        )
         assert least_m <= np.sqrt(change.sigma_in_map_m**2 - found.sigma_m**2) < most_m

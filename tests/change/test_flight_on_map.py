@@ -47,13 +47,20 @@ def looks(rng: np.random.Generator, count: int) -> Floats:
     return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
 
 
-def photos_of(ground: Map, rng: np.random.Generator, *, unchanged: float) -> dict[int, PhotoFeatures]:
+def photos_of(
+    ground: Map, rng: np.random.Generator, *, unchanged: float
+) -> dict[int, PhotoFeatures]:
     """Photos of ground of which that share is as it was, taken where `MOVED` has their poses."""
     stays = rng.random(len(ground.looks)) < unchanged
     later = Map.__new__(Map)
-    later.ground_m, later.looks = ground.ground_m, np.where(stays[:, None], ground.looks, looks(rng, len(stays)))
+    later.ground_m, later.looks = (
+        ground.ground_m,
+        np.where(stays[:, None], ground.looks, looks(rng, len(stays))),
+    )
     return {
-        index: PhotoFeatures(CAMERA, later.seen(MOVED @ site_from_image_homography(CAMERA, pose), CAMERA))
+        index: PhotoFeatures(
+            CAMERA, later.seen(MOVED @ site_from_image_homography(CAMERA, pose), CAMERA)
+        )
         for index, pose in POSES.items()
     }
 
@@ -62,11 +69,21 @@ def photos_of(ground: Map, rng: np.random.Generator, *, unchanged: float) -> dic
 def test_what_each_photo_shows_too_weakly_adds_up(unchanged: float) -> None:
     rng = np.random.default_rng(8)
     ground = Map(rng)
-    fit = FlightOnMap(cast(MapSearch, ground)).find(photos_of(ground, rng, unchanged=unchanged), POSES)
+    fit = FlightOnMap(cast(MapSearch, ground)).find(
+        photos_of(ground, rng, unchanged=unchanged), POSES
+    )
     assert fit is not None and fit.ratio > 10 and fit.residual_m < 0.3
     corners_m: PointsM = np.array([[-20.0, -15], [140, -15], [140, 65], [-20, 65]])
-    assert np.abs(apply_homography(fit.map_from_flight, corners_m) - apply_homography(MOVED, corners_m)).max() < 0.15
-    assert np.allclose(fit.map_from_flight, fit_similarity(apply_homography(fit.map_from_flight, corners_m), corners_m))
+    assert (
+        np.abs(
+            apply_homography(fit.map_from_flight, corners_m) - apply_homography(MOVED, corners_m)
+        ).max()
+        < 0.15
+    )
+    assert np.allclose(
+        fit.map_from_flight,
+        fit_similarity(apply_homography(fit.map_from_flight, corners_m), corners_m),
+    )
 
 
 def test_one_photo_of_changed_ground_is_not_enough() -> None:
@@ -81,7 +98,10 @@ def test_one_photo_of_changed_ground_is_not_enough() -> None:
 def test_other_ground_is_found_nowhere(seed: int) -> None:
     rng = np.random.default_rng(seed)
     ground = Map(rng)
-    assert FlightOnMap(cast(MapSearch, ground)).find(photos_of(ground, rng, unchanged=0.0), POSES) is None
+    assert (
+        FlightOnMap(cast(MapSearch, ground)).find(photos_of(ground, rng, unchanged=0.0), POSES)
+        is None
+    )
 
 
 def test_without_photos_or_beside_the_map_nothing_is_found() -> None:

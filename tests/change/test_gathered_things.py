@@ -29,7 +29,9 @@ def ground() -> ImageRGB:
 
 def soil(rng: np.random.Generator, level: float, shape: tuple[int, int]) -> ImageRGB:
     fine, coarse = (
-        cv2.resize(rng.normal(0, 1, (shape[0] // step, shape[1] // step)).astype(np.float32), shape[::-1])
+        cv2.resize(
+            rng.normal(0, 1, (shape[0] // step, shape[1] // step)).astype(np.float32), shape[::-1]
+        )
         for step in (2, 16)
     )
     gray = level + 14 * fine + 12 * coarse
@@ -44,9 +46,13 @@ def with_car(ground: ImageRGB) -> ImageRGB:
     return shown
 
 
-def test_features_differ_where_a_thing_of_the_grounds_brightness_stands_and_not_by_light_or_noise(ground):
+def test_features_differ_where_a_thing_of_the_grounds_brightness_stands_and_not_by_light_or_noise(
+    ground,
+):
     rng = np.random.default_rng(5)
-    later = np.clip(0.8 * with_car(ground) + rng.normal(0, 4, ground.shape), 0, 255).astype(np.uint8)
+    later = np.clip(0.8 * with_car(ground) + rng.normal(0, 4, ground.shape), 0, 255).astype(
+        np.uint8
+    )
     known = np.ones(ground.shape[:2], bool)
     known[:, 560:] = False
     apart = learned_difference(ground, later, known)
@@ -69,23 +75,41 @@ def gathered(
     """What some views show together, each `shrunk` times smaller and looked at as much larger."""
     things, rng = GatheredThings(float(shrunk)), np.random.default_rng(3)
     size_px = VIEW_PX[0] // shrunk, VIEW_PX[1] // shrunk
-    small_from_view = np.array([[1 / shrunk, 0, 0.5 / shrunk - 0.5], [0, 1 / shrunk, 0.5 / shrunk - 0.5], [0, 0, 1]])
+    small_from_view = np.array(
+        [[1 / shrunk, 0, 0.5 / shrunk - 0.5], [0, 1 / shrunk, 0.5 / shrunk - 0.5], [0, 0, 1]]
+    )
     for index in range(views):
         x, y = 32 * index, 24 * index
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
-        noisy = np.clip(after[part] + rng.normal(0, 3, (*VIEW_PX[::-1], 3)), 0, 255).astype(np.uint8)
-        site_from_image = np.array([[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]])
+        noisy = np.clip(after[part] + rng.normal(0, 3, (*VIEW_PX[::-1], 3)), 0, 255).astype(
+            np.uint8
+        )
+        site_from_image = np.array(
+            [[M_PER_PX, 0, x * M_PER_PX], [0, -M_PER_PX, -y * M_PER_PX], [0, 0, 1.0]]
+        )
         nothing = np.zeros(size_px[::-1], np.uint8)
         image, reference = (
             np.asarray(cv2.resize(each, size_px, interpolation=cv2.INTER_AREA), np.uint8)
             for each in (noisy, before[part])
         )
-        things.add(ComparedView(
-            index, f"{index}", index * 10**9, site_from_image @ np.linalg.inv(small_from_view),
-            np.array([x * M_PER_PX, -y * M_PER_PX, 40.0]), image, reference, nothing == 0, nothing,
-            np.zeros((0, 4), np.int64), np.zeros(0), 0.4,
-            nothing + np.broadcast_to(np.uint8(shade), before.shape[:2])[part][::shrunk, ::shrunk],
-        ))
+        things.add(
+            ComparedView(
+                index,
+                f"{index}",
+                index * 10**9,
+                site_from_image @ np.linalg.inv(small_from_view),
+                np.array([x * M_PER_PX, -y * M_PER_PX, 40.0]),
+                image,
+                reference,
+                nothing == 0,
+                nothing,
+                np.zeros((0, 4), np.int64),
+                np.zeros(0),
+                0.4,
+                nothing
+                + np.broadcast_to(np.uint8(shade), before.shape[:2])[part][::shrunk, ::shrunk],
+            )
+        )
     return things
 
 
@@ -101,15 +125,21 @@ def test_a_thing_that_no_view_flags_is_reported_with_its_place_and_once(ground, 
 
 
 def moved(change: Change, east_m: float, north_m: float, kind: ChangeKind, name: str) -> Change:
-    return replace(change, id=name, kind=kind, outline_m=change.outline_m + np.array([east_m, north_m]))
+    return replace(
+        change, id=name, kind=kind, outline_m=change.outline_m + np.array([east_m, north_m])
+    )
 
 
 def test_a_thing_that_was_announced_goes_on_with_its_id_and_times_and_is_reported_once(ground):
     things = gathered(ground, with_car(ground), 4)
     (thing,) = things.conclude("b", count(7), [])
     a_part = replace(
-        moved(thing, 0, 0, ChangeKind.REPLACED, "b-3"), announced_ns=5, first_seen_ns=2, last_seen_ns=9,
-        outline_m=thing.outline_m.mean(axis=0) + 0.8 * (thing.outline_m - thing.outline_m.mean(axis=0)),
+        moved(thing, 0, 0, ChangeKind.REPLACED, "b-3"),
+        announced_ns=5,
+        first_seen_ns=2,
+        last_seen_ns=9,
+        outline_m=thing.outline_m.mean(axis=0)
+        + 0.8 * (thing.outline_m - thing.outline_m.mean(axis=0)),
     )
     square_m = np.array([[0, 0], [0.6, 0], [0.6, -0.6], [0, -0.6]])
     corner = replace(a_part, id="b-2", outline_m=thing.outline_m.mean(axis=0) + square_m)
@@ -128,12 +158,16 @@ def test_other_changes_stay_but_where_features_hold_the_ground_for_the_same(grou
     moves = moved(thing, 0, 9, ChangeKind.MOVING, "b-3")
     area = moved(thing, 0, 0, ChangeKind.AREA, "b-4")
     beside = moved(thing, 3.2, 0, ChangeKind.APPEARED, "b-5")  # the thing is a quarter of it
-    concluded = {each.id for each in things.conclude("b", count(8), [same, unseen, moves, area, beside])}
+    concluded = {
+        each.id for each in things.conclude("b", count(8), [same, unseen, moves, area, beside])
+    }
     assert concluded == {"b-2", "b-3", "b-4", "b-5", "b-8"}
     assert GatheredThings().conclude("b", count(1), [same]) == [same]
 
 
-def test_what_one_view_alone_shows_is_confirmed_where_it_lies_apart_and_not_as_a_shadow_or_twice_seen(ground):
+def test_what_one_view_alone_shows_is_confirmed_where_it_lies_apart_and_not_as_a_shadow_or_twice_seen(
+    ground,
+):
     west, east, south, north = BOX_M
     box_m = np.array([[west, south], [east, south], [east, north], [west, north]])
     assert gathered(ground, with_car(ground), 1).shows_once(box_m)
@@ -152,7 +186,9 @@ def test_a_thing_within_an_area_lies_apart_and_unchanged_ground_or_none_does_not
     assert not gathered(ground, ground, 0).lies_apart(box_m)
 
 
-def test_an_object_of_one_date_is_a_change_where_the_ground_differs_and_no_other_change_holds_it(ground):
+def test_an_object_of_one_date_is_a_change_where_the_ground_differs_and_no_other_change_holds_it(
+    ground,
+):
     west, east, south, north = BOX_M
     place_m = np.array([(west + east) / 2, (south + north) / 2])
     things = gathered(ground, with_car(ground), 3)
@@ -166,7 +202,9 @@ def test_an_object_of_one_date_is_a_change_where_the_ground_differs_and_no_other
     assert things.standing_at(place_m, 5.0, [replace(known, kind=ChangeKind.AREA)]) is not None
     assert things.standing_at(place_m - [0, 9], 5.0, []) is None, "the same ground"
     assert things.standing_at(place_m - [90, 0], 5.0, []) is None, "never seen"
-    assert gathered(ground, with_car(ground), 1).standing_at(place_m, 5.0, []) is None, "seen by one view"
+    assert gathered(ground, with_car(ground), 1).standing_at(place_m, 5.0, []) is None, (
+        "seen by one view"
+    )
     assert GatheredThings().standing_at(place_m, 5.0, []) is None
 
 
@@ -207,11 +245,17 @@ def outline_around(pixels: np.ndarray) -> np.ndarray:
 def test_the_shadow_of_a_box_that_stays_has_moved_and_that_of_one_that_came_has_not(ground):
     earlier, later = shadow_of_box(EARLIER), shadow_of_box(LATER)
     came, left = later & ~earlier, earlier & ~later
-    both = gathered(ground, ground, 3, came * np.uint8(Shade.LATER_DARK) + left * np.uint8(Shade.EARLIER_DARK))
+    both = gathered(
+        ground, ground, 3, came * np.uint8(Shade.LATER_DARK) + left * np.uint8(Shade.EARLIER_DARK)
+    )
     assert both.is_moved_shadow(outline_around(came), EARLIER, LATER)
-    back = gathered(ground, ground, 3, came * np.uint8(Shade.EARLIER_DARK) + left * np.uint8(Shade.LATER_DARK))
+    back = gathered(
+        ground, ground, 3, came * np.uint8(Shade.EARLIER_DARK) + left * np.uint8(Shade.LATER_DARK)
+    )
     assert back.is_moved_shadow(outline_around(came), LATER, EARLIER)
-    assert not both.is_moved_shadow(outline_around(came), LATER, EARLIER)  # the sun went another way
+    assert not both.is_moved_shadow(
+        outline_around(came), LATER, EARLIER
+    )  # the sun went another way
     assert not both.is_moved_shadow(outline_around(came), LATER, LATER)  # it did not move
     assert not both.is_moved_shadow(outline_around(came) - [0, 9], EARLIER, LATER)  # no shade there
 

@@ -20,7 +20,9 @@ def plain(level: int = 120) -> np.ndarray:
 
 def street() -> np.ndarray:
     """A plain street between rough ground."""
-    rough = cv2.resize(np.random.default_rng(7).normal(0, 25, (180, 240)).astype(np.float32), SIZE[::-1])
+    rough = cv2.resize(
+        np.random.default_rng(7).normal(0, 25, (180, 240)).astype(np.float32), SIZE[::-1]
+    )
     rough[90:270] = 0
     return np.clip(150 + rough[..., None] + np.zeros(3), 0, 255).astype(np.uint8)
 
@@ -55,7 +57,7 @@ def test_a_faint_plate_around_a_bright_middle_is_part_of_the_thing(came: bool) -
     pictures = (plain(), with_thing) if came else (with_thing, plain())
     result = compared(*pictures)
     assert overlap(result.mask, truth) > 0.8
-    (x, y, width, high), = result.boxes
+    ((x, y, width, high),) = result.boxes
     assert (abs(np.array([x, y, x + width, y + high]) - [214, 154, 267, 207]) <= 6).all()
 
 

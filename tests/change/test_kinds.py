@@ -15,7 +15,8 @@ SIZE = 60
 def ground(seed):
     rng = np.random.default_rng(seed)
     rough = sum(
-        cv2.resize(rng.normal(0, 1, (SIZE // step + 2, SIZE // step + 2, 3)), (SIZE, SIZE)) for step in (2, 6, 20)
+        cv2.resize(rng.normal(0, 1, (SIZE // step + 2, SIZE // step + 2, 3)), (SIZE, SIZE))
+        for step in (2, 6, 20)
     )
     return 110 + 8 * rough
 
@@ -23,7 +24,11 @@ def ground(seed):
 def thing_mask(seed):
     rng = np.random.default_rng([seed, 1])
     mask = np.zeros((SIZE, SIZE), np.uint8)
-    box = ((30 + rng.uniform(-3, 3), 30 + rng.uniform(-3, 3)), tuple(rng.uniform(12, 24, 2)), rng.uniform(0, 90))
+    box = (
+        (30 + rng.uniform(-3, 3), 30 + rng.uniform(-3, 3)),
+        tuple(rng.uniform(12, 24, 2)),
+        rng.uniform(0, 90),
+    )
     cv2.fillPoly(mask, [cv2.boxPoints(box).round().astype(np.int32)], 1)
     return mask > 0
 
@@ -39,11 +44,17 @@ def picture(seed, colour=None, light=1.0):
 
 def patch(seed, before, after, light=1.0):
     no_shade = np.zeros((SIZE, SIZE), np.uint8)
-    return Patch(0, 0, 0.05, picture(seed, before), picture(seed, after, light), thing_mask(seed), no_shade)
+    return Patch(
+        0, 0, 0.05, picture(seed, before), picture(seed, after, light), thing_mask(seed), no_shade
+    )
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.integers(0, 1000), st.sampled_from([(190, 60, 50), (60, 60, 160), (150, 150, 150)]), st.floats(0.6, 1.3))
+@given(
+    st.integers(0, 1000),
+    st.sampled_from([(190, 60, 50), (60, 60, 160), (150, 150, 150)]),
+    st.floats(0.6, 1.3),
+)
 def test_a_thing_that_stands_out_is_announced_by_the_date_that_has_it(seed, colour, light):
     assert kind_of(patch(seed, None, colour, light)) == ChangeKind.APPEARED
     assert kind_of(patch(seed, colour, None, light)) == ChangeKind.DISAPPEARED

@@ -23,20 +23,32 @@ def texture(seed: int) -> np.ndarray:
 def waves(most_px: float) -> np.ndarray:
     """(H, W, 2) a smooth displacement."""
     rng = np.random.default_rng(5)
-    moved = np.dstack([
-        cv2.resize(rng.normal(0, 1, (2, 3)).astype(np.float32), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
-        for _ in range(2)
-    ])
+    moved = np.dstack(
+        [
+            cv2.resize(
+                rng.normal(0, 1, (2, 3)).astype(np.float32),
+                (WIDTH, HEIGHT),
+                interpolation=cv2.INTER_CUBIC,
+            )
+            for _ in range(2)
+        ]
+    )
     return moved / np.abs(moved).max() * most_px
 
 
 def moved(image: np.ndarray, by_px: np.ndarray) -> np.ndarray:
     """The picture shows at y + by_px there what it showed at y: a query for the reference `image`."""
     x, y = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))
-    back = by_px.astype(np.float32)  # smooth: where it comes from it is nearly what it is where it arrives
+    back = by_px.astype(
+        np.float32
+    )  # smooth: where it comes from it is nearly what it is where it arrives
     for _ in range(5):
-        back = cv2.remap(by_px.astype(np.float32), x - back[..., 0], y - back[..., 1], cv2.INTER_LINEAR)
-    return cv2.remap(image, x - back[..., 0], y - back[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
+        back = cv2.remap(
+            by_px.astype(np.float32), x - back[..., 0], y - back[..., 1], cv2.INTER_LINEAR
+        )
+    return cv2.remap(
+        image, x - back[..., 0], y - back[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
 
 
 def later(image: np.ndarray, share: float, seed: int = 9) -> np.ndarray:
@@ -45,7 +57,9 @@ def later(image: np.ndarray, share: float, seed: int = 9) -> np.ndarray:
     blocks = (rng.random((18, 32)) < share).astype(np.uint8)
     new = cv2.resize(blocks, (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST) > 0
     mixed = np.where(new, texture(seed + 1), image)
-    return np.clip(255 * (mixed / 255.0) ** 1.6 + rng.normal(0, 3, mixed.shape), 0, 255).astype(np.uint8)
+    return np.clip(255 * (mixed / 255.0) ** 1.6 + rng.normal(0, 3, mixed.shape), 0, 255).astype(
+        np.uint8
+    )
 
 
 def at_cells(by_px: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
@@ -94,17 +108,19 @@ def test_things_that_moved_are_not_followed(size: tuple[int, int]) -> None:
     wide, high = size
     before, by_px = texture(1), waves(3.0)
     after = later(moved(before, by_px), 0.2)
-    place = np.s_[150:150 + high, 260:260 + wide]
+    place = np.s_[150 : 150 + high, 260 : 260 + wide]
     shown = texture(77)[place]
     before[place] = shown
     shift = by_px[150 + high // 2, 260 + wide // 2]
     dx, dy = round(float(shift[0])) + 5, round(float(shift[1]))
-    after[150 + dy:150 + dy + high, 260 + dx:260 + dx + wide] = shown
+    after[150 + dy : 150 + dy + high, 260 + dx : 260 + dx + wide] = shown
     found = fit_locally(before, after, KNOWN, M_PER_PX)
     assert found is not None
     field = cv2.resize(found.moved_px.astype(np.float32), (WIDTH, HEIGHT))
     at_thing = field[place].reshape(-1, 2).mean(axis=0)
-    assert np.linalg.norm(at_thing - by_px[place].reshape(-1, 2).mean(axis=0)) < 1.0  # px; it moved by 5
+    assert (
+        np.linalg.norm(at_thing - by_px[place].reshape(-1, 2).mean(axis=0)) < 1.0
+    )  # px; it moved by 5
 
 
 def test_the_displacement_is_bounded_in_metres_and_holes_show_nothing() -> None:
@@ -117,5 +133,7 @@ def test_the_displacement_is_bounded_in_metres_and_holes_show_nothing() -> None:
     assert found is not None
     assert not found.is_known[:, -6:].any()
     assert np.median(np.linalg.norm(found.moved_px - [4.0, 0.0], axis=2)[found.is_known]) < 0.4
-    close = fit_locally(before, query, known, 0.5)  # 4 px are 2 m there, more than relief and maps do
+    close = fit_locally(
+        before, query, known, 0.5
+    )  # 4 px are 2 m there, more than relief and maps do
     assert close is None or np.linalg.norm(close.moved_px, axis=2).max() <= 3.0 + 1e-6

@@ -35,7 +35,12 @@ def found(name: str, at, kind=APPEARED, size=1.0, sigma_m=math.nan, announced_s=
 def true(name: str, at, kind=APPEARED, must_find=True, path=(), length_m=1.0) -> TrueEvent:
     clear_ns = np.array([10, 10.2, 10.4, 10.6]) * SECOND
     return TrueEvent(
-        name, kind, np.asarray(at) + BOX, length_m, clear_ns.astype(np.int64), np.array(path, float).reshape(-1, 2),
+        name,
+        kind,
+        np.asarray(at) + BOX,
+        length_m,
+        clear_ns.astype(np.int64),
+        np.array(path, float).reshape(-1, 2),
         must_find,
     )
 
@@ -71,10 +76,19 @@ def test_rates_without_a_denominator_are_not_numbers():
     assert math.isnan(Counts().accuracy)
 
 
-@pytest.mark.parametrize(("seen", "there", "least_px", "expected"), [
-    (1, 1, 1, Counts(tp=1)), (0, 1, 1, Counts(fn=1)), (1, 0, 1, Counts(fp=1)), (0, 0, 1, Counts(tn=1)),
-    (5, 3, 4, Counts(unknown=1)), (3, 0, 4, Counts(tn=1)), (3, 5, 4, Counts(fn=1)), (4, 4, 4, Counts(tp=1)),
-])
+@pytest.mark.parametrize(
+    ("seen", "there", "least_px", "expected"),
+    [
+        (1, 1, 1, Counts(tp=1)),
+        (0, 1, 1, Counts(fn=1)),
+        (1, 0, 1, Counts(fp=1)),
+        (0, 0, 1, Counts(tn=1)),
+        (5, 3, 4, Counts(unknown=1)),
+        (3, 0, 4, Counts(tn=1)),
+        (3, 5, 4, Counts(fn=1)),
+        (4, 4, 4, Counts(tp=1)),
+    ],
+)
 def test_a_frame_is_positive_from_so_many_pixels_on(seen, there, least_px, expected):
     masks = np.zeros((2, 30), bool)
     masks[0, :seen] = masks[1, :there] = True
@@ -100,11 +114,16 @@ def test_masks_of_different_size_are_refused():
 
 def test_each_event_ends_in_exactly_one_place():
     trues = [
-        true("found", (0, 0)), true("missed", (10, 0)), true("hidden", (20, 0), must_find=False),
+        true("found", (0, 0)),
+        true("missed", (10, 0)),
+        true("hidden", (20, 0), must_find=False),
         true("seen by luck", (30, 0), must_find=False),
     ]
     reports = [
-        found("right", (0.1, 0.0)), found("again", (0.3, 0.2)), found("nothing", (50, 0)), found("luck", (30, 0)),
+        found("right", (0.1, 0.0)),
+        found("again", (0.3, 0.2)),
+        found("nothing", (50, 0)),
+        found("luck", (30, 0)),
     ]
     match = match_events(reports, trues)
     assert [(pair.true.id, pair.found.id) for pair in match.pairs] == [("found", "right")]
@@ -114,13 +133,21 @@ def test_each_event_ends_in_exactly_one_place():
     assert [each.id for each in match.false] == ["nothing"]
     assert [each.id for each in match.optional] == ["luck"]
     scores = score_events(match, 5000.0)
-    assert (scores.must_find, scores.found, scores.twice, scores.false, scores.optional) == (2, 1, 1, 1, 1)
+    assert (scores.must_find, scores.found, scores.twice, scores.false, scores.optional) == (
+        2,
+        1,
+        1,
+        1,
+        1,
+    )
     assert scores.found_share == 0.5
     assert scores.false_per_hectare == pytest.approx(2.0)
 
 
-@given(st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), max_size=6),
-       st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.booleans()), max_size=6))
+@given(
+    st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), max_size=6),
+    st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3), st.booleans()), max_size=6),
+)
 def test_no_report_and_no_truth_is_lost(reports, truths):
     match = match_events(
         [found(str(i), at) for i, at in enumerate(reports)],
@@ -143,7 +170,9 @@ def test_near_means_touching_or_within_half_the_length():
 
 
 def test_crossing_outlines_touch_though_no_corner_lies_in_the_other():
-    across = FoundEvent("a", APPEARED, np.array([[-0.1, -9.0], [0.1, -9.0], [0.1, 5.0], [-0.1, 5.0]]))
+    across = FoundEvent(
+        "a", APPEARED, np.array([[-0.1, -9.0], [0.1, -9.0], [0.1, 5.0], [-0.1, 5.0]])
+    )
     assert match_events([across], [true("b", (0, 0))]).pairs
 
 
@@ -167,9 +196,13 @@ def test_what_moves_is_found_anywhere_on_its_path():
     assert math.isnan(score_events(match, 1e4).error_median_m)  # its place is not one place
 
 
-@pytest.mark.parametrize(("announced_s", "judged", "late"), [(10.4, 1, 0), (11.3, 1, 0), (11.5, 1, 1), (None, 0, 0)])
+@pytest.mark.parametrize(
+    ("announced_s", "judged", "late"), [(10.4, 1, 0), (11.3, 1, 0), (11.5, 1, 1), (None, 0, 0)]
+)
 def test_late_is_more_than_a_second_after_the_third_clear_view(announced_s, judged, late):
-    scores = score_events(match_events([found("a", (0, 0), announced_s=announced_s)], [true("b", (0, 0))]), 1e4)
+    scores = score_events(
+        match_events([found("a", (0, 0), announced_s=announced_s)], [true("b", (0, 0))]), 1e4
+    )
     assert (scores.judged_late, scores.late) == (judged, late)
 
 
@@ -177,7 +210,8 @@ def test_errors_and_what_sigma_claims():
     trues = [true(str(i), (10 * i, 0)) for i in range(4)]
     errors = [(0.1, 0.0), (0.0, 0.3), (0.0, 0.0), (0.25, 0.25)]
     reports = [
-        found(str(i), (10 * i + x, y), sigma_m=0.1 if i < 3 else math.nan) for i, (x, y) in enumerate(errors)
+        found(str(i), (10 * i + x, y), sigma_m=0.1 if i < 3 else math.nan)
+        for i, (x, y) in enumerate(errors)
     ]
     scores = score_events(match_events(reports, trues), 1e4)
     assert scores.error_median_m == pytest.approx(0.2)

@@ -13,9 +13,22 @@ FRAMES_M = np.array([[[0.0, 0.0], [40, 0], [40, 30], [0, 30]]] * 3)
 SEARCHED = SearchedFrames(FRAMES_M)
 
 
-def car(name: str, east_m: float, north_m: float, *, length_m: float = 4.5, moving: bool = False) -> MapObject:
+def car(
+    name: str, east_m: float, north_m: float, *, length_m: float = 4.5, moving: bool = False
+) -> MapObject:
     return MapObject(
-        name, "car", 0.9, np.array([east_m, north_m]), 0.3, length_m, 1.8, 3, 3, 0, 9, moving=moving,
+        name,
+        "car",
+        0.9,
+        np.array([east_m, north_m]),
+        0.3,
+        length_m,
+        1.8,
+        3,
+        3,
+        0,
+        9,
+        moving=moving,
     )
 
 
@@ -38,7 +51,9 @@ def test_where_the_other_date_was_not_searched_nothing_is_known(frames_m: np.nda
 
 def test_what_moves_or_has_no_size_is_left_out_and_hides_nothing() -> None:
     moves, sizeless = car("moves", 30, 10, moving=True), car("sizeless", 20, 10, length_m=np.nan)
-    assert names(SearchedGround([], [SEARCHED]), SearchedGround([moves, sizeless], [SEARCHED])) == {}
+    assert (
+        names(SearchedGround([], [SEARCHED]), SearchedGround([moves, sizeless], [SEARCHED])) == {}
+    )
     stands = car("stands", 30, 10)
     assert names(SearchedGround([moves], [SEARCHED]), SearchedGround([stands], [SEARCHED])) == {
         "stands": ChangeKind.APPEARED
@@ -49,11 +64,22 @@ def test_two_frames_must_show_a_place_and_one_is_enough_where_there_is_only_one(
     places_m = np.array([[5.0, 5], [50, 5], [35, 5]])
     beside_m = FRAMES_M[:1] + np.array([30.0, 0])
     cars = ["car"] * 3
-    two, one = SearchedFrames(np.concatenate([FRAMES_M[:1], beside_m])), SearchedFrames(FRAMES_M[:1])
+    two, one = (
+        SearchedFrames(np.concatenate([FRAMES_M[:1], beside_m])),
+        SearchedFrames(FRAMES_M[:1]),
+    )
     assert looked_at(places_m, cars, [two]).tolist() == [False, False, True]
     assert looked_at(places_m, cars, [one]).tolist() == [True, False, True]
-    assert looked_at(places_m, cars, [one, SearchedFrames(beside_m)]).tolist() == [False, False, True]
-    assert looked_at(places_m, cars, [SearchedFrames(np.zeros((0, 4, 2)))]).tolist() == [False, False, False]
+    assert looked_at(places_m, cars, [one, SearchedFrames(beside_m)]).tolist() == [
+        False,
+        False,
+        True,
+    ]
+    assert looked_at(places_m, cars, [SearchedFrames(np.zeros((0, 4, 2)))]).tolist() == [
+        False,
+        False,
+        False,
+    ]
 
 
 def test_a_class_that_was_not_looked_for_is_not_gone() -> None:
@@ -63,10 +89,13 @@ def test_a_class_that_was_not_looked_for_is_not_gone() -> None:
     before = SearchedGround([person, car("left", 10, 10)], [SEARCHED])
     assert names(before, SearchedGround([], [coarse])) == {"left": ChangeKind.DISAPPEARED}
     assert names(before, SearchedGround([], [SEARCHED])) == {
-        "person": ChangeKind.DISAPPEARED, "left": ChangeKind.DISAPPEARED
+        "person": ChangeKind.DISAPPEARED,
+        "left": ChangeKind.DISAPPEARED,
     }
     assert names(SearchedGround([], [coarse]), before) == {"left": ChangeKind.APPEARED}
-    assert looked_at(np.array([[20.0, 10]]), ["truck"], [coarse]).tolist() == [False], "of no name at all"
+    assert looked_at(np.array([[20.0, 10]]), ["truck"], [coarse]).tolist() == [False], (
+        "of no name at all"
+    )
 
 
 def test_what_is_longer_may_lie_farther_from_where_it_was() -> None:

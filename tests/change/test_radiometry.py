@@ -20,7 +20,9 @@ def textured(seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize("gamma", [0.75, 1.0, 1.3])
 @pytest.mark.parametrize("gains", [(0.7, 0.7, 0.7), (1.1, 1.0, 0.85)])
-def test_gamma_and_white_balance_are_undone(gamma: float, gains: tuple[float, float, float]) -> None:
+def test_gamma_and_white_balance_are_undone(
+    gamma: float, gains: tuple[float, float, float]
+) -> None:
     before = textured(1)
     after = np.clip(255 * (before / 255.0) ** gamma * gains + 0.5, 0, 255).astype(np.uint8)
     difference = np.abs(relit(before, fit_light(before, after)).astype(int) - after)
@@ -58,7 +60,10 @@ def test_a_thing_is_not_followed_however_large(side: int) -> None:
     after[100 : 100 + side, 150 : 150 + side] = (30, 28, 26)
     lit = relit(before, fit_light(before, after)).astype(int)
     inside = np.s_[100 : 100 + side, 150 : 150 + side]
-    assert np.abs(lit[inside] - before[inside]).mean() < 0.2 * np.abs(before[inside].astype(int) - 28).mean()
+    assert (
+        np.abs(lit[inside] - before[inside]).mean()
+        < 0.2 * np.abs(before[inside].astype(int) - 28).mean()
+    )
 
 
 def test_unknown_ground_does_not_count() -> None:

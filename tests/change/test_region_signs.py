@@ -16,7 +16,9 @@ def signs(reference: np.ndarray, query: np.ndarray) -> dict[str, float]:
     return dict(zip(FEATURES, regions.features[np.argmax(regions.features[:, 0])]))
 
 
-def test_a_shadow_keeps_the_structure_of_its_ground_and_a_thing_hides_it(ground: np.ndarray) -> None:
+def test_a_shadow_keeps_the_structure_of_its_ground_and_a_thing_hides_it(
+    ground: np.ndarray,
+) -> None:
     shaded, covered = ground.copy(), ground.copy()
     narrow = np.s_[140:156, 180:280]  # wide ones are taken for light
     shaded[narrow] = (shaded[narrow] * 0.5).astype(np.uint8)
@@ -39,8 +41,11 @@ def test_a_things_rim_is_sharp_and_a_clouds_is_not(ground: np.ndarray) -> None:
 
 def test_wind_over_a_smooth_lawn_is_no_change_and_hides_no_thing() -> None:
     lawn = np.full((360, 480, 3), (105, 185, 95), np.uint8)
-    noise = cv2.resize(np.random.default_rng(4).normal(0, 1, (72, 96)).astype(np.float32), (480, 360),
-                       interpolation=cv2.INTER_CUBIC)
+    noise = cv2.resize(
+        np.random.default_rng(4).normal(0, 1, (72, 96)).astype(np.float32),
+        (480, 360),
+        interpolation=cv2.INTER_CUBIC,
+    )
     waved = lawn * (1 + 0.06 * noise[..., None])
     assert not compare_robust(camera(lawn, 1), camera(waved, 2)).mask.any()
     waved[150:178, 200:244] = (60, 60, 200)

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sorvolo.change.evidence.cells import CellGrid, CellWindow, LaidView, lay
-from sorvolo.change.shape.outlines import KnownPlace, is_known, mask_of, measures, outline_of, overlap
+from sorvolo.change.shape.outlines import (
+    KnownPlace,
+    is_known,
+    mask_of,
+    measures,
+    outline_of,
+    overlap,
+)
 from sorvolo.change.shape.patches import PatchWindow, cut, moved
 from sorvolo.survey.findings import ChangeKind
 
@@ -72,12 +79,21 @@ def test_patch_windows_hold_the_thing_with_its_surroundings_and_stay_small():
 
 
 def test_a_cut_shows_the_ground_at_its_place_and_nothing_where_nothing_is_known():
-    view = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [Thing(1, 1, colour=(250, 0, 0))], hole_m=(-3, -3, 0, 3))
+    view = view_of(
+        0, 0, (0, 0, CAMERA_HEIGHT_M), [Thing(1, 1, colour=(250, 0, 0))], hole_m=(-3, -3, 0, 3)
+    )
     window = PatchWindow.around(np.array([0.0, 0.0]), np.array([2.0, 2.0]), 0.05, 512)
     pictures = cut(view, window)
-    inside = mask_of(square(0.6, 0.6, 0.8), window.site_from_patch, (window.height_px, window.width_px))
-    assert np.median(pictures.after[inside][:, 0]) > 240 and np.median(pictures.before[inside][:, 0]) < 200
-    unknown = mask_of(square(-0.9, 0.2, 0.8), window.site_from_patch, (window.height_px, window.width_px))
+    inside = mask_of(
+        square(0.6, 0.6, 0.8), window.site_from_patch, (window.height_px, window.width_px)
+    )
+    assert (
+        np.median(pictures.after[inside][:, 0]) > 240
+        and np.median(pictures.before[inside][:, 0]) < 200
+    )
+    unknown = mask_of(
+        square(-0.9, 0.2, 0.8), window.site_from_patch, (window.height_px, window.width_px)
+    )
     assert (pictures.after[unknown] == 0).all() and (pictures.after[inside][:, 3] == 255).all()
 
 
@@ -98,13 +114,19 @@ def test_a_piece_that_only_its_shadow_leaves_is_whole():
     seen = np.ones((20, 20), bool)
     seen[:4] = False
     flags = np.zeros_like(seen)
-    flags[4:12, 3:6] = flags[4:12, 9:12] = flags[8:12, 15:18] = True  # two of three reach the view's rim
+    flags[4:12, 3:6] = flags[4:12, 9:12] = flags[8:12, 15:18] = (
+        True  # two of three reach the view's rim
+    )
     shaded = np.zeros_like(seen)
     shaded[:9, 3:6] = True
     laid = laid_of(flags, seen, CellWindow(0, 0, 20, 20))
     assert np.array_equal(np.flatnonzero(laid.cut_off.any(axis=0)), [3, 4, 5, 9, 10, 11])
-    assert np.array_equal(np.flatnonzero(replace(laid, shaded=shaded).cut_off.any(axis=0)), [9, 10, 11])
-    all_shade = replace(laid, shaded=np.ones_like(seen))  # a dark wall: no shadow of anything that is seen
+    assert np.array_equal(
+        np.flatnonzero(replace(laid, shaded=shaded).cut_off.any(axis=0)), [9, 10, 11]
+    )
+    all_shade = replace(
+        laid, shaded=np.ones_like(seen)
+    )  # a dark wall: no shadow of anything that is seen
     assert np.array_equal(all_shade.cut_off, laid.cut_off)
 
 
@@ -138,8 +160,16 @@ def test_ground_where_nothing_changes_costs_no_memory_and_the_oldest_goes_first(
 
 def test_an_oblique_view_sees_no_ground_behind_its_horizon():
     view = view_of(0, 0, (0, 0, CAMERA_HEIGHT_M), [])
-    tilted = np.array([[1, 0, -160], [0, -1, 0], [0, 0.02, -0.6]], float)  # the horizon is at row 30
-    laid = lay(replace(view, site_from_image=tilted), 0.15, np.zeros(0, bool), np.zeros(0, bool), np.zeros(0, int))
+    tilted = np.array(
+        [[1, 0, -160], [0, -1, 0], [0, 0.02, -0.6]], float
+    )  # the horizon is at row 30
+    laid = lay(
+        replace(view, site_from_image=tilted),
+        0.15,
+        np.zeros(0, bool),
+        np.zeros(0, bool),
+        np.zeros(0, int),
+    )
     assert max(laid.window.shape) <= 2 * 5 * CAMERA_HEIGHT_M / 0.15 + 2
     rows = np.nonzero(laid.seen.any(axis=1))[0]
     assert len(rows)

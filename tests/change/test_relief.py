@@ -29,7 +29,9 @@ def colour(x, y):
 def seen(centre) -> tuple[np.ndarray, np.ndarray]:
     """The picture from a place, and which of its pixels show the roof: each ray ends on the roof or on the ground."""
     x, y = np.meshgrid(np.arange(CAMERA.width_px), np.arange(CAMERA.height_px))
-    rays = CAMERA.rays_from_pixels(np.column_stack([x.ravel(), y.ravel()])) @ NADIR_CAMERA_NORTH_UP.T
+    rays = (
+        CAMERA.rays_from_pixels(np.column_stack([x.ravel(), y.ravel()])) @ NADIR_CAMERA_NORTH_UP.T
+    )
     rays = rays / -rays[:, 2:]
     ground, wall = np.zeros((len(rays), 2)), np.zeros(len(rays), bool)
     ground[:] = (centre + rays * centre[2])[:, :2]
@@ -57,7 +59,7 @@ def rendered(over: Relief | None):
     known = EarlierPicture(CAMERA, site_from_image_homography(CAMERA, pose), pose)
     earlier = EarlierPictures([known], lambda _: with_known_pixels(picture), over)
     later = site_from_image_homography(CAMERA, Pose(NADIR_CAMERA_NORTH_UP, LATER))
-    (bgr, sees), = earlier.seen_from(later, LATER, CAMERA.width_px, CAMERA.height_px, 1)
+    ((bgr, sees),) = earlier.seen_from(later, LATER, CAMERA.width_px, CAMERA.height_px, 1)
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB).astype(int), sees
 
 
@@ -78,11 +80,17 @@ def test_from_where_earlier_pictures_show_a_place() -> None:
     assert both is not None and both.shows == (1, 0) and both.apart_m == pytest.approx(3.0)
     assert both.earlier_m == pytest.approx(EARLIER + np.array([6.0, 0, 0]))
     assert both.later_m == pytest.approx(cameras[1])
-    corners_m = apply_homography(pictures[0].site_from_image, np.array([[0.0, 0], [CAMERA.width_px, 0]]))
+    corners_m = apply_homography(
+        pictures[0].site_from_image, np.array([[0.0, 0], [CAMERA.width_px, 0]])
+    )
     # 1.5 m from the west edge of the first, which the second one does not reach
     first_alone = place - np.array([np.ptp(corners_m[:, 0]) / 2 - 1.5, 0])
     alone = earlier.vantage(first_alone, cameras)
-    assert alone is not None and alone.shows == (0,) and alone.apart_m == pytest.approx(np.hypot(3.5, 4.0))
+    assert (
+        alone is not None
+        and alone.shows == (0,)
+        and alone.apart_m == pytest.approx(np.hypot(3.5, 4.0))
+    )
     assert earlier.vantage(place + np.array([1000.0, 0]), cameras) is None
 
 

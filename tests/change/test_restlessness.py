@@ -77,7 +77,9 @@ def photos_among(ghosts: int, photos: int = 3, **how: object) -> EvidenceMap:
         places = rng.uniform([-7, -4], [7, 4], (2 * ghosts, 2))
         places = places[np.hypot(*places.T) > 1.5][:ghosts]
         around = [Thing(*place, (0.4, 0.4), colour=(40, 40, 200)) for place in places]
-        evidence.add(view_of(i, 1.4 * i, (-1 + i, 0, CAMERA_HEIGHT_M), [Thing(0, 0), *around], **how))
+        evidence.add(
+            view_of(i, 1.4 * i, (-1 + i, 0, CAMERA_HEIGHT_M), [Thing(0, 0), *around], **how)
+        )
     return evidence
 
 

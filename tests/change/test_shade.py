@@ -25,7 +25,9 @@ def test_a_shadow_that_came_is_shade_and_a_thing_is_not(light):
     image = reference * np.array(light)
     image[SHADOW] *= [0.4, 0.45, 0.52]
     image[THING] = [190, 60, 50]
-    shade = shade_of_view(reference, np.clip(image, 0, 255).astype(np.uint8), np.ones((360, 640), bool))
+    shade = shade_of_view(
+        reference, np.clip(image, 0, 255).astype(np.uint8), np.ones((360, 640), bool)
+    )
     assert ((shade[SHADOW] & Shade.LATER_DARK) > 0).mean() > 0.98
     assert not (shade[THING] & (Shade.LATER | Shade.EARLIER)).any()
     far = shade[:, 400:]
@@ -42,7 +44,9 @@ def test_unknown_ground_has_no_shade():
 @settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), most=st.integers(1, 255))
 def test_swapping_the_dates_swaps_the_bits_and_dark_is_no_brighter(seed, most):
-    before, after = np.random.default_rng(seed).integers(0, most + 1, (2, 12, 16, 3)).astype(np.uint8)
+    before, after = (
+        np.random.default_rng(seed).integers(0, most + 1, (2, 12, 16, 3)).astype(np.uint8)
+    )
     one, other = shade_between(before, after), shade_between(after, before)
     for bit, swapped in ((Shade.LATER, Shade.EARLIER), (Shade.LATER_DARK, Shade.EARLIER_DARK)):
         assert (((one & bit) > 0) == ((other & swapped) > 0)).all()

@@ -14,9 +14,15 @@ SUN_OVER_SHADE = np.array([0.52, 0.45, 0.4])  # blue green red: a shadow is a li
 def ground(seed: int = 1) -> np.ndarray:
     """(360, 480, 3) uint8 rough grass."""
     rng = np.random.default_rng(seed)
-    grain = sum(cv2.resize(rng.normal(0, 9, (360 // k, 480 // k)), (480, 360), interpolation=cv2.INTER_CUBIC)
-                for k in (2, 4, 10))
-    return np.clip(np.array([60, 120, 90]) + grain[..., None] * [0.6, 1.0, 0.8], 0, 255).astype(np.uint8)
+    grain = sum(
+        cv2.resize(
+            rng.normal(0, 9, (360 // k, 480 // k)), (480, 360), interpolation=cv2.INTER_CUBIC
+        )
+        for k in (2, 4, 10)
+    )
+    return np.clip(np.array([60, 120, 90]) + grain[..., None] * [0.6, 1.0, 0.8], 0, 255).astype(
+        np.uint8
+    )
 
 
 def shaded(image: np.ndarray, place: tuple[int, int]) -> np.ndarray:
@@ -36,7 +42,9 @@ def test_a_shadow_that_moved_is_no_change() -> None:
     assert np.median(apart[150:220, 200:250]) <= 6 and np.percentile(apart, 99) < 30
 
 
-@pytest.mark.parametrize("place", [(172, 150), (262, 165), (400, 300)], ids=["left", "came", "elsewhere"])
+@pytest.mark.parametrize(
+    "place", [(172, 150), (262, 165), (400, 300)], ids=["left", "came", "elsewhere"]
+)
 def test_a_thing_where_a_shadow_moved_is_found(place: tuple[int, int]) -> None:
     before, after = shaded(ground(), (200, 180)), shaded(ground(), (250, 190))
     x, y = place
@@ -52,7 +60,9 @@ def test_a_thing_where_a_shadow_moved_is_found(place: tuple[int, int]) -> None:
 def test_a_dark_thing_hides_the_grounds_structure_and_is_no_shadow() -> None:
     before = ground()
     after = before.copy()
-    after[150:220, 200:300] = (before[150:220, 200:300].mean(axis=(0, 1)) * SUN_OVER_SHADE).astype(np.uint8)
+    after[150:220, 200:300] = (before[150:220, 200:300].mean(axis=(0, 1)) * SUN_OVER_SHADE).astype(
+        np.uint8
+    )
     assert fit_light(before, after).shades is None
     assert np.count_nonzero(compare_robust(before, after).mask[150:220, 200:300]) > 0.8 * 70 * 100
 

@@ -20,12 +20,16 @@ def patch_with(*painted: tuple[slice, slice, tuple[int, int, int]]) -> Patch:
     after, changed = before.copy(), np.zeros((100, 200), bool)
     for rows, columns, colour in painted:
         after[rows, columns, :3], changed[rows, columns] = colour, True
-    return shaded(Patch(0.0, 0.0, M_PER_PX, before, after, changed, np.zeros(changed.shape, np.uint8)))
+    return shaded(
+        Patch(0.0, 0.0, M_PER_PX, before, after, changed, np.zeros(changed.shape, np.uint8))
+    )
 
 
 def shaded(patch: Patch) -> Patch:
     """The patch with the shade of its pictures as they are now."""
-    return replace(patch, shade=shade_between(patch.before[..., :3].copy(), patch.after[..., :3].copy()))
+    return replace(
+        patch, shade=shade_between(patch.before[..., :3].copy(), patch.after[..., :3].copy())
+    )
 
 
 def test_specks_at_the_rim_of_a_shadow_do_not_stretch_the_thing():
@@ -44,12 +48,15 @@ def test_specks_that_count_as_well_do_not_make_the_shadow_part_of_the_thing():
     changed[5:55, 5:15] = True
     shadow = changed.copy()
     shadow[5:15] = False
-    assert np.array_equal(thing_of(changed, shadow, ThingSettings(least_piece=0.0)), thing_of(changed, shadow))
+    assert np.array_equal(
+        thing_of(changed, shadow, ThingSettings(least_piece=0.0)), thing_of(changed, shadow)
+    )
 
 
 def test_two_things_joined_by_a_shadow_are_two_with_kinds_of_their_own():
     patch = patch_with(
-        (np.s_[40:50], np.s_[60:100], SHADOW), (np.s_[40:50], np.s_[50:60], (220, 40, 40)),
+        (np.s_[40:50], np.s_[60:100], SHADOW),
+        (np.s_[40:50], np.s_[50:60], (220, 40, 40)),
         (np.s_[38:52], np.s_[100:112], (40, 60, 230)),
     )
     patch.before[38:52, 100:112, :3], patch.after[38:52, 100:112, :3] = (40, 60, 230), 110
@@ -101,7 +108,9 @@ def test_dark_pieces_far_enough_apart_are_things_of_their_own(gap_px, count):
 def test_lit_specks_of_a_dark_car_are_no_things_of_their_own():
     specks = [
         (np.s_[y : y + 4, x : x + 4], (40, 58, 90))
-        for columns in (range(24, 56, 9), range(80, 112, 9)) for x in columns for y in range(30, 60, 9)
+        for columns in (range(24, 56, 9), range(80, 112, 9))
+        for x in columns
+        for y in range(30, 60, 9)
     ]
     walker = (np.s_[44:54], np.s_[150:156], (240, 240, 60))
     patch = patch_with((np.s_[20:70], np.s_[20:150], SHADOW), walker)
@@ -119,9 +128,12 @@ def test_people_whose_shadows_join_them_are_two():
 
 
 @pytest.mark.parametrize("gap_m", [1.2, 2.0])
-def test_neighbours_in_a_shadow_are_announced_as_two_while_the_flight_lasts_and_keep_their_ids(gap_m):
+def test_neighbours_in_a_shadow_are_announced_as_two_while_the_flight_lasts_and_keep_their_ids(
+    gap_m,
+):
     things = [
-        Thing(0.5 + gap_m / 2, 0, (gap_m, 0.4), colour=SHADOW), Thing(0.2, 0, (0.6, 0.6)),
+        Thing(0.5 + gap_m / 2, 0, (gap_m, 0.4), colour=SHADOW),
+        Thing(0.2, 0, (0.6, 0.6)),
         Thing(1.05 + gap_m, 0, (0.5, 0.5), colour=(40, 60, 230)),
     ]
     evidence = EvidenceMap(M_PER_PX, EvidenceSettings(), "f")
@@ -129,5 +141,7 @@ def test_neighbours_in_a_shadow_are_announced_as_two_while_the_flight_lasts_and_
     final = evidence.conclude()
     assert [each.id for each in announced] == [each.id for each in final] == ["f-1", "f-2"]
     assert [each.id for each in evidence.conclude()] == ["f-1", "f-2"]
-    whole_in_view_s = (1.3 + gap_m) / 3  # a drone that flies 3 m/s sees just what it flies over at the start
+    whole_in_view_s = (
+        1.3 + gap_m
+    ) / 3  # a drone that flies 3 m/s sees just what it flies over at the start
     assert all((change.announced_ns - START_NS) * 1e-9 < whole_in_view_s + 1.0 for change in final)

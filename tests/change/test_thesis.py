@@ -20,19 +20,25 @@ from sorvolo.change.pair.thesis import (
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.kernels import numpy_thesis as twins
 
-SMALL = ThesisSettings(averaging_px=(4, 3), pattern_px=(5, 4), isolation_px=(6, 7), area_share=0.02, gray_threshold=30)
+SMALL = ThesisSettings(
+    averaging_px=(4, 3), pattern_px=(5, 4), isolation_px=(6, 7), area_share=0.02, gray_threshold=30
+)
 
 
 def pair(seed: int, size: tuple[int, int]) -> tuple[Any, Any]:
     """A textured ground, and the same with other things on it, in other light."""
     rng = np.random.default_rng(seed)
     height, width = size
-    ground = cv2.blur(rng.integers(0, 256, (height, width, 3), np.uint8), (3, 3)).reshape(height, width, 3)
+    ground = cv2.blur(rng.integers(0, 256, (height, width, 3), np.uint8), (3, 3)).reshape(
+        height, width, 3
+    )
     later = np.clip(ground * rng.uniform(0.6, 1.2) + rng.uniform(-20, 20), 0, 255).astype(np.uint8)
     for _ in range(rng.integers(0, 4)):
         x, y = rng.integers(0, width), rng.integers(0, height)
         thing = later[y : y + rng.integers(1, 30), x : x + rng.integers(1, 30)]
-        thing[:] = rng.integers(0, 256, thing.shape) if rng.random() < 0.5 else rng.integers(0, 256, 3)
+        thing[:] = (
+            rng.integers(0, 256, thing.shape) if rng.random() < 0.5 else rng.integers(0, 256, 3)
+        )
     return ground, later
 
 
@@ -45,24 +51,36 @@ def holes(seed: int, size: tuple[int, int]) -> Any:
     return valid
 
 
-def by_the_text(before: Any, after: Any, parameters: ThesisSettings) -> tuple[Any, list[tuple[int, ...]]]:
+def by_the_text(
+    before: Any, after: Any, parameters: ThesisSettings
+) -> tuple[Any, list[tuple[int, ...]]]:
     """Section 3.2 pixel by pixel, with nothing of ours but the equalisation's tables."""
     height, width = before.shape[:2]
 
     def around(image: Any, y: int, x: int, window: tuple[int, int]) -> Any:
         rows = range(y - window[1] // 2, y - window[1] // 2 + window[1])
         columns = range(x - window[0] // 2, x - window[0] // 2 + window[0])
-        where = [[cv2.borderInterpolate(at, size, cv2.BORDER_REFLECT_101) for at in run]
-                 for run, size in ((rows, height), (columns, width))]
+        where = [
+            [cv2.borderInterpolate(at, size, cv2.BORDER_REFLECT_101) for at in run]
+            for run, size in ((rows, height), (columns, width))
+        ]
         return image[np.ix_(*where)].astype(int)
 
     equalised, averaged = [], []
     for image in (before, after):
         tables = twins.equalising_tables(image, None, 1)
         equal = np.stack([tables[c][image[..., c]] for c in range(3)], axis=-1)
-        mean = np.array([[
-            (around(equal, y, x, parameters.averaging_px).mean(axis=(0, 1)) + 0.5).astype(np.uint8)
-            for x in range(width)] for y in range(height)])
+        mean = np.array(
+            [
+                [
+                    (around(equal, y, x, parameters.averaging_px).mean(axis=(0, 1)) + 0.5).astype(
+                        np.uint8
+                    )
+                    for x in range(width)
+                ]
+                for y in range(height)
+            ]
+        )
         equalised.append(equal)
         averaged.append(mean)
     grays = [cv2.cvtColor(each, cv2.COLOR_BGR2GRAY).astype(int) for each in averaged]
@@ -71,23 +89,33 @@ def by_the_text(before: Any, after: Any, parameters: ThesisSettings) -> tuple[An
         for x in range(width):
             if abs(grays[0][y, x] - grays[1][y, x]) < parameters.gray_threshold:
                 continue
-            strings = [~(around(each, y, x, parameters.pattern_px) < each[y, x]) for each in averaged]
+            strings = [
+                ~(around(each, y, x, parameters.pattern_px) < each[y, x]) for each in averaged
+            ]
             if (strings[0] != strings[1]).sum() > parameters.hamming_share * strings[0].size:
                 difference[y, x] = 255
     mask = np.zeros_like(difference)
-    share = parameters.isolation_share if parameters.isolation_as_printed else 1 - parameters.isolation_share
+    share = (
+        parameters.isolation_share
+        if parameters.isolation_as_printed
+        else 1 - parameters.isolation_share
+    )
     for y in range(height):
         for x in range(width):
             window = around(difference, y, x, parameters.isolation_px)
             mask[y, x] = 0 if (window == 0).sum() > share * window.size else 255
     _, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     boxes = [tuple(int(value) for value in each[:4]) for each in stats[1:]]
-    for x, y, w, h in [each for each in boxes if each[2] * each[3] / mask.size < parameters.area_share]:
+    for x, y, w, h in [
+        each for each in boxes if each[2] * each[3] / mask.size < parameters.area_share
+    ]:
         mask[y : y + h, x : x + w] = 0
         boxes.remove((x, y, w, h))
     for x, y, w, h in list(boxes):
         counts = [
-            np.bincount(cv2.cvtColor(each, cv2.COLOR_BGR2GRAY)[y : y + h, x : x + w].ravel(), minlength=256)
+            np.bincount(
+                cv2.cvtColor(each, cv2.COLOR_BGR2GRAY)[y : y + h, x : x + w].ravel(), minlength=256
+            )
             for each in equalised
         ]
         means = [each.sum() / 256 for each in counts]
@@ -95,7 +123,11 @@ def by_the_text(before: Any, after: Any, parameters: ThesisSettings) -> tuple[An
         if np.sqrt(max(0.0, 1 - root)) < parameters.least_distance:
             mask[y : y + h, x : x + w] = 0
             boxes.remove((x, y, w, h))
-    return mask, sorted(each for each in boxes if mask[each[1] : each[1] + each[3], each[0] : each[0] + each[2]].any())
+    return mask, sorted(
+        each
+        for each in boxes
+        if mask[each[1] : each[1] + each[3], each[0] : each[0] + each[2]].any()
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -111,7 +143,12 @@ def test_every_pixel_is_as_the_text_has_it(seed: int, size: tuple[int, int], pri
 
 @pytest.mark.skipif(not kernels.COMPILED, reason="the kernels were not compiled here")
 @settings(max_examples=40, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.tuples(st.integers(1, 90), st.integers(1, 200)), st.booleans(), st.integers(1, 4))
+@given(
+    st.integers(0, 2**32 - 1),
+    st.tuples(st.integers(1, 90), st.integers(1, 200)),
+    st.booleans(),
+    st.integers(1, 4),
+)
 def test_compiled_and_numpy_agree_to_the_last_pixel(
     seed: int, size: tuple[int, int], with_holes: bool, threads: int
 ) -> None:
@@ -143,7 +180,12 @@ def test_a_new_car_is_found_and_nothing_else() -> None:
     assert (mask[60:90, 100:160] > 0).mean() > 0.8  # W_i rounds the corners off
     assert len(boxes) == 1
     x, y, width, height = boxes[0]
-    assert abs(x - 100) < 9 and abs(y - 60) < 9 and abs(x + width - 160) < 9 and abs(y + height - 90) < 9
+    assert (
+        abs(x - 100) < 9
+        and abs(y - 60) < 9
+        and abs(x + width - 160) < 9
+        and abs(y + height - 90) < 9
+    )
     assert set(np.unique(mask)) == {0, 255} and mask.dtype == np.uint8 and boxes.dtype == np.int64
     assert not compare_thesis(before, before).mask.any()
 
@@ -188,7 +230,10 @@ def test_steps_are_those_of_the_figure() -> None:
     steps = thesis_steps(before, after)
     pictures = steps.pictures()
     assert [name[0] for name in pictures] == list("abcdefgh")
-    assert all(picture.dtype == np.uint8 and picture.shape[:2] == (180, 240) for picture in pictures.values())
+    assert all(
+        picture.dtype == np.uint8 and picture.shape[:2] == (180, 240)
+        for picture in pictures.values()
+    )
     np.testing.assert_array_equal(steps.changes, compare_thesis(before, after).mask)
     hist = np.bincount(steps.query_equalised[..., 1].ravel(), minlength=256)
     assert np.abs(np.cumsum(hist) / hist.sum() - (np.arange(256) + 1) / 256).max() < 0.1
@@ -202,7 +247,9 @@ def test_distances_of_equation_3_22() -> None:
     assert bhattacharyya_distances(one, other)[0] == 1
     assert bhattacharyya_distances(0 * one, other)[0] == 0
     third = np.array([[2, 2, 3, 2]])
-    expected = cv2.compareHist(one[0].astype(np.float32), third[0].astype(np.float32), cv2.HISTCMP_BHATTACHARYYA)
+    expected = cv2.compareHist(
+        one[0].astype(np.float32), third[0].astype(np.float32), cv2.HISTCMP_BHATTACHARYYA
+    )
     assert bhattacharyya_distances(one, third)[0] == pytest.approx(expected, abs=1e-6)
 
 
@@ -211,8 +258,13 @@ def test_settings_are_those_of_table_4_2_and_checked() -> None:
     assert ThesisSettings().most_black == 1026
     assert ThesisSettings(isolation_as_printed=True).most_black == 342
     for wrong in (
-        {"averaging_px": (0, 10)}, {"pattern_px": (15, 200)}, {"isolation_px": 37}, {"hamming_share": 1.5},
-        {"least_distance": -0.1}, {"gray_threshold": 300}, {"area_share": float("nan")},
+        {"averaging_px": (0, 10)},
+        {"pattern_px": (15, 200)},
+        {"isolation_px": 37},
+        {"hamming_share": 1.5},
+        {"least_distance": -0.1},
+        {"gray_threshold": 300},
+        {"area_share": float("nan")},
     ):
         with pytest.raises(SettingsError, match=next(iter(wrong))):
             ThesisSettings(**wrong)  # type: ignore[arg-type]

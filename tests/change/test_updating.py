@@ -8,7 +8,9 @@ import pytest
 from sorvolo.change.map_update import is_painted, patched
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
-GRID_FROM_SITE = np.array([[20.0, 0, 0], [0, -20.0, 0], [0, 0, 1]])  # 0.05 m a pixel, pixel (0, 0) at the origin
+GRID_FROM_SITE = np.array(
+    [[20.0, 0, 0], [0, -20.0, 0], [0, 0, 1]]
+)  # 0.05 m a pixel, pixel (0, 0) at the origin
 WINDOW = (0, 0, 128, 128)
 
 

@@ -50,7 +50,9 @@ def test_who_does_not_see_the_place_is_not_asked():
 
 
 def test_what_lies_a_few_pixels_beside_is_the_same_and_announced_once():
-    found = believed((differing((30, 0.9)), ALL), [(differing((34, 0.9)), ALL), (differing((28, 0.8)), ALL)])
+    found = believed(
+        (differing((30, 0.9)), ALL), [(differing((34, 0.9)), ALL), (differing((28, 0.8)), ALL)]
+    )
     assert found.boxes.tolist() == [[30, 20, 10, 10]]
 
 

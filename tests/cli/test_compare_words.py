@@ -13,15 +13,25 @@ from sorvolo.missions.compare.report import comparison_headline
 COVERED = {
     "headline": {"quality": "compared", "text": "1 change in 100 m2; 20 m2 could not be compared"},
     "coverage": {
-        "compared_m2": 100.0, "not_compared_m2": 20.0, "gaps_m2": {"leaning": 19.5, "dark": 0.5}, "smallest_m": 0.3,
-        "faint_m": None, "large_found": 0.9, "faint_known": True, "is_enough": True,
+        "compared_m2": 100.0,
+        "not_compared_m2": 20.0,
+        "gaps_m2": {"leaning": 19.5, "dark": 0.5},
+        "smallest_m": 0.3,
+        "faint_m": None,
+        "large_found": 0.9,
+        "faint_known": True,
+        "is_enough": True,
     },
 }
 
 
 def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
+        "flight": "b",
+        "seconds": 9.0,
+        "peak_memory_mb": 300.0,
+        "warnings": [],
+        "notices": [],
         "changes": {"features": []},
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
         "withdrawn": ["b-4", "b-7"],
@@ -35,9 +45,14 @@ def test_withdrawn_changes_are_named(tmp_path: Path) -> None:
 
 def test_notices_and_the_report_are_shown_as_by_map(tmp_path: Path) -> None:
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "changes": {"features": []}, "withdrawn": [],
+        "flight": "b",
+        "seconds": 9.0,
+        "peak_memory_mb": 300.0,
+        "changes": {"features": []},
+        "withdrawn": [],
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
-        "notices": [{"code": "no_date", "count": 1, "text": "the table has no date"}], "warnings": ["look here"],
+        "notices": [{"code": "no_date", "count": 1, "text": "the table has no date"}],
+        "warnings": ["look here"],
     }
     console = Console(record=True, width=300, file=StringIO())
     show_results([result], tmp_path, console)
@@ -49,19 +64,45 @@ def test_notices_and_the_report_are_shown_as_by_map(tmp_path: Path) -> None:
 def test_how_much_the_map_grew_is_shown(tmp_path: Path) -> None:
     comparison = {"views": {"compared": 7, "outside": 5}, "reasons": {}, **COVERED}
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [],
+        "flight": "b",
+        "seconds": 9.0,
+        "peak_memory_mb": 300.0,
+        "warnings": [],
+        "notices": [],
         "changes": {"features": []},
-        "comparison": comparison | {"extension": {"frames": 3, "shown_as_well": 2, "area_m2": 350.4}}, "withdrawn": [],
+        "comparison": comparison
+        | {"extension": {"frames": 3, "shown_as_well": 2, "area_m2": 350.4}},
+        "withdrawn": [],
     }
     console = Console(record=True, width=120, file=StringIO())
     show_results([result], tmp_path, console)
-    assert "the map grew by 350 m2 from 3 frames; 2 more frames show the same ground" in console.export_text()
+    assert (
+        "the map grew by 350 m2 from 3 frames; 2 more frames show the same ground"
+        in console.export_text()
+    )
 
 
-@pytest.mark.parametrize(("georeference", "shown", "not_shown"), [
-    ({}, ["1 change in 100 m2", "length m", "latitude, longitude", "41.250000, 12.500000", "20 m2"], ["units"]),
-    ({"crs": None}, ["length units", "east, north", "12.5, 41.2", "20 square units"], ["latitude", "0.3 m"]),
-])
+@pytest.mark.parametrize(
+    ("georeference", "shown", "not_shown"),
+    [
+        (
+            {},
+            [
+                "1 change in 100 m2",
+                "length m",
+                "latitude, longitude",
+                "41.250000, 12.500000",
+                "20 m2",
+            ],
+            ["units"],
+        ),
+        (
+            {"crs": None},
+            ["length units", "east, north", "12.5, 41.2", "20 square units"],
+            ["latitude", "0.3 m"],
+        ),
+    ],
+)
 def test_a_map_without_metres_is_not_shown_in_metres(
     tmp_path: Path, georeference: dict, shown: list[str], not_shown: list[str]
 ) -> None:
@@ -69,12 +110,23 @@ def test_a_map_without_metres_is_not_shown_in_metres(
     change = {
         "geometry": {"coordinates": [ring]},
         "properties": {
-            "id": "b-1", "kind": "appeared", "length_m": 1.0, "sigma_m": 2.0, "views": 9, "score": 0.7,
-            "class_before": None, "class_after": None,
+            "id": "b-1",
+            "kind": "appeared",
+            "length_m": 1.0,
+            "sigma_m": 2.0,
+            "views": 9,
+            "score": 0.7,
+            "class_before": None,
+            "class_after": None,
         },
     }
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
+        "flight": "b",
+        "seconds": 9.0,
+        "peak_memory_mb": 300.0,
+        "warnings": [],
+        "notices": [],
+        "withdrawn": [],
         "changes": {"features": [change]} | georeference,
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
@@ -88,12 +140,26 @@ def test_a_map_without_metres_is_not_shown_in_metres(
 @pytest.mark.parametrize(("form", "place"), [("utm", "33T 29053"), ("mgrs", "33T TF 90533 69524")])
 def test_places_are_written_as_asked_for(tmp_path: Path, form: str, place: str) -> None:
     ring = [[12.4, 41.2], [12.6, 41.2], [12.6, 41.3], [12.4, 41.3], [12.4, 41.2]]
-    change = {"geometry": {"coordinates": [ring]}, "properties": {
-        "id": "b-1", "kind": "appeared", "length_m": 1.0, "sigma_m": 2.0, "views": 9, "score": 0.7,
-        "class_before": None, "class_after": "car",
-    }}
+    change = {
+        "geometry": {"coordinates": [ring]},
+        "properties": {
+            "id": "b-1",
+            "kind": "appeared",
+            "length_m": 1.0,
+            "sigma_m": 2.0,
+            "views": 9,
+            "score": 0.7,
+            "class_before": None,
+            "class_after": "car",
+        },
+    }
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
+        "flight": "b",
+        "seconds": 9.0,
+        "peak_memory_mb": 300.0,
+        "warnings": [],
+        "notices": [],
+        "withdrawn": [],
         "changes": {"features": [change]},
         "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
@@ -104,8 +170,14 @@ def test_places_are_written_as_asked_for(tmp_path: Path, form: str, place: str) 
 
 def test_what_was_not_compared_and_how_small_a_thing_is_found_are_shown(tmp_path: Path) -> None:
     result = {
-        "flight": "b", "seconds": 9.0, "peak_memory_mb": 300.0, "warnings": [], "notices": [], "withdrawn": [],
-        "changes": {"features": []}, "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
+        "flight": "b",
+        "seconds": 9.0,
+        "peak_memory_mb": 300.0,
+        "warnings": [],
+        "notices": [],
+        "withdrawn": [],
+        "changes": {"features": []},
+        "comparison": {"views": {"compared": 7}, "reasons": {}, **COVERED},
     }
     console = Console(record=True, width=200, file=StringIO())
     show_results([result], tmp_path, console)
@@ -115,21 +187,42 @@ def test_what_was_not_compared_and_how_small_a_thing_is_found_are_shown(tmp_path
     assert "plain ones are found from 0.3 m; faint ones are not found" in text
 
 
-@pytest.mark.parametrize(("changes", "compared_m2", "missing_m2", "other_m2", "is_enough", "text"), [
-    (0, 21_300.0, 4_100.0, 0.0, True, "0 changes in 2.1 ha; 0.4 ha could not be compared"),
-    (1, 340.0, 0.0, 120.0, True, "1 change in 340 m2; 0 m2 could not be compared"),
-    (8, 3_400.0, 0.0, 2_100.0, True,
-     "not to be relied on, most of the ground is another one now (snow, water, ploughing?), and what stands on it may "
-     "be missed: 8 changes in 0.3 ha; 0 m2 could not be compared"),
-    (0, 4_000.0, 21_000.0, 0.0, False,
-     "not to be relied on, most of the ground could not be compared: 0 changes in 0.4 ha; 2.1 ha could not be "
-     "compared"),
-])
+@pytest.mark.parametrize(
+    ("changes", "compared_m2", "missing_m2", "other_m2", "is_enough", "text"),
+    [
+        (0, 21_300.0, 4_100.0, 0.0, True, "0 changes in 2.1 ha; 0.4 ha could not be compared"),
+        (1, 340.0, 0.0, 120.0, True, "1 change in 340 m2; 0 m2 could not be compared"),
+        (
+            8,
+            3_400.0,
+            0.0,
+            2_100.0,
+            True,
+            "not to be relied on, most of the ground is another one now (snow, water, ploughing?), and what stands on it may "
+            "be missed: 8 changes in 0.3 ha; 0 m2 could not be compared",
+        ),
+        (
+            0,
+            4_000.0,
+            21_000.0,
+            0.0,
+            False,
+            "not to be relied on, most of the ground could not be compared: 0 changes in 0.4 ha; 2.1 ha could not be "
+            "compared",
+        ),
+    ],
+)
 def test_the_headline_never_speaks_of_ground_that_was_not_compared(
     changes: int, compared_m2: float, missing_m2: float, other_m2: float, is_enough: bool, text: str
 ) -> None:
     coverage = {
-        "compared_m2": compared_m2, "not_compared_m2": missing_m2, "is_enough": is_enough, "other_ground_m2": other_m2,
+        "compared_m2": compared_m2,
+        "not_compared_m2": missing_m2,
+        "is_enough": is_enough,
+        "other_ground_m2": other_m2,
     }
     headline = comparison_headline(changes, coverage, is_local=False)
-    assert headline == {"quality": "doubtful" if text.startswith("not to be") else "compared", "text": text}
+    assert headline == {
+        "quality": "doubtful" if text.startswith("not to be") else "compared",
+        "text": text,
+    }

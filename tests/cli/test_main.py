@@ -29,21 +29,30 @@ def test_module_is_the_command() -> None:
 
 
 @pytest.mark.parametrize(("wished", "threads"), [(None, "1"), ("3", "3")])
-def test_linear_algebra_has_one_thread_unless_wished_otherwise(wished: str | None, threads: str) -> None:
+def test_linear_algebra_has_one_thread_unless_wished_otherwise(
+    wished: str | None, threads: str
+) -> None:
     """SciPy is asked what it runs with, as NumPy's own library has no word for it."""
-    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    environment = {
+        name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"
+    }
     asked = (
         "import ctypes, pathlib\nfrom sorvolo.cli.main import main\nmain(['--version'])\nimport scipy, scipy.linalg\n"
         "library = next((pathlib.Path(scipy.__file__).parent.parent / 'scipy.libs').glob('*openblas*'))\n"
         "print(ctypes.CDLL(str(library)).scipy_openblas_get_num_threads())"
     )
     done = subprocess.run(
-        [sys.executable, "-c", asked], env=environment | ({"OPENBLAS_NUM_THREADS": wished} if wished else {}),
-        capture_output=True, text=True, check=False,
+        [sys.executable, "-c", asked],
+        env=environment | ({"OPENBLAS_NUM_THREADS": wished} if wished else {}),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if "StopIteration" in done.stderr or "undefined symbol" in done.stderr:
         pytest.skip("SciPy runs on another library than OpenBLAS")
-    assert done.stdout.splitlines()[-1:] == [str(min(int(threads), os.cpu_count() or 1))], done.stderr
+    assert done.stdout.splitlines()[-1:] == [str(min(int(threads), os.cpu_count() or 1))], (
+        done.stderr
+    )
 
 
 def test_missing_kernels_are_one_line() -> None:
@@ -53,9 +62,14 @@ def test_missing_kernels_are_one_line() -> None:
         "from sorvolo.cli.main import main\n"
         "sys.exit(main(['compare', 'no-such-video.mp4', '--site', 'no-such-site']))"
     )
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    run = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
     first, *others = run.stderr.splitlines()
-    assert first.startswith("warning: the compiled kernels are missing") and "reinstall sorvolo" in first
+    assert (
+        first.startswith("warning: the compiled kernels are missing")
+        and "reinstall sorvolo" in first
+    )
     assert run.returncode == 1 and len(others) == 1 and others[0].startswith("error: ")
 
 
@@ -72,7 +86,10 @@ sorvolo.cli.main.main = main
 
 def test_module_returns_its_code_wherever_ctrl_c_strikes(tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(_STRUCK)
-    command, environment = [sys.executable, "-m", "sorvolo"], {**os.environ, "PYTHONPATH": str(tmp_path)}
+    command, environment = (
+        [sys.executable, "-m", "sorvolo"],
+        {**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
     assert subprocess.run(command, env=environment, timeout=60, check=False).returncode == 130
 
 
@@ -91,8 +108,13 @@ sorvolo.cli.main.app.command()(work)
 
 def test_ctrl_c_is_not_lost_where_python_can_raise_nothing(tmp_path: Path) -> None:
     (tmp_path / "sitecustomize.py").write_text(_STRUCK_IN_A_CLEAN_UP)
-    command, environment = [sys.executable, "-m", "sorvolo"], {**os.environ, "PYTHONPATH": str(tmp_path)}
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    command, environment = (
+        [sys.executable, "-m", "sorvolo"],
+        {**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    run = subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=60, check=False
+    )
     assert run.returncode == 130
     assert run.stderr.startswith("stopped; ") and "Exception ignored" not in run.stderr
 
@@ -111,7 +133,8 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["nonsense"], ["map"], ["map", "x.mp4"], ["map", "x", "--site", "y", "--gsd", "z"]]
+    "arguments",
+    [["nonsense"], ["map"], ["map", "x.mp4"], ["map", "x", "--site", "y", "--gsd", "z"]],
 )
 def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(arguments) == 2
@@ -119,11 +142,18 @@ def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[st
     assert printed.out == "" and "Usage" in printed.err
 
 
-@pytest.mark.parametrize("arguments", [
-    ["inspect", "{gone}"], ["map", "{gone}", "--site", "{made}", "--model", "none"], ["watch", "{gone}"],
-    ["compare", "{gone}", "--site", "{made}"], ["simulate", "{file}"],
-    ["simulate", "{file}", "--pictures", "2"], ["simulate", "{file}", "--pictures", "2", "--json"],
-])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["inspect", "{gone}"],
+        ["map", "{gone}", "--site", "{made}", "--model", "none"],
+        ["watch", "{gone}"],
+        ["compare", "{gone}", "--site", "{made}"],
+        ["simulate", "{file}"],
+        ["simulate", "{file}", "--pictures", "2"],
+        ["simulate", "{file}", "--pictures", "2", "--json"],
+    ],
+)
 def test_an_error_is_one_line_on_stderr(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -132,7 +162,9 @@ def test_an_error_is_one_line_on_stderr(
     assert cli.main([each.format(**names) for each in arguments]) == 1
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert printed.err.startswith("error: ") and any(str(path) in printed.err for path in names.values())
+    assert printed.err.startswith("error: ") and any(
+        str(path) in printed.err for path in names.values()
+    )
     assert printed.err.count("\n") == 1 and "Traceback" not in printed.err
 
 
@@ -144,11 +176,14 @@ def test_nothing_is_left_of_a_map_that_could_not_begin(
     assert not (tmp_path / "site").exists()
 
 
-@pytest.mark.parametrize(("option", "value", "words"), [
-    ("--overlap", "1.5", "overlap must lie between 0 and 1, got 1.5"),
-    ("--gsd", "-1", "(--gsd) must lie in 1e-4 to 100 m, got -1.0"),
-    ("--offset", "1e9", "(--offset) must be a year of seconds at most, got 1000000000.0"),
-])
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--overlap", "1.5", "overlap must lie between 0 and 1, got 1.5"),
+        ("--gsd", "-1", "(--gsd) must lie in 1e-4 to 100 m, got -1.0"),
+        ("--offset", "1e9", "(--offset) must be a year of seconds at most, got 1000000000.0"),
+    ],
+)
 def test_settings_out_of_range_are_errors(
     option: str, value: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -156,10 +191,18 @@ def test_settings_out_of_range_are_errors(
     assert words in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", [
-    "watch x.mp4", "map x.mp4 --site SITE", "compare x.mp4 --site SITE", "search x.mp4 --site SITE",
-    "batch x.mp4 --root SITE --mission watch", "train x --out SITE", "evaluate detector default x",
-])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "watch x.mp4",
+        "map x.mp4 --site SITE",
+        "compare x.mp4 --site SITE",
+        "search x.mp4 --site SITE",
+        "batch x.mp4 --root SITE --mission watch",
+        "train x --out SITE",
+        "evaluate detector default x",
+    ],
+)
 @pytest.mark.parametrize("empty", ["", " ,"])
 def test_classes_that_name_none_are_an_error(
     command: str, empty: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -172,11 +215,15 @@ def test_classes_that_name_none_are_an_error(
     assert not site.exists()
 
 
-@pytest.mark.parametrize(("options", "words"), [
-    (["--thermal", "0.3"], "give their number with --pictures"), (["--ground", "urbn"], "none of dirt, countryside"),
-    (["--pictures", "3", "--preset", "survey", "--fps", "5"], "leave out --preset, --fps"),
-    (["--pictures", "3", "--gps-noise", "0"], "leave out --gps-noise"),
-])
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--thermal", "0.3"], "give their number with --pictures"),
+        (["--ground", "urbn"], "none of dirt, countryside"),
+        (["--pictures", "3", "--preset", "survey", "--fps", "5"], "leave out --preset, --fps"),
+        (["--pictures", "3", "--gps-noise", "0"], "leave out --gps-noise"),
+    ],
+)
 def test_simulate_leaves_no_option_unheard(
     options: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -226,11 +273,20 @@ class TestFailures:
         assert self._printed(InputError("no\nsuch  thing"), capsys) == (1, "error: no such thing\n")
 
     def test_full_disk(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, printed = self._printed(OSError(errno.ENOSPC, "No space left", "/full/tile.png"), capsys)
-        assert code == 1 and "disk is full" in printed and "/full/tile.png" in printed and printed.count("\n") == 1
+        code, printed = self._printed(
+            OSError(errno.ENOSPC, "No space left", "/full/tile.png"), capsys
+        )
+        assert (
+            code == 1
+            and "disk is full" in printed
+            and "/full/tile.png" in printed
+            and printed.count("\n") == 1
+        )
 
     def test_forbidden(self, capsys: pytest.CaptureFixture[str]) -> None:
-        code, printed = self._printed(PermissionError(errno.EACCES, "Permission denied", "/locked"), capsys)
+        code, printed = self._printed(
+            PermissionError(errno.EACCES, "Permission denied", "/locked"), capsys
+        )
         assert code == 1 and printed.startswith("error: /locked: Permission denied")
 
     def test_out_of_memory(self, capsys: pytest.CaptureFixture[str]) -> None:
@@ -254,7 +310,11 @@ class TestFailures:
 
     def test_stopped(self, capsys: pytest.CaptureFixture[str]) -> None:
         code, printed = self._printed(KeyboardInterrupt(), capsys)
-        assert code == 130 and printed == "stopped; unfinished work was discarded, everything before it is unchanged\n"
+        assert (
+            code == 130
+            and printed
+            == "stopped; unfinished work was discarded, everything before it is unchanged\n"
+        )
 
 
 def test_import_is_quick_and_lazy() -> None:

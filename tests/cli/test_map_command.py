@@ -25,7 +25,8 @@ from sorvolo.survey.mosaic import MosaicUpdate, Status
 def _settings() -> SimulationSettings:
     demo = preset("demo")
     return replace(
-        demo, flights=1,
+        demo,
+        flights=1,
         scene=replace(demo.scene, people=0, cars=0, small_objects=0, has_scenery=False),
         path=replace(demo.path, length_m=24, strips=1),
         imaging=replace(demo.imaging, width_px=480, height_px=270, fps=5),
@@ -44,14 +45,18 @@ def _arguments(simulated: Path, site: Path) -> list[str]:
     return ["map", "--model", "none", str(video), "--site", str(site), "--camera", str(camera)]
 
 
-def test_json_then_words(simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_then_words(
+    simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     site = tmp_path / "site"
     assert cli.main([*_arguments(simulated, site), "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert Path(printed["preview_png"]).is_file() and Path(printed["mosaic_tif"]).is_file()
     (report,) = printed["flights"]
     assert report["flight"] == "flight1" and "track" not in report
-    assert report["frames"]["selected"] == sum(report["frames"][status.value] for status in Status) > 2
+    assert (
+        report["frames"]["selected"] == sum(report["frames"][status.value] for status in Status) > 2
+    )
 
     assert cli.main(_arguments(simulated, site)) == 0
     words = capsys.readouterr().out
@@ -66,7 +71,9 @@ def test_json_then_words(simulated: Path, tmp_path: Path, capsys: pytest.Capture
 def test_a_stop_leaves_the_site_as_it_was(simulated: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     command = [sys.executable, "-m", "sorvolo", *_arguments(simulated, site)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
         deadline = time.monotonic() + 60
         while not (site / "site.db").exists() and time.monotonic() < deadline:
             time.sleep(0.02)
@@ -74,7 +81,10 @@ def test_a_stop_leaves_the_site_as_it_was(simulated: Path, tmp_path: Path) -> No
         out, err = running.communicate(timeout=60)
     assert running.returncode == 130, err
     assert out == ""
-    assert err.splitlines()[-1] == "stopped; unfinished work was discarded, everything before it is unchanged"
+    assert (
+        err.splitlines()[-1]
+        == "stopped; unfinished work was discarded, everything before it is unchanged"
+    )
     with Archive.open(site, write=False) as archive:
         assert not [flight for flight in archive.flights() if flight.status == "complete"]
 
@@ -89,10 +99,17 @@ def test_demo_takes_its_own_flights_again_and_no_others(simulated: Path, tmp_pat
 
 def test_demo_ends_with_the_address_of_a_station() -> None:
     *_, where, command = _next_steps(Path("demo-site"), Path("demo-site/site"))
-    assert "http://127.0.0.1:8750/" in where and command.split() == ["sorvolo", "serve", "demo-site", "--open"]
+    assert "http://127.0.0.1:8750/" in where and command.split() == [
+        "sorvolo",
+        "serve",
+        "demo-site",
+        "--open",
+    ]
 
 
-def test_demo_leaves_other_peoples_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_leaves_other_peoples_files(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     precious = tmp_path / "simulation" / "thesis.txt"
     precious.parent.mkdir()
     precious.write_text("years of work")

@@ -18,7 +18,9 @@ class Update:
     seconds: float
 
 
-def test_a_flight_is_sent_when_the_next_one_begins_however_late(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_is_sent_when_the_next_one_begins_however_late(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The first frame of a flight may take longer than all of a short flight before it."""
     events: list[str] = []
 
@@ -41,4 +43,10 @@ def test_a_flight_is_sent_when_the_next_one_begins_however_late(monkeypatch: pyt
         except StopIteration as end:
             assert end.value == "report"
             break
-    assert events == ["two 0.1", "two 0.2", "sent s3://archive/site, over: False", "three 0.5", "three 0.6"]
+    assert events == [
+        "two 0.1",
+        "two 0.2",
+        "sent s3://archive/site, over: False",
+        "three 0.5",
+        "three 0.6",
+    ]

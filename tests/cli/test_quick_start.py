@@ -21,7 +21,11 @@ sys.exit(f"exit code {{code}}" if code else f"loaded: {{loaded}}" if loaded else
 
 def _run(arguments: list[str], **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, *arguments], env={**os.environ, **environment}, capture_output=True, text=True, timeout=60,
+        [sys.executable, *arguments],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
         check=False,
     )
 
@@ -42,7 +46,8 @@ def test_the_probe_finds_what_is_loaded() -> None:
 
 def test_completion_can_be_installed(tmp_path: Path) -> None:
     run = _run(
-        ["-m", "sorvolo", "--install-completion", "bash"], HOME=str(tmp_path),
+        ["-m", "sorvolo", "--install-completion", "bash"],
+        HOME=str(tmp_path),
         _TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION="1",
     )
     assert run.returncode == 0, run.stderr
@@ -51,5 +56,10 @@ def test_completion_can_be_installed(tmp_path: Path) -> None:
 
 
 def test_a_shell_is_given_the_commands() -> None:
-    run = _run(["-m", "sorvolo"], _SORVOLO_COMPLETE="complete_bash", COMP_WORDS="sorvolo pl", COMP_CWORD="1")
+    run = _run(
+        ["-m", "sorvolo"],
+        _SORVOLO_COMPLETE="complete_bash",
+        COMP_WORDS="sorvolo pl",
+        COMP_CWORD="1",
+    )
     assert run.stdout.split() == ["plan"]

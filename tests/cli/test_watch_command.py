@@ -31,7 +31,9 @@ def _fly(folder: Path, frames: int, *, with_telemetry: bool = True) -> Path:
     """A drone flies east over dark ground with two bright boxes; the camera looks down, its top to the north."""
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(3)
-    ground = np.clip(rng.normal(30, 8, (_HEIGHT // 4, (_WIDTH + frames * _STEP_PX) // 4 + 1)), 0, 70).astype(np.uint8)
+    ground = np.clip(
+        rng.normal(30, 8, (_HEIGHT // 4, (_WIDTH + frames * _STEP_PX) // 4 + 1)), 0, 70
+    ).astype(np.uint8)
     ground = np.kron(ground, np.ones((4, 4), np.uint8))
     for left, top, right, bottom in _BOXES:
         ground[top:bottom, left:right] = 250
@@ -44,13 +46,27 @@ def _fly(folder: Path, frames: int, *, with_telemetry: bool = True) -> Path:
     if with_telemetry:
         times_ns = _START_NS + np.arange(frames) * 100_000_000
         east_m = np.arange(frames) * _STEP_PX * _M_PER_PX
-        latitude, longitude, _ = _ORIGIN.wgs84_from_site(np.column_stack([east_m, np.zeros((frames, 2))]))
+        latitude, longitude, _ = _ORIGIN.wgs84_from_site(
+            np.column_stack([east_m, np.zeros((frames, 2))])
+        )
         level = np.zeros(frames)
-        write_telemetry(folder / "flight.srt", Telemetry("srt", times_ns, {
-            "latitude_deg": latitude, "longitude_deg": longitude, "height_above_takeoff_m": level + _HEIGHT_M,
-            "orthometric_height_m": level + 100, "camera_yaw_deg": level, "camera_pitch_deg": level - 90,
-            "camera_roll_deg": level,
-        }, times_ns - _START_NS))
+        write_telemetry(
+            folder / "flight.srt",
+            Telemetry(
+                "srt",
+                times_ns,
+                {
+                    "latitude_deg": latitude,
+                    "longitude_deg": longitude,
+                    "height_above_takeoff_m": level + _HEIGHT_M,
+                    "orthometric_height_m": level + 100,
+                    "camera_yaw_deg": level,
+                    "camera_pitch_deg": level - 90,
+                    "camera_roll_deg": level,
+                },
+                times_ns - _START_NS,
+            ),
+        )
     return video
 
 
@@ -60,14 +76,26 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _arguments(video: Path, model: Path, out: Path) -> list[str]:
-    return ["watch", str(video), "--model", str(model), "--camera", str(video.parent / "camera.xml"), "--out", str(out)]
+    return [
+        "watch",
+        str(video),
+        "--model",
+        str(model),
+        "--camera",
+        str(video.parent / "camera.xml"),
+        "--out",
+        str(out),
+    ]
 
 
 def test_json_then_words(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     video, out = _fly(tmp_path / "flight", 30), tmp_path / "out"
     assert cli.main([*_arguments(video, model, out), "--json", "--classes", "small object"]) == 0
     (printed,) = json.loads(capsys.readouterr().out)["watches"]
-    assert printed["objects"] == {"total": 2, "by_class": {"small object": 2}} and printed["georeferenced"]
+    assert (
+        printed["objects"] == {"total": 2, "by_class": {"small object": 2}}
+        and printed["georeferenced"]
+    )
     assert printed["folder"] == str(out)
     for (left, top, right, bottom), feature in zip(_BOXES, printed["tracks"]["features"]):
         east_m = ((left + right - 1) / 2 - _CAMERA.cx_px) * _M_PER_PX
@@ -80,12 +108,21 @@ def test_json_then_words(model: Path, tmp_path: Path, capsys: pytest.CaptureFixt
     words = capsys.readouterr().out
     assert "2 small objects" in words and "15 of 30 frames searched" in words
     first = printed["tracks"]["features"][0]["properties"]
-    assert f"{first['latitude']:.5f}" in words and str(out / "report.html") in words.replace("\n", "")
+    assert f"{first['latitude']:.5f}" in words and str(out / "report.html") in words.replace(
+        "\n", ""
+    )
 
 
-def test_nothing_found_is_no_error(model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_found_is_no_error(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     video = _fly(tmp_path / "flight", 6, with_telemetry=False)
-    assert cli.main([*_arguments(video, model, tmp_path / "out"), "--classes", "car", "--tiles", "none"]) == 0
+    assert (
+        cli.main(
+            [*_arguments(video, model, tmp_path / "out"), "--classes", "car", "--tiles", "none"]
+        )
+        == 0
+    )
     out = capsys.readouterr().out
     assert "nothing" in out and "followed in the picture" in " ".join(out.split())
 
@@ -93,11 +130,16 @@ def test_nothing_found_is_no_error(model: Path, tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("extra", "words"),
     [
-        (["--classes", "boat"], "knows no 'boat'"), (["--tiles", "big"], "auto, none, or a number"),
-        (["--cot", "tak.local"], "udp://host:port"), (["--cot", "udp://tak.invalid"], "'tak.invalid' has no address"),
-        (["--cot-type", "person"], "person=a-f-G"), (["--cot-type", "persn=a-f-G"], "--cot-type persn"),
-        (["--every", "2", "--fps", "3"], "not both"), (["--model", "no-such-model"], "no-such-model"),
-        (["--alert-command", "no-such-program"], "no program"), (["--alert-url", "ftp://x"], "web address"),
+        (["--classes", "boat"], "knows no 'boat'"),
+        (["--tiles", "big"], "auto, none, or a number"),
+        (["--cot", "tak.local"], "udp://host:port"),
+        (["--cot", "udp://tak.invalid"], "'tak.invalid' has no address"),
+        (["--cot-type", "person"], "person=a-f-G"),
+        (["--cot-type", "persn=a-f-G"], "--cot-type persn"),
+        (["--every", "2", "--fps", "3"], "not both"),
+        (["--model", "no-such-model"], "no-such-model"),
+        (["--alert-command", "no-such-program"], "no program"),
+        (["--alert-url", "ftp://x"], "web address"),
     ],
 )
 def test_wrong_wishes_are_reported_before_anything_is_written(
@@ -126,13 +168,25 @@ def long_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _fly(tmp_path_factory.mktemp("long") / "flight", 1500)
 
 
-@pytest.mark.parametrize("signal_number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "signal_number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)]
+)
 def test_a_stop_ends_well_with_everything_written(
     model: Path, long_flight: Path, tmp_path: Path, signal_number: int
 ) -> None:
     video, out = long_flight, tmp_path / "out"
-    command = [sys.executable, "-m", "sorvolo", *_arguments(video, model, out), "--save", "video", "--json"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+    command = [
+        sys.executable,
+        "-m",
+        "sorvolo",
+        *_arguments(video, model, out),
+        "--save",
+        "video",
+        "--json",
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
         deadline = time.monotonic() + 60
         lines = out / "detections.jsonl"
         while not (lines.exists() and lines.stat().st_size > 3000) and time.monotonic() < deadline:

@@ -10,7 +10,12 @@ from pathlib import Path
 from sorvolo.store.site.files import LOCK
 
 _EFFORT = (  # of report.json
-    "seconds", "cpu_s", "registration_cpu_s_per_keyframe", "peak_memory_mb", "latency_s", "frames_per_second",
+    "seconds",
+    "cpu_s",
+    "registration_cpu_s_per_keyframe",
+    "peak_memory_mb",
+    "latency_s",
+    "frames_per_second",
 )
 _TIMED = {"report.html", "changes.html"}  # which show it
 
@@ -34,7 +39,9 @@ def content(site: Path) -> dict[str, bytes]:
             report = json.loads(data)
             report["settings"]["memory_mb"] = None  # of the caches: a worker's share
             report.get("objects", {}).pop("seconds", None)
-            data = json.dumps({key: value for key, value in report.items() if key not in _EFFORT}).encode()
+            data = json.dumps(
+                {key: value for key, value in report.items() if key not in _EFFORT}
+            ).encode()
         found[str(path.relative_to(site))] = data
     return found
 

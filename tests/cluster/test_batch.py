@@ -44,7 +44,9 @@ class Disturbed(LocalExecutor):
             if number is signal.SIGSEGV:
                 os.kill(worker.pid, number)
                 return
-            threading.Thread(target=_at_work, args=(order, lambda: os.kill(worker.pid, number)), daemon=True).start()
+            threading.Thread(
+                target=_at_work, args=(order, lambda: os.kill(worker.pid, number)), daemon=True
+            ).start()
 
 
 def _at_work(order: Order, strike: Callable[[], None]) -> None:
@@ -55,13 +57,19 @@ def _at_work(order: Order, strike: Callable[[], None]) -> None:
     strike()
 
 
-def run(places: list[Path], root: Path, camera: Path, signals: dict[str, list[signal.Signals]]) -> BatchReport:
+def run(
+    places: list[Path], root: Path, camera: Path, signals: dict[str, list[signal.Signals]]
+) -> BatchReport:
     @contextmanager
     def executor(table: BatchTable) -> Iterator[LocalExecutor]:
         with Disturbed(table.lock, signals) as made:
             yield made
 
-    return ended(run_batch(places, root, BatchSettings(FlightWish(camera=str(camera), model="none")), executor))
+    return ended(
+        run_batch(
+            places, root, BatchSettings(FlightWish(camera=str(camera), model="none")), executor
+        )
+    )
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +90,18 @@ def test_each_flight_is_through_once_or_named(batched: tuple[Path, BatchReport])
     folder, report = batched
     rows = {Path(row.source).relative_to(folder / "in").as_posix(): row for row in report.rows}
     assert {name: row.state for name, row in rows.items()} == {
-        "broken.mp4": State.FAILED, "killed": State.DONE, "sub/killed": State.DUPLICATE, "poisoned": State.SET_ASIDE,
+        "broken.mp4": State.FAILED,
+        "killed": State.DONE,
+        "sub/killed": State.DUPLICATE,
+        "poisoned": State.SET_ASIDE,
         "single": State.SKIPPED,
     }
     assert rows["single"].words == "a single photo (DJI_7.JPG): a flight needs 2 or more"
     assert "broken.mp4" in rows["broken.mp4"].words
     assert rows["sub/killed"].words == f"the same flight as {folder / 'in' / 'killed'}"
-    assert rows["poisoned"].words.startswith("set aside after 3 tries: its process ended by signal 11 (SIGSEGV)")
+    assert rows["poisoned"].words.startswith(
+        "set aside after 3 tries: its process ended by signal 11 (SIGSEGV)"
+    )
     assert (rows["killed"].tries, rows["poisoned"].tries) == (3, 3)
     assert (report.tries, report.crashes) == (6, 5)
     assert rows["killed"].cpu_s > 0.5 and rows["killed"].peak_memory_mb > 50
@@ -119,28 +132,47 @@ def test_a_video_under_a_second_name_is_the_same_flight(tmp_path: Path) -> None:
     shutil.copytree(made / "flight1", tmp_path / "in")
     (tmp_path / "in" / "card2").mkdir()
     for ending in (".mp4", ".csv"):
-        shutil.copy(tmp_path / "in" / f"flight1{ending}", tmp_path / "in" / "card2" / f"DJI_0042{ending}")
+        shutil.copy(
+            tmp_path / "in" / f"flight1{ending}", tmp_path / "in" / "card2" / f"DJI_0042{ending}"
+        )
     report = run([tmp_path / "in"], tmp_path / "maps", made / "camera.xml", {})
     assert {Path(row.source).name: (row.state, row.words) for row in report.rows} == {
         "DJI_0042.mp4": (State.DONE, "3 of 3 frames matched"),
-        "flight1.mp4": (State.DUPLICATE, f"the same flight as {tmp_path / 'in' / 'card2' / 'DJI_0042.mp4'}"),
+        "flight1.mp4": (
+            State.DUPLICATE,
+            f"the same flight as {tmp_path / 'in' / 'card2' / 'DJI_0042.mp4'}",
+        ),
     }
     assert [path.name for path in (tmp_path / "maps").iterdir() if path.is_dir()] == ["DJI_0042"]
 
 
 @pytest.mark.long
-def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Path, tmp_path: Path) -> None:
+def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(
+    flown: Path, tmp_path: Path
+) -> None:
     another(flown, tmp_path / "in" / "one")
     command = [
-        sys.executable, "-m", "sorvolo", "batch", str(tmp_path / "in"), "--root", str(tmp_path / "maps"), "--camera",
-        str(flown / "camera.xml"), "--model", "none", "--json",
+        sys.executable,
+        "-m",
+        "sorvolo",
+        "batch",
+        str(tmp_path / "in"),
+        "--root",
+        str(tmp_path / "maps"),
+        "--camera",
+        str(flown / "camera.xml"),
+        "--model",
+        "none",
+        "--json",
     ]
     first = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     journal = tmp_path / "maps" / "one" / "flights" / "one" / "run.journal"
     end_s = time.monotonic() + 60
     while not journal.exists() and first.poll() is None and time.monotonic() < end_s:
         time.sleep(0.02)
-    with pytest.raises(StoreError, match=f"another batch is running in .*: process {first.pid} on "):
+    with pytest.raises(
+        StoreError, match=f"another batch is running in .*: process {first.pid} on "
+    ):
         BatchTable.open(tmp_path / "maps")
     (worker,) = map(int, Path(f"/proc/{first.pid}/task/{first.pid}/children").read_text().split())
     os.kill(worker, signal.SIGSTOP)  # it cannot end by itself
@@ -148,7 +180,9 @@ def test_a_killed_batch_leaves_no_worker_and_the_same_command_goes_on(flown: Pat
     first.wait()
     BatchTable.open(tmp_path / "maps").close()  # not before its worker is gone
     stat = Path(f"/proc/{worker}/stat")
-    assert not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX"  # dead, if not yet reaped
+    assert (
+        not stat.exists() or stat.read_text().rpartition(")")[2].split()[0] in "ZX"
+    )  # dead, if not yet reaped
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (row,) = json.loads(done.stdout)["flights"]

@@ -23,11 +23,18 @@ def _touch(*paths: Path) -> None:
 
 def test_flights_are_videos_and_folders_of_photos_however_deep(tmp_path: Path) -> None:
     _touch(
-        tmp_path / "a" / "DJI_1.MP4", tmp_path / "a" / "DJI_1.SRT", tmp_path / "b" / "deep" / "1.JPG",
-        tmp_path / "b" / "deep" / "2.jpg", tmp_path / "c" / "alone.jpg", tmp_path / "d" / "1.png",
+        tmp_path / "a" / "DJI_1.MP4",
+        tmp_path / "a" / "DJI_1.SRT",
+        tmp_path / "b" / "deep" / "1.JPG",
+        tmp_path / "b" / "deep" / "2.jpg",
+        tmp_path / "c" / "alone.jpg",
+        tmp_path / "d" / "1.png",
         tmp_path / "d" / "2.png",
-        tmp_path / ".hidden" / "x.mp4", tmp_path / "site" / "site.db", tmp_path / "site" / "flights" / "k" / "v.mp4",
-        tmp_path / "maps" / "x" / "y.mp4", tmp_path / "a" / "GL01.LRV",
+        tmp_path / ".hidden" / "x.mp4",
+        tmp_path / "site" / "site.db",
+        tmp_path / "site" / "flights" / "k" / "v.mp4",
+        tmp_path / "maps" / "x" / "y.mp4",
+        tmp_path / "a" / "GL01.LRV",
     )
     (tmp_path / "e").symlink_to(tmp_path / "a")
     found = find_flights([tmp_path, tmp_path / "b"], tmp_path / "maps")
@@ -46,9 +53,15 @@ def test_a_flights_stamp_changes_with_its_files_and_its_telemetry(tmp_path: Path
 
 def test_folders_without_flights_are_an_error(tmp_path: Path) -> None:
     _touch(tmp_path / "in" / "notes.txt", tmp_path / "one" / "alone.jpg")
-    with pytest.raises(InputError, match=r"no flights among 1 file in .*: videos, or folders with two or more photos"):
+    with pytest.raises(
+        InputError,
+        match=r"no flights among 1 file in .*: videos, or folders with two or more photos",
+    ):
         find_flights([tmp_path / "one"], tmp_path / "maps")
-    with pytest.raises(InputError, match=r"no flights among 1 file in .*: videos, or folders with two or more photos"):
+    with pytest.raises(
+        InputError,
+        match=r"no flights among 1 file in .*: videos, or folders with two or more photos",
+    ):
         find_flights([tmp_path / "in"], tmp_path / "maps")
     with pytest.raises(InputError, match=r"no such folder: .*gone"):
         find_flights([tmp_path / "gone"], tmp_path / "maps")
@@ -58,7 +71,11 @@ def test_what_cannot_be_read_is_named_in_its_place(tmp_path: Path) -> None:
     _touch(tmp_path / "1.mp4", tmp_path / "2.mp4")
     found = scout([tmp_path / "1.mp4", tmp_path / "2.mp4", tmp_path / "gone.mp4"], "", most_tries=3)
     assert all(isinstance(each, Unreadable) and not each.crashed for each in found)
-    assert [each.words.split()[0] for each in found if isinstance(each, Unreadable)] == ["1.mp4", "2.mp4", "no"]
+    assert [each.words.split()[0] for each in found if isinstance(each, Unreadable)] == [
+        "1.mp4",
+        "2.mp4",
+        "no",
+    ]
 
 
 def _placed(name: str, hour: int, south: float, west: float) -> Placed:
@@ -71,22 +88,34 @@ def test_by_flight_each_has_a_site_of_its_own_name() -> None:
     other = Placed(Path("/tuesday/DJI_1.mp4"), Scouted("b", 10, 2, None))
     third = Placed(Path("/tuesday/DJI_2.mp4"), Scouted("c", 10, 3, None))
     assert sites_of([other, one, third], SiteBy.FLIGHT, {}, {}, ["DJI_2"]) == {
-        "a": "DJI_1", "b": "tuesday_DJI_1", "c": "tuesday_DJI_2",
+        "a": "DJI_1",
+        "b": "tuesday_DJI_1",
+        "c": "tuesday_DJI_2",
     }
 
 
 def test_by_place_flights_near_each_other_share_the_site_of_the_first() -> None:
-    later, first, far = _placed("later", 9, 45.0005, 9.0), _placed("first", 8, 45.0, 9.0), _placed("far", 7, 45.0, 9.01)
+    later, first, far = (
+        _placed("later", 9, 45.0005, 9.0),
+        _placed("first", 8, 45.0, 9.0),
+        _placed("far", 7, 45.0, 9.01),
+    )
     beside = _placed("beside", 10, 45.0018, 9.0)  # 33 m north of what `later` covers
     nowhere = Placed(Path("/flights/nowhere.mp4"), Scouted("nowhere", 10, 0, None))
     assert sites_of([later, first, far, beside, nowhere], SiteBy.PLACE, {}, {}) == {
-        "nowhere": "nowhere", "far": "far", "first": "first", "later": "first", "beside": "first",
+        "nowhere": "nowhere",
+        "far": "far",
+        "first": "first",
+        "later": "first",
+        "beside": "first",
     }
 
 
 def test_by_place_flights_join_sites_that_exist_and_stay_where_they_are() -> None:
     first, later = _placed("first", 8, 45.0, 9.0), _placed("later", 9, 45.0, 9.0)
-    assert sites_of([later], SiteBy.PLACE, {}, {"field": (45.0, 9.0, 45.01, 9.01)}) == {"later": "field"}
+    assert sites_of([later], SiteBy.PLACE, {}, {"field": (45.0, 9.0, 45.01, 9.01)}) == {
+        "later": "field"
+    }
     found = sites_of([first, later], SiteBy.PLACE, {"first": "its-own"}, {})
     assert found == {"first": "its-own", "later": "its-own"}
 
@@ -121,12 +150,18 @@ def test_a_flight_that_can_be_read_now_has_one_row(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"notes\n", "line 1 is no row of a batch"), (b'{"a": 1}\n', "is not a table of sorvolo batch"),
+        (b"notes\n", "line 1 is no row of a batch"),
+        (b'{"a": 1}\n', "is not a table of sorvolo batch"),
         (b'{"made_by": "sorvolo batch", "format": 2}\n', "has format 2, this version reads 1"),
-        (b'{"made_by": "sorvolo batch", "format": 1}\n{"source": 1}\n{}\n', "line 2 is no row of a batch"),
+        (
+            b'{"made_by": "sorvolo batch", "format": 1}\n{"source": 1}\n{}\n',
+            "line 2 is no row of a batch",
+        ),
     ],
 )
-def test_a_table_of_something_else_is_an_error_and_stays(tmp_path: Path, content: bytes, words: str) -> None:
+def test_a_table_of_something_else_is_an_error_and_stays(
+    tmp_path: Path, content: bytes, words: str
+) -> None:
     (tmp_path / TABLE).write_bytes(content)
     with pytest.raises(StoreError, match=words):
         BatchTable.open(tmp_path)
@@ -139,7 +174,10 @@ def test_roots_that_cannot_be_used(tmp_path: Path) -> None:
         BatchTable.open(tmp_path / "site")
     with pytest.raises(StoreError, match="is a file, a folder was needed"):
         BatchTable.open(tmp_path / "file")
-    with BatchTable.open(tmp_path / "maps"), pytest.raises(StoreError, match=r"another batch is running .*: process"):
+    with (
+        BatchTable.open(tmp_path / "maps"),
+        pytest.raises(StoreError, match=r"another batch is running .*: process"),
+    ):
         BatchTable.open(tmp_path / "maps")
 
 
@@ -150,7 +188,10 @@ def test_costs_are_those_of_flights_so_far_and_double_after_a_crash() -> None:
         _row("c", state=State.SET_ASIDE, peak_memory_mb=9000.0, cpu_s=1.0, seconds=10.0),
     ]
     assert cost_of(_row("d"), []).memory_mb == 1000
-    assert (cost_of(_row("d"), ended).cpus, cost_of(_row("d"), ended).memory_mb) == (2.0, pytest.approx(1800))
+    assert (cost_of(_row("d"), ended).cpus, cost_of(_row("d"), ended).memory_mb) == (
+        2.0,
+        pytest.approx(1800),
+    )
     assert cost_of(_row("d", crashes=2), ended).memory_mb == pytest.approx(7200)
     live = _row("e", source="rtsp://drone/live")
     assert cost_of(live, ended).cpus == 1  # none was live
@@ -164,12 +205,20 @@ def test_the_tries_of_a_flight_add_up() -> None:
     crashed = Ending(Outcome.CRASHED, "killed", "", 3.0, 2.0, 900.0, "one")
     row = _row("a", tries=1).after(crashed, State.WAITING, "killed")
     row = row.after(Ending(Outcome.DONE, "fine", "a", 4.0, 3.0, 400.0, "two"), State.DONE, "fine")
-    assert (row.seconds, row.cpu_s, row.peak_memory_mb, row.host, row.flight) == (7.0, 5.0, 900.0, "two", "a")
+    assert (row.seconds, row.cpu_s, row.peak_memory_mb, row.host, row.flight) == (
+        7.0,
+        5.0,
+        900.0,
+        "two",
+        "a",
+    )
 
 
 def test_what_libraries_print_is_no_answer() -> None:
     assert answer_of(b'{"ended": {"outcome": "done"}}') == ("ended", {"outcome": "done"})
-    assert [answer_of(each) for each in (b"[h264] error", b"{}", b'{"alive": 1}', b"[1]", b"")] == [None] * 5
+    assert [answer_of(each) for each in (b"[h264] error", b"{}", b'{"alive": 1}', b"[1]", b"")] == [
+        None
+    ] * 5
 
 
 @pytest.mark.parametrize(
@@ -177,8 +226,10 @@ def test_what_libraries_print_is_no_answer() -> None:
     [
         (["--executor", "slurm"], "--executor slurm: give local, ray, or ray://HOST:PORT"),
         (["--workers", "0"], "--workers 0: at least 1 is needed"),
-        (["--tries", "0"], "--tries 0: at least 1 is needed"), (["--stall", "0"], "--stall 0: more than 0"),
-        (["--gsd", "-1"], "--gsd"), (["--model", "nosuch"], "nosuch"),
+        (["--tries", "0"], "--tries 0: at least 1 is needed"),
+        (["--stall", "0"], "--stall 0: more than 0"),
+        (["--gsd", "-1"], "--gsd"),
+        (["--model", "nosuch"], "nosuch"),
     ],
 )
 def test_options_out_of_range(

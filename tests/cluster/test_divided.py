@@ -99,7 +99,9 @@ class Here:
         return self.running.popitem() if self.running else None
 
 
-def run(flight: Flown, root: Path, blocks: int, by: type[LocalExecutor | Here], most_tries: int = 3) -> BatchReport:
+def run(
+    flight: Flown, root: Path, blocks: int, by: type[LocalExecutor | Here], most_tries: int = 3
+) -> BatchReport:
     @contextmanager
     def executor(table: BatchTable) -> Iterator[LocalExecutor | Here]:
         with by(2, 300.0, table.lock) as made:
@@ -128,9 +130,14 @@ def with_key_frames(video: Path, every: int) -> None:
     with av.open(str(video)) as source, av.open(str(copy), "w") as made:
         made.metadata.update(source.metadata)
         old = source.streams.video[0]
-        new = made.add_stream("libx264", rate=old.average_rate, options={
-            "crf": "14", "x264-params": f"keyint={every}:min-keyint={every}:scenecut=0:bframes=2:threads=1",
-        })
+        new = made.add_stream(
+            "libx264",
+            rate=old.average_rate,
+            options={
+                "crf": "14",
+                "x264-params": f"keyint={every}:min-keyint={every}:scenecut=0:bframes=2:threads=1",
+            },
+        )
         new.width, new.height, new.pix_fmt = old.width, old.height, "yuv420p"
         for each in source.decode(old):
             made.mux(new.encode(each))
@@ -139,14 +146,16 @@ def with_key_frames(video: Path, every: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def divided(flight: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BatchReport, BatchReport]:
+def divided(
+    flight: Flown, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, BatchReport, BatchReport]:
     """The root of a batch in two blocks, one of which crashed: what came of that, and of the same command again."""
     root = tmp_path_factory.mktemp("divided") / "maps"
     return root, run(flight, root, 2, Disturbed, most_tries=1), run(flight, root, 2, Here)
 
 
 def test_a_block_that_ends_its_process_each_time_sets_the_flight_aside(
-    divided: tuple[Path, BatchReport, BatchReport]
+    divided: tuple[Path, BatchReport, BatchReport],
 ) -> None:
     (row,) = divided[1].rows
     assert row.state is State.SET_ASIDE
@@ -159,9 +168,15 @@ def test_the_map_in_blocks_is_that_of_one_machine(
     root, _, again = divided
     (row,) = again.rows
     assert (row.state, row.site, row.flight) == (State.DONE, "photos", "photos")
-    is_map_of_one_machine(root / "photos", flight.whole, "photos")  # the notice of the photo that is none, too
+    is_map_of_one_machine(
+        root / "photos", flight.whole, "photos"
+    )  # the notice of the photo that is none, too
     parts = {(each.part.kind, each.part.number) for each in Here.orders if each.part is not None}
-    assert parts == {(PartKind.BLOCK, 1), (PartKind.TILES, 0), (PartKind.TILES, 1)}  # the block that was whole stayed
+    assert parts == {
+        (PartKind.BLOCK, 1),
+        (PartKind.TILES, 0),
+        (PartKind.TILES, 1),
+    }  # the block that was whole stayed
     assert sorted(path.name for path in root.iterdir()) == ["batch.jsonl", "batch.lock", "photos"]
 
 
@@ -175,14 +190,16 @@ def is_map_of_one_machine(site: Path, of_one: Path, name: str) -> None:
         assert frames.keys() == {each.index for each in whole.keyframes()} and len(frames) > 15
         for each in whole.keyframes():
             corners_px = each.camera.corners_px
-            away_m = apply_homography(frames[each.index].site_from_image, corners_px) - apply_homography(
-                each.site_from_image, corners_px
-            )
+            away_m = apply_homography(
+                frames[each.index].site_from_image, corners_px
+            ) - apply_homography(each.site_from_image, corners_px)
             assert np.linalg.norm(away_m, axis=1).max() < 0.1 * whole.site().m_per_px
         ours, theirs = joined.tiles(), whole.tiles()
         assert set(ours) == set(theirs)
         for tile in theirs:
-            assert np.abs(ours[tile].astype(int) - theirs[tile]).mean() < 0.1  # of 255, over all pixels
+            assert (
+                np.abs(ours[tile].astype(int) - theirs[tile]).mean() < 0.1
+            )  # of 255, over all pixels
 
 
 def test_a_flight_in_blocks_is_known_afterwards(
@@ -202,7 +219,11 @@ def test_a_video_in_blocks_is_the_map_of_one_machine(video: Flown, tmp_path: Pat
     assert row.state is State.DONE
     is_map_of_one_machine(root / row.site, video.whole, "flight1")
     parts = [(each.part.kind, each.part.number) for each in Here.orders if each.part is not None]
-    assert parts == [(PartKind.BLOCK, 1), (PartKind.TILES, 0), (PartKind.TILES, 1)]  # its frames were chosen before
+    assert parts == [
+        (PartKind.BLOCK, 1),
+        (PartKind.TILES, 0),
+        (PartKind.TILES, 1),
+    ]  # its frames were chosen before
 
 
 @pytest.mark.long
@@ -210,17 +231,25 @@ def test_a_video_that_gives_other_frames_than_were_chosen_is_refused(video: Flow
     with opened_sources([video.source], None, video.camera) as sources:
         setup = prepare_divided(sources[0], MapSettings(model="none"))
         chosen = choose_frames(setup, MapSettings(model="none"), lambda: None).frames
-        again = [each.posed.frame.index for each in frames_again(setup, chosen[3:9]) if isinstance(each, Selected)]
+        again = [
+            each.posed.frame.index
+            for each in frames_again(setup, chosen[3:9])
+            if isinstance(each, Selected)
+        ]
         assert again == [each.index for each in chosen[3:9]]
         other = replace(chosen[4], time_ns=chosen[4].time_ns + 1)
-        with pytest.raises(InputError, match=r"flight1 does not give the same frames twice: .* without --blocks"):
+        with pytest.raises(
+            InputError, match=r"flight1 does not give the same frames twice: .* without --blocks"
+        ):
             list(frames_again(setup, [chosen[3], other, chosen[5]]))
         with pytest.raises(InputError, match="does not give the same frames twice"):
             list(frames_again(setup, [chosen[3], replace(chosen[4], index=10**6)]))
 
 
 def test_what_cannot_be_divided_is_named(flight: Flown, tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match="--blocks divides flights to be mapped; --mission compare"):
+    with pytest.raises(
+        SettingsError, match="--blocks divides flights to be mapped; --mission compare"
+    ):
         BatchSettings(FlightWish(Mission.COMPARE), blocks=2)
     with pytest.raises(SettingsError, match="--blocks 0: at least 1"):
         BatchSettings(blocks=0)
@@ -228,13 +257,17 @@ def test_what_cannot_be_divided_is_named(flight: Flown, tmp_path: Path) -> None:
     shutil.copytree(flight.source, other)
     first = min(other.iterdir())
     first.write_bytes(first.read_bytes() + b"another")
-    with pytest.raises(SettingsError, match=r"the site whole shows photos already: .* leave --blocks out"):
+    with pytest.raises(
+        SettingsError, match=r"the site whole shows photos already: .* leave --blocks out"
+    ):
         plan_blocks(other, flight.whole, settings, flight.camera, 2, tmp_path / "blocks")
     bare = tmp_path / "bare"
     bare.mkdir()
     for number in range(2):
         cv2.imwrite(str(bare / f"{number}.jpg"), np.full((180, 320, 3), number, np.uint8))
-    with pytest.raises(SettingsError, match="the photos of bare have no GPS, by which flights are divided"):
+    with pytest.raises(
+        SettingsError, match="the photos of bare have no GPS, by which flights are divided"
+    ):
         plan_blocks(bare, tmp_path / "site", settings, flight.camera, 2, tmp_path / "blocks")
     video = tmp_path / "flight.mp4"
     with av.open(str(video), "w") as made:
@@ -244,5 +277,7 @@ def test_what_cannot_be_divided_is_named(flight: Flown, tmp_path: Path) -> None:
             picture = np.full((180, 320, 3), 50 * value, np.uint8)
             made.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         made.mux(stream.encode())
-    with pytest.raises(SettingsError, match=r"the video flight has no GPS, by which flights are divided"):
+    with pytest.raises(
+        SettingsError, match=r"the video flight has no GPS, by which flights are divided"
+    ):
         plan_blocks(video, tmp_path / "site", settings, flight.camera, 2, tmp_path / "blocks")

@@ -18,7 +18,13 @@ from ended_work import ended
 from faulty_link import FaultyLink
 from postgres_server import PostgresServer
 from sorvolo.cli.main import main
-from sorvolo.cluster.batch import BatchReport, BatchSettings, BatchUpdate, RestartSettings, run_batch
+from sorvolo.cluster.batch import (
+    BatchReport,
+    BatchSettings,
+    BatchUpdate,
+    RestartSettings,
+    run_batch,
+)
 from sorvolo.cluster.local_executor import LocalExecutor
 from sorvolo.cluster.orders import FlightWish
 from sorvolo.cluster.table import BatchTable, State
@@ -30,8 +36,11 @@ from sorvolo.store.site.catalogue_place import POINTER, VARIABLE
 
 
 def run(
-    folder: Path, flown: Path, seen: Callable[[BatchUpdate], None], copy_to: str = "",
-    restarts: RestartSettings = RestartSettings(longest_wait_s=2.0),  # noqa: B008
+    folder: Path,
+    flown: Path,
+    seen: Callable[[BatchUpdate], None],
+    copy_to: str = "",
+    restarts: RestartSettings = RestartSettings(longest_wait_s=2.0),
 ) -> BatchReport:
     @contextmanager
     def executor(table: BatchTable) -> Iterator[LocalExecutor]:
@@ -39,7 +48,9 @@ def run(
             yield made
 
     wish = FlightWish(camera=str(flown / "camera.xml"), model="none", copy_to=copy_to)
-    running = run_batch([folder / "in"], folder / "maps", BatchSettings(wish, restarts=restarts), executor)
+    running = run_batch(
+        [folder / "in"], folder / "maps", BatchSettings(wish, restarts=restarts), executor
+    )
     while True:
         try:
             seen(next(running))
@@ -68,7 +79,9 @@ def test_a_database_that_comes_late_and_dies_on_the_way(
 
     def restart_at_work() -> None:
         end_s = time.monotonic() + 30
-        while time.monotonic() < end_s and not list((tmp_path / "maps").glob("*/flights/*/run.journal")):
+        while time.monotonic() < end_s and not list(
+            (tmp_path / "maps").glob("*/flights/*/run.journal")
+        ):
             time.sleep(0.02)
         postgres.stop()
         time.sleep(1.0)
@@ -84,7 +97,9 @@ def test_a_database_that_comes_late_and_dies_on_the_way(
             assert (len(archive.flights()), len(archive.versions())) == (1, 1)
     monkeypatch.delenv(VARIABLE)
     wanted = tmp_path / "undisturbed" / "one"
-    for _ in map_flights([tmp_path / "in" / "one"], wanted, MapSettings(model="none"), camera=flown / "camera.xml"):
+    for _ in map_flights(
+        [tmp_path / "in" / "one"], wanted, MapSettings(model="none"), camera=flown / "camera.xml"
+    ):
         pass
     found = content(tmp_path / "maps" / "one")
     assert found.pop(POINTER) and found == content(wanted)
@@ -109,14 +124,22 @@ def test_an_object_store_that_comes_late_has_every_map(
         report = run(tmp_path, flown, seen, place)
         (row,) = report.rows
         assert (row.state, row.tries, report.crashes) == (State.DONE, 2, 0)
-        assert f"the flight is in {tmp_path / 'maps' / 'one'}, but was not copied: cannot" in words[0]
+        assert (
+            f"the flight is in {tmp_path / 'maps' / 'one'}, but was not copied: cannot" in words[0]
+        )
         assert not ended(verify_copy(str(tmp_path / "maps" / "one"), f"{place}/one")).faults
         again = run(tmp_path, flown, seen, place)
         assert (again.tries, again.counts()) == (0, {"known": 1})
 
         link.cut()  # and does not come back
-        (failed,) = run(tmp_path, flown, lambda _: None, f"{place}2", RestartSettings(patience_s=0.0)).rows
-        assert failed.state is State.FAILED and "was not copied" in failed.words and os.fspath(tmp_path) in failed.words
+        (failed,) = run(
+            tmp_path, flown, lambda _: None, f"{place}2", RestartSettings(patience_s=0.0)
+        ).rows
+        assert (
+            failed.state is State.FAILED
+            and "was not copied" in failed.words
+            and os.fspath(tmp_path) in failed.words
+        )
 
 
 @pytest.mark.long
@@ -146,14 +169,25 @@ def test_an_object_store_that_is_killed_in_the_middle_of_a_copy(
         assert not ended(verify_copy(str(tmp_path / "maps" / "one"), f"{place}/one")).faults
 
 
-def test_places_that_nothing_is_copied_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_places_that_nothing_is_copied_to(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "1.mp4").write_text("no video")
     for options, words in (
-        (["--root", "s3://archive/maps"], "a batch works in a folder; give one, and --copy-to s3://BUCKET/PREFIX"),
+        (
+            ["--root", "s3://archive/maps"],
+            "a batch works in a folder; give one, and --copy-to s3://BUCKET/PREFIX",
+        ),
         (["--root", str(tmp_path), "--copy-to", str(tmp_path)], "is --root itself"),
-        (["--root", str(tmp_path / "maps"), "--copy-to", "ftp://archive/maps"], "ftp:// is no place of sites"),
-        (["--root", str(tmp_path / "maps"), "--copy-to", "s3://a/b", "--mission", "watch"], "are for maps"),
+        (
+            ["--root", str(tmp_path / "maps"), "--copy-to", "ftp://archive/maps"],
+            "ftp:// is no place of sites",
+        ),
+        (
+            ["--root", str(tmp_path / "maps"), "--copy-to", "s3://a/b", "--mission", "watch"],
+            "are for maps",
+        ),
     ):
         assert main(["batch", str(tmp_path / "in"), *options]) == 1
         assert words in " ".join(capsys.readouterr().err.split())

@@ -27,7 +27,13 @@ from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, WatchWish
 from sorvolo.cluster.ray_cluster import WAITS, demand_same, probe_of, why_not
-from sorvolo.cluster.ray_executor import RayExecutor, _demand_fit, _LiveTry, _with_detector, ray_executor
+from sorvolo.cluster.ray_executor import (
+    RayExecutor,
+    _demand_fit,
+    _LiveTry,
+    _with_detector,
+    ray_executor,
+)
 from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.streams import run_streams, streams_of
 from sorvolo.cluster.table import LOCK, State
@@ -51,7 +57,9 @@ def cluster() -> Iterator[Any]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("RAY_CLIENT_RECONNECT_GRACE_PERIOD", "5")  # seconds; 30 of its own
-        patch.setenv("RAY_AUTH_MODE", "disabled")  # this cluster is seen by nobody else for a few seconds
+        patch.setenv(
+            "RAY_AUTH_MODE", "disabled"
+        )  # this cluster is seen by nobody else for a few seconds
         head = {"num_cpus": 0, "include_dashboard": False, "ray_client_server_port": port}
         made = Cluster(initialize_head=True, head_node_args=head)
         made.client_address = f"ray://127.0.0.1:{port}"
@@ -68,7 +76,9 @@ def _kill_a_machine_at_work(cluster: Any, root: Path) -> None:
         time.sleep(0.02)
         for node in list(cluster.worker_nodes):
             for pid in descendants({node.all_processes["raylet"][0].process.pid}):
-                if any(list(site.glob("flights/*/run.journal")) for site in written_sites(pid, root)):
+                if any(
+                    list(site.glob("flights/*/run.journal")) for site in written_sites(pid, root)
+                ):
                     os.kill(pid, signal.SIGSTOP)
                     cluster.remove_node(node, allow_graceful=False)
                     os.kill(pid, signal.SIGCONT)
@@ -76,22 +86,36 @@ def _kill_a_machine_at_work(cluster: Any, root: Path) -> None:
 
 
 @pytest.mark.long
-def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(cluster: Any, tmp_path: Path) -> None:
+def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(
+    cluster: Any, tmp_path: Path
+) -> None:
     order = Order("in", "site", FlightWish())
     with ray_executor("ray", None, 60.0, tmp_path, SharingSettings(True, 0.25)) as executor:
         detectors = executor._detectors
         assert detectors is not None
         addresses = detectors.addresses()
-        assert addresses.keys() == {each["NodeID"] for each in ray.nodes() if each["Resources"].get("CPU")}
+        assert addresses.keys() == {
+            each["NodeID"] for each in ray.nodes() if each["Resources"].get("CPU")
+        }
         assert len(set(addresses.values())) == 2 and detectors.addresses() == addresses
         assert ray.available_resources()["GPU"] == 0.75
-        kept = sum(min(1e9, each["Resources"]["memory"]) for each in ray.nodes() if each["Resources"].get("CPU"))
-        assert ray.cluster_resources()["memory"] - ray.available_resources()["memory"] == pytest.approx(kept, abs=10)
-        for address in addresses.values():  # on the processor: there is no card that anything runs on
+        kept = sum(
+            min(1e9, each["Resources"]["memory"])
+            for each in ray.nodes()
+            if each["Resources"].get("CPU")
+        )
+        assert ray.cluster_resources()["memory"] - ray.available_resources()[
+            "memory"
+        ] == pytest.approx(kept, abs=10)
+        for (
+            address
+        ) in addresses.values():  # on the processor: there is no card that anything runs on
             engine = shared_engine(address, find_model("thermal"))
             assert "CPU" in engine.provider
             assert len(engine.run(np.zeros((1, 3, 64, 64), np.uint8))) == 3
-        executor._running = {("watch", str(number)): None for number in range(8)}  # two cores hold ten of a fifth
+        executor._running = {
+            ("watch", str(number)): None for number in range(8)
+        }  # two cores hold ten of a fifth
         assert executor.has_room(Cost(0.2, 100.0)) and not executor.has_room(Cost(1.0, 100.0))
         executor._running = {}
         given = ray.get(ray.remote(_with_detector).remote(order, addresses))
@@ -109,14 +133,18 @@ def test_a_detector_whose_actor_hangs_is_ended_and_started_again(
         before = detectors.addresses()
         node = next(iter(before))
         (actor,) = [
-            pid for each in cluster.worker_nodes if each.node_id == node
+            pid
+            for each in cluster.worker_nodes
+            if each.node_id == node
             for pid in descendants({each.all_processes["raylet"][0].process.pid})
             if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::_Detector")
         ]
         os.kill(actor, signal.SIGSTOP)
         threading.Timer(120, _let_go, [[actor]]).start()
         monkeypatch.setattr(ray_executor_module, "WAITS", replace(WAITS, probe_s=20.0))
-        assert detectors.addresses().keys() == before.keys() - {node}  # a flight there has its own meanwhile
+        assert detectors.addresses().keys() == before.keys() - {
+            node
+        }  # a flight there has its own meanwhile
         monkeypatch.undo()
         wait_for(lambda: not Path(f"/proc/{actor}/cmdline").exists())
         after = detectors.addresses()
@@ -128,7 +156,9 @@ def test_a_detector_whose_actor_hangs_is_ended_and_started_again(
 def _hold_the_parent_of_a_mission(cluster: Any) -> list[int]:
     """Wait for a mission, and hold the process of Ray's that started it."""
     missions = _held_missions(cluster)
-    held = [int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) for pid in missions]
+    held = [
+        int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]) for pid in missions
+    ]
     for pid in held:
         os.kill(pid, signal.SIGSTOP)
     threading.Timer(150, _let_go, [held]).start()
@@ -146,12 +176,17 @@ def test_a_worker_of_rays_that_hangs_is_killed_and_its_flight_goes_on(
     wish = FlightWish(camera=str(flown / "camera.xml"), model="none", give_up_s=2.0)
     if is_live:
         running: Any = run_streams(
-            streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]), tmp_path / "maps", BatchSettings(wish),
-            lambda table: ray_executor("ray", 1, 8.0, table.root), threading.Event(),
+            streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]),
+            tmp_path / "maps",
+            BatchSettings(wish),
+            lambda table: ray_executor("ray", 1, 8.0, table.root),
+            threading.Event(),
         )
     else:
         running = run_batch(
-            [tmp_path / "in"], tmp_path / "maps", BatchSettings(wish),
+            [tmp_path / "in"],
+            tmp_path / "maps",
+            BatchSettings(wish),
             lambda table: ray_executor("ray", 1, 8.0, table.root),
         )
     for update in running:
@@ -165,7 +200,9 @@ def test_a_worker_of_rays_that_hangs_is_killed_and_its_flight_goes_on(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("look_s", [pytest.param(0.05, id="asked often"), pytest.param(300.0, id="asked at its end")])
+@pytest.mark.parametrize(
+    "look_s", [pytest.param(0.05, id="asked often"), pytest.param(300.0, id="asked at its end")]
+)
 def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
     cluster: Any, flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look_s: float
 ) -> None:
@@ -173,14 +210,22 @@ def test_a_stream_is_watched_by_an_actor_which_reports_what_it_finds(
     another(flown, tmp_path / "in" / "one")
     wish = FlightWish(Mission.WATCH, camera=str(flown / "camera.xml"), give_up_s=2.0)
     running = run_streams(
-        streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]), tmp_path / "out", BatchSettings(wish),
-        lambda table: ray_executor("ray", 1, 60.0, table.root), threading.Event(),
+        streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]),
+        tmp_path / "out",
+        BatchSettings(wish),
+        lambda table: ray_executor("ray", 1, 60.0, table.root),
+        threading.Event(),
     )
     updates = list(running)
-    assert {each.found.partition(" at ")[0] for each in updates if each.found} == {"car 2", "person 1"}
+    assert {each.found.partition(" at ")[0] for each in updates if each.found} == {
+        "car 2",
+        "person 1",
+    }
     last = updates[-1].row
     assert last is not None and (last.state, last.tries, last.words) == (
-        State.DONE, 1, "1 car, 1 person found in 4 frames"
+        State.DONE,
+        1,
+        "1 car, 1 person found in 4 frames",
     )
     assert (tmp_path / "out" / "north-watch" / "one" / "report.html").is_file()
 
@@ -206,7 +251,9 @@ class _SlowRay:
     def __init__(self) -> None:
         self._waits = 0
 
-    def wait(self, tasks: list[list[str]], timeout: float) -> tuple[list[list[str]], list[list[str]]]:
+    def wait(
+        self, tasks: list[list[str]], timeout: float
+    ) -> tuple[list[list[str]], list[list[str]]]:
         """Nothing, nothing, all."""
         self._waits += 1
         return ([], tasks) if self._waits % 3 else (tasks, [])
@@ -217,10 +264,19 @@ class _SlowRay:
 
 
 def test_what_a_watch_found_is_not_lost_when_its_answers_are_late(tmp_path: Path) -> None:
-    executor, actor, key = RayExecutor("ray://127.0.0.1:1", None, 9.0, tmp_path), _SlowActor(), ("watch", "north")
+    executor, actor, key = (
+        RayExecutor("ray://127.0.0.1:1", None, 9.0, tmp_path),
+        _SlowActor(),
+        ("watch", "north"),
+    )
     executor._ray, executor._actors[key], executor._taken[key] = _SlowRay(), actor, 0
     assert [executor._taken_found() for _ in range(6)] == [
-        [], [], [(key, "car 1"), (key, "person 2"), (key, "object 3")], [], [], []
+        [],
+        [],
+        [(key, "car 1"), (key, "person 2"), (key, "object 3")],
+        [],
+        [],
+        [],
     ]
     assert actor.asked == 2
 
@@ -232,7 +288,9 @@ class _FailedRay:
 
     def get(self, task: Exception) -> None:
         """What Ray raises of it: no traceback is lost, and the first line has only the task's name."""
-        failed = ray.exceptions.RayTaskError("sorvolo one", "Traceback: ...", task, pid=7, ip="10.0.0.2")
+        failed = ray.exceptions.RayTaskError(
+            "sorvolo one", "Traceback: ...", task, pid=7, ip="10.0.0.2"
+        )
         raise failed.as_instanceof_cause()
 
 
@@ -240,25 +298,41 @@ def test_a_task_that_cannot_be_run_is_a_crash_with_its_cause(tmp_path: Path) -> 
     executor = RayExecutor("ray://127.0.0.1:1", None, 9.0, tmp_path)
     executor._ray = _FailedRay()
     ending, _ = executor._ending(TypeError("Order() takes 3 arguments\nand more"))
-    assert ending == Ending(Outcome.CRASHED, "its task could not be run (TypeError: Order() takes 3 arguments)")
-    with pytest.raises(InputError, match="install the same one") as caught:  # what all flights would meet
+    assert ending == Ending(
+        Outcome.CRASHED, "its task could not be run (TypeError: Order() takes 3 arguments)"
+    )
+    with pytest.raises(
+        InputError, match="install the same one"
+    ) as caught:  # what all flights would meet
         executor._ending(InputError("the machine far has Sorvolo 0; install the same one"))
     assert type(caught.value) is InputError
 
 
 @pytest.mark.long
-def test_a_stream_whose_actor_dies_goes_on_in_the_same_folder(cluster: Any, flown: Path, tmp_path: Path) -> None:
+def test_a_stream_whose_actor_dies_goes_on_in_the_same_folder(
+    cluster: Any, flown: Path, tmp_path: Path
+) -> None:
     """The first alert kills the process of Ray's that holds the actor, the parent of the watch."""
     another(flown, tmp_path / "in" / "one")
-    script = 'if mkdir "$0"; then kill -9 $(cut -d " " -f 4 /proc/$PPID/stat); else echo $2 >> "$1"; fi'
+    script = (
+        'if mkdir "$0"; then kill -9 $(cut -d " " -f 4 /proc/$PPID/stat); else echo $2 >> "$1"; fi'
+    )
     alert = f"sh -c {shlex.quote(script)} {tmp_path / 'killed'} {tmp_path / 'alerts'} {{class}}"
     wish = FlightWish(
-        Mission.WATCH, camera=str(flown / "camera.xml"), give_up_s=2.0, watch=WatchWish(alert_command=alert)
+        Mission.WATCH,
+        camera=str(flown / "camera.xml"),
+        give_up_s=2.0,
+        watch=WatchWish(alert_command=alert),
     )
-    report = ended(run_streams(
-        streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]), tmp_path / "out", BatchSettings(wish),
-        lambda table: ray_executor("ray", 1, 60.0, table.root), threading.Event(),
-    ))
+    report = ended(
+        run_streams(
+            streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"]),
+            tmp_path / "out",
+            BatchSettings(wish),
+            lambda table: ray_executor("ray", 1, 60.0, table.root),
+            threading.Event(),
+        )
+    )
     (row,) = report.rows
     assert (row.state, row.tries, report.crashes) == (State.DONE, 2, 1)
     assert row.words == "1 car, 1 person found in 4 frames"
@@ -272,10 +346,16 @@ def _hold_a_machine_at_work(cluster: Any, root: Path) -> tuple[Any, list[int]]:
         for node in list(cluster.worker_nodes):
             raylet = node.all_processes["raylet"][0].process.pid
             below = descendants({raylet})
-            if any(list(site.glob("flights/*/run.journal")) for pid in below for site in written_sites(pid, root)):
+            if any(
+                list(site.glob("flights/*/run.journal"))
+                for pid in below
+                for site in written_sites(pid, root)
+            ):
                 for pid in (held := [raylet, *below]):
                     os.kill(pid, signal.SIGSTOP)
-                threading.Timer(200, _let_go, [held]).start()  # a batch that waits for it is to end, too
+                threading.Timer(
+                    200, _let_go, [held]
+                ).start()  # a batch that waits for it is to end, too
                 return node, held
 
 
@@ -286,7 +366,9 @@ def _let_go(held: list[int]) -> None:
 
 
 @pytest.mark.long  # it waits for Ray to count a machine as dead, which takes a minute
-def test_a_machine_that_is_cut_off_does_not_hold_up_the_batch(cluster: Any, flown: Path, tmp_path: Path) -> None:
+def test_a_machine_that_is_cut_off_does_not_hold_up_the_batch(
+    cluster: Any, flown: Path, tmp_path: Path
+) -> None:
     """As behind a cut cable. What it may still write keeps the flight's next try waiting, until it is gone."""
     for name in ("one", "two", "three"):
         another(flown, tmp_path / "in" / name)
@@ -316,14 +398,21 @@ def test_a_machine_that_dies_loses_nothing(cluster: Any, flown: Path, tmp_path: 
     killer = threading.Thread(target=_kill_a_machine_at_work, args=(cluster, root), daemon=True)
     killer.start()
     settings = BatchSettings(FlightWish(camera=str(flown / "camera.xml"), model="none"))
-    report = ended(run_batch(
-        [tmp_path / "in"], root, settings, lambda table: ray_executor("ray", None, 60.0, table.root)
-    ))
+    report = ended(
+        run_batch(
+            [tmp_path / "in"],
+            root,
+            settings,
+            lambda table: ray_executor("ray", None, 60.0, table.root),
+        )
+    )
     assert [row.state for row in report.rows] == [State.DONE, State.DONE]
     assert (report.tries, report.crashes) == (3, 1)
     for name in ("one", "two"):
         wanted = tmp_path / "undisturbed" / name
-        for _ in map_flights([tmp_path / "in" / name], wanted, MapSettings(model="none"), camera=flown / "camera.xml"):
+        for _ in map_flights(
+            [tmp_path / "in" / name], wanted, MapSettings(model="none"), camera=flown / "camera.xml"
+        ):
             pass
         assert content(root / name) == content(wanted)
     # what a machine lacks is no crash of a flight: it would end every one
@@ -337,13 +426,18 @@ def test_a_machine_that_dies_loses_nothing(cluster: Any, flown: Path, tmp_path: 
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("ray://127.0.0.1", "give ray://HOST:PORT"), ("ray://:10001", "give ray://HOST:PORT"),
+        ("ray://127.0.0.1", "give ray://HOST:PORT"),
+        ("ray://:10001", "give ray://HOST:PORT"),
         ("ray://127.0.0.1:{port}", "no Ray cluster answers at 127.0.0.1:"),
         ("ray", "`ray stop` forgets one that is gone"),
     ],
 )
 def test_a_cluster_that_is_not_there_is_an_error_within_seconds(
-    name: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    name: str,
+    words: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with socket.socket() as silent:  # its port is taken, and nobody answers
         silent.bind(("127.0.0.1", 0))
@@ -351,18 +445,44 @@ def test_a_cluster_that_is_not_there_is_an_error_within_seconds(
         (tmp_path / "in" / "1.mp4").write_text("no video")
         monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{silent.getsockname()[1]}")
         address, started_s = name.format(port=silent.getsockname()[1]), time.monotonic()
-        assert main(["batch", str(tmp_path / "in"), "--root", str(tmp_path / "maps"), "--executor", address]) == 1
+        assert (
+            main(
+                [
+                    "batch",
+                    str(tmp_path / "in"),
+                    "--root",
+                    str(tmp_path / "maps"),
+                    "--executor",
+                    address,
+                ]
+            )
+            == 1
+        )
     output = capsys.readouterr().err
     assert f"error: --executor {address}: " in output and words in output
     assert time.monotonic() - started_s < 30
 
 
 @pytest.mark.long  # it waits for Ray to give up
-def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_listens_but_is_no_cluster_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         (tmp_path / "1.mp4").write_text("no video")
         address = f"ray://127.0.0.1:{other.getsockname()[1]}"
-        assert main(["batch", str(tmp_path / "1.mp4"), "--root", str(tmp_path / "maps"), "--executor", address]) == 1
+        assert (
+            main(
+                [
+                    "batch",
+                    str(tmp_path / "1.mp4"),
+                    "--root",
+                    str(tmp_path / "maps"),
+                    "--executor",
+                    address,
+                ]
+            )
+            == 1
+        )
     assert f"{address[6:]} is not a Ray cluster" in capsys.readouterr().err
 
 
@@ -370,19 +490,31 @@ def test_what_listens_but_is_no_cluster_is_named(tmp_path: Path, capsys: pytest.
     ("error", "words"),
     [
         (
-            RuntimeError("Version mismatch: The cluster was started with:\n    Ray: 2.59.0\n    Python: 3.11.7"),
+            RuntimeError(
+                "Version mismatch: The cluster was started with:\n    Ray: 2.59.0\n    Python: 3.11.7"
+            ),
             "another version of Ray or Python than this machine; install the same ones on all machines (here Ray 2.60",
         ),
-        (ConnectionError("ray client connection timeout"), "a cluster with a token (set RAY_AUTH_MODE=token"),
-        (ConnectionError("Initialization failure from server:\nTraceback"), "started nothing to serve this batch"),
+        (
+            ConnectionError("ray client connection timeout"),
+            "a cluster with a token (set RAY_AUTH_MODE=token",
+        ),
+        (
+            ConnectionError("Initialization failure from server:\nTraceback"),
+            "started nothing to serve this batch",
+        ),
         (RuntimeError("Invalid authentication token"), "the cluster needs another token"),
     ],
 )
-def test_what_ray_reports_of_a_cluster_that_takes_no_batch_is_put_in_words(error: Exception, words: str) -> None:
+def test_what_ray_reports_of_a_cluster_that_takes_no_batch_is_put_in_words(
+    error: Exception, words: str
+) -> None:
     assert words in why_not("ray://10.0.0.1:10001", error)
 
 
-def test_a_head_that_has_just_started_is_asked_again_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_head_that_has_just_started_is_asked_again_for_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     failures = [ConnectionError("Initialization failure from server:\nTraceback")] * 2
     asked: list[int] = []
 
@@ -405,7 +537,10 @@ def test_without_ray_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     import importlib.util
 
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SettingsError, match=r"pip install 'sorvolo\[fleet\]'"), ray_executor("ray", 1, 9.0, tmp_path):
+    with (
+        pytest.raises(SettingsError, match=r"pip install 'sorvolo\[fleet\]'"),
+        ray_executor("ray", 1, 9.0, tmp_path),
+    ):
         pass
 
 
@@ -426,7 +561,9 @@ def test_a_machine_with_another_sorvolo_is_named(tmp_path: Path) -> None:
         demand_same("far", "0.0.9")
     with pytest.raises(SettingsError, match="the machine far has no Sorvolo, this one"):
         demand_same("far", "")
-    with pytest.raises(InputError, match=rf"{os.uname().nodename} has Sorvolo .*, the batch 0\.0\.9"):
+    with pytest.raises(
+        InputError, match=rf"{os.uname().nodename} has Sorvolo .*, the batch 0\.0\.9"
+    ):
         _demand_fit(str(tmp_path), "0.0.9")
 
 
@@ -434,9 +571,24 @@ def _started(executor: str, flown: Path, folder: Path) -> "subprocess.Popen[str]
     """A batch of the flight in `folder`, whose first try has begun."""
     another(flown, folder / "in" / "one")
     process = subprocess.Popen(
-        [sys.executable, "-m", "sorvolo", "batch", str(folder / "in"), "--root", str(folder / "maps"), "--camera",
-         str(flown / "camera.xml"), "--model", "none", "--executor", executor],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        [
+            sys.executable,
+            "-m",
+            "sorvolo",
+            "batch",
+            str(folder / "in"),
+            "--root",
+            str(folder / "maps"),
+            "--camera",
+            str(flown / "camera.xml"),
+            "--model",
+            "none",
+            "--executor",
+            executor,
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     table, end_s = folder / "maps" / "batch.jsonl", time.monotonic() + 90
     while not (table.exists() and '"running"' in table.read_text()):
@@ -479,8 +631,12 @@ def test_a_head_that_dies_ends_the_batch_and_the_same_command_goes_on(
     for name, process in batches.items():
         _, printed = process.communicate(timeout=120)
         assert process.returncode == 1, printed
-        (error,) = [line for line in printed.splitlines() if line.startswith("error: ")] or [printed]
-        assert error.startswith(f"error: --executor {executors[name]}: the cluster is gone ("), printed
+        (error,) = [line for line in printed.splitlines() if line.startswith("error: ")] or [
+            printed
+        ]
+        assert error.startswith(f"error: --executor {executors[name]}: the cluster is gone ("), (
+            printed
+        )
         assert error.endswith("; when it is back, the same command goes on")
     # and with another executor as well
     places = [str(tmp_path / "outside" / "in"), "--root", str(tmp_path / "outside" / "maps")]

@@ -85,7 +85,9 @@ def test_a_shared_detector_that_hangs_is_ended_and_who_waits_for_it_learns_that(
         os.waitid(os.P_PID, held, os.WSTOPPED)  # it may answer once more before it stands still
         with pytest.raises(SharedDetectorGone):
             engine.run(planes)
-        wait_for(lambda: shared.address != address)  # who waits may learn it before the system has buried it
+        wait_for(
+            lambda: shared.address != address
+        )  # who waits may learn it before the system has buried it
         assert len(shared_engine(shared.address, find_model("thermal")).run(planes)) == 3
         assert shared.pid != held
 
@@ -103,7 +105,11 @@ def test_the_shared_detector_counts_in_the_memory(shares: bool, fits: bool) -> N
 def test_a_stream_is_budgeted_what_it_takes_once_that_is_known() -> None:
     costs = CostSettings(machine_share=20_000e6 / available_bytes())
     with LocalExecutor(9, 60.0, 0, costs) as executor:
-        for seconds, is_live, fits in ((90.0, True, True), (30.0, True, False), (90.0, False, False)):
+        for seconds, is_live, fits in (
+            (90.0, True, True),
+            (30.0, True, False),
+            (90.0, False, False),
+        ):
             running = SimpleNamespace(pid=os.getpid(), seconds=seconds)
             executor._running["map", "a"] = running, Cost(1.0, 15_000.0)  # type: ignore[assignment]
             executor._live = {("map", "a")} if is_live else set()
@@ -115,14 +121,19 @@ def test_what_shows_nothing_to_a_detector_shares_none() -> None:
     order = Order("in", "site", FlightWish())
     assert searches(order)
     assert not searches(Order("in", "site", FlightWish(model="none")))
-    assert not searches(Order("in", "site", FlightWish(), part=Part(PartKind.BLOCK, 0, 2, "blocks")))
+    assert not searches(
+        Order("in", "site", FlightWish(), part=Part(PartKind.BLOCK, 0, 2, "blocks"))
+    )
 
 
 def test_a_socket_that_cannot_be_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     deep = tmp_path / ("x" * 100)  # longer than a socket's path may be
     deep.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(deep))
-    with SharedDetector() as shared, pytest.raises(StoreError, match="set TMPDIR to a folder of this machine"):
+    with (
+        SharedDetector() as shared,
+        pytest.raises(StoreError, match="set TMPDIR to a folder of this machine"),
+    ):
         _ = shared.address
 
 

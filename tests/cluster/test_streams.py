@@ -47,13 +47,17 @@ def test_streams_are_started_again_and_finished_on_request(flown: Path, tmp_path
 
     def end() -> None:
         end_s = time.monotonic() + 90
-        while time.monotonic() < end_s and not any(path.is_file() for path in (root / "killed").glob("flights/**/*")):
+        while time.monotonic() < end_s and not any(
+            path.is_file() for path in (root / "killed").glob("flights/**/*")
+        ):
             time.sleep(0.05)
         time.sleep(1.0)  # for more than its first picture
         until.set()
 
     threading.Thread(target=end, daemon=True).start()
-    settings = BatchSettings(FlightWish(camera=str(flown / "camera.xml"), model="none", give_up_s=600.0))
+    settings = BatchSettings(
+        FlightWish(camera=str(flown / "camera.xml"), model="none", give_up_s=600.0)
+    )
     streams = streams_of([f"follow:{tmp_path / 'in' / name}" for name in ("killed", "poisoned")])
     running, updates = run_streams(streams, root, settings, executor, until), list[BatchUpdate]()
     while True:
@@ -114,9 +118,12 @@ def test_the_receiver_of_a_stream_goes_with_its_orders(tmp_path: Path) -> None:
     executor = Recording()
     streams = streams_of(["north=udp://:5000", "south=udp://:5001"], ["south=udp://:10110"])
     settings = BatchSettings(FlightWish(Mission.WATCH))
-    ended(run_streams(streams, tmp_path, settings, lambda _: nullcontext(executor), threading.Event()))
+    ended(
+        run_streams(streams, tmp_path, settings, lambda _: nullcontext(executor), threading.Event())
+    )
     assert {Path(each.site).name: each.telemetry for each in executor.orders} == {
-        "north-watch": "", "south-watch": "udp://:10110"
+        "north-watch": "",
+        "south-watch": "udp://:10110",
     }
     assert all(Order.of(json.loads(each.line())["order"]) == each for each in executor.orders)
 

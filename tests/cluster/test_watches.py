@@ -36,9 +36,14 @@ def killing_once(flag: Path, alerts: Path) -> str:
 
 
 def wished(flown: Path, **watch_wish: str) -> BatchSettings:
-    return BatchSettings(FlightWish(
-        Mission.WATCH, camera=str(flown / "camera.xml"), give_up_s=2.0, watch=WatchWish(**watch_wish),
-    ))
+    return BatchSettings(
+        FlightWish(
+            Mission.WATCH,
+            camera=str(flown / "camera.xml"),
+            give_up_s=2.0,
+            watch=WatchWish(**watch_wish),
+        )
+    )
 
 
 class Crowded(LocalExecutor):
@@ -62,7 +67,9 @@ def local(
     return executor
 
 
-def test_a_killed_watch_goes_on_and_leaves_what_an_undisturbed_one_leaves(flown: Path, tmp_path: Path) -> None:
+def test_a_killed_watch_goes_on_and_leaves_what_an_undisturbed_one_leaves(
+    flown: Path, tmp_path: Path
+) -> None:
     flight = another(flown, tmp_path / "in" / "one")
     another(flown, tmp_path / "in" / "sub" / "one")
     (tmp_path / "out" / "one").mkdir(parents=True)  # a map of the same flight has its own name
@@ -70,7 +77,13 @@ def test_a_killed_watch_goes_on_and_leaves_what_an_undisturbed_one_leaves(flown:
     settings = wished(flown, alert_command=killing_once(tmp_path / "killed", alerts))
     report = ended(run_batch([tmp_path / "in"], tmp_path / "out", settings, local()))
     row, copy = sorted(report.rows, key=lambda each: each.state)
-    assert (row.state, row.tries, report.crashes, row.site, row.flight) == (State.DONE, 2, 1, "one-watch", "one")
+    assert (row.state, row.tries, report.crashes, row.site, row.flight) == (
+        State.DONE,
+        2,
+        1,
+        "one-watch",
+        "one",
+    )
     assert (copy.state, copy.words) == (State.DUPLICATE, f"the same flight as {flight}")
     assert row.words == "1 car, 1 person found in 4 frames"
     assert alerts.read_text().split("\n") == ["one person", "one car", ""]
@@ -100,7 +113,8 @@ def test_a_stream_whose_watch_dies_goes_on_in_the_same_folder(flown: Path, tmp_p
                 (row,) = end.value.rows
                 break
     assert [each.row.words for each in updates[:2] if each.row] == [
-        "waits for memory or cores that others have; it starts when they are known to be free", ""
+        "waits for memory or cores that others have; it starts when they are known to be free",
+        "",
     ]
     assert (row.state, row.tries, row.site, row.flight) == (State.DONE, 2, "north-watch", "one")
     assert row.words == "1 car, 1 person found in 4 frames"
@@ -119,14 +133,19 @@ def test_each_flight_of_a_stream_has_a_folder_of_its_own(flown: Path, tmp_path: 
     photos, outputs = another(flown, tmp_path / "in" / "one"), WatchOutputs(below=tmp_path / "out")
     until = threading.Event()
     for _ in range(2):
-        for _ in watch(f"follow:{photos}", outputs=outputs, camera=flown / "camera.xml", until=until):
+        for _ in watch(
+            f"follow:{photos}", outputs=outputs, camera=flown / "camera.xml", until=until
+        ):
             until.set()
         until.clear()
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["one", "one-2"]
 
 
 def test_orders_of_watches_reach_the_worker_whole() -> None:
-    wish = FlightWish(Mission.WATCH, watch=WatchWish(("person",), 0.5, 2.0, "video", "udp://tak:6969", alert_url="u"))
+    wish = FlightWish(
+        Mission.WATCH,
+        watch=WatchWish(("person",), 0.5, 2.0, "video", "udp://tak:6969", alert_url="u"),
+    )
     order = Order("in", "out", wish)
     assert Order.of(json.loads(order.line())["order"]) == order
 
@@ -137,13 +156,17 @@ def test_whose_watch_a_folder_holds(tmp_path: Path) -> None:
     (tmp_path / "one-watch" / "report.json").write_text("{}")
     (tmp_path / "site").mkdir()
     (tmp_path / "batch.jsonl").touch()
-    assert is_watched(tmp_path / "one-watch", "abc") and not is_watched(tmp_path / "one-watch", "abd")
+    assert is_watched(tmp_path / "one-watch", "abc") and not is_watched(
+        tmp_path / "one-watch", "abd"
+    )
     assert existing_watches(tmp_path) == {"abc": "one-watch"}
     (tmp_path / "one-watch" / "objects").mkdir()
     for name in ("in/1.jpg", "in/2.jpg", "one-watch/objects/1.jpg", "one-watch/objects/2.jpg"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-    assert [each.path.name for each in find_flights([tmp_path], tmp_path / "maps")] == ["in"]  # crops are no flight
+    assert [each.path.name for each in find_flights([tmp_path], tmp_path / "maps")] == [
+        "in"
+    ]  # crops are no flight
 
 
 def test_what_nobody_got_stands_in_the_headline() -> None:
@@ -152,7 +175,10 @@ def test_what_nobody_got_stands_in_the_headline() -> None:
         {"code": "lost_frames", "text": "1 frame could not be used"},
     ]
     report = {
-        "objects": {"by_class": {"person": 2}}, "frames": {"detected": 30}, "georeferenced": False, "notices": notices,
+        "objects": {"by_class": {"person": 2}},
+        "frames": {"detected": 30},
+        "georeferenced": False,
+        "notices": notices,
     }
     assert headline(report) == (
         "2 people found in 30 frames, without a place on the ground; "
@@ -163,8 +189,14 @@ def test_what_nobody_got_stands_in_the_headline() -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--cot", "udp://tak:6969"], "are for --mission watch; leave them out, --mission map takes none"),
-        (["--mission", "watch", "--site-by", "place"], "--mission watch makes no sites: leave --site-by out"),
+        (
+            ["--cot", "udp://tak:6969"],
+            "are for --mission watch; leave them out, --mission map takes none",
+        ),
+        (
+            ["--mission", "watch", "--site-by", "place"],
+            "--mission watch makes no sites: leave --site-by out",
+        ),
         (["--mission", "watch", "--model", "none"], "--mission watch needs a detector"),
         (["--mission", "watch", "--gsd", "0.1"], "--gsd and --copy-to are for maps"),
         (["--mission", "watch", "--cot", "tak.local"], "udp://host:port"),

@@ -36,8 +36,13 @@ m (uint8[1, 3, H, W] image) => (float[K, 4] boxes, float[K] scores, int64[K] lab
 def _bomb(path: Path) -> Path:
     """A kilobyte that makes two pictures of 10 GB each; what it states about itself is in order."""
     model = onnx.parser.parse_model(BOMB)
-    onnx.helper.set_model_props(model, {each.key: each.value for each in onnx.load_model(
-        rectangle_model(path.with_name("good.onnx"))).metadata_props})
+    onnx.helper.set_model_props(
+        model,
+        {
+            each.key: each.value
+            for each in onnx.load_model(rectangle_model(path.with_name("good.onnx"))).metadata_props
+        },
+    )
     path.write_bytes(model.SerializeToString())
     assert path.stat().st_size < 2000
     return path
@@ -54,13 +59,21 @@ def test_a_kilobyte_that_asks_for_gigabytes_is_stopped(tmp_path: Path) -> None:
 
 def test_it_answers_as_it_would_here(tmp_path: Path) -> None:
     path = rectangle_model(tmp_path / "toy.onnx")
-    here, beside = (opens(path.read_bytes(), "toy", "cpu", 1) for opens in (open_engine, confined_engine))
+    here, beside = (
+        opens(path.read_bytes(), "toy", "cpu", 1) for opens in (open_engine, confined_engine)
+    )
     batch = np.ascontiguousarray(draw((64, 96), [(10, 20, 30, 50)]).transpose(2, 0, 1))[None]
     for own, other in zip(here.run(batch), beside.run(batch)):
         assert own.dtype == other.dtype
         np.testing.assert_array_equal(own, other)
-    assert (here.provider, here.info, here.fixed_px) == (beside.provider, beside.info, beside.fixed_px)
-    assert described_confined(path.read_bytes(), "toy").info == describe(path.read_bytes(), "toy").info
+    assert (here.provider, here.info, here.fixed_px) == (
+        beside.provider,
+        beside.info,
+        beside.fixed_px,
+    )
+    assert (
+        described_confined(path.read_bytes(), "toy").info == describe(path.read_bytes(), "toy").info
+    )
 
 
 def test_what_is_wrong_with_a_model_is_reported_as_it_would_be_here(tmp_path: Path) -> None:

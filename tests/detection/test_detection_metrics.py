@@ -32,15 +32,27 @@ HALF = {"person": 0.5, "car": 0.5}
 
 
 def picture(boxes, labels, ignored=(), name="a.jpg", group="g", m_per_px=float("nan")):
-    return LabelledPicture(name, 100, 100, group, np.array(boxes, float).reshape(-1, 4), np.array(labels, int),
-                           np.array(ignored, float).reshape(-1, 4), m_per_px)
+    return LabelledPicture(
+        name,
+        100,
+        100,
+        group,
+        np.array(boxes, float).reshape(-1, 4),
+        np.array(labels, int),
+        np.array(ignored, float).reshape(-1, 4),
+        m_per_px,
+    )
 
 
 def seen(*rows):
     """Rows of (box, class, score)."""
     rows = sorted(rows, key=lambda row: -row[2])
-    return Detections(np.array([row[0] for row in rows], float).reshape(-1, 4), np.array([row[2] for row in rows]),
-                      np.array([row[1] for row in rows], int), CLASSES)
+    return Detections(
+        np.array([row[0] for row in rows], float).reshape(-1, 4),
+        np.array([row[2] for row in rows]),
+        np.array([row[1] for row in rows], int),
+        CLASSES,
+    )
 
 
 def square(x, y, side=10):
@@ -64,12 +76,20 @@ def test_what_a_score_means_worked_by_hand():
     """Of three reports around 0.55 two are right, a fourth lies in an ignored region; of two around 0.95 both are."""
     people = [square(20 * index, 0) for index in range(4)]
     truth = LabelledSet("flat", CLASSES, (picture(people, [0] * 4, ignored=[square(0, 60, 30)]),))
-    doubtful = [(people[0], 0, 0.5), (people[1], 0, 0.55), (square(60, 60), 0, 0.59), (square(5, 65), 0, 0.57)]
+    doubtful = [
+        (people[0], 0, 0.5),
+        (people[1], 0, 0.55),
+        (square(60, 60), 0, 0.59),
+        (square(5, 65), 0, 0.57),
+    ]
     sure = [(people[2], 0, 0.9), (people[3], 0, 1.0)]
     (match, _), _, _ = match_pictures(truth, [seen(*doubtful, *sure)], CLASSES)
     low, high = right_by_score(match)
     assert (low.low, low.high, low.count, low.found) == (0.5, 0.6, 3, pytest.approx(2 / 3))
-    assert low.stated == pytest.approx((0.5 + 0.55 + 0.59) / 3) and low.found_low < 2 / 3 < low.found_high
+    assert (
+        low.stated == pytest.approx((0.5 + 0.55 + 0.59) / 3)
+        and low.found_low < 2 / 3 < low.found_high
+    )
     assert (high.low, high.count, high.found) == (0.9, 2, 1.0)
 
 
@@ -78,15 +98,22 @@ def test_average_precision_worked_by_hand():
     # 1/4, 1/2, 3/4. COCO's envelope: 26 recalls (0 to 0.25) at 1, 50 (0.26 to 0.75) at 3/4, the rest at 0.
     boxes = [square(0, 0), square(20, 0), square(40, 0), square(60, 0)]
     truth = LabelledSet("hand", CLASSES, (picture(boxes, [0] * 4),))
-    found = seen((square(0, 0), 0, 0.9), (square(0, 50), 0, 0.8), (square(20, 0), 0, 0.7), (square(40, 0), 0, 0.6),
-                 (square(50, 50), 0, 0.3))
+    found = seen(
+        (square(0, 0), 0, 0.9),
+        (square(0, 50), 0, 0.8),
+        (square(20, 0), 0, 0.7),
+        (square(40, 0), 0, 0.6),
+        (square(50, 50), 0, 0.3),
+    )
     (match, _), numbers, each = match_pictures(truth, [found], CLASSES)
     expected = (26 * 1.0 + 50 * 0.75) / 101
     assert numbers.ap50 == pytest.approx(expected) == pytest.approx(each["person"].ap)
     assert np.isnan(each["car"].ap) and np.isnan(numbers.ap_large)
     assert numbers.ap_small == pytest.approx(expected)
     assert counts_at(match, 0.5) == (3, 1, 1)
-    assert thesis_ap(match, 0.5) == pytest.approx(0.75) and thesis_ap(match, 0.65) == pytest.approx(2 / 3)
+    assert thesis_ap(match, 0.5) == pytest.approx(0.75) and thesis_ap(match, 0.65) == pytest.approx(
+        2 / 3
+    )
     best = best_threshold(match)
     assert (best.score, best.precision, best.recall) == pytest.approx((0.6, 0.75, 0.75))
     assert best.f1 == pytest.approx(0.75)
@@ -104,12 +131,18 @@ def test_a_box_that_fits_by_70_percent_is_right_up_to_that_overlap():
 
 
 def test_ignored_regions_and_unlabelled_classes_judge_nothing():
-    labelled = LabelledSet("cars", CLASSES, (picture([square(0, 0)], [1], ignored=[[50, 50, 100, 100]]),),
-                           frozenset({"person"}))
+    labelled = LabelledSet(
+        "cars",
+        CLASSES,
+        (picture([square(0, 0)], [1], ignored=[[50, 50, 100, 100]]),),
+        frozenset({"person"}),
+    )
     assert judged_classes(labelled, CLASSES) == ("car",)
     found = seen((square(0, 0), 1, 0.6), (square(60, 60), 1, 0.95), (square(20, 20), 0, 0.99))
     (match,), numbers, _ = match_pictures(labelled, [found], ("car",))
-    assert numbers.ap == pytest.approx(1.0)  # neither the one in the ignored region nor the person is wrong
+    assert numbers.ap == pytest.approx(
+        1.0
+    )  # neither the one in the ignored region nor the person is wrong
     assert counts_at(match, 0.5) == (1, 0, 0)
     table, mistakes = confusion((match,), HALF)
     assert table.tolist() == [[1, 0], [0, 0]] and not mistakes
@@ -120,9 +153,13 @@ def test_ignored_regions_and_unlabelled_classes_judge_nothing():
 
 def test_more_than_a_hundred_objects_of_a_picture_are_all_judged():
     boxes = [square(12 * (k % 16), 12 * (k // 16)) for k in range(150)]
-    crowd = LabelledPicture("crowd.jpg", 200, 200, "g", np.array(boxes, float), np.zeros(150, int), np.zeros((0, 4)))
+    crowd = LabelledPicture(
+        "crowd.jpg", 200, 200, "g", np.array(boxes, float), np.zeros(150, int), np.zeros((0, 4))
+    )
     found = seen(*((box, 0, 0.9) for box in boxes))
-    (match, _), numbers, _ = match_pictures(LabelledSet("crowd", CLASSES, (crowd,)), [found], CLASSES)
+    (match, _), numbers, _ = match_pictures(
+        LabelledSet("crowd", CLASSES, (crowd,)), [found], CLASSES
+    )
     assert numbers.ap50 == pytest.approx(1.0) and counts_at(match, 0.5) == (150, 0, 0)
 
 
@@ -140,43 +177,80 @@ def test_no_detection_and_no_label_are_answers():
 
 
 def test_thesis_map_is_the_mean_of_precisions():
-    labelled = LabelledSet("two", CLASSES, (picture([square(0, 0), square(20, 0), square(40, 0)], [0, 0, 1]),))
-    found = seen((square(0, 0), 0, 0.9), (square(40, 0), 1, 0.8), (square(70, 70), 1, 0.7), (square(80, 0), 1, 0.1))
+    labelled = LabelledSet(
+        "two", CLASSES, (picture([square(0, 0), square(20, 0), square(40, 0)], [0, 0, 1]),)
+    )
+    found = seen(
+        (square(0, 0), 0, 0.9),
+        (square(40, 0), 1, 0.8),
+        (square(70, 70), 1, 0.7),
+        (square(80, 0), 1, 0.1),
+    )
     matches, _, _ = match_pictures(labelled, [found], CLASSES)
-    assert thesis_map(matches, HALF) == pytest.approx((1.0 + 0.5) / 2)  # the missed person does not count (eq. 4.3)
+    assert thesis_map(matches, HALF) == pytest.approx(
+        (1.0 + 0.5) / 2
+    )  # the missed person does not count (eq. 4.3)
 
 
 def test_confusions_false_alarms_and_misses():
-    labelled = LabelledSet("mixed", CLASSES, (
-        picture([square(0, 0), square(20, 0), square(40, 0, 30)], [0, 0, 1]), picture([], []),
-    ))
+    labelled = LabelledSet(
+        "mixed",
+        CLASSES,
+        (
+            picture([square(0, 0), square(20, 0), square(40, 0, 30)], [0, 0, 1]),
+            picture([], []),
+        ),
+    )
     found = [
-        seen((square(0, 0), 0, 0.9), (square(20, 0), 1, 0.8), (square(44, 4, 14), 1, 0.7), (square(40, 0, 30), 1, 0.2)),
+        seen(
+            (square(0, 0), 0, 0.9),
+            (square(20, 0), 1, 0.8),
+            (square(44, 4, 14), 1, 0.7),
+            (square(40, 0, 30), 1, 0.2),
+        ),
         seen((square(5, 5), 0, 0.99)),
     ]
     matches, _, _ = match_pictures(labelled, found, CLASSES)
     table, mistakes = confusion(matches, HALF)
     # true person: one found, one called car; true car: missed at 0.5; background: a person and a badly placed car
     assert table.tolist() == [[1, 1, 0], [0, 0, 1], [1, 1, 0]]
-    by_kind = {kind: [each for each in mistakes if each.kind == kind] for kind in ("false alarm", "miss", "confusion")}
+    by_kind = {
+        kind: [each for each in mistakes if each.kind == kind]
+        for kind in ("false alarm", "miss", "confusion")
+    }
     assert [each.score for each in by_kind["false alarm"]] == [0.99, 0.7]
     assert by_kind["false alarm"][0].picture == 1 and by_kind["false alarm"][0].overlap == 0
     assert by_kind["false alarm"][1].overlap == pytest.approx(14 * 14 / 900)
     (confused,), (missed,) = by_kind["confusion"], by_kind["miss"]
     assert (confused.label, confused.true_label) == ("car", "person")
-    assert missed.true_label == "car" and missed.box_px == (40, 0, 70, 30) and missed.score == pytest.approx(0.2)
+    assert (
+        missed.true_label == "car"
+        and missed.box_px == (40, 0, 70, 30)
+        and missed.score == pytest.approx(0.2)
+    )
 
 
 def test_recall_by_size_in_pixels_and_metres():
-    labelled = LabelledSet("sizes", CLASSES, (
-        picture([square(0, 0, 6), square(20, 0, 6), square(40, 0, 20)], [0, 0, 0], m_per_px=0.05),
-        picture([square(0, 0)], [0]),
-    ))
-    found = [seen((square(0, 0, 6), 0, 0.9), (square(20, 0, 6), 0, 0.1), (square(40, 0, 20), 0, 0.8)), seen()]
+    labelled = LabelledSet(
+        "sizes",
+        CLASSES,
+        (
+            picture(
+                [square(0, 0, 6), square(20, 0, 6), square(40, 0, 20)], [0, 0, 0], m_per_px=0.05
+            ),
+            picture([square(0, 0)], [0]),
+        ),
+    )
+    found = [
+        seen((square(0, 0, 6), 0, 0.9), (square(20, 0, 6), 0, 0.1), (square(40, 0, 20), 0, 0.8)),
+        seen(),
+    ]
     matches, _, _ = match_pictures(labelled, found, CLASSES)
     rows = recall_by_size(matches, HALF, np.ones(2), SIZES_PX)["person"]
     assert [(row.low, row.count, row.reported, row.candidates) for row in rows] == [
-        (4, 2, 1, 2), (8, 1, 0, 0), (16, 1, 1, 1)
+        (4, 2, 1, 2),
+        (8, 1, 0, 0),
+        (16, 1, 1, 1),
     ]
     assert rows[0].recall == 0.5
     metres = np.array([each.m_per_px for each in labelled.pictures])
@@ -191,15 +265,28 @@ def random_set(seed, pictures=24, groups=8, skill=0.7):
     for index in range(pictures):
         corners, sides = truth_rng.uniform(0, 80, (6, 2)), truth_rng.uniform(4, 40, (6, 2))
         boxes, labels = np.hstack([corners, corners + sides]), truth_rng.integers(0, 2, 6)
-        labelled.append(picture(boxes[:5], labels[:5], boxes[5:] if index % 3 == 0 else (), f"{index}.jpg",
-                                f"video{index % groups}"))
+        labelled.append(
+            picture(
+                boxes[:5],
+                labels[:5],
+                boxes[5:] if index % 3 == 0 else (),
+                f"{index}.jpg",
+                f"video{index % groups}",
+            )
+        )
         rows = []
         for box, label in zip(boxes, labels):
             if rng.uniform() < skill:
                 rows.append((box + rng.normal(0, 1.5, 4), int(label), float(rng.uniform(0.2, 1))))
             if rng.uniform() < 0.4:
                 corner = rng.uniform(0, 80, 2)
-                rows.append((np.hstack([corner, corner + 12]), int(rng.integers(2)), float(rng.uniform(0.02, 0.8))))
+                rows.append(
+                    (
+                        np.hstack([corner, corner + 12]),
+                        int(rng.integers(2)),
+                        float(rng.uniform(0.02, 0.8)),
+                    )
+                )
         found.append(seen(*rows))
     return LabelledSet("random", CLASSES, tuple(labelled)), found
 
@@ -220,7 +307,11 @@ def test_tables_measure_what_coco_measures_also_on_drawn_groups():
     assert exact["thesis_map"][0] == pytest.approx(thesis_map(matches, HALF), abs=1e-9)
     # a draw is the set with its groups as often as drawn: build it and let COCO measure it
     weights = np.array([2.0, 0, 1, 0, 3, 0, 1, 1])
-    chosen = [k for k, row in enumerate(labelled.pictures) for _ in range(int(weights[int(row.group[5:])]))]
+    chosen = [
+        k
+        for k, row in enumerate(labelled.pictures)
+        for _ in range(int(weights[int(row.group[5:])]))
+    ]
     again = labelled.only([labelled.pictures[k] for k in chosen])
     _, drawn, _ = match_pictures(again, [found[k] for k in chosen], CLASSES)
     measured = tables.measure(weights[None])
@@ -236,7 +327,10 @@ def test_intervals_hold_the_value_shrink_with_data_and_repeat():
             matches, numbers, _ = match_pictures(labelled, found, CLASSES)
             tables = group_tables(matches, group_index(labelled), HALF)
             stated = intervals(tables, draws=200)["AP"]
-            assert stated.value == pytest.approx(numbers.ap, abs=1e-9) and stated.low < stated.value < stated.high
+            assert (
+                stated.value == pytest.approx(numbers.ap, abs=1e-9)
+                and stated.low < stated.value < stated.high
+            )
             assert intervals(tables, draws=200)["AP"] == stated
             seen_widths.append(stated.high - stated.low)
     assert np.mean(widths[64]) < 0.6 * np.mean(widths[8])
@@ -252,7 +346,9 @@ def test_a_better_model_is_clearly_better_and_equal_ones_are_not():
     _, weak_too = random_set(6, pictures=48, skill=0.45)
     groups = group_index(labelled)
     arms = weak, strong, weak_too
-    tables = [group_tables(match_pictures(labelled, each, CLASSES)[0], groups, HALF) for each in arms]
+    tables = [
+        group_tables(match_pictures(labelled, each, CLASSES)[0], groups, HALF) for each in arms
+    ]
     better = differences(tables[:1], tables[1:2], draws=200)["AP50"]
     assert better.is_clear and better.low > 0.1 and better.share_above == 1.0
     same = differences(tables[:1], tables[:1], draws=200)["AP50"]
@@ -263,7 +359,9 @@ def test_a_better_model_is_clearly_better_and_equal_ones_are_not():
     assert not differences([tables[0]], [tables[2]], draws=200)["AP50"].is_clear
 
 
-@pytest.mark.skipif(importlib.util.find_spec("faster_coco_eval") is None, reason="faster-coco-eval is not installed")
+@pytest.mark.skipif(
+    importlib.util.find_spec("faster_coco_eval") is None, reason="faster-coco-eval is not installed"
+)
 def test_another_implementation_agrees():
     from faster_coco_eval import COCO, COCOeval_faster
 
@@ -275,11 +373,17 @@ def test_another_implementation_agrees():
             annotations.append(coco_row(len(annotations) + 1, index, label, box, 0))
         for box in row.ignored_px.tolist():
             annotations += [coco_row(len(annotations) + 1 + k, index, k, box, 1) for k in (0, 1)]
-        for box, label, score in zip(detections.boxes_px.tolist(), detections.labels.tolist(), detections.scores):
+        for box, label, score in zip(
+            detections.boxes_px.tolist(), detections.labels.tolist(), detections.scores
+        ):
             rows.append(coco_row(len(rows) + 1, index, label, box, 0) | {"score": float(score)})
-    truth = COCO({"images": [{"id": k, "width": 100, "height": 100} for k in range(len(found))],
-                  "categories": [{"id": k, "name": name} for k, name in enumerate(CLASSES)],
-                  "annotations": annotations})
+    truth = COCO(
+        {
+            "images": [{"id": k, "width": 100, "height": 100} for k in range(len(found))],
+            "categories": [{"id": k, "name": name} for k, name in enumerate(CLASSES)],
+            "annotations": annotations,
+        }
+    )
     judge = COCOeval_faster(truth, truth.loadRes(rows), "bbox", print_function=lambda *_: None)
     judge.run()
     ours = (numbers.ap, numbers.ap50, numbers.ap75, numbers.ap_small, numbers.ap_medium)
@@ -288,12 +392,20 @@ def test_another_implementation_agrees():
 
 def coco_row(row_id, index, label, box, crowd):
     left, top, right, bottom = box
-    return {"id": row_id, "image_id": index, "category_id": label, "iscrowd": crowd,
-            "bbox": [left, top, right - left, bottom - top], "area": (right - left) * (bottom - top)}
+    return {
+        "id": row_id,
+        "image_id": index,
+        "category_id": label,
+        "iscrowd": crowd,
+        "bbox": [left, top, right - left, bottom - top],
+        "area": (right - left) * (bottom - top),
+    }
 
 
 @pytest.mark.parametrize(("people", "kept"), [(8, True), (40, True), (60, False)])
-def test_few_held_out_labels_keep_threshold_and_sizes_of_the_model_before(people: int, kept: bool) -> None:
+def test_few_held_out_labels_keep_threshold_and_sizes_of_the_model_before(
+    people: int, kept: bool
+) -> None:
     boxes = [square(20 * index, 0) for index in range(people)]
     truth = LabelledSet("held out", CLASSES, (picture(boxes, [0] * people),))
     found = [(box, 0, 0.99 - 0.8 * index / people) for index, box in enumerate(boxes)]

@@ -43,14 +43,20 @@ def test_finds_what_is_there(model: Path, picture: np.ndarray, provider: str) ->
 
 
 @pytest.mark.parametrize("size", [(1, 1), (31, 33), (64, 32), (257, 300)])
-def test_any_size_is_padded_and_boxes_end_at_the_picture(detector: Detector, size: tuple[int, int]) -> None:
+def test_any_size_is_padded_and_boxes_end_at_the_picture(
+    detector: Detector, size: tuple[int, int]
+) -> None:
     height, width = size
     picture = draw(size, [(width // 2, height // 2, width, height)])
-    np.testing.assert_allclose(detector.detect(picture).boxes_px, [(width // 2, height // 2, width, height)])
+    np.testing.assert_allclose(
+        detector.detect(picture).boxes_px, [(width // 2, height // 2, width, height)]
+    )
     assert len(detector.detect(np.zeros(size, np.uint8))) == 0
 
 
-def test_grey_transparent_and_deep_pictures_look_the_same(detector: Detector, picture: np.ndarray) -> None:
+def test_grey_transparent_and_deep_pictures_look_the_same(
+    detector: Detector, picture: np.ndarray
+) -> None:
     expected = detector.detect(picture)
     alpha = np.concatenate([picture, np.zeros_like(picture[:, :, :1])], axis=2)
     deep = picture.astype(np.uint16) * 257
@@ -68,7 +74,14 @@ def test_raw_thermal_frames_are_stretched(detector: Detector) -> None:
     heat = np.full((120, 200), 7300, np.uint16)
     heat[20:80, 10:50] = 7800
     np.testing.assert_allclose(detector.detect(heat, least_score=0.9).boxes_px, [_BOXES[0]])
-    assert len(detector.detect(np.full((120, 200), 7300, np.uint16) + np.arange(200, dtype=np.uint16) % 3)) <= 1
+    assert (
+        len(
+            detector.detect(
+                np.full((120, 200), 7300, np.uint16) + np.arange(200, dtype=np.uint16) % 3
+            )
+        )
+        <= 1
+    )
 
 
 @pytest.mark.parametrize(
@@ -101,7 +114,9 @@ def test_several_pictures_of_different_sizes(detector: Detector, picture: np.nda
 def test_large_cars_are_seen_in_a_smaller_look_and_people_in_the_picture(
     detector: Detector, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    picture = draw((900, 1200), [(10, 20, 50, 80), (300, 300, 900, 600)], labels=[0, 1], scores=[200, 250])
+    picture = draw(
+        (900, 1200), [(10, 20, 50, 80), (300, 300, 900, 600)], labels=[0, 1], scores=[200, 250]
+    )
     scales = []
 
     def noted(session: object, rgb: object, place_px: object, scale: float) -> object:
@@ -114,7 +129,10 @@ def test_large_cars_are_seen_in_a_smaller_look_and_people_in_the_picture(
     early = []
     m_per_px = 4.4 / (1.5 * longest_px)
     seen = detector.detect(
-        picture, tiles="auto", m_per_px=m_per_px, early=lambda *found: early.append((*scales, *found))
+        picture,
+        tiles="auto",
+        m_per_px=m_per_px,
+        early=lambda *found: early.append((*scales, *found)),
     )
     assert scales == pytest.approx([1 / 1.5, 1.0])
     assert seen.names == ["car", "person"], "each once, best first"
@@ -123,13 +141,17 @@ def test_large_cars_are_seen_in_a_smaller_look_and_people_in_the_picture(
     assert classes == ("car",) and cars.names == ["car"]
     np.testing.assert_array_equal(cars.boxes_px, seen.boxes_px[:1])
     found = detector.detect(picture, early=lambda *found: early.append(found))
-    assert len(found) == 2 and scales[2:] == [1.0] and len(early) == 1, "unknown ground is looked at once"
+    assert len(found) == 2 and scales[2:] == [1.0] and len(early) == 1, (
+        "unknown ground is looked at once"
+    )
 
 
 def test_each_class_has_its_own_threshold(detector: Detector) -> None:
     picture = draw((120, 200), _BOXES, labels=[0, 1, 2], scores=[130, 130, 130])
     found = detector.detect(picture)
-    assert found.names == ["person", "car"], "0.51 lies above the thresholds of people and cars, below small objects'"
+    assert found.names == ["person", "car"], (
+        "0.51 lies above the thresholds of people and cars, below small objects'"
+    )
     assert len(detector.detect(picture, least_score=0.5)) == 3
     assert len(detector.detect(picture, least_score=0.52)) == 0
     assert detector.detect(picture, classes=["car"]).names == ["car"]
@@ -137,22 +159,37 @@ def test_each_class_has_its_own_threshold(detector: Detector) -> None:
 
 @pytest.mark.parametrize(
     "wish",
-    [{"classes": ["horse"]}, {"classes": []}, {"least_score": 2.0}, {"tiles": 3}, {"tiles": "some"}, {"m_per_px": 0}],
+    [
+        {"classes": ["horse"]},
+        {"classes": []},
+        {"least_score": 2.0},
+        {"tiles": 3},
+        {"tiles": "some"},
+        {"m_per_px": 0},
+    ],
 )
-def test_wishes_that_cannot_be(detector: Detector, picture: np.ndarray, wish: dict[str, object]) -> None:
+def test_wishes_that_cannot_be(
+    detector: Detector, picture: np.ndarray, wish: dict[str, object]
+) -> None:
     with pytest.raises(SettingsError):
         detector.detect(picture, **({"tiles": "auto"} | wish))  # type: ignore[arg-type]
 
 
-def test_a_sampling_distance_of_nan_is_one_that_is_not_known(detector: Detector, picture: np.ndarray) -> None:
+def test_a_sampling_distance_of_nan_is_one_that_is_not_known(
+    detector: Detector, picture: np.ndarray
+) -> None:
     for tiles in ("auto", 64, None):
-        unsaid, nan = (detector.detect(picture, tiles=tiles, m_per_px=each) for each in (None, float("nan")))  # type: ignore[call-overload]
+        unsaid, nan = (
+            detector.detect(picture, tiles=tiles, m_per_px=each) for each in (None, float("nan"))
+        )  # type: ignore[call-overload]
         np.testing.assert_array_equal(unsaid.boxes_px, nan.boxes_px)
         assert unsaid.names == nan.names and len(nan) == 3
 
 
 @pytest.mark.long
-def test_a_picture_of_a_hundred_megapixels_is_searched_to_its_last_corner(detector: Detector) -> None:
+def test_a_picture_of_a_hundred_megapixels_is_searched_to_its_last_corner(
+    detector: Detector,
+) -> None:
     boxes = [(0, 0, 30, 40), (6380, 4400, 6420, 4450), (11960, 8970, 12000, 9000)]
     picture = draw((9000, 12000), boxes)
     found = detector.detect(picture)
@@ -160,17 +197,27 @@ def test_a_picture_of_a_hundred_megapixels_is_searched_to_its_last_corner(detect
 
 
 def test_a_model_of_one_size_sees_any_picture(tmp_path: Path) -> None:
-    fixed = Detector.load(rectangle_model(tmp_path / "fixed.onnx", fixed=(64, 96)), provider="cpu", threads=1)
-    np.testing.assert_allclose(fixed.detect(draw((40, 50), [(10, 5, 30, 25)])).boxes_px, [(10, 5, 30, 25)])
+    fixed = Detector.load(
+        rectangle_model(tmp_path / "fixed.onnx", fixed=(64, 96)), provider="cpu", threads=1
+    )
+    np.testing.assert_allclose(
+        fixed.detect(draw((40, 50), [(10, 5, 30, 25)])).boxes_px, [(10, 5, 30, 25)]
+    )
     large = draw((256, 256), [(64, 128, 128, 192)])
     np.testing.assert_allclose(fixed.detect(large).boxes_px, [(64, 128, 128, 192)], atol=4)
-    np.testing.assert_allclose(fixed.detect(large, tiles="auto").boxes_px, [(64, 128, 128, 192)], atol=1e-3)
+    np.testing.assert_allclose(
+        fixed.detect(large, tiles="auto").boxes_px, [(64, 128, 128, 192)], atol=1e-3
+    )
 
 
 def test_states_where_it_runs_and_what_it_is(detector: Detector) -> None:
     assert detector.provider == "ONNX Runtime on the CPU, 1 thread"
     assert detector.classes == CLASSES
-    assert (detector.info.name, detector.info.stride, detector.info.best_px["car"]) == ("toy", 32, (16.0, 200.0))
+    assert (detector.info.name, detector.info.stride, detector.info.best_px["car"]) == (
+        "toy",
+        32,
+        (16.0, 200.0),
+    )
 
 
 class TestThermalFramesAndDaylightModels:
@@ -198,28 +245,41 @@ class TestThermalFramesAndDaylightModels:
         assert (notice.code, notice.count) == ("thermal_model", 1) and "night" in notice.text
 
     def test_its_own_thresholds_hold(self) -> None:
-        rectangle_model(self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6))
+        rectangle_model(
+            self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6)
+        )
         picture = draw((120, 200), _BOXES, labels=[0, 0, 0], scores=[130, 130, 130])
         grey = np.repeat(picture[:, :, :1], 3, axis=2)
-        assert len(self.day.detect(grey)) == 0, "0.51 lies below them, above the daylight model's of people"
+        assert len(self.day.detect(grey)) == 0, (
+            "0.51 lies below them, above the daylight model's of people"
+        )
         assert len(self.day.detect(grey, least_score=0.4)) == 3
 
     def test_without_one_it_is_reported(self, picture: np.ndarray, tmp_path: Path) -> None:
         classes = ["boat", "buoy", "raft"]  # none that the packaged model knows
-        stated = {"thresholds": dict.fromkeys(classes, 0.3), "best_px": {each: [4, 300] for each in classes}}
-        model = rectangle_model(tmp_path / "sea.onnx", name="sea", thermal=False, classes=classes, **stated)
+        stated = {
+            "thresholds": dict.fromkeys(classes, 0.3),
+            "best_px": {each: [4, 300] for each in classes},
+        }
+        model = rectangle_model(
+            tmp_path / "sea.onnx", name="sea", thermal=False, classes=classes, **stated
+        )
         sea = Detector.load(model, provider="cpu", threads=1)
         for polarity in (picture[:, :, 0], 255 - picture[:, :, 0]):
             sea.detect(polarity)
         (notice,) = sea.notices
         assert (notice.code, notice.count) == ("thermal_untrained", 2)
 
-    def test_a_model_names_the_one_that_looks_at_thermal_frames(self, picture: np.ndarray, tmp_path: Path) -> None:
+    def test_a_model_names_the_one_that_looks_at_thermal_frames(
+        self, picture: np.ndarray, tmp_path: Path
+    ) -> None:
         known = {"thermal": True, "thermal_by": "night"}
         both = rectangle_model(tmp_path / "both.onnx", name="both", **known)
         grey = draw((120, 200), _BOXES, labels=[0, 0, 0], scores=[130, 130, 130])
         grey = np.repeat(grey[:, :, :1], 3, axis=2)
-        assert len(Detector.load(both, provider="cpu", threads=1).detect(grey)) == 3, "not installed: it looks itself"
+        assert len(Detector.load(both, provider="cpu", threads=1).detect(grey)) == 3, (
+            "not installed: it looks itself"
+        )
         high = {"thresholds": dict.fromkeys(CLASSES, 0.6)}
         rectangle_model(self.folder / "another.onnx", name="another")
         rectangle_model(self.folder / "night.onnx", name="night", daylight=False, **high)
@@ -228,7 +288,10 @@ class TestThermalFramesAndDaylightModels:
         assert len(detector.detect(grey)) == 0, "the thresholds are those of the model that looks"
         assert len(detector.detect(grey, least_score=0.4)) == 3
         (notice,) = detector.notices
-        assert (notice.code, notice.count) == ("thermal_model", 2) and "'night', which was trained" in notice.text
+        assert (notice.code, notice.count) == (
+            "thermal_model",
+            2,
+        ) and "'night', which was trained" in notice.text
         assert [(each.name, count) for each, count in detector.others] == [("night", 2)]
 
     def test_a_thermal_model_states_that_colour_is_not_known(self, picture: np.ndarray) -> None:
@@ -241,9 +304,15 @@ class TestThermalFramesAndDaylightModels:
         (notice,) = detector.notices
         assert (notice.code, notice.count) == ("daylight_untrained", 1) and "'night'" in notice.text
 
-    def test_threads_that_ask_at_once_get_the_same_model(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        rectangle_model(self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6))
-        grey = np.repeat(draw((120, 200), _BOXES, labels=[0, 0, 0], scores=[130, 130, 130])[:, :, :1], 3, axis=2)
+    def test_threads_that_ask_at_once_get_the_same_model(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        rectangle_model(
+            self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6)
+        )
+        grey = np.repeat(
+            draw((120, 200), _BOXES, labels=[0, 0, 0], scores=[130, 130, 130])[:, :, :1], 3, axis=2
+        )
 
         def slowly(*asked: object) -> Path:
             time.sleep(0.2)
@@ -255,7 +324,9 @@ class TestThermalFramesAndDaylightModels:
         assert found == [0, 0, 0, 0]
 
     def test_thresholds_are_those_of_the_model_that_looks(self, picture: np.ndarray) -> None:
-        rectangle_model(self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6))
+        rectangle_model(
+            self.folder / "night.onnx", name="night", thresholds=dict.fromkeys(CLASSES, 0.6)
+        )
         assert self.day.thresholds_for(picture) == self.day.info.thresholds
         assert set(self.day.thresholds_for(picture[:, :, 0]).values()) == {0.6}
         assert self.day.notices == (), "asking is not looking"
@@ -271,7 +342,9 @@ def test_people_who_are_too_small_from_above_are_not_looked_for_and_a_notice_sta
     assert detector.notices == ()
     assert look(m_per_px=coarse).names == ["small object", "car"]
     assert not len(look(m_per_px=coarse, classes=["person"]))
-    assert detector.detect(picture, m_per_px=coarse).names == ["person", "small object", "car"], "from aslant"
+    assert detector.detect(picture, m_per_px=coarse).names == ["person", "small object", "car"], (
+        "from aslant"
+    )
     (notice,) = detector.notices
     assert (notice.code, notice.count) == ("people_too_small", 2) and "10 cm" in notice.text
     above = partial(detector.thresholds_for, picture, from_above=True)

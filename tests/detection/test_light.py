@@ -10,7 +10,9 @@ from sorvolo.detection.light import is_thermal, rgb_from_picture
 
 @pytest.fixture
 def heat() -> np.ndarray:
-    return cv2.GaussianBlur(np.random.default_rng(3).uniform(0, 255, (120, 160)).astype(np.uint8), (0, 0), 4)
+    return cv2.GaussianBlur(
+        np.random.default_rng(3).uniform(0, 255, (120, 160)).astype(np.uint8), (0, 0), 4
+    )
 
 
 def test_grey_is_thermal_in_either_polarity_and_through_a_video(heat: np.ndarray) -> None:
@@ -19,7 +21,9 @@ def test_grey_is_thermal_in_either_polarity_and_through_a_video(heat: np.ndarray
         three = np.repeat(grey[:, :, None], 3, axis=2)
         assert is_thermal(three) and is_thermal(three.astype(np.uint16) * 257)
         chroma = cv2.cvtColor(three, cv2.COLOR_RGB2YCrCb)
-        chroma[..., 1:] += np.random.default_rng(0).integers(-1, 2, chroma[..., 1:].shape).astype(np.uint8)
+        chroma[..., 1:] += (
+            np.random.default_rng(0).integers(-1, 2, chroma[..., 1:].shape).astype(np.uint8)
+        )
         assert is_thermal(cv2.cvtColor(chroma, cv2.COLOR_YCrCb2RGB))
 
 
@@ -53,7 +57,12 @@ def test_a_dead_pixel_does_not_darken_the_frame(heat: np.ndarray) -> None:
 
 
 def test_real_pictures() -> None:
-    for folder, expected in (("hituav", True), ("sdd", False), ("tinyperson", False), ("cats", False)):
+    for folder, expected in (
+        ("hituav", True),
+        ("sdd", False),
+        ("tinyperson", False),
+        ("cats", False),
+    ):
         paths = sorted(real_data(f"detection/{folder}/images").rglob("*.*"))
         for path in paths[:: max(1, len(paths) // 8)]:
             picture = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2RGB)

@@ -16,7 +16,13 @@ from toy_models import rectangle_model, square_model
 
 from sorvolo.cli import main as cli
 from sorvolo.detection.detector import Detector
-from sorvolo.detection.models import Integrity, find_model, installed_models, integrity, models_folder
+from sorvolo.detection.models import (
+    Integrity,
+    find_model,
+    installed_models,
+    integrity,
+    models_folder,
+)
 from sorvolo.detection.session import read_info
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.missions.fetched_files import WebRedirects
@@ -102,7 +108,9 @@ def test_an_own_model_that_a_packaged_name_hides_is_reported(
         assert "is not used: 'thermal' is the name of a packaged model" in printed
 
 
-def test_where_own_models_lie(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_own_models_lie(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert models_folder() == folder
     monkeypatch.delenv("SORVOLO_MODELS")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
@@ -119,10 +127,15 @@ def test_fetched_from_the_web_from_a_file_and_by_name(
     fetch_model(str(model), _hash(model), name="from-disk")
     monkeypatch.setenv("SORVOLO_MODELS_URL", f"{address}/")
     fetch_model("coast", _hash(model))
-    assert [each.name for each in installed_models() if not each.is_packaged] == ["coast", "from-disk"]
+    assert [each.name for each in installed_models() if not each.is_packaged] == [
+        "coast",
+        "from-disk",
+    ]
 
 
-def test_what_is_not_the_file_never_appears(folder: Path, model: Path, address: str, tmp_path: Path) -> None:
+def test_what_is_not_the_file_never_appears(
+    folder: Path, model: Path, address: str, tmp_path: Path
+) -> None:
     attempts = [
         (f"{address}/coast.onnx", "0" * 64, "is not the file"),
         (f"{address}/cut-coast.onnx", _hash(model), "is not the file|cannot be fetched"),
@@ -148,12 +161,26 @@ def test_a_redirect_is_followed_over_the_web_alone(folder: Path, model: Path, ad
     assert not (folder / "elsewhere.onnx").exists()
 
 
-@pytest.mark.parametrize("asked, offered, is_followed", [
-    ("https", "https", True), ("http", "https", True), ("https", "http", False), ("http", "ftp", False),
-])
+@pytest.mark.parametrize(
+    "asked, offered, is_followed",
+    [
+        ("https", "https", True),
+        ("http", "https", True),
+        ("https", "http", False),
+        ("http", "ftp", False),
+    ],
+)
 def test_a_redirect_never_gives_up_encryption(asked: str, offered: str, is_followed: bool) -> None:
     request = urllib.request.Request(f"{asked}://example.org/a.onnx")
-    follow = partial(WebRedirects().redirect_request, request, None, 302, "", {}, f"{offered}://example.org/b.onnx")
+    follow = partial(
+        WebRedirects().redirect_request,
+        request,
+        None,
+        302,
+        "",
+        {},
+        f"{offered}://example.org/b.onnx",
+    )
     if is_followed:
         assert follow().full_url == f"{offered}://example.org/b.onnx"
     else:
@@ -161,16 +188,23 @@ def test_a_redirect_never_gives_up_encryption(asked: str, offered: str, is_follo
             follow()
 
 
-def test_a_failed_fetch_leaves_the_old_model(folder: Path, model: Path, address: str, tmp_path: Path) -> None:
+def test_a_failed_fetch_leaves_the_old_model(
+    folder: Path, model: Path, address: str, tmp_path: Path
+) -> None:
     fetch_model(f"{address}/coast.onnx", _hash(model))
     square_model(model)
     with pytest.raises(InputError):
         fetch_model(f"{address}/coast.onnx", "1" * 64)
     (kept,) = [each for each in installed_models() if not each.is_packaged]
-    assert integrity(kept) is Integrity.GOOD and Detector.load("coast", provider="cpu").info.name == "coast"
+    assert (
+        integrity(kept) is Integrity.GOOD
+        and Detector.load("coast", provider="cpu").info.name == "coast"
+    )
 
 
-def test_a_fetched_file_that_is_no_model_is_named_as_it_was_given(folder: Path, tmp_path: Path) -> None:
+def test_a_fetched_file_that_is_no_model_is_named_as_it_was_given(
+    folder: Path, tmp_path: Path
+) -> None:
     junk = tmp_path / "junk.onnx"
     junk.write_bytes(b"junk")
     with pytest.raises(InputError, match=f"^nothing was installed: {junk} cannot be run"):
@@ -181,7 +215,9 @@ def test_a_fetched_file_that_is_no_model_is_named_as_it_was_given(folder: Path, 
 @pytest.mark.parametrize(
     ("source", "sha256", "name"),
     [
-        ("x.onnx", "12ab", ""), ("given", "0" * 64, "../up"), ("given", "0" * 64, ".hidden"),
+        ("x.onnx", "12ab", ""),
+        ("given", "0" * 64, "../up"),
+        ("given", "0" * 64, ".hidden"),
         ("ftp://a/b.onnx", "0" * 64, ""),
     ],
 )
@@ -206,24 +242,35 @@ def test_the_command(folder: Path, model: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_classes_on_request_are_named(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     model = rectangle_model(tmp_path / "asked.onnx", name="asked", on_request=["small object"])
     assert cli.main(["models", "show", str(model)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert sum("reported only where asked for (--classes), from score" in line for line in lines) == 1
+    assert (
+        sum("reported only where asked for (--classes), from score" in line for line in lines) == 1
+    )
     assert sum("reported from score" in line for line in lines) == 2
     fetch_model(str(model), _hash(model))
     assert cli.main(["models", "list"]) == 0
     assert "person, car, small object (on request)" in capsys.readouterr().out
 
 
-def test_a_card_s_measurements_are_a_table(folder: Path, model: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_card_s_measurements_are_a_table(
+    folder: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     fetch_model(str(model), _hash(model))
-    ap50, ap = {"value": 0.6224, "low": 0.4, "high": 0.77}, {"value": 0.264, "low": None, "high": None}
+    ap50, ap = (
+        {"value": 0.6224, "low": 0.4, "high": 0.77},
+        {"value": 0.264, "low": None, "high": None},
+    )
     card = {
-        "sha256": _hash(model), "fails": ["people below 10 px", "crowds"],
+        "sha256": _hash(model),
+        "fails": ["people below 10 px", "crowds"],
         "measured": {"sea_side": {"person": {"labels": 1387, "AP50": ap50, "AP": ap}}, "odd": 3},
     }
     (folder / "coast.json").write_text(json.dumps(card))
@@ -238,17 +285,26 @@ def test_a_card_s_measurements_are_a_table(folder: Path, model: Path, capsys: py
     assert "measured on pictures held out, by version 2" in printed and "measured by" not in printed
 
 
-def test_the_packaged_model_states_which_version_was_measured(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_packaged_model_states_which_version_was_measured(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert cli.main(["models", "show", "default"]) == 0
     words = " ".join(capsys.readouterr().out.split())
-    assert "held out, by version 12, whose networks are the same, of candidates from a score of 0.02 on" in words
+    assert (
+        "held out, by version 12, whose networks are the same, of candidates from a score of 0.02 on"
+        in words
+    )
 
 
-def test_what_is_no_model_is_reported_as_what_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_model_is_reported_as_what_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     Path("clip.mp4").write_bytes(b"")
     for name in ("clip.mp4", "./clip.mp4"):
-        with pytest.raises(InputError, match=r"clip\.mp4 is no model: those are \.onnx files; give one, or a name"):
+        with pytest.raises(
+            InputError, match=r"clip\.mp4 is no model: those are \.onnx files; give one, or a name"
+        ):
             Detector.load(name)
     with pytest.raises(InputError, match=r"can run code when opened"):
         Detector.load("./net.pth")
@@ -286,16 +342,23 @@ def test_verify_finds_changed_damaged_and_unknown_files(
 
 
 def test_a_model_that_only_looks_again_searches_nothing(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It finds nobody in whole pictures, so that an empty watch would mislead; it is asked by other models alone."""
     monkeypatch.setenv("COLUMNS", "200")
     model = rectangle_model(tmp_path / "again.onnx", name="again", second_only=True)
     fetch_model(str(model), _hash(model))
     for wanted in ("again", model):
-        with pytest.raises(InputError, match=r"'again' only looks again at what other models report.*default") as no:
+        with pytest.raises(
+            InputError, match=r"'again' only looks again at what other models report.*default"
+        ) as no:
             Detector.load(wanted, provider="cpu", threads=1)
-        assert not {"again", "second-opinion"} & set(str(no.value).split("pictures: ")[1].split(", "))
+        assert not {"again", "second-opinion"} & set(
+            str(no.value).split("pictures: ")[1].split(", ")
+        )
     with pytest.raises(InputError, match="installed are: ") as unknown:
         find_model("gone")
     assert "again" not in str(unknown.value) and "second-opinion" not in str(unknown.value)
@@ -321,7 +384,9 @@ def test_packaged_models_are_what_their_cards_state() -> None:
         assert integrity(each) is Integrity.GOOD
         assert each.path.stat().st_size <= 40e6
         assert read_info(each.path).second_only is (each.name == "second-opinion")
-        assert read_info(each.path).classes == (("person",) if each.name == "second-opinion" else CLASSES)
+        assert read_info(each.path).classes == (
+            ("person",) if each.name == "second-opinion" else CLASSES
+        )
     assert sum(each.path.stat().st_size for each in packaged) <= 55e6
     for name in ("default", "default-int8"):
         how = Detector.load(name, provider="cpu", threads=1).info.second_look["person"]
@@ -336,6 +401,10 @@ def test_the_packaged_model_hands_thermal_frames_to_the_thermal_one() -> None:
     assert notice.code == "thermal_model" and "'thermal'" in notice.text
 
 
-def test_the_help_of_quantise_names_the_extra_that_it_needs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_of_quantise_names_the_extra_that_it_needs(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert cli.main(["models", "quantise", "--help"]) == 0
-    assert "extra `training`" in capsys.readouterr().out  # words in square brackets are taken for markup
+    assert (
+        "extra `training`" in capsys.readouterr().out
+    )  # words in square brackets are taken for markup

@@ -42,7 +42,9 @@ def test_thresholds_are_of_what_comes_out(tmp_path: Path) -> None:
     picture = draw((256, 320), BOXES[:1], scores=[225])  # own score 0.88: 0.53 when scaled
     for least, count in ((0.5, 1), (0.56, 0)):
         detector = loaded(
-            tmp_path, calibration=PEOPLE, thresholds={"person": least, "car": 0.5, "small object": 0.5}
+            tmp_path,
+            calibration=PEOPLE,
+            thresholds={"person": least, "car": 0.5, "small object": 0.5},
         )
         assert len(detector.detect(picture)) == count
         assert detector.thresholds_for(picture)["person"] == least
@@ -55,7 +57,9 @@ def test_a_fit_finds_what_scores_mean() -> None:
     right = rng.random(len(own)) < platt_scaled(own, truth)
     fit = platt_fit(own, right)
     assert fit is not None
-    assert fit.slope == pytest.approx(truth.slope, abs=0.05) and fit.shift == pytest.approx(truth.shift, abs=0.05)
+    assert fit.slope == pytest.approx(truth.slope, abs=0.05) and fit.shift == pytest.approx(
+        truth.shift, abs=0.05
+    )
     scores = platt_scaled(own, fit)
     half = (scores > 0.4) & (scores < 0.6)
     assert right[half].mean() == pytest.approx(0.5, abs=0.03)
@@ -64,7 +68,10 @@ def test_a_fit_finds_what_scores_mean() -> None:
 def test_what_counts_twice_is_there_twice() -> None:
     own, right = np.array([0.2, 0.3, 0.6, 0.9]), np.array([False, True, False, True])
     twice = [0, 1, 1, 2, 3]
-    counted, doubled = platt_fit(own, right, np.array([1.0, 2.0, 1.0, 1.0])), platt_fit(own[twice], right[twice])
+    counted, doubled = (
+        platt_fit(own, right, np.array([1.0, 2.0, 1.0, 1.0])),
+        platt_fit(own[twice], right[twice]),
+    )
     assert counted is not None and doubled is not None
     assert counted.slope == pytest.approx(doubled.slope, abs=1e-3)
 
@@ -88,9 +95,14 @@ def test_scores_at_the_ends_stay_between(score: float) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [
-        {"dog": PEOPLE["person"]}, {"person": {"slope": 0.0, "shift": 0.0}}, {"person": {"slope": -1.0, "shift": 0.0}},
-        {"person": {"slope": 1.0}}, {"person": {"slope": 1.0, "shift": float("inf")}}, ["person"],
+    "wrong",
+    [
+        {"dog": PEOPLE["person"]},
+        {"person": {"slope": 0.0, "shift": 0.0}},
+        {"person": {"slope": -1.0, "shift": 0.0}},
+        {"person": {"slope": 1.0}},
+        {"person": {"slope": 1.0, "shift": float("inf")}},
+        ["person"],
     ],
 )
 def test_a_scale_that_cannot_be(tmp_path: Path, wrong: Any) -> None:
@@ -98,9 +110,14 @@ def test_a_scale_that_cannot_be(tmp_path: Path, wrong: Any) -> None:
         loaded(tmp_path, calibration=wrong)
 
 
-@pytest.mark.parametrize("model", [each for each in installed_models() if each.is_packaged], ids=lambda each: each.name)
+@pytest.mark.parametrize(
+    "model", [each for each in installed_models() if each.is_packaged], ids=lambda each: each.name
+)
 def test_packaged_models_name_the_contract_that_brought_it(model: Any) -> None:
     """An older version would report scores of one scale by thresholds of another: it refuses the file."""
-    metadata = {each.key: each.value for each in onnx.load(model.path, load_external_data=False).metadata_props}
+    metadata = {
+        each.key: each.value
+        for each in onnx.load(model.path, load_external_data=False).metadata_props
+    }
     fields = json.loads(metadata[METADATA_KEY])
     assert fields["format"] == (FORMAT if "calibration" in fields else 1)

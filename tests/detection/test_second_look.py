@@ -24,7 +24,9 @@ _PERSON, _BOULDER = (40, 60, 160, 200), (240, 40, 400, 220)
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return rectangle_model(tmp_path_factory.mktemp("models") / "toy.onnx", second_look={"person": HOW})
+    return rectangle_model(
+        tmp_path_factory.mktemp("models") / "toy.onnx", second_look={"person": HOW}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +76,10 @@ def test_weak_reports_stay_behind_those_that_were_looked_at() -> None:
 def test_no_report_is_so_sure_that_the_second_look_cannot_overrule_it() -> None:
     boxes = np.array([[20, 10, 40, 60], [80, 10, 100, 60], [140, 10, 160, 60]], np.float32)
     seen = Seen(boxes, np.array([0.9999, 0.99, 0.9]), np.zeros(3, np.int64))
-    settings, how = SheetSettings(), SecondLook((34.0,), own=1.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0)
+    settings, how = (
+        SheetSettings(),
+        SecondLook((34.0,), own=1.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0),
+    )
     none = Seen(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64))
     after = looked_again(seen, np.zeros((300, 300, 3), np.uint8), lambda sheet: none, {0: how})
     unseen = math.log(settings.unseen / (1 - settings.unseen))
@@ -96,7 +101,9 @@ def test_the_packaged_opinion_answers_for_each_cut_out_in_its_cell() -> None:
             size = np.array([longer, longer * aspect] if is_wide else [longer * aspect, longer])
             corner = rng.uniform(0, np.array([500, 400]) - size)
             cuts.append(cut_out(picture, np.concatenate([corner, corner + size]), look_px))
-        cells = np.stack([shown for shown, _ in cuts]).reshape(rows, columns, settings.cell_px, settings.cell_px, 3)
+        cells = np.stack([shown for shown, _ in cuts]).reshape(
+            rows, columns, settings.cell_px, settings.cell_px, 3
+        )
         seen = session.see(np.concatenate(np.concatenate(cells, axis=1), axis=1))
         for number, (_, box_px) in enumerate(cuts):
             row, column = divmod(number, columns)
@@ -107,7 +114,9 @@ def test_the_packaged_opinion_answers_for_each_cut_out_in_its_cell() -> None:
         assert len(set(seen.scores.tolist())) == rows * columns
 
 
-def test_lists_tiles_and_a_shared_process_judge_alike(detector: Detector, model: Path, tmp_path: Path) -> None:
+def test_lists_tiles_and_a_shared_process_judge_alike(
+    detector: Detector, model: Path, tmp_path: Path
+) -> None:
     alone = detector.detect(pictured(), least_score=0.0)
     with sharing(tmp_path) as (address, _):
         shared = Detector.load(model, shared=address).detect(pictured(), least_score=0.0)
@@ -142,7 +151,9 @@ def test_a_crowd_costs_no_more_than_its_share() -> None:
     assert len(lone.scores) == 60 and (np.diff(lone.scores) <= 0).all()
     none = Seen(boxes[:0], np.zeros(0), np.zeros(0, np.int64))
     shown.clear()
-    assert opinions(none, np.zeros((640, 640, 3), np.uint8), sees, how) == {} and not shown, "nothing to look at"
+    assert opinions(none, np.zeros((640, 640, 3), np.uint8), sees, how) == {} and not shown, (
+        "nothing to look at"
+    )
 
 
 def test_each_position_shows_the_report_where_it_is_said_to_be_and_all_count_alike() -> None:
@@ -157,18 +168,24 @@ def test_each_position_shows_the_report_where_it_is_said_to_be_and_all_count_ali
         sheets.append(sheet)
         rows, columns = np.nonzero(sheet[..., 0] > 200)
         box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-        return Seen(np.array([box], np.float32), np.array([0.1 * len(sheets)]), np.zeros(1, np.int64))
+        return Seen(
+            np.array([box], np.float32), np.array([0.1 * len(sheets)]), np.zeros(1, np.int64)
+        )
 
     how = SecondLook((60.0,), own=0.0, again=1.0, shift=0.0, least=0.5, enlarged=9.0, positions=4)
     np.testing.assert_allclose(opinions(bar, picture, sees, {0: how})[0], [0.1, 0.2, 0.3, 0.4])
     upright, quarter, mirrored_half, mirrored_quarter = sheets
     np.testing.assert_array_equal(quarter, np.rot90(upright))
-    np.testing.assert_array_equal(mirrored_half, upright[::-1], err_msg="half a turn, mirrored, is upside down")
+    np.testing.assert_array_equal(
+        mirrored_half, upright[::-1], err_msg="half a turn, mirrored, is upside down"
+    )
     np.testing.assert_array_equal(mirrored_quarter, np.rot90(upright, 3)[:, ::-1])
     sheets.clear()
     odds = np.log(np.array([0.1, 0.2, 0.3, 0.4]) / np.array([0.9, 0.8, 0.7, 0.6]))
     after = looked_again(bar, picture, sees, {0: how})
-    assert after.scores[0] == pytest.approx(1 / (1 + math.exp(-odds.mean()))), "the mean of the positions' log-odds"
+    assert after.scores[0] == pytest.approx(1 / (1 + math.exp(-odds.mean()))), (
+        "the mean of the positions' log-odds"
+    )
 
 
 def test_looks_that_would_only_blur_are_left_out() -> None:
@@ -177,8 +194,12 @@ def test_looks_that_would_only_blur_are_left_out() -> None:
     assert how.sides_px(40) == (34.0,) and how.sides_px(46) == (34.0, 68.0)
 
 
-@pytest.mark.parametrize("box", [(0, 0, 30, 20), (100, 70, 120, 80), (0, 0, 120, 80), (115, 75, 120, 80)])
-def test_cut_outs_at_the_edge_show_the_report_where_it_is_said_to_be(box: tuple[int, int, int, int]) -> None:
+@pytest.mark.parametrize(
+    "box", [(0, 0, 30, 20), (100, 70, 120, 80), (0, 0, 120, 80), (115, 75, 120, 80)]
+)
+def test_cut_outs_at_the_edge_show_the_report_where_it_is_said_to_be(
+    box: tuple[int, int, int, int],
+) -> None:
     picture = draw((80, 120), [box])
     for side_px in (34.0, 68.0):
         shown, there = cut_out(picture, np.array(box, float), side_px)
@@ -192,14 +213,22 @@ def test_cut_outs_at_the_edge_show_the_report_where_it_is_said_to_be(box: tuple[
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"dog": HOW}, {"person": HOW | {"looks_px": []}}, {"person": HOW | {"looks_px": [0]}},
-        {"person": HOW | {"positions": 0}}, {"person": HOW | {"positions": 5}}, {"person": HOW | {"least": 1.5}},
-        {"person": HOW | {"own": float("nan")}}, {"person": {}}, ["person"],
+        {"dog": HOW},
+        {"person": HOW | {"looks_px": []}},
+        {"person": HOW | {"looks_px": [0]}},
+        {"person": HOW | {"positions": 0}},
+        {"person": HOW | {"positions": 5}},
+        {"person": HOW | {"least": 1.5}},
+        {"person": HOW | {"own": float("nan")}},
+        {"person": {}},
+        ["person"],
     ],
 )
 def test_weights_that_cannot_be(tmp_path: Path, wrong: Any) -> None:
     with pytest.raises(InputError, match="cannot be used"):
-        Detector.load(rectangle_model(tmp_path / "wrong.onnx", second_look=wrong), provider="cpu", threads=1)
+        Detector.load(
+            rectangle_model(tmp_path / "wrong.onnx", second_look=wrong), provider="cpu", threads=1
+        )
 
 
 def test_another_model_may_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,7 +239,10 @@ def test_another_model_may_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     first = rectangle_model(tmp_path / "first.onnx", second_look={"person": how})
     alone = rectangle_model(tmp_path / "alone.onnx", second_look={"person": HOW})
     asked, self_asked = (Detector.load(each, provider="cpu", threads=1) for each in (first, alone))
-    assert asked.info.second_look["person"].by == "stranger" and self_asked.info.second_look["person"].by == ""
+    assert (
+        asked.info.second_look["person"].by == "stranger"
+        and self_asked.info.second_look["person"].by == ""
+    )
     picture = pictured()
     by_itself = self_asked.detect(picture, least_score=0.0)
     by_another = asked.detect(picture, least_score=0.0)
@@ -222,7 +254,9 @@ def test_another_model_may_look(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     np.testing.assert_allclose(asked.detect(picture, least_score=0.0).scores, by_another.scores)
 
 
-def test_a_second_model_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_second_model_that_is_not_installed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path))
     path = rectangle_model(tmp_path / "first.onnx", second_look={"person": HOW | {"by": "nowhere"}})
     with pytest.raises(InputError, match="there is no model 'nowhere'; installed are"):

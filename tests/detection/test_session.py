@@ -17,8 +17,14 @@ from sorvolo.detection.session import Session, read_info, usable_cores
 from sorvolo.errors import InputError, SettingsError
 
 
-def _identity(path: Path, text: str, metadata: dict[str, Any] | None = METADATA, opset: int = 17) -> Path:
-    return write_model(onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["" : {opset}]> {text}'), path, metadata)
+def _identity(
+    path: Path, text: str, metadata: dict[str, Any] | None = METADATA, opset: int = 17
+) -> Path:
+    return write_model(
+        onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["" : {opset}]> {text}'),
+        path,
+        metadata,
+    )
 
 
 def _changed(path: Path, **fields: Any) -> Path:
@@ -49,7 +55,11 @@ def test_damaged_files(tmp_path: Path, provider: Any) -> None:
     if provider == "openvino":
         pytest.importorskip("openvino")
     whole = rectangle_model(tmp_path / "whole.onnx").read_bytes()
-    for name, data in (("empty", b""), ("cut", whole[: len(whole) // 2]), ("text", b"<html>not found</html>" * 20)):
+    for name, data in (
+        ("empty", b""),
+        ("cut", whole[: len(whole) // 2]),
+        ("text", b"<html>not found</html>" * 20),
+    ):
         path = tmp_path / f"{name}.onnx"
         path.write_bytes(data)
         with pytest.raises(InputError, match=f"{name}.onnx"):
@@ -87,11 +97,17 @@ def test_other_inputs(tmp_path: Path, shape: str, reason: str) -> None:
 def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> None:
     start = "m (uint8[1, 3, H, W] image) => "
     with pytest.raises(InputError, match="gives no labels, scores"):
-        Session(_identity(tmp_path / "a.onnx", start + "(int64[4] boxes) { boxes = Shape (image) }"), "cpu")
-    wrong = start + """(float[K, 4] boxes, float[K] scores, int64[K] labels) {
+        Session(
+            _identity(tmp_path / "a.onnx", start + "(int64[4] boxes) { boxes = Shape (image) }"),
+            "cpu",
+        )
+    wrong = (
+        start
+        + """(float[K, 4] boxes, float[K] scores, int64[K] labels) {
       boxes = Constant <value = float[1, 4] {0, 0, 1, 1}> ()
       scores = Constant <value_floats = [0.5]> ()
       labels = Constant <value_ints = [7]> () }"""
+    )
     with pytest.raises(InputError, match="label 7"):
         Session(_identity(tmp_path / "b.onnx", wrong), "cpu").see(np.zeros((8, 8, 3), np.uint8))
 
@@ -110,7 +126,9 @@ def test_missing_outputs_and_answers_that_break_the_contract(tmp_path: Path) -> 
         ({"thresholds": None}, "cannot be used"),
     ],
 )
-def test_metadata_that_contradicts_itself(tmp_path: Path, fields: dict[str, Any], message: str) -> None:
+def test_metadata_that_contradicts_itself(
+    tmp_path: Path, fields: dict[str, Any], message: str
+) -> None:
     with pytest.raises(InputError, match=message):
         Session(rectangle_model(tmp_path / "toy.onnx", **fields), "cpu")
 
@@ -170,12 +188,16 @@ def test_seen_from_several_threads(tmp_path: Path) -> None:
     opened = Session(rectangle_model(tmp_path / "toy.onnx"), "cpu")
     boxes = [(x, x, x + 10, x + 10) for x in range(0, 60, 3)]
     with ThreadPoolExecutor(4) as pool:
-        seen = list(pool.map(opened.see, [draw((80 + x % 7, 90), [box]) for x, box in enumerate(boxes)]))
+        seen = list(
+            pool.map(opened.see, [draw((80 + x % 7, 90), [box]) for x, box in enumerate(boxes)])
+        )
     np.testing.assert_allclose(np.concatenate([each.boxes_px for each in seen]), boxes)
 
 
 def test_a_session_that_rests_gives_memory_back_and_sees_as_before(tmp_path: Path) -> None:
-    with ProcessPoolExecutor(1, get_context("spawn")) as alone:  # what others left in this process hides it
+    with ProcessPoolExecutor(
+        1, get_context("spawn")
+    ) as alone:  # what others left in this process hides it
         full_mb, rested_mb, is_same = alone.submit(_rested).result()
     assert rested_mb < full_mb - 30 and is_same
     fixed = Session(rectangle_model(tmp_path / "fixed.onnx", fixed=(64, 96)), "cpu", 1)
@@ -192,7 +214,10 @@ def _rested() -> tuple[float, float, bool]:
     session.rest()
     rested_mb = _resident_mb()
     after = session.see(picture)
-    is_same = after.boxes_px.tolist() == before.boxes_px.tolist() and after.scores.tolist() == before.scores.tolist()
+    is_same = (
+        after.boxes_px.tolist() == before.boxes_px.tolist()
+        and after.scores.tolist() == before.scores.tolist()
+    )
     return full_mb, rested_mb, is_same
 
 

@@ -86,7 +86,9 @@ class Recorded:
         return self._inner(planes)
 
 
-def asked(batcher: Batcher, pictures: list[Planes]) -> tuple[list[threading.Thread], dict[int, Any]]:
+def asked(
+    batcher: Batcher, pictures: list[Planes]
+) -> tuple[list[threading.Thread], dict[int, Any]]:
     """An asker for each picture, one after the other, and what each is answered once its thread has ended."""
     found: dict[int, Any] = {}
 
@@ -104,7 +106,9 @@ def test_a_model_that_takes_many_is_given_what_waits_at_once(brightness: Path) -
     recorded = Recorded(open_engine(brightness.read_bytes(), "many", "cpu", 1))
     batcher = Batcher(recorded.engine, BatchingSettings(most_pictures=3))
     values = [10, 20, 30, 40, 50, 60]
-    threads, found = asked(batcher, [planes_of(value, 96 if value == 30 else 64) for value in values])
+    threads, found = asked(
+        batcher, [planes_of(value, 96 if value == 30 else 64) for value in values]
+    )
     recorded.go.set()
     for each in threads:
         each.join(20)
@@ -127,13 +131,17 @@ def test_a_model_that_takes_one_answers_in_the_order_of_asking(tmp_path: Path) -
     for each in threads:
         each.join(20)
     assert recorded.shapes == [(1, 3, 32, 64)] * 3
-    assert [found[number][1].tolist() for number in range(3)] == [pytest.approx([v / 255]) for v in (200, 210, 220)]
+    assert [found[number][1].tolist() for number in range(3)] == [
+        pytest.approx([v / 255]) for v in (200, 210, 220)
+    ]
     batcher.end()
 
 
 def test_an_error_of_the_model_reaches_who_asked(brightness: Path) -> None:
     engine = open_engine(brightness.read_bytes(), "many", "cpu", 1)
-    batcher = Batcher(replace(engine, run=lambda planes: (*engine.run(planes)[:3], np.zeros(5, np.int64))))
+    batcher = Batcher(
+        replace(engine, run=lambda planes: (*engine.run(planes)[:3], np.zeros(5, np.int64)))
+    )
     with pytest.raises(InputError, match=r"answers with outputs of .* export it again"):
         batcher.ask(planes_of(10))
     batcher.end()
@@ -159,7 +167,9 @@ def test_a_shared_detector_finds_what_an_own_one_does(tmp_path: Path) -> None:
         _, batcher = models.batcher(path)
         assert batcher.pictures == 9  # one model for all
     for number in range(3):
-        for seen, wanted in zip(found[number], (own.detect(each) for each in pictures), strict=True):
+        for seen, wanted in zip(
+            found[number], (own.detect(each) for each in pictures), strict=True
+        ):
             np.testing.assert_array_equal(seen.boxes_px, wanted.boxes_px)
             np.testing.assert_array_equal(seen.scores, wanted.scores)
 
@@ -167,7 +177,9 @@ def test_a_shared_detector_finds_what_an_own_one_does(tmp_path: Path) -> None:
 def test_the_packaged_model_is_shared_as_well(tmp_path: Path) -> None:
     picture = np.random.default_rng(1).integers(0, 255, (96, 128, 3), np.uint8)
     with sharing(tmp_path) as (address, _):
-        shared = Detector.load("default", threads=1, shared=address).detect(picture, least_score=0.0)
+        shared = Detector.load("default", threads=1, shared=address).detect(
+            picture, least_score=0.0
+        )
     own = Detector.load("default", threads=1).detect(picture, least_score=0.0)
     assert len(own) and shared.boxes_px.tolist() == own.boxes_px.tolist()
     assert shared.scores.tolist() == own.scores.tolist()
@@ -187,7 +199,8 @@ def test_a_process_that_is_gone_is_no_fault_of_the_flight(tmp_path: Path) -> Non
     with pytest.raises(SharedDetectorGone, match="shares with others has ended"):
         shared_engine(address, tmp_path / "toy.onnx")
     process = subprocess.Popen(
-        [sys.executable, "-m", "sorvolo.detection.shared_process", address], stdin=subprocess.PIPE,
+        [sys.executable, "-m", "sorvolo.detection.shared_process", address],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )
     assert process.stdout is not None and process.stdout.readline() == READY

@@ -28,11 +28,16 @@ _INFO = ModelInfo("m", CLASSES, dict.fromkeys(CLASSES, 0.5), _BEST_PX)
 
 @pytest.fixture(scope="module")
 def detector(tmp_path_factory: pytest.TempPathFactory) -> Detector:
-    return Detector.load(rectangle_model(tmp_path_factory.mktemp("m") / "toy.onnx"), provider="cpu", threads=1)
+    return Detector.load(
+        rectangle_model(tmp_path_factory.mktemp("m") / "toy.onnx"), provider="cpu", threads=1
+    )
 
 
 def _rows(boxes: np.ndarray, labels: object) -> list[tuple[int, ...]]:
-    return sorted((*np.rint(box).astype(int).tolist(), int(label)) for box, label in zip(boxes, np.asarray(labels)))
+    return sorted(
+        (*np.rint(box).astype(int).tolist(), int(label))
+        for box, label in zip(boxes, np.asarray(labels))
+    )
 
 
 class TestScale:
@@ -56,11 +61,18 @@ class TestScale:
     def test_no_more_than_three_times(self) -> None:
         assert scale_for(_INFO, 1.0, CLASSES) == 3
 
-    @pytest.mark.parametrize(("size_px", "shown"), [((540, 960), 2.15), ((1080, 1920), 1.08), ((2160, 3840), 1.0)])
-    def test_frames_of_a_video_are_magnified_to_one_tile_at_most(self, size_px: tuple[int, int], shown: float) -> None:
+    @pytest.mark.parametrize(
+        ("size_px", "shown"), [((540, 960), 2.15), ((1080, 1920), 1.08), ((2160, 3840), 1.0)]
+    )
+    def test_frames_of_a_video_are_magnified_to_one_tile_at_most(
+        self, size_px: tuple[int, int], shown: float
+    ) -> None:
         m_per_px = whole_m_per_px(_INFO, CLASSES, 0.25, size_px)
         assert scale_for(_INFO, m_per_px, CLASSES) == pytest.approx(shown, abs=0.01)
-        assert len(plan_tiles(size_px, _INFO, CLASSES, m_per_px=m_per_px).places_px) == 1 or shown == 1.0
+        assert (
+            len(plan_tiles(size_px, _INFO, CLASSES, m_per_px=m_per_px).places_px) == 1
+            or shown == 1.0
+        )
         assert whole_m_per_px(_INFO, CLASSES, 0.01, size_px) == 0.01
 
     def test_cars_alone_need_less(self) -> None:
@@ -68,9 +80,12 @@ class TestScale:
         other = ModelInfo("m", ("boat",), {"boat": 0.5}, {"boat": (9.0, 90.0)})
         assert scale_for(other, 0.5, other.classes) == 1
 
-
     def test_cars_much_longer_than_the_model_knows_get_a_look_of_their_own(self) -> None:
-        assert looks_for(_INFO, 4.4 / 250, CLASSES) == looks_for(_INFO, math.nan, CLASSES) == (CLASSES,)
+        assert (
+            looks_for(_INFO, 4.4 / 250, CLASSES)
+            == looks_for(_INFO, math.nan, CLASSES)
+            == (CLASSES,)
+        )
         people, cars = looks_for(_INFO, 4.4 / 300, CLASSES)
         assert (people, cars) == (("person", "small object"), ("car",))
         assert scale_for(_INFO, 4.4 / 300, people) == 1
@@ -79,7 +94,10 @@ class TestScale:
 
     def test_a_person_in_a_thermal_frame_has_twice_the_pixels(self) -> None:
         for m_per_px in (0.08, 0.12):
-            by_day, by_night = (scale_for(_INFO, 2 * m_per_px, CLASSES), scale_for(_INFO, m_per_px, CLASSES, True))
+            by_day, by_night = (
+                scale_for(_INFO, 2 * m_per_px, CLASSES),
+                scale_for(_INFO, m_per_px, CLASSES, True),
+            )
             assert by_night == pytest.approx(by_day) and by_night > 1
         assert scale_for(_INFO, 0.02, CLASSES, True) == 1
         assert scale_for(_INFO, 0.08, ["car"], True) == 1
@@ -92,11 +110,17 @@ class TestPlan:
         assert plan_tiles((512, 640), _INFO, CLASSES).scale == 1
         assert plan_tiles((512, 640), _INFO, CLASSES, tiles=None, thermal=True).scale == 1
         assert plan_tiles((512, 640), _INFO, CLASSES, tiles=256, thermal=True).scale == 1
-        assert plan_tiles((1080, 1920), _INFO, CLASSES, thermal=True).scale == 1, "a monochrome camera's, rather"
+        assert plan_tiles((1080, 1920), _INFO, CLASSES, thermal=True).scale == 1, (
+            "a monochrome camera's, rather"
+        )
 
-    @pytest.mark.parametrize("size", [(1080, 1920), (3000, 4000), (2250, 4000), (1500, 2000), (700, 9000)])
+    @pytest.mark.parametrize(
+        "size", [(1080, 1920), (3000, 4000), (2250, 4000), (1500, 2000), (700, 9000)]
+    )
     @pytest.mark.parametrize("m_per_px", [math.nan, 0.02, 0.05, 0.2, 0.004])
-    def test_tiles_cover_the_picture_and_overlap_by_an_object(self, size: tuple[int, int], m_per_px: float) -> None:
+    def test_tiles_cover_the_picture_and_overlap_by_an_object(
+        self, size: tuple[int, int], m_per_px: float
+    ) -> None:
         plan = plan_tiles(size, _INFO, CLASSES, m_per_px=m_per_px)
         places = np.array(plan.places_px)
         assert places.min() == 0 and places[:, 2].max() == size[1] and places[:, 3].max() == size[0]
@@ -114,12 +138,20 @@ class TestPlan:
     def test_little_is_shown_twice(self) -> None:
         """Of a photo of 4000 x 2250 px from 40 m, whose tiles overlap by 5.5 m, a third (two thirds with tiles of 1280
         px); of a 4K frame less."""
-        for size, m_per_px, most in (((2250, 4000), 0.017, 1.4), ((2160, 3840), 0.02, 1.3), ((1500, 2000), 0.03, 1.15)):
-            places = np.array(plan_tiles(size, _INFO, ("person", "car"), m_per_px=m_per_px).places_px)
+        for size, m_per_px, most in (
+            ((2250, 4000), 0.017, 1.4),
+            ((2160, 3840), 0.02, 1.3),
+            ((1500, 2000), 0.03, 1.15),
+        ):
+            places = np.array(
+                plan_tiles(size, _INFO, ("person", "car"), m_per_px=m_per_px).places_px
+            )
             assert (places[:, 2:] - places[:, :2]).prod(axis=1).sum() < most * size[0] * size[1]
 
     def test_whole_means_whole_unless_memory_forbids(self) -> None:
-        assert plan_tiles((2160, 3840), _INFO, CLASSES, tiles=None, m_per_px=0.3).places_px == ((0, 0, 3840, 2160),)
+        assert plan_tiles((2160, 3840), _INFO, CLASSES, tiles=None, m_per_px=0.3).places_px == (
+            (0, 0, 3840, 2160),
+        )
         huge = plan_tiles((9000, 9000), _INFO, CLASSES, tiles=None)
         assert len(huge.places_px) > 1 and huge.scale == 1
         assert MOST_AT_ONCE_PX < 9000**2
@@ -140,23 +172,34 @@ class TestTiledPictures:
             rows = {place[side_y] for place in plan.places_px} - {0, size[0]}
             assert len(columns) >= 5 and len(rows) >= 4
             for left, top in ((-30, -9), (-1, -18), (-15, 0)):
-                boxes = [(x + left, y + top, x + left + 30, y + top + 18) for x in columns for y in rows]
+                boxes = [
+                    (x + left, y + top, x + left + 30, y + top + 18) for x in columns for y in rows
+                ]
                 found = detector.detect(draw(size, boxes), tiles=160)
-                assert _rows(found.boxes_px, found.labels) == _rows(np.array(boxes), [0] * len(boxes))
+                assert _rows(found.boxes_px, found.labels) == _rows(
+                    np.array(boxes), [0] * len(boxes)
+                )
 
     @pytest.mark.parametrize("longest", [30, 90, 300])
-    def test_random_pictures_with_objects_longer_than_the_overlap(self, detector: Detector, longest: int) -> None:
+    def test_random_pictures_with_objects_longer_than_the_overlap(
+        self, detector: Detector, longest: int
+    ) -> None:
         rng = np.random.default_rng(longest)
         for _ in range(6):
             size = (int(rng.integers(200, 420)), int(rng.integers(200, 420)))
             boxes, labels = _scatter(rng, size, longest)
-            found = detector.detect(draw(size, boxes, labels=labels), tiles=int(rng.integers(64, 200)))
+            found = detector.detect(
+                draw(size, boxes, labels=labels), tiles=int(rng.integers(64, 200))
+            )
             assert _rows(found.boxes_px, found.labels) == _rows(np.array(boxes), labels)
 
     def test_magnified_tiles_give_boxes_in_the_picture(self, detector: Detector) -> None:
         boxes = [(40, 30, 60, 44), (900, 700, 930, 760), (600, 300, 612, 318)]
         picture = draw((1100, 1400), boxes)
-        for m_per_px in (0.075, 1.7 / 240):  # grey, so taken for thermal: 1.5 times as large, in tiles; half as large
+        for m_per_px in (
+            0.075,
+            1.7 / 240,
+        ):  # grey, so taken for thermal: 1.5 times as large, in tiles; half as large
             found = detector.detect(picture, tiles="auto", m_per_px=m_per_px, least_score=0.3)
             assert len(found) == 3
             order = np.argsort(found.boxes_px[:, 0])
@@ -176,7 +219,12 @@ def _scatter(
     for _ in range(60):
         width, height = np.exp(rng.uniform(np.log(4), np.log(longest), 2)).astype(int).tolist()
         x, y = int(rng.integers(-width // 2, size[1])), int(rng.integers(-height // 2, size[0]))
-        left, top, right, bottom = max(0, x), max(0, y), min(size[1], x + width), min(size[0], y + height)
+        left, top, right, bottom = (
+            max(0, x),
+            max(0, y),
+            min(size[1], x + width),
+            min(size[0], y + height),
+        )
         around = taken[max(0, top - 2) : bottom + 2, max(0, left - 2) : right + 2]
         if min(right - left, bottom - top) < 3 or around.any():
             continue

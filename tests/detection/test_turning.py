@@ -27,7 +27,8 @@ def test_boxes_of_a_turned_picture_lie_where_the_things_are(quarters: int) -> No
 
 def _seen(*rows: tuple[tuple[int, int, int, int], float, int]) -> Seen:
     return Seen(
-        np.array([box for box, _, _ in rows], np.float32).reshape(-1, 4), np.array([score for _, score, _ in rows]),
+        np.array([box for box, _, _ in rows], np.float32).reshape(-1, 4),
+        np.array([score for _, score, _ in rows]),
         np.array([label for _, _, label in rows], np.int64),
     )
 
@@ -38,12 +39,16 @@ def test_what_both_looks_show_counts_more_than_what_one_shows() -> None:
     both = agreed([one, other])
     np.testing.assert_allclose(both.scores, [0.7, 0.46, 0.36, 0.16], atol=1e-9)
     assert both.labels.tolist() == [0, 0, 0, 1], "classes stay apart"
-    np.testing.assert_allclose(both.boxes_px[0], [100 + 0.8 / 1.4, 0, 120 + 0.8 / 1.4, 20], rtol=1e-5)
+    np.testing.assert_allclose(
+        both.boxes_px[0], [100 + 0.8 / 1.4, 0, 120 + 0.8 / 1.4, 20], rtol=1e-5
+    )
     assert len(agreed([_seen(), _seen()]).scores) == 0
 
 
 def test_a_model_that_asks_for_it_looks_twice_from_above(tmp_path: Path) -> None:
-    detector = Detector.load(rectangle_model(tmp_path / "toy.onnx", turned=_TURNED), provider="cpu", threads=1)
+    detector = Detector.load(
+        rectangle_model(tmp_path / "toy.onnx", turned=_TURNED), provider="cpu", threads=1
+    )
     picture = draw((120, 200), _BOXES, labels=[0, 1], scores=[200, 200])
     assert detector.detect(picture).names == ["person", "car"]
     found = detector.detect(picture, from_above=True)
@@ -57,9 +62,14 @@ def test_a_model_that_asks_for_it_looks_twice_from_above(tmp_path: Path) -> None
 
 def test_turned_thresholds_must_name_every_class(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="lacks 'small object'"):
-        Detector.load(rectangle_model(tmp_path / "toy.onnx", turned={"person": 0.5, "car": 0.5}), provider="cpu")
+        Detector.load(
+            rectangle_model(tmp_path / "toy.onnx", turned={"person": 0.5, "car": 0.5}),
+            provider="cpu",
+        )
 
 
-@pytest.mark.parametrize(("pitch_deg", "above"), [(-90, True), (-60, True), (-45, False), (0, False)])
+@pytest.mark.parametrize(
+    ("pitch_deg", "above"), [(-90, True), (-60, True), (-45, False), (0, False)]
+)
 def test_which_cameras_look_down(pitch_deg: float, above: bool) -> None:
     assert is_from_above(site_from_gimbal_rotation(30.0, pitch_deg, 0.0)) == above

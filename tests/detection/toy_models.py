@@ -13,10 +13,18 @@ pytest.importorskip("onnx.reference")
 
 CLASSES = ("person", "car", "small object")
 METADATA: dict[str, Any] = {
-    "format": 1, "name": "toy", "preset": "tiny", "version": "1", "classes": list(CLASSES), "stride": 32,
+    "format": 1,
+    "name": "toy",
+    "preset": "tiny",
+    "version": "1",
+    "classes": list(CLASSES),
+    "stride": 32,
     "thresholds": {"person": 0.5, "car": 0.4, "small object": 0.6},
     "best_px": {"person": [8, 120], "car": [16, 200], "small object": [8, 80]},
-    "licence": "Apache-2.0", "trained_on": "nothing", "thermal": True, "created": "2026-01-01",
+    "licence": "Apache-2.0",
+    "trained_on": "nothing",
+    "thermal": True,
+    "created": "2026-01-01",
 }
 
 # A corner is a bright pixel whose two neighbours on the outside are dark. A rectangle reaches from its top-left corner
@@ -126,7 +134,10 @@ def write_model(model: Any, path: Path, metadata: dict[str, Any] | None) -> Path
 
 
 def draw(
-    size: tuple[int, int], boxes: list[tuple[int, int, int, int]], *, labels: list[int] | None = None,
+    size: tuple[int, int],
+    boxes: list[tuple[int, int, int, int]],
+    *,
+    labels: list[int] | None = None,
     scores: list[int] | None = None,
 ) -> np.ndarray:
     """A dark picture (height, width) with a rectangle for each box (left, top, right, bottom); scores of 255."""
@@ -207,11 +218,14 @@ def square_model(path: Path, *, seed: int = 0) -> Path:
     """Write a model that finds bright squares of 16 px by convolutions with weights of its own."""
     rng = np.random.default_rng(seed)
     weights = {
-        "near_w": rng.uniform(0.5, 1.5, (4, 3, 3, 3)) / 27, "far_w": rng.uniform(0.5, 1.5, (4, 4, 4, 4)) / 64,
+        "near_w": rng.uniform(0.5, 1.5, (4, 3, 3, 3)) / 27,
+        "far_w": rng.uniform(0.5, 1.5, (4, 4, 4, 4)) / 64,
         "heat_w": rng.uniform(0.9, 1.1, (1, 4, 3, 3)) / 36,
     }
     model = onnx.parser.parse_model(_SQUARES)
     for name, values in weights.items():
-        model.graph.initializer.append(onnx.numpy_helper.from_array(values.astype(np.float32), name))
+        model.graph.initializer.append(
+            onnx.numpy_helper.from_array(values.astype(np.float32), name)
+        )
     model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(2), "two_int"))
     return write_model(model, path, METADATA | {"name": "squares"})

@@ -11,20 +11,33 @@ from sorvolo.geometry.camera import Camera
 
 # lenses as they are: barrel or pincushion, decentred by a little
 lenses = st.tuples(
-    st.floats(-0.25, 0.15), st.floats(-0.05, 0.1), st.floats(-0.003, 0.003), st.floats(-0.003, 0.003),
+    st.floats(-0.25, 0.15),
+    st.floats(-0.05, 0.1),
+    st.floats(-0.003, 0.003),
+    st.floats(-0.003, 0.003),
     st.floats(-0.02, 0.02),
 )
 cameras = st.builds(
     lambda size, focal, dx, dy, lens: Camera(
-        *size, focal * size[0], focal * size[0] * 1.01, size[0] / 2 + dx, size[1] / 2 + dy, np.array(lens)
+        *size,
+        focal * size[0],
+        focal * size[0] * 1.01,
+        size[0] / 2 + dx,
+        size[1] / 2 + dy,
+        np.array(lens),
     ),
-    st.sampled_from([(640, 480), (1920, 1080), (4000, 3000)]), st.floats(0.9, 3), st.floats(-20, 20),
-    st.floats(-20, 20), lenses,
+    st.sampled_from([(640, 480), (1920, 1080), (4000, 3000)]),
+    st.floats(0.9, 3),
+    st.floats(-20, 20),
+    st.floats(-20, 20),
+    lenses,
 )
 
 
 def pixels_of(camera, count=60, seed=0):
-    points = np.random.default_rng(seed).random((count, 2)) * [camera.width_px, camera.height_px] - 0.5
+    points = (
+        np.random.default_rng(seed).random((count, 2)) * [camera.width_px, camera.height_px] - 0.5
+    )
     return np.vstack((points, camera.corners_px))
 
 
@@ -41,7 +54,9 @@ def test_pixels_to_rays_and_back(camera):
 @given(cameras)
 def test_projection_is_opencvs(camera):
     points_m = np.random.default_rng(1).normal(0, 0.3, (40, 3)) + np.array([0, 0, 2.0])
-    expected, _ = cv2.projectPoints(points_m, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)
+    expected, _ = cv2.projectPoints(
+        points_m, np.zeros(3), np.zeros(3), camera.matrix, camera.distortion
+    )
     assert np.abs(camera.pixels_from_points(points_m) - expected.reshape(-1, 2)).max() < 1e-6
 
 
@@ -76,7 +91,9 @@ def test_a_resized_camera_sees_the_same_rays(camera, divisor):
     scale = np.array([small.width_px / camera.width_px, small.height_px / camera.height_px])
     points_px = pixels_of(camera, 20)
     np.testing.assert_allclose(
-        small.rays_from_pixels((points_px + 0.5) * scale - 0.5), camera.rays_from_pixels(points_px), atol=1e-9
+        small.rays_from_pixels((points_px + 0.5) * scale - 0.5),
+        camera.rays_from_pixels(points_px),
+        atol=1e-9,
     )
     # the outer corners stay the outer corners
     np.testing.assert_allclose((camera.corners_px + 0.5) * scale - 0.5, small.corners_px, atol=1e-9)
@@ -102,11 +119,27 @@ def test_another_focal_length_keeps_the_pixels_aspect():
     assert (camera.fx_px, camera.fy_px) == (1000, 1020)
 
 
-@pytest.mark.parametrize("change", [
-    {"fx_px": 0.0}, {"fy_px": -5.0}, {"fx_px": np.nan}, {"cx_px": 5000.0}, {"cy_px": -900.0}, {"width_px": 0},
-    {"distortion": np.zeros(4)}, {"distortion": np.full(5, np.inf)},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fx_px": 0.0},
+        {"fy_px": -5.0},
+        {"fx_px": np.nan},
+        {"cx_px": 5000.0},
+        {"cy_px": -900.0},
+        {"width_px": 0},
+        {"distortion": np.zeros(4)},
+        {"distortion": np.full(5, np.inf)},
+    ],
+)
 def test_what_is_no_camera_is_refused(change):
-    good = {"width_px": 640, "height_px": 480, "fx_px": 500.0, "fy_px": 500.0, "cx_px": 320.0, "cy_px": 240.0}
+    good = {
+        "width_px": 640,
+        "height_px": 480,
+        "fx_px": 500.0,
+        "fy_px": 500.0,
+        "cx_px": 320.0,
+        "cy_px": 240.0,
+    }
     with pytest.raises(GeometryError):
         Camera(**(good | change))

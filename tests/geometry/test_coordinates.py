@@ -5,13 +5,16 @@ import pytest
 from sorvolo.geometry.coordinates import Coordinates, place_text
 
 
-@pytest.mark.parametrize(("latitude", "longitude", "mgrs"), [
-    (38.897700, -77.036500, "18S UJ 23394 07395"),  # the White House
-    (48.858222, 2.294500, "31U DQ 48251 11935"),  # the Eiffel Tower
-    (-33.857000, 151.215000, "56H LH 34873 52266"),  # the Sydney Opera House
-    (60.392050, 5.322050, "32V KN 97355 00731"),  # Bergen lies in Norway's widened zone 32
-    (78.220000, 15.650000, "33X WG 14813 83004"),  # Longyearbyen, in Svalbard's widened zone 33
-])
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "mgrs"),
+    [
+        (38.897700, -77.036500, "18S UJ 23394 07395"),  # the White House
+        (48.858222, 2.294500, "31U DQ 48251 11935"),  # the Eiffel Tower
+        (-33.857000, 151.215000, "56H LH 34873 52266"),  # the Sydney Opera House
+        (60.392050, 5.322050, "32V KN 97355 00731"),  # Bergen lies in Norway's widened zone 32
+        (78.220000, 15.650000, "33X WG 14813 83004"),  # Longyearbyen, in Svalbard's widened zone 33
+    ],
+)
 def test_mgrs_as_geotrans_writes_it(latitude: float, longitude: float, mgrs: str) -> None:
     written = place_text(latitude, longitude, Coordinates.MGRS)
     zone, square, east, north = written.split()
@@ -25,7 +28,10 @@ def test_the_same_place_in_each_way() -> None:
     zone, easting, northing = place_text(41.9, 12.5, Coordinates.UTM).split()
     mgrs_zone, square, east, north = place_text(41.9, 12.5, Coordinates.MGRS).split()
     assert zone == mgrs_zone == "33T" and square == "TG"
-    assert abs(int(easting) % 100_000 - int(east)) <= 1 and abs(int(northing) % 100_000 - int(north)) <= 1
+    assert (
+        abs(int(easting) % 100_000 - int(east)) <= 1
+        and abs(int(northing) % 100_000 - int(north)) <= 1
+    )
 
 
 @pytest.mark.parametrize("latitude", [84.0, 89.0, -80.5])

@@ -33,7 +33,14 @@ def test_ecef_is_projs_and_comes_back_to_a_micrometre(latitude, longitude, heigh
     np.testing.assert_allclose(again_m, ecef_m, atol=1e-6)
 
 
-@given(latitudes, longitudes, heights, st.floats(-5000, 5000), st.floats(-5000, 5000), st.floats(-200, 500))
+@given(
+    latitudes,
+    longitudes,
+    heights,
+    st.floats(-5000, 5000),
+    st.floats(-5000, 5000),
+    st.floats(-200, 500),
+)
 @example(90.0, 0.0, 0.0, 10.0, -20.0, 5.0)
 @example(-90.0, 123.0, 0.0, 10.0, -20.0, 5.0)
 @example(10.0, 180.0, 0.0, 30.0, 0.0, 0.0)
@@ -51,7 +58,9 @@ def test_axes_point_east_north_and_up(latitude, longitude):
     above = frame.site_from_wgs84(np.array([latitude]), np.array([longitude]), np.array([7.0]))
     np.testing.assert_allclose(above, [[0, 0, 7]], atol=1e-6)
     east = frame.site_from_wgs84(np.array([latitude]), np.array([longitude + 1e-4]), np.zeros(1))[0]
-    north = frame.site_from_wgs84(np.array([latitude + 1e-4]), np.array([longitude]), np.zeros(1))[0]
+    north = frame.site_from_wgs84(np.array([latitude + 1e-4]), np.array([longitude]), np.zeros(1))[
+        0
+    ]
     assert east[0] > 0.9
     assert abs(east[1]) < 1e-3
     assert 11.0 < north[1] < 11.2
@@ -60,7 +69,9 @@ def test_axes_point_east_north_and_up(latitude, longitude):
 
 def test_a_site_across_the_antimeridian_is_one_piece():
     frame = LocalFrame(Geodetic(-17.0, 179.9999))
-    west, east = frame.site_from_wgs84(np.full(2, -17.0), np.array([179.9998, -179.9999]), np.zeros(2))
+    west, east = frame.site_from_wgs84(
+        np.full(2, -17.0), np.array([179.9998, -179.9999]), np.zeros(2)
+    )
     assert -12 < west[0] < -10
     assert 20 < east[0] < 22
     _, longitude, _ = frame.wgs84_from_site(np.array([[30.0, 0.0]]))
@@ -73,14 +84,33 @@ def test_two_columns_are_points_on_the_sites_ground():
     assert on_ground[2][0] == pytest.approx(120.0, abs=1e-5)
 
 
-@pytest.mark.parametrize(("latitude", "longitude", "epsg"), [
-    (45.0, 9.0, 32632), (-33.9, 151.2, 32756), (0.0, -180.0, 32601), (0.0, 180.0, 32601),
-    (0.0, 179.99, 32660), (0.0, 360.0, 32631), (-0.001, 0.0, 32731),
-    (60.0, 5.0, 32632), (60.0, 2.9, 32631), (64.0, 5.0, 32631), (55.99, 5.0, 32631),  # Bergen's wide zone
-    (78.0, 8.9, 32631), (78.0, 9.0, 32633), (78.0, 20.9, 32633), (78.0, 21.0, 32635), (78.0, 33.0, 32637),
-    (78.0, 42.0, 32638), (71.9, 8.9, 32632),  # Svalbard
-    (84.0, 0.0, 32661), (90.0, 10.0, 32661), (-80.0, 0.0, 32731), (-80.1, 0.0, 32761),
-])
+@pytest.mark.parametrize(
+    ("latitude", "longitude", "epsg"),
+    [
+        (45.0, 9.0, 32632),
+        (-33.9, 151.2, 32756),
+        (0.0, -180.0, 32601),
+        (0.0, 180.0, 32601),
+        (0.0, 179.99, 32660),
+        (0.0, 360.0, 32631),
+        (-0.001, 0.0, 32731),
+        (60.0, 5.0, 32632),
+        (60.0, 2.9, 32631),
+        (64.0, 5.0, 32631),
+        (55.99, 5.0, 32631),  # Bergen's wide zone
+        (78.0, 8.9, 32631),
+        (78.0, 9.0, 32633),
+        (78.0, 20.9, 32633),
+        (78.0, 21.0, 32635),
+        (78.0, 33.0, 32637),
+        (78.0, 42.0, 32638),
+        (71.9, 8.9, 32632),  # Svalbard
+        (84.0, 0.0, 32661),
+        (90.0, 10.0, 32661),
+        (-80.0, 0.0, 32731),
+        (-80.1, 0.0, 32761),
+    ],
+)
 def test_utm_zones(latitude, longitude, epsg):
     assert utm_epsg(latitude, longitude) == epsg
 
@@ -101,7 +131,9 @@ def test_a_crs_that_is_not_projected_is_refused(crs):
         Projection(crs)
 
 
-@pytest.mark.parametrize("place", [(90.1, 0), (-91, 0), (np.nan, 0), (0, 361), (0, -180.1), (0, np.inf)])
+@pytest.mark.parametrize(
+    "place", [(90.1, 0), (-91, 0), (np.nan, 0), (0, 361), (0, -180.1), (0, np.inf)]
+)
 def test_places_off_the_earth_are_refused(place):
     with pytest.raises(GeometryError):
         Geodetic(*place)

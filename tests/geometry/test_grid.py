@@ -34,7 +34,9 @@ def test_tiles_touched_are_those_that_brute_force_finds(points):
     touched = GRID.tiles_touched(outline)
     # every tile with a sample of the outline's inside or border is touched
     steps = np.linspace(0, 1, 50)[:, None]
-    border = np.concatenate([a + steps * (b - a) for a, b in zip(outline, np.roll(outline, -1, axis=0))])
+    border = np.concatenate(
+        [a + steps * (b - a) for a, b in zip(outline, np.roll(outline, -1, axis=0))]
+    )
     x, y = np.meshgrid(np.linspace(-60, 60, 150), np.linspace(-60, 60, 150))
     samples = np.column_stack([x.ravel(), y.ravel()])
     samples = np.concatenate([border, samples[points_inside([outline], samples)]])
@@ -90,7 +92,9 @@ def test_a_grid_without_crs_is_the_sites_own():
     np.testing.assert_allclose(site_grid.grid_from_site(np.array([[5.0, 10.0]])), [[10.0, -20.0]])
 
 
-@pytest.mark.parametrize("arguments", [((0, 0), 0.0), ((0, 0), np.nan), ((0, 0), -1.0), ((0, 0), 0.1, 8)])
+@pytest.mark.parametrize(
+    "arguments", [((0, 0), 0.0), ((0, 0), np.nan), ((0, 0), -1.0), ((0, 0), 0.1, 8)]
+)
 def test_impossible_grids_are_refused(arguments):
     with pytest.raises(GeometryError):
         Grid(*arguments)

@@ -13,8 +13,14 @@ from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose, site_from_gimbal_
 
 CAMERA = Camera(960, 540, 800, 805, 470, 275)
 views = st.builds(
-    lambda yaw, pitch, roll, x, y, z: Pose(site_from_gimbal_rotation(yaw, pitch, roll), np.array([x, y, z])),
-    st.floats(0, 360), st.floats(-90, -60), st.floats(-10, 10), st.floats(-500, 500), st.floats(-500, 500),
+    lambda yaw, pitch, roll, x, y, z: Pose(
+        site_from_gimbal_rotation(yaw, pitch, roll), np.array([x, y, z])
+    ),
+    st.floats(0, 360),
+    st.floats(-90, -60),
+    st.floats(-10, 10),
+    st.floats(-500, 500),
+    st.floats(-500, 500),
     st.floats(5, 120),
 )
 pixels = np.random.default_rng(2).random((30, 2)) * [959, 539]
@@ -32,7 +38,9 @@ def test_the_homography_is_the_rays_way_to_the_ground(site_from_camera, ground_h
 @given(views)
 def test_image_to_ground_and_back(site_from_camera):
     ground_m = ground_from_pixels(CAMERA, site_from_camera, pixels)
-    points_m = site_from_camera.inverse().apply(np.column_stack([ground_m, np.zeros(len(ground_m))]))
+    points_m = site_from_camera.inverse().apply(
+        np.column_stack([ground_m, np.zeros(len(ground_m))])
+    )
     np.testing.assert_allclose(CAMERA.pixels_from_points(points_m), pixels, atol=1e-6)
 
 
@@ -58,7 +66,9 @@ def test_pixels_above_the_horizon_are_nan_in_the_homography_too():
     above_and_below = np.array([[470.0, -200], [470, 539]])
     mapped = apply_homography(site_from_image, above_and_below)
     assert np.isnan(mapped[0]).all()
-    np.testing.assert_allclose(mapped[1], ground_from_pixels(CAMERA, tilted, above_and_below)[1], atol=1e-6)
+    np.testing.assert_allclose(
+        mapped[1], ground_from_pixels(CAMERA, tilted, above_and_below)[1], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("height_m", [0.0, -1.0])

@@ -28,7 +28,9 @@ from sorvolo.geometry.polygons import points_inside
 
 CAMERA = Camera.from_angle_of_view(1200, 800, 60.0)
 SQUARE_M = np.array([[0.0, 0], [100, 0], [100, 100], [0, 100]])
-U_M = np.array([[0.0, 0], [300, 0], [300, 250], [200, 250], [200, 60], [90, 60], [90, 230], [0, 230]])
+U_M = np.array(
+    [[0.0, 0], [300, 0], [300, 250], [200, 250], [200, 60], [90, 60], [90, 230], [0, 230]]
+)
 HOLE_M = np.array([[230.0, 100], [270, 100], [270, 200], [230, 200]])
 
 
@@ -37,7 +39,9 @@ def cut(number, decimals=2):
     return math.floor(number * 10**decimals) / 10**decimals
 
 
-@pytest.mark.parametrize(("task", "front"), [("detection", 2), ("recognition", 8), ("identification", 16)])
+@pytest.mark.parametrize(
+    ("task", "front"), [("detection", 2), ("recognition", 8), ("identification", 16)]
+)
 def test_table_3_1_front_facing(task, front):
     assert required_px_per_m(Task(task), FRONT_CRITICAL_M) == pytest.approx(front)
 
@@ -88,7 +92,9 @@ def test_figure_3_11_running_example():
 def test_frame_rate_follows_height_view_speed_and_overlap(height, aov, speed, overlap):
     rate = minimum_frame_rate(speed, scene_length_m(height, aov), overlap)
     assert minimum_frame_rate(speed, scene_length_m(2 * height, aov), overlap) < rate
-    assert minimum_frame_rate(speed, scene_length_m(height, aov + 5), overlap) < rate  # not as (c) in 3.1.1
+    assert (
+        minimum_frame_rate(speed, scene_length_m(height, aov + 5), overlap) < rate
+    )  # not as (c) in 3.1.1
     assert minimum_frame_rate(2 * speed, scene_length_m(height, aov), overlap) > rate
     assert minimum_frame_rate(speed, scene_length_m(height, aov), overlap + 0.05) > rate
 
@@ -100,21 +106,24 @@ def test_at_the_maximum_height_the_task_is_just_met(height, focal_px, task, crit
     assert px_per_m(height, focal_px) == pytest.approx(focal_px / height)
 
 
-@pytest.mark.parametrize("call", [
-    lambda: required_px_per_m(Task.DETECTION, 0.0),
-    lambda: required_px_per_m(Task.DETECTION, math.nan),
-    lambda: focal_px_from_mm(0.0, 3.0),
-    lambda: focal_px_from_mm(4.0, -1.0),
-    lambda: px_per_m(0.0, 1000.0),
-    lambda: scene_length_m(10.0, 180.0),
-    lambda: minimum_frame_rate(5.0, 10.0, 1.0),
-    lambda: minimum_frame_rate(0.0, 10.0, 0.5),
-    lambda: StripSettings(0.0),
-    lambda: StripSettings(50.0, speed_m_s=-1.0),
-    lambda: StripSettings(50.0, forward_overlap=0.99),
-    lambda: StripSettings(50.0, side_overlap=-0.1),
-    lambda: plan_strips([[SQUARE_M * 1e4]], CAMERA, StripSettings(5.0, side_overlap=0.9)),
-])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: required_px_per_m(Task.DETECTION, 0.0),
+        lambda: required_px_per_m(Task.DETECTION, math.nan),
+        lambda: focal_px_from_mm(0.0, 3.0),
+        lambda: focal_px_from_mm(4.0, -1.0),
+        lambda: px_per_m(0.0, 1000.0),
+        lambda: scene_length_m(10.0, 180.0),
+        lambda: minimum_frame_rate(5.0, 10.0, 1.0),
+        lambda: minimum_frame_rate(0.0, 10.0, 0.5),
+        lambda: StripSettings(0.0),
+        lambda: StripSettings(50.0, speed_m_s=-1.0),
+        lambda: StripSettings(50.0, forward_overlap=0.99),
+        lambda: StripSettings(50.0, side_overlap=-0.1),
+        lambda: plan_strips([[SQUARE_M * 1e4]], CAMERA, StripSettings(5.0, side_overlap=0.9)),
+    ],
+)
 def test_impossible_settings_are_refused(call):
     with pytest.raises(SettingsError):
         call()
@@ -157,14 +166,21 @@ def rotated(ring, angle_deg):
 
 @settings(max_examples=40, deadline=None)
 @given(
-    st.integers(3, 9), st.integers(0, 10**6), st.floats(10, 80), st.sampled_from([0.0, 0.3, 0.65, 0.9]),
+    st.integers(3, 9),
+    st.integers(0, 10**6),
+    st.floats(10, 80),
+    st.sampled_from([0.0, 0.3, 0.65, 0.9]),
     st.sampled_from([math.nan, 0.0, 37.0, 90.0, 200.0]),
 )
 def test_every_point_of_a_star_shaped_area_is_seen(corners, seed, height_m, overlap, bearing_deg):
     rng = np.random.default_rng(seed)
     angles = np.sort(rng.random(corners) * 2 * math.pi)
-    ring = (20 + 150 * rng.random(corners))[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-    plan = plan_strips([[ring]], CAMERA, StripSettings(height_m, 5.0, overlap, overlap, bearing_deg))
+    ring = (20 + 150 * rng.random(corners))[:, None] * np.column_stack(
+        [np.cos(angles), np.sin(angles)]
+    )
+    plan = plan_strips(
+        [[ring]], CAMERA, StripSettings(height_m, 5.0, overlap, overlap, bearing_deg)
+    )
     assert seen_by_photos(plan, points_of([ring], 200)).all()
 
 
@@ -185,7 +201,9 @@ def test_neighbouring_photos_and_strips_overlap_as_wanted():
     plan = plan_strips([[SQUARE_M * 3]], CAMERA, StripSettings(40.0, 6.0, 0.8, 0.6, 0.0))
     width_m, length_m = footprint_size_m(CAMERA, 40.0)
     assert plan.photo_spacing_m == pytest.approx(0.2 * length_m)
-    assert np.linalg.norm(photos_m(plan)[1] - photos_m(plan)[0]) == pytest.approx(plan.photo_spacing_m)
+    assert np.linalg.norm(photos_m(plan)[1] - photos_m(plan)[0]) == pytest.approx(
+        plan.photo_spacing_m
+    )
     levels = np.unique(np.round(plan.passes_m[:, 0, 0], 6))
     assert np.diff(levels) == pytest.approx(0.4 * width_m)
     assert 1 / plan.photo_interval_s == pytest.approx(minimum_frame_rate(6.0, length_m, 0.8))
@@ -210,7 +228,9 @@ def test_an_area_smaller_than_a_photo_is_one_short_pass():
 
 def test_two_polygons_are_covered_together_without_photos_between():
     far_m = SQUARE_M / 2 + [400.0, 0.0]
-    plan = plan_strips([[SQUARE_M / 2], [far_m]], CAMERA, StripSettings(20.0, strip_bearing_deg=90.0))
+    plan = plan_strips(
+        [[SQUARE_M / 2], [far_m]], CAMERA, StripSettings(20.0, strip_bearing_deg=90.0)
+    )
     for ring in (SQUARE_M / 2, far_m):
         assert seen_by_photos(plan, points_of([ring])).all()
     assert not seen_by_photos(plan, np.array([[220.0, 25.0]])).any()

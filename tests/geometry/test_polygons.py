@@ -41,8 +41,12 @@ def share_points(a, b, c, d):
     if turn(a, b, c):
         return "no"
     length2 = r[0] ** 2 + r[1] ** 2
-    t0, t1 = sorted((Fraction(q[0] * r[0] + q[1] * r[1], length2),
-                     Fraction((q[0] + s[0]) * r[0] + (q[1] + s[1]) * r[1], length2)))
+    t0, t1 = sorted(
+        (
+            Fraction(q[0] * r[0] + q[1] * r[1], length2),
+            Fraction((q[0] + s[0]) * r[0] + (q[1] + s[1]) * r[1], length2),
+        )
+    )
     low, high = max(t0, Fraction(0)), min(t1, Fraction(1))
     if low > high:
         return "no"
@@ -84,7 +88,14 @@ def test_area_turns_with_the_ring_and_ignores_where_it_starts(corners):
 def test_area_and_inside_of_a_square_with_a_hole():
     assert polygon_area([SQUARE, HOLE]) == 12
     points = np.array([[0.5, 0.5], [2, 2], [3.5, 2], [5, 2], [-1, 2], [np.nan, 1]])
-    assert points_inside([SQUARE, HOLE], points).tolist() == [True, False, True, False, False, False]
+    assert points_inside([SQUARE, HOLE], points).tolist() == [
+        True,
+        False,
+        True,
+        False,
+        False,
+        False,
+    ]
 
 
 @settings(max_examples=100, deadline=None)

@@ -17,15 +17,23 @@ from sorvolo.geometry.pose import (
 )
 
 vectors = st.tuples(*[st.floats(-3, 3)] * 3).map(np.array)
-poses = st.builds(lambda turn, shift: Pose(rotation_from_vector(turn), shift * 1e3), vectors, vectors)
+poses = st.builds(
+    lambda turn, shift: Pose(rotation_from_vector(turn), shift * 1e3), vectors, vectors
+)
 POINTS_M = np.random.default_rng(0).normal(0, 100, (20, 3))
-FORWARD, RIGHT, DOWN = np.array([0.0, 0, 1]), np.array([1.0, 0, 0]), np.array([0.0, 1, 0])  # camera axes
+FORWARD, RIGHT, DOWN = (
+    np.array([0.0, 0, 1]),
+    np.array([1.0, 0, 0]),
+    np.array([0.0, 1, 0]),
+)  # camera axes
 EAST, NORTH, UP = np.eye(3)
 
 
 @given(poses)
 def test_inverse(a_from_b):
-    np.testing.assert_allclose(a_from_b.inverse().apply(a_from_b.apply(POINTS_M)), POINTS_M, atol=1e-6)
+    np.testing.assert_allclose(
+        a_from_b.inverse().apply(a_from_b.apply(POINTS_M)), POINTS_M, atol=1e-6
+    )
     identity = a_from_b @ a_from_b.inverse()
     np.testing.assert_allclose(identity.rotation, np.eye(3), atol=1e-9)
     np.testing.assert_allclose(identity.translation_m, 0, atol=1e-6)
@@ -64,7 +72,9 @@ def test_rotation_vectors_come_in_stacks():
 
 
 def test_gimbal_straight_down_has_the_image_top_towards_yaw():
-    np.testing.assert_allclose(site_from_gimbal_rotation(0, -90, 0), NADIR_CAMERA_NORTH_UP, atol=1e-12)
+    np.testing.assert_allclose(
+        site_from_gimbal_rotation(0, -90, 0), NADIR_CAMERA_NORTH_UP, atol=1e-12
+    )
     east_up = site_from_gimbal_rotation(90, -90, 0)
     np.testing.assert_allclose(east_up @ -DOWN, EAST, atol=1e-12)
     np.testing.assert_allclose(east_up @ FORWARD, -UP, atol=1e-12)
@@ -80,7 +90,9 @@ def test_gimbal_at_the_horizon_looks_towards_yaw():
 
 
 def test_body_nose_up_and_right_side_down_tilt_the_camera_as_they_should():
-    np.testing.assert_allclose(site_from_body_nadir_rotation(0, 0, 0), NADIR_CAMERA_NORTH_UP, atol=1e-12)
+    np.testing.assert_allclose(
+        site_from_body_nadir_rotation(0, 0, 0), NADIR_CAMERA_NORTH_UP, atol=1e-12
+    )
     np.testing.assert_allclose(site_from_body_nadir_rotation(90, 0, 0) @ -DOWN, EAST, atol=1e-12)
     # nose up: the belly camera looks ahead; right side down: it looks to the left
     assert (site_from_body_nadir_rotation(0, 10, 0) @ FORWARD)[1] > 0.1
@@ -96,7 +108,9 @@ def test_gimbal_angles_there_and_back(yaw_deg, pitch_deg, roll_deg):
 
 @given(st.floats(0, 359.99), st.floats(-89.9, 89.9), st.floats(-179, 179))
 def test_body_angles_there_and_back(yaw_deg, pitch_deg, roll_deg):
-    found = body_nadir_angles_from_rotation(site_from_body_nadir_rotation(yaw_deg, pitch_deg, roll_deg))
+    found = body_nadir_angles_from_rotation(
+        site_from_body_nadir_rotation(yaw_deg, pitch_deg, roll_deg)
+    )
     turn = np.radians(np.subtract(found, (yaw_deg, pitch_deg, roll_deg)))
     np.testing.assert_allclose(np.exp(1j * turn), 1, atol=1e-6)
 
@@ -109,7 +123,9 @@ def test_at_the_nadir_the_angles_still_name_the_same_rotation(yaw_deg, pitch_deg
     np.testing.assert_allclose(site_from_gimbal_rotation(*found), rotation, atol=1e-6)
 
 
-@pytest.mark.parametrize("rotation", [np.eye(3) * 1.01, np.diag([1.0, 1, -1]), np.zeros((3, 3)), np.eye(2)])
+@pytest.mark.parametrize(
+    "rotation", [np.eye(3) * 1.01, np.diag([1.0, 1, -1]), np.zeros((3, 3)), np.eye(2)]
+)
 def test_what_is_no_rotation_is_refused(rotation):
     with pytest.raises(GeometryError):
         Pose(rotation, np.zeros(3))

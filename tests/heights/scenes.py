@@ -40,18 +40,26 @@ def texture(seed: int = 5, m_per_px: float = 0.04, side_m: float = 80.0):
 
     def look(x, y):
         return cv2.remap(
-            picture, (x / m_per_px + side / 2).astype(np.float32), (side / 2 - y / m_per_px).astype(np.float32),
-            cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT,
+            picture,
+            (x / m_per_px + side / 2).astype(np.float32),
+            (side / 2 - y / m_per_px).astype(np.float32),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REFLECT,
         )
 
     return look
 
 
-def photo(view: View, heights: Callable, look: Callable, highest_m: float = 8.0, lowest_m: float = -3.0):
+def photo(
+    view: View, heights: Callable, look: Callable, highest_m: float = 8.0, lowest_m: float = -3.0
+):
     """(H, W, 3) uint8 what the view sees of ground of these heights: each ray followed down to where it meets it."""
     camera = view.camera
     x, y = np.meshgrid(np.arange(camera.width_px), np.arange(camera.height_px))
-    rays = camera.rays_from_pixels(np.column_stack([x.ravel(), y.ravel()])) @ view.site_from_camera.rotation.T
+    rays = (
+        camera.rays_from_pixels(np.column_stack([x.ravel(), y.ravel()]))
+        @ view.site_from_camera.rotation.T
+    )
     rays = rays / -rays[:, 2:]
     eye = view.site_from_camera.translation_m
     up = np.full(len(rays), highest_m)
@@ -69,7 +77,9 @@ def photo(view: View, heights: Callable, look: Callable, highest_m: float = 8.0,
     return np.clip(colours, 0, 255).astype(np.uint8)
 
 
-def survey_views(strips: int = 3, photos: int = 5, height_m: float = 30.0, seed: int = 3, side_px: int = 400):
+def survey_views(
+    strips: int = 3, photos: int = 5, height_m: float = 30.0, seed: int = 3, side_px: int = 400
+):
     """Views of a survey over the origin: strips 8 m apart, a photo every 6 m, a little tilt; their fixes are exact."""
     rng = np.random.default_rng(seed)
     camera = Camera.from_angle_of_view(side_px, side_px * 3 // 4, 62.0)
@@ -77,9 +87,13 @@ def survey_views(strips: int = 3, photos: int = 5, height_m: float = 30.0, seed:
     for strip in range(strips):
         for number in range(photos):
             turn = rotation_from_vector(rng.normal(0, np.radians(2.0), (1, 3)))[0]
-            centre = np.array([
-                6.0 * (number - (photos - 1) / 2), 8.0 * (strip - (strips - 1) / 2), height_m,
-            ]) + rng.normal(0, 0.3, 3)
+            centre = np.array(
+                [
+                    6.0 * (number - (photos - 1) / 2),
+                    8.0 * (strip - (strips - 1) / 2),
+                    height_m,
+                ]
+            ) + rng.normal(0, 0.3, 3)
             pose = Pose(turn @ NADIR_CAMERA_NORTH_UP, centre)
             views.append(View(f"{strip}-{number}", camera, pose, centre))
     return views

@@ -23,7 +23,9 @@ from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.registration.features import gray_from_rgb
 
 
-def scene(focal_scale: float = 1.0, radial: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)) -> Scene:
+def scene(
+    focal_scale: float = 1.0, radial: float = 0.0, centre: tuple[float, float] = (0.0, 0.0)
+) -> Scene:
     """Nine cameras over 200 points with 4 m of relief, seen without noise by a lens that is off as given."""
     rng = np.random.default_rng(1)
     grid = np.array([(x, y) for x in (-10.0, 0, 10) for y in (-10.0, 0, 10)])
@@ -31,7 +33,16 @@ def scene(focal_scale: float = 1.0, radial: float = 0.0, centre: tuple[float, fl
     centres = np.column_stack([grid, 40 + rng.normal(0, 1, 9)])
     points = rng.uniform([-14, -14, -2], [14, 14, 2], (200, 3))
     view, point = np.repeat(np.arange(9), 200), np.tile(np.arange(200), 9)
-    made = Scene(rotations, centres, np.full(9, 1000.0), points, view, point, np.zeros((1800, 2)), np.zeros(5))
+    made = Scene(
+        rotations,
+        centres,
+        np.full(9, 1000.0),
+        points,
+        view,
+        point,
+        np.zeros((1800, 2)),
+        np.zeros(5),
+    )
     local = np.einsum("mji,mj->mi", rotations[view], points[point] - centres[view])
     ideal = focal_scale * local[:, :2] / local[:, 2:] - centre
     seen = ideal.copy()
@@ -49,18 +60,26 @@ def test_derivatives_are_those_of_the_residuals() -> None:
     for k in range(6):
         cameras = np.zeros((9, 6))
         cameras[:, k] = step
-        moved = _advance(made, np.concatenate([cameras.ravel(), np.zeros(5)]), np.zeros_like(made.points_m))
-        np.testing.assert_allclose((moved.residuals_px() - residual) / step, by_camera[:, :, k], atol=0.01)
+        moved = _advance(
+            made, np.concatenate([cameras.ravel(), np.zeros(5)]), np.zeros_like(made.points_m)
+        )
+        np.testing.assert_allclose(
+            (moved.residuals_px() - residual) / step, by_camera[:, :, k], atol=0.01
+        )
     for k in range(5):
         cameras = np.zeros(59)
         cameras[54 + k] = step
         moved = _advance(made, cameras, np.zeros_like(made.points_m))
-        np.testing.assert_allclose((moved.residuals_px() - residual) / step, by_shared[:, :, k], atol=0.01)
+        np.testing.assert_allclose(
+            (moved.residuals_px() - residual) / step, by_shared[:, :, k], atol=0.01
+        )
     for k in range(3):
         points = np.zeros_like(made.points_m)
         points[:, k] = step
         moved = _advance(made, np.zeros(59), points)
-        np.testing.assert_allclose((moved.residuals_px() - residual) / step, by_point[:, :, k], atol=0.01)
+        np.testing.assert_allclose(
+            (moved.residuals_px() - residual) / step, by_point[:, :, k], atol=0.01
+        )
 
 
 def test_points_are_triangulated_where_they_are() -> None:
@@ -73,7 +92,9 @@ def test_adjustment_finds_cameras_points_and_lens() -> None:
     rng = np.random.default_rng(4)
     turn = rotation_from_vector(rng.normal(0, 0.01, (9, 3)))
     off = replace(
-        true, rotations=turn @ true.rotations, centres_m=true.centres_m + rng.normal(0, 0.5, (9, 3)),
+        true,
+        rotations=turn @ true.rotations,
+        centres_m=true.centres_m + rng.normal(0, 0.5, (9, 3)),
     )
     off = replace(off, points_m=triangulate(off))
     priors = Priors(true.centres_m, np.full((9, 3), 0.05), true.rotations)
@@ -90,12 +111,18 @@ def test_heights_err_more_away_from_the_middle_where_fixes_scatter() -> None:
     """What GPS leaves open of the tilt and the scale shows at the rim; better fixes lower it."""
     made = scene()
     errors = [
-        height_deviations(made, Priors(made.centres_m, np.full((9, 3), sigma_m), made.rotations), AdjustmentSettings(
-            sigma_px=0.1)) for sigma_m in (0.4, 0.2)
+        height_deviations(
+            made,
+            Priors(made.centres_m, np.full((9, 3), sigma_m), made.rotations),
+            AdjustmentSettings(sigma_px=0.1),
+        )
+        for sigma_m in (0.4, 0.2)
     ]
     away = np.linalg.norm(made.points_m[:, :2], axis=1)
     assert np.median(errors[0][away > 12]) > 2 * np.median(errors[0][away < 5])
-    assert 0.45 < np.median(errors[1] / errors[0]) < 0.7  # attitudes and the lens have sigmas of their own
+    assert (
+        0.45 < np.median(errors[1] / errors[0]) < 0.7
+    )  # attitudes and the lens have sigmas of their own
     # nine fixes of 0.4 m over 8.2 m rms either way: a tilt of 0.016
     tilted_m = 0.4 / 3 * np.median(away[away > 12]) / np.sqrt(200 / 3)
     assert np.median(errors[0][away > 12]) == pytest.approx(tilted_m, rel=0.5)
@@ -120,7 +147,9 @@ def test_points_err_by_their_features_as_stated() -> None:
     rng = np.random.default_rng(5)
     priors = Priors(true.centres_m, np.full((9, 3), 0.05), true.rotations)
     sigma_m = matched_deviations(true, priors, AdjustmentSettings(sigma_px=0.3))
-    off_m = triangulate(replace(true, seen=true.seen + rng.normal(0, 0.3 / 1000, true.seen.shape)))[:, 2]
+    off_m = triangulate(replace(true, seen=true.seen + rng.normal(0, 0.3 / 1000, true.seen.shape)))[
+        :, 2
+    ]
     times = (off_m - true.points_m[:, 2]) / sigma_m
     assert np.sqrt((times**2).mean()) == pytest.approx(1.0, abs=0.2)
 
@@ -148,10 +177,15 @@ def test_cameras_are_solved_from_pictures(survey) -> None:
     views, pictures = survey
     rng = np.random.default_rng(0)
     off = [
-        replace(view, site_from_camera=Pose(
-            rotation_from_vector(rng.normal(0, 0.015, (1, 3)))[0] @ view.site_from_camera.rotation,
-            view.site_from_camera.translation_m + rng.normal(0, 0.4, 3),
-        )) for view in views
+        replace(
+            view,
+            site_from_camera=Pose(
+                rotation_from_vector(rng.normal(0, 0.015, (1, 3)))[0]
+                @ view.site_from_camera.rotation,
+                view.site_from_camera.translation_m + rng.normal(0, 0.4, 3),
+            ),
+        )
+        for view in views
     ]
     solved = solve_cameras(off, lambda number: pictures[number])
     assert not solved.lost
@@ -173,16 +207,22 @@ def test_a_map_that_leans_on_a_slope_does_not_tilt_the_heights(survey) -> None:
     views, pictures = survey
     lean = rotation_from_vector(np.array([[0.0, np.radians(6), 0.0]]))[0]
     off = [
-        replace(view, site_from_camera=Pose(
-            lean @ view.site_from_camera.rotation,
-            view.site_from_camera.translation_m + np.array([0.0, 0.0, 1.2 * (number % 3 - 1)]),
-        )) for number, view in enumerate(views)
+        replace(
+            view,
+            site_from_camera=Pose(
+                lean @ view.site_from_camera.rotation,
+                view.site_from_camera.translation_m + np.array([0.0, 0.0, 1.2 * (number % 3 - 1)]),
+            ),
+        )
+        for number, view in enumerate(views)
     ]
     solved = solve_cameras(off, lambda number: pictures[number])
-    axes = np.array([
-        (view.site_from_camera.rotation - true.site_from_camera.rotation)[:, 2]
-        for view, true in zip(solved.views, views, strict=True)
-    ])
+    axes = np.array(
+        [
+            (view.site_from_camera.rotation - true.site_from_camera.rotation)[:, 2]
+            for view, true in zip(solved.views, views, strict=True)
+        ]
+    )
     assert np.degrees(np.linalg.norm(axes.mean(axis=0))) < 1.0
 
 
@@ -194,10 +234,15 @@ def test_one_strip_is_named_as_weak(survey) -> None:
 
 def test_an_oblique_orbit_is_named_as_weak() -> None:
     views = tuple(
-        replace(view, site_from_camera=Pose(
-            rotation_from_vector(np.array([[0.7, 0.0, 0.0]]))[0] @ view.site_from_camera.rotation,
-            view.site_from_camera.translation_m,
-        )) for view in survey_views()
+        replace(
+            view,
+            site_from_camera=Pose(
+                rotation_from_vector(np.array([[0.7, 0.0, 0.0]]))[0]
+                @ view.site_from_camera.rotation,
+                view.site_from_camera.translation_m,
+            ),
+        )
+        for view in survey_views()
     )
     solved = Cameras3D(views, (), np.zeros((1, 3)), 0.5, 1.0, (0.0, 0.0), np.full(3, 0.1), 100)
     assert any("off the vertical" in each for each in camera_warnings(solved))

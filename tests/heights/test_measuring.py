@@ -75,7 +75,9 @@ def test_what_lies_beyond_the_heights_is_not_known() -> None:
     reach = float(BOX[:, 0].max())
     half = np.array([[-2, -4], [2 * reach + 2, -4], [2 * reach + 2, 4], [-2, 4]], float)
     found = above_rim(pile, [[half]], VolumeSettings(least_known=0.3))
-    assert found.area_m2 == pytest.approx(8 * (2 * reach + 4)) and found.known_share == pytest.approx(0.5, abs=0.02)
+    assert found.area_m2 == pytest.approx(
+        8 * (2 * reach + 4)
+    ) and found.known_share == pytest.approx(0.5, abs=0.02)
     with pytest.raises(InputError, match="beyond the flight's heights"):
         above_rim(pile, [[half + np.array([reach / 2, 0])]])
     with pytest.raises(InputError, match=r"only 0% of the area has heights.*100% of it is beyond"):
@@ -101,8 +103,11 @@ def test_a_line_around_the_earth_is_refused() -> None:
 
 def test_contours_of_a_cone_are_closed_circles() -> None:
     cone = field(GRID, lambda x, y: 5 - np.hypot(x, y) / 2, sigma_m=0.0)
-    smooth = HeightField(cone.lattice, (5 - np.hypot(*np.moveaxis(cone.lattice.points_m(), 2, 0)) / 2).astype(
-        np.float32), cone.sigma_m)
+    smooth = HeightField(
+        cone.lattice,
+        (5 - np.hypot(*np.moveaxis(cone.lattice.points_m(), 2, 0)) / 2).astype(np.float32),
+        cone.sigma_m,
+    )
     found = list(contours(smooth, 1.0, zero_m=100.0))
     assert {level for level, _ in found} >= {101.0, 102.0, 103.0, 104.0}
     for level, line in found:
@@ -117,7 +122,9 @@ def test_a_long_corridor_has_cells_that_its_raster_can_hold() -> None:
     """A power line of 6 km mapped at 2 cm: OpenCV resamples no picture of more than 32,766 pixels a side."""
     corridor = np.array([[-3000.0, -20], [3000, 20]])
     cell_m = Lattice.cell_for(corridor, 0.02, CellSettings())
-    lattice = Lattice.over(corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), cell_m, "EPSG:32615"))
+    lattice = Lattice.over(
+        corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), cell_m, "EPSG:32615")
+    )
     assert 25_000 < max(lattice.shape) <= MOST_SIDE
     with pytest.raises(GeometryError, match=r"cells larger than 0\.06 m \(--cell\)"):
         Lattice.over(corridor, SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.06, "EPSG:32615"))

@@ -19,15 +19,26 @@ MATCH_M = 0.05
 def level(error_m: float, stated_m: float = MATCH_M, points: int = 5000, views: int = 3):
     """Level ground whose heights err by `error_m` from cell to cell, and points on it that err by a centimetre."""
     rng = np.random.default_rng(3)
-    lattice = Lattice.over(np.array([[-20.0, -20], [20, 20]]), SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.1,
-                                                                        "EPSG:32615"))
+    lattice = Lattice.over(
+        np.array([[-20.0, -20], [20, 20]]),
+        SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.1, "EPSG:32615"),
+    )
     up_m = rng.normal(0, error_m, lattice.shape).astype(np.float32)
     sigma_m = np.full(lattice.shape, np.hypot(stated_m, CAMERA_M), np.float32)
     places = lattice.points_m().reshape(-1, 2)[rng.permutation(up_m.size)[:points]]
     points_m = np.column_stack([places, rng.normal(0, 0.01, len(places))])
     solved = Cameras3D(
-        survey_views(), (), points_m, 0.5, 1.0, (0.0, 0.0), np.full(3, 0.1), 100, SmoothSigma(least_m=CAMERA_M),
-        np.full(len(places), 0.01), np.full(len(places), views),
+        survey_views(),
+        (),
+        points_m,
+        0.5,
+        1.0,
+        (0.0, 0.0),
+        np.full(3, 0.1),
+        100,
+        SmoothSigma(least_m=CAMERA_M),
+        np.full(len(places), 0.01),
+        np.full(len(places), views),
     )
     return Surface(lattice, up_m, sigma_m, np.ones(lattice.shape, bool)), solved
 

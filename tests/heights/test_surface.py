@@ -77,8 +77,12 @@ def test_heights_are_right_to_two_pixels_and_their_sigma_is_honest(surface: Surf
 def test_the_roof_has_its_height(surface: Surface) -> None:
     points = surface.lattice.points_m()
     west, south, east, north, tall = HOUSE
-    roof = ((points[..., 0] > west + 1) & (points[..., 0] < east - 1)
-            & (points[..., 1] > south + 1) & (points[..., 1] < north - 1))
+    roof = (
+        (points[..., 0] > west + 1)
+        & (points[..., 0] < east - 1)
+        & (points[..., 1] > south + 1)
+        & (points[..., 1] < north - 1)
+    )
     floor = float(hills(np.array((west + east) / 2), np.array((south + north) / 2)))
     assert np.nanmedian(surface.up_m[roof]) == pytest.approx(floor + tall, abs=0.1)
 
@@ -101,8 +105,12 @@ def test_bare_ground_is_what_the_houses_stand_on(surface: Surface) -> None:
     off = ground - hills(points[..., 0], points[..., 1])
     assert np.sqrt((off**2).mean()) < 0.4
     west, south, east, north, _ = HOUSE
-    roof = ((points[..., 0] > west + 1) & (points[..., 0] < east - 1)
-            & (points[..., 1] > south + 1) & (points[..., 1] < north - 1))
+    roof = (
+        (points[..., 0] > west + 1)
+        & (points[..., 0] < east - 1)
+        & (points[..., 1] > south + 1)
+        & (points[..., 1] < north - 1)
+    )
     assert not shows[roof].any() and shows.mean() > 0.6
 
 
@@ -158,12 +166,19 @@ def test_single_cells_of_a_wide_roof_that_photos_see_through_are_found(survey) -
     true = true_heights(lattice).astype(np.float32)
     x, y = np.moveaxis(lattice.points_m(), 2, 0)
     west, south, east, north, tall = HOUSE
-    beside = (x > east) & (x < east + 1.5) & (y > south) & (y < north)  # the roof goes on: one piece with it
+    beside = (
+        (x > east) & (x < east + 1.5) & (y > south) & (y < north)
+    )  # the roof goes on: one piece with it
     roof = (x > west) & (x < east) & (y > south) & (y < north)
     floor = float(hills(np.array((west + east) / 2), np.array((south + north) / 2)))
     wrong = np.where(beside, np.float32(floor + tall), true)
     found = seen_through(
-        lattice, wrong, views, lambda number: gray_from_rgb(pictures[number]), 60, SweepSettings(window_cells=(3, 7))
+        lattice,
+        wrong,
+        views,
+        lambda number: gray_from_rgb(pictures[number]),
+        60,
+        SweepSettings(window_cells=(3, 7)),
     )
     assert found[beside].mean() > 0.5
     assert found[roof].mean() < 0.02 and found[~beside & ~roof].mean() < 0.01
@@ -175,7 +190,9 @@ def test_a_photo_of_which_no_cell_can_be_compared_sees_through_nothing(survey) -
     lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
     true = true_heights(lattice).astype(np.float32)
     black = np.zeros((views[0].camera.height_px, views[0].camera.width_px), np.uint8)
-    assert not seen_through(lattice, true, views, lambda _: black, 60, SweepSettings(window_cells=(3, 7))).any()
+    assert not seen_through(
+        lattice, true, views, lambda _: black, 60, SweepSettings(window_cells=(3, 7))
+    ).any()
 
 
 def _wall(lattice: Lattice) -> np.ndarray:
@@ -187,7 +204,9 @@ def _wall(lattice: Lattice) -> np.ndarray:
 def test_what_patches_gave_to_a_roof_is_given_back_to_the_ground(survey) -> None:
     views, pictures, _ = survey
     grays = [gray_from_rgb(each) for each in pictures]
-    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS))
+    lattice = Lattice.over(
+        np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS)
+    )
     true = true_heights(lattice).astype(np.float32)
     points = lattice.points_m()
     bare = hills(points[..., 0], points[..., 1])
@@ -199,7 +218,9 @@ def test_what_patches_gave_to_a_roof_is_given_back_to_the_ground(survey) -> None
     moved = np.isfinite(ground)
     assert moved[given].mean() > 0.9
     inner = cv2.erode(stands.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    assert moved[stands].mean() < 0.2 and not moved[inner].any()  # the border is right to some two cells
+    assert (
+        moved[stands].mean() < 0.2 and not moved[inner].any()
+    )  # the border is right to some two cells
     assert not moved[~wide].any()
     assert np.abs(ground[moved & given] - bare[moved & given]).max() < 0.3
 
@@ -207,7 +228,9 @@ def test_what_patches_gave_to_a_roof_is_given_back_to_the_ground(survey) -> None
 def test_right_borders_stay(survey) -> None:
     views, pictures, _ = survey
     grays = [gray_from_rgb(each) for each in pictures]
-    lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS))
+    lattice = Lattice.over(
+        np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS)
+    )
     true = true_heights(lattice).astype(np.float32)
     stands = true - hills(lattice.points_m()[..., 0], lattice.points_m()[..., 1]) > 1
     ground = beyond_borders(lattice, true, views, lambda i: grays[i], 150, SweepSettings())
@@ -263,7 +286,9 @@ def test_photos_that_see_the_ground_beside_a_house_are_chosen(survey) -> None:
 def test_photos_are_chosen_from_above(survey) -> None:
     views, _, _ = survey
     lattice = Lattice.over(np.array([[-12.0, -10], [12, 11]]), SiteGrid.at(ORIGIN, 0.2, CRS))
-    labels = choose_photos(lattice, np.zeros(lattice.shape, np.float32), views, OrthophotoSettings())
+    labels = choose_photos(
+        lattice, np.zeros(lattice.shape, np.float32), views, OrthophotoSettings()
+    )
     eyes = np.array([view.site_from_camera.translation_m[:2] for view in views])
     away = np.linalg.norm(lattice.points_m()[:, :, None] - eyes, axis=3)
     chosen = np.take_along_axis(away, np.maximum(labels, 0)[..., None].astype(int), axis=2)[..., 0]
@@ -276,7 +301,8 @@ def test_the_orthophoto_shows_roofs_and_ground_in_their_place(survey, surface: S
     views, pictures, look = survey
     site_grid = SiteGrid.at(ORIGIN, 30 / views[0].camera.fx_px, CRS)
     tiles = {
-        index: rgba for index, rgba, _ in paint_orthophoto(surface, site_grid, views, lambda k: pictures[k])
+        index: rgba
+        for index, rgba, _ in paint_orthophoto(surface, site_grid, views, lambda k: pictures[k])
     }
     lattice = surface.lattice
     picture = np.zeros((*lattice.shape, 4), np.uint8)
@@ -288,19 +314,25 @@ def test_the_orthophoto_shows_roofs_and_ground_in_their_place(survey, surface: S
             if 0 <= at < lattice.height:
                 left, right = max(0, x0), min(lattice.width, x0 + 512)
                 if left < right:
-                    picture[at, left:right] = rgba[y, left - x0:right - x0]
+                    picture[at, left:right] = rgba[y, left - x0 : right - x0]
     points = lattice.points_m()
     true = look(points[..., 0], points[..., 1])
     west, south, east, north, _ = HOUSE
     inner = (slice(20, -20), slice(20, -20))
     assert (picture[inner][..., 3] == 255).mean() > 0.99
-    roof = ((points[..., 0] > west + 0.6) & (points[..., 0] < east - 0.6)
-            & (points[..., 1] > south + 0.6) & (points[..., 1] < north - 0.6))
+    roof = (
+        (points[..., 0] > west + 0.6)
+        & (points[..., 0] < east - 0.6)
+        & (points[..., 1] > south + 0.6)
+        & (points[..., 1] < north - 0.6)
+    )
     x, y = np.flatnonzero(roof.any(axis=0)), np.flatnonzero(roof.any(axis=1))
     piece = slice(y[0], y[-1] + 1), slice(x[0], x[-1] + 1)
     shift, likeness = cv2.phaseCorrelate(
         cv2.cvtColor(picture[piece][..., :3], cv2.COLOR_RGB2GRAY).astype(np.float32),
-        cv2.cvtColor(np.clip(true[piece], 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY).astype(np.float32),
+        cv2.cvtColor(np.clip(true[piece], 0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY).astype(
+            np.float32
+        ),
     )
     assert np.hypot(*shift) < 1.0 and likeness > 0.3
 
@@ -328,7 +360,9 @@ def test_water_and_oblique_views_are_named(surface: Surface) -> None:
     up_m[:, : up_m.shape[1] // 2] = np.nan
     half = Surface(surface.lattice, up_m, surface.sigma_m, np.ones(up_m.shape, bool))
     assert any("water" in each for each in surface_warnings(half))
-    assert not surface_warnings(Surface(surface.lattice, surface.up_m, surface.sigma_m, np.isfinite(surface.up_m)))
+    assert not surface_warnings(
+        Surface(surface.lattice, surface.up_m, surface.sigma_m, np.isfinite(surface.up_m))
+    )
     figures = surface_figures(half, np.zeros(up_m.shape, bool), PointJudgement(7))
     assert figures["own_points"]["points"] == 7 and figures["own_points"]["within_2_sigma"] is None
     assert 0.45 < figures["holes_share"] < 0.6
@@ -402,7 +436,9 @@ def test_a_pattern_that_repeats_fits_at_several_heights_and_is_a_hole() -> None:
     side_m = 12 * 1.5 / (30 - 1.5)  # the photos lie alike on planes 1.5 m apart
 
     def tiles(x, y):
-        return patch[np.floor(4 / side_m * y).astype(int) % 8, np.floor(4 / side_m * x).astype(int) % 4]
+        return patch[
+            np.floor(4 / side_m * y).astype(int) % 8, np.floor(4 / side_m * x).astype(int) % 4
+        ]
 
     pictures = [photo(view, lambda x, y: 0 * x, tiles, 0.1, -0.1) for view in views]
     gsd_m = 30 / views[0].camera.fx_px

@@ -20,7 +20,9 @@ def pictures(height: int, width: int, seed: int) -> tuple[np.ndarray, np.ndarray
     """Two noisy pictures with steps, so that every branch of clipping is met."""
     rng = np.random.default_rng(seed)
     before = rng.integers(0, 256, (height, width, 3), dtype=np.uint8)
-    after = np.clip(before.astype(int) + rng.integers(-20, 21, before.shape), 0, 255).astype(np.uint8)
+    after = np.clip(before.astype(int) + rng.integers(-20, 21, before.shape), 0, 255).astype(
+        np.uint8
+    )
     before[height // 2 :, : width // 2] = rng.choice([0, 255], 3)
     after[: height // 2, width // 2 :] = rng.choice([0, 255], 3)
     return before, after
@@ -42,9 +44,13 @@ def test_differences_are_as_specified(
 
 @settings(max_examples=100, deadline=None)
 @given(SIDES, SIDES, st.floats(0.02, 0.98), st.floats(0, 0.2), st.integers(0, 2**32 - 1))
-def test_held_parts_are_as_specified(height: int, width: int, share: float, seeded: float, seed: int) -> None:
+def test_held_parts_are_as_specified(
+    height: int, width: int, share: float, seeded: float, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
-    mask, seeds = ((rng.random((height, width)) < each).astype(np.uint8) * 255 for each in (share, seeded))
+    mask, seeds = (
+        (rng.random((height, width)) < each).astype(np.uint8) * 255 for each in (share, seeded)
+    )
     assert np.array_equal(kernels.held_parts(mask, seeds), numpy_robust.held_parts(mask, seeds))
 
 
@@ -56,7 +62,11 @@ def test_tint_and_rims_are_as_specified(height: int, width: int, seed: int) -> N
     logs = np.sort(rng.integers(0, 256, 256, dtype=np.uint8))
     labels, boxes = kernels.core_regions(
         rng.integers(0, 256, (height, width), dtype=np.uint8),
-        np.full((height, width), rng.integers(80, 200), np.uint8), 1.2, rng.uniform(0.1, 0.9), 3, 8,
+        np.full((height, width), rng.integers(80, 200), np.uint8),
+        1.2,
+        rng.uniform(0.1, 0.9),
+        3,
+        8,
     )
     found, plain = (np.full((height, width), 7, np.uint8) for _ in range(2))
     kernels.tint(before, after, logs, boxes, 2, found)
@@ -64,7 +74,8 @@ def test_tint_and_rims_are_as_specified(height: int, width: int, seed: int) -> N
     assert np.array_equal(found, plain)
     came, went = before[..., 0], after[..., 1]
     assert np.array_equal(
-        kernels.rim_balance(labels, boxes, came, went), numpy_robust.rim_balance(labels, boxes, came, went)
+        kernels.rim_balance(labels, boxes, came, went),
+        numpy_robust.rim_balance(labels, boxes, came, went),
     )
 
 
@@ -110,7 +121,12 @@ def test_what_does_not_fit_is_refused() -> None:
 def test_what_is_handed_out_survives_the_next_pictures() -> None:
     before, after = pictures(60, 80, 1)
     regions = find_regions(before, after, None, RegionSettings(), 0.1, 0.0)
-    kept = regions.weak.copy(), regions.labels.copy(), regions.features.copy(), regions.strength.copy()
+    kept = (
+        regions.weak.copy(),
+        regions.labels.copy(),
+        regions.features.copy(),
+        regions.strength.copy(),
+    )
     find_regions(*pictures(60, 80, 2), None, RegionSettings(), 0.1, 0.0)
     now = regions.weak, regions.labels, regions.features, regions.strength
     assert all(np.array_equal(a, b) for a, b in zip(kept, now, strict=True))
@@ -130,7 +146,9 @@ def test_scratch_keeps_one_size_and_nothing_large() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(1, 140), st.integers(1, 100), st.integers(0, 9), st.integers(0, 2**32 - 1))
-def test_narrow_wide_and_stepped_windows_are_matched_as_specified(wide: int, high: int, reach: int, seed: int) -> None:
+def test_narrow_wide_and_stepped_windows_are_matched_as_specified(
+    wide: int, high: int, reach: int, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     query = rng.integers(0, 256, (high + 3, wide + 5), dtype=np.uint8)
     searched = rng.integers(0, 256, (high + 3 + 2 * reach, wide + 5 + 2 * reach), dtype=np.uint8)

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from sorvolo import kernels
 from sorvolo.kernels import numpy_thesis
 
-needs_compiler = pytest.mark.skipif(not kernels.COMPILED, reason="the kernels were not compiled here")
+needs_compiler = pytest.mark.skipif(
+    not kernels.COMPILED, reason="the kernels were not compiled here"
+)
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 170))
 windows = st.tuples(st.integers(1, 19), st.integers(1, 19))
 seeds = st.integers(0, 2**32 - 1)
@@ -21,7 +23,9 @@ threads = st.integers(1, 5)
 def picture(seed: int, size: tuple[int, int], channels: int = 3) -> Any:
     """Smooth or rough, of many values or few, so that ties and flat pieces occur."""
     rng = np.random.default_rng(seed)
-    values = rng.integers(0, rng.choice([2, 5, 256]), (*size, channels), np.uint8) * rng.choice([1, 50])
+    values = rng.integers(0, rng.choice([2, 5, 256]), (*size, channels), np.uint8) * rng.choice(
+        [1, 50]
+    )
     if rng.random() < 0.5:
         values = cv2.blur(values.astype(np.uint8), (5, 5)).reshape(*size, channels)
     return values.astype(np.uint8)
@@ -35,7 +39,9 @@ def some(seed: int, size: tuple[int, int]) -> Any:
 @needs_compiler
 @settings(max_examples=60, deadline=None)
 @given(seeds, sizes, threads, st.booleans())
-def test_equalising_tables_agree(seed: int, size: tuple[int, int], threads: int, holes: bool) -> None:
+def test_equalising_tables_agree(
+    seed: int, size: tuple[int, int], threads: int, holes: bool
+) -> None:
     image, known = picture(seed, size), some(seed, size) if holes else None
     expected = numpy_thesis.equalising_tables(image, known, 1)
     np.testing.assert_array_equal(kernels.equalising_tables(image, known, threads), expected)
@@ -44,11 +50,15 @@ def test_equalising_tables_agree(seed: int, size: tuple[int, int], threads: int,
 @needs_compiler
 @settings(max_examples=60, deadline=None)
 @given(seeds, sizes, windows, threads)
-def test_averaged_agrees(seed: int, size: tuple[int, int], window: tuple[int, int], threads: int) -> None:
+def test_averaged_agrees(
+    seed: int, size: tuple[int, int], window: tuple[int, int], threads: int
+) -> None:
     image = picture(seed, size)
     tables = np.random.default_rng(seed).integers(0, 256, (3, 256), np.uint8)
     expected = numpy_thesis.averaged(image, tables, *window, 1)
-    for found, right in zip(kernels.averaged(image, tables, *window, threads), expected, strict=True):
+    for found, right in zip(
+        kernels.averaged(image, tables, *window, threads), expected, strict=True
+    ):
         np.testing.assert_array_equal(found, right)
 
 
@@ -58,10 +68,14 @@ def test_averaged_agrees(seed: int, size: tuple[int, int], window: tuple[int, in
 def test_texture_changes_agree(
     seed: int, size: tuple[int, int], window: tuple[int, int], threads: int, share: float
 ) -> None:
-    before, after = (np.ascontiguousarray(picture(seed + k, size).transpose(2, 0, 1)) for k in range(2))
+    before, after = (
+        np.ascontiguousarray(picture(seed + k, size).transpose(2, 0, 1)) for k in range(2)
+    )
     asked, most = some(seed, size), int(share * 3 * window[0] * window[1])
     expected = numpy_thesis.texture_changes(before, after, asked, *window, most, 1)
-    np.testing.assert_array_equal(kernels.texture_changes(before, after, asked, *window, most, threads), expected)
+    np.testing.assert_array_equal(
+        kernels.texture_changes(before, after, asked, *window, most, threads), expected
+    )
 
 
 @needs_compiler
@@ -72,7 +86,9 @@ def test_isolations_agree(
 ) -> None:
     mask, most = some(seed, size), int(share * window[0] * window[1])
     expected = numpy_thesis.without_isolations(mask, *window, most, 1)
-    np.testing.assert_array_equal(kernels.without_isolations(mask, *window, most, threads), expected)
+    np.testing.assert_array_equal(
+        kernels.without_isolations(mask, *window, most, threads), expected
+    )
 
 
 @needs_compiler
@@ -86,7 +102,9 @@ def test_regions_and_their_histograms_agree(seed: int, size: tuple[int, int], sh
     image, tables = picture(seed, size), rng.integers(0, 256, (3, 256), np.uint8)
     for known in (None, some(seed, size)):
         expected = numpy_thesis.gray_histograms(image, tables, boxes, known)
-        np.testing.assert_array_equal(kernels.gray_histograms(image, tables, boxes, known), expected)
+        np.testing.assert_array_equal(
+            kernels.gray_histograms(image, tables, boxes, known), expected
+        )
 
 
 def test_regions_are_those_of_opencv() -> None:
@@ -101,9 +119,13 @@ def test_regions_are_those_of_opencv() -> None:
 def test_equalisation_and_gray_are_those_of_opencv() -> None:
     image = picture(3, (90, 120))
     equalised = numpy_thesis.looked_up(image, kernels.equalising_tables(image))
-    expected = np.stack([cv2.equalizeHist(np.ascontiguousarray(image[..., each])) for each in range(3)], axis=-1)
+    expected = np.stack(
+        [cv2.equalizeHist(np.ascontiguousarray(image[..., each])) for each in range(3)], axis=-1
+    )
     assert np.abs(equalised.astype(int) - expected).max() <= 1  # OpenCV rounds a float product
-    np.testing.assert_array_equal(numpy_thesis.gray_of(image), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    np.testing.assert_array_equal(
+        numpy_thesis.gray_of(image), cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    )
 
 
 def test_a_window_of_ten_is_the_mean_from_five_before_to_four_after() -> None:
@@ -130,4 +152,6 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="outside of the 5 x 4 px image"):
         kernels.gray_histograms(image, identity, np.array([[2, 1, 4, 1]]))
     with pytest.raises(ValueError, match="do not fit"):
-        kernels.texture_changes(np.zeros((3, 4, 5), np.uint8), np.zeros((3, 4, 6), np.uint8), image[..., 0], 3, 3, 1)
+        kernels.texture_changes(
+            np.zeros((3, 4, 5), np.uint8), np.zeros((3, 4, 6), np.uint8), image[..., 0], 3, 3, 1
+        )

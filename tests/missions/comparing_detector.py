@@ -20,9 +20,13 @@ class Comparing:
     provider = "comparison"
     notices = others = ()
     info = ModelInfo(
-        "comparing", CLASSES, MappingProxyType(dict.fromkeys(CLASSES, 0.3)),
-        MappingProxyType(dict.fromkeys(CLASSES, (4.0, 400.0))), version="1",
-        licence="CC0-1.0", trained_on="nothing",
+        "comparing",
+        CLASSES,
+        MappingProxyType(dict.fromkeys(CLASSES, 0.3)),
+        MappingProxyType(dict.fromkeys(CLASSES, (4.0, 400.0))),
+        version="1",
+        licence="CC0-1.0",
+        trained_on="nothing",
     )
 
     def __init__(self, site: Path, *, sees: bool = True) -> None:
@@ -34,15 +38,26 @@ class Comparing:
         """There is nothing to give back."""
 
     def thresholds_for(
-        self, picture: ImageRGB, *, from_above: bool = False, m_per_px: float | None = None,
+        self,
+        picture: ImageRGB,
+        *,
+        from_above: bool = False,
+        m_per_px: float | None = None,
     ) -> Mapping[str, float]:
         """The same for all pictures."""
         return self.info.thresholds
 
     def detect(
-        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, is_part: bool = False,
+        self,
+        image: ImageRGB,
+        *,
+        tiles: object = None,
+        m_per_px: float | None = None,
+        least_score: float | None = None,
+        classes: Sequence[str] | None = None,
+        from_above: bool = False,
+        overlapping: bool = False,
+        is_part: bool = False,
     ) -> Detections:
         """Boxes around what differs from the frame that is most like the picture; cars are the large ones."""
         apart = [int(cv2.norm(each, image, cv2.NORM_L1)) for each in self._frames]

@@ -37,7 +37,10 @@ def photo_map(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     """The site of these photos, which nobody writes to."""
     folder = tmp_path_factory.mktemp("flights") / "site"
     for _ in map_flights(
-        [photographed / "flight1" / "photos"], folder, MapSettings(model="none"), camera=photographed / "camera.xml"
+        [photographed / "flight1" / "photos"],
+        folder,
+        MapSettings(model="none"),
+        camera=photographed / "camera.xml",
     ):
         pass
     return folder
@@ -56,7 +59,9 @@ def oblique(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same video by a camera that looks 45 degrees down, with telemetry in every format."""
     folder = tmp_path_factory.mktemp("flights") / "oblique"
     motion = replace(_SMALL.motion, camera_pitch_deg=-45.0)
-    return simulate_into(folder, replace(_SMALL, motion=motion, output=OutputSettings(telemetry="all")))
+    return simulate_into(
+        folder, replace(_SMALL, motion=motion, output=OutputSettings(telemetry="all"))
+    )
 
 
 @pytest.fixture(scope="session")
@@ -65,9 +70,14 @@ def keyed(filmed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("keyed")
     flight = filmed / "flight1"
     shutil.copy(flight / "flight1.csv", folder)
-    with av.open(str(flight / "flight1.mp4")) as source, av.open(str(folder / "flight1.mp4"), "w") as target:
+    with (
+        av.open(str(flight / "flight1.mp4")) as source,
+        av.open(str(folder / "flight1.mp4"), "w") as target,
+    ):
         target.metadata.update(source.metadata)
-        stream = target.add_stream("libx264", rate=6, options={"crf": "18", "x264-params": "keyint=3:scenecut=0"})
+        stream = target.add_stream(
+            "libx264", rate=6, options={"crf": "18", "x264-params": "keyint=3:scenecut=0"}
+        )
         stream.width, stream.height = _SMALL.imaging.width_px, _SMALL.imaging.height_px
         for frame in source.decode(video=0):
             frame.pict_type = av.video.frame.PictureType.NONE  # the encoder chooses

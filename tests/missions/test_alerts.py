@@ -13,9 +13,22 @@ from typing import ClassVar
 import pytest
 
 from sorvolo.errors import SettingsError, StoreError
-from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url, interpreted_placeholder
+from sorvolo.missions.watch.alerts import (
+    Outbox,
+    Pace,
+    alert_command,
+    alert_url,
+    interpreted_placeholder,
+)
 
-_ALERT = {"id": 3, "class": "small object", "score": 0.9, "latitude": 41.9, "longitude": None, "crop": "/a b/3.jpg"}
+_ALERT = {
+    "id": 3,
+    "class": "small object",
+    "score": 0.9,
+    "latitude": 41.9,
+    "longitude": None,
+    "crop": "/a b/3.jpg",
+}
 
 
 class _Receiver(BaseHTTPRequestHandler):
@@ -55,10 +68,13 @@ def _script(folder: Path, body: str) -> str:
 
 def test_a_command_gets_words_and_json(tmp_path: Path) -> None:
     script = _script(
-        tmp_path, "import json, sys\nopen(sys.argv[1], 'w').write(json.dumps([sys.argv[2:], json.load(sys.stdin)]))"
+        tmp_path,
+        "import json, sys\nopen(sys.argv[1], 'w').write(json.dumps([sys.argv[2:], json.load(sys.stdin)]))",
     )
     out = tmp_path / "out.json"
-    run = alert_command(f"{script} '{out}' {{id}} '{{class}} at {{latitude}} {{longitude}}' {{crop}} ';|$HOME'")
+    run = alert_command(
+        f"{script} '{out}' {{id}} '{{class}} at {{latitude}} {{longitude}}' {{crop}} ';|$HOME'"
+    )
     run(_ALERT)
     words, body = json.loads(out.read_text())
     assert words == ["3", "small object at 41.9 ", "/a b/3.jpg", ";|$HOME"]  # no shell reads them
@@ -67,7 +83,9 @@ def test_a_command_gets_words_and_json(tmp_path: Path) -> None:
 
 def test_what_a_command_does_wrong_is_reported(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="code 3: no such number"):
-        alert_command(_script(tmp_path, "import sys\nprint('no such number', file=sys.stderr); sys.exit(3)"))(_ALERT)
+        alert_command(
+            _script(tmp_path, "import sys\nprint('no such number', file=sys.stderr); sys.exit(3)")
+        )(_ALERT)
     began_s = time.monotonic()
     with pytest.raises(StoreError, match=r"longer than 0.3 s"):
         alert_command("sh -c 'sleep 30 & sleep 30'", limit_s=0.3)(_ALERT)
@@ -77,8 +95,12 @@ def test_what_a_command_does_wrong_is_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("template", "words"),
     [
-        ("", "empty"), ("echo {name}", "no placeholder {name}"), ("echo {id.__class__}", "no placeholder"),
-        ("echo {}", "no placeholder"), ("echo {id", "cannot be read"), ("echo 'a", "cannot be read"),
+        ("", "empty"),
+        ("echo {name}", "no placeholder {name}"),
+        ("echo {id.__class__}", "no placeholder"),
+        ("echo {}", "no placeholder"),
+        ("echo {id", "cannot be read"),
+        ("echo 'a", "cannot be read"),
         ("no-such-program {id}", "no program"),
     ],
 )
@@ -112,6 +134,7 @@ def rude_server() -> Iterator[tuple[str, list[bytes]]]:
     """Answers the first request with what is no HTTP, later ones well."""
     requests: list[bytes] = []
     with socket.create_server(("127.0.0.1", 0)) as listening:
+
         def serve() -> None:
             while True:
                 try:
@@ -120,7 +143,11 @@ def rude_server() -> Iterator[tuple[str, list[bytes]]]:
                     return
                 with connection:
                     requests.append(connection.recv(65536))
-                    connection.sendall(b"GARBAGE\r\n\r\n" if len(requests) == 1 else b"HTTP/1.1 204 No Content\r\n\r\n")
+                    connection.sendall(
+                        b"GARBAGE\r\n\r\n"
+                        if len(requests) == 1
+                        else b"HTTP/1.1 204 No Content\r\n\r\n"
+                    )
 
         threading.Thread(target=serve, daemon=True).start()
         yield f"http://127.0.0.1:{listening.getsockname()[1]}", requests
@@ -159,11 +186,20 @@ def test_an_alert_is_not_sent_elsewhere(server: str) -> None:
     assert not _Receiver.got
 
 
-@pytest.mark.parametrize(("template", "found"), [
-    ("sh -c 'echo {class}'", "class"), ("/bin/bash -ec 'mail {crop}'", "crop"), ("env LANG=C sh -c 'x {id}'", "id"),
-    ("python3 -c 'print(\"{class}\")'", "class"), ("cmd /C 'copy {crop} x'", "crop"),
-    ("sh -c 'echo \"$1\"' alert {class}", ""), ("sh notify.sh {class}", ""), ("notify -c {class}", ""), ("", ""),
-])
+@pytest.mark.parametrize(
+    ("template", "found"),
+    [
+        ("sh -c 'echo {class}'", "class"),
+        ("/bin/bash -ec 'mail {crop}'", "crop"),
+        ("env LANG=C sh -c 'x {id}'", "id"),
+        ("python3 -c 'print(\"{class}\")'", "class"),
+        ("cmd /C 'copy {crop} x'", "crop"),
+        ("sh -c 'echo \"$1\"' alert {class}", ""),
+        ("sh notify.sh {class}", ""),
+        ("notify -c {class}", ""),
+        ("", ""),
+    ],
+)
 def test_a_placeholder_that_an_interpreter_would_run_is_found(template: str, found: str) -> None:
     assert interpreted_placeholder(template) == found
 

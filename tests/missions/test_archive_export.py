@@ -28,7 +28,9 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with Archive.open(root / name, write=True) as archive:
             archive.create_site(fake_flights.SITE)
             for number in range(2 if name == "south" else 1):
-                fake_flights.map_flight(archive, f"flight-{number}", 50 + number, count=2, compared=True)
+                fake_flights.map_flight(
+                    archive, f"flight-{number}", 50 + number, count=2, compared=True
+                )
             archive.review(archive.changes()[0].id, Verdict.CONFIRMED)
     with Archive.open(root / "pond", write=True) as archive:
         archive.create_site(fake_flights.LOCAL_SITE)
@@ -56,7 +58,12 @@ def test_every_site_flight_version_and_change_has_a_row(
 ) -> None:
     rows = {each["id"]: each for each in rows_of(table)}
     kinds = [each["sorvolo:kind"] for each in rows.values()]
-    assert {kind: kinds.count(kind) for kind in set(kinds)} == {"site": 2, "flight": 3, "version": 3, "change": 6}
+    assert {kind: kinds.count(kind) for kind in set(kinds)} == {
+        "site": 2,
+        "flight": 3,
+        "version": 3,
+        "change": 6,
+    }
     flight = rows["south/flight-1"]
     assert flight["start_datetime"] <= flight["datetime"] <= flight["end_datetime"]
     assert flight["datetime"].isoformat().startswith("2023-11-14T22:13:20.123456")
@@ -68,14 +75,28 @@ def test_every_site_flight_version_and_change_has_a_row(
     assert (table.parent / change["assets"]["before"]["href"]).is_file()
     assert main(["archive", "export", str(maps), "--out", str(table), "--json"]) == 1
     outcome = json.loads(capsys.readouterr().out)
-    assert outcome["local"] == ["pond"] and list(outcome["faults"]) == ["broken"] and outcome["rows"] == 14
+    assert (
+        outcome["local"] == ["pond"]
+        and list(outcome["faults"]) == ["broken"]
+        and outcome["rows"] == 14
+    )
 
 
 def test_geometries_lie_where_the_site_is(table: Path, maps: Path) -> None:
     for each in rows_of(table):
         place, box = shapely.from_wkb(each["geometry"]), each["bbox"]
-        assert place.is_valid and place.bounds == (box["xmin"], box["ymin"], box["xmax"], box["ymax"])
-        assert place.distance(shapely.Point(fake_flights.ORIGIN.longitude_deg, fake_flights.ORIGIN.latitude_deg)) < 1e-3
+        assert place.is_valid and place.bounds == (
+            box["xmin"],
+            box["ymin"],
+            box["xmax"],
+            box["ymax"],
+        )
+        assert (
+            place.distance(
+                shapely.Point(fake_flights.ORIGIN.longitude_deg, fake_flights.ORIGIN.latitude_deg)
+            )
+            < 1e-3
+        )
         if each["sorvolo:kind"] == "version":
             with Archive.open(maps / each["sorvolo:site"], write=False) as archive:
                 tiles = len(archive.tiles(each["sorvolo:version"]))
@@ -90,9 +111,13 @@ def test_it_is_geoparquet_1_1_and_stac_geoparquet_1_1(table: Path) -> None:
     geo = json.loads(metadata[b"geo"])
     assert geo["version"] == "1.1.0" and geo["primary_column"] == "geometry"
     column = geo["columns"]["geometry"]
-    assert column["encoding"] == "WKB" and "crs" not in column  # the default: longitude and latitude in WGS84
+    assert (
+        column["encoding"] == "WKB" and "crs" not in column
+    )  # the default: longitude and latitude in WGS84
     assert set(column["geometry_types"]) <= {"Point", "Polygon", "MultiPolygon"}
-    assert column["covering"] == {"bbox": {each: ["bbox", each] for each in ("xmin", "ymin", "xmax", "ymax")}}
+    assert column["covering"] == {
+        "bbox": {each: ["bbox", each] for each in ("xmin", "ymin", "xmax", "ymax")}
+    }
     places = [shapely.from_wkb(each["geometry"]) for each in rows_of(table)]
     assert column["bbox"] == list(shapely.union_all(places).bounds)
     assert {place.geom_type for place in places} == set(column["geometry_types"])
@@ -101,7 +126,9 @@ def test_it_is_geoparquet_1_1_and_stac_geoparquet_1_1(table: Path) -> None:
 
 
 def test_geopandas_reads_it_by_its_boxes(table: Path) -> None:
-    geopandas = pytest.importorskip("geopandas", reason="needs geopandas: pip install 'sorvolo[notebooks]'")
+    geopandas = pytest.importorskip(
+        "geopandas", reason="needs geopandas: pip install 'sorvolo[notebooks]'"
+    )
     found = geopandas.read_parquet(table)
     assert len(found) == 14 and found.crs == "OGC:CRS84"
     assert len(geopandas.read_parquet(table, bbox=(13.249, 46.499, 13.251, 46.501))) == 14
@@ -112,9 +139,15 @@ def test_the_rows_are_stac_items_again(table: Path) -> None:
     pystac = pytest.importorskip("pystac", reason="needs pystac")
     for row in rows_of(table):
         item = pystac.Item(
-            row["id"], shapely.geometry.mapping(shapely.from_wkb(row["geometry"])), list(row["bbox"].values()),
-            row["datetime"], {"sorvolo:kind": row["sorvolo:kind"]}, collection=row["collection"],
-            assets={name: pystac.Asset.from_dict(each) for name, each in row["assets"].items() if each},
+            row["id"],
+            shapely.geometry.mapping(shapely.from_wkb(row["geometry"])),
+            list(row["bbox"].values()),
+            row["datetime"],
+            {"sorvolo:kind": row["sorvolo:kind"]},
+            collection=row["collection"],
+            assets={
+                name: pystac.Asset.from_dict(each) for name, each in row["assets"].items() if each
+            },
         )
         again = pystac.Item.from_dict(item.to_dict(include_self_link=False, transform_hrefs=False))
         assert again.id == row["id"] and again.datetime == row["datetime"]
@@ -126,14 +159,18 @@ def _queries() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("query", _queries())
-def test_the_documentations_queries_find_something(table: Path, query: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_documentations_queries_find_something(
+    table: Path, query: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb: pip install duckdb")
     monkeypatch.chdir(table.parent)
     with duckdb.connect() as connection:
         assert connection.sql(query).to_arrow_table().num_rows > 0
 
 
-def test_an_archive_in_a_bucket(maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_archive_in_a_bucket(
+    maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SORVOLO_CACHE", str(tmp_path / "cache"))
     with served_bucket():
         for _ in copy_site(str(maps / "south"), f"s3://{BUCKET}/archive/south"):
@@ -155,5 +192,8 @@ def test_bad_input_is_named(maps: Path, tmp_path: Path, capsys: pytest.CaptureFi
         assert main(["archive", "export", str(root), "--out", str(out)]) == 1
         assert words in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
-    assert main(["archive", "export", str(tmp_path / "empty"), "--out", str(tmp_path / "a.parquet")]) == 0
+    assert (
+        main(["archive", "export", str(tmp_path / "empty"), "--out", str(tmp_path / "a.parquet")])
+        == 0
+    )
     assert rows_of(tmp_path / "a.parquet") == []

@@ -29,7 +29,9 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> str:
     capsys.readouterr()
     assert cli.main(["map", "--model", "none", *map(str, arguments)]) == 1
     printed = capsys.readouterr().err.splitlines()
-    assert len(printed) == 1 and printed[0].startswith("error: ") and "bug" not in printed[0], printed
+    assert len(printed) == 1 and printed[0].startswith("error: ") and "bug" not in printed[0], (
+        printed
+    )
     return printed[0]
 
 
@@ -47,7 +49,10 @@ def codes(report: dict[str, Any]) -> dict[str, int]:
 def endings(site: Path) -> dict[str, tuple[str, str]]:
     (path,) = site.glob("flights/*/frames.geojson")
     return {
-        str(each["properties"]["frame"]): (each["properties"]["status"], each["properties"]["reason"])
+        str(each["properties"]["frame"]): (
+            each["properties"]["status"],
+            each["properties"]["reason"],
+        )
         for each in json.loads(path.read_text())["features"]
     }
 
@@ -89,7 +94,9 @@ def _latitude(fields: list[str]) -> int:
 # ---- what cannot be read at all ---------------------------------------------------------------------------------
 
 
-def test_inputs_that_are_not_there_or_hold_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inputs_that_are_not_there_or_hold_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     site = tmp_path / "site"
     assert "no such file" in refused(capsys, tmp_path / "none.mp4", "--site", site)
     empty = tmp_path / "empty"
@@ -123,7 +130,12 @@ def test_a_cut_video_is_mapped_as_far_as_it_goes(film: Path, filmed: Path, tmp_p
                 target.mux(packet)
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     report = mapped(
-        tmp_path / "site", cut, "--telemetry", filmed / "flight1" / "flight1.csv", "--camera", filmed / "camera.xml"
+        tmp_path / "site",
+        cut,
+        "--telemetry",
+        filmed / "flight1" / "flight1.csv",
+        "--camera",
+        filmed / "camera.xml",
     )
     assert "truncated" in codes(report) and report["frames"]["vision"] >= 3
 
@@ -131,9 +143,15 @@ def test_a_cut_video_is_mapped_as_far_as_it_goes(film: Path, filmed: Path, tmp_p
 # ---- telemetry --------------------------------------------------------------------------------------------------
 
 
-def test_telemetry_that_is_none(film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_telemetry_that_is_none(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     telemetry = tmp_path / "log.csv"
-    for content, words in ((b"", "0 bytes"), (np.random.default_rng(1).bytes(3000), "binary"), (b"a,b\n1,2\n", "text")):
+    for content, words in (
+        (b"", "0 bytes"),
+        (np.random.default_rng(1).bytes(3000), "binary"),
+        (b"a,b\n1,2\n", "text"),
+    ):
         telemetry.write_bytes(content)
         assert words in refused(capsys, film, "--telemetry", telemetry, "--site", tmp_path / "site")
 
@@ -147,7 +165,9 @@ def test_telemetry_of_another_day(
 
     telemetry = tmp_path / "day.nmea"
     telemetry.write_text(_nmea(filmed, earlier))
-    assert "another flight" in refused(capsys, film, "--telemetry", telemetry, "--site", tmp_path / "site")
+    assert "another flight" in refused(
+        capsys, film, "--telemetry", telemetry, "--site", tmp_path / "site"
+    )
 
 
 def test_half_written_telemetry_with_lost_jumping_and_backward_fixes(
@@ -164,13 +184,17 @@ def test_half_written_telemetry_with_lost_jumping_and_backward_fixes(
     lines = text.splitlines(keepends=True)
     telemetry = tmp_path / "spoilt.nmea"
     telemetry.write_text("".join([*lines[:16], *lines[8:10], *lines[16:]])[:-9])
-    report = mapped(tmp_path / "site", film, "--telemetry", telemetry, "--camera", filmed / "camera.xml")
+    report = mapped(
+        tmp_path / "site", film, "--telemetry", telemetry, "--camera", filmed / "camera.xml"
+    )
     words = " ".join(each["text"] for each in report["notices"])
     assert "0/0" in words and "jump" in words and "cut off" in words and "same time" in words
     assert report["frames"]["vision"] == report["frames"]["selected"] > 8
 
 
-def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tmp_path: Path) -> None:
+def test_telemetry_of_another_path_at_the_same_time(
+    film: Path, filmed: Path, tmp_path: Path
+) -> None:
     """Without a reference one place is like another, but the motion does not fit, and the report states it."""
     lines = (filmed / "flight1" / "other" / "flight1.nmea").read_text().splitlines()
     places = [line.split(",") for line in lines]
@@ -178,7 +202,7 @@ def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tm
     def reverse(fix: int, fields: list[str]) -> None:
         other = places[len(places) - 2 - 2 * fix + (fields[0] == "GPRMC")]
         at = _latitude(fields)
-        fields[at:at + 4] = other[at:at + 4]
+        fields[at : at + 4] = other[at : at + 4]
 
     telemetry = tmp_path / "reversed.nmea"
     telemetry.write_text(_nmea(filmed, reverse))
@@ -187,25 +211,47 @@ def test_telemetry_of_another_path_at_the_same_time(film: Path, filmed: Path, tm
     assert any("telemetry of this flight" in words for words in alone["warnings"])
     right = mapped(tmp_path / "site", film, *camera)
     assert not right["warnings"]
-    again = shutil.copy(film, tmp_path / "again.mp4")  # over ground that is known the pictures decide
-    command = ["map", "--model", "none", again, "--telemetry", telemetry, *camera, "--site", tmp_path / "site"]
+    again = shutil.copy(
+        film, tmp_path / "again.mp4"
+    )  # over ground that is known the pictures decide
+    command = [
+        "map",
+        "--model",
+        "none",
+        again,
+        "--telemetry",
+        telemetry,
+        *camera,
+        "--site",
+        tmp_path / "site",
+    ]
     assert cli.main([*map(str, command)]) == 3, "the map is one to check before use"
     report = json.loads((tmp_path / "site" / "flights" / "again" / "report.json").read_text())
     assert any("disagree by" in words for words in report["warnings"])
     assert report["frames"]["vision"] == report["frames"]["selected"]
 
 
-def test_a_height_of_zero_is_reported_and_not_used(film: Path, filmed: Path, tmp_path: Path) -> None:
-    rows = [line.split(",") for line in (filmed / "flight1" / "flight1.csv").read_text().splitlines()]
-    zeroed = [k for k, name in enumerate(rows[0]) if "alt" in name.lower() or "height" in name.lower()]
+def test_a_height_of_zero_is_reported_and_not_used(
+    film: Path, filmed: Path, tmp_path: Path
+) -> None:
+    rows = [
+        line.split(",") for line in (filmed / "flight1" / "flight1.csv").read_text().splitlines()
+    ]
+    zeroed = [
+        k for k, name in enumerate(rows[0]) if "alt" in name.lower() or "height" in name.lower()
+    ]
     for row in rows[1:]:
         for column in zeroed:
             row[column] = "0.0"
     telemetry = tmp_path / "zero.csv"
     telemetry.write_text("\n".join(",".join(row) for row in rows))
-    report = mapped(tmp_path / "site", film, "--telemetry", telemetry, "--camera", filmed / "camera.xml")
+    report = mapped(
+        tmp_path / "site", film, "--telemetry", telemetry, "--camera", filmed / "camera.xml"
+    )
     assert "height_of_zero" in codes(report)
-    assert 15 < report["height_above_ground_m"] < 26  # flown at 20 m; found from the pictures and GPS
+    assert (
+        15 < report["height_above_ground_m"] < 26
+    )  # flown at 20 m; found from the pictures and GPS
 
 
 # ---- cameras and options ----------------------------------------------------------------------------------------
@@ -228,13 +274,26 @@ def test_a_broken_calibration(
     assert not site.exists()
 
 
-@pytest.mark.parametrize(("option", "value", "words"), [
-    ("--crs", "EPSG:99999", "EPSG:32633"), ("--crs", "EPSG:4978", "projected"), ("--gsd", "0", "sampling distance"),
-    ("--gsd", "nan", "sampling distance"), ("--overlap", "1.5", "between 0 and 1"), ("--offset", "nan", "seconds"),
-    ("--refly", "holes.txt", "not as '.txt'"), ("--refly", "nowhere/holes.kml", "there is no folder"),
-])
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--crs", "EPSG:99999", "EPSG:32633"),
+        ("--crs", "EPSG:4978", "projected"),
+        ("--gsd", "0", "sampling distance"),
+        ("--gsd", "nan", "sampling distance"),
+        ("--overlap", "1.5", "between 0 and 1"),
+        ("--offset", "nan", "seconds"),
+        ("--refly", "holes.txt", "not as '.txt'"),
+        ("--refly", "nowhere/holes.kml", "there is no folder"),
+    ],
+)
 def test_impossible_options_are_refused_before_the_work(
-    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, value: str, words: str
+    film: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    option: str,
+    value: str,
+    words: str,
 ) -> None:
     assert words in refused(capsys, film, "--site", tmp_path / "site", option, value)
     assert not (tmp_path / "site").exists()
@@ -243,7 +302,9 @@ def test_impossible_options_are_refused_before_the_work(
 # ---- photos -----------------------------------------------------------------------------------------------------
 
 
-def test_photos_of_every_bad_kind_among_good_ones(photos: Path, photographed: Path, tmp_path: Path) -> None:
+def test_photos_of_every_bad_kind_among_good_ones(
+    photos: Path, photographed: Path, tmp_path: Path
+) -> None:
     files = sorted(photos.iterdir())
     for number in (3, 4):  # turned in the file, upright by its tag
         with Image.open(files[number]) as image:
@@ -282,7 +343,9 @@ def test_teleporting_fixes_among_photos(photos: Path, photographed: Path, tmp_pa
     assert report["frames"]["vision"] == 12 and report["gps_residual_m"]["median"] < 0.3
     places = [
         (each["properties"]["camera_latitude_deg"], each["geometry"]["coordinates"][0][0][1])
-        for each in json.loads(next(tmp_path.glob("site/flights/*/frames.geojson")).read_text())["features"]
+        for each in json.loads(next(tmp_path.glob("site/flights/*/frames.geojson")).read_text())[
+            "features"
+        ]
     ]
     assert np.ptp(np.array(places)) * 111_000 < 100  # metres: all together
 
@@ -318,8 +381,12 @@ def test_a_gray_video_is_refused_as_without_texture(
         stream = container.add_stream("libx264", rate=5)
         stream.width, stream.height, stream.pix_fmt = 640, 480, "yuv420p"
         for _ in range(15):
-            gray = np.clip(128 + rng.normal(0, noise_levels, (480, 640, 1)), 0, 255).astype(np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.repeat(gray, 3, axis=2), "rgb24")))
+            gray = np.clip(128 + rng.normal(0, noise_levels, (480, 640, 1)), 0, 255).astype(
+                np.uint8
+            )
+            container.mux(
+                stream.encode(av.VideoFrame.from_ndarray(np.repeat(gray, 3, axis=2), "rgb24"))
+            )
         container.mux(stream.encode(None))
     site = tmp_path / "site"
     assert "no texture" in refused(capsys, tmp_path / "gray.mp4", "--site", site)
@@ -333,14 +400,18 @@ def test_water_is_placed_by_gps_alone(photos: Path, photographed: Path, tmp_path
     for path in files[5:7]:
         with Image.open(path) as image:
             water = np.clip(rng.normal((40, 90, 120), 2, (180, 320, 3)), 0, 255).astype(np.uint8)
-            Image.fromarray(water).save(path, exif=image.getexif(), xmp=image.info["xmp"], quality=95)
+            Image.fromarray(water).save(
+                path, exif=image.getexif(), xmp=image.info["xmp"], quality=95
+            )
     mapped(tmp_path / "site", photos, "--camera", photographed / "camera.xml", code=3)
     ended = endings(tmp_path / "site")
     assert all(ended[path.name][0] == "gps-only" and ended[path.name][1] for path in files[5:7])
     assert sum(status == "vision" for status, _ in ended.values()) == 10
 
 
-def test_frames_without_overlap_keep_their_own_fixes(photos: Path, photographed: Path, tmp_path: Path) -> None:
+def test_frames_without_overlap_keep_their_own_fixes(
+    photos: Path, photographed: Path, tmp_path: Path
+) -> None:
     for path in sorted(photos.iterdir()):
         if path.name not in ("IMG_0001.jpg", "IMG_0007.jpg"):
             path.unlink()
@@ -355,7 +426,9 @@ def _pitched(photos: Path, names: list[str], pitch: str) -> None:
         data = (photos / name).read_bytes()
         old = data.partition(b'GimbalPitchDegree="')[2].partition(b'"')[0]
         new = pitch.encode().ljust(len(old), b"0")[: len(old)]
-        (photos / name).write_bytes(data.replace(b'GimbalPitchDegree="' + old, b'GimbalPitchDegree="' + new))
+        (photos / name).write_bytes(
+            data.replace(b'GimbalPitchDegree="' + old, b'GimbalPitchDegree="' + new)
+        )
 
 
 def test_a_camera_at_the_horizon(
@@ -365,7 +438,9 @@ def test_a_camera_at_the_horizon(
     _pitched(photos, names[4:6], "-10.0")
     mapped(tmp_path / "some", photos, "--camera", photographed / "camera.xml")
     ended = endings(tmp_path / "some")
-    assert all(ended[name] == ("rejected", "the camera looks at the horizon") for name in names[4:6])
+    assert all(
+        ended[name] == ("rejected", "the camera looks at the horizon") for name in names[4:6]
+    )
     assert sum(status == "vision" for status, _ in ended.values()) == 10
     _pitched(photos, names, "-10.0")
     assert "horizon" in refused(capsys, photos, "--site", tmp_path / "all")
@@ -388,7 +463,9 @@ def test_a_site_folder_that_cannot_be_used(
     sealed.mkdir()
     sealed.chmod(0o500)
     try:
-        place = sealed / "site" if os.geteuid() else Path("/proc/sorvolo-site")  # root may write anywhere else
+        place = (
+            sealed / "site" if os.geteuid() else Path("/proc/sorvolo-site")
+        )  # root may write anywhere else
         refused(capsys, photos, "--site", place)
     finally:
         sealed.chmod(0o700)
@@ -420,7 +497,11 @@ def test_a_disk_that_fills_up(photos: Path, photographed: Path, tmp_path: Path) 
 
     site, camera = tmp_path / "site", photographed / "camera.xml"
     result = subprocess.run(
-        _command(photos, camera, site), capture_output=True, text=True, timeout=120, preexec_fn=no_large_files
+        _command(photos, camera, site),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        preexec_fn=no_large_files,
     )
     assert result.returncode == 1 and "Traceback" not in result.stderr
     assert "disk full" in result.stderr.splitlines()[-1]
@@ -443,10 +524,15 @@ def is_the_same(path: Path) -> bool:
     return path.is_file() and not path.name.startswith(("site.", "report."))
 
 
-@pytest.mark.parametrize("sign", [
-    pytest.param("site.db", marks=pytest.mark.long), "flights/*/keyframes/*/000004.jpg",
-    pytest.param("tiles/*/*", marks=pytest.mark.long), pytest.param("mosaic.tif", marks=pytest.mark.long),
-])
+@pytest.mark.parametrize(
+    "sign",
+    [
+        pytest.param("site.db", marks=pytest.mark.long),
+        "flights/*/keyframes/*/000004.jpg",
+        pytest.param("tiles/*/*", marks=pytest.mark.long),
+        pytest.param("mosaic.tif", marks=pytest.mark.long),
+    ],
+)
 def test_kill_at_any_moment_and_the_same_command_again(
     photos: Path, photographed: Path, undisturbed: Path, tmp_path: Path, sign: str
 ) -> None:
@@ -463,7 +549,11 @@ def test_kill_at_any_moment_and_the_same_command_again(
         assert len(archive.keyframes()) in (0, 12)
     mapped(site, photos, "--camera", camera)
     again, expected = (
-        {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if is_the_same(path)}
+        {
+            str(path.relative_to(folder)): path.read_bytes()
+            for path in folder.rglob("*")
+            if is_the_same(path)
+        }
         for folder in (site, undisturbed)
     )
     assert again == expected
@@ -472,10 +562,14 @@ def test_kill_at_any_moment_and_the_same_command_again(
         assert len(archive.flights()) == 1 and len(archive.keyframes()) == 12
 
 
-def test_a_stop_by_the_keyboard_leaves_no_traceback(photos: Path, photographed: Path, tmp_path: Path) -> None:
+def test_a_stop_by_the_keyboard_leaves_no_traceback(
+    photos: Path, photographed: Path, tmp_path: Path
+) -> None:
     site = tmp_path / "site"
     with subprocess.Popen(
-        _command(photos, photographed / "camera.xml", site), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        _command(photos, photographed / "camera.xml", site),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
         text=True,
     ) as process:
         while process.poll() is None and not any(site.glob("flights/*/keyframes/*/*")):
@@ -488,12 +582,16 @@ def test_a_stop_by_the_keyboard_leaves_no_traceback(photos: Path, photographed: 
 
 
 @pytest.mark.long
-def test_a_stop_by_the_keyboard_keeps_the_flights_before(photos: Path, photographed: Path, tmp_path: Path) -> None:
+def test_a_stop_by_the_keyboard_keeps_the_flights_before(
+    photos: Path, photographed: Path, tmp_path: Path
+) -> None:
     site, second = tmp_path / "site", tmp_path / "second"
     shutil.copytree(photos, second)
     command = _command(photos, photographed / "camera.xml", site)
     command.insert(command.index(str(photos)) + 1, str(second))
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
         while process.poll() is None and not any(site.glob("flights/second/keyframes/*/*")):
             time.sleep(0.005)
         process.send_signal(signal.SIGINT)
@@ -501,7 +599,9 @@ def test_a_stop_by_the_keyboard_keeps_the_flights_before(photos: Path, photograp
     assert process.returncode == 130 and "Traceback" not in printed and "stopped" in printed
     assert (site / "mosaic.tif").is_file() and not (site / "flights" / "second").exists()
     with Archive.open(site, write=False) as archive:
-        assert [flight.id for flight in archive.flights()] == ["photos"] and len(archive.keyframes()) == 12
+        assert [flight.id for flight in archive.flights()] == ["photos"] and len(
+            archive.keyframes()
+        ) == 12
         assert [version.complete for version in archive.versions()][-1] and archive.tiles()
 
 

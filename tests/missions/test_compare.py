@@ -43,11 +43,23 @@ from sorvolo.survey.mosaic import Status
 _OBJECTS = {"cars": 1, "small_objects": 3, "output": OutputSettings(truth_step=2)}
 _LATER = LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0)
 _PAIR = replace(
-    small_flight(41, height_m=12, length_m=20, spacing_m=5, noise_m=0.2, fps=2.5, **_OBJECTS), flights=2, later=_LATER
+    small_flight(41, height_m=12, length_m=20, spacing_m=5, noise_m=0.2, fps=2.5, **_OBJECTS),
+    flights=2,
+    later=_LATER,
 )
 _SURVEY = replace(
-    small_flight(41, height_m=18, length_m=36, spacing_m=7, size_px=(480, 270), noise_m=0.2, fps=3, **_OBJECTS),
-    flights=2, later=_LATER,
+    small_flight(
+        41,
+        height_m=18,
+        length_m=36,
+        spacing_m=7,
+        size_px=(480, 270),
+        noise_m=0.2,
+        fps=3,
+        **_OBJECTS,
+    ),
+    flights=2,
+    later=_LATER,
 )
 
 _MAP, _COMPARE = MapSettings(model="none"), CompareSettings(model="none")
@@ -84,7 +96,11 @@ def survey(surveyed: Path, tmp_path_factory: pytest.TempPathFactory) -> Survey:
     for _ in map_flights([surveyed / "flight1"], mapped, _MAP, camera=surveyed / "camera.xml"):
         pass
     shutil.copytree(mapped, mapped.with_name("compared"))
-    return Survey(mapped, mapped.with_name("compared"), compare(surveyed, mapped.with_name("compared"), _WITH_MASKS))
+    return Survey(
+        mapped,
+        mapped.with_name("compared"),
+        compare(surveyed, mapped.with_name("compared"), _WITH_MASKS),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +119,9 @@ def site(mapped: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def compared(flown: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[CompareUpdate]]:
+def compared(
+    flown: Path, mapped: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[CompareUpdate]]:
     site = tmp_path_factory.mktemp("pair") / "compared"
     shutil.copytree(mapped, site)
     return site, compare(flown, site, _WITH_MASKS)
@@ -113,7 +131,9 @@ def compare(
     flown: Path, site: Path, settings: CompareSettings | None = None, *, again: bool = False
 ) -> list[CompareUpdate]:
     wanted = settings or CompareSettings(model="none")
-    return list(compare_flights([flown / "flight2"], site, wanted, camera=flown / "camera.xml", again=again))
+    return list(
+        compare_flights([flown / "flight2"], site, wanted, camera=flown / "camera.xml", again=again)
+    )
 
 
 def features(site: Path, flight: str = "flight2") -> list[dict]:
@@ -125,7 +145,11 @@ def report(site: Path, flight: str = "flight2") -> dict:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def test_most_changes_are_found_and_few_are_false(survey, surveyed):
@@ -155,9 +179,15 @@ def test_the_files_hold_what_was_found(survey):
         assert own["first_seen"] <= own["last_seen"]
         assert own["sigma_m"] > 0
         for side in ("before", "after"):
-            assert cv2.imdecode(
-                np.frombuffer((folder / "changes" / f"{own['id']}-{side}.png").read_bytes(), np.uint8), cv2.IMREAD_COLOR
-            ) is not None
+            assert (
+                cv2.imdecode(
+                    np.frombuffer(
+                        (folder / "changes" / f"{own['id']}-{side}.png").read_bytes(), np.uint8
+                    ),
+                    cv2.IMREAD_COLOR,
+                )
+                is not None
+            )
     printed = report(site)["comparison"]
     assert printed["views"]["compared"] == len(updates)
     assert printed["compared_area_m2"] > 200
@@ -169,7 +199,9 @@ def test_the_files_hold_what_was_found(survey):
 def test_masks_have_the_frames_own_pixels(survey):
     site, updates = survey.compared, survey.updates
     masks = site / "flights" / "flight2" / "masks"
-    mask = cv2.imdecode(np.frombuffer((masks / "0.png").read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    mask = cv2.imdecode(
+        np.frombuffer((masks / "0.png").read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED
+    )
     assert mask.shape == (270, 480)
     assert set(np.unique(mask)) <= {0, 128, 255}
     assert len(list(masks.glob("*.png"))) == len(updates)
@@ -223,7 +255,9 @@ def test_heights_made_since_are_a_reason_to_compare_again(compared, flown, tmp_p
         run = run_of(archive.keyframes("flight1"))
         report = archive.height_path("flight1", HeightFile.REPORT)
     report.write_text(json.dumps({"run": run, "cell_m": 0.2}))
-    with pytest.raises(InputError, match=r"heights\.tif"):  # it is missing, which only a comparison notices
+    with pytest.raises(
+        InputError, match=r"heights\.tif"
+    ):  # it is missing, which only a comparison notices
         compare(flown, site, settings)
 
 
@@ -240,7 +274,9 @@ def test_stopping_half_way_leaves_the_site_as_it_was(flown, site):
     assert not (site / "flights" / "flight2").exists()
 
 
-def test_a_view_that_fails_beside_the_rest_is_reported_and_leaves_the_site_as_it_was(flown, site, monkeypatch):
+def test_a_view_that_fails_beside_the_rest_is_reported_and_leaves_the_site_as_it_was(
+    flown, site, monkeypatch
+):
     begun, compare_with_map = [], ViewMaker.compare_with_map
 
     def fails(self, posed, *tried, **how):
@@ -252,12 +288,18 @@ def test_a_view_that_fails_beside_the_rest_is_reported_and_leaves_the_site_as_it
     monkeypatch.setattr(ViewMaker, "compare_with_map", fails)
     before, printed = files(site), []
     with pytest.raises(StoreError, match="a tile is damaged"):
-        for each in compare_flights([flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml"):
+        for each in compare_flights(
+            [flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml"
+        ):
             printed.append(each.frame_name)
     assert len(printed) == 5 and printed == sorted(printed), "those before it are printed, in order"
     after = files(site)
     assert {name for name in after if "flight2" in name} == set()
-    assert all(after[name] == content for name, content in before.items() if name.endswith((".tif", ".geojson")))
+    assert all(
+        after[name] == content
+        for name, content in before.items()
+        if name.endswith((".tif", ".geojson"))
+    )
 
 
 @pytest.mark.long
@@ -266,23 +308,37 @@ def test_the_pictures_of_changes_are_no_finer_than_the_views(flown, compared, tm
     with Archive.open(compared[0], write=False) as archive:
         own_m_per_px = archive.site_grid().grid.m_per_px
     for _ in map_flights(
-        [flown / "flight1"], fine, replace(_MAP, m_per_px=own_m_per_px / 2), camera=flown / "camera.xml"
+        [flown / "flight1"],
+        fine,
+        replace(_MAP, m_per_px=own_m_per_px / 2),
+        camera=flown / "camera.xml",
     ):
         pass
     compare(flown, fine)
     assert len(features(fine)) == len(features(compared[0]))
 
     def rows(site):
-        return sum(len(cv2.imread(str(each))) for each in (site / "flights/flight2/changes").glob("*-after.png"))
+        return sum(
+            len(cv2.imread(str(each)))
+            for each in (site / "flights/flight2/changes").glob("*-after.png")
+        )
 
-    assert rows(fine) == pytest.approx(rows(compared[0]), rel=0.2), "twice as many were there to be drawn"
+    assert rows(fine) == pytest.approx(rows(compared[0]), rel=0.2), (
+        "twice as many were there to be drawn"
+    )
 
 
-@pytest.mark.parametrize("waiting, announced_at", [
-    ([False] * 5, [0, 1, 2, 3, 4]),  # each before the next frame is asked for
-    ([True] * 5, [2, 3, 4, 5, 5]),  # three at work at once; the rest when no frame comes any more
-    ([True, True, False, False, False], [2, 2, 2, 3, 4]),
-])
+@pytest.mark.parametrize(
+    "waiting, announced_at",
+    [
+        ([False] * 5, [0, 1, 2, 3, 4]),  # each before the next frame is asked for
+        (
+            [True] * 5,
+            [2, 3, 4, 5, 5],
+        ),  # three at work at once; the rest when no frame comes any more
+        ([True, True, False, False, False], [2, 2, 2, 3, 4]),
+    ],
+)
 def test_a_live_view_is_reported_at_once_unless_the_next_one_waits_already(waiting, announced_at):
     asked = []
 
@@ -307,12 +363,16 @@ def test_a_rejected_change_does_not_come_back_with_the_next_flight(flown, site, 
     with Archive.open(site, write=True) as archive:
         archive.review(rejected["id"], Verdict.REJECTED)
     compare(flown, site, few)
-    assert [each["geometry"] for each in features(site)] == [each["geometry"] for each in (rejected, *others)]
+    assert [each["geometry"] for each in features(site)] == [
+        each["geometry"] for each in (rejected, *others)
+    ]
     assert features(site)[0]["properties"]["review"] == "rejected"
     for suffix in (".mp4", ".csv"):
         shutil.copy(flown / "flight2" / f"flight2{suffix}", tmp_path / f"next{suffix}")
     list(compare_flights([tmp_path / "next.mp4"], site, few, camera=flown / "camera.xml"))
-    assert [each["geometry"] for each in features(site, "next")] == [each["geometry"] for each in others]
+    assert [each["geometry"] for each in features(site, "next")] == [
+        each["geometry"] for each in others
+    ]
     assert report(site, "next")["comparison"]["suppressed"] == 1
 
 
@@ -329,7 +389,9 @@ def test_without_update_the_map_stays(flown, site):
 
 def test_a_flight_without_telemetry_finds_itself(flown, site, tmp_path):
     shutil.copy(flown / "flight2" / "flight2.mp4", tmp_path / "silent.mp4")
-    updates = list(compare_flights([tmp_path / "silent.mp4"], site, _COMPARE, camera=flown / "camera.xml"))
+    updates = list(
+        compare_flights([tmp_path / "silent.mp4"], site, _COMPARE, camera=flown / "camera.xml")
+    )
     assert sum(each.status is ViewStatus.COMPARED for each in updates) >= 0.8 * len(updates)
     assert features(site, "silent")
 
@@ -339,11 +401,16 @@ def test_a_guessed_camera_becomes_the_one_that_mapping_found(surveyed, tmp_path)
     for _ in map_flights([surveyed / "flight1"], site, _MAP):
         pass
     found = report(site, "flight1")["camera"]
-    for _ in compare_flights([surveyed / "flight2"], site, replace(_COMPARE, updates_map=False, views_per_second=1)):
+    for _ in compare_flights(
+        [surveyed / "flight2"], site, replace(_COMPARE, updates_map=False, views_per_second=1)
+    ):
         pass
     printed = report(site)["camera"]
     assert printed["focal_px"] == pytest.approx(found["focal_found_px"]) != found["focal_px"]
-    assert "as flight flight1 of this site found it" in printed["origin"] and found["origin"] in printed["origin"]
+    assert (
+        "as flight flight1 of this site found it" in printed["origin"]
+        and found["origin"] in printed["origin"]
+    )
     assert printed["focal_sigma_relative"] < found["focal_sigma_relative"]
     assert report(site)["comparison"]["residual_px"]["median"] < 1.0  # 1.4 with the guess
     with Archive.open(site, write=False) as archive:
@@ -356,17 +423,29 @@ def test_a_guessed_camera_becomes_the_one_that_mapping_found(surveyed, tmp_path)
 def test_a_guessed_camera_names_one_that_was_given_for_pictures_of_its_size(site):
     with Archive.open(site, write=False) as archive:
         guess = known_camera(guess_camera(320, 180), archive)
-        assert guess.camera.fx_px == guess_camera(320, 180).camera.fx_px, "another camera may have the same size"
-        assert "flight flight1 of this site had one" in guess.origin and "camera.xml" in guess.origin
+        assert guess.camera.fx_px == guess_camera(320, 180).camera.fx_px, (
+            "another camera may have the same size"
+        )
+        assert (
+            "flight flight1 of this site had one" in guess.origin and "camera.xml" in guess.origin
+        )
         another = guess_camera(1280, 720)
         assert known_camera(another, archive).origin == another.origin
 
 
 def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_path):
-    settings = CompareSettings(model="none", method="thesis", thesis=thesis_options(["T_gray=light", "threads=2"]))
-    updates = list(compare_flights(
-        [flown / "flight2"], site, settings, camera=flown / "camera.xml", steps=tmp_path / "steps",
-    ))
+    settings = CompareSettings(
+        model="none", method="thesis", thesis=thesis_options(["T_gray=light", "threads=2"])
+    )
+    updates = list(
+        compare_flights(
+            [flown / "flight2"],
+            site,
+            settings,
+            camera=flown / "camera.xml",
+            steps=tmp_path / "steps",
+        )
+    )
     assert report(site)["comparison"]["method"] == "thesis"
     assert report(site)["settings"]["thesis"]["threads"] == 2
     assert report(site)["settings"]["thesis"]["settings"]["gray_threshold"] is None
@@ -376,9 +455,15 @@ def test_the_thesis_method_compares_too_and_shows_its_steps(flown, site, tmp_pat
 
 def test_steps_of_another_method_are_refused(flown, site):
     with pytest.raises(SettingsError, match="--method thesis"):
-        list(compare_flights(
-            [flown / "flight2"], site, _COMPARE, camera=flown / "camera.xml", steps=Path("steps")
-        ))
+        list(
+            compare_flights(
+                [flown / "flight2"],
+                site,
+                _COMPARE,
+                camera=flown / "camera.xml",
+                steps=Path("steps"),
+            )
+        )
 
 
 def test_steps_within_the_site_folder_are_refused(tmp_path):
@@ -388,10 +473,14 @@ def test_steps_within_the_site_folder_are_refused(tmp_path):
             list(compare_flights([tmp_path / "later"], tmp_path / "site", thesis, steps=steps))
 
 
-@pytest.mark.parametrize("make", [
-    lambda: CompareSettings(votes=4, voters=3), lambda: CompareSettings(views_per_second=0.0),
-    lambda: CompareSettings(method="best"),
-])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: CompareSettings(votes=4, voters=3),
+        lambda: CompareSettings(views_per_second=0.0),
+        lambda: CompareSettings(method="best"),
+    ],
+)
 def test_settings_are_checked(make: Callable[[], object]):
     with pytest.raises(SettingsError):
         make()
@@ -399,7 +488,11 @@ def test_settings_are_checked(make: Callable[[], object]):
 
 def test_a_site_without_a_map_shows_how_to_make_one(flown, tmp_path):
     with pytest.raises(StoreError, match="sorvolo map"):
-        list(compare_flights([flown / "flight2"], tmp_path / "none", _COMPARE, camera=flown / "camera.xml"))
+        list(
+            compare_flights(
+                [flown / "flight2"], tmp_path / "none", _COMPARE, camera=flown / "camera.xml"
+            )
+        )
     assert not (tmp_path / "none").exists()
 
 
@@ -408,10 +501,16 @@ def test_the_first_flight_cannot_be_compared_with_its_own_map(flown, site):
         list(compare_flights([flown / "flight1"], site, _COMPARE, camera=flown / "camera.xml"))
 
 
-def elsewhere(tmp_path: Path, metres_east: float, like: SimulationSettings = _PAIR) -> Iterator[Path]:
+def elsewhere(
+    tmp_path: Path, metres_east: float, like: SimulationSettings = _PAIR
+) -> Iterator[Path]:
     """A short flight over other ground, so far east of the site's."""
-    scene = replace(like.scene, origin=Geodetic(41.8923127, 12.6035418 + metres_east / 83_000, 83.3))
-    moved = replace(like, flights=1, scene=scene, path=replace(like.path, length_m=12, strips=1), seed=77)
+    scene = replace(
+        like.scene, origin=Geodetic(41.8923127, 12.6035418 + metres_east / 83_000, 83.3)
+    )
+    moved = replace(
+        like, flights=1, scene=scene, path=replace(like.path, length_m=12, strips=1), seed=77
+    )
     simulate_into(tmp_path / "elsewhere", moved)
     yield tmp_path / "elsewhere"
 
@@ -424,10 +523,14 @@ def test_a_flight_over_another_place_is_refused(site, tmp_path, metres_east):
 
 
 @pytest.mark.parametrize("shown_east_m, is_there", [(8_000.0, True), (6_000.0, False)])
-def test_a_place_is_another_one_far_from_the_ground_that_is_shown_not_from_where_it_began(site, shown_east_m, is_there):
+def test_a_place_is_another_one_far_from_the_ground_that_is_shown_not_from_where_it_began(
+    site, shown_east_m, is_there
+):
     with Archive.open(site, write=False) as archive:
         known = archive.site()
-    track = SimpleNamespace(east_north_m=np.array([[np.nan, np.nan], [9_000.0, 0.0], [9_500.0, 0.0]]))
+    track = SimpleNamespace(
+        east_north_m=np.array([[np.nan, np.nan], [9_000.0, 0.0], [9_500.0, 0.0]])
+    )
     shown_m = np.array([[0.0, 0.0], [shown_east_m, 0.0]])
     if is_there:
         _check_place(known, track, "next", shown_m)
@@ -439,9 +542,14 @@ def test_a_place_is_another_one_far_from_the_ground_that_is_shown_not_from_where
 def test_a_flight_that_only_extends_the_map_is_warned_of(site, tmp_path):
     """Its telemetry may as well be off: then the same ground lies in the map twice."""
     folder = next(elsewhere(tmp_path, 150))
-    updates = list(compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml"))
+    updates = list(
+        compare_flights([folder / "flight1"], site, _COMPARE, camera=folder / "camera.xml")
+    )
     assert {each.status for each in updates} == {ViewStatus.OUTSIDE}
-    assert any("none of" in warning and "metres off" in warning for warning in report(site, "flight1-2")["warnings"])
+    assert any(
+        "none of" in warning and "metres off" in warning
+        for warning in report(site, "flight1-2")["warnings"]
+    )
 
 
 def test_other_ground_in_the_same_place_is_refused_and_leaves_no_trace(survey, tmp_path):
@@ -449,7 +557,9 @@ def test_other_ground_in_the_same_place_is_refused_and_leaves_no_trace(survey, t
     shutil.copytree(survey.mapped, site)
     one_a_second = replace(_COMPARE, views_per_second=1)
     with pytest.raises(InputError, match="no frame of flight1-2 could be compared: it"):
-        list(compare_flights([folder / "flight1"], site, one_a_second, camera=folder / "camera.xml"))
+        list(
+            compare_flights([folder / "flight1"], site, one_a_second, camera=folder / "camera.xml")
+        )
     assert not (site / "flights" / "flight1-2").exists()
 
 
@@ -475,16 +585,23 @@ def test_ground_beside_the_map_extends_it(surveyed, tmp_path, monkeypatch):
     As across dates, its features join none of the map's keyframes: where its views lie on the map places it.
     """
     frames = json.loads((surveyed / "truth" / "frames.geojson").read_text())["features"]
-    first = np.array([
-        [each["properties"]["camera_longitude_deg"], each["properties"]["camera_latitude_deg"]]
-        for each in frames if each["properties"]["flight"] == "flight1"
-    ])
+    first = np.array(
+        [
+            [each["properties"]["camera_longitude_deg"], each["properties"]["camera_latitude_deg"]]
+            for each in frames
+            if each["properties"]["flight"] == "flight1"
+        ]
+    )
     (west, south), (east, north) = first.min(axis=0) - 1e-4, np.median(first, axis=0)
     north = first[:, 1].max() + 1e-4
     ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
     (tmp_path / "west.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
     for _ in map_flights(
-        [surveyed / "flight1"], tmp_path / "site", _MAP, camera=surveyed / "camera.xml", area=tmp_path / "west.geojson"
+        [surveyed / "flight1"],
+        tmp_path / "site",
+        _MAP,
+        camera=surveyed / "camera.xml",
+        area=tmp_path / "west.geojson",
     ):
         pass
     with Archive.open(tmp_path / "site", write=False) as archive:
@@ -501,8 +618,10 @@ def test_ground_beside_the_map_extends_it(surveyed, tmp_path, monkeypatch):
     compare(surveyed, tmp_path / "site", replace(_COMPARE, views_per_second=1.5))
     with Archive.open(tmp_path / "site", write=False) as archive:
         after = dict(archive.tiles())
-    area = {version: sum(int(np.count_nonzero(tile[..., 3])) for tile in tiles.values())
-            for version, tiles in (("before", before), ("after", after))}
+    area = {
+        version: sum(int(np.count_nonzero(tile[..., 3])) for tile in tiles.values())
+        for version, tiles in (("before", before), ("after", after))
+    }
     assert area["after"] > 1.3 * area["before"]
     assert features(tmp_path / "site")
     printed = report(tmp_path / "site")
@@ -514,16 +633,27 @@ def test_ground_beside_the_map_extends_it(surveyed, tmp_path, monkeypatch):
         extending = [each for each in archive.keyframes() if each.flight_id == "flight2"]
     corners = np.array([[0, 0], [480, 0], [480, 270], [0, 270]], float)
     apart_m = [
-        float(np.linalg.norm(np.subtract(*(
-            apply_homography(frame.site_from_image, corners) for frame in (each, laid[each.index])
-        )), axis=1).max())
-        for each in extending if laid[each.index].status is Status.VISION
+        float(
+            np.linalg.norm(
+                np.subtract(
+                    *(
+                        apply_homography(frame.site_from_image, corners)
+                        for frame in (each, laid[each.index])
+                    )
+                ),
+                axis=1,
+            ).max()
+        )
+        for each in extending
+        if laid[each.index].status is Status.VISION
     ]
     assert apart_m and max(apart_m) < 0.2
     assert extension["area_m2"] == pytest.approx(grown_m2, rel=1e-6)
     assert not any("have no place" in warning for warning in printed["warnings"])
     views = printed["comparison"]["views"]
-    assert printed["frames"]["rejected"] == views["not-aligned"], "who extends the map does not fail"
+    assert printed["frames"]["rejected"] == views["not-aligned"], (
+        "who extends the map does not fail"
+    )
     page = (tmp_path / "site" / "flights" / "flight2" / "changes.html").read_text()
     assert f"shown by {extension['frames']} frames" in page
 
@@ -536,18 +666,32 @@ def test_the_command_prints_the_changes_as_json(flown, site, capsys):
     printed = json.loads(capsys.readouterr().out)["flights"][0]
     assert printed["flight"] == "flight2"
     assert len(printed["changes"]["features"]) == sum(printed["comparison"]["changes"].values()) > 0
-    assert not set(printed["withdrawn"]) & {each["properties"]["id"] for each in printed["changes"]["features"]}
+    assert not set(printed["withdrawn"]) & {
+        each["properties"]["id"] for each in printed["changes"]["features"]
+    }
 
 
 @pytest.mark.long  # kills at each step, and going on after one, have tests of their own
 def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(compared, flown, site):
     command = [
-        sys.executable, "-m", "sorvolo", "compare", str(flown / "flight2"), "--site", str(site),
-        "--camera", str(flown / "camera.xml"), "--masks", "--model", "none",
+        sys.executable,
+        "-m",
+        "sorvolo",
+        "compare",
+        str(flown / "flight2"),
+        "--site",
+        str(site),
+        "--camera",
+        str(flown / "camera.xml"),
+        "--masks",
+        "--model",
+        "none",
     ]
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         started = time.monotonic()
-        while not list(site.glob("flights/flight2/staged/*/masks/*.png")) and process.poll() is None:
+        while (
+            not list(site.glob("flights/flight2/staged/*/masks/*.png")) and process.poll() is None
+        ):
             assert time.monotonic() - started < 120
             time.sleep(0.02)
         process.kill()
@@ -559,11 +703,18 @@ def test_killed_half_way_the_site_stays_whole_and_the_same_command_ends_well(com
     assert not list(site.glob("flights/flight2/staged"))
 
 
-@pytest.mark.parametrize(("brightness", "printed"), [
-    pytest.param(0.4, "dark or of the ground's colour", marks=pytest.mark.long),
-    pytest.param(0.06, "means little", marks=pytest.mark.long),  # benchmarks/change_unfit.py has nights, too
-])
-def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_ground(site, tmp_path, brightness, printed):
+@pytest.mark.parametrize(
+    ("brightness", "printed"),
+    [
+        pytest.param(0.4, "dark or of the ground's colour", marks=pytest.mark.long),
+        pytest.param(
+            0.06, "means little", marks=pytest.mark.long
+        ),  # benchmarks/change_unfit.py has nights, too
+    ],
+)
+def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_ground(
+    site, tmp_path, brightness, printed
+):
     weather = replace(_PAIR.later.weather, brightness=brightness)
     dark = replace(_PAIR, later=replace(_PAIR.later, weather=weather))
     simulate_into(tmp_path / "dark", dark)
@@ -573,11 +724,17 @@ def test_a_flight_in_the_dark_is_reported_to_show_less_and_paints_no_black_groun
     assert printed in warning
     is_night = printed == "means little"
     assert report(site)["comparison"]["most_missed"] == is_night
-    assert ("too dark" in (site / "flights" / "flight2" / "changes.html").read_text().lower()) == is_night
+    assert (
+        "too dark" in (site / "flights" / "flight2" / "changes.html").read_text().lower()
+    ) == is_night
     assert has_grown(site) != is_night
     if is_night:
         assert report(site)["comparison"]["changes"]["area"] == 0
-        compare(tmp_path / "dark", tmp_path / "thesis", replace(_COMPARE, method="thesis", views_per_second=1.0))
+        compare(
+            tmp_path / "dark",
+            tmp_path / "thesis",
+            replace(_COMPARE, method="thesis", views_per_second=1.0),
+        )
         assert not has_grown(tmp_path / "thesis")
 
 
@@ -585,5 +742,6 @@ def has_grown(site: Path) -> bool:
     with Archive.open(site, write=False) as archive:
         before, after = (archive.tiles(version.id) for version in archive.versions())
         return after.keys() != before.keys() or any(
-            np.count_nonzero(after[index][..., 3]) > np.count_nonzero(before[index][..., 3]) for index in before
+            np.count_nonzero(after[index][..., 3]) > np.count_nonzero(before[index][..., 3])
+            for index in before
         )

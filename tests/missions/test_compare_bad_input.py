@@ -33,7 +33,8 @@ from sorvolo.store.site.archive import Archive
 
 _DAY_NS = 86400 * 10**9
 _UNCHANGED = SimulationSettings(
-    seed=53, flights=2,
+    seed=53,
+    flights=2,
     scene=SceneSettings(people=0, cars=1, small_objects=3, moving_share=0.0, has_scenery=False),
     path=PathSettings(height_m=20, speed_m_s=5, length_m=24, strips=2, strip_spacing_m=8),
     imaging=ImagingSettings(width_px=400, height_px=300, fps=5),
@@ -52,12 +53,20 @@ def flights() -> tuple[SimulatedFlight, ...]:
 def mapped(flights: tuple[SimulatedFlight, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unchanged")
     photos = written(flights[0], folder / "first")
-    assert main(["map", str(photos), "--site", str(folder / "site"), "--model", "none", *camera(photos)]) == 0
+    assert (
+        main(
+            ["map", str(photos), "--site", str(folder / "site"), "--model", "none", *camera(photos)]
+        )
+        == 0
+    )
     return folder / "site"
 
 
 def written(
-    flight: SimulatedFlight, folder: Path, chosen: Sequence[int] | None = None, turned_deg: float = 0.0,
+    flight: SimulatedFlight,
+    folder: Path,
+    chosen: Sequence[int] | None = None,
+    turned_deg: float = 0.0,
     edit: Callable[[ImageRGB, int], ImageRGB] = lambda image, _: image,
 ) -> Path:
     """A flight's photos, or the `chosen` ones, with the compass off by `turned_deg`; beside them camera.xml."""
@@ -68,7 +77,11 @@ def written(
         frame = flight.frame(index)
         row = {name: float(values[index]) for name, values in columns.items()}
         row["camera_yaw_deg"] = (row["camera_yaw_deg"] + turned_deg) % 360
-        later = replace(frame, image=edit(frame.image, index), time_ns=frame.time_ns + (flight.number - 1) * _DAY_NS)
+        later = replace(
+            frame,
+            image=edit(frame.image, index),
+            time_ns=frame.time_ns + (flight.number - 1) * _DAY_NS,
+        )
         write_photo(folder / flight.frame_name(index), later, flight.camera, row)
     return folder
 
@@ -79,7 +92,10 @@ def camera(photos: Path) -> list[str]:
 
 def compared(site: Path, photos: Path, code: int) -> dict[str, Any]:
     """The report's part on a comparison that ended with this exit code; nothing may be reported."""
-    assert main(["compare", str(photos), "--site", str(site), "--model", "none", *camera(photos)]) == code
+    assert (
+        main(["compare", str(photos), "--site", str(site), "--model", "none", *camera(photos)])
+        == code
+    )
     folder = site / "flights" / photos.name
     assert json.loads((folder / "changes.geojson").read_text())["features"] == []
     return json.loads((folder / "report.json").read_text())["comparison"]
@@ -120,7 +136,9 @@ def test_a_wrong_compass_does_not_turn_what_extends_the_map(
         for each in archive.keyframes():
             if each.flight_id == "turned":
                 outline_m = footprint(later.camera, later.true_poses[index_of[each.name]])
-                latitude, longitude, _ = later.site.wgs84_from_site(np.column_stack([outline_m, np.zeros(4)]))
+                latitude, longitude, _ = later.site.wgs84_from_site(
+                    np.column_stack([outline_m, np.zeros(4)])
+                )
                 true_m = frame.ground_from_lonlat(np.column_stack([longitude, latitude]))
                 there_m = apply_homography(each.site_from_image, each.camera.corners_px)
                 off_m.append(float(np.median(np.linalg.norm(there_m - true_m, axis=1))))
@@ -129,10 +147,15 @@ def test_a_wrong_compass_does_not_turn_what_extends_the_map(
 
 
 def test_photos_that_mostly_show_water_are_refused_in_one_line_for_one_reason(
-    flights: tuple[SimulatedFlight, ...], site: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    flights: tuple[SimulatedFlight, ...],
+    site: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     photos = written(flights[1], tmp_path / "shore", edit=flooded)
-    assert main(["compare", str(photos), "--site", str(site), "--model", "none", *camera(photos)]) == 1
+    assert (
+        main(["compare", str(photos), "--site", str(site), "--model", "none", *camera(photos)]) == 1
+    )
     error = capsys.readouterr().err.splitlines()[-1]
     assert "no frame of shore could be compared: more than half of it looks changed (water" in error
     assert not (site / "flights" / "shore").exists()
@@ -154,7 +177,9 @@ def flooded(image: ImageRGB, index: int) -> ImageRGB:
     """The right 60 % of a photo under moving water."""
     rng = np.random.default_rng(index)
     height, width = image.shape[:2]
-    waves = cv2.resize(rng.normal(size=(height // 6, width // 14)), (width, height), interpolation=cv2.INTER_CUBIC)
+    waves = cv2.resize(
+        rng.normal(size=(height // 6, width // 14)), (width, height), interpolation=cv2.INTER_CUBIC
+    )
     water = np.array([60, 84, 92]) + 9 * waves[..., None]
     shore = np.arange(width)[:, None] > 0.4 * width
     return np.clip(np.where(shore, water, image), 0, 255).astype(np.uint8)
@@ -164,7 +189,9 @@ def test_ground_that_differs_all_over_is_warned_of(
     flights: tuple[SimulatedFlight, ...], site: Path, tmp_path: Path
 ) -> None:
     assert warned(site, written(flights[1], tmp_path / "plain")) == []
-    snowy = written(flights[1], tmp_path / "snowy", edit=lambda image, index: snowed(flights[1], image, index))
+    snowy = written(
+        flights[1], tmp_path / "snowy", edit=lambda image, index: snowed(flights[1], image, index)
+    )
     (warning,) = warned(site, snowy)
     assert "of the compared ground looks changed (snow" in warning and "same season" in warning
 
@@ -174,14 +201,31 @@ def test_a_map_far_coarser_than_the_flight_is_warned_of(
 ) -> None:
     first = written(flights[0], tmp_path / "first")
     coarse = tmp_path / "coarse"
-    assert main(["map", str(first), "--site", str(coarse), "--model", "none", "--gsd", "0.56", *camera(first)]) == 0
+    assert (
+        main(
+            [
+                "map",
+                str(first),
+                "--site",
+                str(coarse),
+                "--model",
+                "none",
+                "--gsd",
+                "0.56",
+                *camera(first),
+            ]
+        )
+        == 0
+    )
     (warning,) = warned(coarse, written(flights[1], tmp_path / "second", [0, 1, 2]))
     assert warning.startswith("the map's pixels are 9 times as large as the flight's")
 
 
 def warned(site: Path, photos: Path) -> list[str]:
     """What a comparison warns of, of its ground and its map; it may list changes."""
-    assert main(["compare", str(photos), "--site", str(site), "--model", "none", *camera(photos)]) in (0, 3)
+    assert main(
+        ["compare", str(photos), "--site", str(site), "--model", "none", *camera(photos)]
+    ) in (0, 3)
     report = json.loads((site / "flights" / photos.name / "report.json").read_text())
     return [each for each in report["warnings"] if "season" in each or "pixels" in each]
 
@@ -190,8 +234,12 @@ def snowed(flight: SimulatedFlight, image: ImageRGB, index: int) -> ImageRGB:
     """The photo with snow on a quarter of the ground, the same in every photo."""
     height, width = image.shape[:2]
     x, y = np.meshgrid(np.arange(width), np.arange(height))
-    ground_from_image = site_from_image_homography(flight.camera.undistorted(), flight.true_poses[index])
-    places = apply_homography(ground_from_image, np.column_stack([x.ravel(), y.ravel()]).astype(float))
+    ground_from_image = site_from_image_homography(
+        flight.camera.undistorted(), flight.true_poses[index]
+    )
+    places = apply_homography(
+        ground_from_image, np.column_stack([x.ravel(), y.ravel()]).astype(float)
+    )
     drifts = np.sin(places[:, 0] * 1.1) + np.sin(places[:, 1] * 1.3 + 1)
     cover = np.clip(4 * (drifts - 0.7), 0, 1).reshape(height, width, 1)
     return np.asarray(image * (1 - cover) + 228 * cover, np.uint8)

@@ -25,14 +25,18 @@ from sorvolo.survey.findings import CompareUpdate
 
 _PAIR = replace(
     small_flight(43, height_m=14, speed_m_s=4, length_m=18, cars=1, small_objects=3),
-    flights=2, later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
+    flights=2,
+    later=LaterSettings(people=0, cars=1, small_objects=3, removed=2, moved=0),
 )
 _SETTINGS = CompareSettings(model="none", writes_masks=True)
 _KILLED_AT = 15  # frames
 
 
 def compared(
-    flown: Path, site: Path, settings: CompareSettings = _SETTINGS, then: Callable[[int], None] = lambda _: None
+    flown: Path,
+    site: Path,
+    settings: CompareSettings = _SETTINGS,
+    then: Callable[[int], None] = lambda _: None,
 ) -> list[CompareUpdate]:
     """Compare the second flight; `then` is called after each frame, with their number."""
     updates = []
@@ -56,12 +60,25 @@ def whole(flown: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     """A site that nobody killed, whose map the second flight extends, and a copy of it amid the comparison."""
     folder = tmp_path_factory.mktemp("resume")
     site, amid = (folder / name / "site" for name in ("whole", "amid"))
-    places = np.loadtxt(flown / "flight1" / "flight1.csv", delimiter=",", skiprows=1, usecols=(3, 4))
+    places = np.loadtxt(
+        flown / "flight1" / "flight1.csv", delimiter=",", skiprows=1, usecols=(3, 4)
+    )
     west, middle, north = places[0, 0] - 1e-3, places[:, 0].mean(), places[0, 1]
-    ring = [[west, north - 1e-3], [middle, north - 1e-3], [middle, north + 1e-3], [west, north + 1e-3]]
-    (folder / "west.geojson").write_text(json.dumps({"type": "Polygon", "coordinates": [[*ring, ring[0]]]}))
+    ring = [
+        [west, north - 1e-3],
+        [middle, north - 1e-3],
+        [middle, north + 1e-3],
+        [west, north + 1e-3],
+    ]
+    (folder / "west.geojson").write_text(
+        json.dumps({"type": "Polygon", "coordinates": [[*ring, ring[0]]]})
+    )
     for _ in map_flights(
-        [flown / "flight1"], site, MapSettings(model="none"), camera=flown / "camera.xml", area=folder / "west.geojson"
+        [flown / "flight1"],
+        site,
+        MapSettings(model="none"),
+        camera=flown / "camera.xml",
+        area=folder / "west.geojson",
     ):
         pass
     compared(flown, site, then=lambda count: count != _KILLED_AT or copy_as_killed(site, amid))
@@ -91,14 +108,20 @@ def copy(site: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(site, tmp_path / "site"))
 
 
-def test_it_goes_on_where_it_was(whole: tuple[Path, Path], flown: Path, tmp_path: Path, worked: list[str]) -> None:
+def test_it_goes_on_where_it_was(
+    whole: tuple[Path, Path], flown: Path, tmp_path: Path, worked: list[str]
+) -> None:
     site = copy(whole[1], tmp_path)
     updates = compared(flown, site)
-    assert [each.is_resumed for each in updates] == [number < _KILLED_AT for number in range(len(updates))]
+    assert [each.is_resumed for each in updates] == [
+        number < _KILLED_AT for number in range(len(updates))
+    ]
     assert worked.count("compare_with_map") == len(updates) - _KILLED_AT > 3
     assert content(site) == content(whole[0])
     report = json.loads((site / "flights" / "flight2" / "report.json").read_text())
-    assert 0 < worked.count("register") < report["comparison"]["extension"]["frames"]  # both parts extended the map
+    assert (
+        0 < worked.count("register") < report["comparison"]["extension"]["frames"]
+    )  # both parts extended the map
     assert report["objects"]["sightings"] and sum(report["comparison"]["changes"].values())
     assert not list(site.rglob("run.journal"))
 
@@ -116,18 +139,31 @@ def test_after_a_full_disk_it_goes_on(
     assert not list(site.rglob("run.journal"))
 
 
-@pytest.mark.parametrize(("free", "expected"), [(10**8, ""), (10**6, "may become full"), (2 * 10**5, "free some")])
+@pytest.mark.parametrize(
+    ("free", "expected"), [(10**8, ""), (10**6, "may become full"), (2 * 10**5, "free some")]
+)
 def test_a_disk_too_full_for_the_new_version_is_announced(
-    whole: tuple[Path, Path], flown: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, free: int, expected: str
+    whole: tuple[Path, Path],
+    flown: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    free: int,
+    expected: str,
 ) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
+    monkeypatch.setattr(
+        shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2 * free, free, free)
+    )  # type: ignore[attr-defined]
     monkeypatch.setattr(CompareRun, "__enter__", begun)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         with pytest.raises((StoreError, InterruptedError)) as ended:
             compared(flown, copy(whole[1], tmp_path))
     texts = [str(ended.value), *(str(each.message) for each in caught)]
-    found = [each for each in texts if "the new version of the map after comparing flight2 needs about" in each]
+    found = [
+        each
+        for each in texts
+        if "the new version of the map after comparing flight2 needs about" in each
+    ]
     assert len(found) == bool(expected) and all(expected in each for each in found), texts
     assert isinstance(ended.value, InterruptedError) == (expected != "free some")
 
@@ -136,22 +172,38 @@ def begun(_: CompareRun) -> CompareRun:
     raise InterruptedError("the work began")
 
 
-def test_other_settings_begin_anew_and_report_it(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
+def test_other_settings_begin_anew_and_report_it(
+    whole: tuple[Path, Path], flown: Path, tmp_path: Path
+) -> None:
     site = copy(whole[1], tmp_path)
-    with pytest.warns(SorvoloWarning, match="flight2: a run that was stopped cannot continue: .* other settings"):
+    with pytest.warns(
+        SorvoloWarning, match="flight2: a run that was stopped cannot continue: .* other settings"
+    ):
         updates = compare_flights(
-            [flown / "flight2"], site, CompareSettings(model="none", votes=2), camera=flown / "camera.xml"
+            [flown / "flight2"],
+            site,
+            CompareSettings(model="none", votes=2),
+            camera=flown / "camera.xml",
         )
         assert not next(updates).is_resumed
         updates.close()
     assert not (site / "flights" / "flight2").exists()
 
 
-def test_another_flight_names_whose_run_it_ends(whole: tuple[Path, Path], flown: Path, tmp_path: Path) -> None:
+def test_another_flight_names_whose_run_it_ends(
+    whole: tuple[Path, Path], flown: Path, tmp_path: Path
+) -> None:
     site = copy(whole[1], tmp_path)
-    with pytest.warns(SorvoloWarning, match="a run of flight2 was stopped before it was complete, and cannot continue"):
+    with pytest.warns(
+        SorvoloWarning,
+        match="a run of flight2 was stopped before it was complete, and cannot continue",
+    ):
         updates = map_flights(
-            [flown / "flight1"], site, MapSettings(model="none"), camera=flown / "camera.xml", again=True
+            [flown / "flight1"],
+            site,
+            MapSettings(model="none"),
+            camera=flown / "camera.xml",
+            again=True,
         )
         next(updates)
         updates.close()
@@ -159,11 +211,17 @@ def test_another_flight_names_whose_run_it_ends(whole: tuple[Path, Path], flown:
 
 def test_method_thesis_begins_anew_and_reports_it(flown: Path, tmp_path: Path) -> None:
     settings = MapSettings(method="thesis", model="none")
-    updates = map_flights([flown / "flight1"], tmp_path / "site", settings, camera=flown / "camera.xml")
+    updates = map_flights(
+        [flown / "flight1"], tmp_path / "site", settings, camera=flown / "camera.xml"
+    )
     next(updates)
     copy_as_killed(tmp_path / "site", tmp_path / "amid")
     updates.close()
-    with pytest.warns(SorvoloWarning, match="flight1: a stopped run begins again from the start: --method thesis"):
-        again = map_flights([flown / "flight1"], tmp_path / "amid", settings, camera=flown / "camera.xml")
+    with pytest.warns(
+        SorvoloWarning, match="flight1: a stopped run begins again from the start: --method thesis"
+    ):
+        again = map_flights(
+            [flown / "flight1"], tmp_path / "amid", settings, camera=flown / "camera.xml"
+        )
         assert not next(again).is_resumed
         again.close()

@@ -30,7 +30,9 @@ def test_places(url: str, place: CotPlace) -> None:
     assert cot_place(url) == place
 
 
-@pytest.mark.parametrize("url", ["", "tak.local:4242", "http://tak.local", "udp://:99", "udp://h:77777", "udp://h:0"])
+@pytest.mark.parametrize(
+    "url", ["", "tak.local:4242", "http://tak.local", "udp://:99", "udp://h:77777", "udp://h:0"]
+)
 def test_what_is_no_place(url: str) -> None:
     with pytest.raises(SettingsError, match="udp://host:port"):
         cot_place(url)
@@ -63,7 +65,9 @@ def test_udp_arrives_and_a_dead_receiver_is_an_error_that_passes() -> None:
 
 def test_datagrams_that_a_host_refuses_are_not_counted_as_sent() -> None:
     """Each other one was: a refusal is only known when the next one is sent."""
-    with pytest.raises(InputError, match=r"nothing listens there .*start the receiver, and send them again"):
+    with pytest.raises(
+        InputError, match=r"nothing listens there .*start the receiver, and send them again"
+    ):
         send_all([b"<event/>"] * 16, CotPlace("udp", "127.0.0.1", free_port()))
 
 
@@ -101,18 +105,34 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         path = folder / f"{name}.pem"
         subprocess.run(
             [
-                "openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", f"/CN={name}",
-                "-addext", "subjectAltName=DNS:localhost,IP:127.0.0.1", "-keyout", str(folder / "key"), "-out",
+                "openssl",
+                "req",
+                "-x509",
+                "-newkey",
+                "rsa:2048",
+                "-nodes",
+                "-days",
+                "2",
+                "-subj",
+                f"/CN={name}",
+                "-addext",
+                "subjectAltName=DNS:localhost,IP:127.0.0.1",
+                "-keyout",
+                str(folder / "key"),
+                "-out",
                 str(folder / "cert"),
             ],
-            check=True, capture_output=True,
+            check=True,
+            capture_output=True,
         )
         path.write_bytes((folder / "cert").read_bytes() + (folder / "key").read_bytes())
         made[name] = path
     return made
 
 
-def _tls_server(certificates: dict[str, Path], server: socket.socket, received: list[bytes]) -> threading.Thread:
+def _tls_server(
+    certificates: dict[str, Path], server: socket.socket, received: list[bytes]
+) -> threading.Thread:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificates["server"])
     context.load_verify_locations(certificates["client"])
@@ -149,7 +169,9 @@ def test_tls_with_certificates_on_both_sides(certificates: dict[str, Path]) -> N
     assert received == [b"<event n='1'/>", b"<event n='2'/>"]
 
 
-def _serve_all(certificates: dict[str, Path], server: socket.socket, received: list[bytes], tickets: int) -> None:
+def _serve_all(
+    certificates: dict[str, Path], server: socket.socket, received: list[bytes], tickets: int
+) -> None:
     """Take connections one after the other, each to its end; of a client without the right certificate nothing."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     context.load_cert_chain(certificates["server"])
@@ -170,21 +192,31 @@ def _serve_all(certificates: dict[str, Path], server: socket.socket, received: l
 
 
 @pytest.mark.parametrize("tickets", [0, 2])
-def test_a_client_that_the_server_refuses_has_sent_nothing(certificates: dict[str, Path], tickets: int) -> None:
+def test_a_client_that_the_server_refuses_has_sent_nothing(
+    certificates: dict[str, Path], tickets: int
+) -> None:
     received: list[bytes] = []
     events = [b"<event n='%d'/>" % number for number in range(25)]
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(5)
-        thread = threading.Thread(target=_serve_all, args=(certificates, server, received, tickets), daemon=True)
+        thread = threading.Thread(
+            target=_serve_all, args=(certificates, server, received, tickets), daemon=True
+        )
         thread.start()
         place = CotPlace("tls", "127.0.0.1", server.getsockname()[1])
-        with pytest.raises(InputError, match=r"nothing could be sent.*certificate required.*give --cot-cert"):
+        with pytest.raises(
+            InputError, match=r"nothing could be sent.*certificate required.*give --cot-cert"
+        ):
             send_all(events, place, CotTls(certificates["server"]))
-        with pytest.raises(InputError, match=r"nothing could be sent.*check that it knows .*--cot-cert"):
+        with pytest.raises(
+            InputError, match=r"nothing could be sent.*check that it knows .*--cot-cert"
+        ):
             send_all(events, place, CotTls(certificates["server"], certificates["server"]))
         assert not received
         assert send_all(events, place, CotTls(certificates["server"], certificates["client"])) == 25
-        assert b"".join(received) == b"".join(events)  # `send_all` returns when the server has taken them
+        assert b"".join(received) == b"".join(
+            events
+        )  # `send_all` returns when the server has taken them
         with pytest.raises(ConnectionRefusedError, match="--cot-cert"):
             CotSender(place, CotTls(certificates["server"])).send(events[0])
     thread.join(6)
@@ -223,14 +255,18 @@ def test_an_unknown_server_is_refused(certificates: dict[str, Path]) -> None:
     assert not received
 
 
-def test_a_server_that_is_not_trusted_is_asked_once_and_the_remedy_named(certificates: dict[str, Path]) -> None:
+def test_a_server_that_is_not_trusted_is_asked_once_and_the_remedy_named(
+    certificates: dict[str, Path],
+) -> None:
     """Each event made a handshake, and a later "Connection refused" took the place of the cause."""
     received: list[bytes] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(5)
         thread = _tls_server(certificates, server, received)  # takes one connection
         place = CotPlace("tls", "127.0.0.1", server.getsockname()[1])
-        with pytest.raises(InputError, match=r"certificate is not trusted \(self.signed certificate\).*--cot-ca"):
+        with pytest.raises(
+            InputError, match=r"certificate is not trusted \(self.signed certificate\).*--cot-ca"
+        ):
             send_all([b"<event/>"] * 3, place)
         thread.join(5)
         server.settimeout(0.2)

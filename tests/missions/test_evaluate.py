@@ -56,9 +56,17 @@ def made_frame(index: int, status: Status) -> tuple[PlacedFrame, np.ndarray]:
     )
     outline = footprint(CAMERA, pose) if status is not Status.REJECTED else np.full((4, 2), np.nan)
     placed = PlacedFrame(
-        str(index), index, 1_700_000_000_000_000_000 + index, status,
-        "" if status is Status.VISION else "no match", CAMERA, None if status is Status.REJECTED else pose,
-        site_from_image, outline, 0.4, 0.1,
+        str(index),
+        index,
+        1_700_000_000_000_000_000 + index,
+        status,
+        "" if status is Status.VISION else "no match",
+        CAMERA,
+        None if status is Status.REJECTED else pose,
+        site_from_image,
+        outline,
+        0.4,
+        0.1,
     )
     return placed, image
 
@@ -76,11 +84,14 @@ def site(tmp_path_factory) -> Path:
         site_grid = archive.site_grid()
         grid_from_site = site_grid.grid_from_site_affine(np.zeros(2), 50.0)
         with archive.begin_flight("flight1", "print", {"method": "planar"}) as writer:
-            paths = {placed.index: writer.save_image(placed.index, image) for placed, image in frames}
+            paths = {
+                placed.index: writer.save_image(placed.index, image) for placed, image in frames
+            }
             canvas = Canvas(site_grid.grid, writer.tiles, writer.image)
             canvas.paint(
                 CanvasFrame(placed.index, 0, 320, 240, grid_from_site @ placed.site_from_image)
-                for placed, _ in frames if placed.status is not Status.REJECTED
+                for placed, _ in frames
+                if placed.status is not Status.REJECTED
             )
             writer.commit([placed for placed, _ in frames], paths, {}, "<html></html>")
     return folder
@@ -97,14 +108,20 @@ def truth(tmp_path) -> Path:
             np.vstack([placed.outline_m - MISPLACED_M, camera_m, camera_m + np.array([0.0, 1.0])])
         )
         ring = [[longitude[i], latitude[i]] for i in (0, 1, 2, 3, 0)]
-        features.append({
-            "type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring]},
-            "properties": {
-                "flight": "flight1", "frame": index,
-                "camera_longitude_deg": longitude[4], "camera_latitude_deg": latitude[4],
-                "fix_longitude_deg": longitude[5], "fix_latitude_deg": latitude[5],
-            },
-        })
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Polygon", "coordinates": [ring]},
+                "properties": {
+                    "flight": "flight1",
+                    "frame": index,
+                    "camera_longitude_deg": longitude[4],
+                    "camera_latitude_deg": latitude[4],
+                    "fix_longitude_deg": longitude[5],
+                    "fix_latitude_deg": latitude[5],
+                },
+            }
+        )
     (tmp_path / "truth").mkdir()
     path = tmp_path / "truth" / "frames.geojson"
     path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
@@ -167,10 +184,16 @@ def test_wrong_truth_is_refused(site, truth, tmp_path):
         for point in feature["geometry"]["coordinates"][0]:
             point[1] += 1.0
 
-    rewrite(truth, lambda feature: feature["properties"].update(frame=f"x{feature['properties']['frame']}"))
+    rewrite(
+        truth,
+        lambda feature: feature["properties"].update(frame=f"x{feature['properties']['frame']}"),
+    )
     with pytest.raises(InputError, match="no frame is in both"):
         evaluate_mosaic(site, truth=truth)
-    rewrite(truth, lambda feature: feature["properties"].update(frame=feature["properties"]["frame"][1:]))
+    rewrite(
+        truth,
+        lambda feature: feature["properties"].update(frame=feature["properties"]["frame"][1:]),
+    )
     rewrite(truth, far)
     with pytest.raises(InputError, match="111 km"):
         evaluate_mosaic(site, truth=truth)
@@ -188,7 +211,9 @@ def test_wrong_truth_is_refused(site, truth, tmp_path):
 
 @pytest.mark.parametrize("measure", [evaluate_mosaic, evaluate_objects, evaluate_changes])
 def test_site_and_truth_that_are_swapped_are_reported(site, truth, measure):
-    with pytest.raises(InputError, match=r"a simulation's folder, no site; give the site first, and --truth"):
+    with pytest.raises(
+        InputError, match=r"a simulation's folder, no site; give the site first, and --truth"
+    ):
         measure(truth, truth=site)
 
 
@@ -210,7 +235,9 @@ def test_a_reference_elsewhere_shows_as_shift(site, tmp_path, crs):
     """The same picture one metre east and half a metre south, in the site's UTM zone and in the next one."""
     with rasterio.open(site / "mosaic.tif") as source:
         pixels, profile = source.read(), source.profile
-    profile.update(driver="GTiff", transform=rasterio.Affine.translation(1.0, -0.5) @ profile["transform"])
+    profile.update(
+        driver="GTiff", transform=rasterio.Affine.translation(1.0, -0.5) @ profile["transform"]
+    )
     path = tmp_path / "moved.tif"
     with rasterio.open(path, "w", **profile) as target:
         target.write(pixels)
@@ -227,10 +254,17 @@ def turned_into(path: Path, crs: str) -> Path:
         transform, width, height = calculate_default_transform(
             source.crs, crs, source.width, source.height, *source.bounds, resolution=M_PER_PX
         )
-        profile = {**source.profile, "crs": crs, "transform": transform, "width": width, "height": height}
+        profile = {
+            **source.profile,
+            "crs": crs,
+            "transform": transform,
+            "width": width,
+            "height": height,
+        }
         with rasterio.open(path.with_name("turned.tif"), "w", **profile) as target:
             reproject(
-                rasterio.band(source, [1, 2, 3, 4]), rasterio.band(target, [1, 2, 3, 4]),
+                rasterio.band(source, [1, 2, 3, 4]),
+                rasterio.band(target, [1, 2, 3, 4]),
                 resampling=rasterio.enums.Resampling.bilinear,
             )
     return path.with_name("turned.tif")
@@ -263,7 +297,9 @@ def test_camera_positions_are_compared(site, tmp_path):
     assert measured.missing == 1
 
 
-@pytest.mark.parametrize("text", ["", "a,b\n1,2\n", "frame,longitude_deg,latitude_deg\n1,x,2\n", "\0\0"])
+@pytest.mark.parametrize(
+    "text", ["", "a,b\n1,2\n", "frame,longitude_deg,latitude_deg\n1,x,2\n", "\0\0"]
+)
 def test_broken_positions_are_refused(site, tmp_path, text):
     path = tmp_path / "broken.csv"
     path.write_text(text)
@@ -274,13 +310,17 @@ def test_broken_positions_are_refused(site, tmp_path, text):
 def test_positions_without_a_column_state_which_there_are(site, tmp_path):
     path = tmp_path / "log.csv"
     path.write_text("name,longitude_deg,latitude_deg\n1,9.2,45.5\n")
-    with pytest.raises(InputError, match="no column frame, but name, longitude_deg, latitude_deg; needed are"):
+    with pytest.raises(
+        InputError, match="no column frame, but name, longitude_deg, latitude_deg; needed are"
+    ):
         evaluate_mosaic(site, positions=path)
 
 
 def test_the_command_prints_a_table_and_json(site, truth):
     runner = CliRunner()
-    plain = runner.invoke(evaluate_app, ["mosaic", str(site), "--truth", str(truth)], env={"COLUMNS": "160"})
+    plain = runner.invoke(
+        evaluate_app, ["mosaic", str(site), "--truth", str(truth)], env={"COLUMNS": "160"}
+    )
     assert plain.exit_code == 0
     assert "shape only" in plain.output
     assert "0.500" in plain.output
@@ -301,8 +341,13 @@ def test_the_fixture_shows_the_ground_where_it_should(site):
     pixels = seen[:: len(seen) // 50, ::-1].astype(float)
     projected = grid.grid.projected_from_grid(pixels)
     latitude, longitude = Projection(SITE.crs).wgs84_from_projected(projected)
-    places = SITE.frame.site_from_wgs84(latitude, longitude, np.full(len(pixels), 150.0))[:, :2] - MISPLACED_M
+    places = (
+        SITE.frame.site_from_wgs84(latitude, longitude, np.full(len(pixels), 150.0))[:, :2]
+        - MISPLACED_M
+    )
     where = apply_homography(np.array([[10.0, 0, 600], [0, -10.0, 600], [0, 0, 1]]), places)
-    expected = GROUND[np.rint(where[:, 1]).astype(int), np.rint(where[:, 0]).astype(int)].astype(int)
+    expected = GROUND[np.rint(where[:, 1]).astype(int), np.rint(where[:, 0]).astype(int)].astype(
+        int
+    )
     shown = picture[pixels[:, 1].astype(int), pixels[:, 0].astype(int), :3].astype(int)
     assert np.abs(expected - shown).mean() < 15

@@ -29,7 +29,9 @@ from sorvolo.survey.flight import Site
 
 SETTINGS = SimulationSettings(
     seed=21,
-    scene=SceneSettings("dirt", people=2, cars=1, small_objects=3, has_scenery=False, moving_share=0.4),
+    scene=SceneSettings(
+        "dirt", people=2, cars=1, small_objects=3, has_scenery=False, moving_share=0.4
+    ),
     path=PathSettings(height_m=14, speed_m_s=4, length_m=24, strips=1),
     imaging=ImagingSettings(320, 240, fps=10),
     later=LaterSettings(people=2, cars=1, small_objects=2, removed=2, moved=1),
@@ -66,16 +68,28 @@ def site(simulated, tmp_path) -> Path:
         archive.create_site(Site("field", SETTINGS.scene.origin, "EPSG:32633", 0.03))
     for name in ("flight1", "flight2"):
         rows = [
-            {**each, "geometry": shifted(each["geometry"], SHIFT_DEG), "properties": {
-                **each["properties"], "status": "vision" if name == "flight1" else "compared"
-            }}
-            for each in features(simulated / "truth/frames.geojson") if each["properties"]["flight"] == name
+            {
+                **each,
+                "geometry": shifted(each["geometry"], SHIFT_DEG),
+                "properties": {
+                    **each["properties"],
+                    "status": "vision" if name == "flight1" else "compared",
+                },
+            }
+            for each in features(simulated / "truth/frames.geojson")
+            if each["properties"]["flight"] == name
         ]
         write(folder / "flights" / name / "frames.geojson", rows)
     events = [
-        {"type": "Feature", "geometry": shifted(each["geometry"], SHIFT_DEG), "properties": {
-            "id": f"flight2-{each['properties']['number']}", "kind": each["properties"]["kind"], "sigma_m": 0.05,
-        }}
+        {
+            "type": "Feature",
+            "geometry": shifted(each["geometry"], SHIFT_DEG),
+            "properties": {
+                "id": f"flight2-{each['properties']['number']}",
+                "kind": each["properties"]["kind"],
+                "sigma_m": 0.05,
+            },
+        }
         for each in features(simulated / "truth/flight2/events.geojson")
     ]
     write(folder / "flights/flight2/changes.geojson", events)
@@ -97,7 +111,9 @@ def test_a_perfect_report_is_perfect(site, simulated):
     assert scores.named_right == scores.found
     assert scores.error_median_m < 0.02
     assert scores.within_two_sigma > 0.9
-    assert scores.world_within_two_sigma < 0.6  # to the north all of it is 0.44 m off, and 0.05 m is stated
+    assert (
+        scores.world_within_two_sigma < 0.6
+    )  # to the north all of it is 0.44 m off, and 0.05 m is stated
     assert measured.map_shift_m == pytest.approx(0.444, abs=0.01)
     assert measured.masks is None
     assert any("--masks" in remark for remark in measured.remarks)
@@ -110,11 +126,17 @@ def test_each_fault_is_counted_as_what_it_is(site, simulated):
 
     def spoil(events):
         events[:] = [each for each in events if each["properties"]["id"] != missed.found.id]
-        again = next(each for each in events if each["properties"]["id"] == measured.match.pairs[1].found.id)
+        again = next(
+            each for each in events if each["properties"]["id"] == measured.match.pairs[1].found.id
+        )
         events.append({**again, "properties": {**again["properties"], "id": "again"}})
-        events.append({
-            **again, "geometry": shifted(again["geometry"], 30e-5), "properties": {**again["properties"], "id": "false"}
-        })
+        events.append(
+            {
+                **again,
+                "geometry": shifted(again["geometry"], 30e-5),
+                "properties": {**again["properties"], "id": "false"},
+            }
+        )
 
     edit(site, spoil)
     (measured,) = evaluate_changes(site, simulated)
@@ -129,16 +151,23 @@ def test_late_needs_to_know_when(site, simulated):
     assert measured.events.judged_late == 0
     third_ns = {pair.found.id: int(pair.true.clear_ns[2]) for pair in measured.match.pairs}
     for delay_s, late in ((0.9, 0), (1.1, len(third_ns)), (None, None)):
+
         def announce(events, delay_s=delay_s):
             for each in events:
                 at_ns = third_ns.get(each["properties"]["id"])
-                given = None if at_ns is None or delay_s is None else utc_text(at_ns + round(delay_s * 1e9))
+                given = (
+                    None
+                    if at_ns is None or delay_s is None
+                    else utc_text(at_ns + round(delay_s * 1e9))
+                )
                 each["properties"]["announced"] = given
 
         edit(site, announce)
         (given,) = evaluate_changes(site, simulated)
         assert given.events.judged_late == len(third_ns)
-        assert given.events.late == late or (late is None and given.events.late > 0)  # only after the last frame
+        assert given.events.late == late or (
+            late is None and given.events.late > 0
+        )  # only after the last frame
 
 
 def test_a_clock_without_a_date_is_understood(site, simulated):
@@ -150,7 +179,10 @@ def test_a_clock_without_a_date_is_understood(site, simulated):
     for row in rows:
         row["properties"]["time"] = utc_text(time_ns_of(row["properties"]["time"]) - start_ns)
     write(path, rows)
-    stated = {pair.found.id: int(pair.true.clear_ns[2]) - start_ns + 700_000_000 for pair in measured.match.pairs}
+    stated = {
+        pair.found.id: int(pair.true.clear_ns[2]) - start_ns + 700_000_000
+        for pair in measured.match.pairs
+    }
 
     def announce(events):
         for each in events:
@@ -159,14 +191,16 @@ def test_a_clock_without_a_date_is_understood(site, simulated):
 
     edit(site, announce)
     (given,) = evaluate_changes(site, simulated)
-    assert [pair.delay_s for pair in given.match.pairs] == pytest.approx([0.7] * len(stated), abs=1e-3)
+    assert [pair.delay_s for pair in given.match.pairs] == pytest.approx(
+        [0.7] * len(stated), abs=1e-3
+    )
 
 
 def test_only_what_lies_on_compared_ground_must_be_found(site, simulated):
     (whole,) = evaluate_changes(site, simulated)
     path = site / "flights/flight2/frames.geojson"
     rows = features(path)
-    for row in rows[len(rows) // 2:]:
+    for row in rows[len(rows) // 2 :]:
         row["properties"]["status"] = "not-aligned"
     write(path, rows)
     (half,) = evaluate_changes(site, simulated)
@@ -220,7 +254,10 @@ def test_mask_folders_of_any_form(tmp_path):
     colour[5:15, 10:20, 2] = 200
     jpeg = np.where(truth > 0, 255, 0).astype(np.uint8)
     found = mask_folder(tmp_path / "found", {"a.png": colour, "0007.jpg": jpeg, "c.png": truth * 0})
-    true = mask_folder(tmp_path / "true", {"a.bmp": truth, "7.png": truth * 200, "c.tif": truth * 0, "d.png": truth})
+    true = mask_folder(
+        tmp_path / "true",
+        {"a.bmp": truth, "7.png": truth * 200, "c.tif": truth * 0, "d.png": truth},
+    )
     (measured,) = evaluate_changes(found, true)
     counts = measured.masks.pixels
     assert abs(counts.tp - 150) <= 2 and abs(counts.fp - 50) <= 2 and abs(counts.fn - 50) <= 2
@@ -238,7 +275,8 @@ def test_what_cannot_be_measured_names_the_reason(site, simulated, tmp_path):
     for found, truth, words in (
         (tmp_path / "nothing", simulated, "no such folder"),
         (empty, small, "no masks in it"),
-        (small, empty, "neither the truth"), (small, empty / "nosuch", "no such folder: .*nosuch; give the folder"),
+        (small, empty, "neither the truth"),
+        (small, empty / "nosuch", "no such folder: .*nosuch; give the folder"),
         (small, other, "no mask in"),
         (small, simulated, "differ in size"),
         (site, small, "--masks"),
@@ -290,13 +328,17 @@ def test_the_command_prints_tables_and_json(site, simulated):
     )
     assert plain.exit_code == 0
     assert "reported twice" in plain.output and "found 100.0%" in plain.output
-    answer = runner.invoke(evaluate_app, ["changes", str(site), "--truth", str(simulated), "--json"])
+    answer = runner.invoke(
+        evaluate_app, ["changes", str(site), "--truth", str(simulated), "--json"]
+    )
     (content,) = json.loads(answer.output)
     assert content["events"]["found_share"] == 1.0
     assert content["pixels"] is None
     assert len(content["lists"]["found"]) == content["events"]["found"]
     masks = simulated / "truth/flight2/changes"
-    table = runner.invoke(evaluate_app, ["changes", str(masks), "--truth", str(masks)], env={"COLUMNS": "160"})
+    table = runner.invoke(
+        evaluate_app, ["changes", str(masks), "--truth", str(masks)], env={"COLUMNS": "160"}
+    )
     assert "100.00%" in table.output
 
 
@@ -305,7 +347,10 @@ def test_compared_ground_is_what_both_saw():
     ground = compared_ground([square, square + 2], [square + np.array([5.0, 0.0])])
     assert ground.area_m2 == pytest.approx(5 * 10 + 2 * 8, rel=0.03)
     assert ground.holds(np.array([[6.0, 5], [4, 5], [11, 11], [50, -50]])).tolist() == [
-        True, False, False, False
+        True,
+        False,
+        False,
+        False,
     ]
     assert compared_ground([], [square]).area_m2 == 0
     assert not compared_ground([], []).holds(square).any()

@@ -56,10 +56,18 @@ def labelled(tmp_path_factory):
     for index, (shown, true) in enumerate(zip(painted, truth)):
         path = folder / f"{index}.png"
         paint(path, shown)
-        pictures.append(LabelledPicture(
-            str(path), 96, 64, f"video{index // 2}", np.array([row[0] for row in true], float).reshape(-1, 4),
-            np.array([row[1] for row in true], int), np.zeros((0, 4)), 0.1,
-        ))
+        pictures.append(
+            LabelledPicture(
+                str(path),
+                96,
+                64,
+                f"video{index // 2}",
+                np.array([row[0] for row in true], float).reshape(-1, 4),
+                np.array([row[1] for row in true], int),
+                np.zeros((0, 4)),
+                0.1,
+            )
+        )
     return LabelledSet("painted", CLASSES, tuple(pictures), frozenset({"small object"}))
 
 
@@ -81,7 +89,9 @@ def test_a_model_is_measured_and_its_report_stands_alone(toy, labelled, tmp_path
     assert [(row.low, row.count) for row in scores.by_size_m["car"]] == [(2.0, 2)]
     write_evaluation(evaluation, tmp_path / "out", {"data": "painted"})
     page = (tmp_path / "out" / PAGE).read_text()
-    assert page.count("data:image/jpeg;base64,") == 3 and "http" not in page.replace("http://www.w3.org", "")
+    assert page.count("data:image/jpeg;base64,") == 3 and "http" not in page.replace(
+        "http://www.w3.org", ""
+    )
     assert "person reported as car" in page and "car missed" in page
     numbers = json.loads((tmp_path / "out" / NUMBERS).read_text())
     assert numbers["sets"][0]["mistakes"] == {"false alarm": 1, "miss": 1, "confusion": 1}
@@ -93,32 +103,47 @@ def test_a_model_is_measured_and_its_report_stands_alone(toy, labelled, tmp_path
     assert its["seconds_per_picture"] != its["seconds_per_picture"]  # unknown: nothing was run
 
 
-def test_each_set_is_reported_from_the_scores_of_the_model_that_looks_at_its_light(labelled, tmp_path, monkeypatch):
+def test_each_set_is_reported_from_the_scores_of_the_model_that_looks_at_its_light(
+    labelled, tmp_path, monkeypatch
+):
     monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "models"))
     (tmp_path / "models").mkdir()
     night_scores, day_scores = dict.fromkeys(CLASSES, 0.7), dict.fromkeys(CLASSES, 0.4)
-    rectangle_model(tmp_path / "models" / "night.onnx", name="night", thermal=True, thresholds=night_scores)
+    rectangle_model(
+        tmp_path / "models" / "night.onnx", name="night", thermal=True, thresholds=night_scores
+    )
     day = rectangle_model(
         tmp_path / "day.onnx", name="day", thermal=True, thermal_by="night", thresholds=day_scores
     )
     grey = tmp_path / "grey.png"
     Image.fromarray(np.array(Image.open(labelled.pictures[0].path).convert("L"))).save(grey)
-    night = replace(labelled, name="night", pictures=(replace(labelled.pictures[0], path=str(grey)),))
+    night = replace(
+        labelled, name="night", pictures=(replace(labelled.pictures[0], path=str(grey)),)
+    )
     evaluation = evaluate_detector([[str(day)]], [labelled, night], QUICK)
-    assert [dict(each.thresholds) for each in evaluation.found.sets.values()] == [day_scores, night_scores]
+    assert [dict(each.thresholds) for each in evaluation.found.sets.values()] == [
+        day_scores,
+        night_scores,
+    ]
     assert [each.classes[0].reported.score for each in evaluation.sets] == [0.4, 0.7]
     assert not any("another light" in text for text in evaluation.notices)
     both = replace(labelled, pictures=(*labelled.pictures, *night.pictures))
     evaluation = evaluate_detector([[str(day)]], [both], QUICK)
     assert evaluation.sets[0].classes[0].reported.score == 0.4
-    assert any("painted: 1 of 5 pictures are of another light" in text for text in evaluation.notices)
+    assert any(
+        "painted: 1 of 5 pictures are of another light" in text for text in evaluation.notices
+    )
 
 
-def test_no_other_model_is_measured_in_the_place_of_one_that_knows_daylight_alone(labelled, tmp_path, monkeypatch):
+def test_no_other_model_is_measured_in_the_place_of_one_that_knows_daylight_alone(
+    labelled, tmp_path, monkeypatch
+):
     monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "models"))
     (tmp_path / "models").mkdir()
     blind, seeing = dict.fromkeys(CLASSES, 0.99), dict.fromkeys(CLASSES, 0.4)
-    rectangle_model(tmp_path / "models" / "night.onnx", name="night", thermal=True, thresholds=seeing)
+    rectangle_model(
+        tmp_path / "models" / "night.onnx", name="night", thermal=True, thresholds=seeing
+    )
     day = rectangle_model(tmp_path / "day.onnx", name="day", thermal=False, thresholds=blind)
     both = rectangle_model(tmp_path / "both.onnx", name="both", thermal=True)
     grey = tmp_path / "grey.png"
@@ -127,7 +152,9 @@ def test_no_other_model_is_measured_in_the_place_of_one_that_knows_daylight_alon
     evaluation = evaluate_detector([[str(day)]], [night], QUICK)
     assert dict(evaluation.found.sets["painted"].thresholds) == blind
     (notice,) = evaluation.notices
-    assert notice.startswith("1 frames are thermal, but the model 'day' was trained on daylight alone")
+    assert notice.startswith(
+        "1 frames are thermal, but the model 'day' was trained on daylight alone"
+    )
     rival = evaluate_detector([[str(both)], [str(day)]], [night], QUICK)
     assert dict(rival.comparisons[0].arms[1].mean) and rival.notices == (notice,)
 
@@ -138,12 +165,16 @@ def random_arm(folder, name, labelled, skill, seed):
     found = []
     for picture in labelled.pictures:
         hit = rng.uniform(size=len(picture.labels)) < skill
-        boxes = np.vstack([picture.boxes_px[hit], rng.uniform(0, 20, (1, 4)) + np.array([0, 0, 30, 30])])
+        boxes = np.vstack(
+            [picture.boxes_px[hit], rng.uniform(0, 20, (1, 4)) + np.array([0, 0, 30, 30])]
+        )
         scores = np.append(rng.uniform(0.5, 1, hit.sum()), 0.4)
         found.append(Detections(boxes, scores, np.append(picture.labels[hit], 0), CLASSES))
     names = tuple(Path(each.path).name for each in labelled.pictures)
     path = folder / f"{name}{seed}.json"
-    write_found(path, FoundSets(name, CLASSES, {labelled.name: FoundSet(names, tuple(found), THRESHOLDS)}))
+    write_found(
+        path, FoundSets(name, CLASSES, {labelled.name: FoundSet(names, tuple(found), THRESHOLDS)})
+    )
     return str(path)
 
 
@@ -156,9 +187,17 @@ def many(tmp_path_factory):
         paint(folder / f"{index}.png", [])
         corners = rng.uniform(0, 40, (5, 2))
         boxes = np.hstack([corners, corners + rng.uniform(5, 20, (5, 2))])
-        pictures.append(LabelledPicture(
-            str(folder / f"{index}.png"), 96, 64, f"v{index % 12}", boxes, rng.integers(0, 2, 5), np.zeros((0, 4))
-        ))
+        pictures.append(
+            LabelledPicture(
+                str(folder / f"{index}.png"),
+                96,
+                64,
+                f"v{index % 12}",
+                boxes,
+                rng.integers(0, 2, 5),
+                np.zeros((0, 4)),
+            )
+        )
     return LabelledSet("many", CLASSES, tuple(pictures), frozenset({"small object"}))
 
 
@@ -168,15 +207,27 @@ def test_arms_of_several_seeds_side_by_side(many, tmp_path):
     evaluation = evaluate_detector([standard, extended], [many], QUICK)
     (printed,) = evaluation.comparisons
     assert [arm.seeds for arm in printed.arms] == [3, 3] and printed.groups == 12
-    assert printed.arms[0].lowest["AP50"] < printed.arms[0].mean["AP50"] < printed.arms[0].highest["AP50"]
+    assert (
+        printed.arms[0].lowest["AP50"]
+        < printed.arms[0].mean["AP50"]
+        < printed.arms[0].highest["AP50"]
+    )
     better = printed.differences[0]["AP50"]
-    assert better.value == pytest.approx(printed.arms[1].mean["AP50"] - printed.arms[0].mean["AP50"])
+    assert better.value == pytest.approx(
+        printed.arms[1].mean["AP50"] - printed.arms[0].mean["AP50"]
+    )
     assert better.is_clear and 0.1 < better.low < better.value < better.high
     write_evaluation(evaluation, tmp_path / "out", {})
     page = (tmp_path / "out" / PAGE).read_text()
-    assert "Side by side: many" in page and "extended and 2 more seeds less standard and 2 more seeds" in page
+    assert (
+        "Side by side: many" in page
+        and "extended and 2 more seeds less standard and 2 more seeds" in page
+    )
     fewer = evaluate_detector([standard[:2], extended[:1]], [many], QUICK)
-    assert [arm.name for arm in fewer.comparisons[0].arms] == ["standard and 1 more seed", "extended"]
+    assert [arm.name for arm in fewer.comparisons[0].arms] == [
+        "standard and 1 more seed",
+        "extended",
+    ]
 
 
 def test_detections_of_other_pictures_are_refused(many, labelled, tmp_path):
@@ -187,7 +238,9 @@ def test_detections_of_other_pictures_are_refused(many, labelled, tmp_path):
     assert evaluate_detector([[mine]], [fewer], QUICK).sets[0].pictures == 5
     found = read_found(Path(mine))
     whole = found.sets["many"]
-    half = FoundSets(found.name, CLASSES, {"many": FoundSet(whole.files[:9], whole.detections[:9], THRESHOLDS)})
+    half = FoundSets(
+        found.name, CLASSES, {"many": FoundSet(whole.files[:9], whole.detections[:9], THRESHOLDS)}
+    )
     write_found(tmp_path / "half.json", half)
     with pytest.raises(InputError, match=r"51 are missing, such as 9\.png"):
         evaluate_detector([[str(tmp_path / "half.json")]], [many], QUICK)
@@ -206,27 +259,69 @@ def coco(labelled, tmp_path_factory):
     for index, picture in enumerate(labelled.pictures):
         name = Path(picture.path).name
         (folder / name).write_bytes(Path(picture.path).read_bytes())
-        images.append({"id": index, "file_name": name, "width": 96, "height": 64, "flight": picture.group,
-                       "m_per_px": 0.1})
+        images.append(
+            {
+                "id": index,
+                "file_name": name,
+                "width": 96,
+                "height": 64,
+                "flight": picture.group,
+                "m_per_px": 0.1,
+            }
+        )
         for box, label in zip(picture.boxes_px.tolist(), picture.labels.tolist()):
-            annotations.append({
-                "id": len(annotations) + 1, "image_id": index, "category_id": label + 1, "iscrowd": 0,
-                "bbox": [box[0], box[1], box[2] - box[0], box[3] - box[1]], "area": 1,
-            })
-    (folder / "labels.json").write_text(json.dumps({
-        "images": images, "annotations": annotations,
-        "categories": [{"id": 1, "name": "Walker"}, {"id": 2, "name": "Truck"}],
-    }))
+            annotations.append(
+                {
+                    "id": len(annotations) + 1,
+                    "image_id": index,
+                    "category_id": label + 1,
+                    "iscrowd": 0,
+                    "bbox": [box[0], box[1], box[2] - box[0], box[3] - box[1]],
+                    "area": 1,
+                }
+            )
+    (folder / "labels.json").write_text(
+        json.dumps(
+            {
+                "images": images,
+                "annotations": annotations,
+                "categories": [{"id": 1, "name": "Walker"}, {"id": 2, "name": "Truck"}],
+            }
+        )
+    )
     return folder
 
 
 def test_the_command_reads_labels_prints_numbers_and_writes_the_report(toy, coco, tmp_path, capsys):
-    printed = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
+    printed = [
+        "--classes",
+        "Walker=person,Truck=car",
+        "--unlabelled",
+        "small object",
+        "--draws",
+        "20",
+    ]
     printed += ["--tiles", "none"]
-    assert main(["evaluate", "detector", str(toy), str(coco), *printed, "--out", str(tmp_path / "out"), "--json"]) == 0
+    assert (
+        main(
+            [
+                "evaluate",
+                "detector",
+                str(toy),
+                str(coco),
+                *printed,
+                "--out",
+                str(tmp_path / "out"),
+                "--json",
+            ]
+        )
+        == 0
+    )
     numbers = json.loads(capsys.readouterr().out)
     assert numbers["sets"][0]["confusion"] == [[2, 1, 0], [0, 1, 1], [1, 0, 0]]
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted([PAGE, NUMBERS, FOUND])
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
+        [PAGE, NUMBERS, FOUND]
+    )
     found = str(tmp_path / "out" / FOUND)
     assert main(["evaluate", "detector", str(toy), str(coco), *printed, "--compare", found]) == 0
     shown = capsys.readouterr().out
@@ -245,7 +340,16 @@ def test_pictures_are_shown_as_to_watch_unless_asked_otherwise(toy, coco, monkey
         return detect(self, image, **how)
 
     monkeypatch.setattr(Detector, "detect", noted)
-    command = ["evaluate", "detector", str(toy), str(coco), "--classes", "Walker=person,Truck=car", "--draws", "20"]
+    command = [
+        "evaluate",
+        "detector",
+        str(toy),
+        str(coco),
+        "--classes",
+        "Walker=person,Truck=car",
+        "--draws",
+        "20",
+    ]
     assert main(command) == 0 and set(shown) == {"auto"}
     shown.clear()
     assert main([*command, "--tiles", "none"]) == 0 and set(shown) == {None}
@@ -256,7 +360,14 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
     folder.mkdir()
     for path in coco.iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
-    names = ["--classes", "Walker=person,Truck=car", "--unlabelled", "small object", "--draws", "20"]
+    names = [
+        "--classes",
+        "Walker=person,Truck=car",
+        "--unlabelled",
+        "small object",
+        "--draws",
+        "20",
+    ]
     command = ["evaluate", "detector", str(toy), str(folder), *names]
     assert main([*command, "--out", str(tmp_path / "whole")]) == 0
     data = (folder / "1.png").read_bytes()
@@ -267,8 +378,13 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
     printed = capsys.readouterr().out.replace("\n", "")
     assert f"note: 1 picture left out that cannot be read: {folder / '1.png'}" in printed
     numbers = json.loads((tmp_path / "cut" / NUMBERS).read_text())
-    assert numbers["sets"][0]["pictures"] == 3 and "1 picture left out that cannot be read" in numbers["notices"]
-    assert numbers["comparisons"][0]["arms"][0]["mean"] == numbers["comparisons"][0]["arms"][1]["mean"]
+    assert (
+        numbers["sets"][0]["pictures"] == 3
+        and "1 picture left out that cannot be read" in numbers["notices"]
+    )
+    assert (
+        numbers["comparisons"][0]["arms"][0]["mean"] == numbers["comparisons"][0]["arms"][1]["mean"]
+    )
     assert read_found(tmp_path / "cut" / FOUND).sets["coco"].files == ("0.png", "2.png", "3.png")
     # what was measured without it can be compared without it
     assert main([*command, "--compare", str(tmp_path / "cut" / FOUND)]) == 0
@@ -282,22 +398,34 @@ def test_a_damaged_picture_is_left_out_for_all_models_and_named(toy, coco, tmp_p
 def test_names_that_nothing_has_are_reported(toy, coco, capsys):
     command = ["evaluate", "detector", str(toy), str(coco), "--classes", "Walker=person,Truck=car"]
     assert main([*command, "--ignore", "Lory"]) == 1
-    assert "ignore: 'Lory' is no name in the labels; there are: Walker, Truck" in capsys.readouterr().err
+    assert (
+        "ignore: 'Lory' is no name in the labels; there are: Walker, Truck"
+        in capsys.readouterr().err
+    )
     assert main([*command, "--unlabelled", "Car"]) == 1
-    assert "unlabelled: 'Car' is no class; there are: person, car, small object" in capsys.readouterr().err
+    assert (
+        "unlabelled: 'Car' is no class; there are: person, car, small object"
+        in capsys.readouterr().err
+    )
 
 
 def test_what_was_left_out_on_reading_is_reported_of_chosen_pictures_too(coco):
     names = {"Walker": "person"}
-    (whole,), (some,) = (read_sets([coco], classes=names, videos=videos) for videos in ("", "coco|.*"))
-    assert whole.notices and [each.text for each in some.notices] == [each.text for each in whole.notices]
+    (whole,), (some,) = (
+        read_sets([coco], classes=names, videos=videos) for videos in ("", "coco|.*")
+    )
+    assert whole.notices and [each.text for each in some.notices] == [
+        each.text for each in whole.notices
+    ]
 
 
 def test_videos_choose_pictures(coco):
     names = {"Walker": "person", "Truck": "car"}
     (chosen,) = read_sets([coco], classes=names, videos="video1")
     assert [picture.group for picture in chosen.pictures] == ["video1", "video1"]
-    with pytest.raises(InputError, match="no video or flight fits 'night'; there are video0, video1"):
+    with pytest.raises(
+        InputError, match="no video or flight fits 'night'; there are video0, video1"
+    ):
         read_sets([coco], classes=names, videos="night")
     with pytest.raises(SettingsError, match="no regular expression"):
         read_sets([coco], classes=names, videos="(")

@@ -26,13 +26,26 @@ _CAMERA = Camera.from_angle_of_view(640, 480, 60)
 
 
 def placed(
-    east_m: float, status: Status = Status.VISION, pitch_deg: float = -90.0, residual_px: float = 0.3,
+    east_m: float,
+    status: Status = Status.VISION,
+    pitch_deg: float = -90.0,
+    residual_px: float = 0.3,
     off_m: float = 0.4,
 ) -> PlacedFrame:
     pose = Pose(site_from_gimbal_rotation(0, pitch_deg, 0), np.array([east_m, 0.0, 30.0]))
     return PlacedFrame(
-        str(east_m), int(east_m), 0, status, "", _CAMERA, pose, site_from_image_homography(_CAMERA, pose),
-        footprint(_CAMERA, pose), residual_px, 0.5, gps_residual_m=np.array([off_m, 0.0, 0.0]),
+        str(east_m),
+        int(east_m),
+        0,
+        status,
+        "",
+        _CAMERA,
+        pose,
+        site_from_image_homography(_CAMERA, pose),
+        footprint(_CAMERA, pose),
+        residual_px,
+        0.5,
+        gps_residual_m=np.array([off_m, 0.0, 0.0]),
     )
 
 
@@ -54,24 +67,40 @@ def test_a_map_that_nothing_levels_is_to_be_checked() -> None:
     free, tied = SimpleNamespace(track=None), SimpleNamespace(track=object())
     assert unlevelled(frames, graph, tied) == []  # type: ignore[arg-type]
     (why,) = unlevelled(frames, graph, free)  # type: ignore[arg-type]
-    headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True, others=[why])
+    headline = map_headline(
+        frames, flight_figures(frames, _CAMERA.fx_px), is_video=True, others=[why]
+    )
     assert headline.quality is MapQuality.DOUBTFUL and "looked to the side" in headline.text
 
 
-@pytest.mark.parametrize("frames, why", [
-    ([placed(0.0)], "hovered"), ([placed(0.1 * k) for k in range(5)], "5 frames show one view"),
-    ([placed(0.0, pitch_deg=-45.0)], "45 deg away from straight down"),
-])
+@pytest.mark.parametrize(
+    "frames, why",
+    [
+        ([placed(0.0)], "hovered"),
+        ([placed(0.1 * k) for k in range(5)], "5 frames show one view"),
+        ([placed(0.0, pitch_deg=-45.0)], "45 deg away from straight down"),
+    ],
+)
 def test_a_video_of_one_view_is_no_map(frames: list[PlacedFrame], why: str) -> None:
     headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True)
-    assert headline.quality is MapQuality.ONE_VIEW and headline.text.startswith("no map:") and why in headline.text
+    assert (
+        headline.quality is MapQuality.ONE_VIEW
+        and headline.text.startswith("no map:")
+        and why in headline.text
+    )
     assert quality_of(frames, is_video=False) is MapQuality.MAP, "each photo was meant"
 
 
-@pytest.mark.parametrize("frames, why", [
-    ([placed(10.0 * k, Status.GPS_ONLY if k == 2 else Status.VISION) for k in range(8)], "1 frame is placed by GPS"),
-    ([placed(10.0 * k, residual_px=4.0) for k in range(8)], "badly"),
-])
+@pytest.mark.parametrize(
+    "frames, why",
+    [
+        (
+            [placed(10.0 * k, Status.GPS_ONLY if k == 2 else Status.VISION) for k in range(8)],
+            "1 frame is placed by GPS",
+        ),
+        ([placed(10.0 * k, residual_px=4.0) for k in range(8)], "badly"),
+    ],
+)
 def test_steps_make_a_map_to_check(frames: list[PlacedFrame], why: str) -> None:
     headline = map_headline(frames, flight_figures(frames, _CAMERA.fx_px), is_video=True)
     assert headline.quality is MapQuality.DOUBTFUL and why in headline.text
@@ -88,7 +117,10 @@ def test_a_map_with_faults_is_none_to_build_on() -> None:
 def test_a_map_of_fixes_that_are_another_flights_is_refused_and_nothing_is_compared_with_it(
     photographed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    photos, camera = _with_shuffled_fixes(photographed, tmp_path / "photos"), str(photographed / "camera.xml")
+    photos, camera = (
+        _with_shuffled_fixes(photographed, tmp_path / "photos"),
+        str(photographed / "camera.xml"),
+    )
     site = tmp_path / "site"
     common = ["--site", str(site), "--model", "none", "--camera", camera]
     assert main(["map", str(photos), *common]) == 3
@@ -124,20 +156,40 @@ def test_a_video_from_one_place_ends_with_a_warning_and_its_own_exit_code(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(5)
-    ground = cv2.resize(rng.integers(0, 255, (60, 80, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC)
+    ground = cv2.resize(
+        rng.integers(0, 255, (60, 80, 3), np.uint8), (320, 240), interpolation=cv2.INTER_CUBIC
+    )
     with video_writer(tmp_path / "hover.mp4", (320, 240), 10.0, 1_780_000_000 * 10**9, 18) as write:
         for _ in range(30):
             write(ground)
-    assert main(["map", str(tmp_path / "hover.mp4"), "--site", str(tmp_path / "site"), "--model", "none"]) == 3
+    assert (
+        main(
+            [
+                "map",
+                str(tmp_path / "hover.mp4"),
+                "--site",
+                str(tmp_path / "site"),
+                "--model",
+                "none",
+            ]
+        )
+        == 3
+    )
     assert "no map:" in capsys.readouterr().out
     report = json.loads((tmp_path / "site/flights/hover/report.json").read_text())
     assert report["headline"]["quality"] == "one-view"
 
 
-@pytest.mark.parametrize(("has_angles", "words"), [
-    (True, "the stated angles of 2 frames of 8 contradict"), (False, "no angles are stated, so the camera was taken"),
-])
+@pytest.mark.parametrize(
+    ("has_angles", "words"),
+    [
+        (True, "the stated angles of 2 frames of 8 contradict"),
+        (False, "no angles are stated, so the camera was taken"),
+    ],
+)
 def test_angles_that_nobody_stated_are_not_called_stated(has_angles: bool, words: str) -> None:
     report = GraphReport(1.0, 0.1, 0.0, 0.0, 8, 0, 0.0, 0.4, angles_contradicted=2)
-    (warning,) = _angle_warnings([placed(10.0 * k) for k in range(8)], report, has_angles=has_angles)
+    (warning,) = _angle_warnings(
+        [placed(10.0 * k) for k in range(8)], report, has_angles=has_angles
+    )
     assert warning.startswith(words)

@@ -41,7 +41,9 @@ from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import ChangeKind
 
 _SURVEY = SimulationSettings(
-    seed=12, flights=1, scene=SceneSettings(people=0, cars=2, small_objects=2, has_scenery=True),
+    seed=12,
+    flights=1,
+    scene=SceneSettings(people=0, cars=2, small_objects=2, has_scenery=True),
     path=PathSettings(height_m=25, speed_m_s=4, length_m=20, strips=2, strip_spacing_m=8),
     imaging=ImagingSettings(width_px=480, height_px=360, fps=6, noise=1.0),
     sensor=SensorSettings(noise_m=(0.1, 0.1, 0.1)),
@@ -55,7 +57,21 @@ def with_heights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("heights")
     simulate_into(folder / "made", _SURVEY)
     photos = folder / "made" / "flight1" / "photos"
-    assert main(["map", str(photos), "--site", str(folder / "site"), "--model", "none", "--heights", "--json"]) == 0
+    assert (
+        main(
+            [
+                "map",
+                str(photos),
+                "--site",
+                str(folder / "site"),
+                "--model",
+                "none",
+                "--heights",
+                "--json",
+            ]
+        )
+        == 0
+    )
     assert list((folder / "site").glob("flights/*/heights.tif")), "map --heights makes heights"
     return folder / "site"
 
@@ -77,7 +93,10 @@ def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
     assert main(["heights", str(mapped), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)["heights"]
     folder = mapped / "flights" / report["flight"]
-    with rasterio.open(folder / "heights.tif") as heights, rasterio.open(folder / "terrain.tif") as ground:
+    with (
+        rasterio.open(folder / "heights.tif") as heights,
+        rasterio.open(folder / "terrain.tif") as ground,
+    ):
         up_m, sigma_m = heights.read()
         assert heights.transform == ground.transform and heights.crs == ground.crs
         bare_m = ground.read(1)
@@ -88,7 +107,10 @@ def test_heights_of_a_mapped_flight_are_files_that_fit_each_other(
     # the simulated ground is level, and a house, trees and cars stand on it
     assert np.median(np.abs(up_m[known] - np.median(bare_m))) < 0.3
     assert np.percentile(up_m[known] - np.median(bare_m), 99) > 2.0
-    with rasterio.open(folder / "orthophoto.tif") as picture, rasterio.open(mapped / "mosaic.tif") as flat:
+    with (
+        rasterio.open(folder / "orthophoto.tif") as picture,
+        rasterio.open(mapped / "mosaic.tif") as flat,
+    ):
         assert picture.res == flat.res and picture.crs == flat.crs
         assert (picture.read(4) == 255).mean() > 0.3
     assert report["surface"]["holes_share"] < 0.2
@@ -104,7 +126,10 @@ def test_heights_of_a_map_that_contradicts_itself_or_mixes_lenses_state_it(
     site = Path(shutil.copytree(mapped, tmp_path / "site"))
     (path,) = site.glob("flights/*/report.json")
     report = json.loads(path.read_text())
-    report["headline"] = {"quality": "contradictory", "text": "a map that contradicts itself: two scales"}
+    report["headline"] = {
+        "quality": "contradictory",
+        "text": "a map that contradicts itself: two scales",
+    }
     report["notices"] = [{"code": "zoom", "count": 2, "text": "different focal lengths"}]
     path.write_text(json.dumps(report))
     assert main(["heights", str(site), "--no-orthophoto", "--json"]) == 3
@@ -127,10 +152,23 @@ def test_more_cells_than_can_be_handled_are_refused_before_the_work_begins(mappe
 
 
 def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:
-    imaging, path = replace(_SURVEY.imaging, width_px=240, height_px=180), replace(_SURVEY.path, length_m=12, strips=1)
-    silent = replace(_SURVEY, seed=13, imaging=imaging, path=path, output=replace(_SURVEY.output, telemetry="none"))
+    imaging, path = (
+        replace(_SURVEY.imaging, width_px=240, height_px=180),
+        replace(_SURVEY.path, length_m=12, strips=1),
+    )
+    silent = replace(
+        _SURVEY,
+        seed=13,
+        imaging=imaging,
+        path=path,
+        output=replace(_SURVEY.output, telemetry="none"),
+    )
     simulate_into(tmp_path / "made", silent)
-    list(map_flights([tmp_path / "made" / "flight1" / "photos"], tmp_path / "site", MapSettings(model="none")))
+    list(
+        map_flights(
+            [tmp_path / "made" / "flight1" / "photos"], tmp_path / "site", MapSettings(model="none")
+        )
+    )
     with pytest.raises(InputError, match="no GPS"):
         list(make_heights(tmp_path / "site"))
 
@@ -138,8 +176,12 @@ def test_a_flight_without_gps_has_no_heights(tmp_path: Path) -> None:
 def _area(site: Path, path: Path) -> Path:
     """A square of 16 m around the middle of the cameras, as GeoJSON."""
     frames = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())["features"]
-    places = np.array([[each["properties"][f"camera_{axis}_deg"] for axis in ("longitude", "latitude")]
-                       for each in frames])
+    places = np.array(
+        [
+            [each["properties"][f"camera_{axis}_deg"] for axis in ("longitude", "latitude")]
+            for each in frames
+        ]
+    )
     middle = places.mean(axis=0)
     half = 8 / 111_000 / np.array([np.cos(np.radians(middle[1])), 1.0])
     corners = middle + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
@@ -154,7 +196,10 @@ def test_volumes_profiles_and_contours_are_measured(
     area = _area(with_heights, tmp_path / "area.geojson")
     assert main(["measure", "volume", str(with_heights), "--area", str(area), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["volume"]["area_m2"] == pytest.approx(256, rel=0.05) and found["volume"]["sigma_m3"] > 0
+    assert (
+        found["volume"]["area_m2"] == pytest.approx(256, rel=0.05)
+        and found["volume"]["sigma_m3"] > 0
+    )
     assert main(["measure", "volume", str(with_heights), "--area", str(area)]) == 0
     assert "above the ground around" in capsys.readouterr().out
     corners = json.loads(area.read_text())["coordinates"][0]
@@ -164,7 +209,21 @@ def test_volumes_profiles_and_contours_are_measured(
     assert lines[0].startswith("way_m,latitude_deg") and len(lines) > 50
     assert float(lines[-1].split(",")[0]) == pytest.approx(16 * 2**0.5, rel=0.02)
     out = tmp_path / "lines.geojson"
-    assert main(["measure", "contours", str(with_heights), "--interval", "0.5", "--out", str(out), "--surface"]) == 0
+    assert (
+        main(
+            [
+                "measure",
+                "contours",
+                str(with_heights),
+                "--interval",
+                "0.5",
+                "--out",
+                str(out),
+                "--surface",
+            ]
+        )
+        == 0
+    )
     features = json.loads(out.read_text())["features"]
     assert features and all(each["properties"]["height_m"] % 0.5 == 0 for each in features)
 
@@ -184,7 +243,9 @@ def test_measuring_names_what_is_missing(with_heights: Path, tmp_path: Path) -> 
         write_contours(with_heights, tmp_path / "lines.geojson", 0.0)
 
 
-def test_heights_of_an_earlier_map_of_the_flight_are_refused(with_heights: Path, tmp_path: Path) -> None:
+def test_heights_of_an_earlier_map_of_the_flight_are_refused(
+    with_heights: Path, tmp_path: Path
+) -> None:
     report = next(with_heights.glob("flights/*/heights.json"))
     kept = report.read_text()
     try:
@@ -199,8 +260,12 @@ def test_a_search_knows_what_stands_high_where_the_site_has_heights(
     with_heights: Path, mapped: Path, tmp_path: Path
 ) -> None:
     """By the flight's own heights or by another's of the site; without any that can be read it goes by pictures."""
-    truth = json.loads((with_heights.parent / "made" / "truth" / "objects.geojson").read_text())["features"]
-    rings = [each["geometry"]["coordinates"][0] for each in truth if each["properties"]["height_m"] > 2.5]
+    truth = json.loads((with_heights.parent / "made" / "truth" / "objects.geojson").read_text())[
+        "features"
+    ]
+    rings = [
+        each["geometry"]["coordinates"][0] for each in truth if each["properties"]["height_m"] > 2.5
+    ]
     with Archive.open(with_heights, write=False) as archive:
         above = heights_for(archive, archive.flights()[0].id)
         other = heights_for(archive, "another")
@@ -209,7 +274,9 @@ def test_a_search_knows_what_stands_high_where_the_site_has_heights(
     places_m = frame.ground_from_lonlat([np.mean(ring[:-1], axis=0) for ring in rings])
     above_m, sigma_m = above(places_m)
     known = np.isfinite(above_m)
-    assert known.any() and (above_m[known] > 1.0).mean() >= 0.5 and (sigma_m[known] > 0).all(), above_m
+    assert known.any() and (above_m[known] > 1.0).mean() >= 0.5 and (sigma_m[known] > 0).all(), (
+        above_m
+    )
     np.testing.assert_array_equal(other(places_m)[0], above_m)
     bare = Path(shutil.copytree(mapped, tmp_path / "bare"))
     for each in bare.glob("flights/*/heights.json"):  # of a test that came first
@@ -223,7 +290,9 @@ def test_a_search_knows_what_stands_high_where_the_site_has_heights(
         assert heights_for(archive, archive.flights()[0].id) is None
 
 
-@pytest.mark.parametrize("content", [b"{}", b"[]", b"\xff", b'{"run": 1, "cell_m": 0}', b'{"run": 1, "cell_m": 1e999}'])
+@pytest.mark.parametrize(
+    "content", [b"{}", b"[]", b"\xff", b'{"run": 1, "cell_m": 0}', b'{"run": 1, "cell_m": 1e999}']
+)
 def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
     mapped: Path, tmp_path: Path, content: bytes
 ) -> None:
@@ -232,7 +301,9 @@ def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
     kept = report.read_bytes() if report.exists() else None
     report.write_bytes(content)
     try:
-        with pytest.raises(InputError, match=r"damaged heights.json; make its heights again: sorvolo heights"):
+        with pytest.raises(
+            InputError, match=r"damaged heights.json; make its heights again: sorvolo heights"
+        ):
             write_contours(mapped, tmp_path / "lines.geojson", 1.0)
         with Archive.open(mapped, write=False) as archive:
             _earlier_pictures(archive, "later")
@@ -247,14 +318,20 @@ def test_damaged_heights_are_named_and_no_comparison_stops_at_them(
 @pytest.mark.long
 def test_brighton_beach_has_heights(tmp_path: Path) -> None:
     photos = real_data("flights/brighton_beach")
-    list(map_flights([photos], tmp_path / "site", MapSettings(model="none", m_per_px=0.2)))  # heights use the photos
+    list(
+        map_flights([photos], tmp_path / "site", MapSettings(model="none", m_per_px=0.2))
+    )  # heights use the photos
     list(make_heights(tmp_path / "site", HeightSettings(cell_m=0.3, has_orthophoto=False)))
     report = json.loads(next((tmp_path / "site").glob("flights/*/heights.json")).read_text())
     assert report["cameras"]["views"] == 18 and report["cameras"]["residual_rms_px"] < 1.5
-    assert 8 < report["surface"]["up_m"]["p99"] - report["surface"]["up_m"]["median"] < 20  # the trees
+    assert (
+        8 < report["surface"]["up_m"]["p99"] - report["surface"]["up_m"]["median"] < 20
+    )  # the trees
 
 
-def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(with_heights: Path) -> None:
+def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(
+    with_heights: Path,
+) -> None:
     """The later flight's heights: those of the first, a heap of 0.8 m on them, the whole 0.3 m higher."""
     folder = next(with_heights.glob("flights/*/heights.json")).parent
     other = folder.with_name("other")
@@ -265,8 +342,15 @@ def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(wi
             rows, columns = up_m.shape
         with Archive.open(with_heights, write=False) as archive:
             cell_m = json.loads((folder / "heights.json").read_text())["cell_m"]
-            middle = read_field(archive, folder.name, HeightFile.SURFACE).lattice.points_m()[rows // 2, columns // 2]
-        side = np.hypot(*np.mgrid[-(rows // 2):rows - rows // 2, -(columns // 2):columns - columns // 2]) * cell_m
+            middle = read_field(archive, folder.name, HeightFile.SURFACE).lattice.points_m()[
+                rows // 2, columns // 2
+            ]
+        side = (
+            np.hypot(
+                *np.mgrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]
+            )
+            * cell_m
+        )
         with rasterio.open(other / "heights.tif", "w", **profile) as later:
             later.write(np.stack([up_m + 0.3 + 0.8 * (side < 3.0), sigma_m]))
         (other / "heights.json").write_text((folder / "heights.json").read_text())
@@ -275,8 +359,14 @@ def test_a_changed_area_has_its_height_change_where_both_flights_have_heights(wi
         area = replace(fake_change(1, kind=ChangeKind.AREA), outline_m=heap)
         with Archive.open(with_heights, write=False) as archive:
             beyond = replace(area, id="b-9", outline_m=heap + 1000)
-            (risen, thing, unseen), (notice,) = with_height_changes(archive, "other", [area, fake_change(2), beyond])
-            assert unseen.height_change is None and notice.count == 1 and "1 of 2 changed areas" in notice.text
+            (risen, thing, unseen), (notice,) = with_height_changes(
+                archive, "other", [area, fake_change(2), beyond]
+            )
+            assert (
+                unseen.height_change is None
+                and notice.count == 1
+                and "1 of 2 changed areas" in notice.text
+            )
             assert thing.height_change is None and risen.height_change is not None
             assert abs(risen.height_change.rise_m - 0.8) < 2 * risen.height_change.sigma_m
             assert risen.height_change.rise_m == pytest.approx(0.8, abs=0.1)

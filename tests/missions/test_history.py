@@ -36,21 +36,45 @@ def site(tmp_path: Path) -> Path:
 
 def test_versions_are_listed_with_what_each_cost_and_found(site: Path) -> None:
     first, second = site_history(site)
-    assert (first.version, first.flight, first.kind, first.over, first.tiles) == (1, "a", "map", 0, 2)
+    assert (first.version, first.flight, first.kind, first.over, first.tiles) == (
+        1,
+        "a",
+        "map",
+        0,
+        2,
+    )
     assert (first.tiles_changed, first.changes) == (2, {})
-    assert (second.version, second.flight, second.kind, second.over, second.tiles) == (2, "b", "compare", 1, 2)
+    assert (second.version, second.flight, second.kind, second.over, second.tiles) == (
+        2,
+        "b",
+        "compare",
+        1,
+        2,
+    )
     assert (second.tiles_changed, second.tiles_removed) == (1, 0)
     assert first.bytes_changed == len(png_from_rgba(tile(21)))  # two tiles alike are one file
     assert second.bytes_changed == len(png_from_rgba(tile(90)))
-    assert second.changes == {"appeared": 1, "moving": 1} and (second.confirmed, second.rejected) == (1, 0)
+    assert second.changes == {"appeared": 1, "moving": 1} and (
+        second.confirmed,
+        second.rejected,
+    ) == (1, 0)
 
 
 def test_a_version_that_was_made_again_keeps_its_counts(site: Path) -> None:
     with Archive.open(site, write=True) as archive, archive.begin_flight("b", "", {}) as writer:
         writer.commit([frame(0)], {}, {}, "<html></html>", changes=[])
     _, second, third = site_history(site)
-    assert second.is_replaced and second.changes == {"appeared": 1, "moving": 1} and second.confirmed == 0
-    assert not third.is_replaced and third.changes == {} and third.over == 1 and third.tiles_changed == 0
+    assert (
+        second.is_replaced
+        and second.changes == {"appeared": 1, "moving": 1}
+        and second.confirmed == 0
+    )
+    assert (
+        not third.is_replaced
+        and third.changes == {}
+        and third.over == 1
+        and third.tiles_changed == 0
+    )
 
 
 def test_a_date_means_its_whole_day_and_a_time_its_minute_or_second(site: Path) -> None:
@@ -89,8 +113,15 @@ def test_maps_are_dated_by_their_flights(site: Path) -> None:
 def test_the_map_as_jpeg_is_close_and_smaller(site: Path, tmp_path: Path) -> None:
     export_version(site, None, tmp_path / "exact.tif")
     export_version(site, None, tmp_path / "small.tif", compress="jpeg")
-    with rasterio.open(tmp_path / "exact.tif") as exact, rasterio.open(tmp_path / "small.tif") as small:
-        assert small.compression.name == "jpeg" and small.crs == exact.crs and small.transform == exact.transform
+    with (
+        rasterio.open(tmp_path / "exact.tif") as exact,
+        rasterio.open(tmp_path / "small.tif") as small,
+    ):
+        assert (
+            small.compression.name == "jpeg"
+            and small.crs == exact.crs
+            and small.transform == exact.transform
+        )
         assert np.array_equal(small.dataset_mask() > 0, exact.dataset_mask() > 0)
         seen = exact.read(4) > 0
         assert np.abs(small.read()[:, seen].astype(int) - exact.read([1, 2, 3])[:, seen]).mean() < 4
@@ -103,7 +134,9 @@ def test_a_map_stays_as_compressed_as_its_owner_chose(tmp_path: Path) -> None:
     mosaic, written = tmp_path / "site" / "mosaic.tif", []
     with Archive.open(tmp_path / "site", write=True) as archive:
         archive.create_site(SITE)
-        for number, settings in enumerate(({"compress": "jpeg"}, {"votes": 3}, {"compress": "deflate"}, {})):
+        for number, settings in enumerate(
+            ({"compress": "jpeg"}, {"votes": 3}, {"compress": "deflate"}, {})
+        ):
             with archive.begin_flight(f"f{number}", "", settings) as writer:
                 writer.tiles[0, 0] = tile(20 + number)
                 writer.commit([frame(0)], {}, {}, "<html></html>")
@@ -143,18 +176,28 @@ def test_what_cannot_be_written_is_refused(site: Path, tmp_path: Path) -> None:
 def test_lists_fit_a_terminal_of_eighty_letters(
     site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Archive.open(site, write=True) as archive, archive.begin_flight("flight12", "", {}) as writer:
+    with (
+        Archive.open(site, write=True) as archive,
+        archive.begin_flight("flight12", "", {}) as writer,
+    ):
         changes = [fake_change(3, kind=ChangeKind.DISAPPEARED)]
         writer.commit([frame(0)], {}, {}, "<html></html>", changes=changes)
     monkeypatch.setenv("COLUMNS", "80")
     for command in ("history", "review"):
         assert main([command, str(site)]) == 0
         shown = capsys.readouterr().out
-        for word in ("disappeared", "confirmed", "2023-11-14", "1 moving" if command == "history" else "moving"):
+        for word in (
+            "disappeared",
+            "confirmed",
+            "2023-11-14",
+            "1 moving" if command == "history" else "moving",
+        ):
             assert word in shown, f"{command} cuts {word}"
 
 
-def test_a_site_without_a_map_is_listed_as_such(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_site_without_a_map_is_listed_as_such(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As a flight leaves it that was refused before its first frame."""
     with Archive.open(tmp_path / "site", write=True):
         pass

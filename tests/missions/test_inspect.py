@@ -26,14 +26,21 @@ drone-dji:GimbalYawDegree="{yaw}" drone-dji:GimbalPitchDegree="{pitch}" drone-dj
 
 
 def write_photo(
-    path: Path, north_m: float, east_m: float, second: int, height: str = "+50.0", pitch: str = "-90.0",
-    texture: int = 60, yaw: str = "0",
+    path: Path,
+    north_m: float,
+    east_m: float,
+    second: int,
+    height: str = "+50.0",
+    pitch: str = "-90.0",
+    texture: int = 60,
+    yaw: str = "0",
 ) -> None:
     exif = Image.Exif()
     exif[Base.Model] = "FC300S"
     gps = exif.get_ifd(IFD.GPSInfo)
     for tag, reference, value in (
-        (GPS.GPSLatitude, "N", north_m / M_PER_DEG), (GPS.GPSLongitude, "E", 10 + east_m / 111_320)
+        (GPS.GPSLatitude, "N", north_m / M_PER_DEG),
+        (GPS.GPSLongitude, "E", 10 + east_m / 111_320),
     ):
         degrees = IFDRational(round(value * 10_000_000), 10_000_000)
         gps[tag] = (degrees, IFDRational(0, 1), IFDRational(0, 1))
@@ -53,7 +60,9 @@ def lawnmower(folder: Path, **options: Any) -> Path:
     for strip in range(3):
         along = range(8) if strip % 2 == 0 else range(7, -1, -1)
         for step in along:
-            write_photo(folder / f"{second:03d}.jpg", 1000 + 10 * step, 25 * strip, second, **options)
+            write_photo(
+                folder / f"{second:03d}.jpg", 1000 + 10 * step, 25 * strip, second, **options
+            )
             second += 2
         second += 4
     return folder
@@ -69,11 +78,17 @@ def texts(inspection: Inspection, level: Level) -> str:
 
 
 def write_video(
-    path: Path, metadata: dict[str, str] | None = None, rate: int = 10, step_px: int = 1, grain_px: int = 1
+    path: Path,
+    metadata: dict[str, str] | None = None,
+    rate: int = 10,
+    step_px: int = 1,
+    grain_px: int = 1,
 ) -> Path:
     """Ground of random grains that the camera passes over by `step_px` a frame."""
     wide = 160 + 4 * rate * step_px
-    ground = np.random.default_rng(0).integers(0, 255, (120 // grain_px, wide // grain_px + 1, 3), np.uint8)
+    ground = np.random.default_rng(0).integers(
+        0, 255, (120 // grain_px, wide // grain_px + 1, 3), np.uint8
+    )
     ground = np.kron(ground, np.ones((grain_px, grain_px, 1), np.uint8))
     with av.open(str(path), "w") as container:
         container.metadata.update(metadata or {})
@@ -81,7 +96,7 @@ def write_video(
         stream.width, stream.height, stream.pix_fmt = 160, 90, "yuv420p"
         stream.codec_context.gop_size = rate // 2 or 1  # sample frames are at whole pictures
         for index in range(4 * rate):
-            image = np.ascontiguousarray(ground[:90, index * step_px: index * step_px + 160])
+            image = np.ascontiguousarray(ground[:90, index * step_px : index * step_px + 160])
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
     return path
@@ -130,7 +145,9 @@ def test_a_camera_that_looks_at_the_horizon(tmp_path: Path, pitch: str, level: L
 
 
 def test_a_height_of_zero_and_thin_overlap(tmp_path: Path) -> None:
-    assert "the height is 0.0 m" in texts(one(lawnmower(tmp_path / "zero", height="+0.0")), Level.PROBLEM)
+    assert "the height is 0.0 m" in texts(
+        one(lawnmower(tmp_path / "zero", height="+0.0")), Level.PROBLEM
+    )
     low = one(lawnmower(tmp_path / "low", height="+10.0"))
     assert "consecutive photos overlap by" in texts(low, Level.PROBLEM)
     assert "neighbouring strips overlap by 0 %" in texts(low, Level.WARNING)
@@ -146,7 +163,9 @@ def test_a_video_with_subtitles_is_tied_to_them(tmp_path: Path) -> None:
     write_srt(tmp_path / "a.SRT", 5)
     found = one(video)
     assert found.telemetry.samples == 5 and found.telemetry.rate_hz == 1
-    assert found.telemetry.tie == "by time since the video's start" and found.telemetry.covered_s == 4
+    assert (
+        found.telemetry.tie == "by time since the video's start" and found.telemetry.covered_s == 4
+    )
     assert found.flight.speed_m_s == pytest.approx(10, rel=0.02) and found.flight.height_m == 20
     assert found.frames.codec == "h264" and found.frames.rate_hz == 10
     assert "too few" not in texts(found, Level.PROBLEM)
@@ -155,7 +174,9 @@ def test_a_video_with_subtitles_is_tied_to_them(tmp_path: Path) -> None:
 def test_a_log_without_a_date_is_shown_without_one(tmp_path: Path) -> None:
     video = write_video(tmp_path / "a.mp4", metadata={"creation_time": "2026-05-12T09:00:00Z"})
     rows = [f"{second},{0.5 + second / M_PER_DEG:.7f},10.0,20.0" for second in range(5)]
-    (tmp_path / "a.csv").write_text("offsetTime,latitude,longitude,relativeHeight\n" + "\n".join(rows) + "\n")
+    (tmp_path / "a.csv").write_text(
+        "offsetTime,latitude,longitude,relativeHeight\n" + "\n".join(rows) + "\n"
+    )
     app = Typer()
     app.command()(inspect)
     shown = " ".join(CliRunner().invoke(app, [str(video)]).output.split())
@@ -249,5 +270,11 @@ def test_a_circle_has_no_strips_and_a_hover_no_speed() -> None:
 
 def test_the_real_flight_is_described_as_it_was_flown() -> None:
     flight = one(real_data("flights/brighton_beach")).flight
-    assert flight.height_m == pytest.approx(40.1, abs=0.2) and flight.gsd_m == pytest.approx(0.017, abs=0.001)
-    assert flight.strips == 3 and 0.5 < flight.side_overlap < 0.75 and 0.5 < flight.forward_overlap < 0.75
+    assert flight.height_m == pytest.approx(40.1, abs=0.2) and flight.gsd_m == pytest.approx(
+        0.017, abs=0.001
+    )
+    assert (
+        flight.strips == 3
+        and 0.5 < flight.side_overlap < 0.75
+        and 0.5 < flight.forward_overlap < 0.75
+    )

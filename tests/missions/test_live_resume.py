@@ -57,8 +57,13 @@ def write_film(path: Path, flight: FilmedFlight, count: int, *, metadata: bool) 
     drone = Drone(flight, metadata=metadata, count=count)
     drone.fly()
     Sender(
-        str(path), size=flight.images[0].shape[1::-1], klv=metadata, image=drone._image, klv_of=drone._klv,
-        rate=flight.rate, speed=1000.0,
+        str(path),
+        size=flight.images[0].shape[1::-1],
+        klv=metadata,
+        image=drone._image,
+        klv_of=drone._klv,
+        rate=flight.rate,
+        speed=1000.0,
     ).run()
     path.with_name("film.ts.ended").touch()
 
@@ -66,7 +71,9 @@ def write_film(path: Path, flight: FilmedFlight, count: int, *, metadata: bool) 
 def test_a_disk_that_fills_while_the_flight_goes_on_is_announced_once(
     followed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 9 * 10**8, 6 * 10**7))  # type: ignore[attr-defined]
+    monkeypatch.setattr(
+        shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 9 * 10**8, 6 * 10**7)
+    )  # type: ignore[attr-defined]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         assert len(mapped(f"follow:{followed}", tmp_path / "site", _FILE)) > 3
@@ -75,7 +82,11 @@ def test_a_disk_that_fills_while_the_flight_goes_on_is_announced_once(
 
 
 def mapped(
-    source: str, site: Path, live: LiveSettings, killed_at: int = 0, fly: Callable[[], None] = lambda: None,
+    source: str,
+    site: Path,
+    live: LiveSettings,
+    killed_at: int = 0,
+    fly: Callable[[], None] = lambda: None,
     **kwargs: Any,
 ) -> list[MosaicUpdate]:
     """Map a live source; after so many frames the site is copied as a kill leaves it, and the run is over.
@@ -102,7 +113,9 @@ def mapped(
 
 
 def reports(site: Path) -> list[dict[str, Any]]:
-    return [json.loads(each.read_text()) for each in sorted((site / "flights").glob("*/report.json"))]
+    return [
+        json.loads(each.read_text()) for each in sorted((site / "flights").glob("*/report.json"))
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -129,25 +142,42 @@ def test_a_followed_file_goes_on(
     assert [each.is_resumed for each in resumed] == [number < 5 for number in range(len(whole[1]))]
     before, after = (corners_deg(each) for each in (whole[0], site))
     assert list(before) == list(after)
-    for name, corners in before.items():  # what telemetry had sent when a frame came moves it by a millimetre
+    for (
+        name,
+        corners,
+    ) in before.items():  # what telemetry had sent when a frame came moves it by a millimetre
         np.testing.assert_allclose(after[name], corners, rtol=0, atol=2e-7)
     (report,) = reports(site)
-    assert report["georeferenced"] and "segments" not in [each["code"] for each in report["notices"]]
+    assert report["georeferenced"] and "segments" not in [
+        each["code"] for each in report["notices"]
+    ]
 
 
 def test_a_stream_that_returns_is_a_second_segment(flight: FilmedFlight, tmp_path: Path) -> None:
     site, drone = tmp_path / "site", Drone(flight, metadata=True)
     with drone.sent():
-        mapped(drone.address, site, _LIVE, killed_at=4, fly=drone.fly, camera=flight.camera, until=drone.landed)
+        mapped(
+            drone.address,
+            site,
+            _LIVE,
+            killed_at=4,
+            fly=drone.fly,
+            camera=flight.camera,
+            until=drone.landed,
+        )
     back = Drone(flight, metadata=True, first=38, later_s=40)
     back.port = drone.port
     with back.sent():
-        updates = mapped(back.address, site, _LIVE, fly=back.fly, camera=flight.camera, until=back.landed)
+        updates = mapped(
+            back.address, site, _LIVE, fly=back.fly, camera=flight.camera, until=back.landed
+        )
     assert sum(each.is_resumed for each in updates) == 4 and not updates[-1].is_resumed
     (report,) = reports(site)
     (segments,) = [each for each in report["notices"] if each["code"] == "segments"]
     assert segments["count"] == 2 and "read in 2 segments" in segments["text"]
-    frames = json.loads((site / "flights" / report["flight"] / "frames.geojson").read_text())["features"]
+    frames = json.loads((site / "flights" / report["flight"] / "frames.geojson").read_text())[
+        "features"
+    ]
     times = [each["properties"]["time"] for each in frames]
     assert len(frames) == len(updates) and times == sorted(times)
     assert report["frames"]["vision"] > 4 and report["georeferenced"]
@@ -156,17 +186,24 @@ def test_a_stream_that_returns_is_a_second_segment(flight: FilmedFlight, tmp_pat
 
 
 def test_a_comparison_of_a_stream_goes_on(
-    flight: FilmedFlight, followed: Path, whole: tuple[Path, list[MosaicUpdate]], tmp_path: Path,
+    flight: FilmedFlight,
+    followed: Path,
+    whole: tuple[Path, list[MosaicUpdate]],
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     site, later = Path(shutil.copytree(whole[0], tmp_path / "site")), tmp_path / "later.ts"
     shutil.copy(followed, later)
     later.with_name("later.ts.ended").touch()
-    monkeypatch.setattr(LiveStream, "is_reread", False)  # as a stream, whose frames nobody can read again
+    monkeypatch.setattr(
+        LiveStream, "is_reread", False
+    )  # as a stream, whose frames nobody can read again
 
     def compared() -> Generator[CompareUpdate]:
         settings = CompareSettings(views_per_second=3.0, model="none")
-        return compare_flights([f"follow:{later}"], site, settings, camera=flight.camera, live=_FILE)
+        return compare_flights(
+            [f"follow:{later}"], site, settings, camera=flight.camera, live=_FILE
+        )
 
     comparing = compared()
     before = [each for _, each in zip(range(6), comparing)]
@@ -176,7 +213,9 @@ def test_a_comparison_of_a_stream_goes_on(
     shutil.move(tmp_path / "amid", site)
     updates = list(compared())
     count = sum(each.is_resumed for each in updates)
-    assert count >= 6 and [each.is_resumed for each in updates] == [number < count for number in range(len(updates))]
+    assert count >= 6 and [each.is_resumed for each in updates] == [
+        number < count for number in range(len(updates))
+    ]
     assert [each.frame_name for each in updates[:6]] == [each.frame_name for each in before]
     times = [each.time_ns for each in updates]
     assert len(updates) > count + 5 and times == sorted(set(times))
@@ -191,14 +230,23 @@ class Following(TruthDetector):
     def detect(self, image: ImageRGB, **kwargs: Any) -> Detections:
         """As `ObjectDetector.detect`."""
         self.asked += kwargs.get("tiles") is not None
-        return no_detections(self.classes) if kwargs.get("tiles") is None else Detections(
-            np.array([[100, 60, 150, 100]]), np.array([0.9]), np.array([1]), self.classes
+        return (
+            no_detections(self.classes)
+            if kwargs.get("tiles") is None
+            else Detections(
+                np.array([[100, 60, 150, 100]]), np.array([0.9]), np.array([1]), self.classes
+            )
         )
 
 
 @pytest.mark.parametrize("metadata", [True, False])
 def test_a_watch_of_a_growing_file_goes_on(
-    flight: FilmedFlight, filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, metadata: bool
+    flight: FilmedFlight,
+    filmed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    metadata: bool,
 ) -> None:
     monkeypatch.setattr(LiveStream, "is_reread", False)  # as where the newest frame wins
     path, folder, alerts = tmp_path / "film.ts", tmp_path / "watch", tmp_path / "sent"
@@ -209,12 +257,16 @@ def test_a_watch_of_a_growing_file_goes_on(
     settings = WatchSettings(every=1)
 
     def watched() -> Generator[WatchUpdate]:
-        return watch(f"follow:{path}", settings, outputs, camera=flight.camera, detector=detector, live=_FILE)
+        return watch(
+            f"follow:{path}", settings, outputs, camera=flight.camera, detector=detector, live=_FILE
+        )
 
     watching = watched()
     before = [each for _, each in zip(range(12), watching)]
     sent = sum(len(each.new) for each in before)
-    wait_for(lambda: (folder / "run.journal").read_bytes().count(b'"receiver"') == sent >= 1)  # noted once it is sent
+    wait_for(
+        lambda: (folder / "run.journal").read_bytes().count(b'"receiver"') == sent >= 1
+    )  # noted once it is sent
     copy_as_killed(folder, tmp_path / "amid")
     watching.close()
     shutil.rmtree(folder)
@@ -229,7 +281,9 @@ def test_a_watch_of_a_growing_file_goes_on(
     times = [each.time_ns for each in updates]
     assert times == sorted(set(times))
     found = [track.id for each in updates for track in each.new]
-    assert found == sorted(set(found)) and sorted(alerts.read_text().split(), key=int) == [str(each) for each in found]
+    assert found == sorted(set(found)) and sorted(alerts.read_text().split(), key=int) == [
+        str(each) for each in found
+    ]
     lines = [json.loads(each) for each in (folder / "detections.jsonl").read_text().splitlines()]
     assert len(lines) == len(updates) and report["frames"]["detected"] == len(updates)
     assert {each["code"]: each["count"] for each in report["notices"]}["segments"] == 2
@@ -240,16 +294,29 @@ def test_a_watch_of_a_growing_file_goes_on(
 
 
 def test_a_stream_that_returns_late_is_another_flight(flight: FilmedFlight, tmp_path: Path) -> None:
-    (model,) = (each.camera for each in open_sources([flight.truth.parent / "flight1" / "flight1.mp4"]))
+    (model,) = (
+        each.camera for each in open_sources([flight.truth.parent / "flight1" / "flight1.mp4"])
+    )
     begun = SimpleNamespace(
-        name="drone", fingerprint="f", start_ns=0, start_origin="the clock", camera=model, gaps_s=(), is_reread=True,
+        name="drone",
+        fingerprint="f",
+        start_ns=0,
+        start_origin="the clock",
+        camera=model,
+        gaps_s=(),
+        is_reread=True,
     )
     journal = RunJournal(tmp_path / "run.journal", "key", 0)
     SourceNotes(journal, begun, 0).keep()  # type: ignore[arg-type]
     assert flight_so_far(RunJournal(tmp_path / "run.journal", "key", 0)) is None  # no frame yet
     journal.append(Entry("step", {"index": 7, "name": "7", "time_ns": 50 * 10**9}))
     late = SimpleNamespace(name="new", start_ns=1_000 * 10**9, is_stream=True)
-    with pytest.warns(SorvoloWarning, match="was stopped 950 s ago, more than 900 s: the stream is another flight now"):
+    with pytest.warns(
+        SorvoloWarning,
+        match="was stopped 950 s ago, more than 900 s: the stream is another flight now",
+    ):
         assert go_on(late, RunJournal(tmp_path / "run.journal", "key", 0), 900.0) is None  # type: ignore[arg-type]
-    journal.append(Entry("telemetry", {}, {"times_ns": np.zeros(2, np.int64), "samples": np.zeros(3)}))
+    journal.append(
+        Entry("telemetry", {}, {"times_ns": np.zeros(2, np.int64), "samples": np.zeros(3)})
+    )
     assert flight_so_far(RunJournal(tmp_path / "run.journal", "key", 0)) is None  # damaged

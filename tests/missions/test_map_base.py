@@ -23,9 +23,23 @@ def base(photographed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     site = tmp_path_factory.mktemp("base") / "site"
     photos = str(photographed / "flight1" / "photos")
     camera = str(photographed / "camera.xml")
-    assert cli.main([
-        "map", photos, "--site", str(site), "--model", "none", "--camera", camera, "--crs", "EPSG:3857",
-    ]) == 0
+    assert (
+        cli.main(
+            [
+                "map",
+                photos,
+                "--site",
+                str(site),
+                "--model",
+                "none",
+                "--camera",
+                camera,
+                "--crs",
+                "EPSG:3857",
+            ]
+        )
+        == 0
+    )
     return site
 
 
@@ -47,9 +61,20 @@ def copied(photographed: Path, folder: Path, shift_m: float | None) -> Path:
 
 def run(photos: Path, site: Path, photographed: Path, base: Path) -> int:
     camera = str(photographed / "camera.xml")
-    return cli.main([
-        "map", str(photos), "--site", str(site), "--model", "none", "--camera", camera, "--base", str(base),
-    ])
+    return cli.main(
+        [
+            "map",
+            str(photos),
+            "--site",
+            str(site),
+            "--model",
+            "none",
+            "--camera",
+            camera,
+            "--base",
+            str(base),
+        ]
+    )
 
 
 def report_of(site: Path) -> dict[str, Any]:
@@ -63,7 +88,10 @@ def absolute_m(site: Path, photographed: Path) -> float:
     found = json.loads(next(site.glob("flights/*/frames.geojson")).read_text())
     misses = []
     for each in found["features"]:
-        pair = [np.array(one["geometry"]["coordinates"][0])[:4] for one in (each, true[each["properties"]["frame"]])]
+        pair = [
+            np.array(one["geometry"]["coordinates"][0])[:4]
+            for one in (each, true[each["properties"]["frame"]])
+        ]
         a, b = (frame.ground_from_lonlat(ring) for ring in pair)
         misses.append(a - b)
     return float(np.sqrt((np.concatenate(misses) ** 2).sum(axis=1).mean()))
@@ -98,27 +126,51 @@ def write_map(path: Path, place: Path, m_per_px: float, shift_m: float, seed: in
     with rasterio.open(place) as source:
         step = m_per_px / source.transform.a
         height, width = int(source.height / step), int(source.width / step)
-        rgb = source.read([1, 2, 3], out_shape=(3, height, width), resampling=rasterio.enums.Resampling.average)
-        transform = Affine(m_per_px, 0, source.transform.c + shift_m, 0, -m_per_px, source.transform.f)
+        rgb = source.read(
+            [1, 2, 3], out_shape=(3, height, width), resampling=rasterio.enums.Resampling.average
+        )
+        transform = Affine(
+            m_per_px, 0, source.transform.c + shift_m, 0, -m_per_px, source.transform.f
+        )
         if seed is not None:
             left, top = max(0, width - 80) // 2, max(0, height - 80) // 2
             transform = transform @ Affine.translation(left, top)
-            height, width = min(height, 80), min(width, 80)  # large enough to be searched at several scales
+            height, width = (
+                min(height, 80),
+                min(width, 80),
+            )  # large enough to be searched at several scales
             rgb = np.random.default_rng(seed).integers(0, 255, (3, height, width), np.uint8)
-        profile = {"driver": "GTiff", "count": 3, "dtype": "uint8", "width": width, "height": height}
+        profile = {
+            "driver": "GTiff",
+            "count": 3,
+            "dtype": "uint8",
+            "width": width,
+            "height": height,
+        }
         with rasterio.open(path, "w", crs=source.crs, transform=transform, **profile) as sink:
             sink.write(rgb)
     return path
 
 
 @pytest.mark.parametrize("has_gps", [True, False], ids=["GPS", "no GPS"])
-@pytest.mark.parametrize("m_per_px, shift_m, seed, words", [
-    (0.1, 5000.0, None, "give a map of its ground"), (0.4, 0.0, 5, "found on the base map"),
-    (0.9, 0.0, None, "8 times coarser at most"),
-])
+@pytest.mark.parametrize(
+    "m_per_px, shift_m, seed, words",
+    [
+        (0.1, 5000.0, None, "give a map of its ground"),
+        (0.4, 0.0, 5, "found on the base map"),
+        (0.9, 0.0, None, "8 times coarser at most"),
+    ],
+)
 def test_a_base_map_of_another_place_or_far_too_coarse_is_refused(
-    photographed: Path, base: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], has_gps: bool, m_per_px: float,
-    shift_m: float, seed: int | None, words: str,
+    photographed: Path,
+    base: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    has_gps: bool,
+    m_per_px: float,
+    shift_m: float,
+    seed: int | None,
+    words: str,
 ) -> None:
     if not has_gps and shift_m:
         pytest.skip("without GPS a moved map cannot be known to be moved")
@@ -128,7 +180,9 @@ def test_a_base_map_of_another_place_or_far_too_coarse_is_refused(
     given = write_map(tmp_path / "base.tif", base / "mosaic.tif", m_per_px, shift_m, seed)
     assert run(photos, tmp_path / "site", photographed, given) == 1
     error = capsys.readouterr().err
-    assert error.count("error:") == 1 and (words in error or (not has_gps and "not found on the base map" in error))
+    assert error.count("error:") == 1 and (
+        words in error or (not has_gps and "not found on the base map" in error)
+    )
     assert not (tmp_path / "site" / "mosaic.tif").exists()
 
 

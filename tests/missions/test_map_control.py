@@ -41,13 +41,19 @@ class Surveyed:
     marks: tuple[Mark, ...]
     frames: dict[str, Any]
 
-    def write(self, path: Path, crs: str = _UTM, change: Callable[[Mark], Mark] = lambda each: each) -> Path:
+    def write(
+        self, path: Path, crs: str = _UTM, change: Callable[[Mark], Mark] = lambda each: each
+    ) -> Path:
         transformer = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
         lines = [crs]
         for mark in map(change, self.marks):
-            latitude, longitude, height = (float(each[0]) for each in self.frame.wgs84_from_site(mark.place_m[None]))
+            latitude, longitude, height = (
+                float(each[0]) for each in self.frame.wgs84_from_site(mark.place_m[None])
+            )
             x, y = transformer.transform(longitude, latitude)
-            lines.append(f"{x:.9f} {y:.9f} {height:.3f} {mark.x_px:.2f} {mark.y_px:.2f} {mark.photo} {mark.label}")
+            lines.append(
+                f"{x:.9f} {y:.9f} {height:.3f} {mark.x_px:.2f} {mark.y_px:.2f} {mark.photo} {mark.label}"
+            )
         path.write_text("\n".join(lines) + "\n")
         return path
 
@@ -63,12 +69,16 @@ def surveyed(photographed: Path) -> Surveyed:
     places = [(x, y) for x in (-14.0, -4.0, 6.0, 16.0) for y in (-7.0, 6.0)]
     names = [f"{'CP' if number in (2, 5) else 'G'}{number}" for number in range(len(places))]
     on_ground = {name: np.array([x, y, 0.0]) for name, (x, y) in zip(names, places, strict=True)}
-    made = Surveyed(photos, photographed / "camera.xml", frame, marks_of(on_ground, camera, truth), truth)
+    made = Surveyed(
+        photos, photographed / "camera.xml", frame, marks_of(on_ground, camera, truth), truth
+    )
     assert len({each.label for each in made.marks}) >= 7
     return made
 
 
-def marks_of(places_m: dict[str, np.ndarray], camera: Camera, truth: dict[str, Any]) -> tuple[Mark, ...]:
+def marks_of(
+    places_m: dict[str, np.ndarray], camera: Camera, truth: dict[str, Any]
+) -> tuple[Mark, ...]:
     """Where photos show these places, right to a tenth of a pixel."""
     frame, rng = LocalFrame(Geodetic(**truth["site"])), np.random.default_rng(4)
     marks = []
@@ -83,7 +93,10 @@ def marks_of(places_m: dict[str, np.ndarray], camera: Camera, truth: dict[str, A
 
 def _pose(known: dict[str, Any], frame: LocalFrame) -> Pose:
     place = frame.site_from_wgs84(
-        *(np.array([known[name]]) for name in ("camera_latitude_deg", "camera_longitude_deg", "camera_height_m"))
+        *(
+            np.array([known[name]])
+            for name in ("camera_latitude_deg", "camera_longitude_deg", "camera_height_m")
+        )
     )[0]
     return Pose(np.array(known["rotation"]).reshape(3, 3), place)
 
@@ -103,10 +116,21 @@ def blind(surveyed: Surveyed, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(site: Path, photos: Path, surveyed: Surveyed, gcp: Path, *more: str) -> int:
-    return cli.main([
-        "map", str(photos), "--site", str(site), "--model", "none", "--camera", str(surveyed.camera), "--gcp", str(gcp),
-        *more,
-    ])
+    return cli.main(
+        [
+            "map",
+            str(photos),
+            "--site",
+            str(site),
+            "--model",
+            "none",
+            "--camera",
+            str(surveyed.camera),
+            "--gcp",
+            str(gcp),
+            *more,
+        ]
+    )
 
 
 def control_of(site: Path) -> dict[str, Any]:
@@ -118,7 +142,10 @@ def absolute_m(site: Path, surveyed: Surveyed) -> float:
     true = {each["properties"]["frame"]: each for each in surveyed.frames["features"]}
     misses = []
     for each in found["features"]:
-        pair = [np.array(one["geometry"]["coordinates"][0])[:4] for one in (each, true[each["properties"]["frame"]])]
+        pair = [
+            np.array(one["geometry"]["coordinates"][0])[:4]
+            for one in (each, true[each["properties"]["frame"]])
+        ]
         a, b = (surveyed.frame.ground_from_lonlat(ring) for ring in pair)
         misses.append(a - b)
     return float(np.sqrt((np.concatenate(misses) ** 2).sum(axis=1).mean()))
@@ -131,10 +158,14 @@ def test_control_alone_places_photos_without_gps(
     assert run(tmp_path / "site", blind, surveyed, gcp, "--check", "CP*") == 0
     control = control_of(tmp_path / "site")
     roles = {each["label"]: each["role"] for each in control["points"]}
-    assert all(role == ("check" if label.startswith("CP") else "control") for label, role in roles.items())
+    assert all(
+        role == ("check" if label.startswith("CP") else "control") for label, role in roles.items()
+    )
     assert control["check_rms_m"] < 0.05 and control["control_rms_m"] < 0.05
     assert absolute_m(tmp_path / "site", surveyed) < 0.1
-    assert re.search(r"flight height .* \d+ m above the ground, by the control points", capsys.readouterr().out)
+    assert re.search(
+        r"flight height .* \d+ m above the ground, by the control points", capsys.readouterr().out
+    )
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
     assert report["georeferenced"] and report["headline"]["quality"] == "map"
     listed = json.loads(next((tmp_path / "site").glob("flights/*/control.geojson")).read_text())
@@ -144,7 +175,9 @@ def test_control_alone_places_photos_without_gps(
 
 def test_control_outweighs_fixes_that_lie_beside(surveyed: Surveyed, tmp_path: Path) -> None:
     def shifted(mark: Mark) -> Mark:
-        return Mark(mark.label, mark.place_m + np.array([7.0, -4.0, 0.0]), mark.x_px, mark.y_px, mark.photo)
+        return Mark(
+            mark.label, mark.place_m + np.array([7.0, -4.0, 0.0]), mark.x_px, mark.y_px, mark.photo
+        )
 
     gcp = surveyed.write(tmp_path / "gcp_list.txt", change=shifted)
     assert run(tmp_path / "site", surveyed.photos, surveyed, gcp, "--check", "CP2,CP5") == 0
@@ -155,7 +188,11 @@ def test_control_outweighs_fixes_that_lie_beside(surveyed: Surveyed, tmp_path: P
 
 @pytest.mark.parametrize("has_gps", [True, False], ids=["GPS", "no GPS"])
 def test_a_point_that_contradicts_the_others_is_named_and_left_out(
-    surveyed: Surveyed, blind: Path, tmp_path: Path, has_gps: bool, capsys: pytest.CaptureFixture[str]
+    surveyed: Surveyed,
+    blind: Path,
+    tmp_path: Path,
+    has_gps: bool,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     def wrong(mark: Mark) -> Mark:
         off = np.array([3.0, 0.0, 0.0]) * (mark.label == "G3")
@@ -166,7 +203,9 @@ def test_a_point_that_contradicts_the_others_is_named_and_left_out(
     control = control_of(tmp_path / "site")
     assert control["excluded"] == ["G3"]
     (row,) = (each for each in control["points"] if each["label"] == "G3")
-    assert row["east_m"] == pytest.approx(-3.0, abs=0.15) and row["north_m"] == pytest.approx(0.0, abs=0.15)
+    assert row["east_m"] == pytest.approx(-3.0, abs=0.15) and row["north_m"] == pytest.approx(
+        0.0, abs=0.15
+    )
     assert control["control_rms_m"] < 0.05 and "G3" in capsys.readouterr().out
 
 
@@ -177,7 +216,9 @@ def test_two_points_whose_places_are_exchanged_are_named_and_left_out(
     other = {"G0": "G6", "G6": "G0"}
 
     def swapped(mark: Mark) -> Mark:
-        return Mark(mark.label, place_m[other.get(mark.label, mark.label)], mark.x_px, mark.y_px, mark.photo)
+        return Mark(
+            mark.label, place_m[other.get(mark.label, mark.label)], mark.x_px, mark.y_px, mark.photo
+        )
 
     gcp = surveyed.write(tmp_path / "gcp_list.txt", change=swapped)
     assert run(tmp_path / "site", surveyed.photos, surveyed, gcp) == 0
@@ -191,19 +232,31 @@ def test_heights_of_points_in_feet_are_named(surveyed: Surveyed, tmp_path: Path)
     """Points on roofs and poles: heights in metres fit, in feet they do not, and the report states which was meant."""
     with Image.open(next(surveyed.photos.iterdir())) as first:
         camera = camera_from_option(str(surveyed.camera), *first.size).camera
-    up_m = dict(zip(sorted({each.label for each in surveyed.marks}), (0.0, 2.5, 0.5, 3.0, 1.0, 4.0, 0.0, 1.5)))
-    places_m = {each.label: np.array([*each.place_m[:2], up_m[each.label]]) for each in surveyed.marks}
+    up_m = dict(
+        zip(
+            sorted({each.label for each in surveyed.marks}),
+            (0.0, 2.5, 0.5, 3.0, 1.0, 4.0, 0.0, 1.5),
+        )
+    )
+    places_m = {
+        each.label: np.array([*each.place_m[:2], up_m[each.label]]) for each in surveyed.marks
+    }
     raised = replace(surveyed, marks=marks_of(places_m, camera, surveyed.frames))
 
     def in_feet(mark: Mark) -> Mark:
         return replace(mark, place_m=mark.place_m / (1.0, 1.0, 0.3048))
 
-    for name, change, words in (("metres", lambda mark: mark, ""), ("feet", in_feet, "fit far better as feet")):
+    for name, change, words in (
+        ("metres", lambda mark: mark, ""),
+        ("feet", in_feet, "fit far better as feet"),
+    ):
         gcp = raised.write(tmp_path / f"{name}.txt", change=change)
         assert run(tmp_path / name, raised.photos, raised, gcp) == 0
         report = json.loads(next((tmp_path / name).glob("flights/*/report.json")).read_text())
         missed = [each for each in report["warnings"] if "the control points miss the map" in each]
-        assert len(missed) == bool(words) and all(words in each for each in missed), report["warnings"]
+        assert len(missed) == bool(words) and all(words in each for each in missed), report[
+            "warnings"
+        ]
         rms_m = report["control"]["control_rms_m"]
         assert report["sigma_m"] > 0.5 * rms_m, "what the points show is in the stated accuracy"
 
@@ -218,24 +271,45 @@ def exchanged(text: str, first: int, second: int) -> str:
 
 
 @pytest.mark.parametrize("has_gps", [True, False], ids=["GPS", "no GPS"])
-@pytest.mark.parametrize("crs, change, words", [
-    ("EPSG:4326", lambda text: exchanged(text, 0, 1), "x and y are exchanged"),
-    (_UTM, lambda text: exchanged(text, 0, 1), "x and y are exchanged"),
-    (_UTM, lambda text: text.replace(_UTM, "EPSG:32632"), "UTM zone 33N"),
-    (_UTM, lambda text: "\n".join(re.findall(".*(?:33|G0|G1)$", text, re.M)), "2 control points are marked"),
-    (_UTM, lambda text: text.replace(".jpg", "_of_another_day.jpg"), "none of its pictures"),
-    (_UTM, lambda text: text.replace(_UTM, "Gauss"), "no CRS"),
-    (_UTM, lambda text: text.replace(_UTM, "+proj=pipeline +nadgrids=@/etc/passwd"), "nadgrids"),
-    (_UTM, lambda text: text.replace(" G0", " G0\nhalf a line"), "columns"),
-    (_UTM, lambda text: exchanged(text, 3, 4), "px and py"),
-    ("EPSG:4326", lambda text: text.replace("EPSG:4326", _UTM), "x and y are degrees (longitude, latitude)"),
-    (_UTM, lambda text: text.replace(_UTM, "EPSG:4326"), "for metres name their CRS, as"),
-    ("EPSG:3857", lambda text: text.replace("EPSG:3857", _UTM), "web maps (EPSG:3857)"),
-    ("+proj=utm +zone=33 +units=ft", lambda text: text.replace(" +units=ft", ""), "in feet"),
-])
+@pytest.mark.parametrize(
+    "crs, change, words",
+    [
+        ("EPSG:4326", lambda text: exchanged(text, 0, 1), "x and y are exchanged"),
+        (_UTM, lambda text: exchanged(text, 0, 1), "x and y are exchanged"),
+        (_UTM, lambda text: text.replace(_UTM, "EPSG:32632"), "UTM zone 33N"),
+        (
+            _UTM,
+            lambda text: "\n".join(re.findall(".*(?:33|G0|G1)$", text, re.M)),
+            "2 control points are marked",
+        ),
+        (_UTM, lambda text: text.replace(".jpg", "_of_another_day.jpg"), "none of its pictures"),
+        (_UTM, lambda text: text.replace(_UTM, "Gauss"), "no CRS"),
+        (
+            _UTM,
+            lambda text: text.replace(_UTM, "+proj=pipeline +nadgrids=@/etc/passwd"),
+            "nadgrids",
+        ),
+        (_UTM, lambda text: text.replace(" G0", " G0\nhalf a line"), "columns"),
+        (_UTM, lambda text: exchanged(text, 3, 4), "px and py"),
+        (
+            "EPSG:4326",
+            lambda text: text.replace("EPSG:4326", _UTM),
+            "x and y are degrees (longitude, latitude)",
+        ),
+        (_UTM, lambda text: text.replace(_UTM, "EPSG:4326"), "for metres name their CRS, as"),
+        ("EPSG:3857", lambda text: text.replace("EPSG:3857", _UTM), "web maps (EPSG:3857)"),
+        ("+proj=utm +zone=33 +units=ft", lambda text: text.replace(" +units=ft", ""), "in feet"),
+    ],
+)
 def test_a_wrong_file_ends_in_one_clear_error(
-    surveyed: Surveyed, blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], has_gps: bool, crs: str,
-    change: Callable[[str], str], words: str,
+    surveyed: Surveyed,
+    blind: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    has_gps: bool,
+    crs: str,
+    change: Callable[[str], str],
+    words: str,
 ) -> None:
     if words in ("UTM zone 33N", "web maps (EPSG:3857)", "in feet") and not has_gps:
         pytest.skip("nothing shows a wrong zone or scale where there is no GPS")
@@ -247,12 +321,21 @@ def test_a_wrong_file_ends_in_one_clear_error(
     assert not (tmp_path / "site" / "mosaic.tif").exists()
 
 
-@pytest.mark.parametrize("more, words", [
-    (["--check", "X9"], "no such control point"), (["--check", "G*,CP2"], "at least 3"),
-    (["--method", "thesis"], "method planar only"), (["--gcp-accuracy", "0"], "--gcp-accuracy"),
-])
+@pytest.mark.parametrize(
+    "more, words",
+    [
+        (["--check", "X9"], "no such control point"),
+        (["--check", "G*,CP2"], "at least 3"),
+        (["--method", "thesis"], "method planar only"),
+        (["--gcp-accuracy", "0"], "--gcp-accuracy"),
+    ],
+)
 def test_options_that_cannot_be_are_refused(
-    surveyed: Surveyed, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: list[str], words: str
+    surveyed: Surveyed,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    more: list[str],
+    words: str,
 ) -> None:
     gcp = surveyed.write(tmp_path / "gcp_list.txt")
     assert run(tmp_path / "site", surveyed.photos, surveyed, gcp, *more) == 1

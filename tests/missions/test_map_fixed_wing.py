@@ -24,13 +24,19 @@ def report_of(site: Path) -> dict[str, Any]:
 def test_a_small_survey_is_mapped_whole_and_in_one_piece(tmp_path: Path) -> None:
     wing = preset("fixed-wing")
     small = replace(
-        wing, seed=7, scene=replace(wing.scene, people=0, cars=0, small_objects=0),
-        path=replace(wing.path, length_m=110, strips=2), imaging=replace(wing.imaging, width_px=400, height_px=300),
+        wing,
+        seed=7,
+        scene=replace(wing.scene, people=0, cars=0, small_objects=0),
+        path=replace(wing.path, length_m=110, strips=2),
+        imaging=replace(wing.imaging, width_px=400, height_px=300),
     )
     simulate_into(tmp_path / "flown", small)
     photos = tmp_path / "flown" / "flight1" / "photos"
     site, camera = tmp_path / "site", str(tmp_path / "flown" / "camera.xml")
-    assert cli.main(["map", str(photos), "--site", str(site), "--model", "none", "--camera", camera]) == 0
+    assert (
+        cli.main(["map", str(photos), "--site", str(site), "--model", "none", "--camera", camera])
+        == 0
+    )
     report = report_of(site)
     assert report["frames"]["vision"] == report["frames"]["selected"] >= 9
     assert [each["frames"] for each in report["pieces"]] == [report["frames"]["selected"]]
@@ -39,7 +45,9 @@ def test_a_small_survey_is_mapped_whole_and_in_one_piece(tmp_path: Path) -> None
 
 
 def test_wind_makes_a_wing_faster_downwind_and_turns_its_nose_and_turns_bank_it() -> None:
-    path = PathSettings(height_m=65, speed_m_s=13, length_m=300, strips=2, strip_spacing_m=40, heading_deg=90)
+    path = PathSettings(
+        height_m=65, speed_m_s=13, length_m=300, strips=2, strip_spacing_m=40, heading_deg=90
+    )
     calm = MotionSettings(0, 0, 0, 0, is_fixed_wing=True)
     windy = replace(calm, wind_m_s=5.0, wind_from_deg=270.0)  # along the first strip
     across = replace(calm, wind_m_s=5.0, wind_from_deg=0.0)
@@ -53,7 +61,9 @@ def test_wind_makes_a_wing_faster_downwind_and_turns_its_nose_and_turns_bank_it(
     assert flown(calm) == pytest.approx((13.0, 90.0), abs=0.1)
     assert flown(windy) == pytest.approx((18.0, 90.0), abs=0.1)
     speed, heading = flown(across)
-    assert speed == pytest.approx(12.0, abs=0.1) and heading == pytest.approx(90 - np.degrees(np.arcsin(5 / 13)), abs=1)
+    assert speed == pytest.approx(12.0, abs=0.1) and heading == pytest.approx(
+        90 - np.degrees(np.arcsin(5 / 13)), abs=1
+    )
 
     whole = fly(path, calm, np.random.default_rng(1))
     banks = [abs(float(whole.bank(each))) for each in np.linspace(0, whole.duration_s, 200)]
@@ -69,9 +79,17 @@ def test_wind_makes_a_wing_faster_downwind_and_turns_its_nose_and_turns_bank_it(
 @pytest.mark.long
 def test_a_real_survey_is_one_map_within_what_its_receiver_errs(tmp_path: Path) -> None:
     photos = real_data("flights/fixed_wing")
-    coarse = ["--gsd", "0.4", "--model", "none"]  # how finely it is painted has nothing to do with where it lies
+    coarse = [
+        "--gsd",
+        "0.4",
+        "--model",
+        "none",
+    ]  # how finely it is painted has nothing to do with where it lies
     assert cli.main(["map", str(photos), "--site", str(tmp_path / "site"), *coarse]) == 0
     report = report_of(tmp_path / "site")
-    assert report["frames"]["vision"] >= 0.95 * report["frames"]["selected"] and len(report["pieces"]) == 1
+    assert (
+        report["frames"]["vision"] >= 0.95 * report["frames"]["selected"]
+        and len(report["pieces"]) == 1
+    )
     assert report["gps_residual_m"]["rms"] <= 3.0
     assert report["height_above_ground_m"] == pytest.approx(65, abs=5)

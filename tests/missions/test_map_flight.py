@@ -30,8 +30,16 @@ from sorvolo.survey.mosaic import Status
 _M_PER_PX = 0.075  # of the simulated pictures
 _SHAPE_M = 0.05  # as far as a map's shape may be off, usually: less than a pixel
 _PROPERTIES = {
-    "frame", "time", "status", "reason", "camera_longitude_deg", "camera_latitude_deg", "camera_height_m",
-    "height_above_ground_m", "residual_px", "sigma_m",
+    "frame",
+    "time",
+    "status",
+    "reason",
+    "camera_longitude_deg",
+    "camera_latitude_deg",
+    "camera_height_m",
+    "height_above_ground_m",
+    "residual_px",
+    "sigma_m",
 }
 
 
@@ -54,7 +62,8 @@ def corner_errors_m(site: Path, flight: str, truth: Path) -> tuple[float, float]
     expected = {each["properties"]["frame"]: _corners_m(each, frame) for each in true["features"]}
     pairs = [
         (_corners_m(each, frame), expected[each["properties"]["frame"]])
-        for each in frames_of(site, flight)["features"] if each["geometry"] is not None
+        for each in frames_of(site, flight)["features"]
+        if each["geometry"] is not None
     ]
     found_m, true_m = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
     moved_m = apply_homography(fit_similarity(true_m, found_m), found_m)
@@ -63,7 +72,9 @@ def corner_errors_m(site: Path, flight: str, truth: Path) -> tuple[float, float]
 
 def _corners_m(feature: dict[str, Any], frame: LocalFrame) -> np.ndarray:
     lonlat = np.array(feature["geometry"]["coordinates"][0])[:4]
-    return frame.site_from_wgs84(lonlat[:, 1], lonlat[:, 0], np.full(4, frame.origin.height_m))[:, :2]
+    return frame.site_from_wgs84(lonlat[:, 1], lonlat[:, 0], np.full(4, frame.origin.height_m))[
+        :, :2
+    ]
 
 
 def _rms_m(errors_m: np.ndarray) -> float:
@@ -89,16 +100,29 @@ def _some_photos(photographed: Path, folder: Path, start: int, end: int) -> Path
 @pytest.mark.parametrize("name", ["flight1.csv", "flight1.nmea", "flight1.srt", "flight1.gpx"])
 def test_a_video_with_telemetry_of_each_format(filmed: Path, tmp_path: Path, name: str) -> None:
     site = tmp_path / "site"
-    run_map(site, _film(filmed), "--telemetry", _telemetry(filmed, name), "--camera", filmed / "camera.xml")
+    run_map(
+        site,
+        _film(filmed),
+        "--telemetry",
+        _telemetry(filmed, name),
+        "--camera",
+        filmed / "camera.xml",
+    )
     report = report_of(site, "flight1")
-    assert report["georeferenced"] and report["frames"]["vision"] == report["frames"]["selected"] > 8
+    assert (
+        report["georeferenced"] and report["frames"]["vision"] == report["frames"]["selected"] > 8
+    )
     assert "2.5 s apart" in report["reading"]["whole_because"] and not report["reading"]["skipped"]
     absolute_m, shape_m = corner_errors_m(site, "flight1", filmed / "truth")
     assert shape_m < _SHAPE_M
-    assert absolute_m < 0.6  # 1 Hz formats interpolate a fix from two that are 5 m apart, turns included
+    assert (
+        absolute_m < 0.6
+    )  # 1 Hz formats interpolate a fix from two that are 5 m apart, turns included
 
 
-def test_a_video_is_mapped_by_the_key_frames_of_its_stream(keyed: Path, filmed: Path, tmp_path: Path) -> None:
+def test_a_video_is_mapped_by_the_key_frames_of_its_stream(
+    keyed: Path, filmed: Path, tmp_path: Path
+) -> None:
     site, again = tmp_path / "site", tmp_path / "again.kml"
     run_map(site, keyed, "--camera", filmed / "camera.xml", "--refly", again)
     report = report_of(site, "flight1")
@@ -106,13 +130,22 @@ def test_a_video_is_mapped_by_the_key_frames_of_its_stream(keyed: Path, filmed: 
     assert report["frames"]["vision"] == report["frames"]["selected"] > 8
     reading = report["reading"]
     assert not reading["whole_because"]
-    assert reading["decoded"] + reading["skipped"] == report["frames"]["total"] < 3.5 * reading["skipped"]
+    assert (
+        reading["decoded"] + reading["skipped"]
+        == report["frames"]["total"]
+        < 3.5 * reading["skipped"]
+    )
     absolute_m, shape_m = corner_errors_m(site, "flight1", filmed / "truth")
     assert shape_m < _SHAPE_M and absolute_m < 0.6
-    assert f"{reading['skipped']} skipped" in (site / "flights" / "flight1" / "report.html").read_text()
+    assert (
+        f"{reading['skipped']} skipped"
+        in (site / "flights" / "flight1" / "report.html").read_text()
+    )
 
 
-def test_holes_are_shown_and_planned_while_the_flight_goes_on(keyed: Path, filmed: Path, tmp_path: Path) -> None:
+def test_holes_are_shown_and_planned_while_the_flight_goes_on(
+    keyed: Path, filmed: Path, tmp_path: Path
+) -> None:
     origin = json.loads((filmed / "truth" / "frames.geojson").read_text())["site"]
     longitude, latitude = origin["longitude_deg"], origin["latitude_deg"]
     east, north = 80 / 111_320 / np.cos(np.radians(latitude)), 80 / 111_320
@@ -122,11 +155,15 @@ def test_holes_are_shown_and_planned_while_the_flight_goes_on(keyed: Path, filme
     area.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
     holes_m2 = []
     settings = MapSettings(model="none", live_s=0.0)
-    for _ in map_flights([keyed], site, settings, camera=filmed / "camera.xml", area=area, refly=[again]):
+    for _ in map_flights(
+        [keyed], site, settings, camera=filmed / "camera.xml", area=area, refly=[again]
+    ):
         if (live := site / "live-coverage.geojson").exists():
             parts = [each["properties"] for each in json.loads(live.read_text())["features"]]
             holes_m2.append(sum(each["area_m2"] for each in parts if each["status"] == "hole"))
-            assert again.exists() and {each["views"] for each in parts if each["status"] == "seen"} <= {1, 2, 3, 5}
+            assert again.exists() and {
+                each["views"] for each in parts if each["status"] == "seen"
+            } <= {1, 2, 3, 5}
     assert len(holes_m2) > 5 and holes_m2[-1] < holes_m2[0] - 200
     assert not live.exists()
     found = json.loads((site / "flights" / "flight1" / "coverage.geojson").read_text())["features"]
@@ -139,7 +176,9 @@ def test_holes_are_shown_and_planned_while_the_flight_goes_on(keyed: Path, filme
     outline = np.array(ring)
     lonlat = np.array(path["geometry"]["coordinates"])
     assert len(lonlat) > 4
-    assert (lonlat > outline.min(axis=0) - 2e-4).all() and (lonlat < outline.max(axis=0) + 2e-4).all()
+    assert (lonlat > outline.min(axis=0) - 2e-4).all() and (
+        lonlat < outline.max(axis=0) + 2e-4
+    ).all()
 
 
 def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path: Path) -> None:
@@ -150,16 +189,28 @@ def test_a_video_that_looks_ahead_by_half_a_right_angle(oblique: Path, tmp_path:
     absolute_m, shape_m = corner_errors_m(site, "flight1", oblique / "truth")
     # The far corners lie 60 m off, where a pixel covers 30 cm: over draws of the camera's noise 1 to 11 cm.
     assert shape_m < 4 * _SHAPE_M and absolute_m < 0.4
-    blind = [str(flight / "flight1.mp4"), "--telemetry", str(flight / "other" / "flight1.gpx"), "--model", "none"]
+    blind = [
+        str(flight / "flight1.mp4"),
+        "--telemetry",
+        str(flight / "other" / "flight1.gpx"),
+        "--model",
+        "none",
+    ]
     # pictures that look to opposite sides are not tied: a map to check
     assert cli.main(["map", *blind, "--site", str(tmp_path / "blind")]) == 3
     assert "pieces" in report_of(tmp_path / "blind", "flight1")["headline"]["text"]
-    (warning,) = (each for each in report_of(tmp_path / "blind", "flight1")["warnings"] if "straight down" in each)
+    (warning,) = (
+        each
+        for each in report_of(tmp_path / "blind", "flight1")["warnings"]
+        if "straight down" in each
+    )
     told_deg = float(warning.split(" deg")[0].rpartition(" ")[2])
     assert told_deg == pytest.approx(45, abs=10) and "angles" in warning
 
 
-def test_an_oblique_video_is_recognised_by_its_pictures_alone(oblique: Path, filmed: Path, tmp_path: Path) -> None:
+def test_an_oblique_video_is_recognised_by_its_pictures_alone(
+    oblique: Path, filmed: Path, tmp_path: Path
+) -> None:
     """Without any telemetry the perspective between the pictures shows how far the camera looks from straight down."""
     found = []
     for name, flown in (("oblique", oblique), ("nadir", filmed)):
@@ -167,7 +218,9 @@ def test_an_oblique_video_is_recognised_by_its_pictures_alone(oblique: Path, fil
         shutil.copy(_film(flown), tmp_path / name)
         site = tmp_path / f"{name} site"
         run_map(site, tmp_path / name / "flight1.mp4", "--camera", flown / "camera.xml")
-        found.append([each for each in report_of(site, "flight1")["warnings"] if "straight down" in each])
+        found.append(
+            [each for each in report_of(site, "flight1")["warnings"] if "straight down" in each]
+        )
     ((warning,), none) = found
     assert float(warning.split(" deg")[0].rpartition(" ")[2]) == pytest.approx(45, abs=10)
     assert "there is no telemetry" in warning and not none
@@ -181,10 +234,14 @@ def test_the_report_counts_every_second_up_to_itself(filmed: Path, tmp_path: Pat
     assert seconds["total"] >= sum(value for name, value in seconds.items() if name != "total")
 
 
-def test_a_clock_offset_is_found_from_motion_or_taken_as_given(filmed: Path, tmp_path: Path) -> None:
+def test_a_clock_offset_is_found_from_motion_or_taken_as_given(
+    filmed: Path, tmp_path: Path
+) -> None:
     lines = _telemetry(filmed, "flight1.csv").read_text().splitlines()
     late = tmp_path / "late.csv"
-    late.write_text("\n".join([lines[0], *lines[9:]]))  # at 10 Hz: what is tied to the first frame is 0.8 s late
+    late.write_text(
+        "\n".join([lines[0], *lines[9:]])
+    )  # at 10 Hz: what is tied to the first frame is 0.8 s late
     common = (_film(filmed), "--telemetry", late, "--camera", filmed / "camera.xml")
     run_map(tmp_path / "found", *common)
     found = report_of(tmp_path / "found", "flight1")["time_offset"]
@@ -196,14 +253,20 @@ def test_a_clock_offset_is_found_from_motion_or_taken_as_given(filmed: Path, tmp
         assert corner_errors_m(tmp_path / site, "flight1", filmed / "truth")[0] < 0.5
 
 
-def test_photos_whose_fixes_lag_are_put_where_their_motion_shows(lagging: Path, tmp_path: Path) -> None:
+def test_photos_whose_fixes_lag_are_put_where_their_motion_shows(
+    lagging: Path, tmp_path: Path
+) -> None:
     run_map(tmp_path / "site", lagging / "flight1" / "photos", "--camera", lagging / "camera.xml")
     offset = report_of(tmp_path / "site", "photos")["time_offset"]
     assert offset["origin"] == "estimated" and offset["applied_s"] == pytest.approx(0.4, abs=0.1)
-    assert corner_errors_m(tmp_path / "site", "photos", lagging / "truth")[0] < 0.3  # the lag alone is 2 m
+    assert (
+        corner_errors_m(tmp_path / "site", "photos", lagging / "truth")[0] < 0.3
+    )  # the lag alone is 2 m
 
 
-def test_a_video_without_telemetry_is_mapped_in_a_frame_of_its_own(filmed: Path, tmp_path: Path) -> None:
+def test_a_video_without_telemetry_is_mapped_in_a_frame_of_its_own(
+    filmed: Path, tmp_path: Path
+) -> None:
     alone = tmp_path / "alone"
     alone.mkdir()
     shutil.copy(_film(filmed), alone)
@@ -223,7 +286,7 @@ def test_a_video_without_telemetry_is_mapped_in_a_frame_of_its_own(filmed: Path,
 def test_telemetry_that_ends_before_the_video(filmed: Path, tmp_path: Path) -> None:
     lines = _telemetry(filmed, "flight1.csv").read_text().splitlines()
     short = tmp_path / "short.csv"
-    short.write_text("\n".join(lines[:1 + len(lines) // 2]))
+    short.write_text("\n".join(lines[: 1 + len(lines) // 2]))
     site = tmp_path / "site"
     run_map(site, _film(filmed), "--telemetry", short, "--camera", filmed / "camera.xml")
     frames = report_of(site, "flight1")["frames"]
@@ -241,7 +304,9 @@ def test_photos_and_what_frames_geojson_states_of_them(photographed: Path, tmp_p
     assert sorted(names) == sorted(path.name for path in photos.iterdir())
     text = (site / "flights" / "photos" / "frames.geojson").read_text()
     true = json.loads((photographed / "truth" / "frames.geojson").read_text())
-    expected = {each["properties"]["frame"]: each["geometry"]["coordinates"][0] for each in true["features"]}
+    expected = {
+        each["properties"]["frame"]: each["geometry"]["coordinates"][0] for each in true["features"]
+    }
     for feature in frames["features"]:
         assert set(feature["properties"]) >= _PROPERTIES
         assert feature["properties"]["status"] == "vision" and feature["properties"]["reason"] == ""
@@ -249,7 +314,9 @@ def test_photos_and_what_frames_geojson_states_of_them(photographed: Path, tmp_p
         assert len(ring) == 5 and ring[0] == ring[4]
         # top-left, top-right, bottom-right, bottom-left: each is nearest to the truth's corner of that name
         distances = np.linalg.norm(
-            np.array(ring[:4])[:, None] - np.array(expected[feature["properties"]["frame"]][:4])[None], axis=2
+            np.array(ring[:4])[:, None]
+            - np.array(expected[feature["properties"]["frame"]][:4])[None],
+            axis=2,
         )
         assert list(distances.argmin(axis=1)) == [0, 1, 2, 3]
         assert sum(len(f"{x!r}".partition(".")[2]) >= 9 for point in ring for x in point) >= 8
@@ -294,26 +361,51 @@ def test_another_crs_for_the_map(photographed: Path, tmp_path: Path, crs: str, e
 
 
 @pytest.mark.parametrize("form", ["geojson", "kml", "txt"])
-def test_frames_outside_the_area_are_not_used(photographed: Path, tmp_path: Path, form: str) -> None:
+def test_frames_outside_the_area_are_not_used(
+    photographed: Path, tmp_path: Path, form: str
+) -> None:
     true = json.loads((photographed / "truth" / "frames.geojson").read_text())
-    longitude = {each["properties"]["frame"]: each["properties"]["camera_longitude_deg"] for each in true["features"]}
+    longitude = {
+        each["properties"]["frame"]: each["properties"]["camera_longitude_deg"]
+        for each in true["features"]
+    }
     latitude = [each["properties"]["camera_latitude_deg"] for each in true["features"]]
-    middle, low, high = float(np.median(list(longitude.values()))), min(latitude) - 1e-3, max(latitude) + 1e-3
-    ring = [[middle, low], [middle + 1e-2, low], [middle + 1e-2, high], [middle, high], [middle, low]]
+    middle, low, high = (
+        float(np.median(list(longitude.values()))),
+        min(latitude) - 1e-3,
+        max(latitude) + 1e-3,
+    )
+    ring = [
+        [middle, low],
+        [middle + 1e-2, low],
+        [middle + 1e-2, high],
+        [middle, high],
+        [middle, low],
+    ]
     area = tmp_path / f"area.{form}"
-    area.write_text({
-        "geojson": json.dumps({"type": "Polygon", "coordinates": [ring]}),
-        "kml": (
-            '<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>'
-            + " ".join(f"{x!r},{y!r},0" for x, y in ring)
-            + "</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
-        ),
-        "txt": "\n".join(f"{y!r} {x!r}" for x, y in ring),  # the thesis's list
-    }[form])
+    area.write_text(
+        {
+            "geojson": json.dumps({"type": "Polygon", "coordinates": [ring]}),
+            "kml": (
+                '<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>'
+                + " ".join(f"{x!r},{y!r},0" for x, y in ring)
+                + "</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
+            ),
+            "txt": "\n".join(f"{y!r} {x!r}" for x, y in ring),  # the thesis's list
+        }[form]
+    )
     site = tmp_path / "site"
-    run_map(site, photographed / "flight1" / "photos", "--camera", photographed / "camera.xml", "--area", area)
+    run_map(
+        site,
+        photographed / "flight1" / "photos",
+        "--camera",
+        photographed / "camera.xml",
+        "--area",
+        area,
+    )
     used = {
-        each["properties"]["frame"] for each in frames_of(site, "photos")["features"]
+        each["properties"]["frame"]
+        for each in frames_of(site, "photos")["features"]
         if each["properties"]["status"] != "rejected"
     }
     well_inside = {name for name, where in longitude.items() if where > middle + 5e-6}
@@ -326,8 +418,16 @@ def test_the_thesis_method(photographed: Path, tmp_path: Path, transform: str) -
     photos = _some_photos(photographed, tmp_path / "few", 0, 7)
     site = tmp_path / "site"
     run_map(
-        site, photos, "--camera", photographed / "camera.xml", "--method", "thesis", "--transform", transform,
-        "--thesis", "features=3000",
+        site,
+        photos,
+        "--camera",
+        photographed / "camera.xml",
+        "--method",
+        "thesis",
+        "--transform",
+        transform,
+        "--thesis",
+        "features=3000",
     )
     report = report_of(site, "few")
     assert report["method"] == "thesis" and report["settings"]["thesis"]["transform"] == transform
@@ -335,19 +435,26 @@ def test_the_thesis_method(photographed: Path, tmp_path: Path, transform: str) -
     assert corner_errors_m(site, "few", photographed / "truth")[1] < 1.0  # metres: its own ceiling
 
 
-def test_stored_frames_of_a_coarse_map_lie_where_the_frames_do(photographed: Path, tmp_path: Path) -> None:
+def test_stored_frames_of_a_coarse_map_lie_where_the_frames_do(
+    photographed: Path, tmp_path: Path
+) -> None:
     photos = _some_photos(photographed, tmp_path / "few", 0, 6)
     site = tmp_path / "site"
     run_map(site, photos, "--camera", photographed / "camera.xml", "--gsd", "0.2")
     with Archive.open(site, write=False) as archive:
         frame = archive.site().frame
         outlines = {
-            each["properties"]["frame"]: _corners_m(each, frame) for each in frames_of(site, "few")["features"]
+            each["properties"]["frame"]: _corners_m(each, frame)
+            for each in frames_of(site, "few")["features"]
         }
         for keyframe in archive.keyframes():
             assert archive.image(keyframe).shape[1] == keyframe.camera.width_px < 240
-            centre_m = apply_homography(keyframe.site_from_image, keyframe.camera.corners_px).mean(axis=0)
-            assert np.linalg.norm(centre_m - outlines[keyframe.name].mean(axis=0)) < 0.2  # metres: one pixel
+            centre_m = apply_homography(keyframe.site_from_image, keyframe.camera.corners_px).mean(
+                axis=0
+            )
+            assert (
+                np.linalg.norm(centre_m - outlines[keyframe.name].mean(axis=0)) < 0.2
+            )  # metres: one pixel
 
 
 def test_a_second_flight_extends_the_map_and_leaves_the_first_in_its_place(
@@ -387,8 +494,14 @@ def test_the_same_flight_again_doubles_nothing(
     assert written == {path: path.read_bytes() for path in site.rglob("*") if path.is_file()}
     run_map(site, photos, "--camera", photographed / "camera.xml", "--again")
     assert frames_of(site, "few")["features"] == frames
-    unlike = {path.name for path, data in written.items() if path.is_file() and path.read_bytes() != data}
-    assert unlike == {"site.db", "report.json", "report.html"}  # which hold when it was made, and how quickly
+    unlike = {
+        path.name for path, data in written.items() if path.is_file() and path.read_bytes() != data
+    }
+    assert unlike == {
+        "site.db",
+        "report.json",
+        "report.html",
+    }  # which hold when it was made, and how quickly
     with Archive.open(site, write=False) as archive:
         assert len(archive.flights()) == 1 and len(archive.keyframes()) == 8
     (notice,) = [each for each in report_of(site, "few")["notices"] if each["code"] == "repeated"]
@@ -398,15 +511,29 @@ def test_the_same_flight_again_doubles_nothing(
 def test_the_same_flight_under_another_name_is_named(photographed: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
     for name in ("few", "card2"):
-        run_map(site, _some_photos(photographed, tmp_path / name, 0, 4), "--camera", photographed / "camera.xml")
+        run_map(
+            site,
+            _some_photos(photographed, tmp_path / name, 0, 4),
+            "--camera",
+            photographed / "camera.xml",
+        )
     assert not [each for each in report_of(site, "few")["notices"] if each["code"] == "same_flight"]
-    (notice,) = [each for each in report_of(site, "card2")["notices"] if each["code"] == "same_flight"]
-    assert notice["text"].startswith("card2 begins with the same bytes as few, which is in this site already (ver")
+    (notice,) = [
+        each for each in report_of(site, "card2")["notices"] if each["code"] == "same_flight"
+    ]
+    assert notice["text"].startswith(
+        "card2 begins with the same bytes as few, which is in this site already (ver"
+    )
 
 
 def test_a_map_is_dated_by_its_flight(photographed: Path, tmp_path: Path) -> None:
     site = tmp_path / "site"
-    run_map(site, _some_photos(photographed, tmp_path / "few", 0, 4), "--camera", photographed / "camera.xml")
+    run_map(
+        site,
+        _some_photos(photographed, tmp_path / "few", 0, 4),
+        "--camera",
+        photographed / "camera.xml",
+    )
     frames = json.loads((photographed / "truth" / "frames.geojson").read_text())["features"]
     (version,) = site_history(site)
     assert version.flown_utc[:19] == frames[0]["properties"]["time"][:19]
@@ -417,7 +544,9 @@ def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
     filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     film = tmp_path / "film.mp4"
-    shutil.copy(_film(filmed), film)  # without telemetry, whose offsets would move every frame at last
+    shutil.copy(
+        _film(filmed), film
+    )  # without telemetry, whose offsets would move every frame at last
     maps = []
     for paint_every in (1, 1000):  # keyframes
         painter = partial(FlightPainter, settings=PaintSettings(every=paint_every, rest=0))
@@ -427,7 +556,9 @@ def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
     assert maps[0] == maps[1]
 
 
-def test_every_selected_frame_ends_once_with_a_reason_unless_by_vision(filmed: Path, tmp_path: Path) -> None:
+def test_every_selected_frame_ends_once_with_a_reason_unless_by_vision(
+    filmed: Path, tmp_path: Path
+) -> None:
     site = tmp_path / "site"
     run_map(site, _film(filmed), "--camera", filmed / "camera.xml", "--overlap", "0.5")
     frames, counted = frames_of(site, "flight1")["features"], report_of(site, "flight1")["frames"]
@@ -438,7 +569,9 @@ def test_every_selected_frame_ends_once_with_a_reason_unless_by_vision(filmed: P
         assert (each["geometry"] is None) == (each["properties"]["status"] == "rejected")
 
 
-def test_a_planar_run_paints_through_a_writer_that_another_began(photographed: Path, tmp_path: Path) -> None:
+def test_a_planar_run_paints_through_a_writer_that_another_began(
+    photographed: Path, tmp_path: Path
+) -> None:
     first = _some_photos(photographed, tmp_path / "first", 0, 8)
     second = _some_photos(photographed, tmp_path / "second", 6, 14)
     site = tmp_path / "site"
@@ -455,7 +588,9 @@ def test_a_planar_run_paints_through_a_writer_that_another_began(photographed: P
                     run.add(PosedFrame(frame, setup.prior(frame, first=False)))
                 placed = run.complete()
             writer.flush()  # the run's end is not the writer's
-            assert [each.status for each in placed] == [Status.VISION] * 8 and sorted(run.images) == list(range(8))
+            assert [each.status for each in placed] == [Status.VISION] * 8 and sorted(
+                run.images
+            ) == list(range(8))
             writer.commit(placed, run.images, {}, "")
         assert _opaque_px(archive) > 1.1 * known_px
         assert [flight.id for flight in archive.flights()] == ["first", "second"]

@@ -40,18 +40,27 @@ class FilmedFlight:
         self.camera, self.truth = folder / "camera.xml", folder / "truth"
         (source,) = open_sources([folder / "flight1" / "flight1.mp4"], None, self.camera)
         self.rate, self.telemetry = round(source.frame_rate_hz), source.telemetry
-        self.images = [each.image for each in source.frames(lambda *_: True) if isinstance(each, Frame)]
+        self.images = [
+            each.image for each in source.frames(lambda *_: True) if isinstance(each, Frame)
+        ]
         self.seconds = self.telemetry.video_time_ns / 1e9
         self.level = level = site_from_gimbal_rotation(0.0, 0.0, 0.0)
         printed = self.telemetry
-        self.ground_m = float(np.median(printed["orthometric_height_m"] - printed["height_above_takeoff_m"]))
+        self.ground_m = float(
+            np.median(printed["orthometric_height_m"] - printed["height_above_takeoff_m"])
+        )
         self.headings = printed["body_yaw_deg"] % 360
         self.relative = [
             gimbal_angles_from_rotation(
-                level @ site_from_gimbal_rotation(heading, 0.0, 0.0).T @ site_from_gimbal_rotation(*angles)
+                level
+                @ site_from_gimbal_rotation(heading, 0.0, 0.0).T
+                @ site_from_gimbal_rotation(*angles)
             )
             for heading, *angles in zip(
-                self.headings, printed["camera_yaw_deg"], printed["camera_pitch_deg"], printed["camera_roll_deg"]
+                self.headings,
+                printed["camera_yaw_deg"],
+                printed["camera_pitch_deg"],
+                printed["camera_roll_deg"],
             )
         ]
 
@@ -63,7 +72,13 @@ class Drone:
     """
 
     def __init__(
-        self, flight: FilmedFlight, *, metadata: bool, speed: float = 2.0, count: int = 10_000, first: int = 0,
+        self,
+        flight: FilmedFlight,
+        *,
+        metadata: bool,
+        speed: float = 2.0,
+        count: int = 10_000,
+        first: int = 0,
         later_s: int = 0,
     ) -> None:
         self._first, self._later_ns = first, later_s * 10**9
@@ -89,8 +104,13 @@ class Drone:
     def sent(self) -> Any:
         flight = self._flight
         return sending(
-            udp_url(self.port), size=flight.images[0].shape[1::-1], klv=self._metadata, image=self._image,
-            klv_of=self._klv, rate=flight.rate, speed=self._speed,
+            udp_url(self.port),
+            size=flight.images[0].shape[1::-1],
+            klv=self._metadata,
+            image=self._image,
+            klv_of=self._klv,
+            rate=flight.rate,
+            speed=self._speed,
         )
 
     def _frame(self, index: int) -> int:
@@ -116,13 +136,21 @@ class Drone:
             float(np.interp(at_s, flight.seconds, printed[name]))
             for name in ("latitude_deg", "longitude_deg", "orthometric_height_m")
         )
-        return encode(_CLOCK_NS + self._later_ns + index * 10**9 // flight.rate, {
-            "platform_heading_deg": float(flight.headings[nearest]), "platform_pitch_deg": 0.0,
-            "platform_roll_deg": 0.0, "sensor_relative_azimuth_deg": azimuth,
-            "sensor_relative_elevation_deg": elevation, "sensor_relative_roll_deg": roll % 360,
-            "sensor_latitude_deg": latitude, "sensor_longitude_deg": longitude, "sensor_true_altitude_m": height_m,
-            "frame_center_elevation_m": flight.ground_m,
-        })
+        return encode(
+            _CLOCK_NS + self._later_ns + index * 10**9 // flight.rate,
+            {
+                "platform_heading_deg": float(flight.headings[nearest]),
+                "platform_pitch_deg": 0.0,
+                "platform_roll_deg": 0.0,
+                "sensor_relative_azimuth_deg": azimuth,
+                "sensor_relative_elevation_deg": elevation,
+                "sensor_relative_roll_deg": roll % 360,
+                "sensor_latitude_deg": latitude,
+                "sensor_longitude_deg": longitude,
+                "sensor_true_altitude_m": height_m,
+                "frame_center_elevation_m": flight.ground_m,
+            },
+        )
 
 
 @pytest.fixture(scope="module")
@@ -142,17 +170,24 @@ def corner_error_m(site: Path, flight: FilmedFlight, drone: Drone) -> float:
     (frames,) = (site / "flights").glob("*/frames.geojson")
     errors_m = []
     for each in json.loads(frames.read_text())["features"]:
-        number = drone.flight_s(datetime.fromisoformat(each["properties"]["time"]).timestamp()) * flight.rate
+        number = (
+            drone.flight_s(datetime.fromisoformat(each["properties"]["time"]).timestamp())
+            * flight.rate
+        )
         if each["geometry"] is not None and number > 0.5:
             assert abs(number - round(number)) < 0.1  # the frame's own time, not when it came
-            errors_m.append(_corners_m(each, frame) - _corners_m(true["features"][round(number)], frame))
+            errors_m.append(
+                _corners_m(each, frame) - _corners_m(true["features"][round(number)], frame)
+            )
     assert len(errors_m) >= 5
     return float(np.sqrt((np.concatenate(errors_m) ** 2).sum(axis=1).mean()))
 
 
 def _corners_m(feature: dict[str, Any], frame: LocalFrame) -> Any:
     lonlat = np.array(feature["geometry"]["coordinates"][0])[:4]
-    return frame.site_from_wgs84(lonlat[:, 1], lonlat[:, 0], np.full(4, frame.origin.height_m))[:, :2]
+    return frame.site_from_wgs84(lonlat[:, 1], lonlat[:, 0], np.full(4, frame.origin.height_m))[
+        :, :2
+    ]
 
 
 def fly_and_map(drone: Drone, site: Path, **kwargs: Any) -> int:
@@ -166,7 +201,9 @@ def fly_and_map(drone: Drone, site: Path, **kwargs: Any) -> int:
 
 
 @pytest.fixture(scope="module")
-def mapped_live(flight: FilmedFlight, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Drone, int]:
+def mapped_live(
+    flight: FilmedFlight, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, Drone, int]:
     """The map of a stream with metadata, the drone that sent it, and how many frames were looked at."""
     site, drone = tmp_path_factory.mktemp("live") / "site", Drone(flight, metadata=True)
     return site, drone, fly_and_map(drone, site, camera=flight.camera)
@@ -188,14 +225,20 @@ def test_a_stream_with_metadata_becomes_a_map_like_a_files(
     assert 0 < delay_s["median"] <= delay_s["p95"] <= delay_s["largest"] < 60
 
 
-def test_a_later_flight_is_compared_live(flight: FilmedFlight, mapped_live: tuple[Path, Drone, int]) -> None:
+def test_a_later_flight_is_compared_live(
+    flight: FilmedFlight, mapped_live: tuple[Path, Drone, int]
+) -> None:
     site, _, _ = mapped_live
     drone = Drone(flight, metadata=True, speed=1.0, count=30)
     statuses, announced = [], []
     with drone.sent():
         for update in compare_flights(
-            [drone.address], site, CompareSettings(views_per_second=2.0, model="none"), camera=flight.camera,
-            live=_LIVE, until=drone.landed,
+            [drone.address],
+            site,
+            CompareSettings(views_per_second=2.0, model="none"),
+            camera=flight.camera,
+            live=_LIVE,
+            until=drone.landed,
         ):
             statuses.append(update.status)
             announced += update.announced
@@ -207,7 +250,11 @@ def test_a_later_flight_is_compared_live(flight: FilmedFlight, mapped_live: tupl
 @pytest.mark.long  # a stream in real time; receivers and streams have tests of their own
 def test_a_receiver_beside_a_stream_places_the_map(flight: FilmedFlight, tmp_path: Path) -> None:
     """Neither states more than it must: pictures without times, positions without the camera's angles."""
-    site, drone, gps = tmp_path / "site", Drone(flight, metadata=False, speed=1.0, count=42), free_port()
+    site, drone, gps = (
+        tmp_path / "site",
+        Drone(flight, metadata=False, speed=1.0, count=42),
+        free_port(),
+    )
     printed = flight.telemetry
     is_over = threading.Event()
 
@@ -215,9 +262,14 @@ def test_a_receiver_beside_a_stream_places_the_map(flight: FilmedFlight, tmp_pat
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             while not is_over.wait(0.2):
                 at_s = 0.0 if drone.took_off_s is None else time.monotonic() - drone.took_off_s
-                place = [float(np.interp(at_s, flight.seconds, printed[name])) for name in (
-                    "latitude_deg", "longitude_deg", "orthometric_height_m",
-                )]
+                place = [
+                    float(np.interp(at_s, flight.seconds, printed[name]))
+                    for name in (
+                        "latitude_deg",
+                        "longitude_deg",
+                        "orthometric_height_m",
+                    )
+                ]
                 sender.sendto(gga(*place), ("127.0.0.1", gps))
 
     threading.Thread(target=speak, daemon=True).start()
@@ -228,7 +280,9 @@ def test_a_receiver_beside_a_stream_places_the_map(flight: FilmedFlight, tmp_pat
     assert report["telemetry"]["tie"] == "both are timed by when they came"
     assert "arrival_times" in [notice["code"] for notice in report["notices"]]
     frames = json.loads(next((site / "flights").glob("*/frames.geojson")).read_text())["features"]
-    outlines = np.concatenate([np.array(each["geometry"]["coordinates"][0]) for each in frames if each["geometry"]])
+    outlines = np.concatenate(
+        [np.array(each["geometry"]["coordinates"][0]) for each in frames if each["geometry"]]
+    )
     true = json.loads((flight.truth / "frames.geojson").read_text())["features"]
     expected = np.concatenate([np.array(each["geometry"]["coordinates"][0]) for each in true[:42]])
     # the ground covered is the same to some metres: 1e-5 deg is about one
@@ -250,15 +304,41 @@ def test_a_stream_is_inspected(flight: FilmedFlight) -> None:
     with drone.sent():
         (found,) = inspect_input([drone.address])
     assert (found.kind, found.frames.width_px, found.frames.codec, found.frames.container) == (
-        "video", 320, "h264", "mpegts"
+        "video",
+        320,
+        "h264",
+        "mpegts",
     )
-    assert 1.0 < found.frames.duration_s < 5 and found.telemetry.format == "klv" and found.telemetry.positions > 5
+    assert (
+        1.0 < found.frames.duration_s < 5
+        and found.telemetry.format == "klv"
+        and found.telemetry.positions > 5
+    )
     assert found.telemetry.tie == "the metadata came with the frames"
 
 
-def test_a_source_that_is_not_there_leaves_no_site(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["map", "follow:/no/such.ts", "--site", str(tmp_path / "site"), "--model", "none"]) == 1
-    assert cli.main(["map", str(tmp_path / "nowhere.mp4"), "--site", str(tmp_path / "site"), "--model", "none"]) == 1
+def test_a_source_that_is_not_there_leaves_no_site(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert (
+        cli.main(["map", "follow:/no/such.ts", "--site", str(tmp_path / "site"), "--model", "none"])
+        == 1
+    )
+    assert (
+        cli.main(
+            [
+                "map",
+                str(tmp_path / "nowhere.mp4"),
+                "--site",
+                str(tmp_path / "site"),
+                "--model",
+                "none",
+            ]
+        )
+        == 1
+    )
     printed = capsys.readouterr().err
-    assert "no such file or folder: /no/such.ts" in printed and "no such file or folder: " in printed
+    assert (
+        "no such file or folder: /no/such.ts" in printed and "no such file or folder: " in printed
+    )
     assert not (tmp_path / "site").exists()

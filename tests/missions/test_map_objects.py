@@ -43,8 +43,17 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("objects") / "simulated"
     settings = replace(
         small_flight(
-            5, speed_m_s=6, length_m=24, spacing_m=6, size_px=(320, 180), fps=4, noise_m=0.2,
-            people=3, cars=3, small_objects=3, output=OutputSettings(truth_step=1),
+            5,
+            speed_m_s=6,
+            length_m=24,
+            spacing_m=6,
+            size_px=(320, 180),
+            fps=4,
+            noise_m=0.2,
+            people=3,
+            cars=3,
+            small_objects=3,
+            output=OutputSettings(truth_step=1),
         ),
         flights=2,
     )
@@ -63,7 +72,9 @@ def mapped(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def compared(simulated: Path, mapped: Path) -> Path:
     """The second flight compared with that map."""
-    for _ in compare_flights([simulated / "flight2/flight2.mp4"], mapped, detector=Knowing(simulated, "flight2")):
+    for _ in compare_flights(
+        [simulated / "flight2/flight2.mp4"], mapped, detector=Knowing(simulated, "flight2")
+    ):
         pass
     return mapped
 
@@ -89,11 +100,17 @@ def test_report_crops_and_site_file(mapped: Path) -> None:
     """The report states what was found and shows it; the crops are pictures; both files hold the same objects."""
     reported = report_of(mapped, "flight1")["objects"]
     own = json.loads((mapped / "flights/flight1/objects.geojson").read_text())["features"]
-    assert reported["count"] == len(own) == sum(reported["classes"].values()) == len(reported["list"])
+    assert (
+        reported["count"] == len(own) == sum(reported["classes"].values()) == len(reported["list"])
+    )
     assert reported["model"] == "truth"
     assert reported["frames"] > 3
     for each in own:
-        assert (mapped / "flights/flight1" / each["properties"]["crop"]).read_bytes().startswith(b"\xff\xd8")
+        assert (
+            (mapped / "flights/flight1" / each["properties"]["crop"])
+            .read_bytes()
+            .startswith(b"\xff\xd8")
+        )
     page = (mapped / "flights/flight1/report.html").read_text()
     assert "Objects on the map" in page
     assert own[0]["id"] in page
@@ -116,10 +133,15 @@ def test_compare_names_changes(simulated: Path, compared: Path) -> None:
 
 def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
     """Mapping works, and the report states that nothing was looked for."""
-    for _ in map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="none")):
+    for _ in map_flights(
+        [simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="none")
+    ):
         pass
     assert report_of(tmp_path / "site", "flight1")["objects"]["why_not"] == "no model was wanted"
-    assert "No objects were searched for" in (tmp_path / "site/flights/flight1/report.html").read_text()
+    assert (
+        "No objects were searched for"
+        in (tmp_path / "site/flights/flight1/report.html").read_text()
+    )
     assert not (tmp_path / "site/objects.geojson").exists()
     with pytest.raises(InputError, match="no flight of it was searched"):
         evaluate_objects(tmp_path / "site", simulated)
@@ -127,7 +149,9 @@ def test_without_a_model(simulated: Path, tmp_path: Path) -> None:
         evaluate_objects(tmp_path / "nowhere", simulated)
     left_over = tmp_path / "site/flights/flight1/objects.geojson"
     left_over.write_text('{"type": "FeatureCollection", "features": []}')
-    with pytest.raises(InputError, match="knows of no search of this flight; map it again with --model"):
+    with pytest.raises(
+        InputError, match="knows of no search of this flight; map it again with --model"
+    ):
         evaluate_objects(tmp_path / "site", simulated)
 
 
@@ -135,7 +159,11 @@ def test_a_model_that_is_not_there(simulated: Path, tmp_path: Path) -> None:
     """A name that is not installed is reported before anything is mapped; "none" is no error."""
     assert open_detector("none") is None
     with pytest.raises(InputError, match="no model 'nosuch'"):
-        next(map_flights([simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="nosuch")))
+        next(
+            map_flights(
+                [simulated / "flight1/flight1.mp4"], tmp_path / "site", MapSettings(model="nosuch")
+            )
+        )
     with pytest.raises(InputError, match="no model 'nosuch'"):
         open_detector(CompareSettings(model="nosuch").mapping.model)
 
@@ -150,22 +178,58 @@ def change_at(kind: ChangeKind, velocity_m_s: tuple[float, float] = (0.0, 0.0)) 
     changed = np.zeros((20, 20), bool)
     changed[5:15, 5:15] = True
     return Change(
-        "f-1", kind, 0.9, outline_m, 0, 10 * 10**9, 5, 1.0, 1.0, 0.1,
-        Patch(9.0, 21.0, 0.1, rgba, rgba, changed, np.zeros((20, 20), np.uint8)), np.array(velocity_m_s),
+        "f-1",
+        kind,
+        0.9,
+        outline_m,
+        0,
+        10 * 10**9,
+        5,
+        1.0,
+        1.0,
+        0.1,
+        Patch(9.0, 21.0, 0.1, rgba, rgba, changed, np.zeros((20, 20), np.uint8)),
+        np.array(velocity_m_s),
     )
 
 
-def standing(label: str, east_m: float, north_m: float, length_m: float, *, moving: bool = False) -> MapObject:
+def standing(
+    label: str, east_m: float, north_m: float, length_m: float, *, moving: bool = False
+) -> MapObject:
     """An object that three of four frames saw."""
     velocity = np.array([1.0, 0.0]) if moving else np.zeros(2)
-    return MapObject(label, label, 0.8, np.array([east_m, north_m]), 0.3, length_m, 0.5, 3, 4, 0, 1, moving, velocity)
+    return MapObject(
+        label,
+        label,
+        0.8,
+        np.array([east_m, north_m]),
+        0.3,
+        length_m,
+        0.5,
+        3,
+        4,
+        0,
+        1,
+        moving,
+        velocity,
+    )
 
 
-def sighting(label: str, east_m: float, north_m: float, seconds: float, score: float = 0.8) -> Sighting:
+def sighting(
+    label: str, east_m: float, north_m: float, seconds: float, score: float = 0.8
+) -> Sighting:
     """One view of something a metre long."""
     place_m, size_m = np.array([east_m, north_m]), np.array([1.0, 0.5])
     return Sighting(
-        1, "1", int(seconds * 1e9), label, score, np.array([0, 0, 9, 9]), place_m, 0.01 * np.eye(2), size_m
+        1,
+        "1",
+        int(seconds * 1e9),
+        label,
+        score,
+        np.array([0, 0, 9, 9]),
+        place_m,
+        0.01 * np.eye(2),
+        size_m,
     )
 
 
@@ -186,7 +250,10 @@ def test_sightings_on_the_way_of_what_moves() -> None:
     assert seen_at(change, [sighting("person", 4.0, 26.0, 7.0)]) == ""
     assert seen_at(change, [sighting("car", 10.0, 20.0, 3.0)]) == ""
     still = change_at(ChangeKind.APPEARED)
-    reported = [sighting("car", 10.0, 20.0, 3.0, 0.9), *(sighting("person", 10.2, 20.0, s, 0.5) for s in (4.0, 5.0))]
+    reported = [
+        sighting("car", 10.0, 20.0, 3.0, 0.9),
+        *(sighting("person", 10.2, 20.0, s, 0.5) for s in (4.0, 5.0)),
+    ]
     assert seen_at(still, reported) == "person"
 
 
@@ -198,9 +265,16 @@ class Sees(Knowing):
         self._score = score
 
     def detect(
-        self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, is_part: bool = False,
+        self,
+        image: ImageRGB,
+        *,
+        tiles: object = None,
+        m_per_px: float | None = None,
+        least_score: float | None = None,
+        classes: Sequence[str] | None = None,
+        from_above: bool = False,
+        overlapping: bool = False,
+        is_part: bool = False,
     ) -> Detections:
         """See `Knowing.detect`."""
         x, y = image.shape[1] / 2, image.shape[0] / 2
@@ -210,12 +284,19 @@ class Sees(Knowing):
 
 def test_what_left_or_came_where_another_thing_stands_was_replaced(simulated: Path) -> None:
     here, beside = standing("car", 10.2, 20.0, 1.2), standing("car", 10.8, 20.0, 1.2)
-    small, walks = standing("small object", 10.0, 20.0, 0.4), standing("car", 10.2, 20.0, 1.2, moving=True)
+    small, walks = (
+        standing("small object", 10.0, 20.0, 0.4),
+        standing("car", 10.2, 20.0, 1.2, moving=True),
+    )
     person = standing("person", 10.0, 20.0, 0.8)
     left, came = change_at(ChangeKind.DISAPPEARED), change_at(ChangeKind.APPEARED)
     classes = ChangeClasses(Sees(simulated, 0.1), [person])
     named = classes.final(left, [here], [])
-    assert (named.kind, named.class_before, named.class_after) == (ChangeKind.REPLACED, "person", "car")
+    assert (named.kind, named.class_before, named.class_after) == (
+        ChangeKind.REPLACED,
+        "person",
+        "car",
+    )
     assert classes.preliminary(came).kind == ChangeKind.REPLACED
     for other in (beside, small, walks):
         assert classes.final(left, [other], []).kind == ChangeKind.DISAPPEARED
@@ -226,8 +307,10 @@ def test_a_changes_own_pictures_are_the_last_word(simulated: Path) -> None:
     """Where no flight saw an object, the detector looks at the change's pictures; each kind has the side it has."""
     classes = ChangeClasses(Sees(simulated, 0.8), [standing("person", 10.0, 20.0, 0.6)])
     for kind, before, after in (
-        (ChangeKind.APPEARED, "", "car"), (ChangeKind.DISAPPEARED, "person", ""),
-        (ChangeKind.REPLACED, "person", "car"), (ChangeKind.MOVING, "", "car"),
+        (ChangeKind.APPEARED, "", "car"),
+        (ChangeKind.DISAPPEARED, "person", ""),
+        (ChangeKind.REPLACED, "person", "car"),
+        (ChangeKind.MOVING, "", "car"),
     ):
         named = classes.preliminary(change_at(kind))
         assert (named.class_before, named.class_after) == (before, after)
@@ -241,25 +324,44 @@ def test_a_changes_own_pictures_are_searched_for_the_classes_asked_for(simulated
 
     class Notes(Sees):
         def detect(
-            self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-            least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-            overlapping: bool = False, is_part: bool = False,
+            self,
+            image: ImageRGB,
+            *,
+            tiles: object = None,
+            m_per_px: float | None = None,
+            least_score: float | None = None,
+            classes: Sequence[str] | None = None,
+            from_above: bool = False,
+            overlapping: bool = False,
+            is_part: bool = False,
         ) -> Detections:
             asked.append(classes)
             return super().detect(image)
 
     for classes in ((), ("person",)):
-        ChangeClasses(Notes(simulated, 0.8), [], classes).preliminary(change_at(ChangeKind.APPEARED))
+        ChangeClasses(Notes(simulated, 0.8), [], classes).preliminary(
+            change_at(ChangeKind.APPEARED)
+        )
     assert asked == [None, ("person",)]
 
 
-def test_compare_refuses_a_class_that_the_model_does_not_know(simulated: Path, mapped: Path) -> None:
+def test_compare_refuses_a_class_that_the_model_does_not_know(
+    simulated: Path, mapped: Path
+) -> None:
     wanted = CompareSettings(classes=("boat",))
-    with pytest.raises(SettingsError, match="the model knows no 'boat'; it knows person, car, small object"):
-        next(compare_flights([simulated / "flight2/flight2.mp4"], mapped, wanted, detector=Knowing(simulated)))
+    with pytest.raises(
+        SettingsError, match="the model knows no 'boat'; it knows person, car, small object"
+    ):
+        next(
+            compare_flights(
+                [simulated / "flight2/flight2.mp4"], mapped, wanted, detector=Knowing(simulated)
+            )
+        )
 
 
-def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(simulated: Path, tmp_path: Path) -> None:
+def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(
+    simulated: Path, tmp_path: Path
+) -> None:
     """The map's objects are people and cars where the model is too unsure of small objects."""
     knowing = Knowing(simulated)
     knowing.info = replace(knowing.info, on_request=("small object",))
@@ -270,7 +372,9 @@ def test_a_class_that_is_reported_on_request_alone_is_not_looked_for(simulated: 
     assert set(reported["classes"]) == {"person", "car"} and reported["count"] > 0
 
 
-def test_frames_of_another_light_are_reported_by_their_own_thresholds(simulated: Path, tmp_path: Path) -> None:
+def test_frames_of_another_light_are_reported_by_their_own_thresholds(
+    simulated: Path, tmp_path: Path
+) -> None:
     """As thermal frames by the night model's: what the day's model would not report is on the map."""
 
     class Night(Knowing):
@@ -286,16 +390,25 @@ def test_frames_of_another_light_are_reported_by_their_own_thresholds(simulated:
     assert report_of(tmp_path / "site", "flight1")["objects"]["count"] >= 5
 
 
-def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, tmp_path: Path) -> None:
+def test_small_objects_are_looked_for_where_they_are_asked_for(
+    simulated: Path, tmp_path: Path
+) -> None:
     asked: list[tuple[str, ...]] = []
 
     class Listening(Knowing):
         """Notes what was asked for."""
 
         def detect(
-            self, image: ImageRGB, *, tiles: object = None, m_per_px: float | None = None,
-            least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-            overlapping: bool = False, is_part: bool = False,
+            self,
+            image: ImageRGB,
+            *,
+            tiles: object = None,
+            m_per_px: float | None = None,
+            least_score: float | None = None,
+            classes: Sequence[str] | None = None,
+            from_above: bool = False,
+            overlapping: bool = False,
+            is_part: bool = False,
         ) -> Detections:
             asked.append(tuple(classes or ()))
             assert overlapping, "a thing is seen in many frames, none is worth several sizes"
@@ -306,20 +419,33 @@ def test_small_objects_are_looked_for_where_they_are_asked_for(simulated: Path, 
     video, camera = simulated / "flight1" / "flight1.mp4", simulated / "camera.xml"
     for classes, wanted in (((), ("person", "car")), (("small object",), ("small object",))):
         settings = MapSettings(classes=classes)
-        for _ in map_flights([video], tmp_path / f"site{len(classes)}", settings, camera=camera, detector=detector):
+        for _ in map_flights(
+            [video], tmp_path / f"site{len(classes)}", settings, camera=camera, detector=detector
+        ):
             pass
         assert asked and set(asked) == {wanted}
         asked.clear()
     with pytest.raises(SettingsError, match="bicycle"):
-        list(map_flights(
-            [video], tmp_path / "none", MapSettings(classes=("bicycle",)), camera=camera, detector=detector
-        ))
+        list(
+            map_flights(
+                [video],
+                tmp_path / "none",
+                MapSettings(classes=("bicycle",)),
+                camera=camera,
+                detector=detector,
+            )
+        )
 
 
-@pytest.mark.parametrize(("side_px", "is_live", "most"), [
-    (400, False, 3), (400, True, 8),  # of a live flight all wait, and the map does not
-    (3600, False, 1), (3600, True, 8),
-])
+@pytest.mark.parametrize(
+    ("side_px", "is_live", "most"),
+    [
+        (400, False, 3),
+        (400, True, 8),  # of a live flight all wait, and the map does not
+        (3600, False, 1),
+        (3600, True, 8),
+    ],
+)
 def test_large_photos_wait_for_the_detector_one_by_one_but_those_of_a_live_flight_on_disk(
     tmp_path: Path, side_px: int, is_live: bool, most: int
 ) -> None:
@@ -343,7 +469,9 @@ def test_large_photos_wait_for_the_detector_one_by_one_but_those_of_a_live_fligh
             return no_detections(self.classes)
 
     camera = Camera.from_angle_of_view(640, 480, 60)
-    finder = ObjectFinder(cast(ObjectDetector, Slow()), camera, live_folder=tmp_path if is_live else None)
+    finder = ObjectFinder(
+        cast(ObjectDetector, Slow()), camera, live_folder=tmp_path if is_live else None
+    )
     prior = CameraPrior(np.array([0, 0, 40.0]), np.ones(3), np.diag([1.0, -1, -1]), np.ones(3))
     unfinished = []
     for index in range(8):
@@ -358,7 +486,9 @@ def test_large_photos_wait_for_the_detector_one_by_one_but_those_of_a_live_fligh
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="a thread has a priority of its own on Linux alone")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="a thread has a priority of its own on Linux alone"
+)
 def test_a_live_flights_detector_works_at_low_priority() -> None:
     def own() -> int:
         return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())

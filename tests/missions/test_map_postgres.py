@@ -24,7 +24,8 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two flights along one strip, some things come and gone between them."""
     folder, demo = tmp_path_factory.mktemp("flown") / "flown", preset("demo")
     settings = replace(
-        demo, flights=2,
+        demo,
+        flights=2,
         scene=replace(demo.scene, people=0, cars=1, small_objects=4, has_scenery=False),
         path=replace(demo.path, length_m=16, strips=1),
         imaging=replace(demo.imaging, width_px=320, height_px=180, fps=4),
@@ -38,12 +39,24 @@ def run(capsys: pytest.CaptureFixture[str], *words: object) -> dict[str, Any]:
 
 
 def fly(
-    flown: Path, site: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, url: str = ""
+    flown: Path,
+    site: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    url: str = "",
 ) -> dict[str, Any]:
     """Map, compare, review, history: as a user does, who names the database for the map and then for all commands."""
     camera = ("--camera", flown / "camera.xml", "--model", "none")
     for _ in range(2):  # the second time it is mapped already
-        run(capsys, "map", flown / "flight1", "--site", site, *camera, *(["--catalogue", url] if url else []))
+        run(
+            capsys,
+            "map",
+            flown / "flight1",
+            "--site",
+            site,
+            *camera,
+            *(["--catalogue", url] if url else []),
+        )
     monkeypatch.setenv(VARIABLE, url)
     main([str(each) for each in ("compare", flown / "flight2", "--site", site, *camera, "--json")])
     capsys.readouterr()
@@ -57,17 +70,30 @@ def fly(
 
 def rows(site: Path) -> dict[str, list[dict[str, Any]]]:
     """Every row of the catalogue but when it was written; of settings what does not name the site."""
-    with Archive.open(site, write=False) as archive, archive._files.catalogue.reading() as connection:
+    with (
+        Archive.open(site, write=False) as archive,
+        archive._files.catalogue.reading() as connection,
+    ):
         found = {}
         for table in schema.metadata.sorted_tables:
-            kept = [each for each in connection.execute(select(table).order_by(*table.primary_key)).mappings()]
-            found[table.name] = [{key: value for key, value in each.items() if key not in _TIMES} for each in kept]
+            kept = [
+                each
+                for each in connection.execute(
+                    select(table).order_by(*table.primary_key)
+                ).mappings()
+            ]
+            found[table.name] = [
+                {key: value for key, value in each.items() if key not in _TIMES} for each in kept
+            ]
     return found
 
 
 @pytest.mark.long
 def test_the_same_rows_in_either(
-    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], postgres: PostgresServer,
+    flown: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    postgres: PostgresServer,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     in_file = fly(flown, tmp_path / "a" / "site", capsys, monkeypatch)
@@ -75,12 +101,23 @@ def test_the_same_rows_in_either(
     one, other = tmp_path / "a" / "site", tmp_path / "b" / "site"
     assert (one / "site.db").is_file() and is_site(other) and not (other / "site.db").exists()
     expected, found = rows(one), rows(other)
-    assert len(expected["keyframes"]) > 4 and len(expected["changes"]) > 0 and len(expected["reviews"]) == 1
+    assert (
+        len(expected["keyframes"]) > 4
+        and len(expected["changes"]) > 0
+        and len(expected["reviews"]) == 1
+    )
     for table, kept in expected.items():
         assert found[table] == kept, table
     times = {"date_utc"}
-    assert [{key: value for key, value in each.items() if key not in times} for each in in_file["versions"]] == [
-        {key: value for key, value in each.items() if key not in times} for each in on_server["versions"]
+    assert [
+        {key: value for key, value in each.items() if key not in times}
+        for each in in_file["versions"]
+    ] == [
+        {key: value for key, value in each.items() if key not in times}
+        for each in on_server["versions"]
     ]
     tiles = [{path.name for path in site.glob("tiles/*/*.png")} for site in (one, other)]
-    assert tiles[0] == tiles[1] and (one / "mosaic.tif").read_bytes() == (other / "mosaic.tif").read_bytes()
+    assert (
+        tiles[0] == tiles[1]
+        and (one / "mosaic.tif").read_bytes() == (other / "mosaic.tif").read_bytes()
+    )

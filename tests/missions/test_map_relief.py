@@ -14,16 +14,34 @@ from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.simulation.settings import OutputSettings
 
 _LEVEL = small_flight(
-    6, length_m=20, spacing_m=8, noise_m=0.3, size_px=(400, 300), output=OutputSettings(photos=True, photo_overlap=0.7)
+    6,
+    length_m=20,
+    spacing_m=8,
+    noise_m=0.3,
+    size_px=(400, 300),
+    output=OutputSettings(photos=True, photo_overlap=0.7),
 )
 
 
 @pytest.mark.parametrize("relief_m", [0.0, 12.0])
 def test_the_report_names_ground_that_is_not_level(relief_m: float, tmp_path: Path) -> None:
-    simulate_into(tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=relief_m)))
+    simulate_into(
+        tmp_path / "made", replace(_LEVEL, scene=replace(_LEVEL.scene, relief_m=relief_m))
+    )
     photos = tmp_path / "made" / "flight1" / "photos"
     camera = str(tmp_path / "made" / "camera.xml")
-    exit_code = main(["map", str(photos), "--site", str(tmp_path / "site"), "--model", "none", "--camera", camera])
+    exit_code = main(
+        [
+            "map",
+            str(photos),
+            "--site",
+            str(tmp_path / "site"),
+            "--model",
+            "none",
+            "--camera",
+            camera,
+        ]
+    )
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
     assert any("the ground is not level" in each for each in report["warnings"]) == (relief_m > 0)
     assert exit_code == (3 if relief_m else 0)
@@ -37,10 +55,22 @@ def test_what_stands_on_level_ground_makes_no_hill_of_it(seed: int, tmp_path: Pa
     scene = replace(_LEVEL.scene, ground="urban", has_scenery=True)
     simulate_into(tmp_path / "made", replace(_LEVEL, seed=seed, scene=scene))
     camera = str(tmp_path / "made" / "camera.xml")
-    main(["map", str(tmp_path / "made" / "flight1" / "photos"), "--site", str(tmp_path / "site"), "--model", "none",
-          "--camera", camera])
+    main(
+        [
+            "map",
+            str(tmp_path / "made" / "flight1" / "photos"),
+            "--site",
+            str(tmp_path / "site"),
+            "--model",
+            "none",
+            "--camera",
+            camera,
+        ]
+    )
     report = json.loads(next((tmp_path / "site").glob("flights/*/report.json")).read_text())
-    assert not any("the ground is not level" in each for each in report["warnings"]), report["warnings"]
+    assert not any("the ground is not level" in each for each in report["warnings"]), report[
+        "warnings"
+    ]
     off_m = _off_m(tmp_path)
     assert (off_m < 2 * report["sigma_m"] * np.sqrt(2)).mean() > 0.9, (off_m, report["sigma_m"])
 
@@ -51,10 +81,14 @@ def _off_m(folder: Path) -> np.ndarray:
     frame = LocalFrame(Geodetic(**truth["site"]))
     found = json.loads(next((folder / "site").glob("flights/*/frames.geojson")).read_text())
     true = {each["properties"]["frame"]: _corners_m(each, frame) for each in truth["features"]}
-    return np.array([
-        np.linalg.norm((_corners_m(each, frame) - true[each["properties"]["frame"]]).mean(axis=0))
-        for each in found["features"]
-    ])
+    return np.array(
+        [
+            np.linalg.norm(
+                (_corners_m(each, frame) - true[each["properties"]["frame"]]).mean(axis=0)
+            )
+            for each in found["features"]
+        ]
+    )
 
 
 def _corners_m(feature: dict[str, Any], frame: LocalFrame) -> np.ndarray:

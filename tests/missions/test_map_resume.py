@@ -36,7 +36,9 @@ class Seeing(TruthDetector):
     def detect(self, image: ImageRGB, **_: object) -> Detections:  # type: ignore[override]
         """One box."""
         x = 40 + float(image.mean()) % 100
-        return Detections(np.array([[x, 60, x + 60, 100]]), np.array([0.9]), np.array([1]), self.classes)
+        return Detections(
+            np.array([[x, 60, x + 60, 100]]), np.array([0.9]), np.array([1]), self.classes
+        )
 
 
 class Stopping(PlanarRun):
@@ -55,18 +57,27 @@ def content(site: Path) -> dict[str, bytes]:
             if path.name == "report.json":
                 report = json.loads(data)
                 report["objects"].pop("seconds", None)
-                data = json.dumps({key: value for key, value in report.items() if key not in _EFFORT}).encode()
+                data = json.dumps(
+                    {key: value for key, value in report.items() if key not in _EFFORT}
+                ).encode()
             found[str(path.relative_to(site))] = data
     return found
 
 
 def mapped(
-    filmed: Path, site: Path, settings: MapSettings = MapSettings(), then: Callable[[int], None] = lambda _: None,  # noqa: B008
+    filmed: Path,
+    site: Path,
+    settings: MapSettings = MapSettings(),
+    then: Callable[[int], None] = lambda _: None,
 ) -> list[MosaicUpdate]:
     """Map the flight; `then` is called after each frame, with their number."""
     updates = []
     for each in map_flights(
-        [filmed / "flight1" / "flight1.mp4"], site, settings, camera="aov=70", detector=Seeing(filmed)
+        [filmed / "flight1" / "flight1.mp4"],
+        site,
+        settings,
+        camera="aov=70",
+        detector=Seeing(filmed),
     ):
         updates.append(each)
         then(len(updates))
@@ -131,24 +142,33 @@ def copy(site: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(site, tmp_path / "site"))
 
 
-def test_it_goes_on_where_it_was(whole: tuple[Path, ...], filmed: Path, tmp_path: Path, registered: list[int]) -> None:
+def test_it_goes_on_where_it_was(
+    whole: tuple[Path, ...], filmed: Path, tmp_path: Path, registered: list[int]
+) -> None:
     site = copy(whole[1], tmp_path)
     updates = mapped(filmed, site)
-    assert [each.is_resumed for each in updates] == [number < _KILLED_AT for number in range(len(updates))]
+    assert [each.is_resumed for each in updates] == [
+        number < _KILLED_AT for number in range(len(updates))
+    ]
     assert len(registered) == len(updates) - _KILLED_AT > 3
     assert content(site) == content(whole[0])
     assert not list(site.rglob("run.journal")) and not list(site.rglob(".tmp-*"))
 
 
 FAULTS = (
-    DiskFullError("disk full: could not write it"), OSError(errno.ENOSPC, "No space left on device"),
+    DiskFullError("disk full: could not write it"),
+    OSError(errno.ENOSPC, "No space left on device"),
     ConnectionLostError("no connection to the catalogue"),
 )
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: type(fault).__name__)
 def test_after_a_full_disk_or_a_lost_catalogue_it_goes_on(
-    whole: tuple[Path, ...], filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fault: Exception
+    whole: tuple[Path, ...],
+    filmed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    fault: Exception,
 ) -> None:
     site = tmp_path / "site"
     with monkeypatch.context() as patch:
@@ -163,7 +183,9 @@ def test_after_a_full_disk_or_a_lost_catalogue_it_goes_on(
 
 def test_it_goes_on_among_the_key_frames_of_a_stream(keyed: Path, tmp_path: Path) -> None:
     settings, amid = MapSettings(model="none"), tmp_path / "amid" / "site"
-    for number, _ in enumerate(map_flights([keyed], tmp_path / "site", settings, camera="aov=70"), 1):
+    for number, _ in enumerate(
+        map_flights([keyed], tmp_path / "site", settings, camera="aov=70"), 1
+    ):
         copy_at(number, tmp_path / "site", amid)
     assert any([each.is_resumed for each in map_flights([keyed], amid, settings, camera="aov=70")])
     assert content(amid) == content(tmp_path / "site")
@@ -172,7 +194,9 @@ def test_it_goes_on_among_the_key_frames_of_a_stream(keyed: Path, tmp_path: Path
 def test_killed_before_the_commit_nothing_is_registered_again(
     whole: tuple[Path, ...], filmed: Path, tmp_path: Path, registered: list[int]
 ) -> None:
-    assert list(whole[2].rglob(".tmp-original-*"))  # pictures were straightened, and the first ones kept
+    assert list(
+        whole[2].rglob(".tmp-original-*")
+    )  # pictures were straightened, and the first ones kept
     site = copy(whole[2], tmp_path)
     assert all(each.is_resumed for each in mapped(filmed, site))
     assert not registered
@@ -194,7 +218,10 @@ def test_another_command_begins_anew(whole: tuple[Path, ...], filmed: Path, tmp_
     site = copy(whole[1], tmp_path)
     left = set(site.glob("flights/*/keyframes/*/*"))
     updates = map_flights(
-        [filmed / "flight1" / "flight1.mp4"], site, MapSettings(overlap=0.6, model="none"), camera="aov=70"
+        [filmed / "flight1" / "flight1.mp4"],
+        site,
+        MapSettings(overlap=0.6, model="none"),
+        camera="aov=70",
     )
     assert not next(updates).is_resumed
     assert left and not set(site.glob("flights/*/keyframes/*/*"))
@@ -203,17 +230,26 @@ def test_another_command_begins_anew(whole: tuple[Path, ...], filmed: Path, tmp_
 
 
 @pytest.mark.parametrize(
-    ("free", "expected"), [(1_000_000_000, ""), (20_000_000, "may become full"), (5_000_000, "free some")]
+    ("free", "expected"),
+    [(1_000_000_000, ""), (20_000_000, "may become full"), (5_000_000, "free some")],
 )
 def test_a_disk_too_full_is_announced_before_the_work_begins(
-    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], free: int,
+    filmed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    free: int,
     expected: str,
 ) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2 * free, free, free))  # type: ignore[attr-defined]
+    monkeypatch.setattr(
+        shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(2 * free, free, free)
+    )  # type: ignore[attr-defined]
     video, site = filmed / "flight1" / "flight1.mp4", tmp_path / "site"
     run = "sorvolo.missions.map.flights.PlanarRun"
     monkeypatch.setattr(run, Stopping)
-    assert main(["map", str(video), "--site", str(site), "--camera", "aov=70", "--model", "none"]) == 1
+    assert (
+        main(["map", str(video), "--site", str(site), "--camera", "aov=70", "--model", "none"]) == 1
+    )
     printed = capsys.readouterr().err
     if expected:
         figures = rf"has {free // 1_000_000} MB free, and the map of flight1 needs about \d+ MB "

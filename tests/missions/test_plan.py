@@ -45,7 +45,17 @@ def run(*arguments):
 
 
 def test_the_thesiss_heights_come_out_of_the_command():
-    thesis = ("--focal-mm", 1.7, "--pixel-um", 6.97, "--task", "detection", "--facing", "front", "--json")
+    thesis = (
+        "--focal-mm",
+        1.7,
+        "--pixel-um",
+        6.97,
+        "--task",
+        "detection",
+        "--facing",
+        "front",
+        "--json",
+    )
     result = run(*thesis, "--model", "none", "--max-height", 150)
     assert result.exit_code == 0, result.output
     answers = json.loads(result.output)
@@ -63,7 +73,10 @@ def test_no_flight_is_planned_above_the_laws_limit():
     assert answers["maximum_heights_m"]["detection"] == pytest.approx(1715.65, abs=0.01)
     assert (answers["height_m"], answers["bounded_by"]) == (120.0, "ceiling")
     table = " ".join(run(*mavic, "--task", "detection").output.split())
-    assert "120.00 m above ground" in table and "highest flight allowed" not in table.split("flight height")[0]
+    assert (
+        "120.00 m above ground" in table
+        and "highest flight allowed" not in table.split("flight height")[0]
+    )
     higher = json.loads(run(*mavic, "--max-height", 200, "--json").output)
     assert higher["height_m"] == 200.0
     assert "get a permit" in " ".join(run(*mavic, "--max-height", 200).output.split())
@@ -73,24 +86,32 @@ def test_no_flight_is_planned_above_the_laws_limit():
 
 def test_the_packaged_detector_bounds_the_height_by_its_own_word():
     least_px = read_info(find_model("default")).best_px["person"][0]
-    answers = json.loads(run("--camera", "aov=70", "--size", "1920x1080", "--task", "detection", "--json").output)
+    answers = json.loads(
+        run("--camera", "aov=70", "--size", "1920x1080", "--task", "detection", "--json").output
+    )
     assert answers["bounded_by"] == "detector"
     # a person from above is 0.6 m long, and that many pixels at this height
     assert 0.6 / answers["ground_sampling_m"] == pytest.approx(least_px)
-    alone = json.loads(run("--camera", "aov=70", "--task", "detection", "--model", "none", "--json").output)
+    alone = json.loads(
+        run("--camera", "aov=70", "--task", "detection", "--model", "none", "--json").output
+    )
     assert alone["bounded_by"] == "ceiling" and "detector" not in alone["height_bounds_m"]
     too_high = run("--camera", "aov=70", "--height", 100)
     assert "the detector will miss people" in " ".join(too_high.output.split())
 
 
 def test_another_object_is_not_bounded_by_how_people_are_found():
-    answers = answer_questions(THESIS_LENS, PlanSettings(critical_m=4.0, person_m=seen_person_m("bottom", 4.0)))
+    answers = answer_questions(
+        THESIS_LENS, PlanSettings(critical_m=4.0, person_m=seen_person_m("bottom", 4.0))
+    )
     assert set(answers.height_bounds_m) == {"task", "ceiling"}
     assert seen_person_m("front", math.nan) == 1.7
 
 
 def test_answers_fit_together():
-    settings = PlanSettings(Task.DETECTION, FRONT_CRITICAL_M, height_m=20, speed_m_s=4, forward_overlap=0.6)
+    settings = PlanSettings(
+        Task.DETECTION, FRONT_CRITICAL_M, height_m=20, speed_m_s=4, forward_overlap=0.6
+    )
     answers = answer_questions(THESIS_LENS, settings)
     assert answers.height_m == 20.0
     assert set(answers.fulfilled_tasks) == {"detection", "recognition"}
@@ -111,9 +132,16 @@ def test_a_preset_plans_with_its_full_photo():
     assert (model.camera.width_px, model.camera.height_px) == (5472, 3648)
 
 
-@pytest.mark.parametrize(("option", "focal_mm", "pixel_um"), [
-    ("", math.nan, math.nan), ("", 4.0, math.nan), ("Mavic 2 Pro", 4.0, 2.0), ("", 0.0, 2.0), ("", 4.0, -2.0),
-])
+@pytest.mark.parametrize(
+    ("option", "focal_mm", "pixel_um"),
+    [
+        ("", math.nan, math.nan),
+        ("", 4.0, math.nan),
+        ("Mavic 2 Pro", 4.0, 2.0),
+        ("", 0.0, 2.0),
+        ("", 4.0, -2.0),
+    ],
+)
 def test_a_camera_that_is_not_given_is_asked_for(option, focal_mm, pixel_um):
     with pytest.raises(SettingsError):
         camera_to_plan_with(option, focal_mm, pixel_um, None)
@@ -138,7 +166,13 @@ def test_qgroundcontrol_plan(tmp_path, flight):
     assert plan["geoFence"]["version"] == plan["rallyPoints"]["version"] == 2
     mission = plan["mission"]
     assert mission["version"] == 2
-    assert {"cruiseSpeed", "hoverSpeed", "firmwareType", "vehicleType", "plannedHomePosition"} <= set(mission)
+    assert {
+        "cruiseSpeed",
+        "hoverSpeed",
+        "firmwareType",
+        "vehicleType",
+        "plannedHomePosition",
+    } <= set(mission)
     items = mission["items"]
     assert [item["doJumpId"] for item in items] == list(range(1, len(items) + 1))
     assert all(item["type"] == "SimpleItem" and len(item["params"]) == 7 for item in items)
@@ -154,7 +188,9 @@ def test_qgroundcontrol_plan(tmp_path, flight):
     assert (found[:, 2] == 30.0).all()
     # the camera goes on at every pass's start, off at its end
     triggers = [item["params"][0] for item in items if item["command"] == 206]
-    assert triggers[::2] == pytest.approx([flight.photo_spacing_m] * len(flight.passes_m), abs=0.006)
+    assert triggers[::2] == pytest.approx(
+        [flight.photo_spacing_m] * len(flight.passes_m), abs=0.006
+    )
     assert set(triggers[1::2]) == {0}
     # MAV_CMD_DO_MOUNT_CONTROL, straight down, before the first pass
     (gimbal,) = (item for item in items if item["command"] == 205)
@@ -164,15 +200,40 @@ def test_qgroundcontrol_plan(tmp_path, flight):
 
 _NUMBER = (int, float)
 _PLAN_KEYS = {  # what QGroundControl's loader asks for (its "Plan File Format", and MissionItem's own check)
-    "": {"fileType": str, "version": int, "groundStation": str, "mission": dict, "geoFence": dict, "rallyPoints": dict},
-    "mission": {
-        "version": int, "items": list, "plannedHomePosition": list, "firmwareType": int, "vehicleType": int,
-        "cruiseSpeed": _NUMBER, "hoverSpeed": _NUMBER, "globalPlanAltitudeMode": int,
+    "": {
+        "fileType": str,
+        "version": int,
+        "groundStation": str,
+        "mission": dict,
+        "geoFence": dict,
+        "rallyPoints": dict,
     },
-    "geoFence": {"circles": list, "polygons": list, "version": int}, "rallyPoints": {"points": list, "version": int},
+    "mission": {
+        "version": int,
+        "items": list,
+        "plannedHomePosition": list,
+        "firmwareType": int,
+        "vehicleType": int,
+        "cruiseSpeed": _NUMBER,
+        "hoverSpeed": _NUMBER,
+        "globalPlanAltitudeMode": int,
+    },
+    "geoFence": {"circles": list, "polygons": list, "version": int},
+    "rallyPoints": {"points": list, "version": int},
 }
-_ITEM_KEYS = {"type": str, "frame": int, "command": int, "params": list, "autoContinue": bool, "doJumpId": int}
-_PLACE_KEYS = {"Altitude": _NUMBER, "AltitudeMode": int, "AMSLAltAboveTerrain": (type(None), *_NUMBER)}
+_ITEM_KEYS = {
+    "type": str,
+    "frame": int,
+    "command": int,
+    "params": list,
+    "autoContinue": bool,
+    "doJumpId": int,
+}
+_PLACE_KEYS = {
+    "Altitude": _NUMBER,
+    "AltitudeMode": int,
+    "AMSLAltAboveTerrain": (type(None), *_NUMBER),
+}
 
 
 def test_qgroundcontrols_loader_finds_all_it_asks_for(tmp_path, flight):
@@ -195,17 +256,41 @@ def test_qgroundcontrols_loader_finds_all_it_asks_for(tmp_path, flight):
 _WPML = "{http://www.dji.com/wpmz/1.0.2}"
 _KML = "{http://www.opengis.net/kml/2.2}"
 _MISSION_KEYS = {
-    "flyToWaylineMode", "finishAction", "exitOnRCLost", "executeRCLostAction", "takeOffSecurityHeight",
-    "globalTransitionalSpeed", "globalRTHHeight", "droneInfo",
+    "flyToWaylineMode",
+    "finishAction",
+    "exitOnRCLost",
+    "executeRCLostAction",
+    "takeOffSecurityHeight",
+    "globalTransitionalSpeed",
+    "globalRTHHeight",
+    "droneInfo",
 }
 _TEMPLATE_KEYS = {
-    "templateType", "templateId", "autoFlightSpeed", "waylineCoordinateSysParam", "globalWaypointTurnMode",
-    "gimbalPitchMode", "globalHeight", "globalWaypointHeadingParam", "payloadParam",
+    "templateType",
+    "templateId",
+    "autoFlightSpeed",
+    "waylineCoordinateSysParam",
+    "globalWaypointTurnMode",
+    "gimbalPitchMode",
+    "globalHeight",
+    "globalWaypointHeadingParam",
+    "payloadParam",
 }
 _WAYLINES_KEYS = {"templateId", "waylineId", "autoFlightSpeed", "executeHeightMode"}
-_WAYPOINT_KEYS = {"index", "executeHeight", "waypointSpeed", "waypointHeadingParam", "waypointTurnParam"}
+_WAYPOINT_KEYS = {
+    "index",
+    "executeHeight",
+    "waypointSpeed",
+    "waypointHeadingParam",
+    "waypointTurnParam",
+}
 _GROUP_KEYS = {
-    "actionGroupId", "actionGroupStartIndex", "actionGroupEndIndex", "actionGroupMode", "actionTrigger", "action",
+    "actionGroupId",
+    "actionGroupStartIndex",
+    "actionGroupEndIndex",
+    "actionGroupMode",
+    "actionTrigger",
+    "action",
 }
 
 
@@ -219,7 +304,9 @@ def test_djis_kmz_holds_what_its_documentation_requires(tmp_path, flight, drone)
     write_plan(path, flight, AREA, dji_drone=drone)
     with zipfile.ZipFile(path) as archive:
         assert archive.namelist() == ["wpmz/template.kml", "wpmz/waylines.wpml"]
-        template, waylines = (ElementTree.fromstring(archive.read(name)) for name in archive.namelist())
+        template, waylines = (
+            ElementTree.fromstring(archive.read(name)) for name in archive.namelist()
+        )
     for root, keys in ((template, _TEMPLATE_KEYS), (waylines, _WAYLINES_KEYS)):
         mission = root.find(f"{_KML}Document/{_WPML}missionConfig")
         assert _names(mission) >= _MISSION_KEYS | (set() if drone == "fly" else {"payloadInfo"})
@@ -228,15 +315,23 @@ def test_djis_kmz_holds_what_its_documentation_requires(tmp_path, flight, drone)
         for group in folder.iter(f"{_WPML}actionGroup"):
             assert _names(group) == _GROUP_KEYS
     placemarks = waylines.findall(f".//{_KML}Placemark")
-    assert len(placemarks) == len(flight.waypoints_m) == len(template.findall(f".//{_KML}Placemark"))
+    assert (
+        len(placemarks) == len(flight.waypoints_m) == len(template.findall(f".//{_KML}Placemark"))
+    )
     assert all(_names(each) >= _WAYPOINT_KEYS for each in placemarks)
-    assert [each.find(f"{_WPML}index").text for each in placemarks] == [str(each) for each in range(len(placemarks))]
+    assert [each.find(f"{_WPML}index").text for each in placemarks] == [
+        str(each) for each in range(len(placemarks))
+    ]
     assert {each.find(f"{_WPML}executeHeight").text for each in placemarks} == {"30"}
-    places = np.array([each.find(f"{_KML}Point/{_KML}coordinates").text.split(",") for each in placemarks], float)
+    places = np.array(
+        [each.find(f"{_KML}Point/{_KML}coordinates").text.split(",") for each in placemarks], float
+    )
     latitude_deg, longitude_deg, _ = AREA.frame.wgs84_from_site(flight.waypoints_m)
     np.testing.assert_allclose(places, np.column_stack([longitude_deg, latitude_deg]), atol=1e-8)
     pitches = [each.text for each in waylines.iter(f"{_WPML}gimbalPitchRotateAngle")]
-    assert pitches == ["-90"] and {each.text for each in template.iter(f"{_WPML}gimbalPitchAngle")} == {"-90"}
+    assert pitches == ["-90"] and {
+        each.text for each in template.iter(f"{_WPML}gimbalPitchAngle")
+    } == {"-90"}
     spacings = [float(each.text) for each in waylines.iter(f"{_WPML}actionTriggerParam")]
     assert spacings == pytest.approx([flight.photo_spacing_m] * len(flight.passes_m), abs=0.006)
 
@@ -286,11 +381,18 @@ def test_the_table_marks_heights_that_are_too_great(field_file):
     assert "photos" in plain
 
 
-@pytest.mark.parametrize("arguments", [
-    ["--camera", "aov=70", "--out", "x.plan"], ["--camera", "aov=70", "--size", "big"],
-    ["--camera", "aov=70", "--overlap", "1"], ["--camera", "aov=70", "--speed", "0"],
-    ["--camera", "aov=70", "--height", "-3"], ["--camera", "aov=70", "--critical-m", "0"], [],
-])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--camera", "aov=70", "--out", "x.plan"],
+        ["--camera", "aov=70", "--size", "big"],
+        ["--camera", "aov=70", "--overlap", "1"],
+        ["--camera", "aov=70", "--speed", "0"],
+        ["--camera", "aov=70", "--height", "-3"],
+        ["--camera", "aov=70", "--critical-m", "0"],
+        [],
+    ],
+)
 def test_options_that_cannot_be_are_one_clear_error(arguments):
     result = run(*arguments)
     assert isinstance(result.exception, SettingsError)

@@ -19,7 +19,12 @@ from sorvolo.missions.reproduce.published import TABLE_4_3
 from sorvolo.missions.reproduce.report import MARKDOWN, NUMBERS, PAGE, write_reproduction
 from sorvolo.missions.reproduce.rows import Row
 from sorvolo.missions.reproduce.run import ReproductionUpdate, _Work, reproduce
-from sorvolo.missions.reproduce.settings import DetectorSettings, ReproductionSettings, SimulatedSize, quick
+from sorvolo.missions.reproduce.settings import (
+    DetectorSettings,
+    ReproductionSettings,
+    SimulatedSize,
+    quick,
+)
 from sorvolo.missions.reproduce.simulated import simulated_dataset
 from sorvolo.missions.reproduce.thesis_tables import tables_of
 from sorvolo.store.datasets.umcd import read_umcd_metadata
@@ -28,7 +33,8 @@ from sorvolo.store.exports.flight_files import write_mask
 from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 
 SETTINGS, SIZE = quick(
-    ReproductionSettings(views_per_second=2.5, detector=DetectorSettings(steps=0)), SimulatedSize(bare_videos=0)
+    ReproductionSettings(views_per_second=2.5, detector=DetectorSettings(steps=0)),
+    SimulatedSize(bare_videos=0),
 )
 SMALL = replace(SIZE, length_m=8.0, size_px=(320, 180))
 
@@ -43,7 +49,9 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def reproduced(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[ReproductionUpdate]]:
+def reproduced(
+    dataset: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[ReproductionUpdate]]:
     """All rows, by a run that was stopped after its fourth row, and another one."""
     out = tmp_path_factory.mktemp("chapter4")
     first = reproduce(dataset, out, SETTINGS, is_whole=False)
@@ -61,19 +69,32 @@ def copied(dataset: Path, to: Path) -> Path:
 
 def log_of_another_year() -> str:
     """An NMEA log, a fix a second."""
-    bodies = [f"GPRMC,1200{second:02d}.00,A,4153.5387,N,01236.2125,E,9.7,90.0,010109,,,A" for second in range(9)]
+    bodies = [
+        f"GPRMC,1200{second:02d}.00,A,4153.5387,N,01236.2125,E,9.7,90.0,010109,,,A"
+        for second in range(9)
+    ]
     return "".join(f"${body}*{reduce(xor, body.encode()):02X}\r\n" for body in bodies)
 
 
 def test_simulated_dataset_has_the_layout_of_chapter_2(dataset: Path) -> None:
     folder = read_umcd_folder(dataset)
     (first,), (later,) = folder.mosaicking, folder.change_detection
-    assert (first.environment, first.name, folder.camera is not None) == ("Countryside", "path1", True)
-    assert first.texts[0].read_text().startswith("Tick#,offsetTime,flightTime(msec),Longitude,Latitude")
+    assert (first.environment, first.name, folder.camera is not None) == (
+        "Countryside",
+        "path1",
+        True,
+    )
+    assert (
+        first.texts[0]
+        .read_text()
+        .startswith("Tick#,offsetTime,flightTime(msec),Longitude,Latitude")
+    )
     assert folder.mosaic_of(later) == first
     assert later.masks is not None and later.metadata is not None
     stated = read_umcd_metadata(later.metadata)
-    assert stated.fps == 25 and len(stated.in_view_s) == 2 and stated.boxed  # Table 2.4: a suitcase, a person
+    assert (
+        stated.fps == 25 and len(stated.in_view_s) == 2 and stated.boxed
+    )  # Table 2.4: a suitcase, a person
 
 
 def test_all_rows_are_made_and_those_of_a_stopped_run_are_kept(
@@ -84,17 +105,26 @@ def test_all_rows_are_made_and_those_of_a_stopped_run_are_kept(
     assert [each.is_known for each in updates] == [True] * 4 + [False] * (len(updates) - 4)
     kinds = [each.row.kind for each in updates]
     assert {kind: kinds.count(kind) for kind in kinds} == {
-        "mosaic": 2, "correlation": 1, "transform": 2, "example": 1, "comparison": 4, "seconds": 1, "detector": 1,
+        "mosaic": 2,
+        "correlation": 1,
+        "transform": 2,
+        "example": 1,
+        "comparison": 4,
+        "seconds": 1,
+        "detector": 1,
     }
     rows = {each.row.id: each.row for each in updates}
-    rigid, bent = (rows[f"transform/countryside/path1/{name}"].values for name in ("similarity", "homography"))
+    rigid, bent = (
+        rows[f"transform/countryside/path1/{name}"].values for name in ("similarity", "homography")
+    )
     assert rigid["sides"] < 1.002 < bent["sides"]
     for each in rows.values():
         assert all((out / "pictures" / file).is_file() for file in each.pictures.values())
 
 
 def test_tables_have_the_printed_figures_beside_ours(
-    dataset: Path, reproduced: tuple[Path, list[ReproductionUpdate]],
+    dataset: Path,
+    reproduced: tuple[Path, list[ReproductionUpdate]],
 ) -> None:
     out, updates = reproduced
     document = write_reproduction(out, [each.row for each in updates], dataset, SETTINGS, SMALL)
@@ -103,7 +133,12 @@ def test_tables_have_the_printed_figures_beside_ours(
     for each in table["ours"]:
         assert each["tp"] + each["fp"] + each["fn"] + each["tn"] == each["compared"]
     page = (out / PAGE).read_text()
-    assert "3167" in page and "Figure 4.5" in page and page.count("<svg") >= 4 and "<script" not in page
+    assert (
+        "3167" in page
+        and "Figure 4.5" in page
+        and page.count("<svg") >= 4
+        and "<script" not in page
+    )
     assert "78.2" in (out / MARKDOWN).read_text() and (out / NUMBERS).is_file()
     rows = list(csv.reader(io.StringIO((out / "tables" / "table_4_5.csv").read_text())))
     assert rows[3][0] == "thesis, printed" and len(rows) == 8
@@ -119,24 +154,43 @@ def test_npus_flights_are_mapped_and_compared_with_the_published_mosaics(
     own.mkdir(parents=True)
     for each in (flown.video, *flown.texts):
         shutil.copy(each, own / f"DJI_0007{each.suffix}")
-    shutil.copy(reproduced[0] / "sites" / "countryside-path1" / "planar" / "mosaic.tif", own / "bu-et-al.tif")
+    shutil.copy(
+        reproduced[0] / "sites" / "countryside-path1" / "planar" / "mosaic.tif",
+        own / "bu-et-al.tif",
+    )
     (tmp_path / "npu" / "phantom3-village.mp4").write_bytes(b"no video")
     work = _Work(umcd, tmp_path / "out", replace(SETTINGS, videos=None))
     rows = {row.id: row for row, _ in map(work.done, work.npu_tasks(tmp_path / "npu"))}
     assert len(rows) == 8
-    made = [rows[f"mosaic/with/npu/phantom3-npu/{method}"].values for method in ("thesis", "planar")]
-    assert [(each["sequence"], each["camera"]) for each in made] == [("npu/phantom3-npu", "guessed")] * 2
+    made = [
+        rows[f"mosaic/with/npu/phantom3-npu/{method}"].values for method in ("thesis", "planar")
+    ]
+    assert [(each["sequence"], each["camera"]) for each in made] == [
+        ("npu/phantom3-npu", "guessed")
+    ] * 2
     assert rows["published/npu/phantom3-npu/planar"].values["correlation_after_shift"] > 0.5
     assert "no mosaic (.tif) of Bu et al." in rows["published/npu/phantom3-village/planar"].missing
     assert "phantom3-village.mp4" in rows["mosaic/without/npu/phantom3-village/planar"].missing
     tables = tables_of([each.row for each in reproduced[1]] + list(rows.values()))
-    assert {each["sequence"] for each in tables["table_4_1"]["ours"]} == {"countryside/path1", "npu/phantom3-npu"}
-    assert [(each["videos"], each["published"]) for each in tables["section_4_1_1"]["ours"]] == [(1, 1), (1, 1)]
+    assert {each["sequence"] for each in tables["table_4_1"]["ours"]} == {
+        "countryside/path1",
+        "npu/phantom3-npu",
+    }
+    assert [(each["videos"], each["published"]) for each in tables["section_4_1_1"]["ours"]] == [
+        (1, 1),
+        (1, 1),
+    ]
     sheets = {each.name: each for each in reproduction_sheets(tables)}
-    assert "planar here, with the mosaics of [17]" in {row[0] for row in sheets["section_4_1_1"].rows}
+    assert "planar here, with the mosaics of [17]" in {
+        row[0] for row in sheets["section_4_1_1"].rows
+    }
     assert list(work.npu_tasks(None)) == []
     with pytest.raises(InputError, match="no videos; give the folder of the NPU Drone-Map dataset"):
-        list(work.npu_tasks(own.parent.parent / "out" / "sites" / "npu-phantom3-npu" / "planar" / "flights"))
+        list(
+            work.npu_tasks(
+                own.parent.parent / "out" / "sites" / "npu-phantom3-npu" / "planar" / "flights"
+            )
+        )
 
 
 def test_a_changed_pair_without_anything_to_judge_it_by_is_named(
@@ -150,13 +204,20 @@ def test_a_changed_pair_without_anything_to_judge_it_by_is_named(
     updates = list(reproduce(broken, reproduced[0], SETTINGS, is_whole=False))
     assert [each.is_known for each in updates[:6]] == [True] * 6  # a dataset may be moved
     reasons = {each.row.id: each.row.missing for each in updates if each.row.missing}
-    assert "neither a folder of change masks (path1_masks) nor" in reasons["comparison/countryside/path1/robust"]
+    assert (
+        "neither a folder of change masks (path1_masks) nor"
+        in reasons["comparison/countryside/path1/robust"]
+    )
     assert "no metadata file gives the places of objects" in reasons["detector/UMCD/packaged"]
     assert len(reasons) == 5
 
 
-@pytest.mark.parametrize(("index", "counted"), [(0, "tn"), (1, "unknown"), (2, "tp"), (3, "fn"), (4, "fp")])
-def test_times_of_appearance_judge_frames_where_there_are_no_masks(tmp_path: Path, index: int, counted: str) -> None:
+@pytest.mark.parametrize(
+    ("index", "counted"), [(0, "tn"), (1, "unknown"), (2, "tp"), (3, "fn"), (4, "fp")]
+)
+def test_times_of_appearance_judge_frames_where_there_are_no_masks(
+    tmp_path: Path, index: int, counted: str
+) -> None:
     metadata = tmp_path / "path1.txt"
     metadata.write_text("Fps: 1\nObject 1\nType: Tire\nShape: round\nAppearance: 09 to 18\n")
     stated = read_umcd_metadata(metadata)
@@ -176,15 +237,23 @@ def test_missing_and_broken_files_cost_their_rows_alone(dataset: Path, tmp_path:
     (part / "path3.log").write_text(log_of_another_year())
     (part / "path1.mp4").write_bytes(b"no video at all" * 99)
     (part / "path2.csv").write_text("Name,Value\n1,2\n")
-    (broken / WITH / CHANGES / "Countryside" / "path1.txt").unlink()  # nothing for the detector to look at
+    (
+        broken / WITH / CHANGES / "Countryside" / "path1.txt"
+    ).unlink()  # nothing for the detector to look at
     shutil.copy(part / "path1.csv", broken / WITH / CHANGES / "Countryside" / "path9.csv")
     shutil.copy(part / "path2.mp4", broken / WITH / CHANGES / "Countryside" / "path9.mp4")
     updates = reproduce(broken, tmp_path / "out", replace(SETTINGS, videos=None))
     reasons = {each.row.id: each.row.missing for each in updates if each.row.missing}
     assert "path1.mp4" in reasons["mosaic/with/countryside/path1/planar"]
-    assert "no telemetry beside it (found: path2.csv)" in reasons["mosaic/with/countryside/path2/thesis"]
+    assert (
+        "no telemetry beside it (found: path2.csv)"
+        in reasons["mosaic/with/countryside/path2/thesis"]
+    )
     assert "the telemetry is of another flight" in reasons["mosaic/with/countryside/path3/planar"]
-    assert "the map of countryside/path1 could not be made" in reasons["comparison/countryside/path1/robust"]
+    assert (
+        "the map of countryside/path1 could not be made"
+        in reasons["comparison/countryside/path1/robust"]
+    )
     assert "no mosaicking video of its path" in reasons["comparison/countryside/path9/robust"]
     assert "video/Videos With Telemetry/Mosaicking/Urban/path4.mp4" in reasons
     assert "video/Videos With Telemetry/Mosaicking/Countryside/path1.mp4" not in reasons
@@ -213,7 +282,9 @@ def test_a_row_without_values_is_no_row_of_a_table(tmp_path: Path) -> None:
     assert "&lt;b&gt;cut&lt;/b&gt; off" in (tmp_path / PAGE).read_text()
 
 
-def test_command_names_what_is_missing_in_its_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_names_what_is_missing_in_its_exit_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     place = tmp_path / "umcd"
     part = place / WITH / MOSAICKING / "Urban"
     part.mkdir(parents=True)

@@ -44,7 +44,8 @@ def test_changes_are_listed_by_flight_and_number(site: Path) -> None:
 def test_verdicts_are_kept_and_changed(site: Path) -> None:
     printed = review_changes(site, ["b-1", "c-2"], Verdict.REJECTED, "leaves")
     assert [(each.id, each.verdict, each.note) for each in printed] == [
-        ("b-1", Verdict.REJECTED, "leaves"), ("c-2", Verdict.REJECTED, "leaves"),
+        ("b-1", Verdict.REJECTED, "leaves"),
+        ("c-2", Verdict.REJECTED, "leaves"),
     ]
     review_changes(site, ["2"], Verdict.CONFIRMED, flight="c")
     assert verdicts(site) == {"b-1": "rejected", "c-2": "confirmed"}
@@ -53,10 +54,16 @@ def test_verdicts_are_kept_and_changed(site: Path) -> None:
     assert [each["properties"]["note"] for each in features] == ["leaves", None]
 
 
-@pytest.mark.parametrize(("ids", "flight", "words"), [
-    (["b-1", "x-9"], None, "x-9"), (["1"], None, "no change 1"), (["3"], "b", "no change 3"),
-    ([], None, "no change was"), (["1"], "z", "no flight z"),
-])
+@pytest.mark.parametrize(
+    ("ids", "flight", "words"),
+    [
+        (["b-1", "x-9"], None, "x-9"),
+        (["1"], None, "no change 1"),
+        (["3"], "b", "no change 3"),
+        ([], None, "no change was"),
+        (["1"], "z", "no flight z"),
+    ],
+)
 def test_an_unknown_change_is_named_and_nothing_is_changed(
     site: Path, ids: list[str], flight: str | None, words: str
 ) -> None:
@@ -67,7 +74,11 @@ def test_an_unknown_change_is_named_and_nothing_is_changed(
 
 @pytest.mark.parametrize(("place", "unit"), [(SITE, "m"), (LOCAL_SITE, "units")])
 def test_sizes_are_listed_in_the_units_of_the_map(
-    place: Site, unit: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    place: Site,
+    unit: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("COLUMNS", "160")
     with Archive.open(tmp_path / "site", write=True) as archive:
@@ -79,7 +90,9 @@ def test_sizes_are_listed_in_the_units_of_the_map(
     assert f" length {unit} " in capsys.readouterr().out
 
 
-def test_a_changes_place_is_listed_as_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_changes_place_is_listed_as_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with Archive.open(tmp_path / "site", write=True) as archive:
         archive.create_site(SITE)
         map_flight(archive, "a", 20, count=1)
@@ -94,7 +107,9 @@ def test_a_changes_place_is_listed_as_asked_for(tmp_path: Path, capsys: pytest.C
         assert place in shown and form.heading.split(",")[0] in shown
         assert main(["history", str(tmp_path / "site"), "--coordinates", form.value]) == 0
         origin = SITE.origin
-        assert place_text(origin.latitude_deg, origin.longitude_deg, form) in " ".join(capsys.readouterr().out.split())
+        assert place_text(origin.latitude_deg, origin.longitude_deg, form) in " ".join(
+            capsys.readouterr().out.split()
+        )
 
 
 def test_a_folder_that_is_no_site_is_not_made_one(tmp_path: Path) -> None:
@@ -119,11 +134,16 @@ def test_the_command_lists_and_gives_verdicts(
     assert "no changes" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("arguments", "words"), [
-    (["b-1"], "--confirm or --reject"), (["b-1", "--confirm", "--reject"], "contradict"),
-    (["--reject"], "which changes"), (["nope", "--reject"], "no change nope"),
-    (["1", "--reject"], "give --flight as well"),
-])
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["b-1"], "--confirm or --reject"),
+        (["b-1", "--confirm", "--reject"], "contradict"),
+        (["--reject"], "which changes"),
+        (["nope", "--reject"], "no change nope"),
+        (["1", "--reject"], "give --flight as well"),
+    ],
+)
 def test_the_command_states_what_is_wrong(
     site: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
 ) -> None:

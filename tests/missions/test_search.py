@@ -27,13 +27,17 @@ def site(photo_map: Path) -> Path:
     return photo_map
 
 
-def _report(site: Path, folder: Path, detector: Any, settings: SearchSettings, **outputs: Any) -> dict[str, Any]:
+def _report(
+    site: Path, folder: Path, detector: Any, settings: SearchSettings, **outputs: Any
+) -> dict[str, Any]:
     *_, report = search_site(site, settings, SearchOutputs(folder, **outputs), detector)
     assert isinstance(report, dict)
     return report
 
 
-def test_a_detector_that_sees_all_gives_high_chances_and_the_files_agree(site: Path, tmp_path: Path) -> None:
+def test_a_detector_that_sees_all_gives_high_chances_and_the_files_agree(
+    site: Path, tmp_path: Path
+) -> None:
     settings = SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48))
     report = _report(site, tmp_path / "out", Comparing(site), settings)
     row = report["classes"]["car"]
@@ -47,18 +51,24 @@ def test_a_detector_that_sees_all_gives_high_chances_and_the_files_agree(site: P
         assert file.crs is not None and np.isnan(file.nodata)
         assert seen.sum() * file.res[0] ** 2 >= row["seen_m2"] - 1
     features = json.loads((tmp_path / "out" / "pod.geojson").read_text())["features"]
-    area_m2 = sum(each["properties"]["area_m2"] for each in features if each["properties"]["kind"] == "pod")
+    area_m2 = sum(
+        each["properties"]["area_m2"] for each in features if each["properties"]["kind"] == "pod"
+    )
     assert area_m2 == pytest.approx(row["seen_m2"], rel=0.02)
     assert "probability of detection" in (tmp_path / "out" / "search.html").read_text()
     assert report["headline"]["text"].startswith("probability of detection of a car")
 
 
-def test_a_blind_detector_finds_nothing_and_the_headline_reports_it(site: Path, tmp_path: Path) -> None:
+def test_a_blind_detector_finds_nothing_and_the_headline_reports_it(
+    site: Path, tmp_path: Path
+) -> None:
     settings = SearchSettings(plants=12, classes=("car",), sun_deg=(215, 48))
     report = _report(site, tmp_path / "out", Comparing(site, sees=False), settings)
     assert report["flights"][0]["classes"]["car"]["found"] == 0
     assert report["classes"]["car"]["pod"] < 0.25 and not report["headline"]["complete"]
-    assert sum(report["classes"]["car"]["holes_m2"].values()) == pytest.approx(report["classes"]["car"]["area_m2"])
+    assert sum(report["classes"]["car"]["holes_m2"].values()) == pytest.approx(
+        report["classes"]["car"]["area_m2"]
+    )
 
 
 def _triangles(site: Path, path: Path, *away_deg: float, swapped: bool = False) -> Path:
@@ -69,9 +79,15 @@ def _triangles(site: Path, path: Path, *away_deg: float, swapped: bool = False) 
     with Archive.open(site, write=False) as archive:
         origin = archive.site().origin
     west, south = origin.longitude_deg - 1e-3, origin.latitude_deg - 1e-3
-    around = [[west, south], [west + 2e-3, south], [west + 2e-3, south + 2e-3], [west, south + 2e-3], [west, south]]
+    around = [
+        [west, south],
+        [west + 2e-3, south],
+        [west + 2e-3, south + 2e-3],
+        [west, south + 2e-3],
+        [west, south],
+    ]
     polygons = [] if len(away_deg) < 2 else [[around]]
-    for each in away_deg[len(polygons):]:
+    for each in away_deg[len(polygons) :]:
         south, west = origin.latitude_deg + each, origin.longitude_deg
         ring = [[west, south], [west + 0.002, south], [west + 0.002, south + 0.002], [west, south]]
         polygons.append([[place[::-1] if swapped else place for place in ring]])
@@ -82,7 +98,10 @@ def _triangles(site: Path, path: Path, *away_deg: float, swapped: bool = False) 
 def test_an_area_that_no_drone_reaches_is_refused(site: Path, tmp_path: Path) -> None:
     """Of another search, with a stray polygon, or with latitude before longitude: never an area without holes."""
     settings = SearchSettings(plants=10, classes=("car",), sun_deg=(215, 48))
-    for far, words in (((0.27,), "the area begins 30 km"), ((0.0, 3.0), "polygon 2 of the area begins 33. km")):
+    for far, words in (
+        ((0.27,), "the area begins 30 km"),
+        ((0.0, 3.0), "polygon 2 of the area begins 33. km"),
+    ):
         area = _triangles(site, tmp_path / "area.geojson", *far)
         with pytest.raises(InputError, match=words):
             _report(site, tmp_path / "out", Comparing(site), settings, area=area)
@@ -96,12 +115,19 @@ def test_an_area_elsewhere_is_asked_about(site: Path, tmp_path: Path) -> None:
     area = _triangles(site, tmp_path / "area.geojson", 0.09)
     settings = SearchSettings(plants=10, classes=("car",), sun_deg=(215, 48))
     report = _report(site, tmp_path / "out", Comparing(site), settings, area=area)
-    assert any("begins 10.0 km" in each and "is it the right --area" in each for each in report["warnings"])
+    assert any(
+        "begins 10.0 km" in each and "is it the right --area" in each for each in report["warnings"]
+    )
     assert not any("plants" in each for each in report["warnings"])
-    assert report["headline"]["hole_share"] == pytest.approx(1) and report["classes"]["car"]["pod"] == 0
+    assert (
+        report["headline"]["hole_share"] == pytest.approx(1)
+        and report["classes"]["car"]["pod"] == 0
+    )
 
 
-def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(site: Path, tmp_path: Path) -> None:
+def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(
+    site: Path, tmp_path: Path
+) -> None:
     with Archive.open(site, write=False) as archive:
         origin = archive.site().origin
     d_lat, d_lon = 25 / 111_000, 60 / 111_000 / np.cos(np.radians(origin.latitude_deg))
@@ -109,27 +135,47 @@ def test_ground_beyond_the_flight_is_a_hole_not_seen_and_is_flown_again(site: Pa
     south, north = origin.latitude_deg - d_lat, origin.latitude_deg + d_lat
     ring = [[west, south], [east, south], [east, north], [west, north], [west, south]]
     segments = tmp_path / "segments.geojson"
-    segments.write_text(json.dumps({"type": "FeatureCollection", "features": [{
-        "type": "Feature", "properties": {"name": "all", "poa": 0.9},
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
-    }]}))
+    segments.write_text(
+        json.dumps(
+            {
+                "type": "FeatureCollection",
+                "features": [
+                    {
+                        "type": "Feature",
+                        "properties": {"name": "all", "poa": 0.9},
+                        "geometry": {"type": "Polygon", "coordinates": [ring]},
+                    }
+                ],
+            }
+        )
+    )
     report = _report(
-        site, tmp_path / "out", Comparing(site), SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48)),
-        area=segments, poa=segments, refly=(tmp_path / "holes.kml", tmp_path / "holes.plan"),
+        site,
+        tmp_path / "out",
+        Comparing(site),
+        SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48)),
+        area=segments,
+        poa=segments,
+        refly=(tmp_path / "holes.kml", tmp_path / "holes.plan"),
     )
     row = report["classes"]["car"]
     assert row["area_m2"] == pytest.approx(2.4 * 60 * 50, rel=0.05)
     assert row["holes_m2"]["not seen"] > 0.4 * row["area_m2"] and not report["headline"]["complete"]
     assert "not seen" in report["headline"]["text"]
     (whole,) = report["segments"]
-    assert whole["pod"] == pytest.approx(row["pod"], abs=0.03) and whole["pos"] == pytest.approx(0.9 * whole["pod"])
+    assert whole["pod"] == pytest.approx(row["pod"], abs=0.03) and whole["pos"] == pytest.approx(
+        0.9 * whole["pod"]
+    )
     assert report["refly"]["area_m2"] > 0.4 * row["area_m2"]
     assert (tmp_path / "holes.kml").stat().st_size > 300 and (tmp_path / "holes.plan").is_file()
 
 
 def test_a_sweep_width_is_the_flights_and_not_the_areas(site: Path, tmp_path: Path) -> None:
     """Over a corner of what was flown it is as wide as over all; and nothing to fly is stated, old waypoints go."""
-    settings, old = SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48)), tmp_path / "old.kml"
+    settings, old = (
+        SearchSettings(plants=20, classes=("car",), sun_deg=(215, 48)),
+        tmp_path / "old.kml",
+    )
     whole = _report(site, tmp_path / "out", Comparing(site), settings)
     with Archive.open(site, write=False) as archive:
         origin = archive.site().origin
@@ -143,11 +189,16 @@ def test_a_sweep_width_is_the_flights_and_not_the_areas(site: Path, tmp_path: Pa
     assert other["area_m2"] < 0.05 * one["area_m2"]
     assert other["sweep_width_m"] == pytest.approx(one["sweep_width_m"], rel=0.3)
     assert not old.exists() and "no waypoints were written" in part["warnings"][0]
-    assert str(old) in part["warnings"][0] and "Found over stated" in (tmp_path / "out" / "search.html").read_text()
+    assert (
+        str(old) in part["warnings"][0]
+        and "Found over stated" in (tmp_path / "out" / "search.html").read_text()
+    )
 
 
 @pytest.mark.parametrize("name", ["area.geojson", "out/pod.geojson", "out/plants.geojson"])
-def test_waypoints_never_take_the_place_of_an_input_or_a_result(site: Path, tmp_path: Path, name: str) -> None:
+def test_waypoints_never_take_the_place_of_an_input_or_a_result(
+    site: Path, tmp_path: Path, name: str
+) -> None:
     area = _triangles(site, tmp_path / "area.geojson", 0.0)
     (tmp_path / "out").mkdir()
     outputs = SearchOutputs(tmp_path / "out", area=area, refly=(tmp_path / name,))
@@ -187,13 +238,19 @@ def test_a_flight_is_searched_once(site: Path, tmp_path: Path) -> None:
     for each in plants["features"]:
         east, north = each["geometry"]["coordinates"]
         assert abs(east - origin.longitude_deg) < 0.005 and abs(north - origin.latitude_deg) < 0.005
-    (basis, searched), = read_plants(out).values()
-    assert basis.seed == 1 and len(searched.plants) == len(plants["features"]) and searched.looked == shown
+    ((basis, searched),) = read_plants(out).values()
+    assert (
+        basis.seed == 1
+        and len(searched.plants) == len(plants["features"])
+        and searched.looked == shown
+    )
     (out / "plants.geojson").write_text(json.dumps(plants)[:-400])
     assert not read_plants(out) and not read_plants(tmp_path)
     (tmp_path / "plants.geojson").write_text('{"format": 1, "flights": [], "features": []}')
     assert not read_plants(tmp_path)
-    next(search_site(site, settings, SearchOutputs(out), detector))  # what cannot be read is measured anew
+    next(
+        search_site(site, settings, SearchOutputs(out), detector)
+    )  # what cannot be read is measured anew
     assert detector.shown == shown + 1
 
 
@@ -202,23 +259,34 @@ def test_plants_serve_another_search_of_the_same_frames_alone() -> None:
     assert basis.serves(replace(basis, plants=20, seed=4, area="field"))
     assert basis.serves(replace(basis, classes=("car",)))
     for other in (
-        {"model": "x"}, {"frames": "x"}, {"program": "2"}, {"heights": "x"}, {"through_crowns": 0.3},
-        {"sun_deg": (1.0, 2.0)}, {"classes": ("small object",)},
+        {"model": "x"},
+        {"frames": "x"},
+        {"program": "2"},
+        {"heights": "x"},
+        {"through_crowns": 0.3},
+        {"sun_deg": (1.0, 2.0)},
+        {"classes": ("small object",)},
     ):
         assert not basis.serves(replace(basis, **other))
-    assert Basis.from_json(json.loads(json.dumps(asdict(replace(basis, sun_deg=(1.0, 2.0)))))).sun_deg == (1.0, 2.0)
+    assert Basis.from_json(
+        json.loads(json.dumps(asdict(replace(basis, sun_deg=(1.0, 2.0)))))
+    ).sun_deg == (1.0, 2.0)
 
 
 def test_a_map_without_metres_is_refused(tmp_path: Path, filmed: Path) -> None:
     lonely = tmp_path / "video.mp4"
     lonely.write_bytes((filmed / "flight1" / "flight1.mp4").read_bytes())
-    for _ in map_flights([lonely], tmp_path / "site", MapSettings(model="none"), camera=filmed / "camera.xml"):
+    for _ in map_flights(
+        [lonely], tmp_path / "site", MapSettings(model="none"), camera=filmed / "camera.xml"
+    ):
         pass
     with pytest.raises(InputError, match="without GPS"):
         list(search_site(tmp_path / "site", SearchSettings(), SearchOutputs(tmp_path / "out")))
 
 
-def test_the_command_refuses_what_it_cannot_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_refuses_what_it_cannot_use(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(["search", str(tmp_path / "nothing")]) == 1
     assert "there is no" in (words := capsys.readouterr().err) and "--site" in words
     for option in ("--camera", "--telemetry"):
@@ -237,7 +305,9 @@ def test_classes_that_cannot_be_measured_are_refused(site: Path, tmp_path: Path)
         next(search_site(site, SearchSettings(classes=("giraffe",)), outputs, detector))
     detector.classes = ("truck", "bus")
     detector.info = replace(
-        detector.info, classes=("truck", "bus"), thresholds={"truck": 0.3, "bus": 0.3},
+        detector.info,
+        classes=("truck", "bus"),
+        thresholds={"truck": 0.3, "bus": 0.3},
         best_px={"truck": (4.0, 400.0), "bus": (4.0, 400.0)},
     )
     with pytest.raises(SettingsError, match="no 'truck' can be drawn"):
@@ -250,15 +320,23 @@ def test_classes_that_cannot_be_measured_are_refused(site: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"refly": "holes.txt"}, "not as '.txt'"), ({"refly": "nowhere/holes.kml"}, "there is no folder"),
-        ({"refly": "holes.kmz", "dji-drone": "paper"}, "--dji-drone paper"), ({"area": "missing.geojson"}, "missing"),
-        ({"poa": "missing.geojson"}, "missing"), ({"classes": "giraffe"}, "giraffe"), ({"model": "none"}, "nothing"),
+        ({"refly": "holes.txt"}, "not as '.txt'"),
+        ({"refly": "nowhere/holes.kml"}, "there is no folder"),
+        ({"refly": "holes.kmz", "dji-drone": "paper"}, "--dji-drone paper"),
+        ({"area": "missing.geojson"}, "missing"),
+        ({"poa": "missing.geojson"}, "missing"),
+        ({"classes": "giraffe"}, "giraffe"),
+        ({"model": "none"}, "nothing"),
         ({"out": "camera.xml"}, "is a file"),
     ],
 )
 def test_what_cannot_be_used_is_refused_before_a_flight_is_mapped(
-    photographed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    options: dict[str, str], words: str,
+    photographed: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    options: dict[str, str],
+    words: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "camera.xml").write_bytes((photographed / "camera.xml").read_bytes())
@@ -269,20 +347,30 @@ def test_what_cannot_be_used_is_refused_before_a_flight_is_mapped(
     assert not (tmp_path / "site" / "site.db").exists()
 
 
-@pytest.mark.parametrize(("inputs", "wishes", "words"), [
-    (["photos"], ["--flight", "flight1"], "flights that the map has"), (["photos"], ["--seed", "-1"], "--seed"),
-    (["follow:a", "follow:b"], [], "one live flight"),
-])
+@pytest.mark.parametrize(
+    ("inputs", "wishes", "words"),
+    [
+        (["photos"], ["--flight", "flight1"], "flights that the map has"),
+        (["photos"], ["--seed", "-1"], "--seed"),
+        (["follow:a", "follow:b"], [], "one live flight"),
+    ],
+)
 def test_what_makes_no_sense_of_a_flight_to_map_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], inputs: list[str],
-    wishes: list[str], words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    inputs: list[str],
+    wishes: list[str],
+    words: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["search", *inputs, "--site", "site", *wishes]) == 1
     assert words in capsys.readouterr().err
 
 
-def test_waypoints_of_an_unknown_format_are_refused_before_the_search(site: Path, tmp_path: Path) -> None:
+def test_waypoints_of_an_unknown_format_are_refused_before_the_search(
+    site: Path, tmp_path: Path
+) -> None:
     outputs = SearchOutputs(tmp_path / "out", refly=(tmp_path / "holes.txt",))
     with pytest.raises(SettingsError, match="flight plans are written as"):
         next(search_site(site, SearchSettings(), outputs, Comparing(site)))
@@ -294,10 +382,21 @@ def test_segments_need_probabilities_that_add_up(tmp_path: Path) -> None:
     path = tmp_path / "segments.geojson"
 
     def write(*properties: dict[str, Any]) -> None:
-        path.write_text(json.dumps({"type": "FeatureCollection", "features": [
-            {"type": "Feature", "properties": each, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-            for each in properties
-        ]}))
+        path.write_text(
+            json.dumps(
+                {
+                    "type": "FeatureCollection",
+                    "features": [
+                        {
+                            "type": "Feature",
+                            "properties": each,
+                            "geometry": {"type": "Polygon", "coordinates": [ring]},
+                        }
+                        for each in properties
+                    ],
+                }
+            )
+        )
 
     write({"poa_percent": 40}, {"name": "b", "POA": 0.5})
     assert [(name, poa) for name, _, poa in read_segments(path)] == [("segment 1", 0.4), ("b", 0.5)]

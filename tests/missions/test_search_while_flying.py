@@ -73,19 +73,30 @@ def test_a_blind_detector_is_known_as_such_while_it_flies(site: Path) -> None:
     with Archive.open(site, write=False) as archive:
         (name,) = flights_to_search(archive, ())
         growing = GrowingMeasure(
-            name, archive.site(), Comparing(site, sees=False), _SETTINGS, area_m=None, keep_off_m=[], above=None
+            name,
+            archive.site(),
+            Comparing(site, sees=False),
+            _SETTINGS,
+            area_m=None,
+            keep_off_m=[],
+            above=None,
         )
         for frame in search_frames(archive, name)[:4]:
             growing.add(frame)
         _, flight = growing.measured()
-    assert all(not each.outcomes.found.any() for each in flight.classes) and _chance(flight, "person") < 0.25
+    assert (
+        all(not each.outcomes.found.any() for each in flight.classes)
+        and _chance(flight, "person") < 0.25
+    )
 
 
 def test_a_field_is_the_same_from_wherever_it_is_come_to() -> None:
     ground = np.array([[0.0, 0.0], [60.0, 0.0], [60.0, 40.0], [0.0, 40.0]])
 
     def sown(*corners_m: tuple[float, float]) -> dict[tuple[float, float], str]:
-        field = PlantField(("person", "car"), ground, keep_off_m=[np.array([30.0, 20.0])], free_m=4.0, seed=5)
+        field = PlantField(
+            ("person", "car"), ground, keep_off_m=[np.array([30.0, 20.0])], free_m=4.0, seed=5
+        )
         for corner_m in corners_m:
             field.near(ground + corner_m, 5.0)
         return {tuple(each.place_m): each.label for each in field.places}  # type: ignore[misc]
@@ -97,7 +108,9 @@ def test_a_field_is_the_same_from_wherever_it_is_come_to() -> None:
     assert apart_m.min() >= 4.0 and np.linalg.norm(places_m - (30, 20), axis=1).min() >= 3.0
     cars_m = places_m[[label == "car" for label in one.values()]]
     assert len(cars_m) > 5
-    assert (np.linalg.norm(cars_m[:, None] - cars_m, axis=2) + 1e9 * np.eye(len(cars_m))).min() >= 10.0
+    assert (
+        np.linalg.norm(cars_m[:, None] - cars_m, axis=2) + 1e9 * np.eye(len(cars_m))
+    ).min() >= 10.0
 
 
 def test_a_flight_that_climbs_is_sown_anew(site: Path) -> None:
@@ -105,10 +118,18 @@ def test_a_flight_that_climbs_is_sown_anew(site: Path) -> None:
     with Archive.open(site, write=False) as archive:
         (name,) = flights_to_search(archive, ())
         frames, place = search_frames(archive, name)[:3], archive.site()
-    growing = GrowingMeasure(name, place, Comparing(site), _SETTINGS, area_m=None, keep_off_m=[], above=None)
-    field = PlantField(("person", "car"), frames[0].placed.outline_m / 10, keep_off_m=[], free_m=4.0, seed=1)
+    growing = GrowingMeasure(
+        name, place, Comparing(site), _SETTINGS, area_m=None, keep_off_m=[], above=None
+    )
+    field = PlantField(
+        ("person", "car"), frames[0].placed.outline_m / 10, keep_off_m=[], free_m=4.0, seed=1
+    )
     small = PlantField(
-        ("person", "car"), frames[0].placed.outline_m / 10, keep_off_m=[], free_m=4.0, seed=1,
+        ("person", "car"),
+        frames[0].placed.outline_m / 10,
+        keep_off_m=[],
+        free_m=4.0,
+        seed=1,
         settings=FieldSettings(square_m=0.5),
     )
     assert field.fits(frames[0].placed.outline_m) and not small.fits(frames[0].placed.outline_m)
@@ -132,9 +153,12 @@ class Arriving:
         self.landed = threading.Event()
         self.reports: list[Mapping[str, Any]] = []
 
-    def fly(self, flying: SearchWhileFlying, report: Path, over: threading.Event) -> threading.Thread:
+    def fly(
+        self, flying: SearchWhileFlying, report: Path, over: threading.Event
+    ) -> threading.Thread:
         """Bring the others in a thread, and keep each report that the search writes meanwhile; land when it is
         `over`."""
+
         def bring() -> None:
             for each in [*self._photos[_AT_ONCE:], None]:
                 _wait(lambda: flying.written > len(self.reports), self._most_s)
@@ -164,7 +188,11 @@ def _wait(holds: Any, most_s: float) -> None:
 
 
 def _flown(
-    photos: Path, camera: Path, folder: Path, flying: SearchWhileFlying, most_s: float = 60.0,
+    photos: Path,
+    camera: Path,
+    folder: Path,
+    flying: SearchWhileFlying,
+    most_s: float = 60.0,
     over: threading.Event | None = None,
 ) -> Sequence[Mapping[str, Any]]:
     arriving = Arriving(photos, folder / "in", most_s)
@@ -173,8 +201,13 @@ def _flown(
         over.set()
     thread = arriving.fly(flying, folder / "out" / "search.json", over)
     for _ in map_flights(
-        [f"follow:{folder / 'in'}"], folder / "site", MapSettings(model="none", live_s=0.2), camera=camera, live=_LIVE,
-        until=arriving.landed, search=flying,
+        [f"follow:{folder / 'in'}"],
+        folder / "site",
+        MapSettings(model="none", live_s=0.2),
+        camera=camera,
+        live=_LIVE,
+        until=arriving.landed,
+        search=flying,
     ):
         pass
     thread.join()
@@ -189,16 +222,25 @@ def threads() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("threads")
-def test_files_and_waypoints_follow_the_flight(photographed: Path, site: Path, tmp_path: Path) -> None:
+def test_files_and_waypoints_follow_the_flight(
+    photographed: Path, site: Path, tmp_path: Path
+) -> None:
     refly = tmp_path / "holes.kml"
     outputs = SearchOutputs(tmp_path / "out", area=_area(site, tmp_path), refly=(refly,))
-    flying = SearchWhileFlying(_SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02))
-    reports = _flown(photographed / "flight1" / "photos", photographed / "camera.xml", tmp_path, flying)
+    flying = SearchWhileFlying(
+        _SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02)
+    )
+    reports = _flown(
+        photographed / "flight1" / "photos", photographed / "camera.xml", tmp_path, flying
+    )
     assert len(reports) >= 2
     for each in reports:
         assert 1 <= each["so_far"]["measured"] <= each["so_far"]["placed"]
         assert each["headline"]["text"].startswith(f"so far, by {each['so_far']['measured']} of ")
-        assert "of the flight in alone" in each["headline"]["text"] and each["so_far"]["state"] == "flying"
+        assert (
+            "of the flight in alone" in each["headline"]["text"]
+            and each["so_far"]["state"] == "flying"
+        )
         assert not each["headline"]["complete"] and "not seen" in each["headline"]["text"]
     seen_m2 = [each["classes"]["car"]["seen_m2"] for each in reports]
     assert seen_m2 == sorted(seen_m2) and seen_m2[-1] > seen_m2[0] > 0
@@ -208,7 +250,9 @@ def test_files_and_waypoints_follow_the_flight(photographed: Path, site: Path, t
     assert refly.is_file() and (tmp_path / "out" / "pod.tif").is_file()
 
 
-def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(site: Path, tmp_path: Path) -> None:
+def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(
+    site: Path, tmp_path: Path
+) -> None:
     """What it states of its ground is what the search itself stated, over other cells too."""
     settings, outputs = replace(_SETTINGS, plants=10), SearchOutputs(tmp_path / "out")
     *_, whole = search_site(site, settings, outputs, Comparing(site))
@@ -216,15 +260,23 @@ def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(s
     prepared = prepare_search(settings, outputs, Comparing(site))
     with Archive.open(site, write=False) as archive:
         (name,) = flights_to_search(archive, ())
-        earlier = EarlierFlights(archive, "other", prepared, replace(settings, plants=90, seed=7), outputs)
+        earlier = EarlierFlights(
+            archive, "other", prepared, replace(settings, plants=90, seed=7), outputs
+        )
         for _ in search_frames(archive, name):
             assert not earlier.frames and earlier.uncounted_m and earlier.look()
         assert not earlier.look()
         frames_m = [each.placed.outline_m for each in earlier.frames[name]]
         (flight,) = earlier.on(cells_of(frames_m, archive.site(), None))
-        (beside,) = earlier.on(cells_of([each + np.array([25.0, 0.0]) for each in frames_m], archive.site(), None))
-        blind = EarlierFlights(archive, "other", prepared, replace(settings, through_crowns=0.5), outputs)
-        assert not blind.look() and len(blind.uncounted_m) == len(frames_m) and not earlier.uncounted_m
+        (beside,) = earlier.on(
+            cells_of([each + np.array([25.0, 0.0]) for each in frames_m], archive.site(), None)
+        )
+        blind = EarlierFlights(
+            archive, "other", prepared, replace(settings, through_crowns=0.5), outputs
+        )
+        assert (
+            not blind.look() and len(blind.uncounted_m) == len(frames_m) and not earlier.uncounted_m
+        )
     for own, other in zip(flight.classes, beside.classes, strict=True):
         row = whole["classes"][own.label]
         assert float(np.nansum(own.chances.mean)) == pytest.approx(row["swept_m2"], rel=0.02)
@@ -233,20 +285,30 @@ def test_a_flight_that_an_earlier_search_measured_counts_once_it_was_looked_at(s
 
 
 @pytest.mark.usefixtures("threads")
-def test_a_flight_that_is_stopped_leaves_no_waypoints(photographed: Path, site: Path, tmp_path: Path) -> None:
+def test_a_flight_that_is_stopped_leaves_no_waypoints(
+    photographed: Path, site: Path, tmp_path: Path
+) -> None:
     """And a page that states it, not one that is loaded anew for ever. A flight before it counts as well."""
     refly = tmp_path / "holes.kml"
     outputs = SearchOutputs(tmp_path / "out", area=_area(site, tmp_path), refly=(refly,))
     shutil.copytree(site, tmp_path / "site")
-    settings, pace = replace(_SETTINGS, plants=10), Pace(again_s=0.0, rest=0.0, look_s=0.02, earlier=99)
+    settings, pace = (
+        replace(_SETTINGS, plants=10),
+        Pace(again_s=0.0, rest=0.0, look_s=0.02, earlier=99),
+    )
     *_, whole = search_site(tmp_path / "site", settings, outputs, Comparing(site))
     flying = SearchWhileFlying(settings, outputs, Comparing(site), pace)
     photos = Arriving(photographed / "flight1" / "photos", tmp_path / "in", 0.0)
     over = threading.Event()
     thread = photos.fly(flying, tmp_path / "out" / "search.json", over)
     updates = map_flights(
-        [f"follow:{tmp_path / 'in'}"], tmp_path / "site", MapSettings(model="none", live_s=0.2),
-        camera=photographed / "camera.xml", live=_LIVE, until=photos.landed, search=flying,
+        [f"follow:{tmp_path / 'in'}"],
+        tmp_path / "site",
+        MapSettings(model="none", live_s=0.2),
+        camera=photographed / "camera.xml",
+        live=_LIVE,
+        until=photos.landed,
+        search=flying,
     )
     refly.write_text("of an earlier search")
     next(updates)
@@ -263,11 +325,17 @@ def test_a_flight_that_is_stopped_leaves_no_waypoints(photographed: Path, site: 
     thread.join()
     page = (tmp_path / "out" / "search.html").read_text()
     assert "when the flight was stopped" in page and "refresh" not in page and not refly.exists()
-    assert "of the flight in and 1 flight before it" in page and "no waypoints were written" not in page
+    assert (
+        "of the flight in and 1 flight before it" in page
+        and "no waypoints were written" not in page
+    )
     assert "the flight was stopped, and its waypoints were taken away" in page
     report = json.loads((tmp_path / "out" / "search.json").read_bytes())
     assert report["so_far"]["earlier"] == ["photos"] and isinstance(whole, dict)
-    assert [(each["name"], each["measured_before"]) for each in report["flights"]] == [("photos", True), ("in", False)]
+    assert [(each["name"], each["measured_before"]) for each in report["flights"]] == [
+        ("photos", True),
+        ("in", False),
+    ]
     for label in ("car", "person"):
         before, now = whole["classes"][label], report["classes"][label]
         assert now["seen_m2"] >= 0.97 * before["seen_m2"] and now["pod"] > 0.97 * before["pod"]
@@ -286,9 +354,18 @@ def test_a_fault_of_the_measure_does_not_end_the_map(
 
     monkeypatch.setattr(while_flying, "write_search", full)
     outputs = SearchOutputs(tmp_path / "out")
-    flying = SearchWhileFlying(_SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02))
+    flying = SearchWhileFlying(
+        _SETTINGS, outputs, Comparing(site), Pace(again_s=0.0, rest=0.0, look_s=0.02)
+    )
     with pytest.warns(match="not measured whole while the flight goes on: disk full"):
-        _flown(photographed / "flight1" / "photos", photographed / "camera.xml", tmp_path, flying, 0.0, failed)
+        _flown(
+            photographed / "flight1" / "photos",
+            photographed / "camera.xml",
+            tmp_path,
+            flying,
+            0.0,
+            failed,
+        )
     assert flying.written == 0
     with Archive.open(tmp_path / "site", write=False) as archive:
         assert archive.keyframes()
@@ -296,7 +373,9 @@ def test_a_fault_of_the_measure_does_not_end_the_map(
 
 def test_what_cannot_be_used_is_refused_before_the_flight(site: Path, tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="giraffe"):
-        SearchWhileFlying(SearchSettings(classes=("giraffe",)), SearchOutputs(tmp_path / "out"), Comparing(site))
+        SearchWhileFlying(
+            SearchSettings(classes=("giraffe",)), SearchOutputs(tmp_path / "out"), Comparing(site)
+        )
 
 
 def _area(site: Path, folder: Path) -> Path:
@@ -304,10 +383,20 @@ def _area(site: Path, folder: Path) -> Path:
     with Archive.open(site, write=False) as archive:
         frame = archive.site().frame
         (name,) = flights_to_search(archive, ())
-        outlines_m = np.concatenate([each.placed.outline_m for each in search_frames(archive, name)])
+        outlines_m = np.concatenate(
+            [each.placed.outline_m for each in search_frames(archive, name)]
+        )
     (west, south), (east, north) = outlines_m.min(axis=0), outlines_m.max(axis=0)
-    ring_m = [(west, south), (2 * east - west, south), (2 * east - west, north), (west, north), (west, south)]
-    latitudes_deg, longitudes_deg, _ = frame.wgs84_from_site(np.array([(x, y, 0.0) for x, y in ring_m]))
+    ring_m = [
+        (west, south),
+        (2 * east - west, south),
+        (2 * east - west, north),
+        (west, north),
+        (west, south),
+    ]
+    latitudes_deg, longitudes_deg, _ = frame.wgs84_from_site(
+        np.array([(x, y, 0.0) for x, y in ring_m])
+    )
     ring = np.column_stack([longitudes_deg, latitudes_deg]).tolist()
     path = folder / "area.geojson"
     path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))

@@ -22,7 +22,9 @@ def site(tmp_path: Path) -> Path:
     return tmp_path / "site"
 
 
-def test_the_command_copies_verifies_and_reports_it(site: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_command_copies_verifies_and_reports_it(
+    site: Path, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     target = tmp_path / "a copy"
     assert main(["site", "copy", str(site), target.as_uri(), "--json"]) == 0
     row = json.loads(capsys.readouterr().out)

@@ -36,7 +36,14 @@ from sorvolo.survey.objects import CLASSES, Detections, no_detections
 
 _FLOWN = replace(
     small_flight(
-        77, height_m=25, speed_m_s=6, length_m=40, spacing_m=8, size_px=(480, 270), people=3, cars=2,
+        77,
+        height_m=25,
+        speed_m_s=6,
+        length_m=40,
+        spacing_m=8,
+        size_px=(480, 270),
+        people=3,
+        cars=2,
         output=OutputSettings(telemetry="all", truth_step=1),
     ),
     sensor=SensorSettings(noise_m=(0.4, 0.4, 0.2)),
@@ -54,10 +61,16 @@ def _video(flown: Path) -> Path:
 
 
 def _watch(
-    flown: Path, folder: Path, detector: TruthDetector, settings: WatchSettings = WatchSettings(), **outputs: Any  # noqa: B008
+    flown: Path,
+    folder: Path,
+    detector: TruthDetector,
+    settings: WatchSettings = WatchSettings(),
+    **outputs: Any,
 ) -> list[WatchUpdate]:
     written = WatchOutputs(folder=folder, **outputs)
-    return list(watch(_video(flown), settings, written, camera=flown / "camera.xml", detector=detector))
+    return list(
+        watch(_video(flown), settings, written, camera=flown / "camera.xml", detector=detector)
+    )
 
 
 def _read(path: Path) -> Any:
@@ -75,7 +88,8 @@ def _seen_objects(flown: Path) -> dict[int, tuple[str, np.ndarray]]:
             each["properties"]["class"],
             np.mean(np.array(each["geometry"]["coordinates"][0][:-1]), axis=0),
         )
-        for each in features if each["properties"]["id"] in often
+        for each in features
+        if each["properties"]["id"] in often
     }
 
 
@@ -83,7 +97,9 @@ def _metres(degrees: np.ndarray, latitude_deg: float) -> np.ndarray:
     return degrees * np.array([np.cos(np.radians(latitude_deg)), 1.0]) * 111_200
 
 
-def test_each_object_once_at_its_place(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_each_object_once_at_its_place(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     folder = tmp_path / "watch"
     updates = _watch(flown, folder, detector)
     reported = [track.id for update in updates for track in update.new]
@@ -91,11 +107,14 @@ def test_each_object_once_at_its_place(flown: Path, detector: TruthDetector, tmp
     truth = _seen_objects(flown)
     tracks = _read(folder / "tracks.geojson")["features"]
     assert len(truth) >= 4
-    assert sorted(each["properties"]["class"] for each in tracks) == sorted(name for name, _ in truth.values())
+    assert sorted(each["properties"]["class"] for each in tracks) == sorted(
+        name for name, _ in truth.values()
+    )
     for each in tracks:
         place = np.array(each["geometry"]["coordinates"])
         near_m = [
-            np.linalg.norm(_metres(place - middle, place[1])) for name, middle in truth.values()
+            np.linalg.norm(_metres(place - middle, place[1]))
+            for name, middle in truth.values()
             if name == each["properties"]["class"]
         ]
         assert min(near_m) < 1.5, each["properties"]
@@ -106,7 +125,11 @@ def test_each_object_once_at_its_place(flown: Path, detector: TruthDetector, tmp
     assert report["model"]["licence"] == "CC0-1.0" and report["ended"] == "the source ended"
     assert report["frames"]["detected"] == len(updates) == report["frames"]["read"]
     lines = [json.loads(line) for line in (folder / "detections.jsonl").read_text().splitlines()]
-    assert len(lines) == report["detections"]["total"] == sum(len(update.detections) for update in updates)
+    assert (
+        len(lines)
+        == report["detections"]["total"]
+        == sum(len(update.detections) for update in updates)
+    )
     assert len(_read(folder / "detections.geojson")["features"]) == len(lines)
     assert {each["properties"]["id"] for each in tracks} <= {line["track"] for line in lines}
     page = (folder / "report.html").read_text()
@@ -131,7 +154,9 @@ def test_without_telemetry_objects_are_counted_in_the_picture(
     codes = {each["code"] for each in report["notices"]}
     assert {"not_on_ground", "cot_without_place"} <= codes and not report["georeferenced"]
     counts = report["detections"]
-    assert counts["placed"] == 0 and counts["not_placed"] + counts["set_aside"] == counts["total"] > 0
+    assert (
+        counts["placed"] == 0 and counts["not_placed"] + counts["set_aside"] == counts["total"] > 0
+    )
     truth = _seen_objects(flown)
     # without GPS the way back is another way, on which objects count again; a false alarm may count as well
     assert len(truth) <= report["objects"]["total"] <= 2 * len(truth) + 1 and updates
@@ -144,7 +169,9 @@ def test_without_telemetry_objects_are_counted_in_the_picture(
 
 
 @pytest.mark.parametrize("has_telemetry", [True, False])
-def test_views_never_exceed_the_frames_searched(flown: Path, tmp_path: Path, has_telemetry: bool) -> None:
+def test_views_never_exceed_the_frames_searched(
+    flown: Path, tmp_path: Path, has_telemetry: bool
+) -> None:
     """With the packaged detector: each track's views are frames that show it, each counted once."""
     video = _video(flown)
     if not has_telemetry:
@@ -153,7 +180,16 @@ def test_views_never_exceed_the_frames_searched(flown: Path, tmp_path: Path, has
     settings = WatchSettings(least_score=0.3, every=3, tiles=None)
     folder = tmp_path / "watch"
     found = Detector.load("default", provider="cpu", threads=1)
-    deque(watch(video, settings, WatchOutputs(folder=folder), camera=flown / "camera.xml", detector=found), 0)
+    deque(
+        watch(
+            video,
+            settings,
+            WatchOutputs(folder=folder),
+            camera=flown / "camera.xml",
+            detector=found,
+        ),
+        0,
+    )
     searched = _read(folder / "report.json")["frames"]["detected"]
     lines = [json.loads(line) for line in (folder / "detections.jsonl").read_text().splitlines()]
     features = _read(folder / ("tracks.geojson" if has_telemetry else "tracks.json"))["features"]
@@ -164,7 +200,9 @@ def test_views_never_exceed_the_frames_searched(flown: Path, tmp_path: Path, has
         assert count <= len({line["frame"] for line in lines if line["track"] == track})
 
 
-def test_after_a_cut_places_and_objects_begin_anew(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_after_a_cut_places_and_objects_begin_anew(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     """The same pictures upside down after a few of noise: other objects, in pixels of their own first picture."""
     random = np.random.default_rng(1)
     with av.open(str(_video(flown))) as video:
@@ -175,7 +213,9 @@ def test_after_a_cut_places_and_objects_begin_anew(flown: Path, detector: TruthD
     for number, picture in enumerate(frames):
         cv2.imwrite(str(tmp_path / "photos" / f"{number:03d}.png"), picture[..., ::-1])
     finder = _InTheMiddle(detector.info)
-    updates = list(watch(tmp_path / "photos", outputs=WatchOutputs(folder=tmp_path / "watch"), detector=finder))
+    updates = list(
+        watch(tmp_path / "photos", outputs=WatchOutputs(folder=tmp_path / "watch"), detector=finder)
+    )
     first, last = updates[0].segment, updates[-1].segment
     assert first == 1 and last > 1
     tracks = [each["properties"] for each in _read(tmp_path / "watch" / "tracks.json")["features"]]
@@ -183,7 +223,10 @@ def test_after_a_cut_places_and_objects_begin_anew(flown: Path, detector: TruthD
     assert len({each["id"] for each in tracks}) == len(tracks)
     height, width = pictures[0].shape[:2]
     assert all(abs(each["x_px"]) < 3 * width and abs(each["y_px"]) < 3 * height for each in tracks)
-    lines = [json.loads(line) for line in (tmp_path / "watch" / "detections.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line)
+        for line in (tmp_path / "watch" / "detections.jsonl").read_text().splitlines()
+    ]
     assert lines[0]["segment"] == 1 and lines[-1]["segment"] == last
     assert f"segment {last}" in (tmp_path / "watch" / "report.html").read_text()
 
@@ -201,7 +244,9 @@ class _InTheMiddle:
             return no_detections(CLASSES)
         height, width = image.shape[:2]
         box = [width / 2 - 8, height / 2 - 8, width / 2 + 8, height / 2 + 8]
-        return Detections(np.array([box]), np.array([0.9]), np.array([CLASSES.index("person")]), CLASSES)
+        return Detections(
+            np.array([box]), np.array([0.9]), np.array([CLASSES.index("person")]), CLASSES
+        )
 
 
 def test_heights_without_a_ground_are_reported_and_can_be_helped(
@@ -211,13 +256,31 @@ def test_heights_without_a_ground_are_reported_and_can_be_helped(
     assert log.exists()
     outputs = WatchOutputs(folder=tmp_path / "unknown")
     few = WatchSettings(frames_per_second=1)
-    list(watch(_video(flown), few, outputs, telemetry=log, camera=flown / "camera.xml", detector=detector))
+    list(
+        watch(
+            _video(flown),
+            few,
+            outputs,
+            telemetry=log,
+            camera=flown / "camera.xml",
+            detector=detector,
+        )
+    )
     report = _read(tmp_path / "unknown" / "report.json")
     assert not report["georeferenced"]
     assert any("--ground-elevation" in each["text"] for each in report["notices"])
     outputs = WatchOutputs(folder=tmp_path / "known")
     settings = replace(few, ground_elevation_m=83.3 - 48.3)
-    list(watch(_video(flown), settings, outputs, telemetry=log, camera=flown / "camera.xml", detector=detector))
+    list(
+        watch(
+            _video(flown),
+            settings,
+            outputs,
+            telemetry=log,
+            camera=flown / "camera.xml",
+            detector=detector,
+        )
+    )
     report = _read(tmp_path / "known" / "report.json")
     assert report["georeferenced"]
     assert any("straight down" in each["text"] for each in report["notices"])
@@ -231,20 +294,39 @@ def test_a_height_model_places_what_its_heights_alone_cannot(
     ground_m = 83.3 - 48.3
     model = tmp_path / "ground.tif"
     with rasterio.open(
-        model, "w", driver="GTiff", width=200, height=200, count=1, dtype="float32", crs="EPSG:4326",
+        model,
+        "w",
+        driver="GTiff",
+        width=200,
+        height=200,
+        count=1,
+        dtype="float32",
+        crs="EPSG:4326",
         transform=Affine(1e-4, 0, 12.5935, 0, -1e-4, 41.9025),
     ) as sink:
         sink.write(np.full((1, 200, 200), ground_m, np.float32))
     few = WatchSettings(frames_per_second=1)
     places = []
     for name, settings in (
-        ("number", replace(few, ground_elevation_m=ground_m)), ("model", replace(few, height_model=str(model))),
+        ("number", replace(few, ground_elevation_m=ground_m)),
+        ("model", replace(few, height_model=str(model))),
     ):
         outputs = WatchOutputs(folder=tmp_path / name)
-        list(watch(_video(flown), settings, outputs, telemetry=log, camera=flown / "camera.xml", detector=detector))
+        list(
+            watch(
+                _video(flown),
+                settings,
+                outputs,
+                telemetry=log,
+                camera=flown / "camera.xml",
+                detector=detector,
+            )
+        )
         assert _read(tmp_path / name / "report.json")["georeferenced"]
         tracks = _read(tmp_path / name / "tracks.geojson")["features"]
-        places.append([(each["properties"]["east_m"], each["properties"]["north_m"]) for each in tracks])
+        places.append(
+            [(each["properties"]["east_m"], each["properties"]["north_m"]) for each in tracks]
+        )
     assert len(places[0]) > 3 and len(places[0]) == len(places[1])
     assert np.abs(np.subtract(*places)).max() < 0.05  # the model's own error is in the weights
     notices = _read(tmp_path / "model" / "report.json")["notices"]
@@ -253,7 +335,9 @@ def test_a_height_model_places_what_its_heights_alone_cannot(
         replace(few, height_model=str(model), ground_elevation_m=3.0)
 
 
-def test_those_who_want_it_are_alerted(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_those_who_want_it_are_alerted(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     script = tmp_path / "hook.py"
     script.write_text(
         "import json, sys\n"
@@ -267,8 +351,12 @@ def test_those_who_want_it_are_alerted(flown: Path, detector: TruthDetector, tmp
         receiver.settimeout(0.2)
         port = receiver.getsockname()[1]
         _watch(
-            flown, tmp_path / "watch", detector, cot=f"udp://127.0.0.1:{port}",
-            alert_command=f"{sys.executable} {script} {out} {{id}} '{{class}}'", alert_url="http://127.0.0.1:9/dead",
+            flown,
+            tmp_path / "watch",
+            detector,
+            cot=f"udp://127.0.0.1:{port}",
+            alert_command=f"{sys.executable} {script} {out} {{id}} '{{class}}'",
+            alert_url="http://127.0.0.1:9/dead",
         )
         events = []
         while True:
@@ -282,7 +370,9 @@ def test_those_who_want_it_are_alerted(flown: Path, detector: TruthDetector, tmp
     assert all(words == [str(body["id"]), body["class"]] for words, body in reported)
     assert len({body["id"] for _, body in reported}) == len(reported)
     uids = [event.get("uid", "") for event in events]
-    assert {uid.rsplit(".", 1)[1] for uid in uids} >= {str(each["properties"]["id"]) for each in tracks}
+    assert {uid.rsplit(".", 1)[1] for uid in uids} >= {
+        str(each["properties"]["id"]) for each in tracks
+    }
     assert len(uids) <= 4 * len(set(uids))  # at its pace, not with each frame
     notices = {each["code"]: each for each in _read(tmp_path / "watch" / "report.json")["notices"]}
     assert notices["alert_url_failed"]["count"] == len(reported)
@@ -300,9 +390,14 @@ def test_only_the_classes_asked_for_in_the_frames_asked_for(
     report = _read(tmp_path / "watch" / "report.json")
     counts = report["frames"]
     assert report["looked_for"] == ["car"]
-    assert (counts["read"], counts["detected"]) == (frames, len(updates)) == (frames, -(-frames // 7))
+    assert (
+        (counts["read"], counts["detected"]) == (frames, len(updates)) == (frames, -(-frames // 7))
+    )
     assert [int(update.frame_name) % 7 for update in updates] == [0] * len(updates)
-    lines = [json.loads(line) for line in (tmp_path / "watch" / "detections.jsonl").read_text().splitlines()]
+    lines = [
+        json.loads(line)
+        for line in (tmp_path / "watch" / "detections.jsonl").read_text().splitlines()
+    ]
     assert {line["class"] for line in lines} == {"car"}
     pictures = {int(path.stem) for path in (tmp_path / "watch" / "annotated").iterdir()}
     assert pictures == {int(line["frame"]) for line in lines}
@@ -310,13 +405,17 @@ def test_only_the_classes_asked_for_in_the_frames_asked_for(
         _watch(flown, tmp_path / "other", detector, WatchSettings(classes=("boat",)))
 
 
-def test_what_is_looked_for_is_reported(photographs: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_what_is_looked_for_is_reported(
+    photographs: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     """Classes on request are in the report where they were searched for, not where the model knows them."""
     finder = _Squares(replace(detector.info, on_request=("small object",)))
     outputs = WatchOutputs(folder=tmp_path / "out")
     list(watch(photographs, outputs=outputs, camera="aov=60", detector=finder))
     assert _read(tmp_path / "out" / "report.json")["looked_for"] == ["person", "car"]
-    assert "4 frames were searched for person, car." in (tmp_path / "out" / "report.html").read_text()
+    assert (
+        "4 frames were searched for person, car." in (tmp_path / "out" / "report.html").read_text()
+    )
 
 
 def test_the_model_that_looked_at_thermal_photos_is_reported(
@@ -325,12 +424,23 @@ def test_the_model_that_looked_at_thermal_photos_is_reported(
     """With its thresholds and licence; each photo counts once, however often its middle is looked at as well."""
     monkeypatch.setenv("SORVOLO_MODELS", str(tmp_path / "models"))
     (tmp_path / "models").mkdir()
-    night = {"name": "night", "licence": "CC0-1.0 of the night", "thresholds": dict.fromkeys(CLASSES, 0.77)}
+    night = {
+        "name": "night",
+        "licence": "CC0-1.0 of the night",
+        "thresholds": dict.fromkeys(CLASSES, 0.77),
+    }
     rectangle_model(tmp_path / "models" / "night.onnx", **night)
-    day = rectangle_model(tmp_path / "models" / "day.onnx", name="day", thermal=False, thermal_by="night")
-    list(watch(
-        photographs, WatchSettings(model=str(day)), WatchOutputs(folder=tmp_path / "out"), camera="aov=60"
-    ))
+    day = rectangle_model(
+        tmp_path / "models" / "day.onnx", name="day", thermal=False, thermal_by="night"
+    )
+    list(
+        watch(
+            photographs,
+            WatchSettings(model=str(day)),
+            WatchOutputs(folder=tmp_path / "out"),
+            camera="aov=60",
+        )
+    )
     report = _read(tmp_path / "out" / "report.json")
     (other,) = report["other_models"]
     assert report["model"]["name"] == "day" and other["name"] == "night"
@@ -354,7 +464,9 @@ def test_labels_can_be_read_back(flown: Path, detector: TruthDetector, tmp_path:
     assert _read(labels / "coco.json")["annotations"][0]["score"] > 0.29
 
 
-def test_closing_early_writes_what_was_found(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_closing_early_writes_what_was_found(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     outputs = WatchOutputs(folder=tmp_path / "watch", save="video")
     watching = watch(_video(flown), outputs=outputs, camera=flown / "camera.xml", detector=detector)
     for _ in range(12):
@@ -362,10 +474,14 @@ def test_closing_early_writes_what_was_found(flown: Path, detector: TruthDetecto
     watching.close()
     report = _read(tmp_path / "watch" / "report.json")
     assert report["ended"] == "stopped on demand" and report["frames"]["detected"] == 12
-    assert (tmp_path / "watch" / "annotated.mp4").exists() and (tmp_path / "watch" / "tracks.geojson").exists()
+    assert (tmp_path / "watch" / "annotated.mp4").exists() and (
+        tmp_path / "watch" / "tracks.geojson"
+    ).exists()
 
 
-def test_a_second_watch_replaces_its_own_only(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_a_second_watch_replaces_its_own_only(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     few = WatchSettings(frames_per_second=0.5)
     _watch(flown, tmp_path / "watch", detector, few)
     _watch(flown, tmp_path / "watch", detector, few)
@@ -380,7 +496,13 @@ def test_a_source_without_a_picture_is_an_error(detector: TruthDetector, tmp_pat
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"no picture")
     with pytest.raises(InputError):
-        list(watch(tmp_path / "photos", outputs=WatchOutputs(folder=tmp_path / "out"), detector=detector))
+        list(
+            watch(
+                tmp_path / "photos",
+                outputs=WatchOutputs(folder=tmp_path / "out"),
+                detector=detector,
+            )
+        )
     with pytest.raises(InputError, match="no such file"):
         list(watch(tmp_path / "gone.mp4", detector=detector))
 
@@ -391,10 +513,17 @@ def test_a_photo_that_cannot_be_read_is_reported_once(
     (photographs / "IMG_1.jpg").write_bytes(b"no picture")
     cut = photographs / "IMG_2.jpg"
     cut.write_bytes(cut.read_bytes()[:-400])
-    list(watch(
-        photographs, outputs=WatchOutputs(folder=tmp_path / "out"), camera="aov=60", detector=_Squares(detector.info)
-    ))
-    notices = {each["code"]: each["count"] for each in _read(tmp_path / "out" / "report.json")["notices"]}
+    list(
+        watch(
+            photographs,
+            outputs=WatchOutputs(folder=tmp_path / "out"),
+            camera="aov=60",
+            detector=_Squares(detector.info),
+        )
+    )
+    notices = {
+        each["code"]: each["count"] for each in _read(tmp_path / "out" / "report.json")["notices"]
+    }
     assert notices["lost_frames"] == 2 and not {"unreadable_photo", "corrupt_photo"} & set(notices)
 
 
@@ -408,7 +537,9 @@ class _Squares:
         self.info = info
         self.overlapping: set[object] = set()
 
-    def detect(self, image: ImageRGB, *, tiles: object = None, overlapping: bool = False, **_: object) -> Any:
+    def detect(
+        self, image: ImageRGB, *, tiles: object = None, overlapping: bool = False, **_: object
+    ) -> Any:
         from sorvolo.survey.objects import Detections
 
         if tiles == "auto":  # of frames, not of their middle
@@ -416,7 +547,12 @@ class _Squares:
         _, _, stats, _ = cv2.connectedComponentsWithStats((image[..., 0] > 200).astype(np.uint8))
         boxes = [[x, y, x + w, y + h] for x, y, w, h, area in stats[1:] if area > 20]
         count = len(boxes)
-        return Detections(np.array(boxes, np.float32), np.full(count, 0.9), np.zeros(count, np.int64), self.classes)
+        return Detections(
+            np.array(boxes, np.float32),
+            np.full(count, 0.9),
+            np.zeros(count, np.int64),
+            self.classes,
+        )
 
 
 @pytest.fixture
@@ -430,7 +566,9 @@ def photographs(tmp_path: Path) -> Iterator[Path]:
     yield folder
 
 
-def test_photos_without_anything_else(photographs: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_photos_without_anything_else(
+    photographs: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     outputs = WatchOutputs(folder=tmp_path / "out", save="pictures")
     finder = _Squares(detector.info)
     updates = list(watch(photographs, outputs=outputs, camera="aov=60", detector=finder))
@@ -441,10 +579,14 @@ def test_photos_without_anything_else(photographs: Path, detector: TruthDetector
     ]
 
 
-def test_frames_of_a_video_are_not_worth_several_sizes(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_frames_of_a_video_are_not_worth_several_sizes(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     finder = _Squares(detector.info)
     settings = WatchSettings(frames_per_second=1)
-    assert list(watch(_video(flown), settings, WatchOutputs(folder=tmp_path / "out"), detector=finder))
+    assert list(
+        watch(_video(flown), settings, WatchOutputs(folder=tmp_path / "out"), detector=finder)
+    )
     assert finder.overlapping == {True}
 
 
@@ -462,26 +604,39 @@ def test_a_gimbal_that_is_half_a_turn_off(wrong: slice, photographed: Path, tmp_
                 stated = re.search(rb'GimbalYawDegree="([^"]+)"', photo)
                 assert stated is not None
                 yaw_deg = (float(stated[1]) + 360) % 360 - 180
-                photo = photo.replace(stated[1], f"{yaw_deg:+{len(stated[1])}.3f}"[: len(stated[1])].encode())
+                photo = photo.replace(
+                    stated[1], f"{yaw_deg:+{len(stated[1])}.3f}"[: len(stated[1])].encode()
+                )
             (tmp_path / name / path.name).write_bytes(photo)
         out = tmp_path / f"{name}-watch"
-        list(watch(
-            tmp_path / name, outputs=WatchOutputs(folder=out), camera=photographed / "camera.xml", detector=detector
-        ))
+        list(
+            watch(
+                tmp_path / name,
+                outputs=WatchOutputs(folder=out),
+                camera=photographed / "camera.xml",
+                detector=detector,
+            )
+        )
         reports[name] = json.loads((out / "report.json").read_text())
         places[name] = sorted(
             (each["properties"]["class"], *each["geometry"]["coordinates"][:2])
             for each in json.loads((out / "tracks.geojson").read_text())["features"]
         )
-    assert [each[0] for each in places["wrong"]] == [each[0] for each in places["right"]] and places["right"]
-    off_deg = np.array([each[1:] for each in places["wrong"]]) - np.array([each[1:] for each in places["right"]])
+    assert [each[0] for each in places["wrong"]] == [
+        each[0] for each in places["right"]
+    ] and places["right"]
+    off_deg = np.array([each[1:] for each in places["wrong"]]) - np.array(
+        [each[1:] for each in places["right"]]
+    )
     assert np.abs(off_deg).max() < 2e-5  # 2 m
     notices = {row["code"]: row for row in reports["wrong"]["notices"]}
     assert notices["headings_wrong"]["count"] == len(paths[wrong])
     assert all(row["code"] != "headings_wrong" for row in reports["right"]["notices"])
 
 
-@pytest.mark.parametrize(("off_deg", "part"), [(180.0, slice(42, 62)), (-90.0, slice(42, 62)), (12.0, slice(None))])
+@pytest.mark.parametrize(
+    ("off_deg", "part"), [(180.0, slice(42, 62)), (-90.0, slice(42, 62)), (12.0, slice(None))]
+)
 def test_headings_of_a_video_that_are_far_off_are_set_right(
     off_deg: float, part: slice, flown: Path, detector: TruthDetector, tmp_path: Path
 ) -> None:
@@ -495,47 +650,71 @@ def test_headings_of_a_video_that_are_far_off_are_set_right(
         table.writeheader()
         table.writerows(lines)
     places = {}
-    for name, telemetry in {"right": flown / "flight1" / "flight1.csv", "off": tmp_path / "off.csv"}.items():
-        list(watch(
-            _video(flown), outputs=WatchOutputs(folder=tmp_path / name), camera=flown / "camera.xml", detector=detector,
-            telemetry=telemetry,
-        ))
+    for name, telemetry in {
+        "right": flown / "flight1" / "flight1.csv",
+        "off": tmp_path / "off.csv",
+    }.items():
+        list(
+            watch(
+                _video(flown),
+                outputs=WatchOutputs(folder=tmp_path / name),
+                camera=flown / "camera.xml",
+                detector=detector,
+                telemetry=telemetry,
+            )
+        )
         places[name] = sorted(
             (each["properties"]["class"], *each["geometry"]["coordinates"][:2])
             for each in _read(tmp_path / name / "tracks.geojson")["features"]
         )
     right, notices = (
-        [row["code"] for row in _read(tmp_path / name / "report.json")["notices"]] for name in ("right", "off")
+        [row["code"] for row in _read(tmp_path / name / "report.json")["notices"]]
+        for name in ("right", "off")
     )
-    assert [each[0] for each in places["off"]] == [each[0] for each in places["right"]] and places["right"]
-    beside_deg = np.array([each[1:] for each in places["off"]]) - np.array([each[1:] for each in places["right"]])
+    assert [each[0] for each in places["off"]] == [each[0] for each in places["right"]] and places[
+        "right"
+    ]
+    beside_deg = np.array([each[1:] for each in places["off"]]) - np.array(
+        [each[1:] for each in places["right"]]
+    )
     assert np.abs(beside_deg).max() < 6e-5  # 6 m: what 12 degrees are over 25 m
     assert ("headings_wrong" in notices) == (abs(off_deg) > 30) and "headings_wrong" not in right
 
 
 @pytest.mark.parametrize("shown_by", [1, 2])
-def test_a_photo_that_alone_shows_something_is_enough(shown_by: int, detector: TruthDetector, tmp_path: Path) -> None:
+def test_a_photo_that_alone_shows_something_is_enough(
+    shown_by: int, detector: TruthDetector, tmp_path: Path
+) -> None:
     """Three photos of different ground, one of them, or the last, with a person, who is alerted of once."""
     random = np.random.default_rng(2)
     (tmp_path / "photos").mkdir()
     for number, picture in enumerate(random.integers(0, 150, (3, 240, 320, 3), np.uint8)):
         picture[100:110, 160:170] = 255 if number == shown_by else 90
         cv2.imwrite(str(tmp_path / "photos" / f"{number}.png"), picture)
-    save = "import pathlib, sys; pathlib.Path(sys.argv[1]).open('a').write(sys.stdin.read() + chr(10))"
+    save = (
+        "import pathlib, sys; pathlib.Path(sys.argv[1]).open('a').write(sys.stdin.read() + chr(10))"
+    )
     command = shlex.join([sys.executable, "-c", save, str(tmp_path / "alerts")])
     outputs = WatchOutputs(folder=tmp_path / "out", alert_command=command)
     updates = list(watch(tmp_path / "photos", outputs=outputs, detector=_Squares(detector.info)))
-    assert [len(update.detections) for update in updates] == [int(number == shown_by) for number in range(3)]
+    assert [len(update.detections) for update in updates] == [
+        int(number == shown_by) for number in range(3)
+    ]
     (track,) = [each["properties"] for each in _read(tmp_path / "out" / "tracks.json")["features"]]
     (alert,) = [json.loads(line) for line in (tmp_path / "alerts").read_text().splitlines()]
-    assert track["views"] == 1 and alert["id"] == track["id"] and alert["segment"] == track["segment"]
+    assert (
+        track["views"] == 1 and alert["id"] == track["id"] and alert["segment"] == track["segment"]
+    )
     assert Path(alert["crop"]).is_file()
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"least_score": 1.2}, {"tiles": 10}, {"every": 0}, {"frames_per_second": 0.0},
+        {"least_score": 1.2},
+        {"tiles": 10},
+        {"every": 0},
+        {"frames_per_second": 0.0},
         {"every": 2, "frames_per_second": 1.0},
     ],
 )
@@ -544,7 +723,9 @@ def test_settings_that_cannot_be(wrong: dict[str, Any]) -> None:
         WatchSettings(**wrong)
 
 
-@pytest.mark.parametrize("wrong", [{"save": "gif"}, {"labels": ("voc",)}, {"cot": "tak"}, {"cot_stale_s": 0}])
+@pytest.mark.parametrize(
+    "wrong", [{"save": "gif"}, {"labels": ("voc",)}, {"cot": "tak"}, {"cot_stale_s": 0}]
+)
 def test_outputs_that_cannot_be(wrong: dict[str, Any]) -> None:
     with pytest.raises(SettingsError):
         WatchOutputs(**wrong)

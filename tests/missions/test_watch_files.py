@@ -17,13 +17,17 @@ from sorvolo.survey.objects import Sighting, no_detections
 
 @pytest.fixture
 def files(tmp_path: Path) -> Iterator[WatchFiles]:
-    with WatchFiles(tmp_path, WatchOutputs(), Site("field", Geodetic(0.0, 0.0), "", 1.0, is_local=True)) as made:
+    with WatchFiles(
+        tmp_path, WatchOutputs(), Site("field", Geodetic(0.0, 0.0), "", 1.0, is_local=True)
+    ) as made:
         yield made
 
 
 def sighting(index: int) -> Sighting:
     box_px = np.array([10.0, 10.0, 40.0, 50.0], np.float32)
-    return Sighting(index, str(index), index, "car", 0.9, box_px, np.zeros(2), np.eye(2), np.array([4.0, 2.0]))
+    return Sighting(
+        index, str(index), index, "car", 0.9, box_px, np.zeros(2), np.eye(2), np.array([4.0, 2.0])
+    )
 
 
 def track(track_id: int, best: Sighting) -> Any:
@@ -31,8 +35,12 @@ def track(track_id: int, best: Sighting) -> Any:
 
 
 def add(files: WatchFiles, seen: Sighting) -> None:
-    frame = Frame(seen.frame_index, seen.frame_name, seen.time_ns, np.full((60, 60, 3), 100, np.uint8))
-    files.add(SeenFrame(frame, seen.time_ns, no_detections(("car",)), [seen], [1], frozenset(), "", 0))
+    frame = Frame(
+        seen.frame_index, seen.frame_name, seen.time_ns, np.full((60, 60, 3), 100, np.uint8)
+    )
+    files.add(
+        SeenFrame(frame, seen.time_ns, no_detections(("car",)), [seen], [1], frozenset(), "", 0)
+    )
 
 
 def test_crops_of_views_that_are_no_track_s_best_are_not_kept(files: WatchFiles) -> None:
@@ -43,5 +51,9 @@ def test_crops_of_views_that_are_no_track_s_best_are_not_kept(files: WatchFiles)
         files.keep_crops_of([track(1, seen[min(each.frame_index, 20)]), track(2, seen[0])])
     assert len(files._crops) == 2
     assert files.crop_of(track(1, seen[20])) == files.crop_names[1]
-    assert files.crop_of(track(1, seen[0])) == files.crop_names[1]  # another one's best becomes its own, as they join
-    assert (files.folder / files.crop_names[1]).is_file() and files.crop_of(track(3, seen[10])) is None
+    assert (
+        files.crop_of(track(1, seen[0])) == files.crop_names[1]
+    )  # another one's best becomes its own, as they join
+    assert (files.folder / files.crop_names[1]).is_file() and files.crop_of(
+        track(3, seen[10])
+    ) is None

@@ -48,7 +48,10 @@ class _SlowDetector:
         _, _, stats, _ = cv2.connectedComponentsWithStats((image[..., 0] > 150).astype(np.uint8))
         boxes = [[x, y, x + w, y + h] for x, y, w, h, area in stats[1:] if area > 20]
         return Detections(
-            np.array(boxes, np.float32), np.full(len(boxes), 0.9), np.zeros(len(boxes), np.int64), self.classes
+            np.array(boxes, np.float32),
+            np.full(len(boxes), 0.9),
+            np.zeros(len(boxes), np.int64),
+            self.classes,
         )
 
 
@@ -70,13 +73,18 @@ def test_the_newest_frames_are_searched_and_the_rest_is_counted(tmp_path: Path) 
     (track,) = json.loads((folder / "tracks.geojson").read_text())["features"]
     longitude, latitude = track["geometry"]["coordinates"]
     start = LocalFrame(Geodetic(46.5, 11.3, 0.0))
-    east_m, north_m, _ = start.site_from_wgs84(np.array([latitude]), np.array([longitude]), np.zeros(1))[0]
+    east_m, north_m, _ = start.site_from_wgs84(
+        np.array([latitude]), np.array([longitude]), np.zeros(1)
+    )[0]
     # the first picture's middle lies under the drone's first place
     assert east_m == pytest.approx((113 - 80) * _M_PER_PX, abs=2.0)
     assert north_m == pytest.approx((48 - (_FIRST_TOP_PX + 4)) * _M_PER_PX, abs=2.0)
     assert track["properties"]["first_seen"].startswith("2025-10-09T08:53")  # the drone's own clock
 
-    with sending(udp_url(port), image=_scene, count=RATE), pytest.raises(StoreError, match="which stays"):
+    with (
+        sending(udp_url(port), image=_scene, count=RATE),
+        pytest.raises(StoreError, match="which stays"),
+    ):
         list(watch(address, outputs=outputs, detector=detector, live=_LIVE))
 
 
@@ -86,12 +94,18 @@ def _textured(index: int) -> Any:
     return np.dstack([np.roll(cv2.resize(noise, (160, 400)), 2 * index, axis=0)[:96]] * 3)
 
 
-def test_how_the_picture_moves_is_known_between_the_frames_that_are_searched(tmp_path: Path) -> None:
+def test_how_the_picture_moves_is_known_between_the_frames_that_are_searched(
+    tmp_path: Path,
+) -> None:
     port = free_port()
     steps: list[PictureStep] = []
     address, outputs = f"udp://127.0.0.1:{port}", WatchOutputs(folder=tmp_path / "watch")
     with sending(udp_url(port), klv=True, image=_textured, count=3 * RATE):
-        updates = list(watch(address, outputs=outputs, detector=_SlowDetector(), live=_LIVE, moved=steps.append))
+        updates = list(
+            watch(
+                address, outputs=outputs, detector=_SlowDetector(), live=_LIVE, moved=steps.append
+            )
+        )
     assert len(steps) > 8
     for step in steps:
         frames = (step.to_ns - step.from_ns) * RATE / 1e9
@@ -120,11 +134,17 @@ def test_what_is_known_of_a_frame_early_comes_before_the_rest_of_it(tmp_path: Pa
     came: list[EarlyFound | WatchUpdate] = []
     with sending(udp_url(port), klv=True, image=_scene, count=2 * RATE):
         address, outputs = f"udp://127.0.0.1:{port}", WatchOutputs(folder=tmp_path / "watch")
-        for update in watch(address, outputs=outputs, detector=_EarlyDetector(), live=_LIVE, early=came.append):
+        for update in watch(
+            address, outputs=outputs, detector=_EarlyDetector(), live=_LIVE, early=came.append
+        ):
             came.append(update)
     assert len(came) >= 4
     for early, whole in zip(came[::2], came[1::2], strict=True):
         assert isinstance(early, EarlyFound) and isinstance(whole, WatchUpdate)
         assert early.classes == ("car",) and early.latency_s < whole.latency_s - 0.09
-        assert (early.time_ns, early.clip_ns, early.size_px) == (whole.time_ns, whole.clip_ns, whole.size_px)
+        assert (early.time_ns, early.clip_ns, early.size_px) == (
+            whole.time_ns,
+            whole.clip_ns,
+            whole.size_px,
+        )
         assert np.array_equal(early.detections.boxes_px, whole.detections.boxes_px)

@@ -26,7 +26,13 @@ _KILLED_AT = 12  # frames
 
 
 _FLOWN = small_flight(
-    78, length_m=24, spacing_m=7, noise_m=0.1, people=4, cars=3, output=OutputSettings(telemetry="all", truth_step=1)
+    78,
+    length_m=24,
+    spacing_m=7,
+    noise_m=0.1,
+    people=4,
+    cars=3,
+    output=OutputSettings(telemetry="all", truth_step=1),
 )
 
 
@@ -41,13 +47,20 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def video(request: pytest.FixtureRequest, flown: Path, tmp_path: Path) -> Path:
     """The flight with its telemetry, and without any."""
     source = flown / "flight1" / "flight1.mp4"
-    return source if request.param == "on the ground" else Path(shutil.copy(source, tmp_path / "flight1.mp4"))
+    return (
+        source
+        if request.param == "on the ground"
+        else Path(shutil.copy(source, tmp_path / "flight1.mp4"))
+    )
 
 
 def watched(
-    video: Path, folder: Path, detector: TruthDetector, alerts: Path,
+    video: Path,
+    folder: Path,
+    detector: TruthDetector,
+    alerts: Path,
     then: Callable[[list[WatchUpdate]], None] = lambda _: None,
-    settings: WatchSettings = WatchSettings(),  # noqa: B008
+    settings: WatchSettings = WatchSettings(),
 ) -> list[WatchUpdate]:
     """Watch a flight, with alerts to a program that writes their ids to a file."""
     command = f"{sys.executable} -c \"open('{alerts}', 'a').write('{{id}} ')\""
@@ -71,7 +84,9 @@ def content(folder: Path) -> dict[str, bytes]:
         if path.is_file() and path.name != "report.html":
             data = path.read_bytes()
             if path.name == "report.json":
-                data = json.dumps({k: v for k, v in json.loads(data).items() if k not in _EFFORT}).encode()
+                data = json.dumps(
+                    {k: v for k, v in json.loads(data).items() if k not in _EFFORT}
+                ).encode()
             found[str(path.relative_to(folder))] = data
     return found
 
@@ -106,17 +121,25 @@ def test_it_goes_on_and_notifies_nobody_twice(
     shutil.move(amid, whole)
     alerts.unlink()
     detector.asked = 0
-    monkeypatch.setattr(detector, "night", None)  # it looked at earlier frames alone, and is in the report all the same
+    monkeypatch.setattr(
+        detector, "night", None
+    )  # it looked at earlier frames alone, and is in the report all the same
     resumed = watched(video, whole, detector, alerts)
-    assert [each.is_resumed for each in resumed] == [number < _KILLED_AT for number in range(len(updates))]
+    assert [each.is_resumed for each in resumed] == [
+        number < _KILLED_AT for number in range(len(updates))
+    ]
     assert detector.asked == len(updates) - _KILLED_AT
-    assert ids(alerts, len(found) - len(reported)) == found[len(reported):]
+    assert ids(alerts, len(found) - len(reported)) == found[len(reported) :]
     assert content(whole) == content(tmp_path / "first")
     assert "run.journal" not in content(whole)
-    assert [each["name"] for each in json.loads((whole / "report.json").read_text())["other_models"]] == ["night"]
+    assert [
+        each["name"] for each in json.loads((whole / "report.json").read_text())["other_models"]
+    ] == ["night"]
 
 
-def test_an_alert_that_was_not_sent_is_sent(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_an_alert_that_was_not_sent_is_sent(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     video, folder, amid = flown / "flight1" / "flight1.mp4", tmp_path / "watch", tmp_path / "amid"
     (tmp_path / "none").mkdir()  # no file can be written there: each alert fails
 
@@ -134,16 +157,25 @@ def test_an_alert_that_was_not_sent_is_sent(flown: Path, detector: TruthDetector
     assert ids(tmp_path / "none", len(found)) == found
 
 
-def test_other_settings_begin_anew_and_report_it(flown: Path, detector: TruthDetector, tmp_path: Path) -> None:
+def test_other_settings_begin_anew_and_report_it(
+    flown: Path, detector: TruthDetector, tmp_path: Path
+) -> None:
     video, folder = flown / "flight1" / "flight1.mp4", tmp_path / "watch"
-    updates = watch(video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70", detector=detector)
+    updates = watch(
+        video, WatchSettings(), WatchOutputs(folder=folder), camera="aov=70", detector=detector
+    )
     next(updates)
     copy_as_killed(folder, tmp_path / "amid")
     updates.close()
     assert not (folder / "run.journal").exists()
-    with pytest.warns(SorvoloWarning, match="a watch that was stopped cannot continue: it was of other settings"):
+    with pytest.warns(
+        SorvoloWarning, match="a watch that was stopped cannot continue: it was of other settings"
+    ):
         again = watch(
-            video, WatchSettings(frames_per_second=2), WatchOutputs(folder=tmp_path / "amid"), camera="aov=70",
+            video,
+            WatchSettings(frames_per_second=2),
+            WatchOutputs(folder=tmp_path / "amid"),
+            camera="aov=70",
             detector=detector,
         )
         assert not next(again).is_resumed
@@ -151,7 +183,10 @@ def test_other_settings_begin_anew_and_report_it(flown: Path, detector: TruthDet
 
 
 def test_what_was_printed_is_not_printed_again(
-    flown: Path, detector: TruthDetector, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+    flown: Path,
+    detector: TruthDetector,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     video, folder = flown / "flight1" / "flight1.mp4", tmp_path / "watch"

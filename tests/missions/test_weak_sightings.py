@@ -26,8 +26,17 @@ def placed(index: int) -> PlacedFrame:
     """One of several frames from the same place, 30 m up."""
     pose = Pose(site_from_gimbal_rotation(90.0, -90.0, 0.0), np.array([0.0, 0.0, 30.0]))
     return PlacedFrame(
-        str(index), index, index * 10**9, Status.VISION, "", CAMERA, pose, site_from_image_homography(CAMERA, pose),
-        footprint(CAMERA, pose), 0.2, 0.5,
+        str(index),
+        index,
+        index * 10**9,
+        Status.VISION,
+        "",
+        CAMERA,
+        pose,
+        site_from_image_homography(CAMERA, pose),
+        footprint(CAMERA, pose),
+        0.2,
+        0.5,
     )
 
 
@@ -35,7 +44,9 @@ def searched(scores: list[float]) -> ObjectFinder:
     """A finder whose frames each saw one person in one place, with these scores."""
     finder = ObjectFinder(Silent(), CAMERA)  # type: ignore[arg-type]
     for index, score in enumerate(scores):
-        seen = Detections(np.array([[470.0, 260.0, 486.0, 274.0]]), np.array([score]), np.array([0]), CLASSES)
+        seen = Detections(
+            np.array([[470.0, 260.0, 486.0, 274.0]]), np.array([score]), np.array([0]), CLASSES
+        )
         finder.take_over(FrameDetections(index, seen, (b"",), 0.1, LEAST))
     return finder
 

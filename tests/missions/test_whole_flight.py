@@ -30,12 +30,19 @@ class Flown:
 
     def __init__(self, folder: Path, *, photos: bool) -> None:
         settings = small_flight(
-            21, speed_m_s=8, length_m=80, height_m=60, size_px=(480, 360), fps=1 if photos else 3, cars=4,
+            21,
+            speed_m_s=8,
+            length_m=80,
+            height_m=60,
+            size_px=(480, 360),
+            fps=1 if photos else 3,
+            cars=4,
             output=OutputSettings(photos=photos),
         )
         simulate_into(folder, replace(settings, flights=2))
         first, self._second = (
-            folder / (f"flight{number}/photos" if photos else f"flight{number}/flight{number}.mp4") for number in (1, 2)
+            folder / (f"flight{number}/photos" if photos else f"flight{number}/flight{number}.mp4")
+            for number in (1, 2)
         )
         self._site = folder / "site"
         for _ in map_flights([first], self._site, MapSettings(model="none")):
@@ -87,13 +94,22 @@ def test_what_no_picture_shows_by_itself_is_placed_with_its_flight(
     assert bool(left_out) == flown.is_video
     assert len({each.frame_name for each in updates}) == len(updates), "each frame ends once"
     views = together["comparison"]["views"]["compared"]
-    assert views == together["comparison"]["with_flight"]["views"] == sum(
-        each.status is ViewStatus.COMPARED for each in updates
+    assert (
+        views
+        == together["comparison"]["with_flight"]["views"]
+        == sum(each.status is ViewStatus.COMPARED for each in updates)
     )
-    assert [each["count"] for each in together["notices"] if each["code"] == "placed_with_flight"] == [views]
+    assert [
+        each["count"] for each in together["notices"] if each["code"] == "placed_with_flight"
+    ] == [views]
     ours, theirs = frames_of(tmp_path / "together"), frames_of(tmp_path / "alone")
-    apart_m = [np.linalg.norm(ours[name].outline_m - theirs[name].outline_m, axis=1).mean() for name in ours]
-    assert views == len(ours) >= 2 and max(apart_m) < 0.4, "photos where the strip is bent are left to the search"
+    apart_m = [
+        np.linalg.norm(ours[name].outline_m - theirs[name].outline_m, axis=1).mean()
+        for name in ours
+    ]
+    assert views == len(ours) >= 2 and max(apart_m) < 0.4, (
+        "photos where the strip is bent are left to the search"
+    )
 
 
 def test_where_the_flight_is_not_found_either_nothing_is_compared(

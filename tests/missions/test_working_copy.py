@@ -83,7 +83,9 @@ def newest(address: str) -> int:
     return BucketEnd(open_objects(address)).manifest().held.newest
 
 
-def test_two_machines_add_flights_in_turn(machine: Callable[[str], None], states: dict[str, Path]) -> None:
+def test_two_machines_add_flights_in_turn(
+    machine: Callable[[str], None], states: dict[str, Path]
+) -> None:
     address = f"s3://{BUCKET}/turns"
     with pytest.raises(StoreError, match="no site at s3://archive/turns"):
         fetched(address)
@@ -98,7 +100,10 @@ def test_two_machines_add_flights_in_turn(machine: Callable[[str], None], states
     fake_flights.check_whole(here)
     before = open_objects(address).sizes("")
     ended(send_site(address))  # nothing is new: nothing is written
-    assert BucketEnd(open_objects(address)).manifest().generation == 2 and open_objects(address).sizes("") == before
+    assert (
+        BucketEnd(open_objects(address)).manifest().generation == 2
+        and open_objects(address).sizes("") == before
+    )
 
 
 def test_tiles_and_pictures_come_when_they_are_asked_for(
@@ -111,35 +116,49 @@ def test_tiles_and_pictures_come_when_they_are_asked_for(
     folder = fetched(address)
     assert not list(folder.glob("tiles/*/*")) and not list(folder.glob("flights/*/keyframes/*/*"))
     assert (folder / "mosaic.tif").is_file() and (folder / "flights/flight-0/report.json").is_file()
-    assert [each.bytes_changed for each in site_history(folder)] == [each.bytes_changed for each in site_history(full)]
+    assert [each.bytes_changed for each in site_history(folder)] == [
+        each.bytes_changed for each in site_history(full)
+    ]
     with Archive.open(folder, write=False) as archive, Archive.open(full, write=False) as whole:
         tiles = archive.tiles()
         for index, tile in whole.tiles().items():
             assert np.array_equal(tiles[index], tile)
-        assert np.array_equal(archive.image(archive.keyframes()[0]), whole.image(whole.keyframes()[0]))
+        assert np.array_equal(
+            archive.image(archive.keyframes()[0]), whole.image(whole.keyframes()[0])
+        )
     assert len(list(folder.glob("tiles/*/*"))) == len(list(full.glob("tiles/*/*")))
     # a copy elsewhere asks nobody, whatever a stranger wrote into it
     moved = Path(shutil.copytree(folder, tmp_path / "moved"))
     shutil.rmtree(moved / "tiles")
     assert (moved / ORIGIN).is_file()
-    with Archive.open(moved, write=False) as archive, pytest.raises(StoreError, match="is missing; restore it"):
+    with (
+        Archive.open(moved, write=False) as archive,
+        pytest.raises(StoreError, match="is missing; restore it"),
+    ):
         list(archive.tiles().values())
     # damage in the store is not taken over
     objects = open_objects(address)
     key, size = next(iter(objects.sizes("tiles").items()))
     obstore.put(objects._store, key, b"x" * size)
     shutil.rmtree(folder / "tiles")
-    with Archive.open(folder, write=False) as archive, pytest.raises(StoreError, match="is damaged in the store"):
+    with (
+        Archive.open(folder, write=False) as archive,
+        pytest.raises(StoreError, match="is damaged in the store"),
+    ):
         list(archive.tiles().values())
     assert not list(folder.glob("tiles/*/.tmp-*"))
 
 
-def test_who_is_overtaken_loses_nothing(machine: Callable[[str], None], states: dict[str, Path]) -> None:
+def test_who_is_overtaken_loses_nothing(
+    machine: Callable[[str], None], states: dict[str, Path]
+) -> None:
     address = f"s3://{BUCKET}/overtaken"
     put(states["first"], address)
     work(states["mine"], address)
     put(states["theirs"], address)
-    with pytest.raises(StoreError, match=r"another writer has changed .* kept in (\S+)\. Run the same") as caught:
+    with pytest.raises(
+        StoreError, match=r"another writer has changed .* kept in (\S+)\. Run the same"
+    ) as caught:
         ended(send_site(address))
     kept = Path(re.search(r"kept in (\S+)\. Run", str(caught.value))[1])  # type: ignore[index]
     fake_flights.check_whole(kept)
@@ -159,7 +178,9 @@ def test_what_was_not_sent_is_sent_by_the_next_command(
     with monkeypatch.context() as patched:
         patched.setenv("AWS_ENDPOINT_URL_S3", "http://127.0.0.1:9")
         patched.setattr("time.sleep", lambda _: None)
-        with pytest.raises(StoreError, match=r"no connection, or it was cut.* and sent by the next command"):
+        with pytest.raises(
+            StoreError, match=r"no connection, or it was cut.* and sent by the next command"
+        ):
             ended(send_site(address))
     assert (folder / UNSENT).is_file() and newest(address) == 1
     fetched(address)
@@ -182,7 +203,10 @@ def test_what_was_not_sent_and_is_overtaken_is_kept(
 
 
 def test_commands_take_a_place_in_a_store(
-    machine: Callable[[str], None], photographed: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path,
+    machine: Callable[[str], None],
+    photographed: Path,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -209,7 +233,10 @@ def test_commands_take_a_place_in_a_store(
     assert json.loads(capsys.readouterr().out)["folder"] == "commands-telemetry/one"
     assert (tmp_path / "commands-telemetry" / "one" / "geo.txt").is_file()
     for command, fault in (
-        (["measure", "contours", address, "--out", "contours.geojson"], "flight one of .* has no heights"),
+        (
+            ["measure", "contours", address, "--out", "contours.geojson"],
+            "flight one of .* has no heights",
+        ),
         (["search", address, "--model", "default", "--flight", "nine"], "nine"),
         (["evaluate", "objects", address, "--truth", "x"], "x: no truth/frames.geojson in it"),
         (["evaluate", "changes", address, "--truth", "x"], "no such folder: x"),

@@ -31,8 +31,12 @@ def test_equal_layers_blend_to_themselves():
 def test_colour_steps_become_ramps_and_texture_stays():
     labels = np.zeros((128, 256), np.int16)
     labels[:, 128:] = 1
-    checker = (np.indices((128, 256)).sum(axis=0) % 2 * 20).astype(np.uint8)[..., None] * np.ones(3, np.uint8)
-    picture = blend(labels, [Layer(0, 0, 0, checker + 80), Layer(1, 0, 0, checker + 140)]).astype(int)
+    checker = (np.indices((128, 256)).sum(axis=0) % 2 * 20).astype(np.uint8)[..., None] * np.ones(
+        3, np.uint8
+    )
+    picture = blend(labels, [Layer(0, 0, 0, checker + 80), Layer(1, 0, 0, checker + 140)]).astype(
+        int
+    )
     assert np.abs(np.diff(picture[::2, ::2, 0].mean(axis=0))).max() < 10
     assert np.abs(picture[64, 128:140:2, 0] - picture[64, 129:141:2, 0]).min() > 15
 

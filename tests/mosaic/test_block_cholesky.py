@@ -10,7 +10,9 @@ def strips(across: int, along: int) -> tuple[np.ndarray, np.ndarray]:
     """The ties of a survey: each camera to the next of its strip, and to its neighbours of the next strip."""
     number = np.arange(across * along).reshape(across, along)
     pairs = [
-        (number[:, :-1], number[:, 1:]), (number[:-1], number[1:]), (number[:-1, :-1], number[1:, 1:]),
+        (number[:, :-1], number[:, 1:]),
+        (number[:-1], number[1:]),
+        (number[:-1, :-1], number[1:, 1:]),
     ]
     one, other = (np.concatenate([each[k].ravel() for each in pairs]) for k in (0, 1))
     return one, other
@@ -48,7 +50,10 @@ def test_a_survey_is_solved_as_by_the_whole_matrix(across: int, along: int) -> N
 def test_ties_in_any_order_some_twice_and_flights_apart() -> None:
     rng = np.random.default_rng(3)
     one, other = strips(5, 9)
-    one, other = np.concatenate([one, one[:9] + 45, one[:4]]), np.concatenate([other, other[:9] + 45, other[:4]])
+    one, other = (
+        np.concatenate([one, one[:9] + 45, one[:4]]),
+        np.concatenate([other, other[:9] + 45, other[:4]]),
+    )
     order = rng.permutation(len(one))
     swapped = rng.random(len(one)) < 0.5
     one, other = np.where(swapped, other, one)[order], np.where(swapped, one, other)[order]
@@ -68,7 +73,9 @@ def test_a_camera_that_nothing_holds_moves_no_other() -> None:
     held = np.delete(np.arange(180), SIDE * 12 + np.arange(SIDE))
     right[SIDE * 12 : SIDE * 13] = 0.0
     found = Elimination(30, one, other).factorised(diagonal, between).solve(right)
-    assert np.allclose(found[held], np.linalg.solve(matrix[np.ix_(held, held)], right[held]), rtol=1e-8, atol=1e-8)
+    assert np.allclose(
+        found[held], np.linalg.solve(matrix[np.ix_(held, held)], right[held]), rtol=1e-8, atol=1e-8
+    )
     assert np.array_equal(found[SIDE * 12 : SIDE * 13], np.zeros(SIDE))
 
 

@@ -38,9 +38,13 @@ def staged(
     links = [(old, new) for new in range(count) for old in (new - 1, new - 2) if old >= 0]
     old, new = np.array(links).T
     middle = (centres[old, :2] + centres[new, :2]) / 2
-    ground = np.concatenate([
-        middle[:, None] + rng.uniform(-4, 4, (len(links), pairs_per_link, 2)), np.zeros((len(links), pairs_per_link, 1))
-    ], axis=-1)
+    ground = np.concatenate(
+        [
+            middle[:, None] + rng.uniform(-4, 4, (len(links), pairs_per_link, 2)),
+            np.zeros((len(links), pairs_per_link, 1)),
+        ],
+        axis=-1,
+    )
 
     def ideal(at: np.ndarray) -> np.ndarray:
         local = (ground - centres[at][:, None]) @ rotations[at]
@@ -48,10 +52,18 @@ def staged(
 
     infinite = np.full((count, 3), 1e6)
     is_own = np.ones(count, bool) if own is None else np.isin(along, own)
-    nodes = Nodes(rotations, centres, centres.copy(), np.ones((count, 3)), rotations.copy(), infinite, is_own)
+    nodes = Nodes(
+        rotations, centres, centres.copy(), np.ones((count, 3)), rotations.copy(), infinite, is_own
+    )
     weight = np.ones((len(links), pairs_per_link))
     pairs = Pairs(
-        old, new, ideal(old), ideal(new), weight, np.full(len(links), FOCAL_PX), np.full(len(links), 0.3),
+        old,
+        new,
+        ideal(old),
+        ideal(new),
+        weight,
+        np.full(len(links), FOCAL_PX),
+        np.full(len(links), 0.3),
         np.zeros(len(links)),
     )
     return nodes, pairs
@@ -67,7 +79,9 @@ def moved(nodes: Nodes, at: int, six: np.ndarray) -> Nodes:
 def disturbed(nodes: Nodes, seed: int, metres: float = 0.3, radians: float = 0.02) -> Nodes:
     rng = np.random.default_rng(seed)
     for at in range(len(nodes.centres_m)):
-        nodes = moved(nodes, at, np.concatenate([rng.normal(0, radians, 3), rng.normal(0, metres, 3)]))
+        nodes = moved(
+            nodes, at, np.concatenate([rng.normal(0, radians, 3), rng.normal(0, metres, 3)])
+        )
     return nodes
 
 
@@ -112,7 +126,10 @@ def test_derivatives_by_focal_length_and_radial_distortion(own, which):
 def test_parallax_is_what_a_metre_of_height_moves():
     nodes, pairs = staged(5)
     line = linearise(nodes, pairs, HELD)
-    centre_old, centre_new = nodes.centres_m[pairs.old][:, None], nodes.centres_m[pairs.new][:, None]
+    centre_old, centre_new = (
+        nodes.centres_m[pairs.old][:, None],
+        nodes.centres_m[pairs.new][:, None],
+    )
     ray = np.concatenate([pairs.old_ideal, np.ones((*pairs.old_ideal.shape[:2], 1))], axis=-1)
     ray = ray @ nodes.rotations[pairs.old].transpose(0, 2, 1)
     point = centre_old + ray * ((1e-4 - centre_old[..., 2:]) / ray[..., 2:])
@@ -142,17 +159,22 @@ def known_ground(nodes: Nodes, sigma_m: float = 0.05) -> Ground:
     place_m = np.column_stack([below_m, rng.uniform(-2, 2, len(node))])
     local = np.einsum("mji,mj->mi", nodes.rotations[node], place_m - nodes.centres_m[node])
     focal_px, sigma_px = np.full(len(node), FOCAL_PX), np.full(len(node), 0.5)
-    return Ground(node, local[:, :2] / local[:, 2:], place_m, focal_px, sigma_px, np.full(len(node), sigma_m))
+    return Ground(
+        node, local[:, :2] / local[:, 2:], place_m, focal_px, sigma_px, np.full(len(node), sigma_m)
+    )
 
 
 @pytest.mark.parametrize("has_ground", [False, True], ids=["links", "known ground"])
 @pytest.mark.parametrize("attitude_sigma_rad", [1e6, 0.05])
 def test_the_gradient_is_that_of_the_cost(attitude_sigma_rad, has_ground):
     nodes, pairs = staged(7, count=4, pairs_per_link=8)
-    ground = known_ground(nodes, sigma_m=0.0) if has_ground else NO_GROUND  # px of a place's sigma hang on the camera
+    ground = (
+        known_ground(nodes, sigma_m=0.0) if has_ground else NO_GROUND
+    )  # px of a place's sigma hang on the camera
     turned = rotation_from_vector(np.random.default_rng(8).normal(0, 2e-3, (4, 3)))
     nodes = replace(
-        disturbed(nodes, 9, metres=0.02, radians=1e-3), prior_rotations=turned @ nodes.rotations,
+        disturbed(nodes, 9, metres=0.02, radians=1e-3),
+        prior_rotations=turned @ nodes.rotations,
         prior_sigma_rad=np.full((4, 3), attitude_sigma_rad),
     )
     shared = np.array([0.004, 0.005, 0.1, -0.2, 0.15, 2e-3, -1e-3, 2e-3])
@@ -203,13 +225,19 @@ def test_a_perfect_problem_is_solved_exactly(seed):
     solution = solve(disturbed(nodes, seed + 20), pairs, HELD, HELD, np.ones(6, bool), 40)
     assert np.abs(solution.nodes.centres_m - nodes.centres_m).max() < 1e-6
     assert solution.equations.cost < 1e-8
-    assert np.allclose(solution.nodes.rotations @ solution.nodes.rotations.transpose(0, 2, 1), np.eye(3), atol=1e-12)
+    assert np.allclose(
+        solution.nodes.rotations @ solution.nodes.rotations.transpose(0, 2, 1),
+        np.eye(3),
+        atol=1e-12,
+    )
 
 
 def test_known_ground_brings_a_map_without_fixes_to_its_place():
     nodes, pairs = staged(21, count=6)
     free = replace(nodes, prior_sigma_m=np.full((6, 3), 1e6))
-    away = replace(disturbed(free, 22, 0.1, 0.005), centres_m=nodes.centres_m + np.array([3.0, -2.0, 1.0]))
+    away = replace(
+        disturbed(free, 22, 0.1, 0.005), centres_m=nodes.centres_m + np.array([3.0, -2.0, 1.0])
+    )
     solution = solve(away, pairs, HELD, HELD, np.ones(6, bool), 40, ground=known_ground(nodes))
     assert np.abs(solution.nodes.centres_m - nodes.centres_m).max() < 1e-4
 
@@ -229,10 +257,17 @@ def test_a_fifth_of_wild_pairs_does_no_harm():
     nodes, pairs = staged(16, count=8)
     rng = np.random.default_rng(17)
     wild = rng.random(pairs.weight.shape) < 0.2
-    new_ideal = pairs.new_ideal + wild[..., None] * rng.uniform(-60, 60, pairs.new_ideal.shape) / FOCAL_PX
+    new_ideal = (
+        pairs.new_ideal + wild[..., None] * rng.uniform(-60, 60, pairs.new_ideal.shape) / FOCAL_PX
+    )
     new_ideal += rng.normal(0, 0.2 / FOCAL_PX, new_ideal.shape)
     solution = solve(
-        disturbed(nodes, 18, 0.1, 0.005), replace(pairs, new_ideal=new_ideal), HELD, HELD, np.ones(8, bool), 30
+        disturbed(nodes, 18, 0.1, 0.005),
+        replace(pairs, new_ideal=new_ideal),
+        HELD,
+        HELD,
+        np.ones(8, bool),
+        30,
     )
     assert np.abs(solution.nodes.centres_m - nodes.centres_m).max() < 0.15
     assert np.abs(solution.nodes.centres_m[:, :2] - nodes.centres_m[:, :2]).max() < 0.1
@@ -243,12 +278,23 @@ def test_one_wild_fix_does_no_harm():
     prior = nodes.prior_centres_m.copy()
     prior[4, :2] += [80.0, -50.0]
     solution = solve(
-        disturbed(replace(nodes, prior_centres_m=prior), 20), pairs, HELD, HELD, np.ones(10, bool), 40
+        disturbed(replace(nodes, prior_centres_m=prior), 20),
+        pairs,
+        HELD,
+        HELD,
+        np.ones(10, bool),
+        40,
     )
     assert np.abs(solution.nodes.centres_m - nodes.centres_m).max() < 0.25
     # the same fix believed in squares would pull the whole flight along
     squares = solve(
-        replace(nodes, prior_centres_m=prior), pairs, HELD, HELD, np.ones(10, bool), 40, robust_sigmas=1e6
+        replace(nodes, prior_centres_m=prior),
+        pairs,
+        HELD,
+        HELD,
+        np.ones(10, bool),
+        40,
+        robust_sigmas=1e6,
     )
     assert np.abs(squares.nodes.centres_m - nodes.centres_m).max() > 3.0
 

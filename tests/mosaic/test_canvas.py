@@ -31,23 +31,33 @@ def textured(height: int, width: int, seed: int = 0) -> np.ndarray:
 GROUND = textured(900, 1100)
 
 
-def pose(x: float, y: float, turn_deg: float = 0.0, scale: float = 1.0, bend: float = 0.0) -> np.ndarray:
+def pose(
+    x: float, y: float, turn_deg: float = 0.0, scale: float = 1.0, bend: float = 0.0
+) -> np.ndarray:
     a = np.radians(turn_deg)
-    return np.array([
-        [scale * np.cos(a), -scale * np.sin(a), x],
-        [scale * np.sin(a), scale * np.cos(a), y],
-        [bend, -bend, 1.0],
-    ])
+    return np.array(
+        [
+            [scale * np.cos(a), -scale * np.sin(a), x],
+            [scale * np.sin(a), scale * np.cos(a), y],
+            [bend, -bend, 1.0],
+        ]
+    )
 
 
 def photographed(grid_from_image: np.ndarray, gain: float = 1.0) -> np.ndarray:
     """What a camera at this place sees of GROUND, which lies at grid pixel (-100, -80)."""
-    image_from_ground = np.linalg.inv(grid_from_image) @ np.array([[1, 0, -100], [0, 1, -80], [0, 0, 1.0]])
-    image = cv2.warpPerspective(GROUND, image_from_ground, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT)
+    image_from_ground = np.linalg.inv(grid_from_image) @ np.array(
+        [[1, 0, -100], [0, 1, -80], [0, 0, 1.0]]
+    )
+    image = cv2.warpPerspective(
+        GROUND, image_from_ground, (WIDTH, HEIGHT), borderMode=cv2.BORDER_REFLECT
+    )
     return np.clip(image * gain, 0, 255).astype(np.uint8)
 
 
-def flight(seed: int = 3, gain_spread: float = 0.0) -> tuple[list[CanvasFrame], dict[int, np.ndarray]]:
+def flight(
+    seed: int = 3, gain_spread: float = 0.0
+) -> tuple[list[CanvasFrame], dict[int, np.ndarray]]:
     """Twelve frames in three strips, turned, scaled and a little tilted at random."""
     rng = np.random.default_rng(seed)
     frames, images = [], {}
@@ -64,13 +74,15 @@ def whole(tiles: dict, side: int) -> np.ndarray:
     result = np.zeros((1536, 1536, 4), np.uint8)
     for (column, row), tile in tiles.items():
         for_x, for_y = column * side + 512, row * side + 512
-        result[for_y:for_y + side, for_x:for_x + side] = tile
+        result[for_y : for_y + side, for_x : for_x + side] = tile
     return result
 
 
 def painted(frames, images, side=512, **options) -> np.ndarray:
     tiles: dict = {}
-    Canvas(Grid((0.0, 0.0), 0.05, side), tiles, images.__getitem__, CanvasSettings(**options)).paint(frames)
+    Canvas(
+        Grid((0.0, 0.0), 0.05, side), tiles, images.__getitem__, CanvasSettings(**options)
+    ).paint(frames)
     return whole(tiles, side)
 
 
@@ -88,9 +100,9 @@ def test_the_picture_is_the_ground(reference):
     frames, images = flight()
     picture = painted(frames, images)
     truth = np.zeros_like(picture[..., :3])
-    truth[512 - 80:512 + 820, 512 - 100:512 + 1000] = GROUND
+    truth[512 - 80 : 512 + 820, 512 - 100 : 512 + 1000] = GROUND
     seen = picture[..., 3] == 255
-    seen[:512 - 80] = seen[:, :512 - 100] = False
+    seen[: 512 - 80] = seen[:, : 512 - 100] = False
     assert seen.sum() > 150_000
     assert np.abs(picture[..., :3].astype(int) - truth)[seen].mean() < 3.0
 
@@ -104,6 +116,7 @@ def test_tiles_meet_without_seams(scene, reference, side):
 
 def test_each_tile_is_stored_once(scene, reference):
     """Where much is painted at once: tiles are compressed when memory runs out."""
+
     class Counted(dict):
         stored = 0
 
@@ -128,7 +141,9 @@ def test_frames_one_by_one_in_any_order_paint_the_same(scene, reference):
     for number in order:
         before = {index: tile.copy() for index, tile in tiles.items()}
         touched = canvas.paint([frames[number]])
-        assert touched == {i for i in tiles if i not in before or not np.array_equal(before[i], tiles[i])}
+        assert touched == {
+            i for i in tiles if i not in before or not np.array_equal(before[i], tiles[i])
+        }
     assert np.abs(whole(tiles, 512).astype(int) - reference).max() <= 2
 
 
@@ -138,7 +153,9 @@ def test_forgetting_and_moving_end_as_if_never_there(scene, reference):
     canvas = Canvas(Grid((0.0, 0.0), 0.05), tiles, images.__getitem__)
     stray = CanvasFrame(50, 0, WIDTH, HEIGHT, pose(200, 100, 30))
     far = CanvasFrame(51, 0, WIDTH, HEIGHT, pose(3000, 3000))
-    misplaced = [CanvasFrame(f.id, 0, WIDTH, HEIGHT, pose(7, -5) @ f.grid_from_image) for f in frames[:3]]
+    misplaced = [
+        CanvasFrame(f.id, 0, WIDTH, HEIGHT, pose(7, -5) @ f.grid_from_image) for f in frames[:3]
+    ]
     images = {**images, 50: photographed(pose(0, 0)), 51: photographed(pose(0, 0))}
     canvas._images = images.__getitem__
     canvas.paint([*misplaced, *frames[3:], stray, far])
@@ -176,18 +193,24 @@ def test_a_canvas_opened_again_goes_on_where_it_was(scene, reference):
 def test_ground_of_an_earlier_flight_stays():
     earlier = CanvasFrame(9, 0, WIDTH, HEIGHT, pose(0, 0))
     later = CanvasFrame(2, 1, WIDTH, HEIGHT, pose(150, 0))
-    images = {9: np.full((HEIGHT, WIDTH, 3), 60, np.uint8), 2: np.full((HEIGHT, WIDTH, 3), 200, np.uint8)}
-    picture = painted([earlier, later], images)[512:512 + HEIGHT, 512:]
+    images = {
+        9: np.full((HEIGHT, WIDTH, 3), 60, np.uint8),
+        2: np.full((HEIGHT, WIDTH, 3), 200, np.uint8),
+    }
+    picture = painted([earlier, later], images)[512 : 512 + HEIGHT, 512:]
     assert abs(int(picture[120, WIDTH - 80, 0]) - 60) <= 3
     assert abs(int(picture[120, WIDTH + 80, 0]) - 200) <= 3
-    row = picture[120, :150 + WIDTH, 0].astype(int)
+    row = picture[120, : 150 + WIDTH, 0].astype(int)
     assert np.abs(np.diff(row)).max() < 12, "the border is blended"
 
 
 def test_the_finer_frame_wins():
     coarse = CanvasFrame(0, 0, WIDTH, HEIGHT, pose(-WIDTH, -HEIGHT, 0, 3.0))
     fine = CanvasFrame(1, 0, WIDTH, HEIGHT, pose(0, 0, 0, 1.0))
-    images = {0: np.full((HEIGHT, WIDTH, 3), 50, np.uint8), 1: np.full((HEIGHT, WIDTH, 3), 150, np.uint8)}
+    images = {
+        0: np.full((HEIGHT, WIDTH, 3), 50, np.uint8),
+        1: np.full((HEIGHT, WIDTH, 3), 150, np.uint8),
+    }
     picture = painted([coarse, fine], images)[512:, 512:]
     assert abs(int(picture[HEIGHT // 2, WIDTH // 2, 0]) - 150) <= 3
     assert abs(int(picture[30, 40, 0]) - 150) < 40
@@ -211,17 +234,25 @@ def test_black_lens_borders_are_neither_shown_nor_bleed():
     picture = painted(frames, {0: image, 1: image})
     covered = picture[..., 3] == 255
     union = np.pad(valid, ((0, 0), (0, 120))) | np.pad(valid, ((0, 0), (120, 0)))
-    assert not (covered[512:512 + HEIGHT, 512:512 + WIDTH + 120] & ~union).any()
+    assert not (covered[512 : 512 + HEIGHT, 512 : 512 + WIDTH + 120] & ~union).any()
     assert covered.sum() > 0.97 * union.sum()
     assert np.abs(picture[..., :3][covered].astype(int) - 170).max() <= 2
 
 
 def test_gains_and_vignette_make_exposures_agree():
     yy, xx = np.mgrid[:HEIGHT, :WIDTH]
-    radius2 = ((xx - (WIDTH - 1) / 2) ** 2 + (yy - (HEIGHT - 1) / 2) ** 2) * 4 / (WIDTH**2 + HEIGHT**2)
+    radius2 = (
+        ((xx - (WIDTH - 1) / 2) ** 2 + (yy - (HEIGHT - 1) / 2) ** 2) * 4 / (WIDTH**2 + HEIGHT**2)
+    )
     seen = 140 * np.exp(-0.4 * radius2)[..., None] * np.array([0.8, 1.0, 1.1])
     frame = CanvasFrame(
-        0, 0, WIDTH, HEIGHT, pose(0, 0), gains=1 / np.array([0.8, 1.0, 1.1]), vignette=np.array([-0.4, 0.0])
+        0,
+        0,
+        WIDTH,
+        HEIGHT,
+        pose(0, 0),
+        gains=1 / np.array([0.8, 1.0, 1.1]),
+        vignette=np.array([-0.4, 0.0]),
     )
     picture = painted([frame], {0: seen.round().astype(np.uint8)})
     covered = picture[..., 3] == 255
@@ -230,7 +261,10 @@ def test_gains_and_vignette_make_exposures_agree():
 
 @settings(max_examples=25, deadline=None)
 @given(
-    st.floats(-180, 180), st.floats(0.3, 3.0), st.floats(-700, 700), st.floats(-700, 700),
+    st.floats(-180, 180),
+    st.floats(0.3, 3.0),
+    st.floats(-700, 700),
+    st.floats(-700, 700),
     st.floats(-3e-4, 3e-4),
 )
 def test_coverage_holds_exactly_the_pixels_whose_centre_the_image_sees(turn, scale, x, y, bend):
@@ -238,7 +272,7 @@ def test_coverage_holds_exactly_the_pixels_whose_centre_the_image_sees(turn, sca
     low = np.floor(frame.outline_px.min(axis=0)).astype(int) - 5
     window = low[0], low[1], low[0] + 150, low[1] + 130
     mask = coverage(frame, window) > 0
-    yy, xx = np.mgrid[window[1]:window[3], window[0]:window[2]]
+    yy, xx = np.mgrid[window[1] : window[3], window[0] : window[2]]
     points = np.column_stack([xx.ravel(), yy.ravel()]).astype(float)
     image_from_grid = np.linalg.inv(frame.grid_from_image)
     image_from_grid /= np.sign((image_from_grid @ np.append(frame.outline_px.mean(axis=0), 1))[2])
@@ -263,19 +297,30 @@ def test_covers_gives_the_painted_share(scene):
     assert canvas.covers(frames[0].outline_px) == 0.0
     canvas.paint(frames[:1])
     assert canvas.covers(frames[0].outline_px) > 0.97
-    assert canvas.covers(frames[0].outline_px + np.array([WIDTH / 2, 0])) == pytest.approx(0.5, abs=0.12)
+    assert canvas.covers(frames[0].outline_px + np.array([WIDTH / 2, 0])) == pytest.approx(
+        0.5, abs=0.12
+    )
 
 
-@pytest.mark.parametrize("change", [
-    {"grid_from_image": np.zeros((3, 3))},
-    {"grid_from_image": np.full((3, 3), np.nan)},
-    {"grid_from_image": pose(0, 0, bend=-1e-2)},
-    {"valid": np.ones((3, 3), dtype=bool)},
-    {"gains": np.ones(2)},
-    {"id": -1},
-])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"grid_from_image": np.zeros((3, 3))},
+        {"grid_from_image": np.full((3, 3), np.nan)},
+        {"grid_from_image": pose(0, 0, bend=-1e-2)},
+        {"valid": np.ones((3, 3), dtype=bool)},
+        {"gains": np.ones(2)},
+        {"id": -1},
+    ],
+)
 def test_impossible_frames_are_refused(change):
-    fields = {"id": 0, "rank": 0, "width_px": WIDTH, "height_px": HEIGHT, "grid_from_image": pose(0, 0)}
+    fields = {
+        "id": 0,
+        "rank": 0,
+        "width_px": WIDTH,
+        "height_px": HEIGHT,
+        "grid_from_image": pose(0, 0),
+    }
     with pytest.raises(GeometryError):
         CanvasFrame(**{**fields, **change})
 
@@ -293,7 +338,9 @@ def test_painting_a_frame_stays_cheap():
     spent_s = []
     for number in range(8):
         started = time.process_time()
-        canvas.paint([CanvasFrame(number, 0, 960, 540, pose(240 * number, 30 * number, 3.0 * number))])
+        canvas.paint(
+            [CanvasFrame(number, 0, 960, 540, pose(240 * number, 30 * number, 3.0 * number))]
+        )
         spent_s.append(time.process_time() - started)
     assert np.median(spent_s) < 0.4
 
@@ -305,7 +352,7 @@ def test_real_photos_blend_without_visible_seams():
     frames, images = [], {}
     for number in range(4):
         x = 180 * number
-        crop = photo[60:460, x:x + 420]
+        crop = photo[60:460, x : x + 420]
         images[number] = np.clip(crop * (1.0 + 0.06 * (-1) ** number), 0, 255).astype(np.uint8)
         frames.append(CanvasFrame(number, 0, 420, 400, pose(x, 0)))
     tiles: dict = {}
@@ -323,19 +370,31 @@ def test_a_pixel_does_not_depend_on_the_window_that_it_is_painted_in(scale, bend
     valid = np.ones((480, 640), bool)
     valid[:9], valid[:, 633:] = False, False
     gains, vignette = np.array([1.1, 0.9, 1.0]), np.array([-0.4, 0.1])
-    frame = CanvasFrame(0, 0, 640, 480, pose(40.3, 30.7, 9.0, scale, bends * scale), gains, vignette, valid)
+    frame = CanvasFrame(
+        0, 0, 640, 480, pose(40.3, 30.7, 9.0, scale, bends * scale), gains, vignette, valid
+    )
     whole = warp(image, frame, (-120, -120, 720, 720))
-    for x, y, side in ((-100, -90, 64), (20, 40, 32), (100, 60, 208), (-120, 70, 100), (36, 24, 80)):
+    for x, y, side in (
+        (-100, -90, 64),
+        (20, 40, 32),
+        (100, 60, 208),
+        (-120, 70, 100),
+        (36, 24, 80),
+    ):
         part = warp(image, frame, (x, y, x + side, y + side))
-        away = cv2.absdiff(part, whole[y + 120:y + 120 + side, x + 120:x + 120 + side])
-        assert away.max() <= 1 and (away > 0).mean() < 1e-3  # OpenCV interpolates in single precision
+        away = cv2.absdiff(part, whole[y + 120 : y + 120 + side, x + 120 : x + 120 + side])
+        assert (
+            away.max() <= 1 and (away > 0).mean() < 1e-3
+        )  # OpenCV interpolates in single precision
     assert whole.any()
 
 
 def test_a_window_shows_what_it_sees_of_a_large_picture_at_the_price_of_that():
     image = np.zeros((6000, 8000, 3), np.uint8)
     image[3000:3064, 4000:4064] = 200
-    frame = CanvasFrame(0, 0, 8000, 6000, np.eye(3), np.array([1.2, 1.0, 1.0]), np.array([-0.4, 0.1]))
+    frame = CanvasFrame(
+        0, 0, 8000, 6000, np.eye(3), np.array([1.2, 1.0, 1.0]), np.array([-0.4, 0.1])
+    )
     warp(image, frame, (3900, 2900, 4156, 3156))
     start = time.process_time()
     for _ in range(5):

@@ -17,7 +17,9 @@ STEP = 4
 
 def picture() -> np.ndarray:
     small = np.random.default_rng(3).uniform(0, 255, (15, 20, 3)).astype(np.float32)
-    return np.clip(cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC), 0, 255).astype(np.uint8)
+    return np.clip(cv2.resize(small, (640, 480), interpolation=cv2.INTER_CUBIC), 0, 255).astype(
+        np.uint8
+    )
 
 
 def painted(site_grid: SiteGrid, tiles, image: np.ndarray) -> None:
@@ -35,7 +37,7 @@ def joined(tiles, side: int) -> np.ndarray:
     whole = np.zeros(shape, np.uint8)
     for (column, row), tile in tiles.items():
         y, x = (row - min(rows)) * side, (column - min(columns)) * side
-        whole[y:y + side, x:x + side] = tile
+        whole[y : y + side, x : x + side] = tile
     return whole
 
 
@@ -52,7 +54,9 @@ def test_what_is_painted_coarsely_lies_where_the_fine_picture_does():
     both = cv2.erode((one[..., 3] & other[..., 3]), np.ones((33, 33), np.uint8)) > 0
     assert both.sum() > 200_000
     away = {
-        shift: np.abs(one[both].astype(int) - np.roll(other, shift, axis=(0, 1))[both].astype(int)).mean()
+        shift: np.abs(
+            one[both].astype(int) - np.roll(other, shift, axis=(0, 1))[both].astype(int)
+        ).mean()
         for shift in ((0, 0), (0, 2), (2, 0), (0, -2), (-2, 0))
     }
     assert min(away, key=away.__getitem__) == (0, 0)
@@ -103,6 +107,8 @@ def test_few_tiles_in_memory_show_the_same_as_many():
         assert all(np.array_equal(shown[most_bytes][index], each) for index, each in known.items())
 
 
-@pytest.mark.parametrize(("longest_px", "step"), [(320, 1), (640, 1), (1024, 2), (1920, 4), (4000, 8), (8000, 8)])
+@pytest.mark.parametrize(
+    ("longest_px", "step"), [(320, 1), (640, 1), (1024, 2), (1920, 4), (4000, 8), (8000, 8)]
+)
 def test_pictures_are_made_no_smaller_than_is_needed_to_follow(longest_px, step):
     assert coarseness(longest_px) == step

@@ -15,7 +15,9 @@ def outlines(centres_m: np.ndarray) -> list[np.ndarray]:
 
 
 @given(st.integers(1, 120), st.integers(1, 9), st.integers(0, 1000))
-def test_each_picture_has_one_home_and_its_earlier_neighbours_there(count: int, blocks: int, seed: int) -> None:
+def test_each_picture_has_one_home_and_its_earlier_neighbours_there(
+    count: int, blocks: int, seed: int
+) -> None:
     centres_m = np.random.default_rng(seed).uniform(0, 150, (count, 2))
     found = divide(outlines(centres_m), blocks)
     assert len(found) == min(count, blocks)

@@ -6,7 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.mosaic.exposure import ColourPairs, ExposureSettings, corrected, solve_exposure, tie_colours
+from sorvolo.mosaic.exposure import (
+    ColourPairs,
+    ExposureSettings,
+    corrected,
+    solve_exposure,
+    tie_colours,
+)
 
 
 def seen_pairs(gains, vignette, links, rng, noise=0.02, outliers=0.0, cameras=None):
@@ -49,7 +55,9 @@ def test_each_camera_has_its_own_vignette():
     cameras = {i: i % 2 for i in range(10)}
     true = {i: np.ones(3) for i in cameras}
     links = [(i, j) for i in true for j in (i + 1, i + 2) if j in true]
-    found = solve_exposure(seen_pairs(true, [(-0.5, 0.0), (0.0, 0.0)], links, rng, cameras=cameras), cameras)
+    found = solve_exposure(
+        seen_pairs(true, [(-0.5, 0.0), (0.0, 0.0)], links, rng, cameras=cameras), cameras
+    )
     assert found.vignettes[0].sum() == pytest.approx(-0.5, abs=0.05)
     assert found.vignettes[1].sum() == pytest.approx(0.0, abs=0.05)
 
@@ -61,7 +69,9 @@ def test_a_vignette_that_cannot_be_seen_stays_zero():
     found = solve_exposure(pairs)
     assert np.abs(found.vignettes[0]).max() < 1e-6
     assert np.allclose(found.gains[1] / found.gains[0], 1 / 0.9, rtol=0.01)
-    assert np.allclose(found.gains[0] * found.gains[1], 1, atol=0.02), "the whole keeps its brightness"
+    assert np.allclose(found.gains[0] * found.gains[1], 1, atol=0.02), (
+        "the whole keeps its brightness"
+    )
 
 
 def test_a_long_chain_does_not_drift():
@@ -101,7 +111,9 @@ def test_corrected_undoes_what_the_lens_did():
     flat = corrected(seen, np.array([1.0, 1.0, 0.5]), np.array([-0.5, 0.1]))
     assert np.abs(flat.astype(int) - [150, 150, 75]).max() <= 2
     assert corrected(seen, np.ones(3), np.zeros(2)) is seen
-    assert np.abs(corrected(seen, np.full(3, 2.0), np.zeros(2))[48, 70].astype(int) - 255).max() == 0
+    assert (
+        np.abs(corrected(seen, np.full(3, 2.0), np.zeros(2))[48, 70].astype(int) - 255).max() == 0
+    )
 
 
 def test_bad_settings_and_shapes_are_refused():

@@ -26,9 +26,13 @@ class _Shelf:
 
 def _keyframe(keyframe_id: int) -> tuple[Keyframe, np.ndarray]:
     rng = np.random.default_rng(keyframe_id)
-    features = Features("orb", rng.uniform(0, 60, (5, 2)), rng.integers(0, 256, (5, 32), dtype=np.uint8))
+    features = Features(
+        "orb", rng.uniform(0, 60, (5, 2)), rng.integers(0, 256, (5, 32), dtype=np.uint8)
+    )
     gray = rng.integers(0, 256, (48, 64), dtype=np.uint8)
-    return Keyframe(keyframe_id, _CAMERA, gray, features, _PRIOR), rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)
+    return Keyframe(keyframe_id, _CAMERA, gray, features, _PRIOR), rng.integers(
+        0, 256, (12, 16, 3), dtype=np.uint8
+    )
 
 
 def test_what_comes_back_is_what_was_put_away() -> None:

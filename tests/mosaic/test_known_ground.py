@@ -16,7 +16,10 @@ GRID = Grid((0.0, 0.0), 0.05)
 
 
 def brighter(images: dict[int, np.ndarray], ids: list[int], gain: float) -> dict[int, np.ndarray]:
-    return {k: np.clip(v * (gain if k in ids else 1), 0, 255).astype(np.uint8) for k, v in images.items()}
+    return {
+        k: np.clip(v * (gain if k in ids else 1), 0, 255).astype(np.uint8)
+        for k, v in images.items()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +38,12 @@ def extended(halves, frames=None, window_px=1024) -> dict:
     early, late, images, tiles = halves
     tiles = dict(tiles)
     canvas = Canvas(
-        GRID, tiles, images.__getitem__, CanvasSettings(window_px=window_px), early, keeps_known_ground=True
+        GRID,
+        tiles,
+        images.__getitem__,
+        CanvasSettings(window_px=window_px),
+        early,
+        keeps_known_ground=True,
     )
     for frame in frames or late:
         canvas.paint([frame])
@@ -47,12 +55,14 @@ def test_known_pixels_stay_and_the_new_side_meets_them(halves):
     known = before[..., 3] == 255
     assert np.array_equal(after[known], before[known])
     truth = np.zeros_like(after[..., :3])
-    truth[512 - 80:512 + 820, 512 - 100:512 + 1000] = GROUND
+    truth[512 - 80 : 512 + 820, 512 - 100 : 512 + 1000] = GROUND
     error = after[..., :3].astype(float) - truth
     seen = (after[..., 3] == 255) & truth.any(axis=2)
     outwards_px = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5)
     touching = cv2.dilate(((outwards_px > 0) & seen).astype(np.uint8), np.ones((5, 5))) > 0
-    step = error[seen & (outwards_px > 0) & (outwards_px <= 2)].mean() - error[known & touching].mean()
+    step = (
+        error[seen & (outwards_px > 0) & (outwards_px <= 2)].mean() - error[known & touching].mean()
+    )
     farther = error[seen & (outwards_px > 70)].mean() - error[known].mean()
     assert farther > 5.5  # gray levels: the late flight keeps its own light
     assert abs(step) < 2.0  # blending half-way, the known side held, would have left 3.7
@@ -60,7 +70,10 @@ def test_known_pixels_stay_and_the_new_side_meets_them(halves):
 
 def test_new_ground_is_the_same_however_it_is_cut_and_ordered(halves):
     late = halves[1]
-    one, other = whole(extended(halves), 512), whole(extended(halves, late[::-1], window_px=192), 512)
+    one, other = (
+        whole(extended(halves), 512),
+        whole(extended(halves, late[::-1], window_px=192), 512),
+    )
     assert np.abs(one.astype(int) - other).max() <= 2
 
 
@@ -84,7 +97,9 @@ def test_pixels_patched_into_the_map_are_not_reverted(halves):
     first = next(iter(patched.values()))
     first[first[..., 3] == 255] = (255, 0, 255, 255)
     after = extended((early, late, images, patched))
-    assert all(np.array_equal(after[k][v[..., 3] == 255], v[v[..., 3] == 255]) for k, v in patched.items())
+    assert all(
+        np.array_equal(after[k][v[..., 3] == 255], v[v[..., 3] == 255]) for k, v in patched.items()
+    )
 
 
 def test_a_painted_frame_shows_no_ground_that_the_map_did_not():
@@ -93,12 +108,21 @@ def test_a_painted_frame_shows_no_ground_that_the_map_did_not():
     valid[40:-40, 40:-40] = True
     early = CanvasFrame(0, 0, WIDTH, HEIGHT, pose(0, 0), valid=valid)
     late = CanvasFrame(1, 1, WIDTH, HEIGHT, pose(120, 0))
-    images = {0: np.full((HEIGHT, WIDTH, 3), 90, np.uint8), 1: np.full((HEIGHT, WIDTH, 3), 90, np.uint8)}
+    images = {
+        0: np.full((HEIGHT, WIDTH, 3), 90, np.uint8),
+        1: np.full((HEIGHT, WIDTH, 3), 90, np.uint8),
+    }
     images[0][~valid] = 0
     tiles: dict = {}
     Canvas(GRID, tiles, images.__getitem__).paint([early])
-    Canvas(GRID, tiles, images.__getitem__, painted=[replace(early, valid=None)], keeps_known_ground=True).paint([late])
-    new = whole(tiles, 512)[512:512 + HEIGHT, 512 + 120:512 + 120 + WIDTH]
+    Canvas(
+        GRID,
+        tiles,
+        images.__getitem__,
+        painted=[replace(early, valid=None)],
+        keeps_known_ground=True,
+    ).paint([late])
+    new = whole(tiles, 512)[512 : 512 + HEIGHT, 512 + 120 : 512 + 120 + WIDTH]
     assert (new[..., 3] == 255).all()
     assert (np.abs(new[..., :3].astype(int) - 90) > 30).mean() < 0.01
 
@@ -111,7 +135,7 @@ def test_masks_of_windows_across_tiles_and_none():
     known = KnownGround(Grid((0.0, 0.0), 1.0, 32), tiles)
     whole_mask = np.zeros((64, 64), bool)
     for (x, y), tile in tiles.items():
-        whole_mask[32 * y:32 * y + 32, 32 * x + 32:32 * x + 64] = tile[..., 3] == 255
+        whole_mask[32 * y : 32 * y + 32, 32 * x + 32 : 32 * x + 64] = tile[..., 3] == 255
     assert np.array_equal(known.opaque(-20, 5, 31, 60), whole_mask[5:60, 12:63])
     for tile in tiles.values():
         tile[:] = 255  # painted since: what was shown at the beginning counts

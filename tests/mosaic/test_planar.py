@@ -33,13 +33,19 @@ SCENE, ELSEWHERE = ground(1), ground(2)
 
 
 def seen(pose: Pose, scene: np.ndarray = SCENE, seed: int = 0) -> np.ndarray:
-    scene_from_site = np.array([
-        [1 / SCENE_M_PER_PX, 0, -SCENE_CORNER_M[0] / SCENE_M_PER_PX],
-        [0, -1 / SCENE_M_PER_PX, SCENE_CORNER_M[1] / SCENE_M_PER_PX], [0, 0, 1],
-    ])
+    scene_from_site = np.array(
+        [
+            [1 / SCENE_M_PER_PX, 0, -SCENE_CORNER_M[0] / SCENE_M_PER_PX],
+            [0, -1 / SCENE_M_PER_PX, SCENE_CORNER_M[1] / SCENE_M_PER_PX],
+            [0, 0, 1],
+        ]
+    )
     image = cv2.warpPerspective(
-        scene, scene_from_site @ site_from_image_homography(CAMERA, pose), (400, 300),
-        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REFLECT,
+        scene,
+        scene_from_site @ site_from_image_homography(CAMERA, pose),
+        (400, 300),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        borderMode=cv2.BORDER_REFLECT,
     )
     noise = np.random.default_rng(seed).normal(0, 1.5, image.shape)
     return np.clip(image + noise, 0, 255).astype(np.uint8)
@@ -54,24 +60,34 @@ def flown(seed: int, per_strip: int = 6) -> list[Pose]:
             along = step if strip == 0 else per_strip - 1 - step
             place = np.array([5.0 * along, 10.0 * strip, 20.0]) + rng.normal(0, 0.3, 3)
             tilt, roll, yaw = rng.normal(0, 1.5, 3)
-            poses.append(Pose(site_from_gimbal_rotation(yaw + (90, 270)[strip], -90 + tilt, roll), place))
+            poses.append(
+                Pose(site_from_gimbal_rotation(yaw + (90, 270)[strip], -90 + tilt, roll), place)
+            )
     return poses
 
 
-def measured(pose: Pose, rng: np.random.Generator, shift_m: tuple[float, float, float] = (0, 0, 0)) -> CameraPrior:
+def measured(
+    pose: Pose, rng: np.random.Generator, shift_m: tuple[float, float, float] = (0, 0, 0)
+) -> CameraPrior:
     """GPS of 1 m, a compass of 2 deg, no tilt."""
     forward = pose.rotation @ np.array([0.0, -1.0, 0.0])
     yaw = np.degrees(np.arctan2(forward[0], forward[1])) + rng.normal(0, 2)
     place = pose.translation_m + rng.normal(0, 1, 3) + shift_m
-    return CameraPrior(place, np.ones(3), site_from_gimbal_rotation(yaw, -90, 0), np.array([3.0, 3.0, 4.0]))
+    return CameraPrior(
+        place, np.ones(3), site_from_gimbal_rotation(yaw, -90, 0), np.array([3.0, 3.0, 4.0])
+    )
 
 
 def unmeasured(first: Pose | None = None) -> CameraPrior:
     """Without telemetry: the first frame defines the frame."""
     if first is not None:
-        return CameraPrior(first.translation_m, np.full(3, 0.02), first.rotation, np.array([4.0, 4.0, 0.1]))
+        return CameraPrior(
+            first.translation_m, np.full(3, 0.02), first.rotation, np.array([4.0, 4.0, 0.1])
+        )
     unknown = np.full(3, np.inf)
-    return CameraPrior(np.array([0, 0, 20.0]), unknown, np.diag([1.0, -1, -1]), np.array([12.0, 12.0, np.inf]))
+    return CameraPrior(
+        np.array([0, 0, 20.0]), unknown, np.diag([1.0, -1, -1]), np.array([12.0, 12.0, np.inf])
+    )
 
 
 def shape_rms_px(mapper: PlanarMapper, poses: dict[int, Pose]) -> float:
@@ -124,7 +140,10 @@ def test_a_flight_with_next_to_no_memory_is_placed_as_with_plenty():
             return self[key]
 
     poses, shelf = flown(1, per_strip=4), Shelf()
-    plenty, little = PlanarMapper(PoseGraphSettings()), PlanarMapper(PoseGraphSettings(), shelf=shelf, keyframe_bytes=1)
+    plenty, little = (
+        PlanarMapper(PoseGraphSettings()),
+        PlanarMapper(PoseGraphSettings(), shelf=shelf, keyframe_bytes=1),
+    )
     for mapper in (plenty, little):
         rng = np.random.default_rng(1)
         for k, pose in enumerate(poses):
@@ -143,7 +162,9 @@ def test_a_featureless_frame_stands_by_its_gps_and_the_next_ones_are_found_again
     for k, pose in enumerate(poses):
         image = seen(pose, seed=k)
         if k == 3:
-            image = np.clip(90 + np.random.default_rng(9).normal(0, 1.5, image.shape), 0, 255).astype(np.uint8)
+            image = np.clip(
+                90 + np.random.default_rng(9).normal(0, 1.5, image.shape), 0, 255
+            ).astype(np.uint8)
         mapper.add(k, CAMERA, image, measured(pose, rng))
     mapper.settle()
     status, reason = mapper.ending(3)
@@ -164,7 +185,12 @@ def test_without_gps_a_frame_of_another_place_is_rejected_and_the_flight_goes_on
         image = seen(pose, ELSEWHERE if k == 3 else SCENE, seed=k)
         outcomes.append(mapper.add(k, CAMERA, image, unmeasured(poses[0] if k == 0 else None)))
     assert [each.status for each in outcomes] == [
-        Status.VISION, Status.VISION, Status.VISION, Status.REJECTED, Status.VISION, Status.VISION
+        Status.VISION,
+        Status.VISION,
+        Status.VISION,
+        Status.REJECTED,
+        Status.VISION,
+        Status.VISION,
     ]
     assert "no picture of the map fits it" in outcomes[3].reason
     assert outcomes[3].moved == frozenset()
@@ -175,13 +201,16 @@ def test_without_gps_a_frame_of_another_place_is_rejected_and_the_flight_goes_on
 def test_keyframes_of_a_known_map_tie_the_next_flight():
     first, second = flown(4), flown(5)
     known = [
-        KnownKeyframe(k, CAMERA, pose, 0.05, lambda k=k, pose=pose: seen(pose, seed=k)) for k, pose in enumerate(first)
+        KnownKeyframe(k, CAMERA, pose, 0.05, lambda k=k, pose=pose: seen(pose, seed=k))
+        for k, pose in enumerate(first)
     ]
     rng = np.random.default_rng(5)
     mapper = PlanarMapper(PoseGraphSettings(gps_offset_sigma_m=5.0), known=known)
     for k, pose in enumerate(second[:6]):
         # this day's GPS is two metres off the first one's
-        outcome = mapper.add(100 + k, CAMERA, seen(pose, seed=50 + k), measured(pose, rng, (2.0, -1.5, 0.0)))
+        outcome = mapper.add(
+            100 + k, CAMERA, seen(pose, seed=50 + k), measured(pose, rng, (2.0, -1.5, 0.0))
+        )
         assert outcome.status is Status.VISION
         assert all(each >= 100 for each in outcome.moved)
     mapper.settle()
@@ -208,7 +237,9 @@ def test_a_camera_turned_in_its_mount_does_no_harm():
     for k, pose in enumerate(poses):
         prior = measured(pose, rng)
         half_turn = CameraPrior(
-            prior.position_m, prior.position_sigma_m, prior.rotation @ np.diag([-1.0, -1.0, 1.0]),
+            prior.position_m,
+            prior.position_sigma_m,
+            prior.rotation @ np.diag([-1.0, -1.0, 1.0]),
             prior.attitude_sigma_deg,
         )
         assert mapper.add(k, CAMERA, seen(pose, seed=k), half_turn).status is Status.VISION
@@ -224,4 +255,6 @@ def test_large_pictures_are_registered_small_and_residuals_are_of_the_full_size(
         image = cv2.resize(seen(pose, seed=k), (1600, 1200), interpolation=cv2.INTER_CUBIC)
         assert mapper.add(k, camera, image, measured(pose, rng)).status is Status.VISION
     small = mapper.residuals_px(camera.resized(400, 300))
-    assert all(value == pytest.approx(4 * small[k]) for k, value in mapper.residuals_px(camera).items())
+    assert all(
+        value == pytest.approx(4 * small[k]) for k, value in mapper.residuals_px(camera).items()
+    )

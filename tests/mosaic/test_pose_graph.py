@@ -45,38 +45,66 @@ def tied(
     """The link of two true poses, from points spread over both pictures; None where they share too little ground."""
     x, y = np.meshgrid(np.linspace(20, 940, 14), np.linspace(20, 520, 9))
     old_px = np.column_stack([x.ravel(), y.ravel()])
-    new_from_old = np.linalg.inv(site_from_image_homography(CAMERA, new)) @ site_from_image_homography(CAMERA, old)
+    new_from_old = np.linalg.inv(
+        site_from_image_homography(CAMERA, new)
+    ) @ site_from_image_homography(CAMERA, old)
     new_px = apply_homography(new_from_old, old_px)
     shared = ((new_px > 0) & (new_px < [960, 540])).all(axis=1)
     if shared.mean() < 0.2:
         return None
     noise = rng.normal(0, noise_px, (2, int(shared.sum()), 2))
-    return Link(new_id, old_id, new_px[shared] + noise[0], old_px[shared] + noise[1], new_from_old, max(noise_px, 0.05))
+    return Link(
+        new_id,
+        old_id,
+        new_px[shared] + noise[0],
+        old_px[shared] + noise[1],
+        new_from_old,
+        max(noise_px, 0.05),
+    )
 
 
-def links_of(number: int, poses: list[Pose], rng: np.random.Generator, noise_px: float = 0.2) -> list[Link]:
+def links_of(
+    number: int, poses: list[Pose], rng: np.random.Generator, noise_px: float = 0.2
+) -> list[Link]:
     previous = [each for each in (number - 1, number - 2) if each >= 0]
     centres = np.array([pose.translation_m for pose in poses])
-    far = [int(k) for k in np.argsort(np.linalg.norm(centres[:number] - centres[number], axis=1)) if k not in previous]
-    found = [tied(number, old, poses[number], poses[old], rng, noise_px) for old in [*previous, *far[:2]]]
+    far = [
+        int(k)
+        for k in np.argsort(np.linalg.norm(centres[:number] - centres[number], axis=1))
+        if k not in previous
+    ]
+    found = [
+        tied(number, old, poses[number], poses[old], rng, noise_px) for old in [*previous, *far[:2]]
+    ]
     return [each for each in found if each is not None]
 
 
 def prior_of(
-    pose: Pose, rng: np.random.Generator, *, noise_m: float = 1.0, attitude_deg: np.ndarray = KNOWN_ATTITUDE,
-    yaw_off_deg: float = 0.0, shift_m: tuple[float, float, float] = (0, 0, 0),
+    pose: Pose,
+    rng: np.random.Generator,
+    *,
+    noise_m: float = 1.0,
+    attitude_deg: np.ndarray = KNOWN_ATTITUDE,
+    yaw_off_deg: float = 0.0,
+    shift_m: tuple[float, float, float] = (0, 0, 0),
 ) -> CameraPrior:
     forward = pose.rotation @ np.array([0.0, -1.0, 0.0])
     yaw = np.degrees(np.arctan2(forward[0], forward[1])) + yaw_off_deg + rng.normal(0, 1.5)
     place = pose.translation_m + rng.normal(0, noise_m, 3) + shift_m
     return CameraPrior(
-        place, np.full(3, max(noise_m, 0.1)), site_from_gimbal_rotation(yaw, -90.0, 0.0), attitude_deg
+        place,
+        np.full(3, max(noise_m, 0.1)),
+        site_from_gimbal_rotation(yaw, -90.0, 0.0),
+        attitude_deg,
     )
 
 
 def build(
-    poses: list[Pose], priors: list[CameraPrior], rng: np.random.Generator,
-    settings: PoseGraphSettings = DEFAULTS, noise_px: float = 0.2,
+    poses: list[Pose],
+    priors: list[CameraPrior],
+    rng: np.random.Generator,
+    settings: PoseGraphSettings = DEFAULTS,
+    noise_px: float = 0.2,
 ) -> PoseGraph:
     graph = PoseGraph(settings)
     for number, prior in enumerate(priors):
@@ -106,7 +134,9 @@ def absolute_error_m(graph: PoseGraph, poses: list[Pose]) -> float:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("attitude_deg", [KNOWN_ATTITUDE, UNKNOWN_ATTITUDE], ids=["attitude", "no attitude"])
+@pytest.mark.parametrize(
+    "attitude_deg", [KNOWN_ATTITUDE, UNKNOWN_ATTITUDE], ids=["attitude", "no attitude"]
+)
 def test_the_shape_is_right(seed, attitude_deg):
     rng = np.random.default_rng(seed)
     poses = flown(seed)
@@ -122,8 +152,12 @@ def test_add_names_what_moved_by_half_a_pixel_and_nothing_else():
     for number, pose in enumerate(poses):
         prior = prior_of(pose, rng)
         links = links_of(number, poses, rng) if number else []
-        by_link = pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)) if links else None
-        named = graph.add(number, CAMERA, prior, links, by_link or Pose(prior.rotation, prior.position_m))
+        by_link = (
+            pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)) if links else None
+        )
+        named = graph.add(
+            number, CAMERA, prior, links, by_link or Pose(prior.rotation, prior.position_m)
+        )
         assert number in named
         for each in graph.ids():
             outline = footprint(graph.camera(each), graph.pose(each))
@@ -158,7 +192,10 @@ def test_a_compass_offset_is_found_out():
 def test_some_frames_with_the_yaw_turned_by_half_a_turn_do_no_harm():
     rng = np.random.default_rng(6)
     poses = flown(6)
-    priors = [prior_of(pose, rng, yaw_off_deg=180.0 if k % 5 == 2 else 0.0) for k, pose in enumerate(poses)]
+    priors = [
+        prior_of(pose, rng, yaw_off_deg=180.0 if k % 5 == 2 else 0.0)
+        for k, pose in enumerate(poses)
+    ]
     graph = build(poses, priors, rng)
     graph.settle()
     assert shape_error_m(graph, poses) < 0.06
@@ -172,7 +209,9 @@ def test_an_altitude_of_unknown_zero_is_found_from_gps():
     graph = build(poses, priors, rng, PoseGraphSettings(altitude_offset_sigma_m=1e4))
     graph.settle()
     assert graph.report().altitude_offset_m == pytest.approx(35.0, abs=0.8)
-    assert np.median([graph.pose(k).translation_m[2] for k in graph.ids()]) == pytest.approx(20.0, abs=0.8)
+    assert np.median([graph.pose(k).translation_m[2] for k in graph.ids()]) == pytest.approx(
+        20.0, abs=0.8
+    )
     assert shape_error_m(graph, poses) < 0.05
 
 
@@ -180,9 +219,14 @@ def test_without_gps_the_first_frame_keeps_the_scale():
     rng = np.random.default_rng(8)
     poses = flown(8)
     unknown = np.full(3, np.inf)
-    priors = [CameraPrior(poses[0].translation_m, np.full(3, 0.02), poses[0].rotation, np.array([4.0, 4.0, 0.1]))]
+    priors = [
+        CameraPrior(
+            poses[0].translation_m, np.full(3, 0.02), poses[0].rotation, np.array([4.0, 4.0, 0.1])
+        )
+    ]
     priors += [
-        CameraPrior(np.array([0, 0, 20.0]), unknown, np.diag([1.0, -1.0, -1.0]), UNKNOWN_ATTITUDE) for _ in poses[1:]
+        CameraPrior(np.array([0, 0, 20.0]), unknown, np.diag([1.0, -1.0, -1.0]), UNKNOWN_ATTITUDE)
+        for _ in poses[1:]
     ]
     graph = build(poses, priors, rng, PoseGraphSettings(altitude_offset_sigma_m=0.0))
     found = corners([graph.pose(k) for k in graph.ids()])
@@ -202,7 +246,13 @@ def test_known_keyframes_never_move_and_hold_the_new_ones():
         prior = prior_of(poses[k], rng, shift_m=(3.0, -2.0, 0.0))
         links = links_of(k, poses, rng)
         assert any(each.old_id < 10 for each in links)
-        graph.add(k, CAMERA, prior, links, pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)))
+        graph.add(
+            k,
+            CAMERA,
+            prior,
+            links,
+            pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)),
+        )
     moved = graph.settle()
     assert all(each >= 10 for each in moved)
     for k in range(10):
@@ -218,8 +268,12 @@ def test_residuals_show_the_noise_of_the_pairs():
     quiet = build(poses, [prior_of(pose, rng) for pose in poses], rng, noise_px=0.2)
     loud = build(poses, [prior_of(pose, rng) for pose in poses], rng, noise_px=1.0)
     # noise in both pictures, and the median of a Rayleigh law
-    assert np.median(list(quiet.residuals_px().values())) == pytest.approx(0.2 * np.sqrt(2) * 1.177, rel=0.2)
-    assert np.median(list(loud.residuals_px().values())) == pytest.approx(1.0 * np.sqrt(2) * 1.177, rel=0.2)
+    assert np.median(list(quiet.residuals_px().values())) == pytest.approx(
+        0.2 * np.sqrt(2) * 1.177, rel=0.2
+    )
+    assert np.median(list(loud.residuals_px().values())) == pytest.approx(
+        1.0 * np.sqrt(2) * 1.177, rel=0.2
+    )
     assert quiet.report().links > 19 and quiet.report().links_dropped == 0
 
 
@@ -243,7 +297,9 @@ def test_sigmas_cover_the_errors():
         graph = build(poses, [prior_of(pose, rng) for pose in poses], rng)
         middle = np.array([[CAMERA.cx_px, CAMERA.cy_px]])
         for k, sigma_m in graph.sigmas_m().items():
-            miss = ground_from_pixels(CAMERA, graph.pose(k), middle) - ground_from_pixels(CAMERA, poses[k], middle)
+            miss = ground_from_pixels(CAMERA, graph.pose(k), middle) - ground_from_pixels(
+                CAMERA, poses[k], middle
+            )
             within.append(np.abs(miss).max() < 3 * sigma_m)
             ratios.append(np.sqrt((miss**2).mean()) / sigma_m)
     assert np.mean(within) > 0.9
@@ -271,11 +327,20 @@ def test_a_false_link_is_dropped():
     for k, pose in enumerate(poses):
         prior = prior_of(pose, rng)
         links = links_of(k, poses, rng) if k else []
-        by_link = pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)) if links else None
+        by_link = (
+            pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)) if links else None
+        )
         if k == 15:
             # two places that look alike: 90 px off, to the side and ahead
             true = links[-1]
-            links[-1] = Link(15, true.old_id, true.new_px + np.array([90.0, 70.0]), true.old_px, true.new_from_old, 0.3)
+            links[-1] = Link(
+                15,
+                true.old_id,
+                true.new_px + np.array([90.0, 70.0]),
+                true.old_px,
+                true.new_from_old,
+                0.3,
+            )
         graph.add(k, CAMERA, prior, links, by_link or Pose(prior.rotation, prior.position_m))
     graph.settle()
     graph.settle()
@@ -286,7 +351,9 @@ def test_a_false_link_is_dropped():
 def test_retiming_follows_the_other_fixes():
     rng = np.random.default_rng(13)
     poses = flown(13)
-    graph = build(poses, [prior_of(pose, rng, noise_m=0.3, shift_m=(6.0, 0, 0)) for pose in poses], rng)
+    graph = build(
+        poses, [prior_of(pose, rng, noise_m=0.3, shift_m=(6.0, 0, 0)) for pose in poses], rng
+    )
     before = absolute_error_m(graph, poses)
     moved = graph.retime({k: prior_of(pose, rng, noise_m=0.3) for k, pose in enumerate(poses)})
     assert before > 5.0
@@ -340,7 +407,8 @@ def test_stated_angles_that_pictures_rule_out_are_counted_and_a_compass_that_is_
     wrong = {3, 11, 20}
     settings = PoseGraphSettings(heading_offset_sigma_deg=5.0)
     priors = [
-        prior_of(pose, rng, yaw_off_deg=8.0 + 60.0 * (number in wrong)) for number, pose in enumerate(poses)
+        prior_of(pose, rng, yaw_off_deg=8.0 + 60.0 * (number in wrong))
+        for number, pose in enumerate(poses)
     ]
     graph = build(poses, priors, rng, settings)
     graph.conclude()
@@ -351,17 +419,30 @@ def test_stated_angles_that_pictures_rule_out_are_counted_and_a_compass_that_is_
 
 def test_a_large_flight_is_solved_around_its_newest_keyframes():
     poses = flown(15, strips=6, per_strip=9)
-    graph, rng, most_moved, reached = PoseGraph(replace(DEFAULTS, region=16)), np.random.default_rng(15), [], set()
+    graph, rng, most_moved, reached = (
+        PoseGraph(replace(DEFAULTS, region=16)),
+        np.random.default_rng(15),
+        [],
+        set(),
+    )
     for number, pose in enumerate(poses):
         prior, links = prior_of(pose, rng), links_of(number, poses, rng) if number else []
         before = {each: graph.pose(each).translation_m for each in graph.ids()}
-        by_link = pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)) if links else None
+        by_link = (
+            pose_from_link(links[0], CAMERA, CAMERA, graph.pose(links[0].old_id)) if links else None
+        )
         graph.add(number, CAMERA, prior, links, by_link or Pose(prior.rotation, prior.position_m))
-        moved = {each for each, place in before.items() if (graph.pose(each).translation_m != place).any()}
+        moved = {
+            each
+            for each, place in before.items()
+            if (graph.pose(each).translation_m != place).any()
+        }
         if number > 20:
             most_moved.append(len(moved))
             reached |= {number - each for each in moved}
-    assert max(most_moved) <= 15 + 6 + 4  # the region, the window, and what the links of the new one end at
+    assert (
+        max(most_moved) <= 15 + 6 + 4
+    )  # the region, the window, and what the links of the new one end at
     assert max(reached) > 9  # other strips are in it
     graph.conclude()
     assert shape_error_m(graph, poses) < 0.05
@@ -370,7 +451,10 @@ def test_a_large_flight_is_solved_around_its_newest_keyframes():
 def test_a_loop_that_strains_a_large_flight_moves_all_of_it():
     angles = np.linspace(0, 2 * np.pi, 49)[:-1]
     poses = [
-        Pose(site_from_gimbal_rotation(90.0, -90.0, 0.0), np.array([40 * np.cos(a), 40 * np.sin(a), 20.0]))
+        Pose(
+            site_from_gimbal_rotation(90.0, -90.0, 0.0),
+            np.array([40 * np.cos(a), 40 * np.sin(a), 20.0]),
+        )
         for a in angles
     ]
     rng = np.random.default_rng(16)
@@ -381,11 +465,20 @@ def test_a_loop_that_strains_a_large_flight_moves_all_of_it():
         found = {each: tied(number, each, pose, (poses * 2)[each], rng) for each in others}
         # neighbours are seen askew, as by a lens that nobody calibrated: after a lap the last picture misses the first
         drifted = [
-            replace(link, new_px=link.new_px + np.array([0.0, 3.0 * (number - old) if number - old < 3 else 0.0]))
-            for old, link in found.items() if link is not None
+            replace(
+                link,
+                new_px=link.new_px
+                + np.array([0.0, 3.0 * (number - old) if number - old < 3 else 0.0]),
+            )
+            for old, link in found.items()
+            if link is not None
         ]
-        guess = pose_from_link(drifted[0], CAMERA, CAMERA, graph.pose(number - 1)) if number else pose
-        prior = replace(unknown, rotation=pose.rotation) if number else prior_of(pose, rng, noise_m=0.0)
+        guess = (
+            pose_from_link(drifted[0], CAMERA, CAMERA, graph.pose(number - 1)) if number else pose
+        )
+        prior = (
+            replace(unknown, rotation=pose.rotation) if number else prior_of(pose, rng, noise_m=0.0)
+        )
         before = None if number < 48 else graph.pose(24).translation_m
         graph.add(number, CAMERA, prior, drifted, guess or pose)
         if before is not None and (graph.pose(24).translation_m != before).any():

@@ -20,14 +20,20 @@ from sorvolo.mosaic.map_quality import (
 
 def similarity(scale: float, turn_deg: float, x: float, y: float) -> np.ndarray:
     a = np.radians(turn_deg)
-    return np.array([
-        [scale * np.cos(a), -scale * np.sin(a), x], [scale * np.sin(a), scale * np.cos(a), y], [0, 0, 1]
-    ])
+    return np.array(
+        [
+            [scale * np.cos(a), -scale * np.sin(a), x],
+            [scale * np.sin(a), scale * np.cos(a), y],
+            [0, 0, 1],
+        ]
+    )
 
 
 def outlines(count: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return rng.uniform(-200, 200, (count, 1, 2)) + np.array([[-24, 13], [24, 13], [24, -13], [-24, -13]])
+    return rng.uniform(-200, 200, (count, 1, 2)) + np.array(
+        [[-24, 13], [24, 13], [24, -13], [-24, -13]]
+    )
 
 
 def moved(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -84,14 +90,19 @@ def test_nothing_to_compare_is_not_a_number_and_no_error():
     assert np.isnan(deviation(black, black, np.zeros((4, 4), dtype=bool)).share)
 
 
-@pytest.mark.parametrize("call", [
-    lambda: corner_errors(np.zeros((2, 4, 2)), np.zeros((3, 4, 2)), 0.05),
-    lambda: spread_of(np.ones(3), 0.0),
-    lambda: position_errors(np.zeros((2, 2)), np.zeros((2, 3)), 0.05),
-    lambda: deviation(np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8), np.eye(4) > 0),
-    lambda: correlation(np.zeros((4, 4)), np.zeros((4, 5)), np.ones((4, 4), dtype=bool)),
-    lambda: residual_shift(np.zeros((4, 4)), np.zeros((4, 5)), np.ones((4, 4), dtype=bool)),
-])
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: corner_errors(np.zeros((2, 4, 2)), np.zeros((3, 4, 2)), 0.05),
+        lambda: spread_of(np.ones(3), 0.0),
+        lambda: position_errors(np.zeros((2, 2)), np.zeros((2, 3)), 0.05),
+        lambda: deviation(
+            np.zeros((4, 4, 3), np.uint8), np.zeros((4, 5, 3), np.uint8), np.eye(4) > 0
+        ),
+        lambda: correlation(np.zeros((4, 4)), np.zeros((4, 5)), np.ones((4, 4), dtype=bool)),
+        lambda: residual_shift(np.zeros((4, 4)), np.zeros((4, 5)), np.ones((4, 4), dtype=bool)),
+    ],
+)
 def test_what_does_not_fit_together_is_refused(call):
     with pytest.raises(GeometryError):
         call()
@@ -136,7 +147,9 @@ def test_correlation_ignores_brightness_and_contrast(gain, offset, seed):
 def test_the_residual_shift_is_found_with_its_sign(x, y):
     rng = np.random.default_rng(2)
     a = cv2.resize(rng.uniform(0, 255, (60, 80)), (320, 240), interpolation=cv2.INTER_CUBIC)
-    b = cv2.warpAffine(a, np.array([[1, 0, x], [0, 1, y]]), (320, 240), borderMode=cv2.BORDER_REFLECT)
+    b = cv2.warpAffine(
+        a, np.array([[1, 0, x], [0, 1, y]]), (320, 240), borderMode=cv2.BORDER_REFLECT
+    )
     mask = np.ones(a.shape, dtype=bool)
     mask[:20, :50] = False
     found = residual_shift(a, 0.6 * b + 30, mask)

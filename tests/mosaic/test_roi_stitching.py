@@ -34,9 +34,13 @@ GROUND = ground()
 
 def pose(x: float, y: float, turn_deg: float = 0.0, scale: float = 1.0) -> np.ndarray:
     a = np.radians(turn_deg)
-    return np.array([
-        [scale * np.cos(a), -scale * np.sin(a), x], [scale * np.sin(a), scale * np.cos(a), y], [0, 0, 1]
-    ])
+    return np.array(
+        [
+            [scale * np.cos(a), -scale * np.sin(a), x],
+            [scale * np.sin(a), scale * np.cos(a), y],
+            [0, 0, 1],
+        ]
+    )
 
 
 def photographed(ground_from_image: np.ndarray, gain: float = 1.0) -> np.ndarray:
@@ -44,7 +48,13 @@ def photographed(ground_from_image: np.ndarray, gain: float = 1.0) -> np.ndarray
     return np.clip(image * gain, 0, 255).astype(np.uint8)
 
 
-PATH = [pose(40, 40), pose(130, 60, 4), pose(220, 70, -3, 1.03), pose(330, 120, 6, 0.98), pose(380, 240, 10)]
+PATH = [
+    pose(40, 40),
+    pose(130, 60, 4),
+    pose(220, 70, -3, 1.03),
+    pose(330, 120, 6, 0.98),
+    pose(380, 240, 10),
+]
 
 
 def corner_error_px(placed: Stitched, true: np.ndarray, first: np.ndarray = PATH[0]) -> float:
@@ -63,7 +73,9 @@ def test_frames_are_placed_where_they_were_taken(options):
         assert number == 0 or placed.inliers >= 12
         assert placed.residual_px < 2.0
     centre = np.array([[(WIDTH - 1) / 2, (HEIGHT - 1) / 2]])
-    assert placed.barycentre_px == pytest.approx(apply_homography(placed.mosaic_from_image, centre)[0])
+    assert placed.barycentre_px == pytest.approx(
+        apply_homography(placed.mosaic_from_image, centre)[0]
+    )
 
 
 def test_the_picture_grows_and_shows_the_ground():
@@ -74,10 +86,10 @@ def test_the_picture_grows_and_shows_the_ground():
     assert (x, y) == pytest.approx((0, 0), abs=30)
     left, top = x + 40, y + 40  # in GROUND
     assert left >= 0
-    own = GROUND[top:top + picture.shape[0], left:left + picture.shape[1]]
-    seen = picture[:own.shape[0], :own.shape[1], 3] == 255
+    own = GROUND[top : top + picture.shape[0], left : left + picture.shape[1]]
+    seen = picture[: own.shape[0], : own.shape[1], 3] == 255
     assert seen.sum() > 150_000
-    assert np.abs(picture[:own.shape[0], :own.shape[1], :3].astype(int) - own)[seen].mean() < 8
+    assert np.abs(picture[: own.shape[0], : own.shape[1], :3].astype(int) - own)[seen].mean() < 8
 
 
 def test_it_grows_in_every_direction():
@@ -147,10 +159,19 @@ def test_an_empty_mosaic_is_empty():
     assert offset == (0, 0)
 
 
-@pytest.mark.parametrize("options", [
-    {"akaze_threshold": 0.0}, {"ratio": 1.5}, {"roi_frames": 0.5}, {"min_inliers": 2}, {"bands": 0},
-    {"max_features": 0}, {"matching": "flann"}, {"transform": "affine"},
-])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"akaze_threshold": 0.0},
+        {"ratio": 1.5},
+        {"roi_frames": 0.5},
+        {"min_inliers": 2},
+        {"bands": 0},
+        {"max_features": 0},
+        {"matching": "flann"},
+        {"transform": "affine"},
+    ],
+)
 def test_impossible_settings_are_refused(options):
     with pytest.raises(SettingsError):
         RoiStitchingSettings(**options)
@@ -158,7 +179,10 @@ def test_impossible_settings_are_refused(options):
 
 @settings(max_examples=50, deadline=None)
 @given(
-    st.floats(0.01, 1.0), st.floats(-180, 180), st.floats(-1000, 1000), st.floats(-1000, 1000),
+    st.floats(0.01, 1.0),
+    st.floats(-180, 180),
+    st.floats(-1000, 1000),
+    st.floats(-1000, 1000),
     st.integers(0, 999),
 )
 def test_georeference_finds_the_similarity_and_turns_y_up(scale, turn_deg, east, north, seed):
@@ -187,12 +211,16 @@ def test_georeference_needs_two_places():
 
 
 def test_values_are_written_by_name() -> None:
-    chosen = stitching_settings(["A-kaze=1e-4", "features = 900", "matching=ratio"], transform="homography")
+    chosen = stitching_settings(
+        ["A-kaze=1e-4", "features = 900", "matching=ratio"], transform="homography"
+    )
     assert chosen == RoiStitchingSettings(
         akaze_threshold=1e-4, max_features=900, matching="ratio", transform="homography"
     )
     for written, words in (
-        ("T_gray=40", "features"), ("features=many", "a whole number"), ("matching=best", "cross-check or ratio"),
+        ("T_gray=40", "features"),
+        ("features=many", "a whole number"),
+        ("matching=best", "cross-check or ratio"),
         ("side=9", "256 to 8192"),
     ):
         with pytest.raises(SettingsError, match=words):

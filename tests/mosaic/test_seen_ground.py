@@ -27,7 +27,9 @@ def test_ground_is_counted_by_the_pictures_that_show_it() -> None:
     parts = seen_ground([picture(0, 0), picture(0, 12, 0.03)])
     found = {each.views: each for each in parts}
     assert set(found) == {1, 2}
-    assert found[2].area_m2 == pytest.approx(WIDE_M * 12, rel=0.1) and found[2].m_per_px == pytest.approx(0.02)
+    assert found[2].area_m2 == pytest.approx(WIDE_M * 12, rel=0.1) and found[
+        2
+    ].m_per_px == pytest.approx(0.02)
     assert found[1].area_m2 == pytest.approx(2 * WIDE_M * 12, rel=0.1)
     figures = coverage_figures(parts)
     assert figures["seen_m2"] == pytest.approx(WIDE_M * 36, rel=0.05) and figures["holes"] == 0
@@ -39,15 +41,19 @@ def test_a_gap_between_strips_is_a_hole_and_what_lies_beside_the_flight_is_none(
     strips = [picture(x, y) for x in (0.0, WIDE_M + 10) for y in np.arange(5) * 12.0]
     holes = [each for each in seen_ground(strips) if not each.views]
     assert len(holes) == 1 and holes[0].area_m2 == pytest.approx(10 * (4 * 12 + LONG_M), rel=0.15)
-    (outline,), = holes[0].polygons
+    ((outline,),) = holes[0].polygons
     assert outline.min(axis=0) == pytest.approx([WIDE_M, 0], abs=2) and np.isnan(holes[0].m_per_px)
     far = [picture(x, y) for x in (0.0, WIDE_M + 40) for y in np.arange(5) * 12.0]
     assert all(each.views for each in seen_ground(far))  # two places, not one with a gap
 
 
 def test_what_the_flight_went_around_is_a_hole() -> None:
-    ring = [picture(x, y) for x in (0.0, 36.0, 72.0, 108.0) for y in (0.0, 20.0, 40.0, 60.0, 80.0)
-            if not (x in (36.0, 72.0) and y in (20.0, 40.0, 60.0))]
+    ring = [
+        picture(x, y)
+        for x in (0.0, 36.0, 72.0, 108.0)
+        for y in (0.0, 20.0, 40.0, 60.0, 80.0)
+        if not (x in (36.0, 72.0) and y in (20.0, 40.0, 60.0))
+    ]
     (hole,) = [each for each in seen_ground(ring) if not each.views]
     assert hole.area_m2 == pytest.approx((108 - 40) * (80 - 24), rel=0.15)
 

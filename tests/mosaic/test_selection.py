@@ -36,17 +36,21 @@ GROUND = ground()
 
 
 def posed(index: int, x: int, blur_px: float = 0.0) -> PosedFrame:
-    view = GROUND[60:60 + HEIGHT, x:x + WIDTH]
+    view = GROUND[60 : 60 + HEIGHT, x : x + WIDTH]
     if blur_px:
         view = cv2.GaussianBlur(view, (0, 0), blur_px)
     noise = np.random.default_rng(index).normal(0, 1.0, view.shape)
     gray = np.clip(view + noise, 0, 255).astype(np.uint8)
     prior = CameraPrior(np.array([x, 0, 20.0]), np.ones(3), np.diag([1.0, -1, -1]), np.ones(3))
-    return PosedFrame(Frame(index, str(index), index * 10**8, np.repeat(gray[..., None], 3, axis=2)), prior)
+    return PosedFrame(
+        Frame(index, str(index), index * 10**8, np.repeat(gray[..., None], 3, axis=2)), prior
+    )
 
 
 def chosen(frames, settings=None, *, keep_all=False, inside=EVERYWHERE):
-    return list(select_keyframes(frames, settings or SelectionSettings(), keep_all=keep_all, inside=inside))
+    return list(
+        select_keyframes(frames, settings or SelectionSettings(), keep_all=keep_all, inside=inside)
+    )
 
 
 def places(selected) -> np.ndarray:
@@ -55,13 +59,17 @@ def places(selected) -> np.ndarray:
 
 def test_small_copies_are_made_once_and_forgotten(monkeypatch):
     made = []
-    monkeypatch.setattr("sorvolo.mosaic.selection.small_gray", lambda image: made.append(1) or small_gray(image))
+    monkeypatch.setattr(
+        "sorvolo.mosaic.selection.small_gray", lambda image: made.append(1) or small_gray(image)
+    )
     copies, frames = SmallCopies(), [posed(k, 16 * k) for k in range(40)]
     for each in frames:
         assert np.array_equal(copies.of(each.frame), small_gray(each.frame.image))
         assert copies.of(each.frame) is copies.of(each.frame)
     assert len(made) == 40
-    with_copies = select_keyframes(frames, SelectionSettings(), keep_all=False, inside=EVERYWHERE, small=copies)
+    with_copies = select_keyframes(
+        frames, SelectionSettings(), keep_all=False, inside=EVERYWHERE, small=copies
+    )
     assert np.array_equal(places(with_copies), places(chosen(frames)))
     assert len(copies._kept) < 40
 
@@ -105,7 +113,10 @@ def test_photos_are_all_kept():
 
 
 def test_frames_outside_the_area_are_dropped():
-    found = chosen((posed(k, 150 * k) for k in range(12)), inside=lambda each: 300 <= each.prior.position_m[0] < 1200)
+    found = chosen(
+        (posed(k, 150 * k) for k in range(12)),
+        inside=lambda each: 300 <= each.prior.position_m[0] < 1200,
+    )
     assert [each.posed.frame.index for each in found] == [2, 3, 4, 5, 6, 7]
 
 
@@ -117,7 +128,9 @@ def test_lost_frames_pass_through_in_order():
 
 
 def test_another_picture_size_and_water_are_taken():
-    flat = PosedFrame(Frame(1, "1", 1, np.full((HEIGHT, WIDTH, 3), 90, np.uint8)), posed(0, 0).prior)
+    flat = PosedFrame(
+        Frame(1, "1", 1, np.full((HEIGHT, WIDTH, 3), 90, np.uint8)), posed(0, 0).prior
+    )
     other = PosedFrame(Frame(2, "2", 2, posed(0, 0).frame.image[:200]), posed(0, 0).prior)
     found = chosen([posed(0, 0), other, flat], keep_all=False)
     assert [each.posed.frame.index for each in found] == [0, 2, 1]
@@ -154,7 +167,9 @@ def test_of_frames_over_known_ground_those_that_show_enough_new_ground_are_taken
     selection = StretchSelection(0.7, keep_all=False)
     taken = [selection.take(outline_m + np.array([east_m, 0.0])) for east_m in (0, 5, 7, 9, 14)]
     assert taken == [True, False, True, False, True]
-    assert selection.take(None) and selection.take(outline_m), "after one of unknown place the next is taken"
+    assert selection.take(None) and selection.take(outline_m), (
+        "after one of unknown place the next is taken"
+    )
     photos = StretchSelection(0.7, keep_all=True)
     assert [photos.take(outline_m) for _ in range(3)] == [True] * 3
 
@@ -167,4 +182,6 @@ def test_one_gray_and_noise_alone_are_no_texture(noise_levels):
     seen = posed(0, 0).frame.image
     assert has_texture(seen, SelectionSettings())
     # a field in fog: a twentieth of its contrast
-    assert has_texture(np.clip(128 + (seen.astype(float) - 128) / 20, 0, 255).astype(np.uint8), SelectionSettings())
+    assert has_texture(
+        np.clip(128 + (seen.astype(float) - 128) / 20, 0, 255).astype(np.uint8), SelectionSettings()
+    )

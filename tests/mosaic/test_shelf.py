@@ -42,15 +42,20 @@ def test_the_newest_rows_are_read_without_the_shelf() -> None:
     rows = ShelvedRows("numbers", (1,), np.int64, drawer)
     for number in range(10_000):
         rows.append(np.array([number]))
-    assert rows.read(np.arange(8_000, 10_000))[:, 0].tolist() == list(range(8_000, 10_000)) and drawer.asked == 0
+    assert (
+        rows.read(np.arange(8_000, 10_000))[:, 0].tolist() == list(range(8_000, 10_000))
+        and drawer.asked == 0
+    )
     assert rows.read(np.arange(3))[:, 0].tolist() == [0, 1, 2] and drawer.asked == 1
 
 
 def test_colours_of_a_link_are_those_last_kept() -> None:
     def pairs(count: int, value: float) -> ColourPairs:
         return ColourPairs(
-            np.full((count, 3), value, np.float16), np.full((count, 3), value + 1, np.float16),
-            np.full(count, 0.25, np.float16), np.full(count, 0.5, np.float16),
+            np.full((count, 3), value, np.float16),
+            np.full((count, 3), value + 1, np.float16),
+            np.full(count, 0.25, np.float16),
+            np.full(count, 0.5, np.float16),
         )
 
     colours = LinkedColours(8, Drawer())

@@ -21,8 +21,12 @@ def test_a_child_does_not_run_the_files_of_the_current_folder(module: str, tmp_p
     for name in ("numpy", "cv2", "json", "sorvolo", "struct", "secrets"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'poisoned')!r}, 'w').close()\n")
     subprocess.run(
-        python_command(module, "no-such-folder"), cwd=tmp_path, stdin=subprocess.DEVNULL, capture_output=True,
-        timeout=120, check=False,
+        python_command(module, "no-such-folder"),
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        timeout=120,
+        check=False,
     )
     assert not (tmp_path / "poisoned").exists()
 
@@ -30,7 +34,8 @@ def test_a_child_does_not_run_the_files_of_the_current_folder(module: str, tmp_p
 def test_every_child_is_started_by_the_one_helper() -> None:
     assert len(CHILDREN) >= 5
     others = [
-        path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py")
+        path.relative_to(PACKAGE).as_posix()
+        for path in PACKAGE.rglob("*.py")
         if path.name != "child_process.py" and re.search(r'sys\.executable|"-m"', path.read_text())
     ]
     assert not others

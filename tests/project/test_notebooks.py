@@ -20,10 +20,13 @@ def test_every_notebook_is_tried_and_kept_without_output() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [
-    pytest.param("map_and_changes", marks=pytest.mark.long),  # so have `map` and `compare`
-    pytest.param("tune_detector", marks=pytest.mark.long),  # `train` has tests of its own
-])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("map_and_changes", marks=pytest.mark.long),  # so have `map` and `compare`
+        pytest.param("tune_detector", marks=pytest.mark.long),  # `train` has tests of its own
+    ],
+)
 def test_notebook_runs(
     name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -32,7 +35,9 @@ def test_notebook_runs(
         pytest.skip(f"the notebook {name} needs {', '.join(missing)}")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    if name == "tune_detector":  # the first twenty of the pictures settle the model's norms, not a hundred
+    if (
+        name == "tune_detector"
+    ):  # the first twenty of the pictures settle the model's norms, not a hundred
         monkeypatch.setattr("sorvolo.training.starting._SETTLING_PX", 20 * 256 * 256)
     notebook = json.loads((NOTEBOOKS / f"{name}.ipynb").read_text(encoding="utf-8"))
     variables: dict[str, object] = {"__name__": "__main__"}

@@ -30,17 +30,22 @@ def files_of_package() -> list[Path]:
 def test_the_wheel_takes_every_file_of_the_package_that_is_not_python() -> None:
     patterns = PROJECT["tool"]["setuptools"]["package-data"]["sorvolo"]
     left_out = [
-        path for path in files_of_package()
-        if path.suffix not in {".py", *SOURCES_OF_KERNELS} and not any(path.match(each) for each in patterns)
+        path
+        for path in files_of_package()
+        if path.suffix not in {".py", *SOURCES_OF_KERNELS}
+        and not any(path.match(each) for each in patterns)
     ]
     assert left_out == []
 
 
 def test_the_sdist_takes_every_file_of_the_package() -> None:
     lines = (ROOT / "MANIFEST.in").read_text(encoding="utf-8").splitlines()
-    patterns = next(line.split()[2:] for line in lines if line.startswith("recursive-include src/sorvolo"))
+    patterns = next(
+        line.split()[2:] for line in lines if line.startswith("recursive-include src/sorvolo")
+    )
     left_out = [
-        path for path in files_of_package()
+        path
+        for path in files_of_package()
         if path.suffix != ".py" and not any(fnmatch(path.name, each) for each in patterns)
     ]
     assert left_out == []
@@ -56,20 +61,28 @@ def test_licence_expression_names_a_full_text_each() -> None:
 
 
 @pytest.mark.parametrize("card", CARDS, ids=lambda path: path.stem)
-def test_every_shipped_model_is_under_a_licence_of_the_package_and_its_sources_are_credited(card: Path) -> None:
+def test_every_shipped_model_is_under_a_licence_of_the_package_and_its_sources_are_credited(
+    card: Path,
+) -> None:
     written = json.loads(card.read_text(encoding="utf-8"))
     assert written["licence"] in PROJECT["project"]["license"]
     credited = section_of(written["name"])
     for other in re.findall(r"^All sources of the model `([^`]+)`", credited, re.M):
         credited += section_of(other)
     for source in written["trained_on"]:
-        what = source["what"].partition(", seed")[0]  # how many pictures, and which seed, is the card's
-        assert what in credited, f"NOTICE does not credit {source['what']} under the model {written['name']}"
+        what = source["what"].partition(", seed")[
+            0
+        ]  # how many pictures, and which seed, is the card's
+        assert what in credited, (
+            f"NOTICE does not credit {source['what']} under the model {written['name']}"
+        )
 
 
 def section_of(model: str) -> str:
     notice = (ROOT / "NOTICE").read_text(encoding="utf-8")
-    found = re.search(rf"^Model `{model}`.*?\n-+\n(.*?)(?=^[^\n]+\n-{{5,}}\n|\Z)", notice, re.M | re.S)
+    found = re.search(
+        rf"^Model `{model}`.*?\n-+\n(.*?)(?=^[^\n]+\n-{{5,}}\n|\Z)", notice, re.M | re.S
+    )
     assert found, f"NOTICE has no section for the model {model}"
     return found[1]
 
@@ -109,9 +122,12 @@ def test_the_locks_hold_all_that_their_packages_require() -> None:
 
 def test_build_lock_holds_what_the_build_requires() -> None:
     locked = dict(
-        line.split("==") for line in (ROOT / "requirements-build.lock").read_text(encoding="utf-8").splitlines()
+        line.split("==")
+        for line in (ROOT / "requirements-build.lock").read_text(encoding="utf-8").splitlines()
         if "==" in line
     )
     for required in PROJECT["build-system"]["requires"]:
         name, _, least = required.partition(">=")
-        assert [int(each) for each in locked[name].split(".")] >= [int(each) for each in least.split(".")]
+        assert [int(each) for each in locked[name].split(".")] >= [
+            int(each) for each in least.split(".")
+        ]

@@ -67,7 +67,9 @@ def test_who_is_laid_on_a_picture_is_boxed_and_who_is_hidden_is_ignored() -> Non
         boxes, hidden = boxes + len(made.boxes), hidden + len(made.ignored)
     assert boxes > 12 and hidden > 3
     taken = Shown(below.image, np.array([[0.0, 0, 200, 200]]), below.ignored)
-    assert len(pasted(taken, scene, np.random.default_rng(1)).boxes) == 1  # nobody is laid over a real person
+    assert (
+        len(pasted(taken, scene, np.random.default_rng(1)).boxes) == 1
+    )  # nobody is laid over a real person
 
 
 def test_cells_stand_for_the_person_whose_box_they_lie_in() -> None:
@@ -99,7 +101,9 @@ def test_things_are_learnt_by_class_and_unlabelled_classes_teach_nothing() -> No
     from sorvolo.training.nanodet import BINS, cells
 
     def outputs(of_class: int) -> list[torch.Tensor]:
-        made = [torch.full((1, 2 + 4 * BINS, 96 // stride, 96 // stride), 0.0) for stride in (8, 16, 32)]
+        made = [
+            torch.full((1, 2 + 4 * BINS, 96 // stride, 96 // stride), 0.0) for stride in (8, 16, 32)
+        ]
         _, _, places = cells(made, (8, 16, 32), 2)
         for each in made:
             each[:, :2] = -6.0

@@ -29,7 +29,9 @@ def test_normalised_contrast_forgets_the_exposure(gain, offset):
 
 def test_normalised_contrast_lifts_sand_and_leaves_noise():
     sand = gray_from_rgb(photographed(ground(2, spread=2.0), placed(500, 420), noise=0.5))
-    water = gray_from_rgb(photographed(np.full((900, 1200), 90, np.float32), placed(500, 420), noise=0.5))
+    water = gray_from_rgb(
+        photographed(np.full((900, 1200), 90, np.float32), placed(500, 420), noise=0.5)
+    )
     assert normalise_contrast(sand).std() > 15
     assert normalise_contrast(water).std() < 15
     assert abs(normalise_contrast(sand).mean() - 128) < 3
@@ -58,7 +60,10 @@ def test_points_move_with_the_picture(extract, side_px, limit_px):
 
 def test_kinds_and_descriptors():
     gray = normalise_contrast(GRAY)
-    orb, sift = orb_features(gray, FeatureSettings()), sift_features(gray, FeatureSettings(sift_count=300))
+    orb, sift = (
+        orb_features(gray, FeatureSettings()),
+        sift_features(gray, FeatureSettings(sift_count=300)),
+    )
     assert (orb.kind, orb.descriptors.dtype, orb.descriptors.shape[1]) == ("orb", np.uint8, 32)
     assert (sift.kind, sift.descriptors.shape[1]) == ("sift", 128)
     assert len(sift) <= 301

@@ -50,4 +50,6 @@ def test_a_released_network_finds_the_same_again(ground: np.ndarray) -> None:
     before = learned_features(ground, most=100)
     release_network()
     after = learned_features(ground, most=100)
-    assert np.array_equal(after.points_px, before.points_px) and np.array_equal(after.descriptors, before.descriptors)
+    assert np.array_equal(after.points_px, before.points_px) and np.array_equal(
+        after.descriptors, before.descriptors
+    )

@@ -26,9 +26,11 @@ def dots(image: np.ndarray, near_px: np.ndarray) -> np.ndarray:
     """Where the dots are, each the centre of mass of the 23 px window about its expected place."""
     found = []
     for x, y in np.round(near_px).astype(int):
-        window = image[y - 11:y + 12, x - 11:x + 12, 0].astype(float)
-        rows, columns = np.mgrid[y - 11:y + 12, x - 11:x + 12]
-        found.append([(window * columns).sum() / window.sum(), (window * rows).sum() / window.sum()])
+        window = image[y - 11 : y + 12, x - 11 : x + 12, 0].astype(float)
+        rows, columns = np.mgrid[y - 11 : y + 12, x - 11 : x + 12]
+        found.append(
+            [(window * columns).sum() / window.sum(), (window * rows).sum() / window.sum()]
+        )
     return np.array(found)
 
 
@@ -71,7 +73,9 @@ def test_only_seen_pixels_are_valid():
     assert (white[mask] == 255).all()
     small = lens.valid(120, 80)
     assert small is not None and small.shape == (80, 120)
-    assert (cv2.resize(mask.astype(np.uint8), (120, 80), interpolation=cv2.INTER_AREA)[small] == 1).all()
+    assert (
+        cv2.resize(mask.astype(np.uint8), (120, 80), interpolation=cv2.INTER_AREA)[small] == 1
+    ).all()
 
 
 @pytest.mark.parametrize("radial", [0.0, 1e-5, -1e-4])
@@ -82,7 +86,10 @@ def test_nothing_is_left_over_where_nothing_moves(radial):
 @pytest.mark.parametrize("radial", [0.05, -0.04])
 def test_what_is_left_over_is_taken_out(radial):
     lens = Undistorter.left_over(PERFECT, radial)
-    centre, focal = np.array([PERFECT.cx_px, PERFECT.cy_px]), np.array([PERFECT.fx_px, PERFECT.fy_px])
+    centre, focal = (
+        np.array([PERFECT.cx_px, PERFECT.cy_px]),
+        np.array([PERFECT.fx_px, PERFECT.fy_px]),
+    )
     ideal = (GRID_PX - centre) / focal
     # seen is where the bundle's equation, ideal = seen (1 + k r^2), holds
     seen = ideal.copy()

@@ -26,16 +26,32 @@ NEW_FROM_OLD = np.linalg.inv(NEW) @ OLD
 
 def linked(new_image, old_image, prediction=None):
     settings = LinkSettings()
-    return link(keyframe(7, new_image), keyframe(3, old_image), prediction, settings, LinkCache(settings.features))
+    return link(
+        keyframe(7, new_image),
+        keyframe(3, old_image),
+        prediction,
+        settings,
+        LinkCache(settings.features),
+    )
 
 
 def median_miss_px(found: Link, new_from_old: np.ndarray) -> float:
-    return float(np.median(np.linalg.norm(apply_homography(new_from_old, found.old_px) - found.new_px, axis=1)))
+    return float(
+        np.median(
+            np.linalg.norm(apply_homography(new_from_old, found.old_px) - found.new_px, axis=1)
+        )
+    )
 
 
 def corner_miss_px(found: Link, new_from_old: np.ndarray) -> float:
-    inside = np.array([[150, 80], [WIDTH - 20, 80], [WIDTH - 20, HEIGHT - 40], [150, HEIGHT - 40]], float)
-    return float(np.abs(apply_homography(found.new_from_old, inside) - apply_homography(new_from_old, inside)).max())
+    inside = np.array(
+        [[150, 80], [WIDTH - 20, 80], [WIDTH - 20, HEIGHT - 40], [150, HEIGHT - 40]], float
+    )
+    return float(
+        np.abs(
+            apply_homography(found.new_from_old, inside) - apply_homography(new_from_old, inside)
+        ).max()
+    )
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.3, 0.7])
@@ -62,7 +78,9 @@ def test_a_faint_ghost_in_other_ground_is_no_link():
     new, old = keyframe(7, picture), keyframe(3, np.clip(ghost, 0, 255).astype(np.uint8))
     careless = LinkSettings(min_correlation=-1.0)
     assert isinstance(refine(new, old, np.eye(3), careless, LinkCache(careless.features)), Link)
-    assert isinstance(refine(new, old, np.eye(3), LinkSettings(), LinkCache(careless.features)), str)
+    assert isinstance(
+        refine(new, old, np.eye(3), LinkSettings(), LinkCache(careless.features)), str
+    )
 
 
 def test_asked_cheaply_nobody_pays_for_sift():
@@ -71,7 +89,9 @@ def test_asked_cheaply_nobody_pays_for_sift():
     other = keyframe(8, photographed(ground(20), NEW))
     assert isinstance(link(other, old, None, settings, cache, Effort.CHEAP), NoLink)
     assert not cache._sift
-    found = link(keyframe(7, photographed(SCENE, NEW, seed=1)), old, None, settings, cache, Effort.DEAR)
+    found = link(
+        keyframe(7, photographed(SCENE, NEW, seed=1)), old, None, settings, cache, Effort.DEAR
+    )
     assert isinstance(found, Link) and cache._sift
 
 
@@ -89,7 +109,9 @@ def test_bare_sand_links():
     truth = np.linalg.inv(new) @ OLD
     for prediction in (None, LinkPrediction(placed_off(truth, 12), 40.0)):
         found = linked(
-            photographed(sand, new, noise=0.7, seed=5), photographed(sand, OLD, noise=0.7, seed=6), prediction
+            photographed(sand, new, noise=0.7, seed=5),
+            photographed(sand, OLD, noise=0.7, seed=6),
+            prediction,
         )
         assert isinstance(found, Link)
         assert median_miss_px(found, truth) < 0.3
@@ -101,18 +123,25 @@ def placed_off(new_from_old: np.ndarray, off_px: float) -> np.ndarray:
 
 def test_faint_sand_under_noise_links_by_learned_features():
     """Half of each picture is shared, three gray levels of texture under nine of noise: all else fails."""
-    flight = simulate_flight(SimulationSettings(
-        seed=7104, flights=1, scene=SceneSettings("sand", 0, 0, 0, has_scenery=False),
-        path=PathSettings(height_m=25, length_m=22, strips=1),
-        imaging=ImagingSettings(width_px=640, height_px=480, distortion=(0.0,) * 5, noise=9.0),
-        output=OutputSettings(photos=True, photo_overlap=0.5),
-    ))
+    flight = simulate_flight(
+        SimulationSettings(
+            seed=7104,
+            flights=1,
+            scene=SceneSettings("sand", 0, 0, 0, has_scenery=False),
+            path=PathSettings(height_m=25, length_m=22, strips=1),
+            imaging=ImagingSettings(width_px=640, height_px=480, distortion=(0.0,) * 5, noise=9.0),
+            output=OutputSettings(photos=True, photo_overlap=0.5),
+        )
+    )
     site_from = [site_from_image_homography(flight.camera, pose) for pose in flight.true_poses[:2]]
     truth = np.linalg.inv(site_from[1]) @ site_from[0]
     old, new = (
-        replace(keyframe(number, flight.frame(number).image), camera=flight.camera) for number in (0, 1)
+        replace(keyframe(number, flight.frame(number).image), camera=flight.camera)
+        for number in (0, 1)
     )
-    turned = truth @ np.linalg.inv(placed(240, 180)) @ placed(245, 170, turn_deg=3, scale=1.04)  # as a compass errs
+    turned = (
+        truth @ np.linalg.inv(placed(240, 180)) @ placed(245, 170, turn_deg=3, scale=1.04)
+    )  # as a compass errs
     prediction, settings = LinkPrediction(turned, 60.0), LinkSettings()
     found = link(new, old, prediction, settings, LinkCache(settings.features))
     assert isinstance(found, Link)
@@ -143,13 +172,16 @@ def test_a_prediction_of_another_place_gives_no_false_link():
 
 
 @pytest.mark.parametrize(
-    "prediction", [None, LinkPrediction(NEW_FROM_OLD, 40.0), LinkPrediction(NEW_FROM_OLD, 9, True)],
+    "prediction",
+    [None, LinkPrediction(NEW_FROM_OLD, 40.0), LinkPrediction(NEW_FROM_OLD, 9, True)],
     ids=["none", "loose", "tight"],
 )
 def test_unrelated_pictures_do_not_link(prediction):
     for seed in range(2):
         found = linked(
-            photographed(ground(10 + seed), NEW, seed=9), photographed(ground(20 + seed), OLD, seed=10), prediction
+            photographed(ground(10 + seed), NEW, seed=9),
+            photographed(ground(20 + seed), OLD, seed=10),
+            prediction,
         )
         assert isinstance(found, NoLink)
         assert (found.new_id, found.old_id) == (7, 3)
@@ -157,13 +189,16 @@ def test_unrelated_pictures_do_not_link(prediction):
 
 
 @pytest.mark.parametrize(
-    "prediction", [None, LinkPrediction(NEW_FROM_OLD, 40.0), LinkPrediction(NEW_FROM_OLD, 9, True)],
+    "prediction",
+    [None, LinkPrediction(NEW_FROM_OLD, 40.0), LinkPrediction(NEW_FROM_OLD, 9, True)],
     ids=["none", "loose", "tight"],
 )
 def test_water_does_not_link(prediction):
     flat = np.full((900, 1200), 90.0, np.float32)
     found = linked(
-        photographed(flat, NEW, noise=1.5, seed=11), photographed(flat, OLD, noise=1.5, seed=12), prediction
+        photographed(flat, NEW, noise=1.5, seed=11),
+        photographed(flat, OLD, noise=1.5, seed=12),
+        prediction,
     )
     assert isinstance(found, NoLink)
     assert found.reason
@@ -172,14 +207,19 @@ def test_water_does_not_link(prediction):
 def test_a_black_picture_does_not_link():
     black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     assert isinstance(linked(black, black), NoLink)
-    assert isinstance(linked(black, photographed(SCENE, OLD), LinkPrediction(NEW_FROM_OLD, 9, True)), NoLink)
+    assert isinstance(
+        linked(black, photographed(SCENE, OLD), LinkPrediction(NEW_FROM_OLD, 9, True)), NoLink
+    )
 
 
 def test_what_is_known_to_share_little_is_searched_with_sift_there_alone():
     """And what it finds is as right as what a search of the whole pictures finds."""
     far = placed(500 + 0.8 * WIDTH, 420, turn_deg=3)
     truth = np.linalg.inv(far) @ OLD
-    new, old = keyframe(7, photographed(SCENE, far, seed=13)), keyframe(3, photographed(SCENE, OLD, seed=14))
+    new, old = (
+        keyframe(7, photographed(SCENE, far, seed=13)),
+        keyframe(3, photographed(SCENE, OLD, seed=14)),
+    )
     prediction, settings = LinkPrediction(placed_off(truth, 4), 24.0, is_tight=True), LinkSettings()
     part, whole = LinkCache(settings.features), LinkCache(settings.features)
     whole.sift(new), whole.sift(old)
@@ -201,7 +241,9 @@ def test_pictures_that_share_a_sliver_do_not_link():
 def test_linking_repeats_itself():
     images = photographed(SCENE, NEW, seed=1), photographed(SCENE, OLD, seed=2)
     first, second = linked(*images), linked(*images)
-    assert (first.new_px == second.new_px).all() and (first.new_from_old == second.new_from_old).all()
+    assert (first.new_px == second.new_px).all() and (
+        first.new_from_old == second.new_from_old
+    ).all()
 
 
 def test_the_cache_forgets_the_oldest():

@@ -17,7 +17,9 @@ def scattered(seed: int, count: int = 60, kind: str = "orb") -> Features:
 
 
 def shuffled(features: Features, order: np.ndarray, shift_px: float = 0.0) -> Features:
-    return Features(features.kind, features.points_px[order] + shift_px, features.descriptors[order])
+    return Features(
+        features.kind, features.points_px[order] + shift_px, features.descriptors[order]
+    )
 
 
 @given(st.integers(0, 10_000), st.sampled_from(["orb", "sift"]))
@@ -36,7 +38,9 @@ def test_unrelated_points_do_not_match():
 def test_twins_are_refused():
     old = scattered(3)
     doubled = Features(
-        "orb", np.concatenate([old.points_px, old.points_px + 50]), np.concatenate([old.descriptors, old.descriptors])
+        "orb",
+        np.concatenate([old.points_px, old.points_px + 50]),
+        np.concatenate([old.descriptors, old.descriptors]),
     )
     assert len(match(old, doubled, None, 0.0)) == 0
 
@@ -51,7 +55,9 @@ def test_each_point_is_used_once():
 def test_a_prediction_settles_between_twins():
     old = scattered(5)
     twins = Features(
-        "orb", np.concatenate([old.points_px, old.points_px + 2000]), np.concatenate([old.descriptors, old.descriptors])
+        "orb",
+        np.concatenate([old.points_px, old.points_px + 2000]),
+        np.concatenate([old.descriptors, old.descriptors]),
     )
     shift = np.array([[1, 0, 7.0], [0, 1, 7.0], [0, 0, 1]])
     pairs = match(shuffled(old, np.arange(60), 7.0), twins, shift, 30.0)

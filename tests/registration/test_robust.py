@@ -25,7 +25,9 @@ def paired(wild_share: float, noise_px: float, seed: int = 1, count: int = 200):
 def test_the_model_is_found_among_wild_pairs(wild_share):
     a, b, wild = paired(wild_share, 0.3)
     model, inliers = fit_homography(a, b, 3.0)
-    assert np.abs(apply_homography(model, CORNERS) - apply_homography(A_FROM_B, CORNERS)).max() < 1.0
+    assert (
+        np.abs(apply_homography(model, CORNERS) - apply_homography(A_FROM_B, CORNERS)).max() < 1.0
+    )
     assert inliers.shape == (200,) and inliers.dtype == bool
     assert inliers[~wild].mean() > 0.95
     assert inliers[wild].sum() <= 3
@@ -56,9 +58,13 @@ def test_a_mirrored_picture_has_no_model():
 @given(st.floats(0.3, 3.0), st.floats(-180, 180))
 def test_turns_and_moderate_scales_are_believable(scale, turn_deg):
     a = np.radians(turn_deg)
-    matrix = np.array([
-        [scale * np.cos(a), -scale * np.sin(a), 5], [scale * np.sin(a), scale * np.cos(a), 9], [0, 0, 1.0]
-    ])
+    matrix = np.array(
+        [
+            [scale * np.cos(a), -scale * np.sin(a), 5],
+            [scale * np.sin(a), scale * np.cos(a), 9],
+            [0, 0, 1.0],
+        ]
+    )
     assert is_believable(matrix, CORNERS)
     assert not is_believable(matrix @ np.diag([1.0, -1.0, 1.0]), CORNERS)
 
@@ -66,7 +72,9 @@ def test_turns_and_moderate_scales_are_believable(scale, turn_deg):
 @pytest.mark.parametrize(
     "matrix",
     [
-        np.diag([5.0, 5.0, 1.0]), np.diag([0.2, 0.2, 1.0]), np.diag([2.5, 1.0, 1.0]),
+        np.diag([5.0, 5.0, 1.0]),
+        np.diag([0.2, 0.2, 1.0]),
+        np.diag([2.5, 1.0, 1.0]),
         np.array([[1, 0, 0], [0, 1, 0], [-4e-3, 0, 1.0]]),
     ],
     ids=["five times larger", "five times smaller", "stretched one way", "folded"],

@@ -16,7 +16,7 @@ def ground() -> np.ndarray:
 
 @pytest.mark.parametrize("shift_px", [0, 100, 300])
 def test_a_shifted_window_shares_what_is_left(ground: np.ndarray, shift_px: int) -> None:
-    share = shared_view(ground[:, :800], ground[:, shift_px:shift_px + 800])
+    share = shared_view(ground[:, :800], ground[:, shift_px : shift_px + 800])
     assert share == pytest.approx(1 - shift_px / 800, abs=0.03)
 
 

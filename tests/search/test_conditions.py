@@ -14,7 +14,9 @@ M_PER_PX, SIDE_PX = 0.1, 400
 def crowns_of(is_crown: np.ndarray) -> np.ndarray:
     """(H, W) bool at picture size: where trees show in a picture from straight above, lawn elsewhere."""
     rng = np.random.default_rng(4)
-    leaves = cv2.resize(rng.normal(1.0, 0.45, (SIDE_PX // 4, SIDE_PX // 4)), (SIDE_PX, SIDE_PX)).clip(0.1, 2.0)
+    leaves = cv2.resize(
+        rng.normal(1.0, 0.45, (SIDE_PX // 4, SIDE_PX // 4)), (SIDE_PX, SIDE_PX)
+    ).clip(0.1, 2.0)
     light = np.where(is_crown, leaves, 1.0)[..., None]
     image = np.uint8(np.clip(np.array([60.0, 110.0, 45.0]) * light, 0, 255))
     return crowns_of_picture(image, None)
@@ -23,13 +25,17 @@ def crowns_of(is_crown: np.ndarray) -> np.ndarray:
 def straight_down() -> tuple[Camera, Pose]:
     """A camera that looks straight down, the picture's top to the north."""
     camera = Camera(SIDE_PX, SIDE_PX, 400.0, 400.0, (SIDE_PX - 1) / 2, (SIDE_PX - 1) / 2)
-    return camera, Pose(site_from_gimbal_rotation(0.0, -90.0, 0.0), np.array([0.0, 0.0, 400 * M_PER_PX]))
+    return camera, Pose(
+        site_from_gimbal_rotation(0.0, -90.0, 0.0), np.array([0.0, 0.0, 400 * M_PER_PX])
+    )
 
 
 def crowns_of_picture(image: np.ndarray, sun: np.ndarray | None) -> np.ndarray:
     """(H, W) bool at picture size: where trees show."""
     crowns = look_at(image, *straight_down(), 0.5, sun).crowns
-    return cv2.resize(crowns.astype(np.uint8), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_NEAREST) > 0
+    return (
+        cv2.resize(crowns.astype(np.uint8), (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_NEAREST) > 0
+    )
 
 
 def disc(x: int, y: int, radius_m: float) -> np.ndarray:
@@ -55,13 +61,23 @@ def tree_on_a_lawn(*, is_rough: bool) -> tuple[np.ndarray, np.ndarray, np.ndarra
     """A picture of a sunlit crown of 6 m on a lawn with its shadow to the right; where the crown and the shadow are."""
     rng = np.random.default_rng(6)
     crown, shadow = disc(180, 200, 3.0), disc(225, 200, 3.0) & ~disc(180, 200, 3.0)
-    leaves = cv2.resize(rng.normal(1.0, 0.5, (SIDE_PX // 2, SIDE_PX // 2)), (SIDE_PX, SIDE_PX)).clip(0.1, 2.0)
+    leaves = cv2.resize(
+        rng.normal(1.0, 0.5, (SIDE_PX // 2, SIDE_PX // 2)), (SIDE_PX, SIDE_PX)
+    ).clip(0.1, 2.0)
     light = 1.0 + rng.normal(0, 0.05, (SIDE_PX, SIDE_PX))
-    light = np.where(shadow, 0.45 * light, np.where(crown, 0.8 * (leaves if is_rough else light), light))
-    return np.uint8(np.clip(np.array([80.0, 130.0, 60.0]) * light[..., None], 0, 255)), crown, shadow
+    light = np.where(
+        shadow, 0.45 * light, np.where(crown, 0.8 * (leaves if is_rough else light), light)
+    )
+    return (
+        np.uint8(np.clip(np.array([80.0, 130.0, 60.0]) * light[..., None], 0, 255)),
+        crown,
+        shadow,
+    )
 
 
-@pytest.mark.parametrize(("is_rough", "sun"), [(True, None), (True, (-0.7, 0.0, 0.7)), (False, (-0.7, 0.0, 0.7))])
+@pytest.mark.parametrize(
+    ("is_rough", "sun"), [(True, None), (True, (-0.7, 0.0, 0.7)), (False, (-0.7, 0.0, 0.7))]
+)
 def test_the_lit_crown_of_a_single_tree_hides_the_ground_and_its_shadow_does_not(
     is_rough: bool, sun: tuple[float, float, float] | None
 ) -> None:
@@ -80,7 +96,9 @@ def test_nothing_is_found_on_the_side_of_a_shadow_that_is_away_from_the_sun() ->
 
 def test_what_stands_high_hides_the_ground_as_a_crown_or_a_roof() -> None:
     """A raised green place is a crown, a raised grey one a roof; what the pictures show to be crowns stays so."""
-    rough = cv2.resize(np.random.default_rng(4).normal(1.0, 0.45, (100, 100)), (SIDE_PX, SIDE_PX)).clip(0.1, 2.0)
+    rough = cv2.resize(
+        np.random.default_rng(4).normal(1.0, 0.45, (100, 100)), (SIDE_PX, SIDE_PX)
+    ).clip(0.1, 2.0)
     image = np.uint8(np.clip(np.array([60.0, 110.0, 45.0]) * rough[..., None], 0, 255))
     image[:, :200] = (90, 90, 90)
     image[:130, 200:] = (60, 110, 45)

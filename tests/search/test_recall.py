@@ -32,7 +32,10 @@ def test_what_is_stated_as_eight_of_ten_comes_true_eight_times_of_ten() -> None:
 
 def test_few_plants_leave_wide_intervals() -> None:
     columns, _, found = _tried(300, 4)
-    few, many = fit_recall(columns[:8], found[:8]).of(columns), fit_recall(columns, found).of(columns)
+    few, many = (
+        fit_recall(columns[:8], found[:8]).of(columns),
+        fit_recall(columns, found).of(columns),
+    )
     assert (few.high - few.low).mean() > 2 * (many.high - many.low).mean()
 
 
@@ -59,8 +62,14 @@ def test_wilson_interval_of_eight_out_of_ten() -> None:
 
 
 def test_flights_together_miss_what_each_misses() -> None:
-    first = Chances(np.array([0.5, np.nan, np.nan]), np.array([0.4, np.nan, np.nan]), np.array([0.6, np.nan, np.nan]))
-    second = Chances(np.array([0.6, 0.3, np.nan]), np.array([0.5, 0.2, np.nan]), np.array([0.7, 0.4, np.nan]))
+    first = Chances(
+        np.array([0.5, np.nan, np.nan]),
+        np.array([0.4, np.nan, np.nan]),
+        np.array([0.6, np.nan, np.nan]),
+    )
+    second = Chances(
+        np.array([0.6, 0.3, np.nan]), np.array([0.5, 0.2, np.nan]), np.array([0.7, 0.4, np.nan])
+    )
     both = together([first, second])
     assert both.mean[:2] == pytest.approx([0.8, 0.3]) and np.isnan(both.mean[2])
     assert both.low[0] == pytest.approx(0.7) and both.high[0] == pytest.approx(0.88)
@@ -72,9 +81,15 @@ def test_figures_count_unseen_ground_as_nought() -> None:
     found = figures([chances], np.array([True, True, True, False]), 10.0, 20.0)
     assert found.area_m2 == 300 and found.seen_m2 == 200
     assert found.pod == pytest.approx(1.6 / 3) and found.swept_m2 == pytest.approx(160)
-    assert found.sweep_width_m == pytest.approx(12.0) and found.random_pod == pytest.approx(1 - np.exp(-1.6 / 3))
+    assert found.sweep_width_m == pytest.approx(12.0) and found.random_pod == pytest.approx(
+        1 - np.exp(-1.6 / 3)
+    )
     north = segment("north", 0.6, chances, np.array([True, True, False, False]), 10.0, 400.0)
-    assert north.pod == pytest.approx(0.4) and north.pos == pytest.approx(0.24) and north.left == pytest.approx(0.36)
+    assert (
+        north.pod == pytest.approx(0.4)
+        and north.pos == pytest.approx(0.24)
+        and north.left == pytest.approx(0.36)
+    )
 
 
 def test_the_effort_of_two_flights_adds_up_and_their_sweep_width_stays() -> None:

@@ -30,7 +30,9 @@ SETTINGS = SimulationSettings(
     scene=SceneSettings("dirt", people=3, cars=2, small_objects=3, moving_share=0.6),
     path=PathSettings(height_m=14, speed_m_s=4, length_m=16, strips=1),
     imaging=ImagingSettings(320, 240, fps=10),
-    later=LaterSettings(people=1, cars=1, small_objects=2, removed=2, moved=2, weather=WeatherSettings(wind_m=0.0)),
+    later=LaterSettings(
+        people=1, cars=1, small_objects=2, removed=2, moved=2, weather=WeatherSettings(wind_m=0.0)
+    ),
     output=OutputSettings(truth_step=5),
 )
 
@@ -64,15 +66,25 @@ def test_clear_views_show_the_whole_thing(later):
     events = [e for e in true_events(later) if e.after is not None and e.clear_views]
     assert len(events) >= 4
     for event in events:
-        assert np.diff(event.clear_views).min(initial=2) >= 2  # 0.2 s of a video of ten frames a second
+        assert (
+            np.diff(event.clear_views).min(initial=2) >= 2
+        )  # 0.2 s of a video of ten frames a second
         index = event.clear_views[len(event.clear_views) // 2]
         labels, totals = render_labels(
-            later.day.things, later.day.bodies, later.view(index), later.true_poses[index],
+            later.day.things,
+            later.day.bodies,
+            later.view(index),
+            later.true_poses[index],
             float(later.from_middle_s[index]),
         )
         seen = labels == event.after.id
         assert seen.sum() > 0.5 * totals[event.after.id]
-        assert not seen[0].any() and not seen[:, 0].any() and not seen[-1].any() and not seen[:, -1].any()
+        assert (
+            not seen[0].any()
+            and not seen[:, 0].any()
+            and not seen[-1].any()
+            and not seen[:, -1].any()
+        )
         place = event.after.place_m(float(later.from_middle_s[index]))[:2]
         assert np.allclose(event.path_m[len(event.clear_views) // 2], place)
 
@@ -103,7 +115,9 @@ def test_features_are_plain_json_and_repeat_exactly(later):
         reported = feature["properties"]
         assert bool(reported["class_before"]) == (reported["kind"] in ("disappeared", "replaced"))
         assert bool(reported["class_after"]) == (reported["kind"] != "disappeared")
-        assert bool(reported["path"]) == (reported["kind"] == "moving" and bool(reported["clear_views"]))
+        assert bool(reported["path"]) == (
+            reported["kind"] == "moving" and bool(reported["clear_views"])
+        )
 
 
 def test_a_later_flight_may_have_its_own_camera_height_and_heading(tmp_path):
@@ -114,7 +128,9 @@ def test_a_later_flight_may_have_its_own_camera_height_and_heading(tmp_path):
     assert (first.camera.width_px, second.camera.width_px) == (320, 480)
     assert second.frame(3).image.shape == (270, 480, 3)
     assert second.true_poses[3].translation_m[2] > 1.3 * first.true_poses[3].translation_m[2]
-    across = abs(float(first.path.heading_deg(np.zeros(1))[0] - second.path.heading_deg(np.zeros(1))[0]))
+    across = abs(
+        float(first.path.heading_deg(np.zeros(1))[0] - second.path.heading_deg(np.zeros(1))[0])
+    )
     assert abs(across - 90) < 15
     area = second.world.ground.area
     corners = np.array([[area.west_m, area.south_m], [area.east_m, area.north_m]])
@@ -132,7 +148,9 @@ def test_a_later_flight_may_have_its_own_camera_height_and_heading(tmp_path):
 
 def test_night_and_snow_change_the_picture_but_no_event():
     def second(weather: WeatherSettings):
-        return list(simulate_flights(replace(SETTINGS, later=replace(SETTINGS.later, weather=weather))))[1]
+        return list(
+            simulate_flights(replace(SETTINGS, later=replace(SETTINGS.later, weather=weather)))
+        )[1]
 
     day, night, snow = (
         second(WeatherSettings(False, False, 0.0)),
@@ -150,18 +168,26 @@ def test_night_and_snow_change_the_picture_but_no_event():
 
 def test_a_comparing_preset_has_changes_of_every_kind():
     settings = preset("compare")
-    small = replace(settings, seed=3, imaging=ImagingSettings(320, 180, fps=5), scene=replace(
-        settings.scene, ground="dirt", has_scenery=False
-    ))
+    small = replace(
+        settings,
+        seed=3,
+        imaging=ImagingSettings(320, 180, fps=5),
+        scene=replace(settings.scene, ground="dirt", has_scenery=False),
+    )
     first, second = simulate_flights(small)
     kinds = [event.kind for event in true_events(second)]
     assert len(kinds) >= 10 and {"appeared", "disappeared", "moving"} <= set(kinds)
     assert not any(thing.is_moving for thing in first.day.things)
 
 
-@pytest.mark.parametrize("make", [
-    lambda: WeatherSettings(snow=1.5), lambda: WeatherSettings(brightness=-1), lambda: RevisitSettings(0.1),
-])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: WeatherSettings(snow=1.5),
+        lambda: WeatherSettings(brightness=-1),
+        lambda: RevisitSettings(0.1),
+    ],
+)
 def test_impossible_later_flights_are_refused(make):
     with pytest.raises(SettingsError, match="must lie in"):
         make()
@@ -169,9 +195,11 @@ def test_impossible_later_flights_are_refused(make):
 
 def test_a_preset_without_changes_has_none():
     settings = preset("compare-none")
-    small = replace(settings, imaging=ImagingSettings(160, 90, fps=5), scene=replace(
-        settings.scene, ground="dirt", has_scenery=False
-    ))
+    small = replace(
+        settings,
+        imaging=ImagingSettings(160, 90, fps=5),
+        scene=replace(settings.scene, ground="dirt", has_scenery=False),
+    )
     first, second = simulate_flights(small)
     assert true_events(second) == []
     assert not change_mask(second, 5).any()

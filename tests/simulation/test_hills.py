@@ -26,11 +26,17 @@ _HILLS = Relief.hills(8.0, 25.0, _AREA, np.random.default_rng(3))
 
 @pytest.fixture(scope="module")
 def flight() -> SimulatedFlight:
-    return simulate_flight(SimulationSettings(
-        seed=5, flights=1, scene=SceneSettings(people=0, cars=2, small_objects=0, relief_m=8.0),
-        path=PathSettings(height_m=25, length_m=20, strips=1), motion=MotionSettings(camera_pitch_deg=-80.0),
-        imaging=ImagingSettings(width_px=320, height_px=240, noise=0.0), output=OutputSettings(photos=True),
-    ))
+    return simulate_flight(
+        SimulationSettings(
+            seed=5,
+            flights=1,
+            scene=SceneSettings(people=0, cars=2, small_objects=0, relief_m=8.0),
+            path=PathSettings(height_m=25, length_m=20, strips=1),
+            motion=MotionSettings(camera_pitch_deg=-80.0),
+            imaging=ImagingSettings(width_px=320, height_px=240, noise=0.0),
+            output=OutputSettings(photos=True),
+        )
+    )
 
 
 def test_hills_are_as_high_as_asked_and_level_ground_has_none() -> None:
@@ -65,8 +71,12 @@ def test_each_pixel_shows_the_ground_that_projects_there(flight: SimulatedFlight
     assert np.abs(pixels - np.column_stack([columns.ravel(), rows.ravel()])).max() < 0.05
 
 
-def test_pictures_differ_from_those_of_level_ground_and_things_stand_on_the_hills(flight: SimulatedFlight) -> None:
-    level = simulate_flight(replace(flight.settings, scene=replace(flight.settings.scene, relief_m=0.0)))
+def test_pictures_differ_from_those_of_level_ground_and_things_stand_on_the_hills(
+    flight: SimulatedFlight,
+) -> None:
+    level = simulate_flight(
+        replace(flight.settings, scene=replace(flight.settings.scene, relief_m=0.0))
+    )
     assert np.abs(flight.frame(2).image.astype(int) - level.frame(2).image).mean() > 5
     feet = np.array([thing.place_m(0.0) for thing in flight.day.things])
     assert feet[:, 2] == pytest.approx(flight.world.relief.up_m(feet[:, :2]))
@@ -75,7 +85,9 @@ def test_pictures_differ_from_those_of_level_ground_and_things_stand_on_the_hill
 
 def test_outlines_and_heights_of_the_truth_are_those_of_the_hills(flight: SimulatedFlight) -> None:
     relief, pose = flight.world.relief, flight.true_poses[0]
-    corners = flight.site.ground_from_lonlat(frame_features(flight)[0]["geometry"]["coordinates"][0][:4])
+    corners = flight.site.ground_from_lonlat(
+        frame_features(flight)[0]["geometry"]["coordinates"][0][:4]
+    )
     points = np.column_stack([corners, relief.up_m(corners)])
     pixels = flight.camera.pixels_from_points(pose.inverse().apply(points))
     assert np.abs(pixels - flight.camera.corners_px).max() < 0.05

@@ -40,9 +40,13 @@ def test_a_limb_turns_and_moves_with_its_person_and_shows_its_face() -> None:
     patch = limb.facing(quarter, np.array([3.0, 5.0, 0.0]), eye)
     middle = patch.corners_m.mean(axis=0)
     assert middle == pytest.approx([3.0, 5.3, 1.0])
-    normal = np.cross(patch.corners_m[1] - patch.corners_m[0], patch.corners_m[3] - patch.corners_m[0])
+    normal = np.cross(
+        patch.corners_m[1] - patch.corners_m[0], patch.corners_m[3] - patch.corners_m[0]
+    )
     sight = eye[:3] - middle
-    assert abs(normal @ sight) == pytest.approx(np.linalg.norm(normal) * np.linalg.norm(sight), rel=1e-6)
+    assert abs(normal @ sight) == pytest.approx(
+        np.linalg.norm(normal) * np.linalg.norm(sight), rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("kind", list(POSES))
@@ -63,14 +67,22 @@ def test_people_stand_on_the_ground_within_about_their_size(kind: str, seed: int
 
 def test_no_two_people_look_alike_and_a_seed_gives_one_person() -> None:
     one, again, other = (_limbs(_person("walking", seed)) for seed in (3, 3, 4))
-    assert all(np.array_equal(a.ends_m, b.ends_m) and np.array_equal(a.texture, b.texture) for a, b in zip(one, again))
+    assert all(
+        np.array_equal(a.ends_m, b.ends_m) and np.array_equal(a.texture, b.texture)
+        for a, b in zip(one, again)
+    )
     assert not np.allclose(one[0].ends_m, other[0].ends_m)
 
 
 def test_who_is_shown_coarsely_stays_whole_and_fades_instead_of_flickering() -> None:
     fine, coarse = (
-        sum(int(part.texture[..., 3].max()) for part in build_body(_person("walking", 5), _LIGHT, m_per_px).parts)
+        sum(
+            int(part.texture[..., 3].max())
+            for part in build_body(_person("walking", 5), _LIGHT, m_per_px).parts
+        )
         for m_per_px in (0.01, 0.15)
     )
     assert coarse < fine
-    assert all(part.width_m >= 0.15 for part in build_body(_person("walking", 5), _LIGHT, 0.15).parts)
+    assert all(
+        part.width_m >= 0.15 for part in build_body(_person("walking", 5), _LIGHT, 0.15).parts
+    )

@@ -17,8 +17,14 @@ POSE = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, HEIGHT_M]))
 
 
 def _light(**others: object) -> FrameLight:
-    known = {"gain": np.ones(3), "haze": np.zeros(3), "blur_px2": 0.1 * np.eye(2), "noise": 0.0, "shadow": 1.0,
-             "is_thermal": False}
+    known = {
+        "gain": np.ones(3),
+        "haze": np.zeros(3),
+        "blur_px2": 0.1 * np.eye(2),
+        "noise": 0.0,
+        "shadow": 1.0,
+        "is_thermal": False,
+    }
     return FrameLight(**(known | others))  # type: ignore[arg-type]
 
 
@@ -46,11 +52,17 @@ def test_shadows_fall_away_from_the_sun_and_an_overcast_sky_throws_none() -> Non
     person = [new_plant(3, "car", np.array([0.0, 0.0]), 2)]
     sunny = plant(_grey(), CAMERA, POSE, person, _light(), direction_from_angles(180, 30), [1.0], 1)
     box = sunny.boxes_px[0].astype(int)
-    above = sunny.image[box[1] - 12:box[1] - 4, box[0] + 5:box[2] - 5].mean()
-    below = sunny.image[box[3] + 6:box[3] + 14, box[0] + 5:box[2] - 5].mean()
-    assert above < 80 and below == pytest.approx(110, abs=2)  # the sun stands in the south: shadows fall north, upwards
-    cloudy = plant(_grey(), CAMERA, POSE, person, _light(shadow=0.0), direction_from_angles(180, 30), [1.0], 1)
-    assert cloudy.image[box[1] - 12:box[1] - 4, box[0] + 5:box[2] - 5].mean() == pytest.approx(110, abs=2)
+    above = sunny.image[box[1] - 12 : box[1] - 4, box[0] + 5 : box[2] - 5].mean()
+    below = sunny.image[box[3] + 6 : box[3] + 14, box[0] + 5 : box[2] - 5].mean()
+    assert above < 80 and below == pytest.approx(
+        110, abs=2
+    )  # the sun stands in the south: shadows fall north, upwards
+    cloudy = plant(
+        _grey(), CAMERA, POSE, person, _light(shadow=0.0), direction_from_angles(180, 30), [1.0], 1
+    )
+    assert cloudy.image[box[1] - 12 : box[1] - 4, box[0] + 5 : box[2] - 5].mean() == pytest.approx(
+        110, abs=2
+    )
 
 
 def test_crowns_hide_all_but_their_gaps() -> None:
@@ -65,7 +77,16 @@ def test_crowns_hide_all_but_their_gaps() -> None:
 
 
 def test_what_is_out_of_sight_has_no_box_and_leaves_the_picture() -> None:
-    planted = plant(_grey(), CAMERA, POSE, [new_plant(1, "car", np.array([90.0, 0.0]), 7)], _light(), None, [1.0], 1)
+    planted = plant(
+        _grey(),
+        CAMERA,
+        POSE,
+        [new_plant(1, "car", np.array([90.0, 0.0]), 7)],
+        _light(),
+        None,
+        [1.0],
+        1,
+    )
     assert np.isnan(planted.boxes_px).all() and (planted.image == 110).all()
 
 
@@ -99,14 +120,18 @@ def test_dark_noisy_and_thermal_frames_are_distinguished() -> None:
 def test_a_person_is_warm_in_a_thermal_frame() -> None:
     person = [new_plant(1, "person", np.array([0.0, 0.0]), 3)]
     light = _light(gain=np.ones(3), haze=np.full(3, 90.0), is_thermal=True, shadow=0.0)
-    planted = plant(_grey(90), CAMERA, POSE, person, light, direction_from_angles(180, 30), [1.0], 1)
+    planted = plant(
+        _grey(90), CAMERA, POSE, person, light, direction_from_angles(180, 30), [1.0], 1
+    )
     box = planted.boxes_px[0].astype(int)
-    assert planted.image[box[1]:box[3], box[0]:box[2]].max() > 120
+    assert planted.image[box[1] : box[3], box[0] : box[2]].max() > 120
     assert planted.image.min() >= 85  # no shadow
 
 
 def test_the_sun_at_noon_of_the_equinox_and_by_an_almanac() -> None:
-    noon = sun_direction(1_710_936_000_000_000_000, 0.0, 1.9)  # 2024-03-20 12:00 UTC, the equation of time is -7.5 min
+    noon = sun_direction(
+        1_710_936_000_000_000_000, 0.0, 1.9
+    )  # 2024-03-20 12:00 UTC, the equation of time is -7.5 min
     assert noon[2] > 0.9998
     # NOAA's calculator: Rome, 2024-06-21 10:00 UTC: azimuth 132.5, elevation 65.5 degrees
     east, north, up = sun_direction(1_718_964_000_000_000_000, 41.9, 12.5)

@@ -52,7 +52,8 @@ def run(folder: Path, settings: SimulationSettings) -> None:
 def hashes(folder: Path) -> dict[str, str]:
     return {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*")) if path.is_file()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
     }
 
 
@@ -81,7 +82,9 @@ def test_a_video_does_not_depend_on_what_lay_in_memory_before(tmp_path):
     for filling in ("1", "85", "170"):  # glibc fills new memory with it; elsewhere it does nothing
         path = tmp_path / f"{filling}.mp4"
         subprocess.run(
-            [sys.executable, "-c", WRITE_A_VIDEO, str(path)], check=True, timeout=60,
+            [sys.executable, "-c", WRITE_A_VIDEO, str(path)],
+            check=True,
+            timeout=60,
             env={**os.environ, "MALLOC_PERTURB_": filling},
         )
         written.append(path.read_bytes())
@@ -92,7 +95,9 @@ def test_one_seed_gives_the_same_bytes(site, tmp_path):
     again = tmp_path / "again"
     run(again, SMALL)
     assert hashes(again) == hashes(site)
-    run(again, replace(SMALL, seed=8, flights=1, output=OutputSettings("csv")))  # replaces the first one
+    run(
+        again, replace(SMALL, seed=8, flights=1, output=OutputSettings("csv"))
+    )  # replaces the first one
     other = hashes(again)
     assert "flight2/flight2.mp4" not in other
     assert other["flight1/flight1.mp4"] != hashes(site)["flight1/flight1.mp4"]
@@ -123,7 +128,11 @@ def test_everything_is_there(site):
 
 def test_the_video_holds_every_frame_at_its_time(site):
     truth = json.loads((site / "truth/frames.geojson").read_text())
-    expected = [f["properties"]["frame"] for f in truth["features"] if f["properties"]["flight"] == "flight1"]
+    expected = [
+        f["properties"]["frame"]
+        for f in truth["features"]
+        if f["properties"]["flight"] == "flight1"
+    ]
     with av.open(str(site / "flight1/flight1.mp4")) as container:
         times = [float(frame.time) for frame in container.decode(video=0)]
         assert container.metadata["creation_time"].startswith("2026-04-02T12:44:00")
@@ -133,14 +142,23 @@ def test_the_video_holds_every_frame_at_its_time(site):
 
 def test_every_format_gives_the_same_place(site):
     flight = next(simulate_flights(SMALL))
-    for name in ("flight1.csv", "other/flight1.srt", "other/flight1_old_dialect.srt", "other/flight1.nmea",
-                 "other/flight1.gpx"):
+    for name in (
+        "flight1.csv",
+        "other/flight1.srt",
+        "other/flight1_old_dialect.srt",
+        "other/flight1.nmea",
+        "other/flight1.gpx",
+    ):
         telemetry = read_telemetry(site / "flight1" / name)
         recorded = flight.telemetry(name.rsplit(".", 1)[1])
         assert len(telemetry) >= len(recorded) - (2 if name.endswith("nmea") else 0)
         # subtitles of the old kind print six decimals, 0.11 m; readers may refine whole-second clocks
-        assert np.isin(np.round(telemetry["latitude_deg"], 6), np.round(recorded["latitude_deg"], 6)).all()
-        assert np.isin(np.round(telemetry["longitude_deg"], 6), np.round(recorded["longitude_deg"], 6)).all()
+        assert np.isin(
+            np.round(telemetry["latitude_deg"], 6), np.round(recorded["latitude_deg"], 6)
+        ).all()
+        assert np.isin(
+            np.round(telemetry["longitude_deg"], 6), np.round(recorded["longitude_deg"], 6)
+        ).all()
 
 
 def test_the_table_has_the_thesis_columns(site):
@@ -179,10 +197,15 @@ def test_the_ground_picture_agrees_with_the_frames(site):
     on_map = cv2.remap(picture, columns, rows, cv2.INTER_LINEAR)
     in_frame = flight.frame(index).image.mean(axis=2).astype(np.float32)
     labels, _ = render_labels(
-        flight.day.things, flight.day.bodies, flight.view(index), flight.true_poses[index],
+        flight.day.things,
+        flight.day.bodies,
+        flight.view(index),
+        flight.true_poses[index],
         float(flight.from_middle_s[index]),
     )
-    bare = cv2.dilate((labels > 0).astype(np.uint8), np.ones((25, 25))) == 0  # what stands up leans elsewhere
+    bare = (
+        cv2.dilate((labels > 0).astype(np.uint8), np.ones((25, 25))) == 0
+    )  # what stands up leans elsewhere
 
     def agreement(shown: np.ndarray) -> float:
         smooth = [cv2.GaussianBlur(each, (0, 0), 1.0)[bare] for each in (shown, in_frame)]
@@ -195,21 +218,31 @@ def test_the_ground_picture_agrees_with_the_frames(site):
 def test_boxes_hold_objects_and_masks_hold_changes(site):
     flights = list(simulate_flights(SMALL))
     boxes = json.loads((site / "truth/flight2/boxes.json").read_text())
-    assert [category["name"] for category in boxes["categories"]] == ["person", "car", "small object"]
+    assert [category["name"] for category in boxes["categories"]] == [
+        "person",
+        "car",
+        "small object",
+    ]
     assert boxes["annotations"]
     for box in boxes["annotations"]:
         left, top, width, height = box["bbox"]
         assert left >= 0 and top >= 0 and left + width <= 320 and top + height <= 240
         assert 0 < box["visibility"] <= 1 and box["area"] <= width * height
-    added = {thing.id for thing in flights[1].day.things} - {thing.id for thing in flights[0].day.things}
+    added = {thing.id for thing in flights[1].day.things} - {
+        thing.id for thing in flights[0].day.things
+    }
     assert len(added) == 4
     for image in boxes["images"]:
-        mask = cv2.imread(str(site / f"truth/flight2/changes/{image['frame']}.png"), cv2.IMREAD_GRAYSCALE)
+        mask = cv2.imread(
+            str(site / f"truth/flight2/changes/{image['frame']}.png"), cv2.IMREAD_GRAYSCALE
+        )
         assert set(np.unique(mask)) <= {0, 255}
         for box in boxes["annotations"]:
             if box["image_id"] == image["id"] and box["object_id"] in added:
                 left, top, width, height = box["bbox"]
-                assert np.count_nonzero(mask[top:top + height, left:left + width]) >= box["area"]
+                assert (
+                    np.count_nonzero(mask[top : top + height, left : left + width]) >= box["area"]
+                )
 
 
 def test_photos_carry_place_and_attitude(tmp_path):

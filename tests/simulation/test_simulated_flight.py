@@ -35,7 +35,9 @@ from sorvolo.simulation.world import needed_area
 
 LONG = PathSettings(height_m=30, speed_m_s=5, length_m=100, strips=4, strip_spacing_m=12)
 QUICK = SimulationSettings(
-    seed=3, flights=1, scene=SceneSettings("sand", people=1, cars=1, small_objects=1),
+    seed=3,
+    flights=1,
+    scene=SceneSettings("sand", people=1, cars=1, small_objects=1),
     path=PathSettings(height_m=10, speed_m_s=4, length_m=8, strips=1),
     imaging=ImagingSettings(320, 240, fps=4),
 )
@@ -87,9 +89,13 @@ def test_noise_bias_clock_and_faults_are_as_asked():
     assert seen.true_s[0] == pytest.approx(-0.7)
     sound = seen.is_sound
     assert np.count_nonzero(~sound) == 7
-    assert np.count_nonzero((telemetry["latitude_deg"] == 0) & (telemetry["longitude_deg"] == 0)) == 4
+    assert (
+        np.count_nonzero((telemetry["latitude_deg"] == 0) & (telemetry["longitude_deg"] == 0)) == 4
+    )
     heights = telemetry["orthometric_height_m"] + 48.3
-    fixes = frame.site_from_wgs84(telemetry["latitude_deg"], telemetry["longitude_deg"], heights)[sound]
+    fixes = frame.site_from_wgs84(telemetry["latitude_deg"], telemetry["longitude_deg"], heights)[
+        sound
+    ]
     error = fixes - path.position_m(seen.true_s[sound])
     tolerance = 5 / np.sqrt(len(error))
     assert error.mean(axis=0) == pytest.approx([3.0, -2.0, 0.0], abs=2 * tolerance)
@@ -105,9 +111,13 @@ def test_gaps_leave_samples_out():
 
 def test_attitude_without_noise_is_the_true_rotation():
     path = fly(LONG, MotionSettings(), np.random.default_rng(3))
-    seen = observe(path, site(), 0, SensorSettings(attitude_noise_deg=0), "csv", np.random.default_rng(4))
+    seen = observe(
+        path, site(), 0, SensorSettings(attitude_noise_deg=0), "csv", np.random.default_rng(4)
+    )
     for i in (0, 100, 333):
-        angles = [float(seen.telemetry[f"camera_{axis}_deg"][i]) for axis in ("yaw", "pitch", "roll")]
+        angles = [
+            float(seen.telemetry[f"camera_{axis}_deg"][i]) for axis in ("yaw", "pitch", "roll")
+        ]
         assert np.allclose(
             site_from_gimbal_rotation(*angles), path.pose(float(seen.true_s[i])).rotation, atol=1e-9
         )
@@ -139,14 +149,19 @@ def test_all_that_the_camera_sees_is_painted():
     area = needed_area(settings, planned_waypoints(LONG))
     path = fly(LONG, settings.motion, np.random.default_rng(8))
     times_s = np.linspace(0, path.duration_s, 400)
-    outlines = np.concatenate([footprint(settings.imaging.camera, path.pose(float(t))) for t in times_s])
+    outlines = np.concatenate(
+        [footprint(settings.imaging.camera, path.pose(float(t))) for t in times_s]
+    )
     assert outlines[:, 0].min() > area.west_m and outlines[:, 0].max() < area.east_m
     assert outlines[:, 1].min() > area.south_m and outlines[:, 1].max() < area.north_m
 
 
 def test_later_flights_find_changes_and_other_light():
     first, second = simulate_flights(replace(QUICK, flights=2))
-    before, now = {thing.id for thing in first.day.things}, {thing.id for thing in second.day.things}
+    before, now = (
+        {thing.id for thing in first.day.things},
+        {thing.id for thing in second.day.things},
+    )
     assert before - now and now - before
     assert not np.allclose(first.day.light.sun, second.day.light.sun)
     assert second.started_ns > first.started_ns
@@ -160,7 +175,9 @@ def test_the_sun_of_a_flight_stands_where_its_time_and_place_put_it(place):
     assert times_ns == sorted(set(times_ns))
     for sun, time_ns in zip(suns, times_ns):
         assert np.allclose(sun, sun_direction(time_ns, *place)) and sun[2] > 0.3
-    same_light = replace(settings, later=replace(settings.later, weather=WeatherSettings(has_other_light=False)))
+    same_light = replace(
+        settings, later=replace(settings.later, weather=WeatherSettings(has_other_light=False))
+    )
     assert np.degrees(np.arccos(suns[0] @ sun_of_flight(same_light, 2))) < 0.2
 
 
@@ -177,10 +194,16 @@ def test_an_orthophoto_must_cover_the_flight():
         simulate_flight(settings)
 
 
-@pytest.mark.parametrize("make", [
-    lambda: SceneSettings("moon"), lambda: PathSettings(height_m=-1), lambda: ImagingSettings(641, 480),
-    lambda: OutputSettings(telemetry="morse"), lambda: SensorSettings(clock_offset_s=60.0),
-])
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SceneSettings("moon"),
+        lambda: PathSettings(height_m=-1),
+        lambda: ImagingSettings(641, 480),
+        lambda: OutputSettings(telemetry="morse"),
+        lambda: SensorSettings(clock_offset_s=60.0),
+    ],
+)
 def test_impossible_settings_are_refused(make):
     with pytest.raises(SettingsError):
         make()

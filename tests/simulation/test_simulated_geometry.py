@@ -36,7 +36,9 @@ def dotted_ground(size_m: float) -> PaintedGround:
         for north in places:
             centre = (np.array([east + size_m / 2, size_m / 2 - north]) / RASTER_M - 0.5) * 256
             x, y = np.round(centre).astype(int).tolist()
-            cv2.circle(fine, (x, y), int(0.22 / RASTER_M * 256), (240, 240, 240), -1, cv2.LINE_AA, 8)
+            cv2.circle(
+                fine, (x, y), int(0.22 / RASTER_M * 256), (240, 240, 240), -1, cv2.LINE_AA, 8
+            )
     return orthophoto_ground(fine, RASTER_M)
 
 
@@ -47,7 +49,9 @@ def clean_settings(**imaging: object) -> SimulationSettings:
         path=PathSettings(height_m=20, speed_m_s=4, length_m=10, strips=1, heading_deg=30),
         motion=MotionSettings(tilt_rms_deg=2.0),
         imaging=replace(
-            ImagingSettings(640, 480, fps=2, exposure_s=0, exposure_drift=0, white_balance_drift=0, noise=0),
+            ImagingSettings(
+                640, 480, fps=2, exposure_s=0, exposure_drift=0, white_balance_drift=0, noise=0
+            ),
             **imaging,
         ),
         output=OutputSettings(telemetry="none"),
@@ -70,9 +74,12 @@ def centroid_errors_px(flight: SimulatedFlight, index: int) -> np.ndarray:
         if not (14 < x < camera.width_px - 15 and 14 < y < camera.height_px - 15):
             continue
         x0, y0 = round(x) - 12, round(y) - 12
-        part = gray[y0:y0 + 25, x0:x0 + 25]
-        part = np.clip(part / part.max() - 0.35, 0, None) / np.clip(part / part.max() - 0.35, 0, None).sum()
-        rows, columns = np.mgrid[y0:y0 + 25, x0:x0 + 25]
+        part = gray[y0 : y0 + 25, x0 : x0 + 25]
+        part = (
+            np.clip(part / part.max() - 0.35, 0, None)
+            / np.clip(part / part.max() - 0.35, 0, None).sum()
+        )
+        rows, columns = np.mgrid[y0 : y0 + 25, x0 : x0 + 25]
         errors.append(np.hypot((part * columns).sum() - x, (part * rows).sum() - y))
     return np.array(errors)
 
@@ -90,8 +97,11 @@ def test_a_shifted_truth_would_be_noticed():
     """The dot test can fail: half a pixel of shift is far beyond its tolerance."""
     flight = simulate_flight(clean_settings(), dotted_ground(70))
     shifted = GroundRaster(
-        flight.day.ground.rgb, flight.day.ground.vegetation, flight.day.ground.west_m + 0.02,
-        flight.day.ground.north_m, flight.day.ground.m_per_px,
+        flight.day.ground.rgb,
+        flight.day.ground.vegetation,
+        flight.day.ground.west_m + 0.02,
+        flight.day.ground.north_m,
+        flight.day.ground.m_per_px,
     )
     moved = replace(flight, day=replace(flight.day, ground=shifted))
     assert centroid_errors_px(moved, 1).mean() > 0.3
@@ -110,12 +120,16 @@ def test_a_roof_stands_at_its_height():
     flight = simulate_flight(clean_settings(), dotted_ground(70))
     pose, camera = flight.true_poses[2], flight.camera
     middle = ground_from_pixels(camera, pose, np.array([[160.0, 130.0]]))[0]
-    thing = Thing(1, Label.HOUSE, "flat roof", float(middle[0]), float(middle[1]), 20.0, (4.0, 3.0, 5.0), 3)
+    thing = Thing(
+        1, Label.HOUSE, "flat roof", float(middle[0]), float(middle[1]), 20.0, (4.0, 3.0, 5.0), 3
+    )
     light = Light(np.array([0.0, 0.3, 0.954]))
     body = build_body(thing, light, 0.03)
     labels, totals = render_labels([thing], {1: body}, flight.view(2), pose, 0.0)
     corners = np.array([[x, y, z] for x in (-2, 2) for y in (-1.5, 1.5) for z in (0.0, 5.0)])
-    seen = camera.pixels_from_points(pose.inverse().apply(corners @ thing.turn.T + thing.place_m(0.0)))
+    seen = camera.pixels_from_points(
+        pose.inverse().apply(corners @ thing.turn.T + thing.place_m(0.0))
+    )
     rows, columns = np.nonzero(labels)
     hull = cv2.convexHull(seen.astype(np.float32))
     assert abs(len(rows) - cv2.contourArea(hull)) < 0.06 * len(
@@ -131,8 +145,12 @@ def test_what_stands_nearer_hides_what_is_behind():
     flight = simulate_flight(clean_settings(), dotted_ground(70))
     pose = flight.true_poses[2]
     below = pose.translation_m[:2]
-    wall = Thing(1, Label.HOUSE, "flat roof", float(below[0] + 3), float(below[1]), 0.0, (2.0, 6.0, 6.0), 3)
-    hidden = Thing(2, Label.SMALL, "box", float(below[0] + 4.6), float(below[1]), 0.0, (0.4, 0.3, 0.3), 4)
+    wall = Thing(
+        1, Label.HOUSE, "flat roof", float(below[0] + 3), float(below[1]), 0.0, (2.0, 6.0, 6.0), 3
+    )
+    hidden = Thing(
+        2, Label.SMALL, "box", float(below[0] + 4.6), float(below[1]), 0.0, (0.4, 0.3, 0.3), 4
+    )
     light = Light(np.array([0.0, 0.3, 0.954]))
     bodies = {thing.id: build_body(thing, light, 0.03) for thing in (wall, hidden)}
     labels, totals = render_labels([wall, hidden], bodies, flight.view(2), pose, 0.0)
@@ -144,7 +162,11 @@ def test_what_stands_nearer_hides_what_is_behind():
 
 def test_shadows_fall_away_from_the_sun():
     gray = GroundRaster(
-        np.full((700, 700, 3), 200, np.uint8), np.zeros((700, 700), np.uint8), -17.5, 17.5, (0.05, 0.05)
+        np.full((700, 700, 3), 200, np.uint8),
+        np.zeros((700, 700), np.uint8),
+        -17.5,
+        17.5,
+        (0.05, 0.05),
     )
     sun = np.array([np.sin(0.9), 0.0, np.cos(0.9)])  # in the east
     pole = Thing(1, Label.SMALL, "big box", 0.0, 0.0, 0.0, (0.6, 0.6, 2.0), 5)

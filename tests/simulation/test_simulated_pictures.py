@@ -12,7 +12,9 @@ from sorvolo.missions.simulate.pictures import simulate_pictures
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.pictures import SMALLEST_PX, PictureSettings, simulate_picture
 
-SETTINGS = PictureSettings(seed=11, empty_share=0.0, m_per_px=(0.04, 0.1), height_m=(15.0, 60.0), ground="sand")
+SETTINGS = PictureSettings(
+    seed=11, empty_share=0.0, m_per_px=(0.04, 0.1), height_m=(15.0, 60.0), ground="sand"
+)
 
 
 def test_a_picture_follows_from_seed_and_index_alone():
@@ -36,7 +38,9 @@ def test_boxes_lie_in_the_picture_and_cars_have_a_car_s_size():
             if box["category_id"] == 2 and inside and box["visibility"] == 1:
                 cars_m.append(max(w, h) * picture.m_per_px)
     assert len(cars_m) >= 4
-    assert min(cars_m) > 2.6 and max(cars_m) < 6.8  # 4.0 to 5.2 m long, seen at any heading, some from the side
+    assert (
+        min(cars_m) > 2.6 and max(cars_m) < 6.8
+    )  # 4.0 to 5.2 m long, seen at any heading, some from the side
 
 
 def test_heights_and_ground_sampling_distances_keep_their_bounds():
@@ -57,7 +61,7 @@ def test_people_stand_out_in_thermal_pictures_which_are_grey():
         for box in picture.boxes:
             x, y, w, h = box["bbox"]
             if box["category_id"] == 1 and box["visibility"] == 1 and min(w, h) >= 6:
-                inside = np.median(grey[y + h // 3:y + h - h // 3, x + w // 3:x + w - w // 3])
+                inside = np.median(grey[y + h // 3 : y + h - h // 3, x + w // 3 : x + w - w // 3])
                 found += abs(inside - np.median(grey)) > 1.5 * grey.std()
     assert found >= 4
 
@@ -83,7 +87,9 @@ def test_the_folder_is_coco_and_only_a_simulation_is_replaced(tmp_path):
     assert len({image["flight"] for image in truth["images"]}) == 3
     ids = [row["id"] for row in truth["annotations"]]
     assert ids == list(range(1, len(ids) + 1))
-    assert {row["image_id"] for row in truth["annotations"]} <= {image["id"] for image in truth["images"]}
+    assert {row["image_id"] for row in truth["annotations"]} <= {
+        image["id"] for image in truth["images"]
+    }
     assert steps[-1].boxes == sum(1 - row["iscrowd"] for row in truth["annotations"])
     for image in truth["images"]:
         assert Image.open(folder / image["file_name"]).size == (image["width"], image["height"])

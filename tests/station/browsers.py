@@ -19,8 +19,15 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not 
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or ""
 FLAGS = (
-    "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-sync",
-    "--disable-background-networking", "--disable-component-update", "--mute-audio",
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-sync",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--mute-audio",
 )
 WAIT_MS = 20_000
 
@@ -42,7 +49,9 @@ class Served:
     def __init__(self, root: Path, **settings: Any) -> None:
         app = station_app(StationSettings(root, **settings))
         self.station = app.state.station
-        config = uvicorn.Config(app, "127.0.0.1", 0, log_level="error", ws="websockets-sansio", ws_max_size=16_000_000)
+        config = uvicorn.Config(
+            app, "127.0.0.1", 0, log_level="error", ws="websockets-sansio", ws_max_size=16_000_000
+        )
         self.server = uvicorn.Server(config)
         self._thread = threading.Thread(target=self.server.run, daemon=True)
 
@@ -57,7 +66,9 @@ class Served:
     def ask(self, path: str, method: str = "GET", body: object = None) -> Any:
         """The JSON that the station answers to somebody else's program. Raises HTTPError."""
         data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(self.url + path, data, {"content-type": "application/json"}, method=method)
+        request = urllib.request.Request(
+            self.url + path, data, {"content-type": "application/json"}, method=method
+        )
         with urllib.request.urlopen(request) as answer:
             return json.load(answer)
 
@@ -95,7 +106,9 @@ class Watched:
             self.faults.append(f"{message.type}: {message.text} {message.location.get('url', '')}")
 
     def _asked(self, request: Any) -> None:
-        if not request.url.startswith((self._url, "blob:", "data:", self._url.replace("http", "ws"))):
+        if not request.url.startswith(
+            (self._url, "blob:", "data:", self._url.replace("http", "ws"))
+        ):
             self.faults.append(f"asked a third party: {request.url}")
 
     def _answered(self, response: Any) -> None:

@@ -39,7 +39,9 @@ def root(made_site: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def client(root: Path) -> Iterator[TestClient]:
     """A browser on the station's own machine."""
-    with TestClient(station_app(StationSettings(root)), base_url=HOST, client=("127.0.0.1", 5000)) as client:
+    with TestClient(
+        station_app(StationSettings(root)), base_url=HOST, client=("127.0.0.1", 5000)
+    ) as client:
         yield client
 
 
@@ -48,5 +50,7 @@ def reader(made_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     """A browser at a station that all tests of a module share: for requests that change nothing there."""
     root = tmp_path_factory.mktemp("shared") / "maps"
     shutil.copytree(made_site, root / "field")
-    with TestClient(station_app(StationSettings(root)), base_url=HOST, client=("127.0.0.1", 5000)) as client:
+    with TestClient(
+        station_app(StationSettings(root)), base_url=HOST, client=("127.0.0.1", 5000)
+    ) as client:
         yield client

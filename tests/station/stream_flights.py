@@ -54,13 +54,22 @@ def write_video(
     with av.open(str(path), "w") as output:
         options = {"g": str(keyint), "bf": str(bframes), "preset": "ultrafast"}
         if codec == "libx265":
-            options = {"x265-params": f"keyint={keyint}:bframes={bframes}:log-level=none", "preset": "ultrafast"}
-        stream = output.add_stream(codec, rate=RATE, options=options if codec.startswith("libx") else {})
-        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuvj420p" if codec == "mjpeg" else "yuv420p"
+            options = {
+                "x265-params": f"keyint={keyint}:bframes={bframes}:log-level=none",
+                "preset": "ultrafast",
+            }
+        stream = output.add_stream(
+            codec, rate=RATE, options=options if codec.startswith("libx") else {}
+        )
+        stream.width, stream.height, stream.pix_fmt = (
+            160,
+            120,
+            "yuvj420p" if codec == "mjpeg" else "yuv420p",
+        )
         stream.time_base = Fraction(1, RATE)
         for number in range(round(seconds * RATE)):
             picture = np.full((120, 160, 3), min(250, 40 + 4 * number), np.uint8)
-            picture[40:80, (5 * number) % 120: (5 * number) % 120 + 30] = 255
+            picture[40:80, (5 * number) % 120 : (5 * number) % 120 + 30] = 255
             for packet in stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")):
                 output.mux(packet)
         for packet in stream.encode(None):
@@ -70,9 +79,13 @@ def write_video(
 
 def write_track(path: Path, *, seconds: float = 3.0) -> Path:
     """Telemetry twice a second beside a video: a flight north at 5 m/s, 40 m above take-off."""
-    rows = ["time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(meters),compass_heading(degrees)"]
+    rows = [
+        "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(meters),compass_heading(degrees)"
+    ]
     for step in range(round(2 * seconds) + 1):
         second = step / 2
-        rows.append(f"{500 * step},2024-05-01 10:00:{int(second):02d},{45 + second * 4.5e-5:.7f},9.0,40.0,0.0")
+        rows.append(
+            f"{500 * step},2024-05-01 10:00:{int(second):02d},{45 + second * 4.5e-5:.7f},9.0,40.0,0.0"
+        )
     path.write_text("\n".join(rows) + "\n")
     return path

@@ -32,7 +32,12 @@ class StreamServer:
     """Runs in a thread; `kill` cuts all links as a crash does, and `start` begins anew at the same port."""
 
     def __init__(
-        self, folder: Path, *, limits: IngestLimits = _LIMITS, pause_s: float = 0.0, tls: ssl.SSLContext | None = None
+        self,
+        folder: Path,
+        *,
+        limits: IngestLimits = _LIMITS,
+        pause_s: float = 0.0,
+        tls: ssl.SSLContext | None = None,
     ) -> None:
         self.folder, self._limits, self._pause_s, self._tls = folder, limits, pause_s, tls
         self.port = 0
@@ -71,7 +76,9 @@ class StreamServer:
         self._loop.close()
 
     async def _serve(self, ready: threading.Event) -> None:
-        self.ingest = Ingest(self.folder, self._limits, lambda stream, state: self.states.append((stream, state)))
+        self.ingest = Ingest(
+            self.folder, self._limits, lambda stream, state: self.states.append((stream, state))
+        )
 
         async def talk(socket: Any) -> None:
             self._sockets.add(socket)

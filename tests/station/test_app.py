@@ -30,7 +30,9 @@ def tile_of(longitude_deg: float, latitude_deg: float, z: int) -> str:
 
 def pixels(data: bytes) -> np.ndarray:
     """RGBA of an encoded tile."""
-    return cv2.cvtColor(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA)
+    return cv2.cvtColor(
+        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA
+    )
 
 
 def test_status_and_sites(client: TestClient) -> None:
@@ -44,8 +46,11 @@ def test_status_and_sites(client: TestClient) -> None:
     assert abs(site["center_wgs84"][0] - SITE.origin.longitude_deg) < 0.01
     detail = client.get(FIELD).json()
     assert [(each["n"], each["flight"]) for each in detail["versions"]] == [(1, "a"), (2, "b")]
-    assert [(each["id"], each["kind"], each["matched"], each["rejected"]) for each in detail["flights"]] == [
-        ("a", "map", 4, 1), ("b", "compare", 4, 1),
+    assert [
+        (each["id"], each["kind"], each["matched"], each["rejected"]) for each in detail["flights"]
+    ] == [
+        ("a", "map", 4, 1),
+        ("b", "compare", 4, 1),
     ]
 
 
@@ -75,7 +80,9 @@ def test_tiles_show_the_map_where_it_lies(client: TestClient, root: Path) -> Non
         x = (longitude + 180) / 360 * n % 1 * 256
         y = (1 - np.arcsinh(np.tan(np.radians(latitude))) / np.pi) / 2 * n % 1 * 256
         shown = pixels(answer.content)[int(y), int(x)].astype(int)
-        step = 4 if z == 19 else 2  # grid pixels a tile's pixel covers: the gradient runs half a level a grid pixel
+        step = (
+            4 if z == 19 else 2
+        )  # grid pixels a tile's pixel covers: the gradient runs half a level a grid pixel
         assert np.abs(shown - [*source[200, 300, :3], 255]).max() <= step, (z, shown)
 
 
@@ -96,7 +103,10 @@ def test_the_growing_map_is_shown_while_a_flight_is_mapped(client: TestClient, r
     before = client.get(FIELD).json()["live_revision"]
     place = tile_of(*client.get(FIELD).json()["center_wgs84"], 20)
     shown = client.get(f"{FIELD}/tiles/live-{before}/{place}.webp").content
-    with Archive.open(root / "field", write=True) as archive, archive.begin_flight("c", "c", {}) as writer:
+    with (
+        Archive.open(root / "field", write=True) as archive,
+        archive.begin_flight("c", "c", {}) as writer,
+    ):
         for column in (-1, 0, 1, 2):
             writer.tiles[column, 0] = np.full((512, 512, 4), 255, np.uint8)
         writer.flush()
@@ -106,18 +116,29 @@ def test_the_growing_map_is_shown_while_a_flight_is_mapped(client: TestClient, r
         assert client.get(f"{FIELD}/tiles/2/{place}.webp").content == shown
 
 
-@pytest.mark.parametrize("path", [
-    "tiles/2/20/0/0.webp", "tiles/2/3/4/2.webp", "tiles/live/20/5/5.png",
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "tiles/2/20/0/0.webp",
+        "tiles/2/3/4/2.webp",
+        "tiles/live/20/5/5.png",
+    ],
+)
 def test_where_the_map_is_not_there_is_no_tile(reader: TestClient, path: str) -> None:
     """The other side of the Earth, and far out, have no picture; that is no error."""
     assert reader.get(f"{FIELD}/{path}").status_code == 204
 
 
-@pytest.mark.parametrize("path", [
-    "/api/sites/nowhere", f"{FIELD}/tiles/9/20/1/1.webp", f"{FIELD}/tiles/2/40/1/1.webp", f"{FIELD}/tiles/x/2/1/1.webp",
-    "/api/nothing",
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/api/sites/nowhere",
+        f"{FIELD}/tiles/9/20/1/1.webp",
+        f"{FIELD}/tiles/2/40/1/1.webp",
+        f"{FIELD}/tiles/x/2/1/1.webp",
+        "/api/nothing",
+    ],
+)
 def test_problems_are_documents(reader: TestClient, path: str) -> None:
     """RFC 9457: title, status, detail."""
     answer = reader.get(path)
@@ -173,13 +194,18 @@ def test_a_small_map_is_shown_from_afar_without_gathering_the_country(tmp_path: 
         tracemalloc.stop()
 
 
-def test_an_error_of_the_station_is_answered_in_words(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_station_is_answered_in_words(
+    root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As a problem document, without what is inside."""
     app = station_app(StationSettings(root))
     with TestClient(app, base_url="http://localhost:8750", raise_server_exceptions=False) as client:
         monkeypatch.setattr(app.state.station.shelf, "open", lambda _: 1 / 0)
         answer = client.get(FIELD)
-        assert answer.status_code == 500 and answer.headers["content-type"] == "application/problem+json"
+        assert (
+            answer.status_code == 500
+            and answer.headers["content-type"] == "application/problem+json"
+        )
         assert "ZeroDivisionError" in answer.json()["detail"] and "division by" not in answer.text
 
 

@@ -72,7 +72,10 @@ def own_processes(station: Served, run: str) -> list[tuple[int, bytes]]:
     found = []
     for each in Path("/proc").glob("[0-9]*"):
         try:
-            if os.getsid(int(each.name)) == leader and (each / "stat").read_text().rpartition(")")[2].split()[0] != "Z":
+            if (
+                os.getsid(int(each.name)) == leader
+                and (each / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+            ):
                 found.append((int(each.name), (each / "cmdline").read_bytes()))
         except OSError:
             continue
@@ -94,21 +97,32 @@ async def viewed(station: Served, stream: str) -> tuple[list[int], dict[str, Any
                 pictures.append(int.from_bytes(item[:8], "big"))
                 continue
             words = json.loads(item)
-            if boxes is None and words["type"] == "boxes" and pictures and words["pts_us"] > pictures[0] - HALF_US:
+            if (
+                boxes is None
+                and words["type"] == "boxes"
+                and pictures
+                and words["pts_us"] > pictures[0] - HALF_US
+            ):
                 boxes = words
         return pictures, boxes
 
 
-def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(camera: RtspServer, tmp_path: Path) -> None:
+def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(
+    camera: RtspServer, tmp_path: Path
+) -> None:
     """Its password is in no file and no command line; a broken connection is one flight; a stop keeps it."""
     with Served(tmp_path, free_floor_gb=0.0, stream_ranges=LOOPBACK) as station:
         run = watched(station, camera.address.replace("//", f"//ada:{SECRET}@"))
         wait_for(lambda: is_seen(station, run), 60)
         (stream,) = station.ask("/api/streams")
         assert stream["stream"].startswith("rtsp-127.0.0.1-") and stream["is_connected"]
-        played = camera.methods.count("PLAY")  # mostly once; a busy machine may need a second call to reach it
+        played = camera.methods.count(
+            "PLAY"
+        )  # mostly once; a busy machine may need a second call to reach it
         pictures, boxes = asyncio.run(viewed(station, stream["stream"]))
-        assert min(abs(boxes["pts_us"] - each) for each in pictures) < HALF_US  # nearer than the next
+        assert (
+            min(abs(boxes["pts_us"] - each) for each in pictures) < HALF_US
+        )  # nearer than the next
         assert camera.playing == 1 and camera.methods.count("PLAY") == played
         processes = own_processes(station, run)
         assert sum(b"sorvolo.station.camera" in line for _, line in processes) == 1
@@ -133,7 +147,10 @@ def test_a_camera_is_opened_once_and_seen_by_the_mission_and_by_browsers(camera:
         assert refused(station, f"/api/streams/{stream['stream']}/flights/nothing") == 404
         assert refused(station, f"/api/runs/{run}") == 0
         assert station.ask("/api/streams") == station.ask("/api/runs") == []
-    assert not list((tmp_path / "streams").iterdir()) and not (tmp_path / "station" / "runs" / run).exists()
+    assert (
+        not list((tmp_path / "streams").iterdir())
+        and not (tmp_path / "station" / "runs" / run).exists()
+    )
 
 
 def test_a_camera_outlives_a_restarted_station(tmp_path: Path) -> None:
@@ -170,7 +187,9 @@ def test_a_killed_mission_takes_its_camera_with_it(camera: RtspServer, tmp_path:
         assert not stream["is_connected"] and stream["flights"][0]["is_over"]
 
 
-def test_a_mission_whose_folder_is_taken_away_ends_with_its_camera(camera: RtspServer, tmp_path: Path) -> None:
+def test_a_mission_whose_folder_is_taken_away_ends_with_its_camera(
+    camera: RtspServer, tmp_path: Path
+) -> None:
     """It wrote into nothing until the machine was switched off: no next station would have found it."""
     with Served(tmp_path, free_floor_gb=0.0, stream_ranges=LOOPBACK) as station:
         run = watched(station, camera.address)
@@ -185,11 +204,15 @@ def test_a_mission_whose_folder_is_taken_away_ends_with_its_camera(camera: RtspS
 
 
 @pytest.mark.long
-def test_a_killed_camera_ends_the_flight_and_what_came_is_kept(camera: RtspServer, tmp_path: Path) -> None:
+def test_a_killed_camera_ends_the_flight_and_what_came_is_kept(
+    camera: RtspServer, tmp_path: Path
+) -> None:
     with Served(tmp_path, free_floor_gb=0.0, stream_ranges=LOOPBACK) as station:
         run = watched(station, camera.address)
         wait_for(lambda: is_seen(station, run), 60)
-        (reader,) = [pid for pid, line in own_processes(station, run) if b"sorvolo.station.camera" in line]
+        (reader,) = [
+            pid for pid, line in own_processes(station, run) if b"sorvolo.station.camera" in line
+        ]
         os.kill(reader, signal.SIGKILL)
         assert ended(station, run)["state"] == "finished"
 
@@ -201,16 +224,19 @@ def test_a_camera_that_refuses_the_password_fails_the_mission_in_words(tmp_path:
         done = ended(station, watched(station, camera.address.replace("//", f"//ada:{SECRET}@")))
     camera.close()
     assert done["state"] == "failed" and "password" in done["error"] and SECRET not in done["error"]
-    assert camera.methods.count("DESCRIBE") <= 2  # asked, and asked with the password: not again and again
+    assert (
+        camera.methods.count("DESCRIBE") <= 2
+    )  # asked, and asked with the password: not again and again
 
 
 @pytest.mark.long
 def test_pictures_that_no_browser_plays_are_read_by_the_mission_itself(tmp_path: Path) -> None:
     """No video then, and no failure: the watch sees its frames."""
     port = free_port()
-    with sending(udp_url(port), codec="mpeg2video"), Served(
-        tmp_path, free_floor_gb=0.0, stream_ranges=LOOPBACK
-    ) as station:
+    with (
+        sending(udp_url(port), codec="mpeg2video"),
+        Served(tmp_path, free_floor_gb=0.0, stream_ranges=LOOPBACK) as station,
+    ):
         run = watched(station, f"udp://:{port}")
         wait_for(lambda: is_seen(station, run, 2), 60)
         assert station.ask("/api/streams") == []

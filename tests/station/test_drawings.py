@@ -29,7 +29,9 @@ def test_drawings_are_kept_with_a_revision_and_announced(client: TestClient) -> 
     answer = client.put(URL, json={"revision": 0, "features": [zone("a")]})
     assert (answer.status_code, answer.json()["revision"]) == (200, 1)
     assert client.get(URL).json()["features"][0]["geometry"]["coordinates"][0][1] == [12.001, 41.0]
-    types = [each["type"] for each in events.after(before)]  # among others', such as of a site seen for the first time
+    types = [
+        each["type"] for each in events.after(before)
+    ]  # among others', such as of a site seen for the first time
     assert types.count("drawings.changed") == 1
 
 
@@ -48,27 +50,37 @@ def test_what_is_no_drawing_is_refused(client: TestClient) -> None:
     assert client.get("/api/sites/nowhere/drawings").status_code == 404
 
 
-def test_a_new_site_has_none_of_a_deleted_one_of_its_name(client: TestClient, root: Path, made_site: Path) -> None:
+def test_a_new_site_has_none_of_a_deleted_one_of_its_name(
+    client: TestClient, root: Path, made_site: Path
+) -> None:
     client.put(URL, json={"revision": 0, "features": [zone("old")]})
     shutil.rmtree(root / "field")
     time.sleep(0.01)
     with Archive.open(root / "field", write=True) as archive:
         archive.create_site(SITE)
-    wait_for(lambda: client.get(URL).status_code == 200)  # it may have been looked for while it was gone
+    wait_for(
+        lambda: client.get(URL).status_code == 200
+    )  # it may have been looked for while it was gone
     assert client.get(URL).json() == {"type": "FeatureCollection", "revision": 0, "features": []}
     assert client.put(URL, json={"revision": 0, "features": [zone("new")]}).json()["revision"] == 1
     shutil.rmtree(root / "field")
-    shutil.copytree(made_site, root / "field")  # the first site is back, and what was drawn since is not of it
+    shutil.copytree(
+        made_site, root / "field"
+    )  # the first site is back, and what was drawn since is not of it
     wait_for(lambda: client.get(URL).status_code == 200)
     assert client.get(URL).json()["features"] == []
 
 
-def test_drawings_of_an_earlier_station_stay_with_the_site_that_was_there(client: TestClient, root: Path) -> None:
+def test_drawings_of_an_earlier_station_stay_with_the_site_that_was_there(
+    client: TestClient, root: Path
+) -> None:
     client.put(URL, json={"revision": 0, "features": [zone("a")]})
     (path,) = (root / "station" / "drawings").iterdir()
     kept = json.loads(path.read_bytes())
     del kept["made_utc"]
     path.write_text(json.dumps(kept))
     assert [each["id"] for each in client.get(URL).json()["features"]] == ["a"]
-    os.utime(path, (1_000_000_000, 1_000_000_000))  # before the site was made: of one that had its name
+    os.utime(
+        path, (1_000_000_000, 1_000_000_000)
+    )  # before the site was made: of one that had its name
     assert client.get(URL).json()["features"] == []

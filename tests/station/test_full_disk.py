@@ -33,9 +33,13 @@ def disk(tmp_path: Path) -> Iterator[Path]:
     """A file system of 150 MB."""
     place = tmp_path / "disk"
     place.mkdir()
-    mounted = shutil.which("mount") and not subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(place)], capture_output=True
-    ).returncode
+    mounted = (
+        shutil.which("mount")
+        and not subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(place)],
+            capture_output=True,
+        ).returncode
+    )
     if not mounted:
         pytest.skip("this user may not mount a small file system")
     yield place
@@ -62,12 +66,18 @@ class Drone:
 
     def __init__(self, flown: Path, station: Served, spool: Path) -> None:
         footage = open_footage(
-            str(flown / "flight1" / "flight1.mp4"), None, str(flown / "camera.xml"), LiveSettings(), threading.Event()
+            str(flown / "flight1" / "flight1.mp4"),
+            None,
+            str(flown / "camera.xml"),
+            LiveSettings(),
+            threading.Event(),
         )
         self._held, self.stop = HeldFootage(footage, before=32), threading.Event()
         url = stream_url(station.url, "scout")
         settings = StreamSettings(speed=4.0, flush_s=0.5)
-        self.client = StreamClient(self._held, Spool(spool, 50_000_000), url, "", settings, self.stop)
+        self.client = StreamClient(
+            self._held, Spool(spool, 50_000_000), url, "", settings, self.stop
+        )
         self.thread = threading.Thread(target=self.client.run, daemon=True)
         self.thread.start()
         wait_for(lambda: self.client.report.frames >= 24)
@@ -77,7 +87,12 @@ class Drone:
 
 
 def mapped(station: Served, source: dict[str, str], **options: Any) -> str:
-    wish = {"mission": "map", "site": "new", "input": source, "options": {"model": "none", **options}}
+    wish = {
+        "mission": "map",
+        "site": "new",
+        "input": source,
+        "options": {"model": "none", **options},
+    }
     return str(station.ask("/api/runs", "POST", wish)["id"])
 
 
@@ -87,7 +102,9 @@ def has_frames(station: Served, run: str) -> bool:
     return bool(found["progress"])
 
 
-def test_a_flight_waits_for_a_full_disk_and_goes_on(flown: Path, disk: Path, tmp_path: Path) -> None:
+def test_a_flight_waits_for_a_full_disk_and_goes_on(
+    flown: Path, disk: Path, tmp_path: Path
+) -> None:
     """The run states why nothing moves, the drone keeps its pictures; with room again nothing is missing."""
     with Served(disk, free_floor_gb=FLOOR_GB) as station:
         drone = Drone(flown, station, tmp_path / "spool")
@@ -95,13 +112,19 @@ def test_a_flight_waits_for_a_full_disk_and_goes_on(flown: Path, disk: Path, tmp
         wait_for(lambda: has_frames(station, run))
         filler = fill(disk, 20_000_000)
         wait_for(lambda: state(station, run)["notice"])
-        assert "disk is full (0.02 GB are free, and 0.03 GB must stay so)" in state(station, run)["notice"]
+        assert (
+            "disk is full (0.02 GB are free, and 0.03 GB must stay so)"
+            in state(station, run)["notice"]
+        )
         drone.goes_on()
         wait_for(lambda: "disk is full" in drone.client.report.words)
         filler.unlink()
         wait_for(lambda: state(station, run)["notice"] is None)
         drone.thread.join(60)
-        assert drone.client.is_complete and drone.client.report.late == drone.client.report.overflowed == 0
+        assert (
+            drone.client.is_complete
+            and drone.client.report.late == drone.client.report.overflowed == 0
+        )
         done = ended(station, run)
         assert (done["state"], done["exit_code"], done["notice"]) == ("finished", 0, None)
 
@@ -125,7 +148,12 @@ def test_a_flight_that_a_full_disk_cut_is_kept_and_called_incomplete(
         if way == "stopped":
             station.ask(f"/api/runs/{run}/stop", "POST")
         done = ended(station, run)
-        assert (done["state"], done["exit_code"], done["error"], done["notice"]) == ("incomplete", 3, None, None)
+        assert (done["state"], done["exit_code"], done["error"], done["notice"]) == (
+            "incomplete",
+            3,
+            None,
+            None,
+        )
         assert done["headline"].startswith("incomplete: the station's disk is full (0.0")
         assert ("nothing came for 6 s" in done["headline"]) == (way == "given up")
         assert "matched" in done["headline"]
@@ -151,9 +179,15 @@ def test_a_camera_whose_station_has_no_room_ends_incomplete(disk: Path) -> None:
             station.ask(f"/api/runs/{run}/stop", "POST")
             done = ended(station, run)
             assert (done["state"], done["exit_code"]) == ("incomplete", 3)
-            assert "disk is full" in done["headline"] and "of the camera did not get to the station" in done["headline"]
+            assert (
+                "disk is full" in done["headline"]
+                and "of the camera did not get to the station" in done["headline"]
+            )
             text = station.read("/metrics")
-            assert 'sorvolo_missions{state="incomplete"} 1.0' in text and "sorvolo_disk_floor_bytes 3e+07" in text
+            assert (
+                'sorvolo_missions{state="incomplete"} 1.0' in text
+                and "sorvolo_disk_floor_bytes 3e+07" in text
+            )
     finally:
         camera.close()
 
@@ -163,11 +197,15 @@ def test_an_upload_s_mission_on_a_full_disk_fails_in_words(flown: Path, disk: Pa
     """It is warned of before; the site is as it was, and the station goes on."""
     shutil.copytree(flown, disk / "flown")
     with Served(disk, free_floor_gb=FLOOR_GB) as station:
-        (video,) = [each["id"] for each in station.ask("/api/inputs") if each["name"].endswith(".mp4")]
+        (video,) = [
+            each["id"] for each in station.ask("/api/inputs") if each["name"].endswith(".mp4")
+        ]
         first = mapped(station, {"input": video})
         assert ended(station, first)["state"] == "finished"
         before = station.ask("/api/sites/new")
-        run = mapped(station, {"input": video}, overlap=0.97)  # needs more than the station holds back
+        run = mapped(
+            station, {"input": video}, overlap=0.97
+        )  # needs more than the station holds back
         fill(disk, 0)
         done = ended(station, run)
         assert done["state"] == "failed" and done["exit_code"] == 1, done

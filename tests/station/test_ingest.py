@@ -12,7 +12,9 @@ from sorvolo.station.ingest import BUSY_CODE, REFUSED_CODE, Ingest, IngestLimits
 from sorvolo.station.messages import Hello, Kind, Message, Sample
 from sorvolo.station.video import VideoHub
 
-HELLO = Message(Kind.HELLO, 0, 0, Hello("a" * 16, "h264", 160, 120, 10.0).to_json().encode()).to_bytes()
+HELLO = Message(
+    Kind.HELLO, 0, 0, Hello("a" * 16, "h264", 160, 120, 10.0).to_json().encode()
+).to_bytes()
 KEY = b"\x00\x00\x00\x01\x67\x42\x00\x0a\x00\x00\x00\x01\x68\xce\x00\x00\x01\x65\x88\x84"
 
 
@@ -37,8 +39,13 @@ class Drone:
         self.closed = self.closed or (code, reason)
 
 
-def served(folder: Path, *messages: bytes, stream: str = "drone", limits: IngestLimits | None = None,
-           waits: bool = False) -> Drone:
+def served(
+    folder: Path,
+    *messages: bytes,
+    stream: str = "drone",
+    limits: IngestLimits | None = None,
+    waits: bool = False,
+) -> Drone:
     drone = Drone(*messages, waits=waits)
     ingest = Ingest(folder, limits or IngestLimits(free_bytes=0, message_bytes=2000, silent_s=0.1))
     asyncio.run(ingest.serve(stream, drone))
@@ -49,31 +56,48 @@ def picture(seq: int = 1, pts_us: int = 0, payload: bytes = KEY) -> bytes:
     return Message(Kind.VIDEO, seq, pts_us, payload, is_key=True).to_bytes()
 
 
-@pytest.mark.parametrize(("messages", "words"), [
-    ([b""], "26 at least"), ([picture()], "the first message must be a hello"),
-    ([HELLO.replace(b"h264", b"vp80")], "h264 or hevc"), ([HELLO[:40]], "no JSON"),
-    ([HELLO, HELLO], "in the middle of a flight"), ([HELLO, b"?" * 40], "unknown kind"),
-    ([HELLO, picture(payload=b"GIF89a")], "none: it has no pictures"),
-    ([HELLO, picture(payload=KEY[8:])], "no parameter sets"),
-    ([HELLO, picture(payload=KEY + bytes(2000))], "2,000 at most"),
-    ([HELLO, picture(pts_us=-1)], "at the time -1 us"), ([HELLO, picture(pts_us=2**60)], "at the time"),
-    ([HELLO, Message(Kind.TELEMETRY, 1, 0, b"[]").to_bytes()], "no JSON object"),
-])
-def test_what_cannot_be_is_refused_for_good_and_in_words(tmp_path: Path, messages: list[bytes], words: str) -> None:
+@pytest.mark.parametrize(
+    ("messages", "words"),
+    [
+        ([b""], "26 at least"),
+        ([picture()], "the first message must be a hello"),
+        ([HELLO.replace(b"h264", b"vp80")], "h264 or hevc"),
+        ([HELLO[:40]], "no JSON"),
+        ([HELLO, HELLO], "in the middle of a flight"),
+        ([HELLO, b"?" * 40], "unknown kind"),
+        ([HELLO, picture(payload=b"GIF89a")], "none: it has no pictures"),
+        ([HELLO, picture(payload=KEY[8:])], "no parameter sets"),
+        ([HELLO, picture(payload=KEY + bytes(2000))], "2,000 at most"),
+        ([HELLO, picture(pts_us=-1)], "at the time -1 us"),
+        ([HELLO, picture(pts_us=2**60)], "at the time"),
+        ([HELLO, Message(Kind.TELEMETRY, 1, 0, b"[]").to_bytes()], "no JSON object"),
+    ],
+)
+def test_what_cannot_be_is_refused_for_good_and_in_words(
+    tmp_path: Path, messages: list[bytes], words: str
+) -> None:
     drone = served(tmp_path / "streams", *messages)
-    assert drone.closed is not None and drone.closed[0] == REFUSED_CODE and words in drone.closed[1], drone.closed
+    assert (
+        drone.closed is not None and drone.closed[0] == REFUSED_CODE and words in drone.closed[1]
+    ), drone.closed
 
 
 def test_what_may_pass_later_is_not_refused_for_good(tmp_path: Path) -> None:
     drone = served(tmp_path / "streams", HELLO, waits=True)
     assert drone.closed == (BUSY_CODE, "nothing came for 0 s")
     drone = served(tmp_path / "streams", HELLO, limits=IngestLimits(free_bytes=10**18))
-    assert drone.closed is not None and drone.closed[0] == BUSY_CODE and "disk is full" in drone.closed[1]
+    assert (
+        drone.closed is not None
+        and drone.closed[0] == BUSY_CODE
+        and "disk is full" in drone.closed[1]
+    )
     drone = served(tmp_path / "streams", HELLO, limits=IngestLimits(streams=0, free_bytes=0))
     assert drone.closed is not None and drone.closed[0] == BUSY_CODE
 
 
-def test_a_stream_that_falls_silent_after_its_hello_is_free_for_the_drone_s_next_link(tmp_path: Path) -> None:
+def test_a_stream_that_falls_silent_after_its_hello_is_free_for_the_drone_s_next_link(
+    tmp_path: Path,
+) -> None:
     """It is listed as not connected, its flight is not over, and goes on."""
     states: list[bool] = []
     limits = IngestLimits(free_bytes=0, silent_s=0.05)
@@ -102,20 +126,30 @@ def test_a_stream_of_many_flights_states_its_newest(tmp_path: Path) -> None:
     ingest = Ingest(tmp_path, IngestLimits(free_bytes=0))
     state = ingest.state("drone")
     assert state["flight_count"] == 25 and len(state["flights"]) == 10
-    assert state["flights"][-1] == {"flight": f"20260101T000024Z_{24:016x}", "bytes": 5, "is_over": False}
+    assert state["flights"][-1] == {
+        "flight": f"20260101T000024Z_{24:016x}",
+        "bytes": 5,
+        "is_over": False,
+    }
     newest = ingest.newest("drone")
     assert newest is not None and newest.stem == state["flights"][-1]["flight"]
     assert ingest.kept_bytes("drone") == 125
 
 
-@pytest.mark.parametrize(("seconds", "is_known"), [(0, True), (-50, True), (-3600, False), (3600, False)])
-def test_the_delay_of_pictures_is_stated_where_the_clocks_agree(tmp_path: Path, seconds: int, is_known: bool) -> None:
+@pytest.mark.parametrize(
+    ("seconds", "is_known"), [(0, True), (-50, True), (-3600, False), (3600, False)]
+)
+def test_the_delay_of_pictures_is_stated_where_the_clocks_agree(
+    tmp_path: Path, seconds: int, is_known: bool
+) -> None:
     """Clocks apart, or a recorded flight: no page is given the flight's zero to count from."""
     ingest = Ingest(tmp_path, IngestLimits(free_bytes=0))
     sample = Sample(time.time_ns() + seconds * 1_000_000_000, {"latitude_deg": 46.0})
     stated = Message(Kind.TELEMETRY, 1, 2_000_000, sample.to_json().encode()).to_bytes()
     asyncio.run(ingest.serve("drone", Drone(HELLO, stated)))
-    assert ingest.hub("drone").epoch_us == (sample.time_ns // 1000 - 2_000_000 if is_known else None)
+    assert ingest.hub("drone").epoch_us == (
+        sample.time_ns // 1000 - 2_000_000 if is_known else None
+    )
 
 
 def test_names_that_were_asked_for_once_are_forgotten(tmp_path: Path) -> None:
@@ -130,21 +164,35 @@ def test_names_that_were_asked_for_once_are_forgotten(tmp_path: Path) -> None:
 
 def test_a_flight_comes_back_with_its_own_pictures_alone(tmp_path: Path) -> None:
     served(tmp_path / "streams", HELLO, picture())
-    other = Message(Kind.HELLO, 0, 0, Hello("a" * 16, "hevc", 160, 120).to_json().encode()).to_bytes()
+    other = Message(
+        Kind.HELLO, 0, 0, Hello("a" * 16, "hevc", 160, 120).to_json().encode()
+    ).to_bytes()
     drone = served(tmp_path / "streams", other)
     assert drone.closed is not None and "this flight is h264, and now hevc comes" in drone.closed[1]
     assert len(list((tmp_path / "streams" / "drone").glob("*.ts"))) == 1
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.one_of(
-    st.binary(max_size=60),
-    st.builds(
-        lambda kind, seq, pts, payload, key: Message(kind, seq, pts, payload, key).to_bytes(),
-        st.sampled_from([Kind.VIDEO, Kind.TELEMETRY]), st.integers(0, 9), st.integers(-5, 10**7),
-        st.one_of(st.binary(max_size=30), st.just(KEY), st.just(b'{"time_ns": 5}')), st.booleans(),
-    ),
-), max_size=6))
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.lists(
+        st.one_of(
+            st.binary(max_size=60),
+            st.builds(
+                lambda kind, seq, pts, payload, key: Message(
+                    kind, seq, pts, payload, key
+                ).to_bytes(),
+                st.sampled_from([Kind.VIDEO, Kind.TELEMETRY]),
+                st.integers(0, 9),
+                st.integers(-5, 10**7),
+                st.one_of(st.binary(max_size=30), st.just(KEY), st.just(b'{"time_ns": 5}')),
+                st.booleans(),
+            ),
+        ),
+        max_size=6,
+    )
+)
 def test_no_bytes_break_the_station(tmp_path: Path, messages: list[bytes]) -> None:
     """Whatever comes is taken or refused; the file stays whole and the numbers in it increase."""
     drone = served(tmp_path / "streams", HELLO, *messages)
@@ -153,10 +201,14 @@ def test_no_bytes_break_the_station(tmp_path: Path, messages: list[bytes]) -> No
     assert path.stat().st_size % 188 == 0
 
 
-def test_parameter_sets_that_ffmpeg_does_not_take_leave_the_other_viewers_their_pictures(tmp_path: Path) -> None:
+def test_parameter_sets_that_ffmpeg_does_not_take_leave_the_other_viewers_their_pictures(
+    tmp_path: Path,
+) -> None:
     """Fragments need a header made of them, access units do not."""
     hub = VideoHub()
     hub.begin(Hello("a" * 16, "h264", 160, 120, 10.0))
     pages = hub.join("annexb"), hub.join("fmp4")
     hub.show(Message(Kind.VIDEO, 1, 0, KEY, is_key=True))
-    assert [len([each for each in iter(page.take, None) if isinstance(each, bytes)]) for page in pages] == [1, 0]
+    assert [
+        len([each for each in iter(page.take, None) if isinstance(each, bytes)]) for page in pages
+    ] == [1, 0]

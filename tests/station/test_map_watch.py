@@ -53,7 +53,9 @@ def test_a_site_deleted_before_the_first_look_is_announced(
     station: Station, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A page may have listed it by then."""
-    monkeypatch.setattr(map_watch, "_LOOK_EVERY_S", 60.0)  # the station's own thread does not look: the test does
+    monkeypatch.setattr(
+        map_watch, "_LOOK_EVERY_S", 60.0
+    )  # the station's own thread does not look: the test does
     station.map_watch.start()
     shutil.rmtree(root / "field")
     station.shelf.forget("field")

@@ -27,7 +27,12 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-CHECKS = [not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance]
+CHECKS = [
+    not_a_server_error,
+    status_code_conformance,
+    content_type_conformance,
+    response_schema_conformance,
+]
 
 _ENDLESS = "/api/events"  # Server-Sent Events go on for ever
 
@@ -63,7 +68,9 @@ def test_whatever_is_sent_by_the_description_is_answered_as_described(api) -> No
         if operation.path == _ENDLESS:
             continue
         _ask(client, operation, GenerationMode.POSITIVE, asked)
-        if len(operation.query) or len(operation.body) or len(operation.headers):  # a name in a path cannot be wrong
+        if (
+            len(operation.query) or len(operation.body) or len(operation.headers)
+        ):  # a name in a path cannot be wrong
             _ask(client, operation, GenerationMode.NEGATIVE, asked)
     assert len(asked) > 30 and sum(asked.values()) > 60
 
@@ -72,18 +79,32 @@ def _ask(client: TestClient, operation: Any, mode: GenerationMode, asked: Counte
     """Some requests of one operation; raises what schemathesis finds wrong with an answer."""
 
     @settings(
-        max_examples=2, deadline=None, database=None, derandomize=True, phases=[Phase.generate],
+        max_examples=2,
+        deadline=None,
+        database=None,
+        derandomize=True,
+        phases=[Phase.generate],
         suppress_health_check=list(HealthCheck),
     )
     @given(operation.as_strategy(generation_mode=mode))
     def ask(case: Any) -> None:
         body = {}
         if case.body is not NOT_SET:
-            body["content"] = case.body if isinstance(case.body, bytes) else json.dumps(case.body, default=str).encode()
-        headers = {name: text for name, text in (case.headers or {}).items() if _can_be_sent(name, text)}
+            body["content"] = (
+                case.body
+                if isinstance(case.body, bytes)
+                else json.dumps(case.body, default=str).encode()
+            )
+        headers = {
+            name: text for name, text in (case.headers or {}).items() if _can_be_sent(name, text)
+        }
         kind = {"content-type": case.media_type} if body and case.media_type else {}
         answer = client.request(
-            case.method, case.formatted_path, params=dict(case.query or {}), headers={**kind, **headers}, **body
+            case.method,
+            case.formatted_path,
+            params=dict(case.query or {}),
+            headers={**kind, **headers},
+            **body,
         )
         asked[operation.label] += 1
         case.validate_response(answer, checks=CHECKS)
@@ -94,4 +115,8 @@ def _ask(client: TestClient, operation: Any, mode: GenerationMode, asked: Counte
 
 def _can_be_sent(name: str, text: Any) -> bool:
     """Whether a client can put this into a header at all."""
-    return str(text).isascii() and str(text).isprintable() and name.lower() not in ("host", "cookie", "authorization")
+    return (
+        str(text).isascii()
+        and str(text).isprintable()
+        and name.lower() not in ("host", "cookie", "authorization")
+    )

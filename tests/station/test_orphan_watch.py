@@ -26,7 +26,18 @@ def folder(tmp_path: Path) -> Path:
     found = tmp_path / "station" / "runs" / RUN
     found.mkdir(parents=True)
     options = MissionOptions(model="none").model_dump(mode="json")
-    Order(RUN, "map", "new", str(tmp_path / "new"), f"follow:{tmp_path}", "", "", str(found), "", options).write(found)
+    Order(
+        RUN,
+        "map",
+        "new",
+        str(tmp_path / "new"),
+        f"follow:{tmp_path}",
+        "",
+        "",
+        str(found),
+        "",
+        options,
+    ).write(found)
     with closing(StationState.open(tmp_path / "station")) as state, state.changing() as connection:
         connection.execute(
             "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, '', 'new', 'map', 'running', ?)",
@@ -73,7 +84,9 @@ def test_a_process_without_a_record_states_why_it_ended(folder: Path) -> None:
     forget(folder)
     with (folder / "log.txt").open("wb") as log:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sorvolo.station.worker", str(folder)], stderr=log, start_new_session=True
+            [sys.executable, "-m", "sorvolo.station.worker", str(folder)],
+            stderr=log,
+            start_new_session=True,
         )
     try:
         wait_for(lambda: process.poll() is not None, 40)

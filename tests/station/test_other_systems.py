@@ -33,7 +33,8 @@ def metrics(client: TestClient) -> dict[tuple[str, tuple[tuple[str, str], ...]],
     text = client.get("/metrics").text
     return {
         (sample.name, tuple(sorted(sample.labels.items()))): sample.value
-        for family in text_string_to_metric_families(text) for sample in family.samples
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
     }
 
 
@@ -49,7 +50,13 @@ def test_metrics_count_requests_streams_and_what_is_refused(client: TestClient) 
         assert found["sorvolo_stream_connected", (("stream", "scout"),)] == 1
     site = (("method", "GET"), ("route", "/api/sites/{site}"), ("status", "200"))
     assert found["sorvolo_http_requests_total", site] == 2
-    assert found["sorvolo_http_requests_total", (("method", "GET"), ("route", "refused"), ("status", "421"))] == 1
+    assert (
+        found[
+            "sorvolo_http_requests_total",
+            (("method", "GET"), ("route", "refused"), ("status", "421")),
+        ]
+        == 1
+    )
     assert found["sorvolo_http_request_seconds_count", (("route", "/api/sites/{site}"),)] == 3
     assert found["sorvolo_disk_free_bytes", ()] > 0 and found["sorvolo_events_total", ()] >= 1
 
@@ -70,14 +77,19 @@ def test_logs_are_json_without_queries_and_tokens(client: TestClient) -> None:
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)
     try:
-        client.get("/api/sites/field?place=45.1234567,9.2", headers={"Authorization": "Bearer hidden"})
+        client.get(
+            "/api/sites/field?place=45.1234567,9.2", headers={"Authorization": "Bearer hidden"}
+        )
         logger.error("fell over", exc_info=ValueError("why"))
     finally:
         logger.removeHandler(handler)
         logger.setLevel(logging.NOTSET)
     request, fault = map(json.loads, stream.getvalue().splitlines())
     assert (request["path"], request["status"], request["method"], request["who"]) == (
-        "/api/sites/field", 200, "GET", "this machine",
+        "/api/sites/field",
+        200,
+        "GET",
+        "this machine",
     )
     assert request["time"].endswith("Z") and request["ms"] > 0 and request["level"] == "info"
     assert "45.1234567" not in stream.getvalue() and "hidden" not in stream.getvalue()
@@ -90,25 +102,47 @@ def test_a_field_of_view_from_telemetry_and_from_a_footprint() -> None:
     east_m = 111_320 * math.cos(math.radians(45))
     corners = [(1, 1), (1, -1), (-1, -1), (-1, 1)]  # the top left one lies in the north-east
     outline = [[9 + x * half_m[1] / east_m, 45 + y * half_m[0] / 111_320] for x, y in corners]
-    view = view_of_frame({
-        "position": [9.0, 45.0], "height_m": 100.0, "heading_deg": 90.0, "pitch_deg": -90.0,
-        "footprint": [*outline, outline[0]],
-    })
+    view = view_of_frame(
+        {
+            "position": [9.0, 45.0],
+            "height_m": 100.0,
+            "heading_deg": 90.0,
+            "pitch_deg": -90.0,
+            "footprint": [*outline, outline[0]],
+        }
+    )
     assert view is not None
     assert (view.across_deg, view.down_deg, view.range_m) == pytest.approx((60, 40, 100), rel=1e-6)
     view = view_of_sample(
-        {"latitude_deg": 45.0, "longitude_deg": 9.0, "camera_yaw_deg": -90.0, "camera_pitch_deg": -30.0,
-         "height_above_takeoff_m": 50.0}, {"sensor_horizontal_fov_deg": 60.0},
+        {
+            "latitude_deg": 45.0,
+            "longitude_deg": 9.0,
+            "camera_yaw_deg": -90.0,
+            "camera_pitch_deg": -30.0,
+            "height_above_takeoff_m": 50.0,
+        },
+        {"sensor_horizontal_fov_deg": 60.0},
     )
     assert view is not None and view.range_m == pytest.approx(100) and math.isnan(view.height_m)
     event = fromstring(cot_drone(view, uid="u", callsign="scout\x00", now_ns=0, stale_s=15))
     sensor = event.find("detail/sensor")
     assert sensor is not None and event.get("type") == "a-f-A-M-H-Q"
-    assert (sensor.get("azimuth"), sensor.get("elevation"), sensor.get("fov"), sensor.get("range")) == (
-        "270.0", "-30.0", "60.0", "100",
+    assert (
+        sensor.get("azimuth"),
+        sensor.get("elevation"),
+        sensor.get("fov"),
+        sensor.get("range"),
+    ) == (
+        "270.0",
+        "-30.0",
+        "60.0",
+        "100",
     )
     assert event.find("detail/contact").get("callsign") == "scout"  # type: ignore[union-attr]
-    assert view_of_sample({"latitude_deg": 45.0}, {}) is None and view_of_frame({"position": [1]}) is None
+    assert (
+        view_of_sample({"latitude_deg": 45.0}, {}) is None
+        and view_of_frame({"position": [1]}) is None
+    )
 
 
 @pytest.fixture
@@ -134,7 +168,11 @@ def heard(team: socket.socket, *, wanted: str, limit_s: float = 4.0) -> Element:
 
 
 def feature(**properties: Any) -> dict[str, Any]:
-    return {"type": "Feature", "geometry": {"type": "Point", "coordinates": [9.0, 45.0]}, "properties": properties}
+    return {
+        "type": "Feature",
+        "geometry": {"type": "Point", "coordinates": [9.0, 45.0]},
+        "properties": properties,
+    }
 
 
 def test_a_team_sees_the_drone_what_it_found_and_what_turned_out_to_be_none(
@@ -144,15 +182,25 @@ def test_a_team_sees_the_drone_what_it_found_and_what_turned_out_to_be_none(
     messages = units(write_video(tmp_path / "v.mp4", seconds=1), "h264")
     receivers = OutwardSettings(cot=f"udp://127.0.0.1:{team.getsockname()[1]}")
     app = station_app(StationSettings(root), receivers)
-    with TestClient(app, base_url=HOST) as client, client.websocket_connect(f"{WS}/api/ingest/scout") as drone:
+    with (
+        TestClient(app, base_url=HOST) as client,
+        client.websocket_connect(f"{WS}/api/ingest/scout") as drone,
+    ):
         drone.send_bytes(HELLO)
         for each in messages:
             drone.send_bytes(each.to_bytes())
         assert heard(team, wanted="sorvolo.drone.scout").find("point").get("lat") == "45.0000000"  # type: ignore[union-attr]
         events = app.state.station.events
         events.append(
-            NewEvent("object.found", {"feature": feature(id=3, score=0.9, **{"class": "person"})}, "field", "r1"),
-            NewEvent("change.announced", {"feature": feature(id="c-1", kind="appeared")}, "field", "r2"),
+            NewEvent(
+                "object.found",
+                {"feature": feature(id=3, score=0.9, **{"class": "person"})},
+                "field",
+                "r1",
+            ),
+            NewEvent(
+                "change.announced", {"feature": feature(id="c-1", kind="appeared")}, "field", "r2"
+            ),
             NewEvent("change.withdrawn", {"id": "c-1"}, "field", "r2"),
         )
         person = heard(team, wanted="sorvolo.field.r1.3")

@@ -66,7 +66,9 @@ def served(made_site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterato
     crops.mkdir(exist_ok=True)
     for number in range(4):
         for name in crop_names(f"b-{number}"):
-            (crops / name).write_bytes(png_from_rgba(np.full((32, 32, 4), 90 + 20 * number, np.uint8)))
+            (crops / name).write_bytes(
+                png_from_rgba(np.full((32, 32, 4), 90 + 20 * number, np.uint8))
+            )
     with Served(root) as station:
         yield station
 
@@ -102,7 +104,9 @@ def greeted(served: Served, stream: str, session: str) -> Iterator[ClientConnect
 
 
 @contextmanager
-def video_shown(served: Served, page: Any, folder: Path, session: str) -> Iterator[tuple[ClientConnection, int]]:
+def video_shown(
+    served: Served, page: Any, folder: Path, session: str
+) -> Iterator[tuple[ClientConnection, int]]:
     """A drone whose video, made in a folder, the page shows, and the time of its last picture, us."""
     messages = units(write_video(folder / "v.mp4"), "h264")
     with greeted(served, "scout", session) as drone:
@@ -140,7 +144,9 @@ def test_a_cold_page_is_small_and_lists_the_sites(browser: Any, served: Served) 
     context.close()
 
 
-def test_a_site_that_is_deleted_while_it_is_watched(browser: Any, made_site: Path, tmp_path: Path) -> None:
+def test_a_site_that_is_deleted_while_it_is_watched(
+    browser: Any, made_site: Path, tmp_path: Path
+) -> None:
     """The page goes back to the list, and states why."""
     shutil.copytree(made_site, tmp_path / "field")
     shutil.copytree(made_site, tmp_path / "other")
@@ -156,13 +162,23 @@ def test_a_site_that_is_deleted_while_it_is_watched(browser: Any, made_site: Pat
         watched.page.context.close()
 
 
-def test_a_site_is_deleted_once_its_name_is_typed(browser: Any, made_site: Path, tmp_path: Path) -> None:
+def test_a_site_is_deleted_once_its_name_is_typed(
+    browser: Any, made_site: Path, tmp_path: Path
+) -> None:
     """What would be lost is stated before; everybody who looks at it hears of it."""
     shutil.copytree(made_site, tmp_path / "field")
     shutil.copytree(made_site, tmp_path / "other")
     with Served(tmp_path) as station:
         watch_run(station.station, "fee1", "field")  # whose record goes with the site
-        record = Run("fee1", "watch", "field", "finished", "ada", "2026-05-01T10:00:00Z", "2026-05-01T10:01:00Z")
+        record = Run(
+            "fee1",
+            "watch",
+            "field",
+            "finished",
+            "ada",
+            "2026-05-01T10:00:00Z",
+            "2026-05-01T10:01:00Z",
+        )
         with station.station.state.changing() as connection:
             connection.execute("UPDATE runs SET record = ?", (json.dumps(asdict(record)),))
         looking, deleting = (Watched(browser.new_context(), station.url) for _ in range(2))
@@ -173,7 +189,10 @@ def test_a_site_is_deleted_once_its_name_is_typed(browser: Any, made_site: Path,
         box = page.get_by_role("dialog")
         expect(box).to_contain_text("2 flights, 2 versions of the map")
         expect(box).to_contain_text(re.compile(r"\d+ files, \d+\.\d kB"))
-        name, button = box.get_by_label("Type field to confirm"), box.get_by_role("button", name="Delete")
+        name, button = (
+            box.get_by_label("Type field to confirm"),
+            box.get_by_role("button", name="Delete"),
+        )
         name.fill("other")
         expect(button).to_be_disabled()
         box.get_by_role("button", name="Close").click()
@@ -230,7 +249,9 @@ def test_changes_are_judged_with_the_keyboard_and_others_see_it(
     other.page.context.close()
 
 
-def test_keys_are_meant_for_what_is_shown_though_the_station_answers_late(browser: Any, served: Served) -> None:
+def test_keys_are_meant_for_what_is_shown_though_the_station_answers_late(
+    browser: Any, served: Served
+) -> None:
     """What is pressed and written after a verdict concerns the next change, also before the station has answered."""
     watched = Watched(browser.new_context(), served.url)
     page = watched.page
@@ -242,25 +263,34 @@ def test_keys_are_meant_for_what_is_shown_though_the_station_answers_late(browse
     page.route("**/reviews", late)
     show(watched, served, "review")
     page.locator(".gallery h3").wait_for()
-    first, second, third, *_ = page.locator(".strip button").evaluate_all("all => all.map(each => each.dataset.id)")
+    first, second, third, *_ = page.locator(".strip button").evaluate_all(
+        "all => all.map(each => each.dataset.id)"
+    )
     before = {each["id"]: each["properties"].get("review") for each in changes(served)}
     with page.expect_response("**/reviews"):
         page.keyboard.press("c")
         assert page.locator(".strip [aria-current]").get_attribute("data-id") == second
         page.keyboard.press("n")
-        page.keyboard.type("rucksack", delay=100)  # its letters are keys that judge, withdraw, move on
+        page.keyboard.type(
+            "rucksack", delay=100
+        )  # its letters are keys that judge, withdraw, move on
     page.keyboard.press("Enter")
     page.locator(".gallery .remark", has_text="rucksack").wait_for()
     page.keyboard.press("r")
     page.keyboard.press("k")
-    with page.expect_response("**/reviews"), page.expect_response(lambda each: "none" in str(each.request.post_data)):
+    with (
+        page.expect_response("**/reviews"),
+        page.expect_response(lambda each: "none" in str(each.request.post_data)),
+    ):
         page.keyboard.press("u")  # before the station has taken what it withdraws
     page.locator(f".strip button.open[data-id='{second}']").wait_for()
     kept = {each["id"]: each["properties"] for each in changes(served)}
     assert [kept[each].get("review") for each in (first, second)] == ["confirmed", "none"]
     assert kept[second]["note"] == "rucksack" and kept[third].get("review") == before[third]
     page.reload()
-    page.locator(f".strip button.open[data-id='{second}']").wait_for()  # withdrawn: it is to be reviewed again
+    page.locator(
+        f".strip button.open[data-id='{second}']"
+    ).wait_for()  # withdrawn: it is to be reviewed again
     assert watched.faults == []
     page.context.close()
 
@@ -275,10 +305,18 @@ def test_a_note_on_the_map_stays_under_the_hands(browser: Any, served: Served) -
     note = page.locator(".card-over input")
     note.focus()
     page.keyboard.type("a red")
-    announce(served, "object.found", {"feature": {
-        "type": "Feature", "id": "o9", "properties": {"id": "o9", "class": "boat", "score": 0.9},
-        "geometry": {"type": "Point", "coordinates": [0, 0]},
-    }})
+    announce(
+        served,
+        "object.found",
+        {
+            "feature": {
+                "type": "Feature",
+                "id": "o9",
+                "properties": {"id": "o9", "class": "boat", "score": 0.9},
+                "geometry": {"type": "Point", "coordinates": [0, 0]},
+            }
+        },
+    )
     page.get_by_text("boats (1)").or_(page.get_by_text("boat (1)")).first.wait_for()
     page.keyboard.type(" car")
     assert note.input_value().endswith("a red car")
@@ -300,14 +338,27 @@ def test_a_change_and_an_object_are_tapped_on_the_map(browser: Any, served: Serv
     tapped = card.locator("dt", has_text=re.compile("^Id$")).locator("+ dd").inner_text()
     card.get_by_role("button", name="Confirm").click()
     card.locator(".verdict.confirmed").wait_for()
-    kept = next(each["properties"] for each in changes(served) if each["id"] == tapped)  # others lie there, too
+    kept = next(
+        each["properties"] for each in changes(served) if each["id"] == tapped
+    )  # others lie there, too
     assert kept["review"] == "confirmed"
     card.get_by_role("button", name="Close").click()
     ring = np.array(change["geometry"]["coordinates"][0])
-    announce(served, "object.found", {"feature": {
-        "type": "Feature", "id": "o7", "properties": {"id": "o7", "class": "boat", "score": 0.9},
-        "geometry": {"type": "Point", "coordinates": ((ring.min(axis=0) + ring.max(axis=0)) / 2).tolist()},
-    }})
+    announce(
+        served,
+        "object.found",
+        {
+            "feature": {
+                "type": "Feature",
+                "id": "o7",
+                "properties": {"id": "o7", "class": "boat", "score": 0.9},
+                "geometry": {
+                    "type": "Point",
+                    "coordinates": ((ring.min(axis=0) + ring.max(axis=0)) / 2).tolist(),
+                },
+            }
+        },
+    )
     tap_middle_until(page, card.locator("h3", has_text=re.compile("boat", re.IGNORECASE)))
     assert watched.faults == []
     context.close()
@@ -324,19 +375,32 @@ def tap_middle_until(page: Any, shown: Any) -> None:
     raise AssertionError("nothing was shown")
 
 
-def test_a_verdict_that_came_first_is_shown_and_not_overwritten(browser: Any, served: Served) -> None:
+def test_a_verdict_that_came_first_is_shown_and_not_overwritten(
+    browser: Any, served: Served
+) -> None:
     context = browser.new_context()
     watched = Watched(context, served.url)
-    watched.page.route_web_socket(re.compile("/api/events"), lambda _: None)  # a page that hears nothing
+    watched.page.route_web_socket(
+        re.compile("/api/events"), lambda _: None
+    )  # a page that hears nothing
     show(watched, served, "review")
     watched.page.locator(".gallery h3").wait_for()
     chosen = watched.page.locator(".strip [aria-current]").get_attribute("data-id")
     now = next(each["properties"]["revision"] for each in changes(served) if each["id"] == chosen)
-    theirs = {"kind": "change", "id": chosen, "verdict": "confirmed", "note": "my car", "revision": now}
+    theirs = {
+        "kind": "change",
+        "id": chosen,
+        "verdict": "confirmed",
+        "note": "my car",
+        "revision": now,
+    }
     served.ask("/api/sites/field/reviews", "POST", theirs)
     watched.page.keyboard.press("r")
     watched.page.locator(".message.warning", has_text="was quicker: confirmed, “my car”").wait_for()
-    assert next(each["properties"]["review"] for each in changes(served) if each["id"] == chosen) == "confirmed"
+    assert (
+        next(each["properties"]["review"] for each in changes(served) if each["id"] == chosen)
+        == "confirmed"
+    )
     watched.page.get_by_role("button", name="Show it").click()  # the gallery had gone on
     watched.page.keyboard.press("r")  # seen, and still meant
     watched.page.locator(f".strip button.rejected[data-id='{chosen}']").wait_for()
@@ -370,27 +434,61 @@ def test_before_and_after_are_swiped_and_blinked(opened: Watched) -> None:
 def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     page = opened.page
     lon, lat = changes(served)[0]["geometry"]["coordinates"][0][0]
-    ring = [[lon - 1e-4, lat - 1e-4], [lon + 1e-4, lat - 1e-4], [lon + 1e-4, lat + 1e-4], [lon - 1e-4, lat - 1e-4]]
-    zone = {"type": "Feature", "id": "z", "geometry": {"type": "Polygon", "coordinates": [ring]},
-            "properties": {"purpose": "alert", "name": "Camp"}}
+    ring = [
+        [lon - 1e-4, lat - 1e-4],
+        [lon + 1e-4, lat - 1e-4],
+        [lon + 1e-4, lat + 1e-4],
+        [lon - 1e-4, lat - 1e-4],
+    ]
+    zone = {
+        "type": "Feature",
+        "id": "z",
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+        "properties": {"purpose": "alert", "name": "Camp"},
+    }
     now = served.ask("/api/sites/field/drawings")["revision"]
     served.ask("/api/sites/field/drawings", "PUT", {"revision": now, "features": [zone]})
     page.locator("[data-panel=draw]").click()
     page.locator(".drawn input[aria-label=Name]").wait_for()
     announce(served, "run.started", {"id": "run-1"})
-    announce(served, "frame.placed", {
-        "status": "vision", "footprint": ring, "position": [lon, lat], "height_m": 40, "heading_deg": 10,
-        "time": "2024-05-01T10:00:00Z",
-    })
+    announce(
+        served,
+        "frame.placed",
+        {
+            "status": "vision",
+            "footprint": ring,
+            "position": [lon, lat],
+            "height_m": 40,
+            "heading_deg": 10,
+            "time": "2024-05-01T10:00:00Z",
+        },
+    )
     latency = page.locator(".figure", has_text="latency")
-    for seconds, words in ((-86400, "–"), (-3, r"^3[\d.]* s$"), (300, "–"), (0.1, r"^[01][\d.]* s$")):
-        time = datetime.now(UTC) + timedelta(seconds=seconds)  # of the picture; ahead: the clocks are apart
-        announce(served, "frame.placed", {
-            "status": "vision", "footprint": ring, "position": [lon, lat], "height_m": 40, "heading_deg": 10,
-            "time": time.isoformat(),
-        })
+    for seconds, words in (
+        (-86400, "–"),
+        (-3, r"^3[\d.]* s$"),
+        (300, "–"),
+        (0.1, r"^[01][\d.]* s$"),
+    ):
+        time = datetime.now(UTC) + timedelta(
+            seconds=seconds
+        )  # of the picture; ahead: the clocks are apart
+        announce(
+            served,
+            "frame.placed",
+            {
+                "status": "vision",
+                "footprint": ring,
+                "position": [lon, lat],
+                "height_m": 40,
+                "heading_deg": 10,
+                "time": time.isoformat(),
+            },
+        )
         expect(latency.locator("b")).to_have_text(re.compile(words))
-    announce(served, "run.progress", {"frames": 9, "selected": 5, "matched": 3, "frames_per_second": 7.5})
+    announce(
+        served, "run.progress", {"frames": 9, "selected": 5, "matched": 3, "frames_per_second": 7.5}
+    )
     page.locator(".figure", has_text="frames/s").get_by_text("7.5").wait_for()
     page.locator(".figure", has_text="rejected").get_by_text("2").wait_for()
     with page.expect_request(re.compile("/tiles/live-abc123/")):
@@ -399,15 +497,25 @@ def test_a_flight_is_followed_live(served: Served, opened: Watched) -> None:
     with page.expect_request(re.compile("/collections/coverage/items")):
         announce(served, "coverage.changed", {})
     hostile = "<img src=x onerror=window.pwned=1>"
-    announce(served, "object.found", {"feature": {
-        "type": "Feature", "id": "o1", "geometry": {"type": "Point", "coordinates": [lon + 5e-5, lat - 5e-5]},
-        "properties": {"id": "o1", "class": hostile, "score": 0.9},
-    }})
+    announce(
+        served,
+        "object.found",
+        {
+            "feature": {
+                "type": "Feature",
+                "id": "o1",
+                "geometry": {"type": "Point", "coordinates": [lon + 5e-5, lat - 5e-5]},
+                "properties": {"id": "o1", "class": hostile, "score": 0.9},
+            }
+        },
+    )
     alert = page.locator(".message.alert", has_text="Camp")
     alert.wait_for()
     assert hostile in alert.inner_text()
     alert.get_by_role("button", name="Show").click()
-    announce(served, "site.changed", {"versions": 2})  # everything is loaded anew; what the watch found stays
+    announce(
+        served, "site.changed", {"versions": 2}
+    )  # everything is loaded anew; what the watch found stays
     page.locator("[data-panel=map]").click()
     page.locator(".card-over h3", has_text="onerror").wait_for()
     page.wait_for_timeout(100)
@@ -428,7 +536,9 @@ def test_the_api_can_be_read_as_a_page(served: Served, opened: Watched) -> None:
     assert serious(page) == []
 
 
-def test_of_two_missions_at_once_the_map_s_figures_are_shown(served: Served, opened: Watched) -> None:
+def test_of_two_missions_at_once_the_map_s_figures_are_shown(
+    served: Served, opened: Watched
+) -> None:
     """A watch beside a map knows of no matched frames, and its end is not the map's."""
     page = opened.page
 
@@ -437,10 +547,18 @@ def test_of_two_missions_at_once_the_map_s_figures_are_shown(served: Served, ope
 
     figure = page.locator(".figure", has_text="matched").locator("b")
     happens("run-map", "run.started", {"id": "run-map"})
-    happens("run-map", "run.progress", {"frames": 9, "selected": 5, "matched": 3, "frames_per_second": 7.5})
+    happens(
+        "run-map",
+        "run.progress",
+        {"frames": 9, "selected": 5, "matched": 3, "frames_per_second": 7.5},
+    )
     expect(figure).to_have_text("3")
     happens("run-watch", "run.started", {"id": "run-watch"})
-    happens("run-watch", "run.progress", {"frames": 8, "searched": 2, "frames_per_second": 0.6, "latency_s": 1.2})
+    happens(
+        "run-watch",
+        "run.progress",
+        {"frames": 8, "searched": 2, "frames_per_second": 0.6, "latency_s": 1.2},
+    )
     happens("run-watch", "run.finished", {"headline": "two cars found"})
     page.locator(".message", has_text="two cars found").wait_for()
     expect(page.locator(".figure", has_text="frames/s").locator("b")).to_have_text("7.5")
@@ -476,7 +594,9 @@ def test_a_link_to_a_site_shows_it_once_its_first_mission_made_it(
         page.context.close()
 
 
-def test_tiles_of_a_site_whose_name_looks_like_a_growing_map(browser: Any, made_site: Path, tmp_path: Path) -> None:
+def test_tiles_of_a_site_whose_name_looks_like_a_growing_map(
+    browser: Any, made_site: Path, tmp_path: Path
+) -> None:
     shutil.copytree(made_site, tmp_path / "live-a1")
     with Served(tmp_path) as station:
         watched = Watched(browser.new_context(), station.url)
@@ -484,22 +604,30 @@ def test_tiles_of_a_site_whose_name_looks_like_a_growing_map(browser: Any, made_
             watched.page.goto(f"{station.url}/#/site/live-a1/map")
         watched.page.locator(".figure", has_text="matched").wait_for()
         with watched.page.expect_response(re.compile("/api/sites/live-a1/tiles/live-abc123/")):
-            station.station.events.append(NewEvent("map.tiles", {"revision": "abc123", "bounds": None}, "live-a1", "r"))
+            station.station.events.append(
+                NewEvent("map.tiles", {"revision": "abc123", "bounds": None}, "live-a1", "r")
+            )
         watched.page.wait_for_timeout(300)
         assert watched.faults == []
         watched.page.context.close()
 
 
-def test_a_delay_does_not_depend_on_the_browser_s_clock(browser: Any, served: Served, tmp_path: Path) -> None:
+def test_a_delay_does_not_depend_on_the_browser_s_clock(
+    browser: Any, served: Served, tmp_path: Path
+) -> None:
     """It is an hour ahead; the drone's and the station's agree."""
     watched = Watched(browser.new_context(), served.url)
     watched.page.add_init_script("const now = Date.now; Date.now = () => now() + 3600000;")
     show(watched, served)
-    messages = [each for each in units(write_video(tmp_path / "v.mp4"), "h264") if each.kind is Kind.VIDEO]
+    messages = [
+        each for each in units(write_video(tmp_path / "v.mp4"), "h264") if each.kind is Kind.VIDEO
+    ]
     with greeted(served, "punctual", "f" * 16) as drone:
         now = Sample(time.time_ns() - 5_000_000_000, {"latitude_deg": 45.0, "longitude_deg": 9.0})
         drone.send(Message(Kind.TELEMETRY, 1, 0, now.to_json().encode()).to_bytes())
-        for number, each in enumerate(messages):  # three seconds of them, taken five to two seconds ago
+        for number, each in enumerate(
+            messages
+        ):  # three seconds of them, taken five to two seconds ago
             drone.send(replace(each, seq=number + 2).to_bytes())
         expect(watched.page.locator("aside.video header b")).to_have_text("punctual")
         delay = watched.page.locator(".delay")
@@ -551,7 +679,9 @@ def test_a_video_whose_connection_died_in_sleep_is_asked_for_anew(
     page.context.close()
 
 
-def test_a_page_that_slept_asks_from_its_last_event_and_gets_each_once(browser: Any, served: Served) -> None:
+def test_a_page_that_slept_asks_from_its_last_event_and_gets_each_once(
+    browser: Any, served: Served
+) -> None:
     context = browser.new_context()
     watched = Watched(context, served.url)
     sockets: list[Any] = []
@@ -598,7 +728,10 @@ def test_a_browser_that_slept_notices_its_dead_connection(browser: Any, served: 
     is_dead[0] = True
     announce(served, "run.failed", {"error": "the battery is empty"})
     watched.page.wait_for_timeout(300)
-    assert watched.page.locator(".message", has_text="the battery is empty").count() == 0 and len(sockets) == 1
+    assert (
+        watched.page.locator(".message", has_text="the battery is empty").count() == 0
+        and len(sockets) == 1
+    )
     watched.page.clock.fast_forward("10:00")
     watched.page.locator(".message", has_text="the battery is empty").wait_for()
     watched.page.locator("#link-state.live").wait_for()
@@ -635,13 +768,19 @@ def test_a_frozen_tab_catches_up_when_it_is_looked_at_again(browser: Any, served
         watched.page.locator(".message", has_text="fault 2").wait_for()
         watched.page.locator("#link-state.live").wait_for()
         heard = [each for each in watched.page.evaluate("window.heard") if "fault" in each]
-        assert [re.search(r"fault \d", each)[0] for each in heard] == ["fault 0", "fault 1", "fault 2"]  # type: ignore[index]
+        assert [re.search(r"fault \d", each)[0] for each in heard] == [
+            "fault 0",
+            "fault 1",
+            "fault 2",
+        ]  # type: ignore[index]
         tried = "ERR_CONNECTION_REFUSED"  # by the part of the browser that does not sleep
         assert [each for each in watched.faults if tried not in each] == []
         context.close()
 
 
-def test_a_page_that_lost_the_station_asks_at_once_when_it_is_looked_at(browser: Any, served: Served) -> None:
+def test_a_page_that_lost_the_station_asks_at_once_when_it_is_looked_at(
+    browser: Any, served: Served
+) -> None:
     """It waits up to 15 s between two tries; nobody who comes back to it does."""
     context = browser.new_context()
     with FaultyLink(served.port) as link:
@@ -654,7 +793,9 @@ def test_a_page_that_lost_the_station_asks_at_once_when_it_is_looked_at(browser:
         link.cut()
         lost = watched.page.locator("#link-state.lost")
         for _ in range(40):
-            watched.page.wait_for_timeout(100)  # of the test's own clock: for the answer to its last try
+            watched.page.wait_for_timeout(
+                100
+            )  # of the test's own clock: for the answer to its last try
             if lost.count():
                 break
             watched.page.clock.run_for(5_000)
@@ -670,16 +811,22 @@ def test_a_page_that_lost_the_station_asks_at_once_when_it_is_looked_at(browser:
         context.close()
 
 
-def test_recordings_are_listed_with_their_size_and_deleted(served: Served, opened: Watched, tmp_path: Path) -> None:
+def test_recordings_are_listed_with_their_size_and_deleted(
+    served: Served, opened: Watched, tmp_path: Path
+) -> None:
     """Not without being asked again; a mission that is over, too."""
     page = opened.page
     folder = served.station.settings.root / "streams" / "old-flight"
     folder.mkdir(parents=True)
     (folder / "20260501T100000Z_aa.ts").write_bytes(bytes(2_500_000))
     watch_run(served.station, "feed", "field")
-    record = Run("feed", "watch", "field", "finished", "ada", "2026-05-01T10:00:00Z", "2026-05-01T10:01:00Z")
+    record = Run(
+        "feed", "watch", "field", "finished", "ada", "2026-05-01T10:00:00Z", "2026-05-01T10:01:00Z"
+    )
     with served.station.state.changing() as connection:
-        connection.execute("UPDATE runs SET record = ? WHERE id = 'feed'", (json.dumps(asdict(record)),))
+        connection.execute(
+            "UPDATE runs SET record = ? WHERE id = 'feed'", (json.dumps(asdict(record)),)
+        )
     show(opened, served, "missions")
     row = page.locator(".files li", has_text="Stream old-flight")
     expect(row).to_contain_text("1 flight, 2.5 MB")
@@ -698,7 +845,9 @@ def test_recordings_are_listed_with_their_size_and_deleted(served: Served, opene
 
 def test_a_place_is_remembered(served: Served, opened: Watched) -> None:
     page = opened.page
-    frame = served.ask("/api/sites/field/collections/frames/items")["features"][1]["geometry"]["coordinates"][0]
+    frame = served.ask("/api/sites/field/collections/frames/items")["features"][1]["geometry"][
+        "coordinates"
+    ][0]
     lon, lat = np.mean(frame[:4], axis=0)
     page.goto(f"{served.url}/#/site/field/place?at={lon},{lat}")  # a link that somebody sent
     page.locator(".film li").first.wait_for()
@@ -713,7 +862,9 @@ def test_a_place_is_remembered(served: Served, opened: Watched) -> None:
     expect(page.locator(".place-name")).to_have_text(re.compile(r"^33T [A-Z]{2} \d{5} \d{5}$"))
 
 
-def test_what_is_drawn_is_measured_and_shared(browser: Any, served: Served, opened: Watched) -> None:
+def test_what_is_drawn_is_measured_and_shared(
+    browser: Any, served: Served, opened: Watched
+) -> None:
     page = opened.page
     page.keyboard.press("5")
     before = len(served.ask("/api/sites/field/drawings")["features"])
@@ -757,7 +908,10 @@ def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
     opened: Watched, served: Served, tmp_path: Path
 ) -> None:
     page = opened.page
-    video, track = write_video(tmp_path / "f.mp4", seconds=1), write_track(tmp_path / "f.csv", seconds=1)
+    video, track = (
+        write_video(tmp_path / "f.mp4", seconds=1),
+        write_track(tmp_path / "f.csv", seconds=1),
+    )
     cuts = []
 
     def cut_once(route: Any) -> None:
@@ -787,12 +941,21 @@ def test_an_upload_goes_on_after_a_cut_and_starts_a_mission(
     assert states[wish["input"]["upload"]] == ("f.mp4", "ready")
     assert states[wish["options"]["telemetry"]["upload"]] == ("f.csv", "ready")
     assert cuts
-    opened.faults[:] = [each for each in opened.faults if "ERR_FAILED" not in each]  # the cut itself
+    opened.faults[:] = [
+        each for each in opened.faults if "ERR_FAILED" not in each
+    ]  # the cut itself
 
 
 def test_a_cut_video_is_named_as_it_goes_up(opened: Watched, tmp_path: Path) -> None:
-    page, whole, head_first = opened.page, write_video(tmp_path / "whole.mp4", seconds=1), {"movflags": "faststart"}
-    with av.open(str(whole)) as read, av.open(str(tmp_path / "f.mp4"), "w", options=head_first) as written:
+    page, whole, head_first = (
+        opened.page,
+        write_video(tmp_path / "whole.mp4", seconds=1),
+        {"movflags": "faststart"},
+    )
+    with (
+        av.open(str(whole)) as read,
+        av.open(str(tmp_path / "f.mp4"), "w", options=head_first) as written,
+    ):
         stream = written.add_stream_from_template(read.streams.video[0])
         for packet in read.demux(video=0):
             if packet.size:
@@ -800,16 +963,25 @@ def test_a_cut_video_is_named_as_it_goes_up(opened: Watched, tmp_path: Path) -> 
                 written.mux(packet)
     data = (tmp_path / "f.mp4").read_bytes()
     (tmp_path / "cut.mp4").write_bytes(data[:-2000])
-    page.route(re.compile(r"/api/runs"), lambda route: route.fulfill(
-        status=201, content_type="application/json", body='{"id": "r"}'
-    ) if route.request.method == "POST" else route.continue_())
+    page.route(
+        re.compile(r"/api/runs"),
+        lambda route: (
+            route.fulfill(status=201, content_type="application/json", body='{"id": "r"}')
+            if route.request.method == "POST"
+            else route.continue_()
+        ),
+    )
     page.keyboard.press("6")
     page.get_by_label("Files of the flight").first.set_input_files([str(tmp_path / "cut.mp4")])
     page.get_by_role("button", name="Start").click()
-    page.locator(".message.warning", has_text="cut.mp4 is cut: its last 2 kB are missing").wait_for()
+    page.locator(
+        ".message.warning", has_text="cut.mp4 is cut: its last 2 kB are missing"
+    ).wait_for()
 
 
-def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, tmp_path: Path) -> None:
+def test_the_drone_s_video_is_shown_with_boxes(
+    served: Served, opened: Watched, tmp_path: Path
+) -> None:
     page = opened.page
     with video_shown(served, page, tmp_path, "a" * 16) as (drone, last_us):
         grey = page.locator("aside.video canvas").first.evaluate(
@@ -817,10 +989,18 @@ def test_the_drone_s_video_is_shown_with_boxes(served: Served, opened: Watched, 
         )
         assert grey > 30  # a picture of the flight, not an empty canvas
         ingest = served.station.ingest
-        ingest._loop.call_soon_threadsafe(ingest.hub("scout").note, {
-            "type": "boxes", "pts_us": last_us, "frame_size_px": [160, 120],
-            "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, top, 20, 30]} for top in (40, 0)],
-        })
+        ingest._loop.call_soon_threadsafe(
+            ingest.hub("scout").note,
+            {
+                "type": "boxes",
+                "pts_us": last_us,
+                "frame_size_px": [160, 120],
+                "boxes": [
+                    {"class": "person", "score": 0.8, "xywh_px": [40, top, 20, 30]}
+                    for top in (40, 0)
+                ],
+            },
+        )
         page.locator("aside.video footer", has_text="2 in the picture").wait_for()
         assert columns_drawn(page)[0] == pytest.approx(39, abs=2)
         assert page.locator("aside.video canvas.boxes").evaluate(
@@ -842,7 +1022,10 @@ def test_the_drone_s_video_lies_beside_what_is_reviewed(
     with video_shown(served, page, tmp_path, f"{width_px:016x}"):
         page.get_by_label("Larger or smaller").click()
         page.locator("[data-panel=review]").first.click()
-        gallery, pane = page.locator(".gallery").bounding_box(), page.locator("aside.video").bounding_box()
+        gallery, pane = (
+            page.locator(".gallery").bounding_box(),
+            page.locator("aside.video").bounding_box(),
+        )
         assert gallery["width"] > 0.55 * page.locator(".stage").bounding_box()["width"]
         assert (pane is None) == (width_px < 760)
         assert pane is None or pane["x"] >= gallery["x"] + gallery["width"]
@@ -879,7 +1062,9 @@ def test_a_slow_device_stays_near_live(browser: Any, served: Served, tmp_path: P
         for each in messages[1:]:
             drone.send(each.to_bytes())
         last_us = max(each.pts_us for each in messages if each.kind is Kind.VIDEO)
-        wait_for(lambda: watched.page.evaluate("window.newestShown") >= last_us, 12)  # all would take 24 s
+        wait_for(
+            lambda: watched.page.evaluate("window.newestShown") >= last_us, 12
+        )  # all would take 24 s
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
     assert watched.faults == []
     watched.page.context.close()
@@ -904,20 +1089,31 @@ def test_boxes_follow_the_picture_until_it_is_looked_at_again(
     with video_shown(served, page, tmp_path, "c" * 16) as (drone, last_us):
         note, loop = served.station.ingest.hub("scout").note, served.station.ingest._loop
         boxes = {
-            "type": "boxes", "pts_us": last_us - 1_000_000, "frame_size_px": [160, 120],
+            "type": "boxes",
+            "pts_us": last_us - 1_000_000,
+            "frame_size_px": [160, 120],
             "boxes": [{"class": "person", "score": 0.8, "xywh_px": [40, 40, 20, 30]}],
         }
         loop.call_soon_threadsafe(note, boxes)
-        page.locator("aside.video footer", has_text="1 in the picture, faint: seen 1 s ago").wait_for()
+        page.locator(
+            "aside.video footer", has_text="1 in the picture, faint: seen 1 s ago"
+        ).wait_for()
         assert columns_drawn(page) == pytest.approx((39, 61), abs=2)
         for number in range(9):  # 5 px a step; the last 0.1 s are not known yet
             from_us = last_us - 1_000_000 + 100_000 * number
-            loop.call_soon_threadsafe(note, {
-                "type": "motion", "from_us": from_us, "pts_us": from_us + 100_000,
-                "to_from": [1, 0, 5, 0, 1, 0, 0, 0, 1],
-            })
+            loop.call_soon_threadsafe(
+                note,
+                {
+                    "type": "motion",
+                    "from_us": from_us,
+                    "pts_us": from_us + 100_000,
+                    "to_from": [1, 0, 5, 0, 1, 0, 0, 0, 1],
+                },
+            )
         loop.call_soon_threadsafe(note, boxes)
-        page.locator("aside.video footer", has_text="1 in the picture, dashed: seen 1 s ago").wait_for()
+        page.locator(
+            "aside.video footer", has_text="1 in the picture, dashed: seen 1 s ago"
+        ).wait_for()
         assert columns_drawn(page) == pytest.approx((89, 111), abs=2)
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
 
@@ -930,24 +1126,41 @@ def test_boxes_of_cars_that_are_known_before_people_take_the_place_of_earlier_ca
         note, loop = served.station.ingest.hub("scout").note, served.station.ingest._loop
 
         def look(before_us: int, boxes: dict[str, int], **classes: list[str]) -> None:
-            loop.call_soon_threadsafe(note, {
-                "type": "boxes", "pts_us": last_us - before_us, "frame_size_px": [160, 120], **classes,
-                "boxes": [{"class": name, "score": 0.8, "xywh_px": [x, 40, 10, 30]} for name, x in boxes.items()],
-            })
+            loop.call_soon_threadsafe(
+                note,
+                {
+                    "type": "boxes",
+                    "pts_us": last_us - before_us,
+                    "frame_size_px": [160, 120],
+                    **classes,
+                    "boxes": [
+                        {"class": name, "score": 0.8, "xywh_px": [x, 40, 10, 30]}
+                        for name, x in boxes.items()
+                    ],
+                },
+            )
 
         look(1_000_000, {"person": 40, "car": 140})
-        page.locator("aside.video footer", has_text="2 in the picture, faint: seen 1 s ago").wait_for()
+        page.locator(
+            "aside.video footer", has_text="2 in the picture, faint: seen 1 s ago"
+        ).wait_for()
         assert columns_drawn(page) == pytest.approx((39, 151), abs=2)
-        look(0, {"car": 120}, classes=["car"])  # not searched for people yet: the earlier one stays, with its age
+        look(
+            0, {"car": 120}, classes=["car"]
+        )  # not searched for people yet: the earlier one stays, with its age
         wait_for(lambda: columns_drawn(page) == pytest.approx((39, 131), abs=2))
-        expect(page.locator("aside.video footer")).to_contain_text("2 in the picture, faint: seen 1 s ago")
+        expect(page.locator("aside.video footer")).to_contain_text(
+            "2 in the picture, faint: seen 1 s ago"
+        )
         look(0, {"person": 60, "car": 120})
         wait_for(lambda: columns_drawn(page) == pytest.approx((59, 131), abs=2))
         expect(page.locator("aside.video footer")).to_contain_text(re.compile("2 in the picture$"))
         drone.send(Message(Kind.END, 0, 0, b"").to_bytes())
 
 
-def test_how_far_the_picture_moved_between_two_of_its_times(served: Served, opened: Watched) -> None:
+def test_how_far_the_picture_moved_between_two_of_its_times(
+    served: Served, opened: Watched
+) -> None:
     ways = opened.page.evaluate("""async () => {
       const {PictureMotion} = await import('/page/picture_motion.js');
       const motion = new PictureMotion();
@@ -969,18 +1182,32 @@ def test_how_far_the_picture_moved_between_two_of_its_times(served: Served, open
         anew: (step(0, 100000, 7), carried(look(0, 10), 100000)), ahead: carried(look(100000, 10), 300000),
       };
     }""")
-    assert {name: way and [[round(each, 3) for each in box] for box in way] for name, way in ways.items()} == {
-        "unknown": None, "chain": [[40, 40, 10, 20]], "part": [[25, 40, 10, 20]], "back": [[10, 40, 10, 20]],
-        "gap": None, "grown": [[15, 60, 15, 30]], "gone": [], "far": None,
+    assert {
+        name: way and [[round(each, 3) for each in box] for box in way]
+        for name, way in ways.items()
+    } == {
+        "unknown": None,
+        "chain": [[40, 40, 10, 20]],
+        "part": [[25, 40, 10, 20]],
+        "back": [[10, 40, 10, 20]],
+        "gap": None,
+        "grown": [[15, 60, 15, 30]],
+        "gone": [],
+        "far": None,
         # the stream began anew: the old steps are gone, and its last one goes on for a while
-        "anew": [[17, 40, 10, 20]], "ahead": [[24, 40, 10, 20]],
+        "anew": [[17, 40, 10, 20]],
+        "ahead": [[24, 40, 10, 20]],
     }
 
 
-def test_a_search_is_of_the_site_s_flights_or_of_one_that_is_given(served: Served, opened: Watched) -> None:
+def test_a_search_is_of_the_site_s_flights_or_of_one_that_is_given(
+    served: Served, opened: Watched
+) -> None:
     page = opened.page
     show(opened, served, "missions")
-    mission, origin = (page.get_by_role("combobox", name=name, exact=True) for name in ("Mission", "From"))
+    mission, origin = (
+        page.get_by_role("combobox", name=name, exact=True) for name in ("Mission", "From")
+    )
     mission.select_option("search")
     expect(origin).to_have_value("site")
     expect(page.get_by_label("Files of the flight")).to_have_count(0)
@@ -1002,17 +1229,23 @@ def test_a_camera_s_address_shows_its_video(served: Served, opened: Watched) -> 
         page.get_by_role("combobox", name="From").select_option("stream")
         page.get_by_label("Stream's address").fill(f"udp://:{port}")
         page.get_by_role("button", name="Start").click()
-        expect(page.locator("aside.video header b")).to_have_text(re.compile("^udp-"), timeout=60_000)
+        expect(page.locator("aside.video header b")).to_have_text(
+            re.compile("^udp-"), timeout=60_000
+        )
         expect(page.locator(".delay")).to_have_text(re.compile("behind"))
         brightest = page.locator("aside.video canvas").first.evaluate(
             "each => Math.max(...each.getContext('2d').getImageData(0, 40, 160, 1).data.filter((_, n) => n % 4 < 3))"
         )
-        assert brightest > 150  # the column in the middle of gray that moves: a picture, no empty canvas
+        assert (
+            brightest > 150
+        )  # the column in the middle of gray that moves: a picture, no empty canvas
         page.locator(".run.running").get_by_role("button", name="Stop").click()
         page.locator(".run.finished").wait_for(timeout=60_000)
 
 
-def test_without_webcodecs_the_video_plays_as_fragments(browser: Any, served: Served, tmp_path: Path) -> None:
+def test_without_webcodecs_the_video_plays_as_fragments(
+    browser: Any, served: Served, tmp_path: Path
+) -> None:
     context = browser.new_context()
     context.add_init_script("delete window.VideoDecoder")
     watched = Watched(context, served.url)
@@ -1030,7 +1263,9 @@ def test_without_webcodecs_the_video_plays_as_fragments(browser: Any, served: Se
             watched.page.wait_for_timeout(100)
         else:
             raise AssertionError("no picture was played")
-        for each in messages[20:]:  # after three seconds without, that is stated in place of the delay
+        for each in messages[
+            20:
+        ]:  # after three seconds without, that is stated in place of the delay
             drone.send(each.to_bytes())
         expect(watched.page.locator(".delay")).to_have_text(re.compile("behind"))
     assert watched.faults == []
@@ -1042,9 +1277,12 @@ def test_photos_go_up_as_one_file(opened: Watched, served: Served, tmp_path: Pat
     photos = [tmp_path / f"DJI_000{number}.jpg" for number in (2, 1, 3)]
     for each in photos:
         each.write_bytes(jpeg_from_image(np.full((48, 64, 3), 120, np.uint8)))
-    page.route(re.compile(r"/api/runs$"), lambda route: route.fulfill(
-        status=201, content_type="application/json", body='{"id": "r"}'
-    ))
+    page.route(
+        re.compile(r"/api/runs$"),
+        lambda route: route.fulfill(
+            status=201, content_type="application/json", body='{"id": "r"}'
+        ),
+    )
     page.keyboard.press("6")
     page.get_by_label("Files of the flight").first.set_input_files([str(each) for each in photos])
     page.get_by_role("button", name="Start").click()
@@ -1055,7 +1293,12 @@ def test_photos_go_up_as_one_file(opened: Watched, served: Served, tmp_path: Pat
 
 def test_heights_along_a_line_and_the_printed_sheet(opened: Watched, served: Served) -> None:
     page = opened.page
-    heights = {"distance_m": [0, 10, 20, 30], "height_m": [101.5, None, 104, 103], "ground_m": [], "sigma_m": 0.2}
+    heights = {
+        "distance_m": [0, 10, 20, 30],
+        "height_m": [101.5, None, 104, 103],
+        "ground_m": [],
+        "sigma_m": 0.2,
+    }
     page.route(re.compile("/profile"), lambda route: route.fulfill(json=heights))
     page.keyboard.press("5")
     draw_profile(page)
@@ -1064,7 +1307,9 @@ def test_heights_along_a_line_and_the_printed_sheet(opened: Watched, served: Ser
     made.parent.mkdir(exist_ok=True)
     made.write_text("{}")  # in a terminal meanwhile
     draw_profile(page)
-    page.locator(".profile figcaption", has_text="Difference 2.5 m, accuracy of a height 0.2 m").wait_for()
+    page.locator(
+        ".profile figcaption", has_text="Difference 2.5 m, accuracy of a height 0.2 m"
+    ).wait_for()
     made.unlink()
     page.evaluate("""() => {
       window.print = () => { document.body.dataset.printed = document.querySelector('.sheet').textContent; };
@@ -1074,7 +1319,9 @@ def test_heights_along_a_line_and_the_printed_sheet(opened: Watched, served: Ser
     page.locator("body[data-printed]").wait_for(state="attached")
     printed = page.locator("body").get_attribute("data-printed")
     assert "b-3" in printed
-    assert re.search(r"the picture is [\d.]+ (m|km) wide, north up, its middle at (46|33T)", printed)
+    assert re.search(
+        r"the picture is [\d.]+ (m|km) wide, north up, its middle at (46|33T)", printed
+    )
     assert page.locator(".sheet img").evaluate("each => each.naturalWidth") > 500
     page.evaluate("dispatchEvent(new Event('afterprint'))")
 
@@ -1102,14 +1349,18 @@ def test_a_site_that_is_not_there_yet_is_not_asked_for(browser: Any, tmp_path: P
         page.route_web_socket(re.compile("/api/events"), passed_on)
         page.goto(f"{station.url}/#/site/new/missions")
         page.get_by_text("Start a mission").wait_for()
-        station.station.events.append(NewEvent("run.failed", {"error": "no picture"}, "new", "run-1"))
+        station.station.events.append(
+            NewEvent("run.failed", {"error": "no picture"}, "new", "run-1")
+        )
         page.locator(".message", has_text="no picture").wait_for()
         sockets[0].close()
         for _ in range(200):  # the page's, which Playwright passes on only while it waits
             if len(sockets) == 2:
                 break
             page.wait_for_timeout(100)
-        station.station.events.append(NewEvent("run.failed", {"error": "the lens is wet"}, "new", "run-2"))
+        station.station.events.append(
+            NewEvent("run.failed", {"error": "the lens is wet"}, "new", "run-2")
+        )
         page.locator(".message", has_text="the lens is wet").wait_for()
         page.wait_for_timeout(300)
         assert watched.faults == []
@@ -1128,7 +1379,9 @@ def test_a_base_map_comes_from_a_file(opened: Watched, tmp_path: Path) -> None:
     page.locator(".message.error", has_text="cannot be read").wait_for()
 
 
-def test_the_station_s_own_base_map_is_shown_at_once(browser: Any, made_site: Path, tmp_path: Path) -> None:
+def test_the_station_s_own_base_map_is_shown_at_once(
+    browser: Any, made_site: Path, tmp_path: Path
+) -> None:
     shutil.copytree(made_site, tmp_path / "root" / "field")
     base = tmp_path / "base.pmtiles"
     base.write_bytes(pmtiles_of(png_from_rgba(np.full((256, 256, 4), (255, 0, 0, 255), np.uint8))))
@@ -1152,7 +1405,9 @@ def wait_for_red(page: Any) -> None:
 
 def pmtiles_of(tile: bytes) -> bytes:
     """A PMTiles archive (version 3) of one PNG tile, that of zoom 0: the header, the root directory, metadata, data."""
-    directory = bytes([1, 0, 1]) + varint(len(tile)) + bytes([1])  # one entry: tile 0, run 1, its length, offset 0
+    directory = (
+        bytes([1, 0, 1]) + varint(len(tile)) + bytes([1])
+    )  # one entry: tile 0, run 1, its length, offset 0
     meta = b"{}"
     start = 127 + len(directory)
     sections = [127, len(directory), start, len(meta), 0, 0, start + len(meta), len(tile), 1, 1, 1]
@@ -1174,23 +1429,34 @@ def varint(value: int) -> bytes:
 
 def test_coordinates_are_those_of_the_command_line(opened: Watched) -> None:
     places = [
-        (12.6037, 41.8923), (5.3, 60.4), (16.0, 78.2), (-70.6, -33.4), (179.99, -16.5), (-0.001, 51.5), (8.5, 0.0001),
+        (12.6037, 41.8923),
+        (5.3, 60.4),
+        (16.0, 78.2),
+        (-70.6, -33.4),
+        (179.99, -16.5),
+        (-0.001, 51.5),
+        (8.5, 0.0001),
     ]
-    found = opened.page.evaluate("""async places => {
+    found = opened.page.evaluate(
+        """async places => {
       const {distance_m} = await import('/page/places.js');
       const {place} = await import('/page/words.js');
       const {choices} = await import('/page/choices.js');
       const written = kind => { choices.set('coordinates', kind); return places.map(each => place(each)); };
       const far = places.map(([lon, lat]) => distance_m([lon, lat], [lon + 1e-3, lat + 1e-3]));
       return {utm: written('utm'), mgrs: written('mgrs'), latlon: written('latlon'), far};
-    }""", places)
+    }""",
+        places,
+    )
     for system in Coordinates:
         assert found[system.value] == [place_text(lat, lon, system) for lon, lat in places]
     true_m = [Geod(ellps="WGS84").inv(lon, lat, lon + 1e-3, lat + 1e-3)[2] for lon, lat in places]
     assert found["far"] == pytest.approx(true_m, rel=1e-5)
 
 
-def test_a_station_with_tokens_asks_who_comes(browser: Any, made_site: Path, tmp_path: Path) -> None:
+def test_a_station_with_tokens_asks_who_comes(
+    browser: Any, made_site: Path, tmp_path: Path
+) -> None:
     shutil.copytree(made_site, tmp_path / "field")
     with Served(tmp_path) as station:
         token = make_token(station.station.state, "Ann", "view")
@@ -1248,7 +1514,9 @@ def test_a_tablet_shows_every_panel_whole(browser: Any, served: Served) -> None:
         cut[panel] = page.evaluate(BEYOND)
         if panel == "review":
             page.locator(".gallery .facts dd").first.wait_for()
-            assert page.locator(".gallery .facts dd").first.evaluate("each => each.offsetWidth") > 200
+            assert (
+                page.locator(".gallery .facts dd").first.evaluate("each => each.offsetWidth") > 200
+            )
     assert {name: each for name, each in found.items() if each} == {}
     assert {name: each for name, each in cut.items() if each} == {}
     assert watched.faults == []
@@ -1272,8 +1540,11 @@ def test_what_a_watch_found_is_judged_with_the_keyboard(opened: Watched, served:
 
 def serious(page: Any, rules: list[str] | None = None) -> list[str]:
     only = {"runOnly": {"type": "rule", "values": rules}} if rules else {}
-    result = page.evaluate("only => axe.run(document, {resultTypes: ['violations'], ...only})", only)
+    result = page.evaluate(
+        "only => axe.run(document, {resultTypes: ['violations'], ...only})", only
+    )
     return [
         f"{each['id']}: {each['nodes'][0]['html'][:160]} {each['nodes'][0].get('failureSummary', '')[:200]}"
-        for each in result["violations"] if each["impact"] in ("serious", "critical")
+        for each in result["violations"]
+        if each["impact"] in ("serious", "critical")
     ]

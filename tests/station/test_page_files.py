@@ -22,10 +22,14 @@ def libraries(folder: Path) -> list[dict]:
 @pytest.mark.parametrize("folder", [PAGE / "vendor", TESTS_OWN], ids=["page", "tests"])
 def test_every_packed_file_has_its_hash_and_its_licence(folder: Path) -> None:
     listed = {each["path"]: each for library in libraries(folder) for each in library["files"]}
-    assert set(listed) == {each.name for each in folder.iterdir() if each.is_file()} - {"manifest.json"}
+    assert set(listed) == {each.name for each in folder.iterdir() if each.is_file()} - {
+        "manifest.json"
+    }
     for name, entry in listed.items():
         data = (folder / name).read_bytes()
-        assert (len(data), hashlib.sha256(data).hexdigest()) == (entry["bytes"], entry["sha256"]), name
+        assert (len(data), hashlib.sha256(data).hexdigest()) == (entry["bytes"], entry["sha256"]), (
+            name
+        )
     texts = {library["licence_file"] for library in libraries(folder)}
     assert texts == {f"licences/{each.name}" for each in (folder / "licences").iterdir()}
     for each in texts:
@@ -39,7 +43,11 @@ def test_the_page_ships_no_copyleft() -> None:
 
 def test_the_page_is_small_enough_to_come_over_a_field_radio() -> None:
     late = {"pmtiles.js"}  # only where somebody chooses a base map
-    files = [each for each in (*OURS, *(PAGE / "vendor").glob("*.*")) if each.name not in late | {"manifest.json"}]
+    files = [
+        each
+        for each in (*OURS, *(PAGE / "vendor").glob("*.*"))
+        if each.name not in late | {"manifest.json"}
+    ]
     assert sum(each.stat().st_size for each in files) < MOST_BYTES
 
 
@@ -47,15 +55,22 @@ def test_the_page_is_small_enough_to_come_over_a_field_radio() -> None:
 def test_no_address_of_others_and_no_markup_from_data(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     addresses = set(re.findall(r"https?://[\w.-]+", text))
-    assert addresses <= {"http://www.w3.org", "http://www.opengis.net"}  # names of XML vocabularies, never asked for
-    assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc", text)
+    assert addresses <= {
+        "http://www.w3.org",
+        "http://www.opengis.net",
+    }  # names of XML vocabularies, never asked for
+    assert not re.search(
+        r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\(|new Function|srcdoc", text
+    )
     if path.suffix == ".html":  # the policy forbids both
         assert not re.search(r"<style|\sstyle=|\son\w+=|<script(?![^>]*\bsrc=)", text)
 
 
 def test_every_module_that_is_imported_is_there() -> None:
     for path in OURS:
-        for name in re.findall(r"""(?:from|import)\s*\(?["']\./([\w./-]+)["']""", path.read_text(encoding="utf-8")):
+        for name in re.findall(
+            r"""(?:from|import)\s*\(?["']\./([\w./-]+)["']""", path.read_text(encoding="utf-8")
+        ):
             assert (PAGE / name).is_file(), f"{path.name} imports {name}"
 
 

@@ -17,25 +17,44 @@ from sorvolo.store.site.archive import Archive
 from waiting import wait_for
 
 
-def test_every_flight_that_saw_a_place_is_remembered_in_order(client: TestClient, root: Path) -> None:
+def test_every_flight_that_saw_a_place_is_remembered_in_order(
+    client: TestClient, root: Path
+) -> None:
     """With the changes that were found there and the verdicts on them."""
-    with Archive.open(root / "field", write=True) as archive, archive.begin_flight("c", "c", {}) as writer:
+    with (
+        Archive.open(root / "field", write=True) as archive,
+        archive.begin_flight("c", "c", {}) as writer,
+    ):
         paths = {0: writer.save_image(0, image(0))}
-        writer.commit([frame(0)], paths, {}, "", changes=[fake_change(1, "c", east_m=0.0, north_m=5.0)])
+        writer.commit(
+            [frame(0)], paths, {}, "", changes=[fake_change(1, "c", east_m=0.0, north_m=5.0)]
+        )
     change = client.get("/api/sites/field/collections/changes/items/c-1").json()
     longitude, latitude = np.mean(change["geometry"]["coordinates"][0][:-1], axis=0)
-    client.post("/api/sites/field/reviews", json={
-        "kind": "change", "id": "c-1", "verdict": "confirmed", "revision": 0, "note": "a shed"})
+    client.post(
+        "/api/sites/field/reviews",
+        json={
+            "kind": "change",
+            "id": "c-1",
+            "verdict": "confirmed",
+            "revision": 0,
+            "note": "a shed",
+        },
+    )
     rows = client.get("/api/sites/field/place", params={"lon": longitude, "lat": latitude}).json()
     assert {each["flight"] for each in rows} == {"a", "b", "c"}
     assert [each["time"] for each in rows] == sorted(each["time"] for each in rows)
     for each in rows:
         assert ("c-1" in {one["id"] for one in each["changes"]}) == (each["flight"] == "c")
-        assert [one["verdict"] for one in each["reviews"]] == (["confirmed"] if each["flight"] == "c" else [])
+        assert [one["verdict"] for one in each["reviews"]] == (
+            ["confirmed"] if each["flight"] == "c" else []
+        )
         picture = client.get(each["crop_url"])
         assert picture.status_code == 200
         assert cv2.imdecode(np.frombuffer(picture.content, np.uint8), 1).shape == (320, 320, 3)
-    few = client.get("/api/sites/field/place", params={"lon": longitude, "lat": latitude, "most_per_flight": 1}).json()
+    few = client.get(
+        "/api/sites/field/place", params={"lon": longitude, "lat": latitude, "most_per_flight": 1}
+    ).json()
     assert len(few) == 3
 
 
@@ -58,7 +77,11 @@ def test_the_frame_of_a_number_is_that_frame(tmp_path: Path) -> None:
         stream = file.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         for number in range(20):
-            file.mux(stream.encode(av.VideoFrame.from_ndarray(np.full((48, 64, 3), 12 * number, np.uint8))))
+            file.mux(
+                stream.encode(
+                    av.VideoFrame.from_ndarray(np.full((48, 64, 3), 12 * number, np.uint8))
+                )
+            )
         file.mux(stream.encode())
     for number in (0, 7, 13, 19):
         assert abs(float(frame_of(str(path), number).mean()) - 12 * number) < 4, number
@@ -78,18 +101,31 @@ def test_all_sites_are_asked_at_once(client: TestClient, root: Path, made_site: 
         (site, flight) for site in ("field", "more:field") for flight in ("a", "b")
     }
     assert all(each["frames"] and each["best_frame"] for each in rows)
-    with Archive.open(root / "field", write=True) as archive, archive.begin_flight("c", "c", {}) as writer:
+    with (
+        Archive.open(root / "field", write=True) as archive,
+        archive.begin_flight("c", "c", {}) as writer,
+    ):
         writer.commit([frame(0)], {0: writer.save_image(0, image(0))}, {}, "")
     shutil.rmtree(root / "more" / "field")
     time.sleep(1.1)  # the station looks for sites once a second
     rows = client.get("/api/place", params=place).json()
-    assert {(each["site"], each["flight"]) for each in rows} == {("field", flight) for flight in "abc"}
+    assert {(each["site"], each["flight"]) for each in rows} == {
+        ("field", flight) for flight in "abc"
+    }
     assert client.get("/api/place", params={"lon": 170, "lat": 80}).json() == []
 
 
-def test_an_index_of_no_use_is_named_and_one_site_does_without(client: TestClient, root: Path) -> None:
+def test_an_index_of_no_use_is_named_and_one_site_does_without(
+    client: TestClient, root: Path
+) -> None:
     frames = client.get("/api/sites/field/collections/frames/items").json()["features"]
-    place = dict(zip(("lon", "lat"), np.mean(frames[0]["geometry"]["coordinates"][0][:-1], axis=0), strict=True))
+    place = dict(
+        zip(
+            ("lon", "lat"),
+            np.mean(frames[0]["geometry"]["coordinates"][0][:-1], axis=0),
+            strict=True,
+        )
+    )
     with_index = client.get("/api/sites/field/place", params=place).json()
     (root / "archive-index.db").write_bytes(b"nothing of ours")
     answer = client.get("/api/place", params=place)

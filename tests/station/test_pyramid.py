@@ -21,14 +21,19 @@ def test_halved_tiles_average_the_ground_and_keep_its_edge(made_site: Path) -> N
     """No dark fringe where the map ends."""
     with Archive.open(made_site, write=False) as archive:
         state = pyramid(archive)
-        assert [len(each) for each in state.keys[:2]] == [4, 3] and set(state.keys[-1]) <= {(-1, 0), (0, 0)}
+        assert [len(each) for each in state.keys[:2]] == [4, 3] and set(state.keys[-1]) <= {
+            (-1, 0),
+            (0, 0),
+        }
         fine, coarse = archive.tiles(2)[0, 0], state.picture(1, (0, 0))
         assert coarse is not None
         expected = fine[..., :3].reshape(256, 2, 256, 2, 3).mean(axis=(1, 3))
         assert np.abs(coarse[:256, :256, :3] - expected).max() <= 1
         assert state.picture(1, (7, 7)) is None
         edge = pyramid(archive, 1).picture(2, (0, 0))
-        assert edge is not None and int(edge[..., 0][edge[..., 3] > 0].min()) >= 42  # the darkest red of any tile
+        assert (
+            edge is not None and int(edge[..., 0][edge[..., 3] > 0].min()) >= 42
+        )  # the darkest red of any tile
 
 
 @pytest.mark.parametrize("alphas", [(255,), (0, 255), (0, 40, 255), (0,)])
@@ -47,7 +52,9 @@ def test_a_picture_at_half_its_size_is_the_mean_by_alpha(alphas: tuple[int, ...]
     assert np.abs(small[..., :3] - expected)[is_seen].max(initial=0.0) <= 0.51
 
 
-def test_a_tile_of_the_web_reads_only_the_tiles_under_it(made_site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tile_of_the_web_reads_only_the_tiles_under_it(
+    made_site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """While a map grows each of them was painted anew."""
     with Archive.open(made_site, write=False) as archive:
         state, read = pyramid(archive), set[tuple[int, int]]()
@@ -70,7 +77,10 @@ def test_the_geotiffs_overviews_are_the_same_tiles(made_site: Path) -> None:
     """Within the rounding of its steps; a file that was replaced gives nothing."""
     with Archive.open(made_site, write=False) as archive:
         assert archive.exported_version == 2
-        state, overview = pyramid(archive), MapOverview(archive.mosaic_path, archive.site_grid().grid)
+        state, overview = (
+            pyramid(archive),
+            MapOverview(archive.mosaic_path, archive.site_grid().grid),
+        )
         for level in (1, 2):
             for index in state.keys[level]:
                 computed, read = state.picture(level, index), overview.tile(level, index)
@@ -79,7 +89,9 @@ def test_the_geotiffs_overviews_are_the_same_tiles(made_site: Path) -> None:
                 assert abs((computed[..., 3] > 0).mean() - (read[..., 3] > 0).mean()) < 0.02
                 assert np.abs(computed.astype(int) - read)[inside].max() <= 2 + level
         assert overview.tile(12, (0, 0)) is None
-        assert MapOverview(made_site / "preview.png", archive.site_grid().grid).tile(2, (0, 0)) is None
+        assert (
+            MapOverview(made_site / "preview.png", archive.site_grid().grid).tile(2, (0, 0)) is None
+        )
 
 
 def test_the_same_tiles_have_the_same_revision_and_others_another(made_site: Path) -> None:

@@ -25,22 +25,36 @@ def test_the_map_as_ogc_tiles(client: TestClient) -> None:
     tilejson = client.get(listed["tilejson"]).json()
     assert tilejson["tiles"][0].startswith("http://127.0.0.1:8750" + COG)
     place = corner_tile(client)
-    theirs = client.get(f"{COG}/tiles/WebMercatorQuad/{place}.png", params={"resampling": "bilinear"})
+    theirs = client.get(
+        f"{COG}/tiles/WebMercatorQuad/{place}.png", params={"resampling": "bilinear"}
+    )
     ours = client.get(f"/api/sites/field/tiles/2/{place}.png")
     assert theirs.status_code == ours.status_code == 200
-    one, other = (cv2.imdecode(np.frombuffer(each.content, np.uint8), -1).astype(int) for each in (theirs, ours))
+    one, other = (
+        cv2.imdecode(np.frombuffer(each.content, np.uint8), -1).astype(int)
+        for each in (theirs, ours)
+    )
     both = (one[..., 3] == 255) & (other[..., 3] == 255)
     assert both.sum() > 5000 and np.median(np.abs(one - other)[both]) <= 1
     assert "WebMercatorQuad" in client.get(f"{COG}/tiles").text
     assert client.get(f"{COG}/info").json()["driver"] == "GTiff"
 
 
-@pytest.mark.parametrize(("path", "status"), [
-    ("tiles/WebMercatorQuad/{}?tilesize=100000", 422), ("tiles/WebMercatorQuad/{}?buffer=1000", 422),
-    ("tiles/WebMercatorQuad/{}?bidx=99", 400), ("tiles/WebMercatorQuad/20/1/1.png", 404),
-    ("tiles/WebMercatorQuad/{}?expression=1%2B1", 200), ("statistics", 404), ("preview", 404), ("map.html", 404),
-    ("tiles/WebMercatorQuad/{}?algorithm=contours", 422), ("tiles/WebMercatorQuad/{}?rescale=x", 422),
-])
+@pytest.mark.parametrize(
+    ("path", "status"),
+    [
+        ("tiles/WebMercatorQuad/{}?tilesize=100000", 422),
+        ("tiles/WebMercatorQuad/{}?buffer=1000", 422),
+        ("tiles/WebMercatorQuad/{}?bidx=99", 400),
+        ("tiles/WebMercatorQuad/20/1/1.png", 404),
+        ("tiles/WebMercatorQuad/{}?expression=1%2B1", 200),
+        ("statistics", 404),
+        ("preview", 404),
+        ("map.html", 404),
+        ("tiles/WebMercatorQuad/{}?algorithm=contours", 422),
+        ("tiles/WebMercatorQuad/{}?rescale=x", 422),
+    ],
+)
 def test_what_would_cost_too_much_is_not_there(reader: TestClient, path: str, status: int) -> None:
     """No sizes without bound, no expressions, nothing that reads the whole raster."""
     assert reader.get(f"{COG}/{path.format(corner_tile(reader) + '.png')}").status_code == status
@@ -48,14 +62,20 @@ def test_what_would_cost_too_much_is_not_there(reader: TestClient, path: str, st
 
 def test_files_come_by_id_and_are_geotiffs(client: TestClient, root: Path, tmp_path: Path) -> None:
     """A path, an address, a VRT named .tif, a link: none is opened."""
-    for other in ("..%2f..%2fmosaic", "http:%2f%2fevil.example%2fx.tif", "%2fvsicurl%2fhttp:%2f%2fx", "heights:a"):
+    for other in (
+        "..%2f..%2fmosaic",
+        "http:%2f%2fevil.example%2fx.tif",
+        "%2fvsicurl%2fhttp:%2f%2fx",
+        "heights:a",
+    ):
         assert client.get(f"/api/sites/field/cogs/{other}/info").status_code == 404, other
     assert client.get(f"{COG}/info?url=http://evil.example/x.tif").json()["driver"] == "GTiff"
     mosaic = root / "field/mosaic.tif"
     kept = mosaic.read_bytes()
     mosaic.write_text(
         '<VRTDataset rasterXSize="9" rasterYSize="9"><VRTRasterBand dataType="Byte" band="1"><SimpleSource>'
-        f'<SourceFilename>{tmp_path / "secret.tif"}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>')
+        f"<SourceFilename>{tmp_path / 'secret.tif'}</SourceFilename></SimpleSource></VRTRasterBand></VRTDataset>"
+    )
     (tmp_path / "secret.tif").write_bytes(kept)
     assert client.get(f"{COG}/info").status_code == 400
     mosaic.unlink()
@@ -68,7 +88,9 @@ def test_wmts_names_every_version(client: TestClient) -> None:
     tree = ET.fromstring(client.get("/api/sites/field/WMTSCapabilities.xml").text)
     space = {"w": "http://www.opengis.net/wmts/1.0", "o": "http://www.opengis.net/ows/1.1"}
     layers = {
-        each.findtext("o:Identifier", namespaces=space): each.find("w:ResourceURL", space).get("template")  # type: ignore[union-attr]
+        each.findtext("o:Identifier", namespaces=space): each.find("w:ResourceURL", space).get(
+            "template"
+        )  # type: ignore[union-attr]
         for each in tree.findall("w:Contents/w:Layer", space)
     }
     assert list(layers) == ["live", "1", "2"]
@@ -83,10 +105,14 @@ def test_wmts_names_every_version(client: TestClient) -> None:
 
 def test_stac_leads_from_the_station_to_each_version(client: TestClient) -> None:
     """Catalogue, collection, items with their ground, time and tiles."""
-    child = next(each["href"] for each in client.get("/api/stac").json()["links"] if each["rel"] == "child")
+    child = next(
+        each["href"] for each in client.get("/api/stac").json()["links"] if each["rel"] == "child"
+    )
     collection = client.get(child).json()
     assert collection["type"] == "Collection" and collection["stac_version"] == "1.1.0"
-    items = [client.get(each["href"]).json() for each in collection["links"] if each["rel"] == "item"]
+    items = [
+        client.get(each["href"]).json() for each in collection["links"] if each["rel"] == "item"
+    ]
     assert [each["id"] for each in items] == ["field-1", "field-2"]
     for each in items:
         west, south, east, north = each["bbox"]
@@ -94,4 +120,8 @@ def test_stac_leads_from_the_station_to_each_version(client: TestClient) -> None
         assert each["properties"]["datetime"] == "2023-11-14T22:13:20Z"
         assert "{z}" in each["assets"]["tiles"]["href"]
     assert "mosaic" in items[1]["assets"] and "mosaic" not in items[0]["assets"]
-    assert client.get("/api/stac/field/9").status_code == client.get("/api/stac/nowhere").status_code == 404
+    assert (
+        client.get("/api/stac/field/9").status_code
+        == client.get("/api/stac/nowhere").status_code
+        == 404
+    )

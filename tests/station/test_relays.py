@@ -27,7 +27,12 @@ from sorvolo.station.state import StationState
 from sorvolo.station.webhooks import SIGNATURE, webhook, webhook_name
 from waiting import wait_for
 
-FOUND = NewEvent("object.found", {"feature": {"type": "Feature", "properties": {"class": "person"}}}, "field", "r1")
+FOUND = NewEvent(
+    "object.found",
+    {"feature": {"type": "Feature", "properties": {"class": "person"}}},
+    "field",
+    "r1",
+)
 
 
 @pytest.fixture
@@ -65,7 +70,9 @@ class Receiver:
         return [json.loads(body)["seq"] for _, body in self.got]
 
 
-def test_a_webhook_gets_signed_events_in_order_and_again_after_a_restart(events: EventLog, tmp_path: Path) -> None:
+def test_a_webhook_gets_signed_events_in_order_and_again_after_a_restart(
+    events: EventLog, tmp_path: Path
+) -> None:
     receiver = Receiver(503)
     place = tmp_path / "hook.json"
     relay = Relay("hook", webhook(receiver.url, "secret"), events, place, pause_s=0.02)
@@ -95,11 +102,16 @@ def test_an_event_that_a_receiver_refuses_is_counted_and_holds_up_nothing(
     wait_for(lambda: relay.figures().delivered == 1)
     relay.close()
     figures = relay.figures()
-    assert (figures.delivered, figures.lost, figures.waiting) == (1, 1, 0) and receiver.seqs == [1, 2]
+    assert (figures.delivered, figures.lost, figures.waiting) == (1, 1, 0) and receiver.seqs == [
+        1,
+        2,
+    ]
 
 
 def test_a_receiver_that_is_away_is_waited_for(events: EventLog, tmp_path: Path) -> None:
-    relay = Relay("hook", webhook("http://127.0.0.1:9/"), events, tmp_path / "hook.json", pause_s=0.02)
+    relay = Relay(
+        "hook", webhook("http://127.0.0.1:9/"), events, tmp_path / "hook.json", pause_s=0.02
+    )
     relay.start()
     events.append(FOUND)
     wait_for(lambda: relay.figures().words != "")
@@ -107,7 +119,9 @@ def test_a_receiver_that_is_away_is_waited_for(events: EventLog, tmp_path: Path)
     relay.close()
 
 
-@pytest.mark.parametrize("url", ["ftp://host/x", "host", "http://user:secret@host/", "gopher://host/secret"])
+@pytest.mark.parametrize(
+    "url", ["ftp://host/x", "host", "http://user:secret@host/", "gopher://host/secret"]
+)
 def test_what_is_no_web_address_is_refused_without_its_password(url: str) -> None:
     with pytest.raises(SettingsError, match="no web address") as refused:
         webhook(url)
@@ -118,7 +132,9 @@ def test_a_receiver_is_named_without_its_path_and_its_port_is_one() -> None:
     """Figures and logs name receivers; the path of a chat's webhook is its password."""
     urls = [f"https://hooks.example:8443/services/T{number}secret?key=secret" for number in (0, 1)]
     names = {webhook_name(each) for each in urls}
-    assert len(names) == 2 and all(each.startswith("https://hooks.example:8443/#") for each in names)
+    assert len(names) == 2 and all(
+        each.startswith("https://hooks.example:8443/#") for each in names
+    )
     assert not any("secret" in each for each in names)
     with pytest.raises(SettingsError, match="give one with"):
         webhook("http://host:99999")
@@ -132,7 +148,12 @@ def test_what_is_no_broker_is_refused(url: str) -> None:
 
 def test_a_broker_s_address_in_its_parts() -> None:
     place = mqtt_place("mqtts://crew@broker.example/team/a", "p@ss")
-    assert (place.host, place.port, place.prefix, place.password) == ("broker.example", 8883, "team/a", "p@ss")
+    assert (place.host, place.port, place.prefix, place.password) == (
+        "broker.example",
+        8883,
+        "team/a",
+        "p@ss",
+    )
     assert "p@ss" not in str(place)
 
 

@@ -12,8 +12,10 @@ from sorvolo.station.app import Station
 from sorvolo.station.root_lock import RootLock
 from sorvolo.station.settings import StationSettings
 
-HOLDS = "import sys, time; from pathlib import Path; from sorvolo.station.root_lock import RootLock; " \
-        "lock = RootLock(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+HOLDS = (
+    "import sys, time; from pathlib import Path; from sorvolo.station.root_lock import RootLock; "
+    "lock = RootLock(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+)
 
 
 def test_a_second_station_is_refused_and_the_next_one_is_not(tmp_path: Path) -> None:
@@ -23,7 +25,9 @@ def test_a_second_station_is_refused_and_the_next_one_is_not(tmp_path: Path) -> 
         Station.open(StationSettings(tmp_path))
     command = [sys.executable, "-m", "sorvolo", "serve", str(tmp_path), "--port", "8999"]
     second = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert second.returncode and "another station serves" in " ".join((second.stderr + second.stdout).split())
+    assert second.returncode and "another station serves" in " ".join(
+        (second.stderr + second.stdout).split()
+    )
     assert first.events.last == 0 and first.shelf.folders() == {}
     first.close()
     Station.open(StationSettings(tmp_path)).close()
@@ -31,7 +35,9 @@ def test_a_second_station_is_refused_and_the_next_one_is_not(tmp_path: Path) -> 
 
 def test_a_killed_station_blocks_nobody(tmp_path: Path) -> None:
     """Its file stays, with the number of its process, which nobody holds any more."""
-    process = subprocess.Popen([sys.executable, "-c", HOLDS, str(tmp_path / "station")], stdout=subprocess.PIPE)
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(tmp_path / "station")], stdout=subprocess.PIPE
+    )
     assert process.stdout is not None and process.stdout.readline() == b"held\n"
     with pytest.raises(StoreError, match=f"process {process.pid}"):
         RootLock(tmp_path / "station")

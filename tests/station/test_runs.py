@@ -53,12 +53,18 @@ def open_station(flown: Path, tmp_path: Path) -> Iterator[Callable[[], TestClien
         each.__exit__(None, None, None)
 
 
-def wish(client: TestClient, mission: str = "map", site: str = "new", **options: Any) -> dict[str, Any]:
+def wish(
+    client: TestClient, mission: str = "map", site: str = "new", **options: Any
+) -> dict[str, Any]:
     """A mission on the flight."""
-    inputs = {each["name"].rpartition("/")[2]: each["id"] for each in client.get("/api/inputs").json()}
+    inputs = {
+        each["name"].rpartition("/")[2]: each["id"] for each in client.get("/api/inputs").json()
+    }
     video = next(identity for name, identity in inputs.items() if name.endswith(".mp4"))
     return {
-        "mission": mission, "site": site, "input": {"input": video},
+        "mission": mission,
+        "site": site,
+        "input": {"input": video},
         "options": {"camera_file": {"input": inputs["camera.xml"]}, "model": "none", **options},
     }
 
@@ -115,7 +121,9 @@ def test_a_mission_outlives_its_server_and_nothing_is_lost_or_doubled(
     assert site["versions"][0]["n"] == 1 and site["flights"][0]["matched"] > 2
     events = all_events(client)
     assert [each["seq"] for each in events] == list(range(1, len(events) + 1))
-    journal = (tmp_path / "root/station/runs" / run["id"] / "journal.jsonl").read_text().splitlines()
+    journal = (
+        (tmp_path / "root/station/runs" / run["id"] / "journal.jsonl").read_text().splitlines()
+    )
     types = [each["type"] for each in events if each["run"] == run["id"]]
     assert types == ["run.started", *(json.loads(each)["type"] for each in journal)]
     placed = [each["data"] for each in events if each["type"] == "frame.placed"]
@@ -135,7 +143,9 @@ def test_a_mission_outlives_its_server_and_nothing_is_lost_or_doubled(
         time.sleep(0.05)
 
 
-def test_a_killed_mission_is_named_and_the_next_one_may_start(open_station: Callable[[], TestClient]) -> None:
+def test_a_killed_mission_is_named_and_the_next_one_may_start(
+    open_station: Callable[[], TestClient],
+) -> None:
     """By a signal from outside, as the system does when memory is short; stopped by a person; both at the beginning."""
     client = open_station()
     run = client.post("/api/runs", json=wish(client)).json()
@@ -150,11 +160,15 @@ def test_a_killed_mission_is_named_and_the_next_one_may_start(open_station: Call
     assert [each["state"] for each in client.get("/api/runs").json()] == ["stopped", "failed"]
 
 
-def test_a_mission_that_cannot_do_its_work_names_the_reason(open_station: Callable[[], TestClient]) -> None:
+def test_a_mission_that_cannot_do_its_work_names_the_reason(
+    open_station: Callable[[], TestClient],
+) -> None:
     """The same words as on the command line."""
     client = open_station()
     order = wish(client)
-    inputs = {each["name"].rpartition("/")[2]: each["id"] for each in client.get("/api/inputs").json()}
+    inputs = {
+        each["name"].rpartition("/")[2]: each["id"] for each in client.get("/api/inputs").json()
+    }
     order["input"] = {"input": inputs["camera.xml"]}
     done = ended(client, client.post("/api/runs", json=order).json()["id"])
     assert done["state"] == "failed" and done["exit_code"] == 1 and "camera.xml" in done["error"]
@@ -166,7 +180,9 @@ def test_a_station_over_a_relative_folder_flies_what_lies_there(
     """As `sorvolo serve maps` has it: missions run in folders of their own."""
     shutil.copytree(flown, tmp_path / "maps" / "flown")
     monkeypatch.chdir(tmp_path)
-    with TestClient(station_app(StationSettings(Path("maps"), free_floor_gb=0.0)), base_url=HOST) as client:
+    with TestClient(
+        station_app(StationSettings(Path("maps"), free_floor_gb=0.0)), base_url=HOST
+    ) as client:
         done = ended(client, client.post("/api/runs", json=wish(client)).json()["id"])
     assert (done["state"], done["error"]) == ("finished", None)
 
@@ -189,7 +205,10 @@ def test_a_mission_that_cannot_be_noted_does_not_run(
     monkeypatch.setattr(runs_module, "_spawned", spawn)
     monkeypatch.setattr(runs, "_begin", fail)
     with pytest.raises(StoreError):
-        runs.start(RunWish(mission="map", site="new", input=InputWish(input=runs._inputs.all()[0].id)), "Ada")
+        runs.start(
+            RunWish(mission="map", site="new", input=InputWish(input=runs._inputs.all()[0].id)),
+            "Ada",
+        )
     assert spawned[0].poll() == -signal.SIGKILL and runs.all() == []
 
 
@@ -220,7 +239,10 @@ def waiting(runs: Runs, run: Run, program: str) -> Run:
     with (folder / "running.lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         process = subprocess.Popen(
-            [sys.executable, "-c", program], pass_fds=(lock.fileno(),), start_new_session=True, stdout=subprocess.PIPE
+            [sys.executable, "-c", program],
+            pass_fds=(lock.fileno(),),
+            start_new_session=True,
+            stdout=subprocess.PIPE,
         )
     assert process.stdout is not None and process.stdout.readline() == b"ready\n"
     runs._processes[run.id] = process
@@ -231,13 +253,17 @@ def waiting(runs: Runs, run: Run, program: str) -> Run:
 
 def test_a_watch_that_is_stopped_keeps_what_it_found_and_states_that_it_was(tmp_path: Path) -> None:
     simulate_into(tmp_path / "flown", small_flight(5, length_m=60, fps=8))
-    with TestClient(station_app(StationSettings(tmp_path, free_floor_gb=0.0)), base_url=HOST) as client:
+    with TestClient(
+        station_app(StationSettings(tmp_path, free_floor_gb=0.0)), base_url=HOST
+    ) as client:
         run = client.post("/api/runs", json=wish(client, "watch", model="default-int8")).json()
         path = f"/api/runs/{run['id']}"
         wait_for(lambda: client.get(path).json()["progress"])
         client.post(f"{path}/stop")
         done = ended(client, run["id"])
-    assert done["state"] == "finished" and done["headline"].startswith("stopped before the flight's end: ")
+    assert done["state"] == "finished" and done["headline"].startswith(
+        "stopped before the flight's end: "
+    )
     assert done["progress"]["frames"] < done["progress"]["frames_expected"]
 
 
@@ -253,24 +279,33 @@ def test_a_mission_that_hangs_is_killed_some_time_after_it_was_stopped(
     with TestClient(station_app(StationSettings(tmp_path, limits=limits)), base_url=HOST) as client:
         runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
         runs.close()
-        run = waiting(runs, Run("2" * 16, "map", "new", "running", "Ada", utc_now(), input=source), DEAF)
+        run = waiting(
+            runs, Run("2" * 16, "map", "new", "running", "Ada", utc_now(), input=source), DEAF
+        )
         for _ in range(stops):
             assert runs.look() == 1
             runs.stop(run.id)
-            assert runs.look() == 1 and runs._processes[run.id].poll() is None  # it did not wait for its end
+            assert (
+                runs.look() == 1 and runs._processes[run.id].poll() is None
+            )  # it did not wait for its end
         wait_for(lambda: not runs.look())
         done = runs.get(run.id)
         assert done.state == "stopped" and done.exit_code == -signal.SIGKILL
 
 
-def test_a_process_that_states_its_end_and_does_not_come_to_it_holds_up_nobody(tmp_path: Path) -> None:
+def test_a_process_that_states_its_end_and_does_not_come_to_it_holds_up_nobody(
+    tmp_path: Path,
+) -> None:
     """A thread that never ends; the mission is over, its process is killed after a while."""
     limits = StationLimits(stop_within_s=0.3)
     with TestClient(station_app(StationSettings(tmp_path, limits=limits)), base_url=HOST) as client:
         runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
         runs.close()
         run = waiting(runs, Run("3" * 16, "map", "new", "running", "Ada", utc_now()), DEAF)
-        line = {"type": "run.finished", "data": {"headline": "mapped", "exit_code": 0, "error": None}}
+        line = {
+            "type": "run.finished",
+            "data": {"headline": "mapped", "exit_code": 0, "error": None},
+        }
         (runs._folder / run.id / "journal.jsonl").write_text(json.dumps(line) + "\n")
         process = runs._processes[run.id]
         assert runs.look() == 0 and process.poll() is None  # it did not wait for its end
@@ -279,7 +314,9 @@ def test_a_process_that_states_its_end_and_does_not_come_to_it_holds_up_nobody(t
         assert process.returncode == -signal.SIGKILL
 
 
-def test_a_line_of_a_mission_is_taken_in_when_it_comes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_of_a_mission_is_taken_in_when_it_comes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Not when the station next looks at all missions: boxes wait for it."""
     with TestClient(station_app(StationSettings(tmp_path)), base_url=HOST) as client:
         runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
@@ -298,7 +335,9 @@ def test_a_search_maps_the_flight_that_it_is_given_and_measures_it(
 ) -> None:
     """It writes into its site as a map does; a search of the site's own flights does not."""
     client = open_station()
-    run = client.post("/api/runs", json=wish(client, "search", model="default", classes=["car"], plants=10)).json()
+    run = client.post(
+        "/api/runs", json=wish(client, "search", model="default", classes=["car"], plants=10)
+    ).json()
     second = client.post("/api/runs", json=wish(client, "map"))
     assert second.status_code == 409 and "search" in second.json()["detail"]
     state = ended(client, run["id"])
@@ -315,20 +354,32 @@ def test_the_missions_of_a_site_are_not_cut_off_by_those_of_others(tmp_path: Pat
         runs: Runs = client.app.state.station.runs  # type: ignore[attr-defined]
         runs.close()
         for number, site in enumerate(["mine", "theirs", "theirs"]):
-            runs._begin(Run(str(number), "map", site, "failed", "Ada", f"2026-01-01T00:00:0{number}Z"))
+            runs._begin(
+                Run(str(number), "map", site, "failed", "Ada", f"2026-01-01T00:00:0{number}Z")
+            )
         assert [each["id"] for each in client.get("/api/runs?site=mine&limit=2").json()] == ["0"]
         assert [each["id"] for each in client.get("/api/runs?limit=2").json()] == ["2", "1"]
 
 
 WRONG: list[tuple[dict[str, Any], int]] = [
-    ({"mission": "fly"}, 422), ({"site": ""}, 422), ({"site": "../out"}, 400), ({"site": "station"}, 400),
+    ({"mission": "fly"}, 422),
+    ({"site": ""}, 422),
+    ({"site": "../out"}, 400),
+    ({"site": "station"}, 400),
     ({"site": "streams"}, 400),
-    ({"input": {"input": "0" * 16}}, 404), ({"input": {"upload": "../../etc/passwd"}}, 404), ({"input": None}, 422),
-    ({"input": {"path": "/etc/passwd"}}, 422), ({"input": {"input": "a", "upload": "b"}}, 422),
-    ({"options": {"camera": "/etc/passwd"}}, 422), ({"options": {"model": "../model"}}, 422),
-    ({"options": {"alert_command": "rm"}}, 422), ({"options": {"overlap": 2}}, 422),
-    ({"mission": "compare", "site": "nowhere"}, 404), ({"mission": "search", "site": "nowhere", "input": None}, 404),
-    ({"input": {"stream_url": "rtsp://127.0.0.1/live"}}, 400), ({"input": {"stream": "../x"}}, 400),
+    ({"input": {"input": "0" * 16}}, 404),
+    ({"input": {"upload": "../../etc/passwd"}}, 404),
+    ({"input": None}, 422),
+    ({"input": {"path": "/etc/passwd"}}, 422),
+    ({"input": {"input": "a", "upload": "b"}}, 422),
+    ({"options": {"camera": "/etc/passwd"}}, 422),
+    ({"options": {"model": "../model"}}, 422),
+    ({"options": {"alert_command": "rm"}}, 422),
+    ({"options": {"overlap": 2}}, 422),
+    ({"mission": "compare", "site": "nowhere"}, 404),
+    ({"mission": "search", "site": "nowhere", "input": None}, 404),
+    ({"input": {"stream_url": "rtsp://127.0.0.1/live"}}, 400),
+    ({"input": {"stream": "../x"}}, 400),
     ({"input": {"stream": "nobody"}}, 404),
 ]
 
@@ -346,7 +397,9 @@ def test_what_cannot_be_started_is_refused(open_station: Callable[[], TestClient
 def test_without_free_space_nothing_starts(flown: Path, tmp_path: Path) -> None:
     """507, and what to do."""
     shutil.copytree(flown, tmp_path / "root" / "flown")
-    with TestClient(station_app(StationSettings(tmp_path / "root", free_floor_gb=1e6)), base_url=HOST) as client:
+    with TestClient(
+        station_app(StationSettings(tmp_path / "root", free_floor_gb=1e6)), base_url=HOST
+    ) as client:
         answer = client.post("/api/runs", json=wish(client))
         assert answer.status_code == 507 and "delete" in answer.json()["detail"]
         client.app.state.station.runs.look_at_disk()  # type: ignore[attr-defined]

@@ -59,7 +59,9 @@ def refused(client: TestClient, address: str, **headers: str) -> int:
 # ---- hosts and origins --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8750", "", "[::2]"])
+@pytest.mark.parametrize(
+    "host", ["evil.example", "127.0.0.1.evil.example", "localhost.evil.example:8750", "", "[::2]"]
+)
 def test_a_forged_host_is_refused(reader: TestClient, host: str) -> None:
     """A page whose name was pointed to this machine (DNS rebinding) sends its own name."""
     assert reader.get("/api/status", headers={"host": host}).status_code == 421
@@ -79,7 +81,11 @@ def test_names_are_known_on_other_addresses_too(root: Path) -> None:
     settings = StationSettings(root, "0.0.0.0", insecure_lan=True, names=("field.example",))
     with TestClient(station_app(settings), base_url=HOST) as client:
         client.headers["authorization"] = f"Bearer {token}"
-        for host, status in (("field.example:8750", 200), ("192.168.7.9:8750", 200), ("evil.example", 421)):
+        for host, status in (
+            ("field.example:8750", 200),
+            ("192.168.7.9:8750", 200),
+            ("evil.example", 421),
+        ):
             assert client.get("/api/status", headers={"host": host}).status_code == status, host
 
 
@@ -91,7 +97,9 @@ def proxied(root: Path, **headers: str) -> tuple[TestClient, str]:
     config = server_config(station_app(settings), settings)
     config.load()
     client = TestClient(config.loaded_app, base_url=HOST, client=("127.0.0.1", 4000))  # type: ignore[arg-type]
-    client.headers.update({"x-forwarded-for": "198.51.100.7", "x-forwarded-proto": "https", **headers})
+    client.headers.update(
+        {"x-forwarded-for": "198.51.100.7", "x-forwarded-proto": "https", **headers}
+    )
     return client, token
 
 
@@ -107,7 +115,11 @@ def test_behind_a_proxy_its_pages_may_ask(root: Path, host: str) -> None:
         body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
         assert client.post("/api/sites/field/reviews", json=body).status_code == 201
         assert refused(client, "/api/events", **dict(client.headers)) == 0
-        for origin in ("https://evil.example", "https://maps.example.evil.example", "https://maps.example:444"):
+        for origin in (
+            "https://evil.example",
+            "https://maps.example.evil.example",
+            "https://maps.example:444",
+        ):
             foreign = client.post("/api/sites/field/reviews", json=body, headers={"origin": origin})
             assert foreign.status_code == 403, origin
         assert client.get("/api/status", headers={"host": "evil.example"}).status_code == 421
@@ -121,11 +133,18 @@ def test_behind_a_proxy_guesses_count_for_who_made_them(root: Path) -> None:
             client.post("/api/session", json={"token": "sorvolo_0_wrong"})
         assert client.post("/api/session", json={"token": "sorvolo_0_wrong"}).status_code == 429
         other = {"x-forwarded-for": "198.51.100.8"}
-        assert client.post("/api/session", json={"token": "sorvolo_0_wrong"}, headers=other).status_code == 401
+        assert (
+            client.post(
+                "/api/session", json={"token": "sorvolo_0_wrong"}, headers=other
+            ).status_code
+            == 401
+        )
         assert client.post("/api/session", json={"token": token}, headers=other).status_code == 200
 
 
-@pytest.mark.parametrize("more", [{"names": ("field.example",)}, {"public_url": "https://maps.example"}])
+@pytest.mark.parametrize(
+    "more", [{"names": ("field.example",)}, {"public_url": "https://maps.example"}]
+)
 def test_other_names_of_a_station_on_loopback_need_tokens(root: Path, more: dict[str, Any]) -> None:
     """Without any a page under that name, wherever it came from, could start missions."""
     settings = StationSettings(root, **more)
@@ -137,10 +156,18 @@ def test_other_names_of_a_station_on_loopback_need_tokens(root: Path, more: dict
             assert client.get("/api/sites", headers={"host": host}).status_code in (401, 421)
 
 
-@pytest.mark.parametrize("url", [
-    "http://maps.example", "maps.example", "https://maps.example/station", "https://me:pw@maps.example", "https://:1",
-    "https://maps.example:x", "https://maps.example/?a=b",
-])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://maps.example",
+        "maps.example",
+        "https://maps.example/station",
+        "https://me:pw@maps.example",
+        "https://:1",
+        "https://maps.example:x",
+        "https://maps.example/?a=b",
+    ],
+)
 def test_what_is_no_proxy_s_address(tmp_path: Path, url: str) -> None:
     """The station's pages ask for /api of a whole host, by TLS."""
     with pytest.raises(SettingsError, match=r"without a path: https://maps\.example"):
@@ -150,8 +177,10 @@ def test_what_is_no_proxy_s_address(tmp_path: Path, url: str) -> None:
 def test_one_address_keeps_so_many_live_channels_and_no_more(root: Path) -> None:
     """Each holds memory and a task for as long as it is open; closing one makes room."""
     settings = StationSettings(root, limits=StationLimits(most_live_per_address=2))
-    with TestClient(station_app(settings), base_url=HOST, client=("127.0.0.1", 5000)) as client, \
-            client.websocket_connect(SOCKET):
+    with (
+        TestClient(station_app(settings), base_url=HOST, client=("127.0.0.1", 5000)) as client,
+        client.websocket_connect(SOCKET),
+    ):
         with client.websocket_connect(SOCKET):
             assert refused(client, SOCKET) in (429, 4429)
             assert client.get("/api/events").status_code == 429
@@ -167,13 +196,23 @@ def test_the_server_takes_so_many_connections(root: Path) -> None:
     app.state.station.close()
 
 
-@pytest.mark.parametrize("origin", [
-    "http://evil.example", "https://127.0.0.1:8750", "http://127.0.0.1:9999", "http://localhost:8750", "null",
-])
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "http://evil.example",
+        "https://127.0.0.1:8750",
+        "http://127.0.0.1:9999",
+        "http://localhost:8750",
+        "null",
+    ],
+)
 def test_pages_of_other_sites_change_nothing(client: TestClient, origin: str) -> None:
     """Nor do they open a WebSocket."""
     body = {"kind": "change", "id": "b-1", "verdict": "confirmed", "revision": 0}
-    assert client.post("/api/sites/field/reviews", json=body, headers={"origin": origin}).status_code == 403
+    assert (
+        client.post("/api/sites/field/reviews", json=body, headers={"origin": origin}).status_code
+        == 403
+    )
     assert client.delete("/api/session", headers={"origin": origin}).status_code == 403
     assert refused(client, SOCKET, origin=origin) in (403, 4403)
     own = client.post("/api/sites/field/reviews", json=body, headers={"origin": HOST})
@@ -182,7 +221,10 @@ def test_pages_of_other_sites_change_nothing(client: TestClient, origin: str) ->
 
 def test_requests_that_browsers_mark_as_cross_site(client: TestClient) -> None:
     """A form of another page that names no origin."""
-    assert client.post("/api/runs", json={}, headers={"sec-fetch-site": "cross-site"}).status_code == 403
+    assert (
+        client.post("/api/runs", json={}, headers={"sec-fetch-site": "cross-site"}).status_code
+        == 403
+    )
     assert refused(client, SOCKET, **{"sec-fetch-site": "cross-site"}) in (403, 4403)
     assert refused(client, SOCKET) == 0
 
@@ -191,10 +233,17 @@ def test_headers_that_keep_a_page_to_its_own(client: TestClient) -> None:
     """No third party, no framing, no guessing of kinds; what is private is not kept by caches."""
     headers = client.get("/api/sites").headers
     policy = headers["content-security-policy"]
-    assert "default-src 'none'" in policy and "frame-ancestors 'none'" in policy and "http" not in policy
+    assert (
+        "default-src 'none'" in policy
+        and "frame-ancestors 'none'" in policy
+        and "http" not in policy
+    )
     assert headers["x-content-type-options"] == "nosniff" and headers["cache-control"] == "no-store"
     assert "access-control-allow-origin" not in headers
-    assert "access-control-allow-origin" not in client.get("/api/sites", headers={"origin": "http://evil.example"}).headers
+    assert (
+        "access-control-allow-origin"
+        not in client.get("/api/sites", headers={"origin": "http://evil.example"}).headers
+    )
 
 
 # ---- tokens -------------------------------------------------------------------------------------------------------
@@ -226,7 +275,9 @@ def test_without_a_token_nothing_is_shown_once_there_is_one(root: Path) -> None:
         tile = "/api/sites/field/tiles/1/18/1/1.webp"
         for path in ("/api/status", "/api/sites", "/openapi.json", tile, "/api/events"):
             answer = client.get(path)
-            assert answer.status_code == 401 and answer.headers["www-authenticate"] == "Bearer", path
+            assert answer.status_code == 401 and answer.headers["www-authenticate"] == "Bearer", (
+                path
+            )
         assert refused(client, SOCKET) in (401, 4401)
         assert client.get("/").status_code in (200, 404)
         assert client.post("/api/session", json={"token": token}).status_code == 200
@@ -255,8 +306,9 @@ def test_roles(root: Path, role: str, allowed: set[str]) -> None:
         statuses = {
             "view": client.get("/api/sites").status_code,
             "review": client.post("/api/sites/field/reviews", json=review).status_code,
-            "operate": client.post("/api/runs", json={
-                "mission": "search", "site": "nowhere"}).status_code,
+            "operate": client.post(
+                "/api/runs", json={"mission": "search", "site": "nowhere"}
+            ).status_code,
         }
         assert {name for name, status in statuses.items() if status != 403} == allowed
         assert client.get("/api/uploads").status_code == 403
@@ -279,17 +331,30 @@ def test_who_guesses_keeps_nobody_else_out(root: Path) -> None:
     """A crew shares one address: one of them with an old token must not hold up the others, nor its own next login."""
     client, token = guarded(root)
     with client:
-        old = {"authorization": "Bearer sorvolo_000000000000_old", "cookie": "sorvolo_session=sorvolo_000000000000_old"}
+        old = {
+            "authorization": "Bearer sorvolo_000000000000_old",
+            "cookie": "sorvolo_session=sorvolo_000000000000_old",
+        }
         assert [client.get("/api/sites", headers=old).status_code for _ in range(7)][-1] == 429
-        assert client.get("/api/sites", headers={"authorization": f"Bearer {token}"}).status_code == 200
+        assert (
+            client.get("/api/sites", headers={"authorization": f"Bearer {token}"}).status_code
+            == 200
+        )
         assert client.get("/", headers=old).status_code == 200
         assert client.post("/api/session", json={"token": token}, headers=old).status_code == 200
 
 
 def test_a_network_of_ipv6_addresses_guesses_as_one() -> None:
     """Whoever has one address of it has 2^64."""
-    assert address_group("2001:db8::1") == address_group("2001:db8::ffff:2") != address_group("2001:db8:0:1::1")
-    assert address_group("192.0.2.1") != address_group("192.0.2.2") and address_group("testclient") == "testclient"
+    assert (
+        address_group("2001:db8::1")
+        == address_group("2001:db8::ffff:2")
+        != address_group("2001:db8:0:1::1")
+    )
+    assert (
+        address_group("192.0.2.1") != address_group("192.0.2.2")
+        and address_group("testclient") == "testclient"
+    )
 
 
 def test_each_wrong_token_doubles_the_wait() -> None:
@@ -321,7 +386,9 @@ def test_others_reach_it_only_with_tokens_and_tls(tmp_path: Path) -> None:
     check_exposure(StationSettings(tmp_path, "0.0.0.0", insecure_lan=True), has_tokens=True)
     certificate = tmp_path / "cert.pem"
     certificate.write_text("")
-    check_exposure(StationSettings(tmp_path, "::", tls_cert=certificate, tls_key=certificate), has_tokens=True)
+    check_exposure(
+        StationSettings(tmp_path, "::", tls_cert=certificate, tls_key=certificate), has_tokens=True
+    )
     with pytest.raises(SettingsError, match="belong together"):
         StationSettings(tmp_path, tls_cert=certificate)
 
@@ -339,26 +406,47 @@ def test_the_command_refuses_in_one_line(tmp_path: Path) -> None:
     with closing(socket.socket()) as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        result = CliRunner().invoke(command, ["serve", str(tmp_path), "--port", str(taken.getsockname()[1])])
+        result = CliRunner().invoke(
+            command, ["serve", str(tmp_path), "--port", str(taken.getsockname()[1])]
+        )
         assert "another program" in str(result.exception)
 
 
 # ---- paths and links ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("path", [
-    "/page/../app.py", "/page/..%2fapp.py", "/page/%2e%2e/state.py", "/page//etc/passwd", "/page/..\\app.py",
-    "/api/sites/..%2f..%2fetc", "/api/sites/%2e%2e", "/api/sites/..", "/api/sites/field%2f..%2f..",
-    "/api/sites/field/crops/change/..%2f..%2fsite.db/0.jpg", "/api/sites/field/flights/..%2f..%2f/video",
-    "/api/sites/field/flights/..%5c..%5csite.db/video", "/api/runs/..%2fstation.db", "/api/uploads/..%2fstation.db",
-    "/api/sites/field/tiles/..%2f1/18/1/1.webp", "/api/sites/station/tiles/1/18/1/1.webp", "/station/station.db",
-    "/api/streams/..%2f..",
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/page/../app.py",
+        "/page/..%2fapp.py",
+        "/page/%2e%2e/state.py",
+        "/page//etc/passwd",
+        "/page/..\\app.py",
+        "/api/sites/..%2f..%2fetc",
+        "/api/sites/%2e%2e",
+        "/api/sites/..",
+        "/api/sites/field%2f..%2f..",
+        "/api/sites/field/crops/change/..%2f..%2fsite.db/0.jpg",
+        "/api/sites/field/flights/..%2f..%2f/video",
+        "/api/sites/field/flights/..%5c..%5csite.db/video",
+        "/api/runs/..%2fstation.db",
+        "/api/uploads/..%2fstation.db",
+        "/api/sites/field/tiles/..%2f1/18/1/1.webp",
+        "/api/sites/station/tiles/1/18/1/1.webp",
+        "/station/station.db",
+        "/api/streams/..%2f..",
+    ],
+)
 def test_no_path_leads_outside(reader: TestClient, path: str) -> None:
     """Names are looked up, never followed."""
     answer = reader.get(path)
     assert answer.status_code in (400, 404, 405), path
-    assert b"root:" not in answer.content and b"SQLite" not in answer.content and b"import" not in answer.content
+    assert (
+        b"root:" not in answer.content
+        and b"SQLite" not in answer.content
+        and b"import" not in answer.content
+    )
 
 
 def test_links_in_a_site_are_not_followed(root: Path, tmp_path: Path) -> None:
@@ -382,22 +470,53 @@ def test_a_large_request_is_refused(client: TestClient) -> None:
     """Announced, or in pieces of unknown length."""
     large = b'{"note": "' + b"x" * 1_500_000 + b'"}'
     assert client.post("/api/sites/field/reviews", content=large).status_code == 413
-    assert client.post("/api/sites/field/reviews", content=(large[i:i + 99_999] for i in range(0, len(large), 99_999))
-                       ).status_code == 413
-    assert client.post("/api/runs", content=large[:100], headers={"content-length": "-5"}).status_code in (400, 413)
+    assert (
+        client.post(
+            "/api/sites/field/reviews",
+            content=(large[i : i + 99_999] for i in range(0, len(large), 99_999)),
+        ).status_code
+        == 413
+    )
+    assert client.post(
+        "/api/runs", content=large[:100], headers={"content-length": "-5"}
+    ).status_code in (400, 413)
 
 
 # ---- streams ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("url", [
-    "rtsp://127.0.0.1/live", "rtsp://localhost:554/live", "rtsp://[::1]/live", "rtsp://10.0.0.5/live",
-    "rtsp://192.168.1.1/", "rtsp://169.254.169.254/latest", "rtsp://[fe80::1]/x", "rtsp://[::ffff:127.0.0.1]/x",
-    "rtsp://0.0.0.0/x", "rtsp://224.0.0.1/x", "rtmp://[fd00::1]/live", "rtsp://2130706433/x", "rtsp://[2002:7f00:1::]/x",
-    "http://example.com/x.m3u8", "https://example.com/x", "file:///etc/passwd", "tcp://8.8.8.8:80", "concat:/etc/x",
-    "follow:/etc/passwd", "webcam:0", "/etc/passwd", "udp://:80", "udp://:5600?localaddr=10.0.0.1", "rtsp://8.8.8.8\r\nx",
-    "rtsp:///x", "srt://8.8.8.8:9000?mode=listener", "rtsp://8.8.8.8:99999/x",
-])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "rtsp://127.0.0.1/live",
+        "rtsp://localhost:554/live",
+        "rtsp://[::1]/live",
+        "rtsp://10.0.0.5/live",
+        "rtsp://192.168.1.1/",
+        "rtsp://169.254.169.254/latest",
+        "rtsp://[fe80::1]/x",
+        "rtsp://[::ffff:127.0.0.1]/x",
+        "rtsp://0.0.0.0/x",
+        "rtsp://224.0.0.1/x",
+        "rtmp://[fd00::1]/live",
+        "rtsp://2130706433/x",
+        "rtsp://[2002:7f00:1::]/x",
+        "http://example.com/x.m3u8",
+        "https://example.com/x",
+        "file:///etc/passwd",
+        "tcp://8.8.8.8:80",
+        "concat:/etc/x",
+        "follow:/etc/passwd",
+        "webcam:0",
+        "/etc/passwd",
+        "udp://:80",
+        "udp://:5600?localaddr=10.0.0.1",
+        "rtsp://8.8.8.8\r\nx",
+        "rtsp:///x",
+        "srt://8.8.8.8:9000?mode=listener",
+        "rtsp://8.8.8.8:99999/x",
+    ],
+)
 def test_streams_of_the_own_network_are_not_called(url: str) -> None:
     """Nor other schemes, nor files in disguise."""
     with pytest.raises(Problem) as problem:
@@ -405,10 +524,15 @@ def test_streams_of_the_own_network_are_not_called(url: str) -> None:
     assert problem.value.status == 400
 
 
-@pytest.mark.parametrize(("url", "words"), [
-    ("file:///etc/passwd", "streams of file are not called"), ("rtsp:///x", "names no host"), ("/etc/x", "no scheme"),
-    ("udp://:80", "with a port from 1024 on"),
-])
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        ("file:///etc/passwd", "streams of file are not called"),
+        ("rtsp:///x", "names no host"),
+        ("/etc/x", "no scheme"),
+        ("udp://:80", "with a port from 1024 on"),
+    ],
+)
 def test_an_address_that_is_refused_states_what_was_found(url: str, words: str) -> None:
     with pytest.raises(Problem, match=words):
         checked_stream(url, ())
@@ -419,11 +543,15 @@ def test_a_stream_that_may_be_called_is_called_where_it_was_checked() -> None:
     answers = iter([["203.0.113.9"], ["127.0.0.1"]])
     with pytest.raises(Problem):  # a documentation network is no public one
         checked_stream("rtsp://cam.example/live", (), lambda _, __: next(answers))
-    assert checked_stream("rtsp://me:pw@cam.example:8554/live?x=1", (), lambda _, __: ["93.184.216.34"]) == (
-        "rtsp://me:pw@93.184.216.34:8554/live?x=1")
+    assert checked_stream(
+        "rtsp://me:pw@cam.example:8554/live?x=1", (), lambda _, __: ["93.184.216.34"]
+    ) == ("rtsp://me:pw@93.184.216.34:8554/live?x=1")
     with pytest.raises(Problem):
         checked_stream("rtsp://cam.example/live", (), lambda _, __: ["93.184.216.34", "10.0.0.1"])
-    assert checked_stream("rtsp://192.168.1.10/live", ("192.168.1.0/24",)) == "rtsp://192.168.1.10/live"
+    assert (
+        checked_stream("rtsp://192.168.1.10/live", ("192.168.1.0/24",))
+        == "rtsp://192.168.1.10/live"
+    )
     with pytest.raises(Problem):
         checked_stream("rtsp://192.168.2.10/live", ("192.168.1.0/24",))
     assert checked_stream("udp://:5600", ()) == "udp://:5600"
@@ -431,13 +559,21 @@ def test_a_stream_that_may_be_called_is_called_where_it_was_checked() -> None:
 
 def test_a_streams_password_is_shown_to_nobody(client: TestClient, root: Path) -> None:
     """Not in the run, its events, its errors; on the disk for the mission's eyes alone."""
-    run = client.post("/api/runs", json={
-        "mission": "watch", "site": "field", "input": {"stream_url": "rtsp://me:secretword@127.0.0.1/live"}})
+    run = client.post(
+        "/api/runs",
+        json={
+            "mission": "watch",
+            "site": "field",
+            "input": {"stream_url": "rtsp://me:secretword@127.0.0.1/live"},
+        },
+    )
     assert run.status_code == 400 and "secretword" not in run.text
     inputs = client.app.state.station.inputs  # type: ignore[attr-defined]
     from sorvolo.station.orders import InputWish
 
-    shown = inputs.shown(InputWish(stream_url="rtsp://me:secretword@93.184.216.34/live?token=secretword"))
+    shown = inputs.shown(
+        InputWish(stream_url="rtsp://me:secretword@93.184.216.34/live?token=secretword")
+    )
     assert shown == {"stream_url": "rtsp://93.184.216.34/live"}
     assert (root / "station").stat().st_mode & 0o077 == 0
 
@@ -447,17 +583,23 @@ def test_a_missions_error_holds_no_password(
 ) -> None:
     """FFmpeg's own errors state the whole address, and every viewer reads why a mission failed."""
     source = "rtsp://me:secretword@93.184.216.34/live?token=hidden"
-    Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {}).write(tmp_path)
+    Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {}).write(
+        tmp_path
+    )
 
     def fail(*_: object) -> str:
         raise ValueError(f"Invalid data found when processing input: {source!r}")
 
     monkeypatch.setitem(worker._MISSIONS, "watch", fail)
-    monkeypatch.setattr(worker, "_Stop", lambda _: SimpleNamespace(until=None, at_once=None, why=""))
+    monkeypatch.setattr(
+        worker, "_Stop", lambda _: SimpleNamespace(until=None, at_once=None, why="")
+    )
     monkeypatch.setenv(SOURCE_VARIABLE, source)
     assert worker.main(tmp_path) == 1
     text = (tmp_path / "journal.jsonl").read_text() + capsys.readouterr().err
-    assert text.count("93.184.216.34/live") == 2 and "secretword" not in text and "hidden" not in text
+    assert (
+        text.count("93.184.216.34/live") == 2 and "secretword" not in text and "hidden" not in text
+    )
 
 
 def test_a_mission_gets_a_streams_password_by_its_environment_alone(
@@ -467,7 +609,9 @@ def test_a_mission_gets_a_streams_password_by_its_environment_alone(
     source = "rtsp://me:secretword@93.184.216.34/live?token=hidden"
     order = Order("r", "watch", "field", str(tmp_path), source, "", "", str(tmp_path), "", {})
     order.write(tmp_path)
-    assert "secretword" not in (text := (tmp_path / "order.json").read_text()) and "hidden" not in text
+    assert (
+        "secretword" not in (text := (tmp_path / "order.json").read_text()) and "hidden" not in text
+    )
     monkeypatch.setenv(SOURCE_VARIABLE, source)
     assert Order.read(tmp_path).source == source and SOURCE_VARIABLE not in os.environ
     monkeypatch.setenv(SOURCE_VARIABLE, "rtsp://me:pw@192.0.2.1/else")

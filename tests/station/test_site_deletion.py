@@ -39,7 +39,9 @@ def keep_run(client: TestClient, run: str, state: str) -> None:
     watch_run(station, run)
     record = asdict(Run(run, "watch", "field", state, "ada", utc_now()))
     with station.state.changing() as connection:
-        connection.execute("UPDATE runs SET state = ?, record = ? WHERE id = ?", (state, compact_json(record), run))
+        connection.execute(
+            "UPDATE runs SET state = ?, record = ? WHERE id = ?", (state, compact_json(record), run)
+        )
 
 
 def events(client: TestClient) -> list[tuple[str, str | None]]:
@@ -47,7 +49,9 @@ def events(client: TestClient) -> list[tuple[str, str | None]]:
     return [(each["type"], each["site"]) for each in client.app.state.station.events.after(0)]  # type: ignore[attr-defined]
 
 
-def test_a_site_goes_with_all_that_the_station_keeps_of_it(client: TestClient, root: Path, made_site: Path) -> None:
+def test_a_site_goes_with_all_that_the_station_keeps_of_it(
+    client: TestClient, root: Path, made_site: Path
+) -> None:
     """Its size is stated before; every page hears of it; a new site of its name knows nothing of it."""
     shutil.copytree(made_site, root / "other")
     keep_run(client, "feed", "finished")
@@ -63,7 +67,9 @@ def test_a_site_goes_with_all_that_the_station_keeps_of_it(client: TestClient, r
     assert client.delete(FIELD, headers={"if-match": answer.headers["etag"]}).status_code == 204
     assert not (root / "field").exists() and not list((root / "station" / "deleted").iterdir())
     assert client.get(FIELD).status_code == 404 and client.get("/api/runs").json() == []
-    assert not (root / "station" / "runs" / "feed").exists() and not list((root / "station" / "drawings").iterdir())
+    assert not (root / "station" / "runs" / "feed").exists() and not list(
+        (root / "station" / "drawings").iterdir()
+    )
     assert client.app.state.station.state.rows("SELECT * FROM reviews") == []  # type: ignore[attr-defined]
     wait_for(lambda: ("site.gone", "field") in events(client))
     assert [each["id"] for each in client.get("/api/sites").json()] == ["other"]
@@ -103,7 +109,9 @@ def test_a_site_that_is_used_stays(client: TestClient, root: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [POINTER, ORIGIN, COPYING])
-def test_a_folder_that_is_not_the_whole_of_a_site_stays(client: TestClient, root: Path, name: str) -> None:
+def test_a_folder_that_is_not_the_whole_of_a_site_stays(
+    client: TestClient, root: Path, name: str
+) -> None:
     """Its catalogue, or its truth, lies elsewhere; or it is still being copied."""
     mark = mark_of(client)
     (root / "field" / name).write_text("{}")
@@ -143,11 +151,29 @@ def test_who_may_not_start_missions_deletes_nothing(root: Path, role: str) -> No
         assert client.delete(FIELD, headers={"if-match": "x"}).status_code == 403
 
 
-@pytest.mark.parametrize("name", [
-    "..", "%2e%2e", "..%2f..%2foutside", "%2e%2e:outside", "..:outside", "field%2f..%2f..%2foutside", "field%2f..",
-    "station", "streams", ".", "%00", "field%00", "linked", "field%3alinked", "%2fetc",
-])
-def test_no_name_leads_outside(client: TestClient, root: Path, made_site: Path, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name",
+    [
+        "..",
+        "%2e%2e",
+        "..%2f..%2foutside",
+        "%2e%2e:outside",
+        "..:outside",
+        "field%2f..%2f..%2foutside",
+        "field%2f..",
+        "station",
+        "streams",
+        ".",
+        "%00",
+        "field%00",
+        "linked",
+        "field%3alinked",
+        "%2fetc",
+    ],
+)
+def test_no_name_leads_outside(
+    client: TestClient, root: Path, made_site: Path, tmp_path: Path, name: str
+) -> None:
     """Not by a path, not by a link to a site that lies elsewhere."""
     shutil.copytree(made_site, tmp_path / "outside")
     (root / "linked").symlink_to(tmp_path / "outside")
@@ -161,7 +187,9 @@ def test_no_name_leads_outside(client: TestClient, root: Path, made_site: Path, 
     assert all(each.exists() for each in kept)
 
 
-def test_links_in_a_site_go_and_what_they_lead_to_stays(client: TestClient, root: Path, tmp_path: Path) -> None:
+def test_links_in_a_site_go_and_what_they_lead_to_stays(
+    client: TestClient, root: Path, tmp_path: Path
+) -> None:
     mark = mark_of(client)
     outside = tmp_path / "outside"
     outside.mkdir()
@@ -191,7 +219,9 @@ def test_a_folder_that_became_a_link_meanwhile_is_not_emptied(
     assert (outside / "site.db").is_file() and (outside / "mosaic.tif").is_file()
 
 
-def test_what_a_killed_station_had_begun_to_delete_goes_when_the_next_one_starts(root: Path) -> None:
+def test_what_a_killed_station_had_begun_to_delete_goes_when_the_next_one_starts(
+    root: Path,
+) -> None:
     (root / "station" / "deleted").mkdir(parents=True)
     (root / "field").rename(root / "station" / "deleted" / "half")
     with TestClient(station_app(StationSettings(root)), base_url=HOST) as client:

@@ -16,7 +16,9 @@ from sorvolo.station.state import StationState
 def logged(folder: Path, count: int, start: int = 0) -> EventLog:
     """A log with some events."""
     log = EventLog(StationState.open(folder))
-    log.append(*[NewEvent("run.progress", {"n": n}, "field", "r") for n in range(start, start + count)])
+    log.append(
+        *[NewEvent("run.progress", {"n": n}, "field", "r") for n in range(start, start + count)]
+    )
     return log
 
 
@@ -24,7 +26,12 @@ def test_numbers_go_on_after_a_restart(tmp_path: Path) -> None:
     """A page that asks a restarted server from its last number misses nothing."""
     assert logged(tmp_path, 3).last == 3
     log = logged(tmp_path, 2, start=3)
-    assert [(each["seq"], each["data"]["n"]) for each in log.after(1)] == [(2, 1), (3, 2), (4, 3), (5, 4)]
+    assert [(each["seq"], each["data"]["n"]) for each in log.after(1)] == [
+        (2, 1),
+        (3, 2),
+        (4, 3),
+        (5, 4),
+    ]
     assert log.after(5) == []
 
 
@@ -33,7 +40,9 @@ def test_what_is_written_with_events_is_written_or_neither(tmp_path: Path) -> No
     log = logged(tmp_path, 1)
     with pytest.raises(RuntimeError), log.appending([NewEvent("x", {})]):
         raise RuntimeError
-    assert log.last == 1 and [each["seq"] for each in EventLog(StationState.open(tmp_path)).after(0)] == [1]
+    assert log.last == 1 and [
+        each["seq"] for each in EventLog(StationState.open(tmp_path)).after(0)
+    ] == [1]
 
 
 def test_events_older_than_memory_come_from_the_disk_and_lost_ones_are_named(
@@ -46,7 +55,11 @@ def test_events_older_than_memory_come_from_the_disk_and_lost_ones_are_named(
     with log._state.changing() as connection:
         connection.execute("DELETE FROM events WHERE seq <= 4")
     found = log.after(1)
-    assert found[0]["type"] == LOST and found[0]["data"] == {"from": 2, "to": 4} and found[0]["seq"] == 4
+    assert (
+        found[0]["type"] == LOST
+        and found[0]["data"] == {"from": 2, "to": 4}
+        and found[0]["seq"] == 4
+    )
     assert [each["seq"] for each in found[1:]] == [5, 6, 7, 8]
 
 

@@ -17,7 +17,9 @@ def test_listed_files_can_be_taken_and_nothing_else(client: TestClient, root: Pa
     assert listed["mosaic.tif"]["bytes"] == 10
     answer = client.get(listed["mosaic.tif"]["url"])
     assert answer.content == b"II*\0 a map"
-    assert answer.headers["content-disposition"].startswith("attachment; filename*=UTF-8''field-mosaic.tif")
+    assert answer.headers["content-disposition"].startswith(
+        "attachment; filename*=UTF-8''field-mosaic.tif"
+    )
     for wrong in ("site.db", "..%2Fstation%2Fstation.db", "pod.tif"):
         assert client.get(f"{URL}/{wrong}").status_code == 404
 
@@ -42,7 +44,9 @@ def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path)
         rows = file.execute("SELECT id, kind FROM changes ORDER BY fid").fetchall()
         query = "SELECT geometry_type_name, srs_id FROM gpkg_geometry_columns WHERE table_name = 'changes'"
         kind, srs = file.execute(query).fetchone()
-        (qml,) = file.execute("SELECT styleQML FROM layer_styles WHERE f_table_name = 'changes'").fetchone()
+        (qml,) = file.execute(
+            "SELECT styleQML FROM layer_styles WHERE f_table_name = 'changes'"
+        ).fetchone()
     assert rows == [(each["id"], each["properties"]["kind"]) for each in features]
     assert (kind, srs) == ("POLYGON", 4326)
     renderer = fromstring(qml).find("renderer-v2")
@@ -55,10 +59,14 @@ def test_geopackage_holds_what_the_map_shows(client: TestClient, tmp_path: Path)
 def test_geopackage_mixes_polygons_and_odd_names(tmp_path: Path) -> None:
     ring = [[0, 0], [1, 0], [1, 1], [0, 0]]
     features = [
-        {"geometry": {"type": "Polygon", "coordinates": [ring]},
-         "properties": {'a"b': 1, "A": None, "list": [1], "fid": 7}},
-        {"geometry": {"type": "MultiPolygon", "coordinates": [[ring]]},
-         "properties": {'a"b': 2.5, "a": "x", "yes": True}},
+        {
+            "geometry": {"type": "Polygon", "coordinates": [ring]},
+            "properties": {'a"b': 1, "A": None, "list": [1], "fid": 7},
+        },
+        {
+            "geometry": {"type": "MultiPolygon", "coordinates": [[ring]]},
+            "properties": {'a"b': 2.5, "a": "x", "yes": True},
+        },
     ]
     write_geopackage(tmp_path / "x.gpkg", {"some": features, "none": []})
     with sqlite3.connect(tmp_path / "x.gpkg") as file:

@@ -19,8 +19,16 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Message]:
     video = write_video(tmp_path_factory.mktemp("video") / "v.mp4", bframes=2)
     shift = 200_000  # a client lets the flight's clock begin with the first decoded picture
     return [
-        Message(each.kind, each.seq, each.pts_us + shift, each.payload, each.is_key, (each.dts_us or 0) + shift)
-        for each in units(video, "h264") if each.kind is Kind.VIDEO
+        Message(
+            each.kind,
+            each.seq,
+            each.pts_us + shift,
+            each.payload,
+            each.is_key,
+            (each.dts_us or 0) + shift,
+        )
+        for each in units(video, "h264")
+        if each.kind is Kind.VIDEO
     ]
 
 
@@ -54,7 +62,12 @@ def test_a_new_viewer_begins_at_the_last_key_frame(pictures: list[Message], mode
         hub.show(each)
     first, *rest = taken(viewer)
     assert json.loads(str(first)) == {
-        "type": "format", "codec": "avc1.4d400a", "width": 160, "height": 120, "fps": 10.0, "mode": mode,
+        "type": "format",
+        "codec": "avc1.4d400a",
+        "width": 160,
+        "height": 120,
+        "fps": 10.0,
+        "mode": mode,
         "epoch_us": 7,
     }
     expected = pictures[10:]
@@ -65,7 +78,9 @@ def test_a_new_viewer_begins_at_the_last_key_frame(pictures: list[Message], mode
             assert sum(1 for _ in container.decode(video=0)) == 20
         return
     data = b"".join(each for each in rest if isinstance(each, bytes))
-    assert decoded(data) == sorted(each.pts_us for each in expected)  # the flight's own times, to the microsecond
+    assert decoded(data) == sorted(
+        each.pts_us for each in expected
+    )  # the flight's own times, to the microsecond
 
 
 def test_late_and_early_viewers_share_what_was_packed_once(pictures: list[Message]) -> None:
@@ -81,7 +96,9 @@ def test_late_and_early_viewers_share_what_was_packed_once(pictures: list[Messag
         assert len(decoded(data)) == count
 
 
-def test_a_slow_viewer_is_dropped_forward_to_a_key_frame_and_others_are_not(pictures: list[Message]) -> None:
+def test_a_slow_viewer_is_dropped_forward_to_a_key_frame_and_others_are_not(
+    pictures: list[Message],
+) -> None:
     hub = hub_with([])
     slow, quick = hub.join("annexb"), hub.join("annexb")
     got = []
@@ -111,7 +128,9 @@ def test_boxes_come_between_the_pictures(pictures: list[Message]) -> None:
     viewer = hub.join("annexb")
     hub.note({"type": "boxes", "pts_us": 200_000, "boxes": []})
     hub.show(pictures[1])
-    kinds = [json.loads(each)["type"] if isinstance(each, str) else "picture" for each in taken(viewer)]
+    kinds = [
+        json.loads(each)["type"] if isinstance(each, str) else "picture" for each in taken(viewer)
+    ]
     assert kinds == ["format", "picture", "boxes", "picture"]
 
 

@@ -46,7 +46,9 @@ def test_a_station_serves_the_sites_of_a_bucket(bucket: str) -> None:
     root = StoreRoot(ADDRESS)
     assert ended(root.step()) == {}
     with TestClient(
-        station_app(StationSettings(root.folder)), base_url="http://127.0.0.1:8750", client=("127.0.0.1", 5000)
+        station_app(StationSettings(root.folder)),
+        base_url="http://127.0.0.1:8750",
+        client=("127.0.0.1", 5000),
     ) as client:
         sites = client.get("/api/sites").json()
         assert [each["id"] for each in sites] == ["field"] and sites[0]["versions"] == 2

@@ -35,8 +35,14 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def client(
-    video: Path, server: StreamServer, spool: Path, *, token: str = TOKEN, stream: str = "drone",
-    settings: StreamSettings = ALL, stop: threading.Event | None = None,
+    video: Path,
+    server: StreamServer,
+    spool: Path,
+    *,
+    token: str = TOKEN,
+    stream: str = "drone",
+    settings: StreamSettings = ALL,
+    stop: threading.Event | None = None,
     held: Callable[[Footage], Footage] = lambda footage: footage,
 ) -> StreamClient:
     stop = stop or threading.Event()
@@ -49,7 +55,11 @@ class InTheAir:
     """A client whose flight stands still before its 16th picture of 30, with what comes before at the station."""
 
     def __init__(
-        self, flight: Path, server: StreamServer, spool: Path, stop: threading.Event | None = None,
+        self,
+        flight: Path,
+        server: StreamServer,
+        spool: Path,
+        stop: threading.Event | None = None,
         settings: StreamSettings = ALL,
     ) -> None:
         self.client = client(flight, server, spool, stop=stop, settings=settings, held=self._held)
@@ -86,14 +96,20 @@ def test_a_flight_arrives_whole_with_its_telemetry(flight: Path, tmp_path: Path)
         assert times(path) == list(range(30))
         assert path.with_name(path.name + ".ended").exists()
         (before,), (after,) = open_sources([flight]), open_sources([path])
-        assert after.telemetry["latitude_deg"] == pytest.approx(before.telemetry["latitude_deg"], abs=1e-6)
+        assert after.telemetry["latitude_deg"] == pytest.approx(
+            before.telemetry["latitude_deg"], abs=1e-6
+        )
         assert after.telemetry["height_above_takeoff_m"] == pytest.approx(40.0, abs=0.01)
         assert after.telemetry["body_yaw_deg"] == pytest.approx(0.0, abs=0.01)
-        assert after.telemetry.video_time_ns == pytest.approx([500_000_000 * each for each in range(7)], abs=2e6)
+        assert after.telemetry.video_time_ns == pytest.approx(
+            [500_000_000 * each for each in range(7)], abs=2e6
+        )
         assert after.telemetry.time_ns == pytest.approx(before.telemetry.time_ns, abs=2e6)
 
 
-def test_a_server_killed_in_mid_flight_loses_and_doubles_nothing(flight: Path, tmp_path: Path) -> None:
+def test_a_server_killed_in_mid_flight_loses_and_doubles_nothing(
+    flight: Path, tmp_path: Path
+) -> None:
     with StreamServer(tmp_path / "streams") as server:
         drone = InTheAir(flight, server, tmp_path / "spool")
         server.kill()
@@ -114,7 +130,9 @@ def test_a_server_killed_in_mid_flight_loses_and_doubles_nothing(flight: Path, t
 def test_a_client_that_restarts_goes_on_with_its_flight(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams") as server:
         stop = threading.Event()
-        drone = InTheAir(flight, server, tmp_path / "spool", stop, StreamSettings(speed=0, flush_s=0.2))
+        drone = InTheAir(
+            flight, server, tmp_path / "spool", stop, StreamSettings(speed=0, flush_s=0.2)
+        )
         first = drone.client
         server.kill()
         drone.goes_on()
@@ -132,15 +150,21 @@ def test_a_client_that_restarts_goes_on_with_its_flight(flight: Path, tmp_path: 
 
 
 def test_on_a_slow_link_old_pictures_go_to_the_next_key_frame(tmp_path: Path) -> None:
-    flight = write_video(tmp_path / "plain.mp4", seconds=2.4)  # shown in the order in which they are sent
-    with StreamServer(tmp_path / "streams", pause_s=0.25) as server:  # 4 messages a second, of the 11 that come
+    flight = write_video(
+        tmp_path / "plain.mp4", seconds=2.4
+    )  # shown in the order in which they are sent
+    with StreamServer(
+        tmp_path / "streams", pause_s=0.25
+    ) as server:  # 4 messages a second, of the 11 that come
         settings = StreamSettings(latency_s=0.8)
         report = client(flight, server, tmp_path / "spool", settings=settings).run()
         found = times(kept(server))
         assert report.late > 0 and report.frames + report.late == 24 and len(found) == report.frames
         gaps = [after for before, after in pairwise(found) if after != before + 1]
         assert gaps and all(each % 10 == 0 for each in gaps)  # key frames stand at every tenth
-        assert max(report.delays_s) < 6.0  # 0.8 s, and what a link that takes 4 of them a second holds
+        assert (
+            max(report.delays_s) < 6.0
+        )  # 0.8 s, and what a link that takes 4 of them a second holds
 
 
 def test_a_full_spool_gives_up_the_oldest_pictures(tmp_path: Path) -> None:
@@ -156,7 +180,10 @@ def test_a_full_spool_gives_up_the_oldest_pictures(tmp_path: Path) -> None:
     assert sum(each.kind is Kind.TELEMETRY for each in found) == 30
     assert spool.counts().overflowed == 20
     spool.acknowledge(60)
-    assert spool.is_empty and sum(each.stat().st_size for each in (tmp_path / "spool").glob("*.spool")) < 400_000
+    assert (
+        spool.is_empty
+        and sum(each.stat().st_size for each in (tmp_path / "spool").glob("*.spool")) < 400_000
+    )
 
 
 def test_a_wrong_token_is_no_outage(flight: Path, tmp_path: Path) -> None:
@@ -171,18 +198,40 @@ def test_tls_with_an_authority_of_one_s_own(flight: Path, tmp_path: Path) -> Non
         pytest.skip("openssl is not installed")
     key, certificate = tmp_path / "key.pem", tmp_path / "cert.pem"
     subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", "-days", "2", "-subj", "/CN=station", "-addext",
-         "subjectAltName=IP:127.0.0.1", "-keyout", str(key), "-out", str(certificate)], check=True, capture_output=True,
+        [
+            "openssl",
+            "req",
+            "-x509",
+            "-newkey",
+            "rsa:2048",
+            "-nodes",
+            "-days",
+            "2",
+            "-subj",
+            "/CN=station",
+            "-addext",
+            "subjectAltName=IP:127.0.0.1",
+            "-keyout",
+            str(key),
+            "-out",
+            str(certificate),
+        ],
+        check=True,
+        capture_output=True,
     )
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     tls.load_cert_chain(certificate, key)
     with StreamServer(tmp_path / "streams", tls=tls) as server:
-        with pytest.raises(InputError, match=r"certificate is not trusted .* give its authority as --ca"):
+        with pytest.raises(
+            InputError, match=r"certificate is not trusted .* give its authority as --ca"
+        ):
             client(flight, server, tmp_path / "spool1").run()
         trusting = StreamSettings(speed=0, authority=certificate)
         assert client(flight, server, tmp_path / "spool2", settings=trusting).run().frames == 30
         with pytest.raises(SettingsError, match="no usable certificate"):
-            client(flight, server, tmp_path / "spool3", settings=StreamSettings(authority=flight)).run()
+            client(
+                flight, server, tmp_path / "spool3", settings=StreamSettings(authority=flight)
+            ).run()
 
 
 def test_pictures_that_no_browser_plays_are_refused_at_once(tmp_path: Path) -> None:
@@ -205,19 +254,31 @@ def test_two_drones_of_one_name(flight: Path, tmp_path: Path) -> None:
         second = client(flight, server, tmp_path / "spool2")
         also = threading.Thread(target=second.run, daemon=True)
         also.start()
-        wait_for(lambda: second.report.words == "another drone sends as drone; give --stream another name")
+        wait_for(
+            lambda: (
+                second.report.words == "another drone sends as drone; give --stream another name"
+            )
+        )
         drone.goes_on()
         for each in (drone.thread, also):
             each.join(60)
             assert not each.is_alive()
         files = sorted((tmp_path / "streams" / "drone").glob("*.ts"))
-        assert [times(each) for each in files] == [list(range(30))] * 2  # one after the other, never mixed
+        assert [times(each) for each in files] == [
+            list(range(30))
+        ] * 2  # one after the other, never mixed
 
 
 def test_a_full_disk_is_waited_for(flight: Path, tmp_path: Path) -> None:
     with StreamServer(tmp_path / "streams", limits=IngestLimits(free_bytes=10**18)) as server:
         stop = threading.Event()
-        sending = client(flight, server, tmp_path / "spool", settings=StreamSettings(speed=0, flush_s=0.1), stop=stop)
+        sending = client(
+            flight,
+            server,
+            tmp_path / "spool",
+            settings=StreamSettings(speed=0, flush_s=0.1),
+            stop=stop,
+        )
 
         def show(report: StreamReport) -> None:
             if "disk is full" in report.words and report.spooled == 30:
@@ -229,7 +290,9 @@ def test_a_full_disk_is_waited_for(flight: Path, tmp_path: Path) -> None:
 
 def test_a_clock_that_restarts_is_joined(tmp_path: Path) -> None:
     video = write_video(tmp_path / "a.ts", seconds=1.0)
-    (tmp_path / "b.ts").write_bytes(video.read_bytes() * 2)  # the second half begins at the first one's time
+    (tmp_path / "b.ts").write_bytes(
+        video.read_bytes() * 2
+    )  # the second half begins at the first one's time
     with StreamServer(tmp_path / "streams") as server:
         sending = client(tmp_path / "b.ts", server, tmp_path / "spool")
         sending.run()

@@ -57,7 +57,7 @@ class Camera:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             while not self.off.is_set():
                 for at in range(0, len(self._stream), step):
-                    sender.sendto(self._stream[at: at + step], ("127.0.0.1", self._port))
+                    sender.sendto(self._stream[at : at + step], ("127.0.0.1", self._port))
                     time.sleep(step / len(self._stream))
                 self.off.wait(self._pause_s)
 
@@ -65,7 +65,9 @@ class Camera:
 def taken(port: int, seconds: float) -> tuple[list[Piece], list[str]]:
     """What a client takes from the camera in so many seconds, and what it noticed."""
     stop = threading.Event()
-    footage = open_footage(f"udp://127.0.0.1:{port}", None, None, LiveSettings(first_s=10, give_up_s=3), stop)
+    footage = open_footage(
+        f"udp://127.0.0.1:{port}", None, None, LiveSettings(first_s=10, give_up_s=3), stop
+    )
     threading.Timer(seconds, stop.set).start()
     return list(footage.pieces(0, stop)), list(footage.notices())
 
@@ -80,8 +82,15 @@ def test_a_camera_that_restarts_is_one_flight(stream: bytes, port: int) -> None:
     samples = [json.loads(each.payload) for each in pieces if each.kind is Kind.TELEMETRY]
     assert len(pictures) > 10 and any("began anew" in each for each in notices)
     steps = [after.dts_us - before.dts_us for before, after in pairwise(pictures)]
-    assert min(steps) > 0 and max(steps) < 4_000_000  # FFmpeg holds the last picture back over the pause
-    assert sum(each["columns"].get("latitude_deg") == pytest.approx(45.0, abs=1e-6) for each in samples) >= 2
+    assert (
+        min(steps) > 0 and max(steps) < 4_000_000
+    )  # FFmpeg holds the last picture back over the pause
+    assert (
+        sum(
+            each["columns"].get("latitude_deg") == pytest.approx(45.0, abs=1e-6) for each in samples
+        )
+        >= 2
+    )
 
 
 def test_no_camera_and_wrong_wishes_are_named(port: int, tmp_path: Path) -> None:
@@ -98,19 +107,34 @@ def test_no_camera_and_wrong_wishes_are_named(port: int, tmp_path: Path) -> None
 def test_a_timeline_never_jumps_back() -> None:
     timeline = Timeline(5_000_000)
     shown = []
-    for dts_us, now_us in ((900, 0), (40_900, 40_000), (7, 2_040_000), (40_007, 2_080_000), (99_000_000, 2_120_000)):
+    for dts_us, now_us in (
+        (900, 0),
+        (40_900, 40_000),
+        (7, 2_040_000),
+        (40_007, 2_080_000),
+        (99_000_000, 2_120_000),
+    ):
         shown.append(dts_us + timeline.shift(dts_us, now_us))
-    assert shown == [5_000_000, 5_040_000, 7_040_000, 7_080_000, 7_120_000] and timeline.restarts == 2
+    assert (
+        shown == [5_000_000, 5_040_000, 7_040_000, 7_080_000, 7_120_000] and timeline.restarts == 2
+    )
 
 
 def test_late_pictures_do_not_move_the_time_of_a_camera_without_telemetry() -> None:
     """The one that came soonest counts; a clock that is slow by 30 ms a minute is followed."""
     clock, began_ns, second_ns = ArrivalClock(), 1_760_000_000 * 10**9, 10**9
     late_ms = [900, 40, 8, 90, 30, 8, 200, 8]
-    found = [clock.utc_ns(1_000_000 * step, began_ns + step * second_ns + late * 10**6) - step * second_ns - began_ns
-             for step, late in enumerate(late_ms)]
+    found = [
+        clock.utc_ns(1_000_000 * step, began_ns + step * second_ns + late * 10**6)
+        - step * second_ns
+        - began_ns
+        for step, late in enumerate(late_ms)
+    ]
     assert found[0] == 900 * 10**6 and all(7_900_000 < each < 12_000_000 for each in found[2:])
-    slow = [clock.utc_ns(1_000_000 * step, began_ns + round(step * second_ns * 1.0005)) for step in range(60, 600)]
+    slow = [
+        clock.utc_ns(1_000_000 * step, began_ns + round(step * second_ns * 1.0005))
+        for step in range(60, 600)
+    ]
     assert abs(slow[-1] - began_ns - round(599 * second_ns * 1.0005)) < 10_000_000
     assert clock.utc_ns(600_000_000, began_ns + 660 * second_ns) == began_ns + 660 * second_ns
 
@@ -121,15 +145,29 @@ def test_what_an_earlier_flight_left_is_sent_as_that_flight(stream: bytes, tmp_p
     left = units(write_video(tmp_path / "v.mp4", seconds=1), "h264")
     hour_ago_ns = time.time_ns() - 3_600_000_000_000
     for each in left:
-        spool.append(each.kind, each.pts_us, each.payload, taken_ns=hour_ago_ns, is_key=each.is_key, dts_us=each.dts_us)
+        spool.append(
+            each.kind,
+            each.pts_us,
+            each.payload,
+            taken_ns=hour_ago_ns,
+            is_key=each.is_key,
+            dts_us=each.dts_us,
+        )
     spool.close()
     again = Spool(tmp_path / "spool", 1_000_000)
-    assert remains_of(again, hour_ago_ns + 1) is None  # a client that came back at once goes on with its flight
+    assert (
+        remains_of(again, hour_ago_ns + 1) is None
+    )  # a client that came back at once goes on with its flight
     remains = remains_of(again, time.time_ns())
     assert remains is not None and remains.name == "old"
     with StreamServer(tmp_path / "streams") as server:
         client = StreamClient(
-            remains, again, stream_url(server.url, "drone"), TOKEN, StreamSettings(latency_s=1), threading.Event()
+            remains,
+            again,
+            stream_url(server.url, "drone"),
+            TOKEN,
+            StreamSettings(latency_s=1),
+            threading.Event(),
         )
         report = client.run()
         assert client.is_complete and report.late == 0 and report.frames == 10

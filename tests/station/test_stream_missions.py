@@ -32,7 +32,9 @@ from sorvolo.station.settings import StationSettings
 from sorvolo.station.spool import Spool
 from waiting import wait_for
 
-IS_AWAY = re.compile(r"ERR_CONNECTION_REFUSED|ERR_CONNECTION_RESET|WebSocket connection to .* failed|Failed to fetch")
+IS_AWAY = re.compile(
+    r"ERR_CONNECTION_REFUSED|ERR_CONNECTION_RESET|WebSocket connection to .* failed|Failed to fetch"
+)
 """What a browser's console states while its station is gone."""
 
 
@@ -46,9 +48,16 @@ class Station:
     def start(self) -> None:
         app = station_app(StationSettings(self._root, free_floor_gb=0.0))
         self._lock = app.state.station.lock
-        self._server = uvicorn.Server(uvicorn.Config(
-            app, "127.0.0.1", self._port, log_level="critical", ws="websockets-sansio", timeout_graceful_shutdown=0,
-        ))
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                app,
+                "127.0.0.1",
+                self._port,
+                log_level="critical",
+                ws="websockets-sansio",
+                timeout_graceful_shutdown=0,
+            )
+        )
         self._thread = threading.Thread(target=self._server.run, daemon=True)
         self._thread.start()
         while not self._server.started:
@@ -67,7 +76,9 @@ class Station:
 
     def ask(self, path: str, body: Any = None) -> Any:
         data = None if body is None else json.dumps(body).encode()
-        request = urllib.request.Request(f"{self.url}{path}", data, {"Content-Type": "application/json"})
+        request = urllib.request.Request(
+            f"{self.url}{path}", data, {"Content-Type": "application/json"}
+        )
         with urllib.request.urlopen(request, timeout=10) as answer:
             return json.loads(answer.read())
 
@@ -87,9 +98,19 @@ class StationProcess(Station):
             with socket.socket() as free:
                 free.bind(("127.0.0.1", 0))
                 self._port = free.getsockname()[1]
-        self._process = subprocess.Popen([
-            sys.executable, "-m", "sorvolo", "serve", str(self._root), "--port", str(self._port), "--free-floor", "0",
-        ])
+        self._process = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "sorvolo",
+                "serve",
+                str(self._root),
+                "--port",
+                str(self._port),
+                "--free-floor",
+                "0",
+            ]
+        )
         wait_for(self._answers)
 
     def stop(self) -> None:
@@ -137,21 +158,33 @@ def footage_of(flown: Path) -> Footage:
     return open_footage(str(flown), None, camera, LiveSettings(), threading.Event())
 
 
-def test_a_map_of_a_stream_outlives_a_restarted_station(station: Station, flown: Path, tmp_path: Path) -> None:
+def test_a_map_of_a_stream_outlives_a_restarted_station(
+    station: Station, flown: Path, tmp_path: Path
+) -> None:
     held = HeldFootage(footage_of(flown), before=6)
     drone = sending(held, station, tmp_path / "spool")
     flying = threading.Thread(target=drone.run, daemon=True)
     flying.start()
     wait_for(lambda: any(each["flights"] for each in station.ask("/api/streams")))
-    run = station.ask("/api/runs", {
-        "mission": "map", "site": "new", "input": {"stream": "scout"}, "options": {"model": "none"},
-    })
+    run = station.ask(
+        "/api/runs",
+        {
+            "mission": "map",
+            "site": "new",
+            "input": {"stream": "scout"},
+            "options": {"model": "none"},
+        },
+    )
     station.stop()
     wait_for(lambda: not drone.report.is_linked)
     station.start()
     held.goes_on.set()
     flying.join(60)
-    assert drone.is_complete and drone.report.outages == 1 and drone.report.late == drone.report.overflowed == 0
+    assert (
+        drone.is_complete
+        and drone.report.outages == 1
+        and drone.report.late == drone.report.overflowed == 0
+    )
     done = station.ended(run["id"])
     assert done["state"] == "finished", done
     (flight,) = station.ask("/api/sites/new")["flights"]
@@ -163,7 +196,10 @@ def test_a_recorded_stream_is_searched_whole(station: Station, flown: Path, tmp_
     drone = sending(footage_of(flown), station, tmp_path / "spool", speed=0)
     drone.run()
     assert drone.is_complete
-    run = station.ask("/api/runs", {"mission": "watch", "site": "new", "input": {"stream": "scout"}, "options": {}})
+    run = station.ask(
+        "/api/runs",
+        {"mission": "watch", "site": "new", "input": {"stream": "scout"}, "options": {}},
+    )
     done = station.ended(run["id"])
     assert done["state"] == "finished", done
     assert done["progress"]["searched"] == done["progress"]["frames"] == drone.report.frames
@@ -185,14 +221,21 @@ def test_a_page_sees_a_flight_grow_though_its_station_is_killed(
     drone = sending(held, station, tmp_path / "spool", speed=4.0)
     flying = threading.Thread(target=drone.run, daemon=True)
     with chromium() as browser:
-        context = browser.new_context(viewport={"width": 900, "height": 600}, reduced_motion="reduce")
+        context = browser.new_context(
+            viewport={"width": 900, "height": 600}, reduced_motion="reduce"
+        )
         watched = Watched(context, station.url)
         page = watched.page
         page.goto(f"{station.url}/#/site/new/missions")
         page.get_by_text("Start a mission").wait_for()
         flying.start()
         wait_for(lambda: any(each["flights"] for each in station.ask("/api/streams")))
-        wish = {"mission": "map", "site": "new", "input": {"stream": "scout"}, "options": {"model": "none"}}
+        wish = {
+            "mission": "map",
+            "site": "new",
+            "input": {"stream": "scout"},
+            "options": {"model": "none"},
+        }
         run = station.ask("/api/runs", wish)
         page.get_by_role("button", name="Close the video").click()  # which lies over the map
         wait_for(lambda: length_of_ground(page) > 1)
@@ -215,15 +258,21 @@ def test_a_page_sees_a_flight_grow_though_its_station_is_killed(
 def length_of_ground(page: Any) -> float:
     """How much wider the ground on the map is than high, at whatever zoom; 0 where there is none on the gray yet."""
     page.evaluate("document.getElementById('messages').replaceChildren()")  # they lie over the map
-    shot = np.asarray(Image.open(BytesIO(page.locator(".map-canvas").screenshot())).convert("RGB")).astype(int)
+    shot = np.asarray(
+        Image.open(BytesIO(page.locator(".map-canvas").screenshot())).convert("RGB")
+    ).astype(int)
     rows, columns = np.nonzero(np.ptp(shot, axis=2) > 25)
     return float(np.ptp(columns) / max(1, np.ptp(rows))) if len(rows) > 1000 else 0.0
 
 
-def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, flown: Path, tmp_path: Path) -> None:
+def test_boxes_reach_a_viewer_with_the_time_of_their_picture(
+    station: Station, flown: Path, tmp_path: Path
+) -> None:
     async def watch() -> tuple[list[int], list[dict[str, Any]], list[dict[str, Any]]]:
         pictures, boxes, motion = [], [], []
-        async with connect(f"{station.url.replace('http', 'ws')}/api/streams/scout/video") as socket:
+        async with connect(
+            f"{station.url.replace('http', 'ws')}/api/streams/scout/video"
+        ) as socket:
             flying.start()
             while not (boxes and motion):
                 item = await asyncio.wait_for(socket.recv(), 60)
@@ -234,9 +283,16 @@ def test_boxes_reach_a_viewer_with_the_time_of_their_picture(station: Station, f
                     continue
                 pictures.append(int.from_bytes(item[:8], "big"))
                 if len(pictures) == 2:
-                    await asyncio.to_thread(station.ask, "/api/runs", {
-                        "mission": "watch", "site": "new", "input": {"stream": "scout"}, "options": {},
-                    })
+                    await asyncio.to_thread(
+                        station.ask,
+                        "/api/runs",
+                        {
+                            "mission": "watch",
+                            "site": "new",
+                            "input": {"stream": "scout"},
+                            "options": {},
+                        },
+                    )
         return pictures, boxes, motion
 
     drone = sending(footage_of(flown), station, tmp_path / "spool", speed=0.3)

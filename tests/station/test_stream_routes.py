@@ -25,7 +25,9 @@ from sorvolo.station.tokens import make_token
 from waiting import wait_for
 
 WS = "ws://127.0.0.1:8750"
-HELLO = Message(Kind.HELLO, 0, 0, Hello("a" * 16, "h264", 160, 120, 10.0).to_json().encode()).to_bytes()
+HELLO = Message(
+    Kind.HELLO, 0, 0, Hello("a" * 16, "h264", 160, 120, 10.0).to_json().encode()
+).to_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +37,9 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_video(folder / "scout.mp4")
 
 
-def test_a_flight_comes_in_and_its_pictures_go_out(client: TestClient, video: Path, root: Path) -> None:
+def test_a_flight_comes_in_and_its_pictures_go_out(
+    client: TestClient, video: Path, root: Path
+) -> None:
     messages = units(video, "h264")
     with client.websocket_connect(f"{WS}/api/ingest/scout") as drone:
         drone.send_bytes(HELLO)
@@ -47,7 +51,11 @@ def test_a_flight_comes_in_and_its_pictures_go_out(client: TestClient, video: Pa
             assert page.receive_json()["codec"] == "avc1.42c00a"
             assert len(page.receive_bytes()) > 100
         state = client.get("/api/streams/scout").json()
-        assert state["is_connected"] and state["frames"] + state["samples"] <= 20 and state["width"] == 160
+        assert (
+            state["is_connected"]
+            and state["frames"] + state["samples"] <= 20
+            and state["width"] == 160
+        )
         for each in messages[20:]:
             drone.send_bytes(each.to_bytes())
         drone.send_bytes(Message(Kind.END, 0, 0, b"").to_bytes())
@@ -61,7 +69,10 @@ def test_a_flight_comes_in_and_its_pictures_go_out(client: TestClient, video: Pa
 
 @pytest.mark.parametrize("name", ["..", "a%2Fb", ".hidden", "x" * 65])
 def test_a_stream_s_name_reaches_no_other_folder(client: TestClient, root: Path, name: str) -> None:
-    with pytest.raises(WebSocketDisconnect), client.websocket_connect(f"{WS}/api/ingest/{name}") as drone:
+    with (
+        pytest.raises(WebSocketDisconnect),
+        client.websocket_connect(f"{WS}/api/ingest/{name}") as drone,
+    ):
         drone.send_bytes(HELLO)
         drone.receive_json()
     assert not (root / "streams").exists()
@@ -149,7 +160,9 @@ def test_only_operators_send_and_whoever_sees_the_station_sees_the_video(root: P
 def station(root: Path) -> Iterator[str]:
     """A station at a port of its own, on the network."""
     app = station_app(StationSettings(root))
-    config = uvicorn.Config(app, "127.0.0.1", 0, log_level="error", ws="websockets-sansio", ws_max_size=16_000_000)
+    config = uvicorn.Config(
+        app, "127.0.0.1", 0, log_level="error", ws="websockets-sansio", ws_max_size=16_000_000
+    )
     server = uvicorn.Server(config)
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
@@ -168,7 +181,11 @@ def test_the_command_sends_a_recording_and_cleans_up(
     arguments = ["stream", str(video), "--to", station, "--spool", str(spool), "--speed", "0"]
     assert cli.main([*arguments, "--json"]) == 0
     (flight,) = json.loads(capsys.readouterr().out)["flights"]
-    assert flight["frames"] == 30 and flight["samples"] == 7 and flight["waiting"] == flight["dropped_late"] == 0
+    assert (
+        flight["frames"] == 30
+        and flight["samples"] == 7
+        and flight["waiting"] == flight["dropped_late"] == 0
+    )
     assert not spool.exists() and list((root / "streams" / "scout").glob("*.ts.ended"))
     assert cli.main(arguments) == 0
     assert "Sent as scout: 30 frames and 7 telemetry samples" in capsys.readouterr().out

@@ -34,13 +34,22 @@ GIGA = 10**9
 def begin(client: TestClient, name: str, length: int) -> Any:
     """The answer to a creation."""
     text = "filename " + base64.b64encode(name.encode()).decode()
-    return client.post("/api/uploads", headers={**HEADERS, "Upload-Length": str(length), "Upload-Metadata": text})
+    return client.post(
+        "/api/uploads", headers={**HEADERS, "Upload-Length": str(length), "Upload-Metadata": text}
+    )
 
 
 def send(client: TestClient, address: str, offset: int, data: bytes) -> Any:
     """The answer to a PATCH."""
-    return client.patch(address, content=data, headers={
-        **HEADERS, "Upload-Offset": str(offset), "Content-Type": "application/offset+octet-stream"})
+    return client.patch(
+        address,
+        content=data,
+        headers={
+            **HEADERS,
+            "Upload-Offset": str(offset),
+            "Content-Type": "application/offset+octet-stream",
+        },
+    )
 
 
 def checked(client: TestClient, address: str) -> dict[str, Any]:
@@ -90,11 +99,17 @@ def test_a_flight_comes_in_pieces_and_is_ready(client: TestClient, tmp_path: Pat
     assert send(client, address, 0, data[:1000]).headers["upload-offset"] == "1000"
     assert send(client, address, 500, data[500:]).status_code == 409
     where = client.head(address)
-    assert where.headers["upload-offset"] == "1000" and where.headers["upload-length"] == str(len(data))
+    assert where.headers["upload-offset"] == "1000" and where.headers["upload-length"] == str(
+        len(data)
+    )
     assert where.headers["cache-control"] == "no-store"
     assert send(client, address, 1000, data[1000:]).status_code == 204
     done = checked(client, address)
-    assert done["state"] == "ready" and done["name"] == "DJI_0001.MP4" and done["facts"]["width_px"] == 64
+    assert (
+        done["state"] == "ready"
+        and done["name"] == "DJI_0001.MP4"
+        and done["facts"]["width_px"] == 64
+    )
     here = client.app.state.station.uploads  # type: ignore[attr-defined]
     assert here.finished_path(done["id"]).read_bytes() == data
     assert client.delete(address).status_code == 204 and client.get(address).status_code == 404
@@ -105,10 +120,20 @@ def test_an_upload_that_a_mission_reads_is_not_deleted(client: TestClient) -> No
     """As its flight, its telemetry or its camera; once the mission is over it may go."""
     runs = client.app.state.station.runs  # type: ignore[attr-defined]
     runs.close()
-    addresses = [begin(client, f"{name}.srt", 5).headers["location"] for name in ("flight", "log", "other")]
+    addresses = [
+        begin(client, f"{name}.srt", 5).headers["location"] for name in ("flight", "log", "other")
+    ]
     flight, log, _ = (each.rpartition("/")[2] for each in addresses)
-    run = Run("1" * 16, "map", "new", "running", "Ada", "2026-01-01T00:00:00Z", input={"upload": flight},
-              options={"telemetry": {"upload": log}})
+    run = Run(
+        "1" * 16,
+        "map",
+        "new",
+        "running",
+        "Ada",
+        "2026-01-01T00:00:00Z",
+        input={"upload": flight},
+        options={"telemetry": {"upload": log}},
+    )
     runs._begin(run)
     assert [client.delete(each).status_code for each in addresses] == [423, 423, 204]
     assert "Ada" in client.delete(addresses[0]).json()["detail"]
@@ -123,16 +148,20 @@ def test_a_cut_off_video_is_refused_and_cannot_be_flown(client: TestClient, tmp_
     send(client, address, 0, data)
     done = checked(client, address)
     assert done["state"] == "refused" and "cut off" in done["why"]
-    answer = client.post("/api/runs", json={"mission": "map", "site": "x", "input": {"upload": done["id"]}})
+    answer = client.post(
+        "/api/runs", json={"mission": "map", "site": "x", "input": {"upload": done["id"]}}
+    )
     assert answer.status_code == 409 and "cut off" in answer.json()["detail"]
 
 
-def test_of_a_video_that_was_cut_it_is_stated_how_much_is_missing(client: TestClient, tmp_path: Path) -> None:
+def test_of_a_video_that_was_cut_it_is_stated_how_much_is_missing(
+    client: TestClient, tmp_path: Path
+) -> None:
     """Its head comes first, so what is there can be used: of a drone that was lost there is no more."""
     data = video(tmp_path / "v.mp4", movflags="faststart")
     for cut in (0, 100):
         address = begin(client, "cut.mp4", len(data) - cut).headers["location"]
-        send(client, address, 0, data[:len(data) - cut])
+        send(client, address, 0, data[: len(data) - cut])
         done = checked(client, address)
         assert done["state"] == "ready" and done["facts"]["missing_bytes"] == cut
 
@@ -151,8 +180,12 @@ def test_what_tus_can_do_and_what_is_not_taken(client: TestClient) -> None:
     assert client.post("/api/uploads", headers=broken).status_code == 400
     address = begin(client, "a.srt", 5).headers["location"]
     assert send(client, address, 0, b"123456").status_code == 413
-    assert client.patch(address, content=b"x", headers={"Upload-Offset": "0", "Content-Type": "text/plain"}
-                        ).status_code == 415
+    assert (
+        client.patch(
+            address, content=b"x", headers={"Upload-Offset": "0", "Content-Type": "text/plain"}
+        ).status_code
+        == 415
+    )
     assert client.head("/api/uploads/../../x").status_code in (404, 405)
     assert client.get("/api/uploads/" + "0" * 24).status_code == 404
 
@@ -170,7 +203,9 @@ def test_so_many_uploads_are_kept_and_no_more(root: Path) -> None:
 
 def test_the_floor_of_free_space_holds(root: Path) -> None:
     """Nothing is taken in below it."""
-    with TestClient(station_app(StationSettings(root, free_floor_gb=1e6)), base_url="http://127.0.0.1:8750") as client:
+    with TestClient(
+        station_app(StationSettings(root, free_floor_gb=1e6)), base_url="http://127.0.0.1:8750"
+    ) as client:
         answer = begin(client, "a.mp4", 10)
         assert answer.status_code == 507 and "free" in answer.json()["detail"]
 
@@ -189,7 +224,9 @@ def test_the_floor_holds_for_every_piece_and_for_what_is_unpacked(
     assert not (tmp_path / "photos").exists()
 
 
-def test_a_link_that_fell_silent_holds_up_nobody(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_that_fell_silent_holds_up_nobody(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A radio link ends without a word: the next request goes on where the first one was left."""
     monkeypatch.setattr(uploads, "_SILENT_S", 0.05)
     address = begin(client, "a.srt", 5).headers["location"]
@@ -217,7 +254,10 @@ def test_a_station_that_ends_while_it_looks_into_an_upload_looks_again(root: Pat
 def test_the_process_that_looks_is_out_of_the_terminals_reach_and_ends_with_the_station() -> None:
     """In a session of its own; killed at the end, so that the station need not wait for it."""
     child = Child()
-    assert child.run([sys.executable, "-c", "import os; print(os.getsid(0) == os.getpid())"], 30) == b"True\n"
+    assert (
+        child.run([sys.executable, "-c", "import os; print(os.getsid(0) == os.getpid())"], 30)
+        == b"True\n"
+    )
     threading.Timer(0.2, child.end).start()
     began_s = time.monotonic()
     assert child.run([sys.executable, "-c", "import time; time.sleep(60)"], 60) == b""
@@ -226,37 +266,66 @@ def test_the_process_that_looks_is_out_of_the_terminals_reach_and_ends_with_the_
 
 def test_photos_are_unpacked_into_one_folder(tmp_path: Path) -> None:
     """Files of the same name in two folders stay two; what is no photo is left out."""
-    part = packed(tmp_path / "p", {
-        "one/DJI_1.JPG": photo(), "two/DJI_1.JPG": photo(50), "two/DJI_2.tif": photo(kind="TIFF"), "run.sh": b"rm",
-        "__MACOSX/._DJI_1.JPG": b"x", "one/log.csv": b"a,b",
-    })
+    part = packed(
+        tmp_path / "p",
+        {
+            "one/DJI_1.JPG": photo(),
+            "two/DJI_1.JPG": photo(50),
+            "two/DJI_2.tif": photo(kind="TIFF"),
+            "run.sh": b"rm",
+            "__MACOSX/._DJI_1.JPG": b"x",
+            "one/log.csv": b"a,b",
+        },
+    )
     facts = look(part, tmp_path / "photos", GIGA)
     assert facts == {"kind": "photos", "photos": 3}
     assert sorted(each.name for each in (tmp_path / "photos").iterdir()) == [
-        "DJI_1.JPG", "DJI_2.tif", "log.csv", "two_DJI_1.JPG"]
+        "DJI_1.JPG",
+        "DJI_2.tif",
+        "log.csv",
+        "two_DJI_1.JPG",
+    ]
 
 
-@pytest.mark.parametrize(("files", "words"), [
-    ({"../../evil.jpg": photo()}, "outside"), ({"/etc/evil.jpg": photo()}, "outside"),
-    ({"C:\\evil.jpg": photo()}, "outside"), ({"..\\evil.jpg": photo()}, "outside"),
-    ({"map.tif": b"<VRTDataset><SourceFilename>/etc/passwd</SourceFilename></VRTDataset>"}, "no picture"),
-    ({"a.jpg": b"\0" * 20_000_000}, "no photo does"), ({"readme.txt": b"x"}, "no photo in it"),
-    ({"a.heic": b"nothing of the kind"}, "no HEIC"), ({"a.jpg": photo()[:40]}, "no picture"),
-])
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"../../evil.jpg": photo()}, "outside"),
+        ({"/etc/evil.jpg": photo()}, "outside"),
+        ({"C:\\evil.jpg": photo()}, "outside"),
+        ({"..\\evil.jpg": photo()}, "outside"),
+        (
+            {"map.tif": b"<VRTDataset><SourceFilename>/etc/passwd</SourceFilename></VRTDataset>"},
+            "no picture",
+        ),
+        ({"a.jpg": b"\0" * 20_000_000}, "no photo does"),
+        ({"readme.txt": b"x"}, "no photo in it"),
+        ({"a.heic": b"nothing of the kind"}, "no HEIC"),
+        ({"a.jpg": photo()[:40]}, "no picture"),
+    ],
+)
 def test_zip_files_made_to_do_harm(tmp_path: Path, files: dict[str, bytes], words: str) -> None:
     """Zip slip, disguises, bombs: refused, and nothing is written outside."""
     target = tmp_path / "deep" / "photos"
     target.parent.mkdir()
     with pytest.raises(Refusal, match=words):
         look(packed(tmp_path / "part", files), target, GIGA)
-    outside = [each for each in tmp_path.rglob("*") if each.is_file() and target not in each.parents]
+    outside = [
+        each for each in tmp_path.rglob("*") if each.is_file() and target not in each.parents
+    ]
     assert [each.name for each in outside] == ["part"]
 
 
-def test_links_in_zip_files_and_sizes_that_lie(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_links_in_zip_files_and_sizes_that_lie(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A link could lead anywhere; what an archive announces is not trusted."""
     with pytest.raises(Refusal, match="link"):
-        look(packed(tmp_path / "part", {"a.jpg": b"/etc/passwd"}, mode=0o120777), tmp_path / "photos", GIGA)
+        look(
+            packed(tmp_path / "part", {"a.jpg": b"/etc/passwd"}, mode=0o120777),
+            tmp_path / "photos",
+            GIGA,
+        )
     with pytest.raises(Refusal, match="taken"):
         look(packed(tmp_path / "large", {"a.jpg": photo(900)}), tmp_path / "photos", 100)
     monkeypatch.setattr(check_upload, "_MOST_PIXELS", 100)
@@ -264,9 +333,15 @@ def test_links_in_zip_files_and_sizes_that_lie(tmp_path: Path, monkeypatch: pyte
         look(packed(tmp_path / "wide", {"a.jpg": photo()}), tmp_path / "wide-photos", GIGA)
 
 
-@pytest.mark.parametrize("data", [
-    b"#EXTM3U\nfile:///etc/passwd\n", b"ffconcat version 1.0\nfile /etc/passwd", b"", bytes(range(130, 194)),
-])
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"#EXTM3U\nfile:///etc/passwd\n",
+        b"ffconcat version 1.0\nfile /etc/passwd",
+        b"",
+        bytes(range(130, 194)),
+    ],
+)
 def test_playlists_named_as_videos(tmp_path: Path, data: bytes) -> None:
     """FFmpeg would open what they name."""
     (tmp_path / "part").write_bytes(data)
@@ -285,11 +360,14 @@ check_upload.main(*sys.argv[1:5])
 """
 
 
-@pytest.mark.parametrize(("work", "within_s", "words"), [
-    ("bytearray(2 << 30)", 60.0, "more memory than a flight needs"),
-    ("while True: pass", 60.0, "more memory or time than a flight needs"),
-    ("import time; time.sleep(60)", 1.0, "took too long"),
-])
+@pytest.mark.parametrize(
+    ("work", "within_s", "words"),
+    [
+        ("bytearray(2 << 30)", 60.0, "more memory than a flight needs"),
+        ("while True: pass", 60.0, "more memory or time than a flight needs"),
+        ("import time; time.sleep(60)", 1.0, "took too long"),
+    ],
+)
 def test_the_process_that_looks_has_limits(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, work: str, within_s: float, words: str
 ) -> None:

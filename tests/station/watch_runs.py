@@ -12,7 +12,9 @@ from sorvolo.store.images import jpeg_from_image
 PICTURE = jpeg_from_image(np.full((32, 32, 3), 120, np.uint8))
 
 
-def watch_run(station: Station, run: str, site: str = "field", place: tuple[float, float] = (11.0, 46.0)) -> Path:
+def watch_run(
+    station: Station, run: str, site: str = "field", place: tuple[float, float] = (11.0, 46.0)
+) -> Path:
     """A watch of a site that found a person, with a picture, and a car, without; the folder of its results."""
     with station.state.changing() as connection:
         connection.execute(
@@ -22,9 +24,21 @@ def watch_run(station: Station, run: str, site: str = "field", place: tuple[floa
     results = station.settings.state_folder / "runs" / run / "results"
     (results / "objects").mkdir(parents=True)
     (results / "objects" / "1.jpg").write_bytes(PICTURE)
-    common = {"score": 0.9, "first_seen": "2026-05-01T10:00:00Z", "last_seen": "2026-05-01T10:00:09Z", "path": [1]}
-    rows = [{"id": 1, "class": "person", "crop": "objects/1.jpg"}, {"id": 2, "class": "car", "crop": None}]
+    common = {
+        "score": 0.9,
+        "first_seen": "2026-05-01T10:00:00Z",
+        "last_seen": "2026-05-01T10:00:09Z",
+        "path": [1],
+    }
+    rows = [
+        {"id": 1, "class": "person", "crop": "objects/1.jpg"},
+        {"id": 2, "class": "car", "crop": None},
+    ]
     point = {"type": "Point", "coordinates": list(place)}
-    features = [{"type": "Feature", "properties": {**row, **common}, "geometry": point} for row in rows]
-    (results / "tracks.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    features = [
+        {"type": "Feature", "properties": {**row, **common}, "geometry": point} for row in rows
+    ]
+    (results / "tracks.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": features})
+    )
     return results

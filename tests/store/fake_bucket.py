@@ -17,8 +17,11 @@ KEY = "AKIANOBODYMAYREADTHIS"
 def environment(endpoint: str) -> dict[str, str]:
     """The variables with which a person names the store."""
     return {
-        "AWS_ENDPOINT_URL": endpoint, "AWS_ACCESS_KEY_ID": KEY, "AWS_SECRET_ACCESS_KEY": SECRET,
-        "AWS_SESSION_TOKEN": f"{SECRET}-token", "AWS_REGION": "eu-central-1",
+        "AWS_ENDPOINT_URL": endpoint,
+        "AWS_ACCESS_KEY_ID": KEY,
+        "AWS_SECRET_ACCESS_KEY": SECRET,
+        "AWS_SESSION_TOKEN": f"{SECRET}-token",
+        "AWS_REGION": "eu-central-1",
     }
 
 
@@ -26,7 +29,9 @@ def environment(endpoint: str) -> dict[str, str]:
 def served_bucket() -> Iterator[str]:
     """The endpoint of a server with the bucket, which the environment names meanwhile."""
     pytest.importorskip("obstore", reason="object stores need obstore: pip install 'sorvolo[s3]'")
-    server_module = pytest.importorskip("moto.server", reason="needs moto's S3 server: pip install 'moto[server]'")
+    server_module = pytest.importorskip(
+        "moto.server", reason="needs moto's S3 server: pip install 'moto[server]'"
+    )
     logging.getLogger("werkzeug").setLevel(logging.ERROR)
     server = server_module.ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
     server.start()

@@ -47,12 +47,17 @@ def frame(index: int, status: Status = Status.VISION, name: str = "") -> PlacedF
     lost = status is Status.REJECTED
     pose = Pose(site_from_gimbal_rotation(30.0, -85.0, 0.0), np.array([10.0 * index, 5.0, 20.0]))
     return PlacedFrame(
-        name or str(index), index, 1_700_000_000_123_456_000 + index, status, "blurred" if lost else "",
+        name or str(index),
+        index,
+        1_700_000_000_123_456_000 + index,
+        status,
+        "blurred" if lost else "",
         CAMERA,
         None if lost else pose,
         np.full((3, 3), np.nan) if lost else site_from_image_homography(CAMERA, pose),
         np.full((4, 2), np.nan) if lost else footprint(CAMERA, pose),
-        np.nan if lost else 0.4, np.nan if lost else 0.02,
+        np.nan if lost else 0.4,
+        np.nan if lost else 0.02,
         gps_residual_m=np.array([0.1, -0.2, np.nan]),
     )
 
@@ -63,13 +68,19 @@ def image(seed: int) -> np.ndarray:
     return np.dstack([x * 2, y * 4, np.full_like(x, (seed * 37) % 256)]).astype(np.uint8)
 
 
-def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4, *, compared: bool = False) -> int:
+def map_flight(
+    archive: Archive, flight_id: str, colour: int, count: int = 4, *, compared: bool = False
+) -> int:
     """Map a fake flight of `count` tiles, painted `count` deep, and as many frames, and commit it.
 
     A flight that is `compared` finds `count` changes and saves as many masks, of its colour.
     """
     settings = {"method": "planar", "colour": colour, "count": count}
-    changes = [fake_change(number, flight_id, size_m=colour / 100) for number in range(count)] if compared else None
+    changes = (
+        [fake_change(number, flight_id, size_m=colour / 100) for number in range(count)]
+        if compared
+        else None
+    )
     with archive.begin_flight(flight_id, f"print-{flight_id}", settings) as writer:
         paths = {}
         for index in range(count):
@@ -78,9 +89,13 @@ def map_flight(archive: Archive, flight_id: str, colour: int, count: int = 4, *,
                 writer.tiles[column - 1, 0] = tile(colour + index)
             writer.flush()
             if compared:
-                writer.save_masks(str(index), np.full((8, 8), colour, np.uint8), np.ones((8, 8), bool), _NO_BOXES)
+                writer.save_masks(
+                    str(index), np.full((8, 8), colour, np.uint8), np.ones((8, 8), bool), _NO_BOXES
+                )
         placed = [frame(index) for index in range(count)] + [frame(count, Status.REJECTED)]
-        return writer.commit(placed, paths, {"colour": colour}, f"<html>{colour}</html>", changes=changes)
+        return writer.commit(
+            placed, paths, {"colour": colour}, f"<html>{colour}</html>", changes=changes
+        )
 
 
 def check_whole(folder: Path) -> None:
@@ -95,9 +110,13 @@ def check_whole(folder: Path) -> None:
         flights = {flight.id: flight for flight in archive.flights() if flight.status == "complete"}
         for flight_id, flight in flights.items():
             keyframes = archive.keyframes(flight_id)
-            assert [keyframe.index for keyframe in keyframes] == list(range(flight.settings["count"]))
+            assert [keyframe.index for keyframe in keyframes] == list(
+                range(flight.settings["count"])
+            )
             for keyframe in keyframes:
-                assert np.abs(archive.image(keyframe).astype(int) - image(keyframe.index)).mean() < 4
+                assert (
+                    np.abs(archive.image(keyframe).astype(int) - image(keyframe.index)).mean() < 4
+                )
             changes = archive.changes(flight_id)
             assert [change.number for change in changes] == list(range(flight.settings["count"]))
             assert {change.length_m for change in changes} == {flight.settings["colour"] / 100}
@@ -119,7 +138,9 @@ def map_for_ever(folder: Path, seed: int) -> None:
         with Archive.open(folder, write=True) as archive:
             if not archive.has_site:
                 archive.create_site(SITE)
-            map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2, compared=True)
+            map_flight(
+                archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2, compared=True
+            )
 
 
 def _forked(task: Callable[..., None], *arguments: object) -> int:
@@ -172,7 +193,14 @@ def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
 
     def watch(called: FrameType, event: str, _: object) -> None:
         nonlocal count, commit
-        ordering = ("archive.py", "flight_writer.py", "catalogue.py", "sqlite_database.py", "derived.py", "atomic.py")
+        ordering = (
+            "archive.py",
+            "flight_writer.py",
+            "catalogue.py",
+            "sqlite_database.py",
+            "derived.py",
+            "atomic.py",
+        )
         if event != "call" or not called.f_code.co_filename.endswith(ordering):
             return
         if count == last:
@@ -185,7 +213,9 @@ def _map_to_step(folder: Path, seed: int, last: int, steps: Path) -> None:
         if not archive.has_site:
             archive.create_site(SITE)
         sys.setprofile(watch)
-        map_flight(archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2, compared=True)
+        map_flight(
+            archive, f"flight-{seed % 2}", 10 + seed % 200, count=2 + seed % 2, compared=True
+        )
         sys.setprofile(None)
     steps.write_text(f"{count} {commit}")
 
@@ -209,7 +239,8 @@ def hashes(folder: Path) -> dict[str, str]:
     """SHA-256 of each file of a site but the catalogue's, by path."""
     return {
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in folder.rglob("*") if path.is_file() and not path.name.startswith("site.")
+        for path in folder.rglob("*")
+        if path.is_file() and not path.name.startswith("site.")
     }
 
 

@@ -19,7 +19,9 @@ class Checker(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.names.append(tag)
         self.classes += [value or "" for name, value in attrs if name == "class"]
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
+        self.addresses += [
+            value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")
+        ]
         assert not [name for name, _ in attrs if name.startswith("on")]
         if tag not in _VOID or tag in ("circle", "rect", "path"):
             self.open.append(tag)

@@ -33,7 +33,9 @@ class KilledBucket:
     """The server, a process at a port of its own that stays the same, with the bucket. A context manager."""
 
     def __init__(self) -> None:
-        pytest.importorskip("moto.server", reason="needs moto's S3 server: pip install 'moto[server]'")
+        pytest.importorskip(
+            "moto.server", reason="needs moto's S3 server: pip install 'moto[server]'"
+        )
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
@@ -53,15 +55,24 @@ class KilledBucket:
     def start(self, dies_after: int = 0) -> None:
         """Listen again. With `dies_after` it kills itself once it has made so many changes, the last one unanswered."""
         self._process = subprocess.Popen(
-            [sys.executable, __file__, str(self.port), str(Path(self._folder.name, "log")), str(dies_after)],
-            stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            [
+                sys.executable,
+                __file__,
+                str(self.port),
+                str(Path(self._folder.name, "log")),
+                str(dies_after),
+            ],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         end_s = time.monotonic() + _UP_WITHIN_S
         while True:
             with suppress(OSError):
                 socket.create_connection(("127.0.0.1", self.port), timeout=5.0).close()
                 return
-            assert self._process.poll() is None and time.monotonic() < end_s, "the S3 server does not start"
+            assert self._process.poll() is None and time.monotonic() < end_s, (
+                "the S3 server does not start"
+            )
             time.sleep(0.05)
 
     def stop(self) -> None:
@@ -90,7 +101,9 @@ class _Logged:
         os.truncate(log, whole)  # the last entry may be torn
         self._log = log.open("ab", buffering=0)
 
-    def __call__(self, environ: dict[str, Any], start_response: Callable[..., Any]) -> Iterable[bytes]:
+    def __call__(
+        self, environ: dict[str, Any], start_response: Callable[..., Any]
+    ) -> Iterable[bytes]:
         if environ["REQUEST_METHOD"] in _READING:
             return self._app(environ, start_response)
         body = environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
@@ -106,12 +119,19 @@ class _Logged:
         start_response(status, headers)
         return [answer]
 
-    def _answered(self, environ: dict[str, str], body: bytes) -> tuple[str, list[tuple[str, str]], bytes]:
+    def _answered(
+        self, environ: dict[str, str], body: bytes
+    ) -> tuple[str, list[tuple[str, str]], bytes]:
         from werkzeug.test import run_wsgi_app
 
         served: dict[str, Any] = {
-            **environ, "wsgi.input": io.BytesIO(body), "wsgi.errors": sys.stderr, "wsgi.version": (1, 0),
-            "wsgi.multithread": True, "wsgi.multiprocess": False, "wsgi.run_once": False,
+            **environ,
+            "wsgi.input": io.BytesIO(body),
+            "wsgi.errors": sys.stderr,
+            "wsgi.version": (1, 0),
+            "wsgi.multithread": True,
+            "wsgi.multiprocess": False,
+            "wsgi.run_once": False,
         }
         answer, status, headers = run_wsgi_app(self._app, served, buffered=True)
         return status, list(headers), b"".join(answer)
@@ -130,7 +150,11 @@ def _entries(log: Path) -> Iterator[tuple[dict[str, str], bytes, int]]:
 
 def main(port: int, log: Path, dies_after: int) -> None:
     """Serve."""
-    from moto.moto_server.werkzeug_app import DomainDispatcherApplication, MotoRequestHandler, create_backend_app
+    from moto.moto_server.werkzeug_app import (
+        DomainDispatcherApplication,
+        MotoRequestHandler,
+        create_backend_app,
+    )
     from werkzeug.serving import make_server
 
     app = _Logged(DomainDispatcherApplication(create_backend_app), log, dies_after)

@@ -77,13 +77,23 @@ def test_a_flight_comes_back_whole(folder: Path) -> None:
         version = map_flight(archive, "morning", 20)
     with Archive.open(folder, write=False) as archive:
         (flight,) = archive.flights()
-        assert (flight.id, flight.rank, flight.status, flight.method) == ("morning", 0, "complete", "planar")
+        assert (flight.id, flight.rank, flight.status, flight.method) == (
+            "morning",
+            0,
+            "complete",
+            "planar",
+        )
         assert flight.fingerprint == "print-morning"
         assert flight.settings["colour"] == 20
         assert flight.frames == {"vision": 4, "gps-only": 0, "rejected": 1}
         assert flight.started_utc <= flight.finished_utc
         (entry,) = archive.versions()
-        assert (entry.id, entry.flight_id, entry.tiles, entry.complete) == (version, "morning", 4, True)
+        assert (entry.id, entry.flight_id, entry.tiles, entry.complete) == (
+            version,
+            "morning",
+            4,
+            True,
+        )
         tiles = archive.tiles()
         assert set(tiles) == {(-1, 0), (0, 0), (1, 0), (2, 0)}
         assert np.array_equal(tiles[2, 0], tile(23))
@@ -96,14 +106,20 @@ def test_a_flight_comes_back_whole(folder: Path) -> None:
             assert keyframe.status is Status.VISION
             assert np.array_equal(keyframe.site_from_image, made.site_from_image)
             assert keyframe.site_from_camera is not None
-            assert np.array_equal(keyframe.site_from_camera.rotation, made.site_from_camera.rotation)
+            assert np.array_equal(
+                keyframe.site_from_camera.rotation, made.site_from_camera.rotation
+            )
             assert not keyframe.camera.is_distorted
             assert np.abs(archive.image(keyframe).astype(int) - image(keyframe.index)).max() < 12
     flight_folder = folder / "flights" / "morning"
     assert json.loads((flight_folder / "report.json").read_text()) == {"colour": 20}
     assert (flight_folder / "report.html").read_text() == "<html>20</html>"
     assert len(json.loads((flight_folder / "frames.geojson").read_text())["features"]) == 5
-    assert {path.name for path in folder.iterdir()} >= {"mosaic.tif", "preview.png", "mosaic.kmz"} and is_site(folder)
+    assert {path.name for path in folder.iterdir()} >= {
+        "mosaic.tif",
+        "preview.png",
+        "mosaic.kmz",
+    } and is_site(folder)
 
 
 def test_a_keyframe_stored_smaller_sees_the_same_ground(file_folder: Path) -> None:
@@ -138,7 +154,11 @@ def test_images_come_out_of_the_writer_as_out_of_the_archive(file_folder: Path) 
 def test_leaving_without_commit_changes_nothing(folder: Path) -> None:
     with opened(folder) as archive:
         map_flight(archive, "a", 20)
-        before = (archive.flights(), archive.versions(), sorted(path for path in folder.rglob("*.[pj]*g")))
+        before = (
+            archive.flights(),
+            archive.versions(),
+            sorted(path for path in folder.rglob("*.[pj]*g")),
+        )
         with pytest.raises(ZeroDivisionError), archive.begin_flight("b", "", {}) as writer:
             writer.save_image(0, image(0))
             writer.tiles[0, 0] = tile(200)
@@ -151,7 +171,9 @@ def test_leaving_without_commit_changes_nothing(folder: Path) -> None:
         assert not (folder / "flights" / "b").exists()
 
 
-def test_a_flight_that_is_left_writes_no_more(file_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_flight_that_is_left_writes_no_more(
+    file_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Threads write tiles: what they had begun has ended, and gone, before another may write the site."""
     with opened(file_folder) as archive:
         map_flight(archive, "a", 20)
@@ -166,7 +188,10 @@ def test_a_flight_that_is_left_writes_no_more(file_folder: Path, monkeypatch: py
             return sha256
 
         monkeypatch.setattr(TileBlobs, "keep", slow)
-        with pytest.raises(ZeroDivisionError), archive.begin_flight("b", "", {}, tiles_mb=1) as writer:
+        with (
+            pytest.raises(ZeroDivisionError),
+            archive.begin_flight("b", "", {}, tiles_mb=1) as writer,
+        ):
             for column in range(4):
                 writer.tiles[column, 7] = tile(200 + column)
             raise ZeroDivisionError
@@ -176,7 +201,9 @@ def test_a_flight_that_is_left_writes_no_more(file_folder: Path, monkeypatch: py
         assert sorted(file_folder.rglob("*.png")) == before
 
 
-def test_mapping_again_keeps_the_rank_and_shows_the_former_run_until_the_commit(folder: Path) -> None:
+def test_mapping_again_keeps_the_rank_and_shows_the_former_run_until_the_commit(
+    folder: Path,
+) -> None:
     with opened(folder) as archive:
         map_flight(archive, "a", 20)
         map_flight(archive, "b", 40)
@@ -232,9 +259,14 @@ def test_versions_share_the_tiles_in_which_they_agree(folder: Path) -> None:
 
 
 def test_repainting_leaves_no_blobs_behind(folder: Path) -> None:
-    with opened(folder) as archive, archive.begin_flight("a", "", {}, tiles_mb=2, images_mb=2) as writer:
+    with (
+        opened(folder) as archive,
+        archive.begin_flight("a", "", {}, tiles_mb=2, images_mb=2) as writer,
+    ):
         for colour in range(20, 30):
-            for column in range(4):  # more than fit into memory, so that some are written between flushes
+            for column in range(
+                4
+            ):  # more than fit into memory, so that some are written between flushes
                 writer.tiles[column, 0] = tile(colour, opaque_columns=100 + column)
             writer.flush()
             assert len(list(folder.glob("tiles/*/*.png"))) == 4
@@ -295,7 +327,10 @@ def test_only_one_writer_and_one_flight_at_a_time(folder: Path) -> None:
             opened(folder)
         with archive.begin_flight("a", "", {}), pytest.raises(StoreError, match="already"):
             archive.begin_flight("b", "", {})
-    with Archive.open(folder, write=False) as archive, pytest.raises(StoreError, match="write=True"):
+    with (
+        Archive.open(folder, write=False) as archive,
+        pytest.raises(StoreError, match="write=True"),
+    ):
         archive.begin_flight("a", "", {})
 
 
@@ -315,7 +350,9 @@ def test_a_folder_that_is_no_site_is_refused_and_left_alone(tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.doc"]
 
 
-@pytest.mark.parametrize("content", [b"", b"no database at all" * 100, b"SQLite format 3\0" + bytes(5000)])
+@pytest.mark.parametrize(
+    "content", [b"", b"no database at all" * 100, b"SQLite format 3\0" + bytes(5000)]
+)
 def test_a_catalogue_that_is_none_is_refused_and_left_alone(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "site.db").write_bytes(content)
     for write in (True, False):
@@ -342,16 +379,23 @@ def test_another_format_version_is_refused_with_both_versions(file_folder: Path)
         connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 6}")
     connection.close()
     for write in (True, False):
-        with pytest.raises(StoreError, match=rf"version {SCHEMA_VERSION + 6},.* version {SCHEMA_VERSION};"):
+        with pytest.raises(
+            StoreError, match=rf"version {SCHEMA_VERSION + 6},.* version {SCHEMA_VERSION};"
+        ):
             Archive.open(file_folder, write=write)
 
 
-def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(file_folder: Path, tmp_path: Path) -> None:
+def test_a_folder_on_a_read_only_disk_can_be_read_but_not_written(
+    file_folder: Path, tmp_path: Path
+) -> None:
     with opened(file_folder) as archive:
         map_flight(archive, "a", 20)
     view = tmp_path / "view"
     view.mkdir()
-    commands = [["mount", "--bind", str(file_folder), str(view)], ["mount", "-o", "remount,bind,ro", str(view)]]
+    commands = [
+        ["mount", "--bind", str(file_folder), str(view)],
+        ["mount", "-o", "remount,bind,ro", str(view)],
+    ]
     if any(subprocess.run(command, capture_output=True).returncode for command in commands):
         subprocess.run(["umount", str(view)], capture_output=True)
         pytest.skip("no read-only mount could be made here")
@@ -385,14 +429,20 @@ def test_files_that_a_commit_still_owed_are_written_by_the_next_opening(folder: 
     with opened(folder) as archive:
         map_flight(archive, "a", 20, count=1)
         archive.preview_path.unlink()
-        (archive.preview_path / "in the way").mkdir(parents=True)  # as good as a kill: the commit stops here
+        (archive.preview_path / "in the way").mkdir(
+            parents=True
+        )  # as good as a kill: the commit stops here
         with pytest.raises(OSError, match=r"preview\.png"):
             map_flight(archive, "b", 40, count=3)
         assert [flight.id for flight in archive.flights()] == ["a", "b"]
     (folder / "preview.png" / "in the way").rmdir()
     (folder / "preview.png").rmdir()
     with opened(folder) as archive:
-        assert cv2.imread(str(archive.preview_path), cv2.IMREAD_UNCHANGED).shape == (512, 3 * 512, 4)
+        assert cv2.imread(str(archive.preview_path), cv2.IMREAD_UNCHANGED).shape == (
+            512,
+            3 * 512,
+            4,
+        )
         archive.mosaic_path.unlink()
     with opened(folder) as archive:
         assert archive.mosaic_path.is_file()
@@ -404,7 +454,9 @@ def test_a_flight_without_any_tile_leaves_no_map(folder: Path) -> None:
             writer.commit([frame(0, Status.REJECTED)], {}, {"value": np.nan}, "")
         assert not archive.mosaic_path.exists()
         assert archive.keyframes() == []
-        assert json.loads((archive.flight_folder("a") / "report.json").read_text()) == {"value": None}
+        assert json.loads((archive.flight_folder("a") / "report.json").read_text()) == {
+            "value": None
+        }
 
 
 def test_a_local_site_has_a_map_without_a_place_on_earth(tmp_path: Path) -> None:

@@ -44,7 +44,13 @@ def fly(folder: Path, site, flight: str, day: int, **found: object) -> None:
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two sites beside each other, a third without a place on Earth, and files of no site."""
     root = tmp_path_factory.mktemp("archive") / "root"
-    fly(root / "north" / "field", SITE, "a", 0, search=search((thing("a-o1", 3.0, 4.0), thing("a-o2", 25.0, 4.0))))
+    fly(
+        root / "north" / "field",
+        SITE,
+        "a",
+        0,
+        search=search((thing("a-o1", 3.0, 4.0), thing("a-o2", 25.0, 4.0))),
+    )
     fly(root / "north" / "field", SITE, "b", 1, changes=[fake_change(1)])
     fly(root / "second", SECOND, "c", 2)
     with Archive.open(root / "pond", write=True) as archive:
@@ -92,8 +98,11 @@ def brute_force(root: Path, place: str) -> dict[tuple[str, str], int]:
     latitude, longitude = map(float, place.split(","))
     found = {}
     for file in sorted(root.rglob("frames.geojson")):
-        shapes = [shapely.geometry.shape(each["geometry"])
-                  for each in json.loads(file.read_text())["features"] if each["geometry"]]
+        shapes = [
+            shapely.geometry.shape(each["geometry"])
+            for each in json.loads(file.read_text())["features"]
+            if each["geometry"]
+        ]
         count = sum(each.intersects(shapely.Point(longitude, latitude)) for each in shapes)
         if count:
             found[file.parents[2].relative_to(root).as_posix(), file.parent.name] = count
@@ -109,7 +118,9 @@ def test_it_finds_what_the_files_hold(root: Path, address: str) -> None:
     for _ in range(60):
         place = at(*chance.uniform(-20, 45, 2))
         found = find_place(root, place)
-        assert {(each.site, each.flight): each.frames for each in found if each.frames} == brute_force(root, place)
+        assert {
+            (each.site, each.flight): each.frames for each in found if each.frames
+        } == brute_force(root, place)
         seen += bool(found)
     assert 10 < seen < 60
     first, second, third = find_place(root, at(12.0, 5.0))
@@ -124,7 +135,9 @@ def test_what_was_found_there(root: Path, address: str) -> None:
     indexed(root, address)
     (flight,) = find_place(root, at(3.0, 4.5), classes=("car",))
     (car,) = flight.things
-    assert (car.type, car.id, car.label) == ("object", "a-o1", "car") and abs(car.distance_m - 0.5) < 0.02
+    assert (car.type, car.id, car.label) == ("object", "a-o1", "car") and abs(
+        car.distance_m - 0.5
+    ) < 0.02
     assert not find_place(root, at(3.0, 7.0), classes=("car",))
     assert find_place(root, at(3.0, 7.0), classes=("car",), within_m=3.1)
     assert not find_place(root, at(3.0, 4.5), classes=("person",))
@@ -133,8 +146,15 @@ def test_what_was_found_there(root: Path, address: str) -> None:
         archive.review(change.id, Verdict.CONFIRMED)
     assert indexed(root).added == 0
     centre = change.outline_m.mean(axis=0)
-    found = [each for flight in find_place(root, at(*centre)) for each in flight.things if each.type == "change"]
-    assert [(each.id, each.verdict, each.distance_m) for each in found] == [(change.id, "confirmed", 0.0)]
+    found = [
+        each
+        for flight in find_place(root, at(*centre))
+        for each in flight.things
+        if each.type == "change"
+    ]
+    assert [(each.id, each.verdict, each.distance_m) for each in found] == [
+        (change.id, "confirmed", 0.0)
+    ]
 
 
 def test_by_time(root: Path, address: str) -> None:
@@ -147,7 +167,9 @@ def test_by_time(root: Path, address: str) -> None:
     assert not find_place(root, place, first="2023-11-15T22:14")[:-1]
 
 
-def test_only_what_changed_is_read(root: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_changed_is_read(
+    root: Path, address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     indexed(root, address)
     read: list[str] = []
     rows = indexing.flight_rows
@@ -158,7 +180,9 @@ def test_only_what_changed_is_read(root: Path, address: str, monkeypatch: pytest
 
     monkeypatch.setattr(indexing, "flight_rows", counted)
     assert indexed(root).added == 0 and not read
-    fly(root / "north" / "field", SITE, "b", 5, search=search((thing("b-o1", 3.0, 4.0),)))  # again, another day
+    fly(
+        root / "north" / "field", SITE, "b", 5, search=search((thing("b-o1", 3.0, 4.0),))
+    )  # again, another day
     shutil.rmtree(root / "second")
     outcome = indexed(root)
     assert read == ["b"] and outcome.gone == ["second"]
@@ -173,7 +197,9 @@ def test_only_what_changed_is_read(root: Path, address: str, monkeypatch: pytest
             assert boxes == [2, 3, 0]
 
 
-def test_a_site_that_cannot_be_read_is_named_and_what_is_known_of_it_stays(root: Path, capsys) -> None:
+def test_a_site_that_cannot_be_read_is_named_and_what_is_known_of_it_stays(
+    root: Path, capsys
+) -> None:
     indexed(root)
     (root / "second" / "site.db").write_bytes(b"broken")
     assert main(["archive", "index", str(root)]) == 1
@@ -194,21 +220,31 @@ def test_across_the_antimeridian(tmp_path: Path, address: str) -> None:
     fly(tmp_path / "fiji", site, "a", 0)
     indexed(tmp_path, address)
     for longitude in (179.9999, -179.9999, 180.0, -180.0, 180.0001):
-        assert [each.flight for each in find_place(tmp_path, f"-16.99996,{longitude}")] == ["a"], longitude
+        assert [each.flight for each in find_place(tmp_path, f"-16.99996,{longitude}")] == ["a"], (
+            longitude
+        )
     assert not find_place(tmp_path, "-16.99996,0.0001")
 
 
-@pytest.mark.parametrize(("words", "match"), [
-    ({"at": "north pole"}, "latitude and longitude"), ({"at": "91,0"}, "no place"), ({"at": "nan,0"}, "no place"),
-    ({"at": "1,2", "first": "soon"}, "is not a date"), ({"at": "1,2", "within_m": 0}, "more than 0"),
-    ({"at": "1,2", "first": "2026-02-01", "last": "2026-01-01"}, "in order"),
-])
+@pytest.mark.parametrize(
+    ("words", "match"),
+    [
+        ({"at": "north pole"}, "latitude and longitude"),
+        ({"at": "91,0"}, "no place"),
+        ({"at": "nan,0"}, "no place"),
+        ({"at": "1,2", "first": "soon"}, "is not a date"),
+        ({"at": "1,2", "within_m": 0}, "more than 0"),
+        ({"at": "1,2", "first": "2026-02-01", "last": "2026-01-01"}, "in order"),
+    ],
+)
 def test_what_cannot_be_asked_is_named(tmp_path: Path, words: dict, match: str) -> None:
     with pytest.raises(SettingsError, match=match):
         find_place(tmp_path, **words)
 
 
-def test_without_an_index_or_with_another_one(root: Path, postgis: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_index_or_with_another_one(
+    root: Path, postgis: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(StoreError, match="sorvolo archive index"):
         find_place(root, "46.5,13.25")
     indexed(root)
@@ -227,8 +263,13 @@ def test_without_postgis(root: Path, postgres: PostgresServer, capsys) -> None:
 
 def test_the_command_lists_and_prints_json(root: Path, capsys) -> None:
     assert main(["archive", "index", str(root)]) == 0
-    assert "3 sites, 3 flights, 9 frames, 2 objects, 1 change; 3 flights new, 0 gone" in capsys.readouterr().out
-    assert main(["archive", "find", str(root), "--at", at(3.0, 4.5), "--class", "car", "--json"]) == 0
+    assert (
+        "3 sites, 3 flights, 9 frames, 2 objects, 1 change; 3 flights new, 0 gone"
+        in capsys.readouterr().out
+    )
+    assert (
+        main(["archive", "find", str(root), "--at", at(3.0, 4.5), "--class", "car", "--json"]) == 0
+    )
     (flight,) = json.loads(capsys.readouterr().out)["flights"]
     assert flight["flight"] == "a" and flight["things"][0]["id"] == "a-o1"
     assert main(["archive", "find", str(root), "--at", at(3.0, 4.5)]) == 0

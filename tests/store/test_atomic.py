@@ -70,7 +70,9 @@ def test_a_file_that_grows_too_large_is_a_full_disk(tmp_path: Path) -> None:
         "except StoreError as error:\n"
         "    print(error)\n"
     )
-    result = subprocess.run([sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True
+    )
     assert result.stdout.startswith("disk full: "), result.stderr
     assert (tmp_path / "x").read_bytes() == b"a" * 1000
     assert len(list(tmp_path.iterdir())) == 1
@@ -81,7 +83,9 @@ def small_disk(tmp_path: Path):
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(disk)], capture_output=True, text=True
+        ["mount", "-t", "tmpfs", "-o", "size=6m", "tmpfs", str(disk)],
+        capture_output=True,
+        text=True,
     )
     if mounted.returncode:
         pytest.skip(f"no small disk could be mounted: {mounted.stderr.strip()}")
@@ -97,7 +101,10 @@ def test_a_full_disk_is_named_and_leaves_the_site_whole(small_disk: Path) -> Non
         archive.create_site(SITE)
         map_flight(archive, "first", 20)
         ballast.write_bytes(b"x" * 3_000_000)
-        with pytest.raises(StoreError, match="disk full"), archive.begin_flight("second", "", {}) as writer:
+        with (
+            pytest.raises(StoreError, match="disk full"),
+            archive.begin_flight("second", "", {}) as writer,
+        ):
             for index in range(20):
                 writer.save_image(index, image(index))
                 writer.tiles[index, 3] = np.roll(noise, index, axis=0)

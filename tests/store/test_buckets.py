@@ -33,7 +33,9 @@ def bucket() -> Iterator[str]:
 
 @pytest.fixture
 def memory() -> Objects:
-    store = pytest.importorskip("obstore.store", reason="object stores need obstore: pip install 'sorvolo[s3]'")
+    store = pytest.importorskip(
+        "obstore.store", reason="object stores need obstore: pip install 'sorvolo[s3]'"
+    )
     return Objects(store.MemoryStore(), "memory://site")
 
 
@@ -56,7 +58,10 @@ def test_a_site_goes_to_s3_and_back(bucket: str, site: Path, tmp_path: Path) -> 
     there = BucketEnd(open_objects(f"s3://{BUCKET}/maps/field"))
     outcome = copied(FolderEnd(site), there)
     assert outcome.copied == outcome.files and not outcome.faults
-    assert copied(FolderEnd(site), BucketEnd(open_objects(f"s3://{BUCKET}/maps/field"))).copied_bytes < outcome.bytes
+    assert (
+        copied(FolderEnd(site), BucketEnd(open_objects(f"s3://{BUCKET}/maps/field"))).copied_bytes
+        < outcome.bytes
+    )
     assert not verified(FolderEnd(site), there).faults
     back = tmp_path / "back"
     assert copied(there, FolderEnd(back)).copied == outcome.files
@@ -71,7 +76,9 @@ def test_a_site_goes_to_s3_and_back(bucket: str, site: Path, tmp_path: Path) -> 
 
 
 def test_a_site_goes_from_store_to_store(bucket: str, site: Path, tmp_path: Path) -> None:
-    first, second = (BucketEnd(open_objects(f"s3://{BUCKET}/{name}/field")) for name in ("first", "second"))
+    first, second = (
+        BucketEnd(open_objects(f"s3://{BUCKET}/{name}/field")) for name in ("first", "second")
+    )
     outcome = copied(FolderEnd(site), first)
     assert copied(first, second).copied == outcome.files
     assert not verified(FolderEnd(site), second).faults
@@ -83,11 +90,14 @@ def test_a_site_goes_from_store_to_store(bucket: str, site: Path, tmp_path: Path
 def test_gdal_reads_the_map_where_it_lies(bucket: str, site: Path) -> None:
     copied(FolderEnd(site), BucketEnd(open_objects(f"s3://{BUCKET}/gis")))
     options = {
-        "AWS_S3_ENDPOINT": bucket.removeprefix("http://"), "AWS_HTTPS": "NO", "AWS_VIRTUAL_HOSTING": "FALSE",
+        "AWS_S3_ENDPOINT": bucket.removeprefix("http://"),
+        "AWS_HTTPS": "NO",
+        "AWS_VIRTUAL_HOSTING": "FALSE",
         "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".tif",
     }
     with (
-        rasterio.Env(**options), rasterio.open(f"/vsis3/{BUCKET}/gis/mosaic.tif") as there,
+        rasterio.Env(**options),
+        rasterio.open(f"/vsis3/{BUCKET}/gis/mosaic.tif") as there,
         rasterio.open(site / "mosaic.tif") as here,
     ):
         assert there.crs == here.crs and there.transform == here.transform
@@ -118,14 +128,18 @@ class _Overtaken(BucketEnd):
         super()._swap(manifest)
 
 
-def test_of_two_writers_one_wins_and_the_other_loses_nothing(bucket: str, site: Path, tmp_path: Path) -> None:
+def test_of_two_writers_one_wins_and_the_other_loses_nothing(
+    bucket: str, site: Path, tmp_path: Path
+) -> None:
     objects = open_objects(f"s3://{BUCKET}/race")
     other = Path(shutil.copytree(site, tmp_path / "other"))
     copied(FolderEnd(site), BucketEnd(objects))
     map_again(site, "mine", 90)
     map_again(other, "theirs", 140)
     mine = hashes(site)
-    with pytest.raises(StoreError, match="another writer has changed the site at s3://archive/race meanwhile"):
+    with pytest.raises(
+        StoreError, match="another writer has changed the site at s3://archive/race meanwhile"
+    ):
         copied(FolderEnd(site), _Overtaken(objects, other))
     assert not verified(FolderEnd(other), BucketEnd(objects)).faults
     assert hashes(site) == mine
@@ -171,7 +185,9 @@ def test_a_lost_answer_is_no_conflict(memory: Objects, site: Path) -> None:
     assert BucketEnd(memory).manifest().held.newest == 2
 
 
-def test_other_objects_and_other_sites_are_not_overwritten(memory: Objects, site: Path, tmp_path: Path) -> None:
+def test_other_objects_and_other_sites_are_not_overwritten(
+    memory: Objects, site: Path, tmp_path: Path
+) -> None:
     import obstore
 
     obstore.put(memory._store, "holiday.jpg", b"x")
@@ -182,10 +198,15 @@ def test_other_objects_and_other_sites_are_not_overwritten(memory: Objects, site
     with pytest.raises(StoreError, match="holds another site"):
         copied(FolderEnd(mapped_site(tmp_path / "another")), BucketEnd(memory))
     with pytest.raises(StoreError, match="no site at memory://site"):
-        copied(BucketEnd(Objects(obstore.store.MemoryStore(), "memory://site")), FolderEnd(tmp_path / "back"))
+        copied(
+            BucketEnd(Objects(obstore.store.MemoryStore(), "memory://site")),
+            FolderEnd(tmp_path / "back"),
+        )
 
 
-def test_damage_in_the_store_is_found_and_named(memory: Objects, site: Path, tmp_path: Path) -> None:
+def test_damage_in_the_store_is_found_and_named(
+    memory: Objects, site: Path, tmp_path: Path
+) -> None:
     import obstore
 
     copied(FolderEnd(site), BucketEnd(memory))
@@ -198,7 +219,9 @@ def test_damage_in_the_store_is_found_and_named(memory: Objects, site: Path, tmp
     assert copied(BucketEnd(memory), FolderEnd(tmp_path / "back")).faults == expected
 
 
-def test_what_no_state_names_is_removed_and_all_else_stays(memory: Objects, site: Path, tmp_path: Path) -> None:
+def test_what_no_state_names_is_removed_and_all_else_stays(
+    memory: Objects, site: Path, tmp_path: Path
+) -> None:
     copied(FolderEnd(site), BucketEnd(memory))
     before = set(memory.sizes(""))
     map_again(site, "flight-1", 120)
@@ -227,17 +250,30 @@ def test_no_writer_relies_on_what_is_being_removed(memory: Objects, site: Path) 
         copied(FolderEnd(site), Pruned(memory))
     manifest, etag = BucketEnd(memory).find_manifest()
     assert manifest is not None
-    memory.swap(MANIFEST, replace(manifest, tidying="2026-11-23T05:00:00+00:00").data(), etag)  # a prune was killed
-    with pytest.raises(StoreError, match=r"has been pruned since 2026-11-23.*sorvolo site prune memory://site"):
+    memory.swap(
+        MANIFEST, replace(manifest, tidying="2026-11-23T05:00:00+00:00").data(), etag
+    )  # a prune was killed
+    with pytest.raises(
+        StoreError, match=r"has been pruned since 2026-11-23.*sorvolo site prune memory://site"
+    ):
         copied(FolderEnd(site), BucketEnd(memory))
     prune(memory, -1.0)
     copied(FolderEnd(site), BucketEnd(memory))
     assert not verified(FolderEnd(site), BucketEnd(memory)).faults
 
 
-@pytest.mark.parametrize("path", [
-    "../outside.txt", "/etc/passwd", "flights/../../x.txt", "flights/a/run.journal", "site.db", "tiles/aa/no.png", 5,
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../outside.txt",
+        "/etc/passwd",
+        "flights/../../x.txt",
+        "flights/a/run.journal",
+        "site.db",
+        "tiles/aa/no.png",
+        5,
+    ],
+)
 def test_a_manifest_that_was_made_to_do_harm_is_refused(
     memory: Objects, site: Path, tmp_path: Path, path: object
 ) -> None:

@@ -37,7 +37,11 @@ def folder(tmp_path: Path) -> Path:
 
 
 def compare(
-    archive: Archive, flight_id: str, changes: list[Change] | None, colour: int = 0, report_html: str = "<html></html>"
+    archive: Archive,
+    flight_id: str,
+    changes: list[Change] | None,
+    colour: int = 0,
+    report_html: str = "<html></html>",
 ) -> int:
     """Compare a fake flight; it paints one tile unless `colour` is 0."""
     with archive.begin_flight(flight_id, "print", {"method": "compare-robust"}) as writer:
@@ -54,10 +58,28 @@ def properties(folder: Path, flight_id: str = "b") -> list[dict]:
 
 def same(one: StoredChange, other: Change) -> bool:
     return (
-        (one.id, one.kind, one.score, one.views, one.first_seen_ns, one.last_seen_ns, one.class_after)
-        == (other.id, other.kind, other.score, other.views, other.first_seen_ns, other.last_seen_ns, other.class_after)
+        (
+            one.id,
+            one.kind,
+            one.score,
+            one.views,
+            one.first_seen_ns,
+            one.last_seen_ns,
+            one.class_after,
+        )
+        == (
+            other.id,
+            other.kind,
+            other.score,
+            other.views,
+            other.first_seen_ns,
+            other.last_seen_ns,
+            other.class_after,
+        )
         and np.array_equal(one.outline_m, other.outline_m)
-        and np.allclose([one.area_m2, one.length_m, one.sigma_m], [other.area_m2, other.length_m, other.sigma_m])
+        and np.allclose(
+            [one.area_m2, one.length_m, one.sigma_m], [other.area_m2, other.length_m, other.sigma_m]
+        )
     )
 
 
@@ -66,7 +88,9 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
     made = [
         fake_change(2, kind=ChangeKind.MOVING, velocity_m_s=(1.0, -0.5)),
         replace(
-            fake_change(1, kind=ChangeKind.DISAPPEARED), sigma_in_map_m=0.03, height_change=HeightChange(-0.4, 0.1)
+            fake_change(1, kind=ChangeKind.DISAPPEARED),
+            sigma_in_map_m=0.03,
+            height_change=HeightChange(-0.4, 0.1),
         ),
     ]
     with Archive.open(folder, write=True) as archive:
@@ -80,16 +104,23 @@ def test_changes_come_back_as_they_were_found(folder: Path) -> None:
         assert np.isnan(second.sigma_in_map_m) and second.height_change is None
         assert first.crop.width_px == 64 and first.crop.m_per_px == made[1].patch.m_per_px
         assert archive.changes("a") == []
-        assert archive.comparisons() == {2: {"appeared": 0, "disappeared": 1, "replaced": 0, "moving": 1, "area": 0}}
+        assert archive.comparisons() == {
+            2: {"appeared": 0, "disappeared": 1, "replaced": 0, "moving": 1, "area": 0}
+        }
     written = cv2.imread(str(folder / "flights/b/changes/b-1-before.png"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(cv2.cvtColor(written, cv2.COLOR_BGRA2RGBA), made[1].patch.before)
     page = (folder / "flights/b/changes.html").read_text()
     assert "-0.40 m (accuracy 0.10 m, 1 sigma)" in page and "position on this map (1 sigma)" in page
     reported, other = properties(folder)
     names = "sigma_in_map_m", "height_change_m", "height_change_sigma_m"
-    assert [reported[name] for name in names] == [0.03, -0.4, 0.1] and not any(other[name] for name in names)
+    assert [reported[name] for name in names] == [0.03, -0.4, 0.1] and not any(
+        other[name] for name in names
+    )
     assert "2 changes" not in page and "1 change " in page and "1 moving object" in page
-    assert "version 1: flight a, <time>flown 2023-11-14</time>" in page and "version 2: flight b" in page
+    assert (
+        "version 1: flight a, <time>flown 2023-11-14</time>" in page
+        and "version 2: flight b" in page
+    )
     assert ".dates time{white-space:nowrap}" in page  # on a telephone, too, no line breaks a date
 
 
@@ -100,18 +131,39 @@ def test_the_geojson_states_what_is_promised_in_wgs84(folder: Path) -> None:
     text = (folder / "flights/b/changes.geojson").read_text()
     (feature,) = json.loads(text)["features"]
     assert set(feature["properties"]) >= {
-        "id", "kind", "score", "first_seen", "last_seen", "views", "area_m2", "length_m", "sigma_m", "class_before",
-        "class_after", "number", "east_m", "north_m", "velocity_m_s", "review",
+        "id",
+        "kind",
+        "score",
+        "first_seen",
+        "last_seen",
+        "views",
+        "area_m2",
+        "length_m",
+        "sigma_m",
+        "class_before",
+        "class_after",
+        "number",
+        "east_m",
+        "north_m",
+        "velocity_m_s",
+        "review",
     }
     reported = feature["properties"]
-    assert (reported["id"], reported["kind"], reported["score"], reported["number"]) == ("b-3", "appeared", 0.875, 3)
+    assert (reported["id"], reported["kind"], reported["score"], reported["number"]) == (
+        "b-3",
+        "appeared",
+        0.875,
+        3,
+    )
     assert reported["review"] is reported["class_after"] is reported["velocity_m_s"] is None
     seen = datetime.fromisoformat(reported["first_seen"])
     assert abs(seen.timestamp() - SEEN_NS / 1e9) < 1e-6 and reported["first_seen"].endswith("Z")
     ring = np.array(feature["geometry"]["coordinates"][0])
     assert np.array_equal(ring[0], ring[-1]) and signed_area(ring[:-1]) > 0
     # every corner lies where the outline does, to a tenth of a millimetre
-    back_m = site.frame.site_from_wgs84(ring[:-1, 1], ring[:-1, 0], np.full(5, site.origin.height_m))[:, :2]
+    back_m = site.frame.site_from_wgs84(
+        ring[:-1, 1], ring[:-1, 0], np.full(5, site.origin.height_m)
+    )[:, :2]
     gaps_m = np.linalg.norm(back_m[:, None] - fake_change(3).outline_m[None], axis=-1).min(axis=1)
     assert gaps_m.max() < 1e-4
     assert np.allclose(feature["outline_m"], fake_change(3).outline_m, atol=1e-4)
@@ -127,22 +179,35 @@ def test_a_local_site_writes_no_places_on_earth_and_names_the_reason(tmp_path: P
     frames = json.loads((tmp_path / "site/flights/b/frames.json").read_text())
     collection = json.loads((tmp_path / "site/flights/b/changes.json").read_text())
     assert "no GPS" in collection["note"] and "no GPS" in frames["note"]
-    assert collection["crs"] is None and "type" not in collection and "type" not in collection["features"][0]
+    assert (
+        collection["crs"] is None
+        and "type" not in collection
+        and "type" not in collection["features"][0]
+    )
     ring = np.array(collection["features"][0]["geometry"]["coordinates"][0])
     assert np.allclose(ring.max(axis=0), fake_change(1).outline_m.max(axis=0))
     page = (tmp_path / "site/flights/b/changes.html").read_text().split("All changes")[1]
-    assert " m²" not in page and "unit" not in page and "MGRS" not in page and "changes.geojson" not in page
+    assert (
+        " m²" not in page
+        and "unit" not in page
+        and "MGRS" not in page
+        and "changes.geojson" not in page
+    )
 
 
 def test_changes_are_places_for_google_earth_and_receivers(folder: Path) -> None:
     with Archive.open(folder, write=True) as archive:
-        compare(archive, "b", [fake_change(1, east_m=30.0), fake_change(2, kind=ChangeKind.DISAPPEARED)])
+        compare(
+            archive, "b", [fake_change(1, east_m=30.0), fake_change(2, kind=ChangeKind.DISAPPEARED)]
+        )
         archive.review("b-2", Verdict.REJECTED)
     flight = folder / "flights" / "b"
     (waypoint,) = gpxpy.parse((flight / "changes.gpx").read_text()).waypoints
     longitudes, latitudes = longitude_latitude(np.array([[30.0, -4.0]]), SITE)
     assert waypoint.name == "b-1 appeared" and "score 0.80" in waypoint.description
-    assert (waypoint.longitude, waypoint.latitude) == pytest.approx((longitudes[0], latitudes[0]), abs=1e-7)
+    assert (waypoint.longitude, waypoint.latitude) == pytest.approx(
+        (longitudes[0], latitudes[0]), abs=1e-7
+    )
     assert waypoint.time is not None and waypoint.time.isoformat() == "2023-11-14T22:13:20+00:00"
     document = ElementTree.fromstring((flight / "changes.kml").read_bytes())
     kml = "{http://www.opengis.net/kml/2.2}"
@@ -154,16 +219,23 @@ def test_changes_are_places_for_google_earth_and_receivers(folder: Path) -> None
 
 
 def test_names_from_elsewhere_stay_xml() -> None:
-    odd = Placemark("<&\x00\x1b>\"", "]]> & <b>", 13.0, 46.0, 0)
+    odd = Placemark('<&\x00\x1b>"', "]]> & <b>", 13.0, 46.0, 0)
     for data in (kml_bytes(odd.name, [odd]), gpx_bytes(odd.name, [odd])):
-        texts = [each.text for each in ElementTree.fromstring(data).iter() if each.text and each.text.strip()]
+        texts = [
+            each.text
+            for each in ElementTree.fromstring(data).iter()
+            if each.text and each.text.strip()
+        ]
         assert '<&>"' in texts and "]]> & <b>" in texts
 
 
-@given(st.lists(st.tuples(st.floats(-5e3, 5e3), st.floats(-5e3, 5e3), st.floats(0.05, 50)), max_size=4))
+@given(
+    st.lists(st.tuples(st.floats(-5e3, 5e3), st.floats(-5e3, 5e3), st.floats(0.05, 50)), max_size=4)
+)
 def test_any_change_makes_plain_json(places: list[tuple[float, float, float]]) -> None:
     changes = [
-        fake_change(k, east_m=east, north_m=north, size_m=size) for k, (east, north, size) in enumerate(places)
+        fake_change(k, east_m=east, north_m=north, size_m=size)
+        for k, (east, north, size) in enumerate(places)
     ]
     collection = changes_geojson(stored_changes("b", changes), SITE)
     assert json.loads(json.dumps(collection, allow_nan=False)) == collection
@@ -185,24 +257,45 @@ def test_comparing_again_replaces_everything(folder: Path) -> None:
         for number in (1, 2):  # the second time other changes, without masks
             with archive.begin_flight("b", "", {}) as writer:
                 if number == 1:
-                    writer.save_masks("7", np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), np.zeros((0, 4), int))
+                    writer.save_masks(
+                        "7",
+                        np.zeros((4, 4), np.uint8),
+                        np.ones((4, 4), bool),
+                        np.zeros((0, 4), int),
+                    )
                 changes = [fake_change(number), fake_change(3, east_m=number)]
                 more = {f"notes-{number}.txt": b"x"}
-                writer.commit([], {}, {"flight": "b"}, "<html></html>", changes=changes, documents=more)
+                writer.commit(
+                    [], {}, {"flight": "b"}, "<html></html>", changes=changes, documents=more
+                )
         assert [each.id for each in archive.changes()] == ["b-2", "b-3"]
         assert archive.changes()[1].centre_m[0] == pytest.approx(2)
     flight = folder / "flights" / "b"
     assert {path.name for path in flight.iterdir()} == {
-        "frames.geojson", "report.json", "report.html", "changes.geojson", "changes.kml", "changes.gpx",
-        "changes.html", "changes", "notes-2.txt",
+        "frames.geojson",
+        "report.json",
+        "report.html",
+        "changes.geojson",
+        "changes.kml",
+        "changes.gpx",
+        "changes.html",
+        "changes",
+        "notes-2.txt",
     }
     assert {path.name for path in (flight / "changes").iterdir()} == {
-        "b-2-before.png", "b-2-after.png", "b-3-before.png", "b-3-after.png"
+        "b-2-before.png",
+        "b-2-after.png",
+        "b-3-before.png",
+        "b-3-after.png",
     }
     assert [each["id"] for each in properties(folder)] == ["b-2", "b-3"]
     with Archive.open(folder, write=True) as archive:
         compare(archive, "b", None)
-    assert {path.name for path in flight.iterdir()} == {"frames.geojson", "report.json", "report.html"}
+    assert {path.name for path in flight.iterdir()} == {
+        "frames.geojson",
+        "report.json",
+        "report.html",
+    }
 
 
 @pytest.mark.usefixtures("kind")
@@ -211,15 +304,21 @@ def test_leaving_a_comparison_without_commit_changes_nothing(folder: Path) -> No
         compare(archive, "b", [fake_change(1)])
         before = {path: path.read_bytes() for path in folder.glob("flights/**/*") if path.is_file()}
         with pytest.raises(ZeroDivisionError), archive.begin_flight("b", "", {}) as writer:
-            writer.save_masks("1", np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), np.zeros((0, 4), int))
+            writer.save_masks(
+                "1", np.zeros((4, 4), np.uint8), np.ones((4, 4), bool), np.zeros((0, 4), int)
+            )
             raise ZeroDivisionError
-    assert {path: path.read_bytes() for path in folder.glob("flights/**/*") if path.is_file()} == before
+    assert {
+        path: path.read_bytes() for path in folder.glob("flights/**/*") if path.is_file()
+    } == before
     assert not (folder / "flights/b/staged").exists()
 
 
 @pytest.mark.usefixtures("kind")
 def test_files_that_a_commit_still_owed_are_written_by_the_next_opening(folder: Path) -> None:
-    (folder / "flights/b/changes.geojson/in the way").mkdir(parents=True)  # as good as a kill: the commit stops here
+    (folder / "flights/b/changes.geojson/in the way").mkdir(
+        parents=True
+    )  # as good as a kill: the commit stops here
     with Archive.open(folder, write=True) as archive:
         with pytest.raises(OSError, match=r"changes\.geojson"):
             compare(archive, "b", [fake_change(1)])
@@ -262,8 +361,13 @@ def test_a_verdict_reaches_the_files_and_outlives_the_run(folder: Path) -> None:
     assert "1 confirmed and 1 rejected" in page and "Schatten &lt;&amp;&gt;" in page
     with Archive.open(folder, write=True) as archive:
         reported = {review.change_id: review for review in archive.reviews()}
-        assert {each: reported[each].verdict.value for each in reported} == {"b-1": "confirmed", "b-2": "rejected"}
-        assert reported["b-2"].note == "Schatten <&>" and reported["b-2"].kind is ChangeKind.APPEARED
+        assert {each: reported[each].verdict.value for each in reported} == {
+            "b-1": "confirmed",
+            "b-2": "rejected",
+        }
+        assert (
+            reported["b-2"].note == "Schatten <&>" and reported["b-2"].kind is ChangeKind.APPEARED
+        )
         assert np.array_equal(reported["b-2"].outline_m, fake_change(2, east_m=-8).outline_m)
         assert np.allclose(reported["b-2"].centre_m, [-8, -4])
         # the same number on other ground was not reviewed; the same ground was
@@ -281,7 +385,10 @@ def test_an_unknown_id_is_named_and_nothing_is_changed(folder: Path) -> None:
         with pytest.raises(InputError, match="b-9"):
             archive.review(["b-1", "b-9"], Verdict.REJECTED)
         assert archive.reviews() == []
-    with Archive.open(folder, write=False) as archive, pytest.raises(StoreError, match="write=True"):
+    with (
+        Archive.open(folder, write=False) as archive,
+        pytest.raises(StoreError, match="write=True"),
+    ):
         archive.review("b-1", Verdict.REJECTED)
 
 
@@ -292,7 +399,9 @@ def test_masks_state_changed_unchanged_and_unknown(folder: Path) -> None:
     valid[:, :2] = False
     with Archive.open(folder, write=True) as archive, archive.begin_flight("b", "", {}) as writer:
         writer.save_masks("12", changed, valid, np.array([[3, 2, 3, 2]]))
-        writer.save_masks("IMG_01.JPG", np.zeros((6, 8), np.uint8), valid, np.zeros((0, 4), np.int64))
+        writer.save_masks(
+            "IMG_01.JPG", np.zeros((6, 8), np.uint8), valid, np.zeros((0, 4), np.int64)
+        )
         assert not (folder / "flights/b/masks").exists()
         writer.commit([], {}, {}, "", changes=())
     masks = folder / "flights/b/masks"
@@ -301,11 +410,17 @@ def test_masks_state_changed_unchanged_and_unknown(folder: Path) -> None:
     mask = cv2.imread(str(masks / "12.png"), cv2.IMREAD_UNCHANGED)
     assert mask.shape == (6, 8)
     assert np.array_equal(mask, np.where(valid, changed, 128))
-    assert write_view_masks(masks, "x", changed, valid).read_bytes() == (masks / "12.png").read_bytes()
+    assert (
+        write_view_masks(masks, "x", changed, valid).read_bytes() == (masks / "12.png").read_bytes()
+    )
 
 
 def test_frames_of_one_name_keep_a_mask_each() -> None:
-    assert mask_name("a.jpg") == "a" and mask_name("a.dng", {"a"}) == "a.dng" and mask_name("1.5") == "1.5"
+    assert (
+        mask_name("a.jpg") == "a"
+        and mask_name("a.dng", {"a"}) == "a.dng"
+        and mask_name("1.5") == "1.5"
+    )
     assert "/" not in mask_name("../up.jpg")
 
 
@@ -334,12 +449,18 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
         first, second = archive.versions()
         difference = archive.tile_difference(second)
         blob = max(folder.glob("tiles/*/*"), key=lambda path: path.stat().st_mtime_ns)
-        assert (difference.changed, difference.removed, difference.changed_bytes) == (1, 0, blob.stat().st_size)
+        assert (difference.changed, difference.removed, difference.changed_bytes) == (
+            1,
+            0,
+            blob.stat().st_size,
+        )
         assert archive.tile_difference(first).changed == 4
         # both were flown in 2023, whenever they were mapped
         assert [version.flown_utc[:10] for version in (first, second)] == ["2023-11-14"] * 2
         flown = datetime(2023, 11, 14, 22, 13, 21, tzinfo=UTC)
-        assert archive.version_at(flown).id == archive.version_at(flown.replace(tzinfo=None)).id == 2
+        assert (
+            archive.version_at(flown).id == archive.version_at(flown.replace(tzinfo=None)).id == 2
+        )
         with pytest.raises(InputError, match=r"had no map.*2023-11-14T22:13:20"):
             archive.version_at(flown - timedelta(seconds=2))
     page = (folder / "flights/b/changes.html").read_text()
@@ -349,7 +470,11 @@ def test_a_version_is_found_by_its_time_and_differs_by_its_tiles(folder: Path) -
     connection.close()
     with Archive.open(folder, write=False) as archive:
         made = [datetime.fromisoformat(version.created_utc) for version in archive.versions()]
-        assert archive.version_at(made[0]).id == archive.version_at(made[1] - timedelta(milliseconds=1)).id == 1
+        assert (
+            archive.version_at(made[0]).id
+            == archive.version_at(made[1] - timedelta(milliseconds=1)).id
+            == 1
+        )
         assert archive.version_at(made[1]).id == archive.version_at(datetime.now(UTC)).id == 2
         assert {version.flown_utc for version in archive.versions()} == {""}
         with pytest.raises(InputError, match="had no map"):
@@ -366,7 +491,9 @@ def older_format(folder: Path) -> None:
     connection.close()
 
 
-def test_a_site_of_the_first_format_is_read_as_it_is_and_upgraded_to_be_written(folder: Path) -> None:
+def test_a_site_of_the_first_format_is_read_as_it_is_and_upgraded_to_be_written(
+    folder: Path,
+) -> None:
     older_format(folder)
     with Archive.open(folder, write=False) as archive:
         assert archive.changes() == archive.reviews() == [] and archive.comparisons() == {}
@@ -384,13 +511,18 @@ def test_a_site_of_the_first_format_is_read_as_it_is_and_upgraded_to_be_written(
     connection.close()
 
 
-def test_an_upgrade_that_fails_leaves_the_first_format(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_upgrade_that_fails_leaves_the_first_format(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     older_format(folder)
     monkeypatch.setattr(schema, "set_format", "no function")  # the last step of the upgrade fails
     with pytest.raises(TypeError), Archive.open(folder, write=True):
         pass
     connection = sqlite3.connect(folder / "site.db")
-    tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    tables = {
+        name
+        for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+    }
     assert connection.execute("PRAGMA user_version").fetchone() == (1,)
     connection.close()
     assert not tables & {"changes", "comparisons", "leftovers", "reviews"}

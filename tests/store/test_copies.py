@@ -26,14 +26,20 @@ from sorvolo.survey.findings import Verdict
 
 
 def copied(source: Path, target: Path) -> CopyOutcome:
-    return ended(copy(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent))))
+    return ended(
+        copy(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent)))
+    )
 
 
 def verified(source: Path, target: Path) -> CopyOutcome:
-    return ended(verify(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent))))
+    return ended(
+        verify(FolderEnd(source), FolderEnd(target), Path(tempfile.mkdtemp(dir=target.parent)))
+    )
 
 
-def test_a_copy_has_every_file_of_the_site_and_can_be_worked_in(two_flights: Path, tmp_path: Path) -> None:
+def test_a_copy_has_every_file_of_the_site_and_can_be_worked_in(
+    two_flights: Path, tmp_path: Path
+) -> None:
     target = tmp_path / "copy"
     outcome = copied(two_flights, target)
     assert outcome.copied == outcome.files and outcome.newest == 2 and not outcome.faults
@@ -50,7 +56,9 @@ def test_a_later_copy_takes_what_is_new_and_drops_what_is_gone(site: Path, tmp_p
     target = tmp_path / "copy"
     first = copied(site, target)
     with Archive.open(site, write=True) as archive, Archive.open(target, write=False) as reader:
-        fake_flights.map_flight(archive, "flight-0", 99, count=2, compared=True)  # its former pictures are gone
+        fake_flights.map_flight(
+            archive, "flight-0", 99, count=2, compared=True
+        )  # its former pictures are gone
         archive.review(archive.changes()[0].id, Verdict.REJECTED)
         (site / "flights/flight-1/heights.json").write_text("{}")
         second = copied(site, target)
@@ -74,7 +82,9 @@ def test_what_a_run_left_unfinished_is_left_out(site: Path, tmp_path: Path) -> N
     assert outcome.newest == before and outcome.left_out == ("notes.txt",)
     names = set(hashes(tmp_path / "copy"))
     assert not any("flight-7" in name or "notes" in name for name in names)
-    assert len([name for name in names if name.startswith("tiles/")]) == len(list(site.glob("tiles/*/*")))
+    assert len([name for name in names if name.startswith("tiles/")]) == len(
+        list(site.glob("tiles/*/*"))
+    )
     with Archive.open(tmp_path / "copy", write=False) as archive:
         assert all(each.complete for each in archive.versions())
         assert [each.id for each in archive.flights()] == ["flight-0", "flight-1"]
@@ -95,11 +105,15 @@ class _MappedInto(FolderEnd):
         if self.is_new and self.left:
             self.left, self.is_new = self.left - 1, False
             with Archive.open(self.folder, write=True) as archive:
-                fake_flights.map_flight(archive, f"flight-{self.left % 2}", 70 + self.left, count=2, compared=True)
+                fake_flights.map_flight(
+                    archive, f"flight-{self.left % 2}", 70 + self.left, count=2, compared=True
+                )
         return super().opened(file)
 
 
-def test_a_copy_is_of_one_piece_though_flights_are_mapped_into_the_site_meanwhile(site: Path, tmp_path: Path) -> None:
+def test_a_copy_is_of_one_piece_though_flights_are_mapped_into_the_site_meanwhile(
+    site: Path, tmp_path: Path
+) -> None:
     source, target = _MappedInto(site, 2), tmp_path / "copy"
     scratch = tmp_path / "scratch"
     scratch.mkdir()
@@ -108,7 +122,15 @@ def test_a_copy_is_of_one_piece_though_flights_are_mapped_into_the_site_meanwhil
     assert hashes(target) == hashes(site)
     fake_flights.check_whole(target)
     with pytest.raises(StoreError, match="changes faster than it can be copied"):
-        ended(copy(_MappedInto(site, 100), FolderEnd(tmp_path / "other"), scratch, threads=1, most_rounds=2))
+        ended(
+            copy(
+                _MappedInto(site, 100),
+                FolderEnd(tmp_path / "other"),
+                scratch,
+                threads=1,
+                most_rounds=2,
+            )
+        )
     assert not (tmp_path / "other/site.db").exists()
 
 
@@ -168,7 +190,9 @@ def test_a_target_with_anything_else_is_refused(site: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("what", ["version", "review", "heights"])
-def test_a_copy_that_was_worked_in_is_not_overwritten(site: Path, tmp_path: Path, what: str) -> None:
+def test_a_copy_that_was_worked_in_is_not_overwritten(
+    site: Path, tmp_path: Path, what: str
+) -> None:
     target = tmp_path / "copy"
     copied(site, target)
     if what == "heights":
@@ -203,7 +227,9 @@ def test_damage_is_found_and_named(site: Path, tmp_path: Path) -> None:
     (target / "preview.png").write_bytes(b"x" * (site / "preview.png").stat().st_size)
     (target / "flights/flight-1/report.html").unlink()
     faults = verified(site, target).faults
-    assert faults["preview.png"] == "differs" and faults["flights/flight-1/report.html"] == "missing"
+    assert (
+        faults["preview.png"] == "differs" and faults["flights/flight-1/report.html"] == "missing"
+    )
     assert faults[name] == "missing" and len(faults) == 4
 
 

@@ -12,7 +12,21 @@ from sorvolo.store.exports.telemetry_files import cot_track, geo_txt, is_dated, 
 from sorvolo.survey.corrected import CorrectedFrame
 
 FRAME = CorrectedFrame(
-    "0001.jpg", 0, 1_700_000_000_000_000_000, 0.0, 45.0, 7.0, 330.0, 30.0, 0.0, -90.0, 0.0, 0.5, 60.0, 40.0, "vision",
+    "0001.jpg",
+    0,
+    1_700_000_000_000_000_000,
+    0.0,
+    45.0,
+    7.0,
+    330.0,
+    30.0,
+    0.0,
+    -90.0,
+    0.0,
+    0.5,
+    60.0,
+    40.0,
+    "vision",
 )
 ENU_FROM_NED = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
@@ -35,9 +49,16 @@ def _read_by_odm(line: str) -> np.ndarray:
     return ENU_FROM_NED @ np.column_stack([right, -top, view])
 
 
-@pytest.mark.parametrize("gimbal_deg", [
-    (299.086, -88.071, 151.882), (91.0, -90.0, 0.0), (40.0, -60.0, 0.0), (200.0, -85.0, 35.0), (10.0, -30.0, -170.0),
-])
+@pytest.mark.parametrize(
+    "gimbal_deg",
+    [
+        (299.086, -88.071, 151.882),
+        (91.0, -90.0, 0.0),
+        (40.0, -60.0, 0.0),
+        (200.0, -85.0, 35.0),
+        (10.0, -30.0, -170.0),
+    ],
+)
 def test_odm_reads_the_attitude_that_the_camera_had(gimbal_deg: tuple[float, float, float]) -> None:
     """Pitch plus 90 beside a gimbal's yaw and roll was off by 113 degrees where the roll is not near 0."""
     site_from_camera = site_from_gimbal_rotation(*gimbal_deg)
@@ -48,7 +69,9 @@ def test_odm_reads_the_attitude_that_the_camera_had(gimbal_deg: tuple[float, flo
 
 
 def test_a_camera_straight_down_has_no_pitch_and_roll_for_odm() -> None:
-    angles_deg = [float(each) for each in geo_txt([replace(FRAME, yaw_deg=91.0)]).splitlines()[1].split()[4:7]]
+    angles_deg = [
+        float(each) for each in geo_txt([replace(FRAME, yaw_deg=91.0)]).splitlines()[1].split()[4:7]
+    ]
     assert angles_deg == pytest.approx([91.0, 0.0, 0.0], abs=1e-3)
 
 
@@ -61,10 +84,15 @@ def test_no_time_is_invented_for_a_flight_without_a_date() -> None:
     """Its frames count from 1970."""
     undated = [replace(FRAME, time_ns=k * 10**9) for k in range(2)]
     assert not is_dated(undated) and is_dated([FRAME])
-    rows, dated = (list(csv.DictReader(track_csv(frames, "ellipsoidal").splitlines())) for frames in (undated, [FRAME]))
+    rows, dated = (
+        list(csv.DictReader(track_csv(frames, "ellipsoidal").splitlines()))
+        for frames in (undated, [FRAME])
+    )
     assert [row["utc"] for row in rows] == ["", ""] and rows[1]["height_reference"] == "ellipsoidal"
     assert dated[0]["utc"].startswith("2023-11-14T22:13:20")
-    assert b"<time>" not in track_gpx(undated, "f") and b"<time>2023-11-14" in track_gpx([FRAME], "f")
+    assert b"<time>" not in track_gpx(undated, "f") and b"<time>2023-11-14" in track_gpx(
+        [FRAME], "f"
+    )
 
 
 def test_the_azimuth_of_a_camera_that_looks_down_does_not_swing() -> None:
@@ -81,5 +109,7 @@ def test_the_azimuth_of_a_camera_that_looks_down_does_not_swing() -> None:
     *straight, oblique = (ElementTree.fromstring(line).find("detail/sensor") for line in lines)
     for sensor in straight:
         assert sensor is not None and float(sensor.get("elevation", "0")) < -86
-        assert float(sensor.get("azimuth", "0")) + float(sensor.get("roll", "0")) == pytest.approx(91.0, abs=0.2)
+        assert float(sensor.get("azimuth", "0")) + float(sensor.get("roll", "0")) == pytest.approx(
+            91.0, abs=0.2
+        )
     assert oblique is not None and (oblique.get("azimuth"), oblique.get("roll")) == ("200.0", "3.0")

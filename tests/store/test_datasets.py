@@ -17,7 +17,9 @@ from sorvolo.store.datasets.checking import turned
 from sorvolo.store.datasets.groups import group_of
 from sorvolo.store.datasets.yolo import names_in_yaml
 
-FUZZ = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FUZZ = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 def notices(labelled):
@@ -46,19 +48,32 @@ def test_yolo_boxes_are_shares_of_the_picture(tmp_path):
 
 
 def test_yolo_segments_and_turned_boxes_give_the_box_around_them(tmp_path):
-    labelled = read_dataset(yolo_folder(tmp_path, "0 0.1 0.2 0.3 0.1 0.2 0.6\n0 0.5 0.5 0.6 0.5 0.6 0.7 0.5 0.7"))
+    labelled = read_dataset(
+        yolo_folder(tmp_path, "0 0.1 0.2 0.3 0.1 0.2 0.6\n0 0.5 0.5 0.6 0.5 0.6 0.7 0.5 0.7")
+    )
     assert put.edges(labelled.pictures[0].boxes_px) == [[20, 10, 60, 60], [100, 50, 120, 70]]
 
 
-@pytest.mark.parametrize("picture, label", [
-    ("images/train/v_1.png", "labels/train/v_1.txt"), ("train/images/v_1.png", "train/labels/v_1.txt"),
-    ("v_1.png", "v_1.txt"), ("obj_train_data/v_1.png", "obj_train_data/v_1.txt"),
-])
-@pytest.mark.parametrize("names", [
-    ("data.yaml", "nc: 2\nnames: ['Boat', 'Car']\n"), ("data.yaml", "names:\n- boat\n- car # the second\ntrain: x\n"),
-    ("data.yaml", "names:\n  0: boat\n  1: 'Car'\nnc: 2"), ("obj.names", "boat\ncar\n"), ("classes.txt", "boat\ncar"),
-    ("data.yaml", "names: [\n  'boat',\n  'car',\n]\n"),
-])
+@pytest.mark.parametrize(
+    "picture, label",
+    [
+        ("images/train/v_1.png", "labels/train/v_1.txt"),
+        ("train/images/v_1.png", "train/labels/v_1.txt"),
+        ("v_1.png", "v_1.txt"),
+        ("obj_train_data/v_1.png", "obj_train_data/v_1.txt"),
+    ],
+)
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("data.yaml", "nc: 2\nnames: ['Boat', 'Car']\n"),
+        ("data.yaml", "names:\n- boat\n- car # the second\ntrain: x\n"),
+        ("data.yaml", "names:\n  0: boat\n  1: 'Car'\nnc: 2"),
+        ("obj.names", "boat\ncar\n"),
+        ("classes.txt", "boat\ncar"),
+        ("data.yaml", "names: [\n  'boat',\n  'car',\n]\n"),
+    ],
+)
 def test_yolo_folders_and_names_as_tools_lay_them(tmp_path, picture, label, names):
     put.put_picture(tmp_path / picture)
     put.put_text(tmp_path / label, "1 0.5 0.5 0.1 0.2\n0 0.5 0.5 0.1 0.2\n")
@@ -74,9 +89,13 @@ def test_look_alikes_that_are_ignored_are_counted(tmp_path):
     folder = yolo_folder(tmp_path, boxes, "person\ncar\nTruck\nothers\n")
     labelled = read_dataset(folder)
     assert len(labelled.pictures[0].ignored_px) == 3 and not len(labelled.pictures[0].labels)
-    assert notices(labelled) == {"look_alikes_ignored": 2}, "what a set ignores itself is not counted"
+    assert notices(labelled) == {"look_alikes_ignored": 2}, (
+        "what a set ignores itself is not counted"
+    )
     assert "Truck (2)" in labelled.notices[0].text and "--classes" in labelled.notices[0].text
-    assert notices(read_dataset(folder, classes={"car": "car", "truck": "car"})) == {"unmapped_classes": 1}
+    assert notices(read_dataset(folder, classes={"car": "car", "truck": "car"})) == {
+        "unmapped_classes": 1
+    }
 
 
 def test_linked_folders_count_and_rings_of_links_end(tmp_path):
@@ -117,7 +136,9 @@ def test_a_yolo_folder_may_hold_pictures_of_nothing_only(tmp_path):
 def test_pixels_in_yolo_files_are_refused_and_one_slip_is_not(tmp_path):
     with pytest.raises(InputError, match="shares"):
         read_dataset(yolo_folder(tmp_path / "pixels", "0 90 40 20 20\n"), form="yolo")
-    labelled = read_dataset(yolo_folder(tmp_path / "slip", "0 0.5 0.5 0.1 0.1\n0 0.5 0.6 0.1 0.1\n0 5 5 1 1\n"))
+    labelled = read_dataset(
+        yolo_folder(tmp_path / "slip", "0 0.5 0.5 0.1 0.1\n0 0.5 0.6 0.1 0.1\n0 5 5 1 1\n")
+    )
     assert len(labelled.pictures[0].labels) == 2 and notices(labelled) == {"outside_boxes": 1}
 
 
@@ -127,8 +148,11 @@ def test_pixels_in_yolo_files_are_refused_and_one_slip_is_not(tmp_path):
 def test_coco_boxes_crowds_groups_and_sampling_distance(tmp_path):
     put.put_picture(tmp_path / "images" / "x.jpg")
     path = put.put_coco(
-        tmp_path / "boxes.json", ["x.jpg"], [(0, 7, 10, 20, 30, 40, 0), (0, 1, 0, 0, 50, 50, 1), (0, 8, 1, 1, 5, 5, 0)],
-        video_id=12, m_per_px=0.05,
+        tmp_path / "boxes.json",
+        ["x.jpg"],
+        [(0, 7, 10, 20, 30, 40, 0), (0, 1, 0, 0, 50, 50, 1), (0, 8, 1, 1, 5, 5, 0)],
+        video_id=12,
+        m_per_px=0.05,
     )
     for place in (path, tmp_path):
         labelled = read_dataset(place, unlabelled=("small object",))
@@ -140,11 +164,17 @@ def test_coco_boxes_crowds_groups_and_sampling_distance(tmp_path):
         assert notices(labelled) == {"unmapped_classes": 1}
 
 
-@pytest.mark.parametrize("labels, picture", [
-    ("annotations/instances_train.json", "train/p.jpg"), ("annotations/val.json", "images/val/p.jpg"),
-    ("train/_annotations.coco.json", "train/p.jpg"), ("boxes.json", "somewhere/deep/p.jpg"),
-    ("truth/flight2/boxes.json", "flight2/photos/p.jpg"), ("labels.json", "p.jpg"),
-])
+@pytest.mark.parametrize(
+    "labels, picture",
+    [
+        ("annotations/instances_train.json", "train/p.jpg"),
+        ("annotations/val.json", "images/val/p.jpg"),
+        ("train/_annotations.coco.json", "train/p.jpg"),
+        ("boxes.json", "somewhere/deep/p.jpg"),
+        ("truth/flight2/boxes.json", "flight2/photos/p.jpg"),
+        ("labels.json", "p.jpg"),
+    ],
+)
 def test_coco_pictures_are_found_where_tools_put_them(tmp_path, labels, picture):
     put.put_picture(tmp_path / picture)
     path = put.put_coco(tmp_path / labels, ["p.jpg"], [(0, 1, 1, 2, 3, 4, 0)])
@@ -155,7 +185,11 @@ def test_coco_pictures_are_found_where_tools_put_them(tmp_path, labels, picture)
 
 def test_coco_of_a_video_asks_for_its_frames(tmp_path):
     put.put_text(tmp_path / "flight1" / "flight1.mp4", "")
-    path = put.put_coco(tmp_path / "truth" / "flight1" / "boxes.json", ["flight1_000003.png"], [(0, 1, 1, 2, 3, 4, 0)])
+    path = put.put_coco(
+        tmp_path / "truth" / "flight1" / "boxes.json",
+        ["flight1_000003.png"],
+        [(0, 1, 1, 2, 3, 4, 0)],
+    )
     with pytest.raises(InputError, match=r"video \(flight1.mp4\).*extract"):
         read_dataset(path)
 
@@ -170,40 +204,61 @@ def test_coco_missing_pictures_are_counted_and_none_left_is_an_error(tmp_path):
         read_dataset(put.put_coco(lonely / "all.json", ["gone.jpg"], []))
 
 
-@pytest.mark.parametrize("name", ["../secret.jpg", "images/../../secret.jpg", "{}/secret.jpg", "C:/secret.jpg"])
+@pytest.mark.parametrize(
+    "name", ["../secret.jpg", "images/../../secret.jpg", "{}/secret.jpg", "C:/secret.jpg"]
+)
 def test_coco_names_that_lead_out_of_the_set_are_refused(tmp_path, name):
     put.put_picture(tmp_path / "secret.jpg")
     put.put_picture(tmp_path / "set" / "a.jpg")
-    path = put.put_coco(tmp_path / "set" / "c.json", ["a.jpg", name.format(tmp_path)], [(0, 1, 1, 2, 3, 4, 0)])
+    path = put.put_coco(
+        tmp_path / "set" / "c.json", ["a.jpg", name.format(tmp_path)], [(0, 1, 1, 2, 3, 4, 0)]
+    )
     with pytest.raises(InputError, match=r"leads out of the set; needed are names below"):
         read_dataset(path)
 
 
-@pytest.mark.parametrize(("share", "how"), [(0.35, "breaks off"), (0.8, "breaks off"), (1.0, "is damaged")])
+@pytest.mark.parametrize(
+    ("share", "how"), [(0.35, "breaks off"), (0.8, "breaks off"), (1.0, "is damaged")]
+)
 def test_coco_that_breaks_off_is_reported_with_file_and_place(tmp_path, share, how):
     put.put_picture(tmp_path / "a.jpg")
     path = put.put_coco(tmp_path / "cut.json", ["a.jpg"], [(0, 1, 1, 2, 3, 4, 0)] * 9)
     text = path.read_text()
     path.write_text(text[: int(share * len(text))] if share < 1 else text.replace("[", "[,", 1))
     for place in (path, tmp_path):
-        with pytest.raises(InputError, match=rf"cut\.json {how} at line 1, column \d+ \(character \d+ of \d+: .*again"):
+        with pytest.raises(
+            InputError,
+            match=rf"cut\.json {how} at line 1, column \d+ \(character \d+ of \d+: .*again",
+        ):
             read_dataset(place)
 
 
 def test_names_that_nothing_has_are_refused_over_all_sets_together(tmp_path):
     one = yolo_folder(tmp_path / "one", "0 0.5 0.5 0.1 0.2\n")
     two = yolo_folder(tmp_path / "two", "0 0.5 0.5 0.1 0.2\n", names="person\nBicycle\n")
-    read = read_datasets([one, two], ignore=["bicycle", "CAR"], unlabelled=["small object", "boat"], known=["boat"])
-    assert [each.name for each in read] == ["one", "two"] and read[0].unlabelled == {"small object", "boat"}
-    with pytest.raises(SettingsError, match="ignore: 'Bicycl' is no name in the labels; there are: person, car, Bi"):
+    read = read_datasets(
+        [one, two], ignore=["bicycle", "CAR"], unlabelled=["small object", "boat"], known=["boat"]
+    )
+    assert [each.name for each in read] == ["one", "two"] and read[0].unlabelled == {
+        "small object",
+        "boat",
+    }
+    with pytest.raises(
+        SettingsError, match="ignore: 'Bicycl' is no name in the labels; there are: person, car, Bi"
+    ):
         read_datasets([one, two], ignore=["car", "Bicycl"])
-    with pytest.raises(SettingsError, match="unlabelled: 'People' is no class; there are: person, car, small object"):
+    with pytest.raises(
+        SettingsError,
+        match="unlabelled: 'People' is no class; there are: person, car, small object",
+    ):
         read_datasets([one, two], unlabelled=["car", "People"])
 
 
 def test_coco_listed_twice_is_one_picture_and_two_files_are_too_many(tmp_path):
     put.put_picture(tmp_path / "a.jpg")
-    put.put_coco(tmp_path / "one.json", ["a.jpg", "a.jpg"], [(0, 1, 1, 2, 3, 4, 0), (1, 7, 5, 5, 9, 9, 0)])
+    put.put_coco(
+        tmp_path / "one.json", ["a.jpg", "a.jpg"], [(0, 1, 1, 2, 3, 4, 0), (1, 7, 5, 5, 9, 9, 0)]
+    )
     labelled = read_dataset(tmp_path)
     assert len(labelled) == 1 and len(labelled.pictures[0].labels) == 2
     put.put_coco(tmp_path / "two.json", ["a.jpg"], [])
@@ -214,7 +269,9 @@ def test_coco_listed_twice_is_one_picture_and_two_files_are_too_many(tmp_path):
 def test_coco_scaled_labels_are_scaled_and_those_of_another_shape_left_out(tmp_path):
     put.put_picture(tmp_path / "half.jpg", 100, 50)
     put.put_picture(tmp_path / "square.jpg", 100, 100)
-    path = put.put_coco(tmp_path / "c.json", ["half.jpg", "square.jpg"], [(0, 1, 20, 20, 40, 60, 0)])
+    path = put.put_coco(
+        tmp_path / "c.json", ["half.jpg", "square.jpg"], [(0, 1, 20, 20, 40, 60, 0)]
+    )
     labelled = read_dataset(path)
     assert put.edges(labelled.pictures[0].boxes_px) == [[10, 10, 30, 40]]
     assert notices(labelled) == {"scaled_labels": 1, "other_size": 1}
@@ -239,13 +296,16 @@ def test_voc_counts_pixels_from_one_and_ignores_what_is_difficult(tmp_path):
     put.put_picture(tmp_path / "JPEGImages" / "v_001.jpg")
     put.put_picture(tmp_path / "JPEGImages" / "v_002.jpg")
     objects = [
-        {"name": "Person", "box": (1, 1, 10, 20)}, {"name": "car", "box": (31, 41, 60, 50), "difficult": 1},
+        {"name": "Person", "box": (1, 1, 10, 20)},
+        {"name": "car", "box": (31, 41, 60, 50), "difficult": 1},
     ]
     put.put_voc(tmp_path / "Annotations" / "v_001.xml", objects)
     for place in (tmp_path, tmp_path / "Annotations"):
         labelled = read_dataset(place)
         first, second = labelled.pictures
-        assert put.edges(first.boxes_px) == [[0, 0, 10, 20]] and put.edges(first.ignored_px) == [[30, 40, 60, 50]]
+        assert put.edges(first.boxes_px) == [[0, 0, 10, 20]] and put.edges(first.ignored_px) == [
+            [30, 40, 60, 50]
+        ]
         assert len(second.labels) == 0 and notices(labelled) == {"pictures_without_labels": 1}
 
 
@@ -254,13 +314,19 @@ def test_voc_files_that_count_from_zero_are_read_so(tmp_path):
         put.put_picture(tmp_path / f"{name}.jpg")
         put.put_voc(tmp_path / f"{name}.xml", [{"name": "car", "box": box}])
     labelled = read_dataset(tmp_path)
-    assert [put.edges(each.boxes_px) for each in labelled.pictures] == [[[0, 5, 10, 20]], [[30, 40, 50, 60]]]
+    assert [put.edges(each.boxes_px) for each in labelled.pictures] == [
+        [[0, 5, 10, 20]],
+        [[30, 40, 50, 60]],
+    ]
     assert "counted_from_zero" in notices(labelled)
 
 
 def test_voc_bombs_and_broken_files_are_counted(tmp_path):
     put.put_picture(tmp_path / "a_1.jpg")
-    put.put_voc(tmp_path / "a_1.xml", [{"name": "car", "box": (2, 2, 9, 9)}, {"name": "car", "box": (2, 2, 9, "x")}])
+    put.put_voc(
+        tmp_path / "a_1.xml",
+        [{"name": "car", "box": (2, 2, 9, 9)}, {"name": "car", "box": (2, 2, 9, "x")}],
+    )
     put.put_text(tmp_path / "a_2.xml", "<annotation><object>")
     bomb = '<!DOCTYPE x [<!ENTITY a "aaa"><!ENTITY b "&a;&a;">]><annotation>&b;</annotation>'
     put.put_text(tmp_path / "a_3.xml", bomb)
@@ -278,9 +344,16 @@ def test_visdrone_pictures(tmp_path):
         "10,20,5,8,1,1,0,0\n30,20,4,8,1,2,0,2\n60,20,40,20,1,4,1,0,\n0,0,50,10,0,0,0,0\n90,60,9,9,1,11,0,0\n"
         "100,60,20,20,1,9,0,0\n150,60,20,20,1,6,0,0\n",
     )
-    labelled = read_dataset(tmp_path, classes={"pedestrian": "person", "people": "person", "car": "car", "bus": "car"})
+    labelled = read_dataset(
+        tmp_path, classes={"pedestrian": "person", "people": "person", "car": "car", "bus": "car"}
+    )
     (picture,) = labelled.pictures
-    assert put.edges(picture.boxes_px) == [[10, 20, 15, 28], [30, 20, 34, 28], [60, 20, 100, 40], [100, 60, 120, 80]]
+    assert put.edges(picture.boxes_px) == [
+        [10, 20, 15, 28],
+        [30, 20, 34, 28],
+        [60, 20, 100, 40],
+        [100, 60, 120, 80],
+    ]
     assert picture.labels.tolist() == [0, 0, 1, 1]
     assert put.edges(picture.ignored_px) == [[0, 0, 50, 10], [90, 60, 99, 69]]
     assert picture.group == "0000002" and notices(labelled) == {"unmapped_classes": 1}
@@ -290,7 +363,8 @@ def test_visdrone_videos(tmp_path):
     for number in (1, 2):
         put.put_picture(tmp_path / "sequences" / "uav7_v" / f"{number:07d}.jpg")
     put.put_text(
-        tmp_path / "annotations" / "uav7_v.txt", "1,0,10,20,5,8,1,1,0,0\n1,1,50,20,5,8,1,4,0,0\n9,0,1,1,5,5,1,1,0,0\n"
+        tmp_path / "annotations" / "uav7_v.txt",
+        "1,0,10,20,5,8,1,1,0,0\n1,1,50,20,5,8,1,4,0,0\n9,0,1,1,5,5,1,1,0,0\n",
     )
     labelled = read_dataset(tmp_path)
     assert [len(each.labels) for each in labelled.pictures] == [2, 0]
@@ -314,9 +388,13 @@ def test_okutama_is_scaled_from_the_original_and_lost_people_are_left_out(tmp_pa
         put.put_text(tmp_path / "Labels" / kind / "3840x2160" / "1.1.1.txt", lines)
     labelled = read_dataset(tmp_path)
     assert [put.edges(each.boxes_px) for each in labelled.pictures] == [
-        [[400, 200, 420, 240]], [[401, 200, 421, 240]], []
+        [[400, 200, 420, 240]],
+        [[401, 200, 421, 240]],
+        [],
     ]
-    assert {each.group for each in labelled.pictures} == {"1.1.1"} and labelled.classes == ("person",)
+    assert {each.group for each in labelled.pictures} == {"1.1.1"} and labelled.classes == (
+        "person",
+    )
     assert notices(labelled) == {"labels_without_picture": 1, "scaled_labels": 3}
 
 
@@ -378,8 +456,12 @@ def test_umcd_without_places_or_frame_rate_is_of_no_use(tmp_path):
 def test_boxes_beyond_the_picture_are_clipped_dropped_and_counted(tmp_path):
     put.put_picture(tmp_path / "a.jpg")
     boxes = [
-        (0, 1, -10, 20, 30, 40, 0), (0, 1, 199, 10, 40, 10, 0), (0, 1, 300, 300, 5, 5, 0), (0, 1, 5, 5, 0, 9, 0),
-        (0, 1, 50, 50, -5, 9, 0), (0, 1, 100, 50, 10, 50.4, 0),
+        (0, 1, -10, 20, 30, 40, 0),
+        (0, 1, 199, 10, 40, 10, 0),
+        (0, 1, 300, 300, 5, 5, 0),
+        (0, 1, 5, 5, 0, 9, 0),
+        (0, 1, 50, 50, -5, 9, 0),
+        (0, 1, 100, 50, 10, 50.4, 0),
     ]
     labelled = read_dataset(put.put_coco(tmp_path / "c.json", ["a.jpg"], boxes))
     assert put.edges(labelled.pictures[0].boxes_px) == [[0, 20, 20, 60], [100, 50, 110, 100]]
@@ -390,7 +472,9 @@ def test_ignored_names_become_regions_whatever_their_case(tmp_path):
     boxes = "0 0.5 0.5 0.1 0.2\n1 0.2 0.2 0.1 0.2\n2 0.8 0.8 0.1 0.2\n"
     folder = yolo_folder(tmp_path, boxes, "Person\nDONT_CARE\nvan\n")
     labelled = read_dataset(folder, classes={"PERSON": "person"}, ignore=("dont care",))
-    assert put.edges(labelled.pictures[0].ignored_px) == [[30, 10, 50, 30]] and labelled.classes == ("person",)
+    assert put.edges(labelled.pictures[0].ignored_px) == [
+        [30, 10, 50, 30]
+    ] and labelled.classes == ("person",)
     assert notices(labelled) == {"unmapped_classes": 1}
     usual = read_dataset(folder, ignore=("van",))
     assert usual.classes == ("person",) and len(usual.pictures[0].ignored_px) == 2
@@ -410,7 +494,10 @@ def test_pictures_without_labels_and_labels_without_pictures_are_counted(tmp_pat
     labelled = read_dataset(tmp_path)
     assert [len(each.labels) for each in labelled.pictures] == [1, 0]
     assert notices(labelled) == {
-        "malformed_labels": 2, "pictures_without_labels": 1, "labels_without_picture": 1, "unreadable_pictures": 1,
+        "malformed_labels": 2,
+        "pictures_without_labels": 1,
+        "labels_without_picture": 1,
+        "unreadable_pictures": 1,
     }
 
 
@@ -423,7 +510,9 @@ def test_any_kind_of_picture_will_do(tmp_path, mode):
 
 
 def test_sizes_and_boxes_are_those_of_the_picture_as_shown(tmp_path):
-    put.put_picture(tmp_path / "a.jpg", orientation=6)  # stored 200x100, shown 100x200 after a clockwise turn
+    put.put_picture(
+        tmp_path / "a.jpg", orientation=6
+    )  # stored 200x100, shown 100x200 after a clockwise turn
     path = put.put_coco(tmp_path / "c.json", ["a.jpg"], [(0, 1, 10, 20, 30, 40, 0)])
     (picture,) = read_dataset(path).pictures
     assert (picture.width_px, picture.height_px) == (100, 200)
@@ -475,13 +564,23 @@ def test_the_wrong_form_names_the_right_one(tmp_path):
 # Groups and names
 
 
-@pytest.mark.parametrize("path, group", [
-    ("images/0_35.jpg", "0"), ("images/Drone2_(90).jpg", "Drone2"), ("1_130_40_0_03855.jpg", "1_130_40_0"),
-    ("bb_V0014_I0003160_jpg.rf.0a6bf9c5d2.jpg", "bb_V0014"), ("flight1/photos/DJI_0031.JPG", "flight1/DJI"),
-    ("sequences/uav1/0000001.jpg", "uav1"), ("clip7/frame_000031.png", "clip7"), ("lonely.jpg", "lonely"),
-    ("train/0001.jpg", "set"), ("google_P000_aZk5uQM_jpg.rf.12ab.jpg", "google_P000_aZk5uQM"),
-    ("baidu_timg-17-.jpg", "baidu_timg"), ("site5 (12).jpg", "site5"),
-])
+@pytest.mark.parametrize(
+    "path, group",
+    [
+        ("images/0_35.jpg", "0"),
+        ("images/Drone2_(90).jpg", "Drone2"),
+        ("1_130_40_0_03855.jpg", "1_130_40_0"),
+        ("bb_V0014_I0003160_jpg.rf.0a6bf9c5d2.jpg", "bb_V0014"),
+        ("flight1/photos/DJI_0031.JPG", "flight1/DJI"),
+        ("sequences/uav1/0000001.jpg", "uav1"),
+        ("clip7/frame_000031.png", "clip7"),
+        ("lonely.jpg", "lonely"),
+        ("train/0001.jpg", "set"),
+        ("google_P000_aZk5uQM_jpg.rf.12ab.jpg", "google_P000_aZk5uQM"),
+        ("baidu_timg-17-.jpg", "baidu_timg"),
+        ("site5 (12).jpg", "site5"),
+    ],
+)
 def test_a_picture_s_video_is_recognised_by_its_name(tmp_path, path, group):
     place = tmp_path / "set"
     put.put_picture(place / path)
@@ -491,7 +590,9 @@ def test_a_picture_s_video_is_recognised_by_its_name(tmp_path, path, group):
 def test_a_group_pattern_is_the_user_s_own_rule(tmp_path):
     put.put_picture(tmp_path / "day2" / "a_7.jpg")
     put.put_picture(tmp_path / "b_8.jpg")
-    path = put.put_coco(tmp_path / "c.json", ["day2/a_7.jpg", "b_8.jpg"], [(0, 1, 1, 1, 5, 5, 0)], flight="f")
+    path = put.put_coco(
+        tmp_path / "c.json", ["day2/a_7.jpg", "b_8.jpg"], [(0, 1, 1, 1, 5, 5, 0)], flight="f"
+    )
     groups = [each.group for each in read_dataset(path, group_pattern="^(day[0-9]+)/").pictures]
     assert groups == ["day2", "b"]
 
@@ -514,24 +615,43 @@ def test_any_bytes_give_labels_or_a_clear_error(tmp_path, data, form):
     path.unlink()
 
 
-KEYS = st.sampled_from([
-    "id", "image_id", "category_id", "bbox", "segmentation", "file_name", "name", "width", "height",
-])
+KEYS = st.sampled_from(
+    [
+        "id",
+        "image_id",
+        "category_id",
+        "bbox",
+        "segmentation",
+        "file_name",
+        "name",
+        "width",
+        "height",
+    ]
+)
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(KEYS, inner, max_size=4),
     max_leaves=8,
 )
 NUMBERS = st.lists(st.integers(-9, 20) | st.floats(), min_size=4, max_size=4)
-ROWS = st.dictionaries(KEYS, JSON | st.sampled_from([1, "a_1.png", "car", "x" * 300, "a\0b"]) | NUMBERS, max_size=5)
+ROWS = st.dictionaries(
+    KEYS, JSON | st.sampled_from([1, "a_1.png", "car", "x" * 300, "a\0b"]) | NUMBERS, max_size=5
+)
 
 
 @FUZZ
 @given(rows=st.tuples(*[st.lists(ROWS, max_size=2)] * 3) | st.tuples(JSON, JSON, JSON))
 def test_any_json_gives_labels_or_a_clear_error(tmp_path, rows):
     put.put_picture(tmp_path / "a_1.png", 8, 8)
-    good = {"images": {"id": 0, "file_name": "a_1.png"}, "annotations": {}, "categories": {"id": 0, "name": "car"}}
-    whole = {key: [value, *row] if isinstance(row, list) else row for (key, value), row in zip(good.items(), rows)}
+    good = {
+        "images": {"id": 0, "file_name": "a_1.png"},
+        "annotations": {},
+        "categories": {"id": 0, "name": "car"},
+    }
+    whole = {
+        key: [value, *row] if isinstance(row, list) else row
+        for (key, value), row in zip(good.items(), rows)
+    }
     path = put.put_text(tmp_path / "c.json", json.dumps(whole))
     try:
         labelled = read_dataset(path)
@@ -545,20 +665,46 @@ def demand_within(boxes, side_px):
     assert (boxes >= 0).all() and (boxes <= side_px).all() and (boxes[:, 2:] >= boxes[:, :2]).all()
 
 
-WORDS = st.sampled_from([
-    "0", "1", "-5", "3840", "1e400", "1e308", "9" * 320, "nan", '"Person"', "Person", ",", "0.5", "Type:", "Box:", "\n",
-    " ", "0 0.5 0.5 0.2 0.3", "1,2,3,4,1,1,0,0", '0 1 2 3 4 1 0 0 0 "Person"', "1e308 1e308", "Appearance:",
-])
+WORDS = st.sampled_from(
+    [
+        "0",
+        "1",
+        "-5",
+        "3840",
+        "1e400",
+        "1e308",
+        "9" * 320,
+        "nan",
+        '"Person"',
+        "Person",
+        ",",
+        "0.5",
+        "Type:",
+        "Box:",
+        "\n",
+        " ",
+        "0 0.5 0.5 0.2 0.3",
+        "1,2,3,4,1,1,0,0",
+        '0 1 2 3 4 1 0 0 0 "Person"',
+        "1e308 1e308",
+        "Appearance:",
+    ]
+)
 
 
 @FUZZ
-@given(words=st.lists(WORDS, max_size=40), form=st.sampled_from(["yolo", "visdrone", "okutama", "umcd"]))
+@given(
+    words=st.lists(WORDS, max_size=40),
+    form=st.sampled_from(["yolo", "visdrone", "okutama", "umcd"]),
+)
 def test_any_words_give_boxes_within_the_picture_or_a_clear_error(tmp_path, words, form):
     put.put_picture(tmp_path / "v_1.png", 8, 8)
     path = put.put_text(tmp_path / "v_1.txt", " ".join(words))
     video = put.put_text(tmp_path / "v.txt", " ".join(words))
     try:
-        labelled = read_dataset(tmp_path, form=form, classes={"0": "car", "Person": "person", "pedestrian": "person"})
+        labelled = read_dataset(
+            tmp_path, form=form, classes={"0": "car", "Person": "person", "pedestrian": "person"}
+        )
     except SorvoloError as error:
         assert len(str(error)) > 20
     else:
@@ -568,12 +714,21 @@ def test_any_words_give_boxes_within_the_picture_or_a_clear_error(tmp_path, word
     video.unlink()
 
 
-@given(names=st.lists(st.text("abc XY-é", min_size=1, max_size=6).map(str.strip).filter(bool), min_size=1, max_size=5))
+@given(
+    names=st.lists(
+        st.text("abc XY-é", min_size=1, max_size=6).map(str.strip).filter(bool),
+        min_size=1,
+        max_size=5,
+    )
+)
 def test_names_in_yaml_come_back_in_each_way_of_writing(names):
     quoted = [f"'{name}'" for name in names]
     for text in (
-        f"path: x\nnames: [{', '.join(quoted)}]\nnc: 3\n", "names:\n" + "".join(f"- {name}\n" for name in quoted),
-        "names:\n" + "".join(f"  {number}: {name}\n" for number, name in enumerate(quoted)) + "nc: 2\n",
+        f"path: x\nnames: [{', '.join(quoted)}]\nnc: 3\n",
+        "names:\n" + "".join(f"- {name}\n" for name in quoted),
+        "names:\n"
+        + "".join(f"  {number}: {name}\n" for number, name in enumerate(quoted))
+        + "nc: 2\n",
     ):
         assert names_in_yaml(text) == names
 
@@ -581,14 +736,21 @@ def test_names_in_yaml_come_back_in_each_way_of_writing(names):
 # Real sets
 
 
-@pytest.mark.parametrize("name, options, expected", [
-    ("hituav", {}, {"person": 9349, "car": 6068}),
-    ("aerial_cars", {"classes": {"car": "car", "truck": "car", "minibus": "car"}}, {"car": 935}),
-    ("cats", {"classes": {"0": "car"}}, {"car": 2824}),
-    ("mannequin", {"classes": {"0": "person"}}, {"person": 131}),
-    ("tinyperson", {"classes": {"0": "person"}}, {"person": 9872}),
-    ("sdd", {}, {"person": 89, "car": 1}),
-])
+@pytest.mark.parametrize(
+    "name, options, expected",
+    [
+        ("hituav", {}, {"person": 9349, "car": 6068}),
+        (
+            "aerial_cars",
+            {"classes": {"car": "car", "truck": "car", "minibus": "car"}},
+            {"car": 935},
+        ),
+        ("cats", {"classes": {"0": "car"}}, {"car": 2824}),
+        ("mannequin", {"classes": {"0": "person"}}, {"person": 131}),
+        ("tinyperson", {"classes": {"0": "person"}}, {"person": 9872}),
+        ("sdd", {}, {"person": 89, "car": 1}),
+    ],
+)
 def test_the_real_sets_have_the_boxes_that_their_files_list(name, options, expected):
     labelled = read_dataset(real_data(f"detection/{name}"), **options)
     found = Counter(labelled.classes[label] for each in labelled.pictures for label in each.labels)

@@ -63,7 +63,10 @@ def untouched(site: Path) -> Iterator[Path]:
     """The folder beside the site, which the test must leave as it was."""
 
     def content() -> dict[str, bytes]:
-        return {str(path): path.read_bytes() if path.is_file() else b"" for path in sorted(outside.rglob("*"))}
+        return {
+            str(path): path.read_bytes() if path.is_file() else b""
+            for path in sorted(outside.rglob("*"))
+        }
 
     outside = site.parent / "outside"
     before = content()
@@ -108,23 +111,35 @@ def craft(site: Path, *statements: str) -> None:
 OWED = "UPDATE runs SET files_written = 0"
 
 
-@pytest.mark.parametrize("name", ["../../../outside/victim.txt", "..", "a/b.txt", "/tmp/x.txt", "", "no ending"])
-def test_documents_are_written_into_their_flights_folder_only(site: Path, untouched: Path, name: str) -> None:
-    craft(site, OWED, f"UPDATE documents SET name = '{name}', content = x'6576696c' WHERE name = 'report.html'")
+@pytest.mark.parametrize(
+    "name", ["../../../outside/victim.txt", "..", "a/b.txt", "/tmp/x.txt", "", "no ending"]
+)
+def test_documents_are_written_into_their_flights_folder_only(
+    site: Path, untouched: Path, name: str
+) -> None:
+    craft(
+        site,
+        OWED,
+        f"UPDATE documents SET name = '{name}', content = x'6576696c' WHERE name = 'report.html'",
+    )
     with pytest.raises(StoreError, match="document"):
         Archive.open(site, write=True)
 
 
 def test_leftovers_are_deleted_in_their_flights_folder_only(site: Path, untouched: Path) -> None:
-    craft(site, OWED, "INSERT INTO leftovers SELECT max(id), '../../../outside/victim.txt' FROM runs")
+    craft(
+        site, OWED, "INSERT INTO leftovers SELECT max(id), '../../../outside/victim.txt' FROM runs"
+    )
     with pytest.raises(StoreError, match="document"):
         Archive.open(site, write=True)
 
 
 @pytest.mark.parametrize("name", ["../../outside", "..", ".", "/outside"])
 def test_a_flights_id_names_no_folder_elsewhere(site: Path, untouched: Path, name: str) -> None:
-    names = [f"UPDATE {table} SET {column} = '{name}' WHERE {column} = 'b'" for table, column in
-             (("flights", "id"), ("runs", "flight_id"), ("versions", "flight_id"))]
+    names = [
+        f"UPDATE {table} SET {column} = '{name}' WHERE {column} = 'b'"
+        for table, column in (("flights", "id"), ("runs", "flight_id"), ("versions", "flight_id"))
+    ]
     craft(site, OWED, *names)
     with pytest.raises(StoreError, match="flight"):
         Archive.open(site, write=True)
@@ -132,10 +147,16 @@ def test_a_flights_id_names_no_folder_elsewhere(site: Path, untouched: Path, nam
         archive.report(name)
 
 
-@pytest.mark.parametrize("path", [
-    "../outside/keyframes/1/000000.jpg", "flights/a/keyframes/../../../../outside/keyframes/1/000000.jpg",
-    "/etc/passwd", "flights/a/report.json", "site.db",
-])
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../outside/keyframes/1/000000.jpg",
+        "flights/a/keyframes/../../../../outside/keyframes/1/000000.jpg",
+        "/etc/passwd",
+        "flights/a/report.json",
+        "site.db",
+    ],
+)
 def test_a_keyframes_image_lies_in_its_flight(site: Path, untouched: Path, path: str) -> None:
     craft(site, f"UPDATE keyframes SET image_path = '{path}'")
     with Archive.open(site, write=False) as archive, pytest.raises(StoreError, match="keyframe"):
@@ -149,7 +170,8 @@ def test_a_tiles_name_is_a_hash(site: Path, untouched: Path) -> None:
         with Archive.open(site, write=False) as archive, pytest.raises(StoreError, match="tile"):
             dict(archive.tiles())
         with (
-            Archive.open(site, write=True) as archive, pytest.raises(StoreError, match="tile"),
+            Archive.open(site, write=True) as archive,
+            pytest.raises(StoreError, match="tile"),
             archive.begin_flight("c", "", {}) as writer,
         ):
             writer.tiles[0, 0]
@@ -167,10 +189,20 @@ def test_a_changes_id_names_no_picture_elsewhere(site: Path, untouched: Path, na
         Archive.open(site, write=True)
 
 
-@pytest.mark.parametrize("place", [
-    "flights", "flights/a", "flights/b/changes", "flights/a/keyframes", "flights/a/keyframes/1", "tiles", "tiles/00",
-    "flights/b/staged", "flights/c",
-])
+@pytest.mark.parametrize(
+    "place",
+    [
+        "flights",
+        "flights/a",
+        "flights/b/changes",
+        "flights/a/keyframes",
+        "flights/a/keyframes/1",
+        "tiles",
+        "tiles/00",
+        "flights/b/staged",
+        "flights/c",
+    ],
+)
 def test_a_link_to_a_folder_is_refused(site: Path, untouched: Path, place: str) -> None:
     craft(site, OWED)
     at = site / place
@@ -181,10 +213,18 @@ def test_a_link_to_a_folder_is_refused(site: Path, untouched: Path, place: str) 
         Archive.open(site, write=True)
 
 
-@pytest.mark.parametrize("place", [
-    "site.lock", "site.db", "mosaic.tif", "live.png", "flights/a/report.json", ".tmp-x",
-    "flights/a/keyframes/1/000000.jpg",
-])
+@pytest.mark.parametrize(
+    "place",
+    [
+        "site.lock",
+        "site.db",
+        "mosaic.tif",
+        "live.png",
+        "flights/a/report.json",
+        ".tmp-x",
+        "flights/a/keyframes/1/000000.jpg",
+    ],
+)
 def test_a_link_to_a_file_is_refused(site: Path, untouched: Path, place: str) -> None:
     (site / place).unlink(missing_ok=True)
     (site / place).symlink_to(untouched / "victim.txt")
@@ -229,7 +269,9 @@ def test_a_rollback_journal_is_refused(site: Path, untouched: Path) -> None:
             Archive.open(site, write=write)
 
 
-def test_a_crs_that_is_an_address_is_not_fetched(site: Path, untouched: Path, web: tuple[str, list[str]]) -> None:
+def test_a_crs_that_is_an_address_is_not_fetched(
+    site: Path, untouched: Path, web: tuple[str, list[str]]
+) -> None:
     address, asked = web
     with Archive.open(site, write=True) as archive:
         grid = archive.site_grid().grid
@@ -246,21 +288,27 @@ def test_a_crs_that_is_an_address_is_not_fetched(site: Path, untouched: Path, we
     assert not asked
 
 
-def test_a_users_raster_fetches_and_opens_nothing_else(tmp_path: Path, web: tuple[str, list[str]]) -> None:
+def test_a_users_raster_fetches_and_opens_nothing_else(
+    tmp_path: Path, web: tuple[str, list[str]]
+) -> None:
     address, asked = web
     secret = tmp_path / "secret.png"
     cv2.imwrite(str(secret), np.full((8, 8, 3), 99, np.uint8))
     readers = (
-        lambda path: read_raster(path, 100), lambda path: read_orthophoto(path, 0.1),
+        lambda path: read_raster(path, 100),
+        lambda path: read_orthophoto(path, 0.1),
         lambda path: read_height_model(path, (13.0, 46.0, 14.0, 47.0)),
     )
     bands = "".join(
         f'<VRTRasterBand dataType="Byte" band="{band}"><SimpleSource><SourceFilename>{{source}}</SourceFilename>'
-        f"<SourceBand>{band}</SourceBand></SimpleSource></VRTRasterBand>" for band in (1, 2, 3)
+        f"<SourceBand>{band}</SourceBand></SimpleSource></VRTRasterBand>"
+        for band in (1, 2, 3)
     )
     vrt = tmp_path / "map.tif"
     for source in (f"/vsicurl/{address}", str(secret)):
-        vrt.write_text(f'<VRTDataset rasterXSize="8" rasterYSize="8">{bands.format(source=source)}</VRTDataset>')
+        vrt.write_text(
+            f'<VRTDataset rasterXSize="8" rasterYSize="8">{bands.format(source=source)}</VRTDataset>'
+        )
         for reader in readers:
             with pytest.raises(InputError):
                 reader(vrt)
@@ -273,9 +321,19 @@ def test_a_users_raster_fetches_and_opens_nothing_else(tmp_path: Path, web: tupl
 
 def raster_of(path: Path, side_px: int, bands: int, dtype: str, *, written: bool = True) -> Path:
     with rasterio.open(
-        path, "w", driver="GTiff", width=side_px, height=side_px, count=bands, dtype=dtype, crs="EPSG:32632",
-        transform=rasterio.Affine(0.5, 0, 500_000, 0, -0.5, 5_100_000), tiled=True, compress="deflate",
-        SPARSE_OK=not written, bigtiff="YES" if side_px > 10_000 else "NO",
+        path,
+        "w",
+        driver="GTiff",
+        width=side_px,
+        height=side_px,
+        count=bands,
+        dtype=dtype,
+        crs="EPSG:32632",
+        transform=rasterio.Affine(0.5, 0, 500_000, 0, -0.5, 5_100_000),
+        tiled=True,
+        compress="deflate",
+        SPARSE_OK=not written,
+        bigtiff="YES" if side_px > 10_000 else "NO",
     ) as sink:
         if written:
             sink.write(np.arange(bands * side_px**2).reshape(bands, side_px, side_px).astype(dtype))
@@ -292,11 +350,19 @@ def test_a_small_raster_of_many_pixels_is_no_ground_to_simulate_over(tmp_path: P
 def test_a_raster_in_coordinates_of_a_building_site_has_no_place_on_earth(tmp_path: Path) -> None:
     local = 'LOCAL_CS["site",LOCAL_DATUM["site",0],UNIT["metre",1],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
     for bands, dtype, reader in (
-        (3, "uint8", BaseMap.open), (1, "float32", lambda path: read_height_model(path, (8.9, 46.0, 9.1, 46.1))),
+        (3, "uint8", BaseMap.open),
+        (1, "float32", lambda path: read_height_model(path, (8.9, 46.0, 9.1, 46.1))),
     ):
         path = tmp_path / f"{dtype}.tif"
         with rasterio.open(
-            path, "w", driver="GTiff", width=64, height=64, count=bands, dtype=dtype, crs=local,
+            path,
+            "w",
+            driver="GTiff",
+            width=64,
+            height=64,
+            count=bands,
+            dtype=dtype,
+            crs=local,
             transform=rasterio.Affine(0.5, 0, 1000, 0, -0.5, 2000),
         ) as sink:
             sink.write(np.ones((bands, 64, 64), dtype))
@@ -306,14 +372,24 @@ def test_a_raster_in_coordinates_of_a_building_site_has_no_place_on_earth(tmp_pa
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_any_raster_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_any_raster_is_read_or_refused(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
     folder = tmp_path_factory.getbasetemp()
-    colours, heights = raster_of(folder / "a.tif", 64, 3, "uint8"), raster_of(folder / "b.tif", 64, 1, "float32")
-    reader, valid = data.draw(st.sampled_from([
-        (lambda path: read_raster(path, 100), colours), (read_orthophoto, colours),
-        (lambda path: BaseMap.open(path).bounds_deg, colours),
-        (lambda path: read_height_model(path, (8.9, 46.0, 9.1, 46.1)), heights),
-    ]))
+    colours, heights = (
+        raster_of(folder / "a.tif", 64, 3, "uint8"),
+        raster_of(folder / "b.tif", 64, 1, "float32"),
+    )
+    reader, valid = data.draw(
+        st.sampled_from(
+            [
+                (lambda path: read_raster(path, 100), colours),
+                (read_orthophoto, colours),
+                (lambda path: BaseMap.open(path).bounds_deg, colours),
+                (lambda path: read_height_model(path, (8.9, 46.0, 9.1, 46.1)), heights),
+            ]
+        )
+    )
     path = folder / "any.tif"
     path.write_bytes(mutated(data, valid.read_bytes(), 4))
     try:
@@ -329,12 +405,22 @@ def test_a_pixel_size_that_cannot_be_is_named(site: Path, value: str) -> None:
         Archive.open(site, write=False).site_grid()
 
 
-@pytest.mark.parametrize(("table", "column", "value"), [
-    ("keyframes", "camera", '{"width_px": 0}'), ("keyframes", "camera", "[]"), ("keyframes", "rotation", "[1]"),
-    ("keyframes", "site_from_image", "7"), ("keyframes", "status", "seen"), ("changes", "properties", "{}"),
-    ("changes", "kind", "exploded"), ("site", "latitude_deg", "text"),
-])
-def test_values_that_no_sorvolo_wrote_are_named(site: Path, table: str, column: str, value: str) -> None:
+@pytest.mark.parametrize(
+    ("table", "column", "value"),
+    [
+        ("keyframes", "camera", '{"width_px": 0}'),
+        ("keyframes", "camera", "[]"),
+        ("keyframes", "rotation", "[1]"),
+        ("keyframes", "site_from_image", "7"),
+        ("keyframes", "status", "seen"),
+        ("changes", "properties", "{}"),
+        ("changes", "kind", "exploded"),
+        ("site", "latitude_deg", "text"),
+    ],
+)
+def test_values_that_no_sorvolo_wrote_are_named(
+    site: Path, table: str, column: str, value: str
+) -> None:
     craft(site, f"UPDATE {table} SET {column} = '{value}'")
     with Archive.open(site, write=False) as archive, pytest.raises(StoreError, match="cannot be"):
         archive.keyframes(), archive.changes(), archive.site()
@@ -344,11 +430,15 @@ def _png(width: int, height: int) -> bytes:
     """A PNG of so many transparent pixels, small as a file."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
-        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+        return (
+            len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+        )
 
     rows = zlib.compress(bytes((4 * width + 1) * 8)) if width * height < 1e6 else b""
     header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + b"\x08\x06\0\0\0"
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    return (
+        b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    )
 
 
 def test_a_picture_that_announces_too_many_pixels_is_not_decoded() -> None:
@@ -356,7 +446,7 @@ def test_a_picture_that_announces_too_many_pixels_is_not_decoded() -> None:
         rgba_from_png(_png(17_000, 17_000), "tile")
     jpeg = bytearray(jpeg_from_image(image(1)))
     at = jpeg.index(b"\xff\xc0")
-    jpeg[at + 5:at + 9] = b"\xff\xff\xff\xff"
+    jpeg[at + 5 : at + 9] = b"\xff\xff\xff\xff"
     with pytest.raises(StoreError, match="4295 million pixels"):
         image_from_jpeg(bytes(jpeg), "keyframe")
     assert image_from_jpeg(jpeg_from_image(image(1)), "keyframe").shape == (54, 96, 3)
@@ -380,7 +470,9 @@ def test_a_disk_that_is_full_when_the_catalogue_is_made_is_named(tmp_path: Path)
         "except StoreError as error:\n"
         "    print(error)\n"
     )
-    result = subprocess.run([sys.executable, "-c", program, str(tmp_path / "s")], capture_output=True, text=True)
+    result = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "s")], capture_output=True, text=True
+    )
     assert "site.db" in result.stdout and "disk" in result.stdout, result.stderr
     assert not (tmp_path / "s" / "site.db").exists()
     with Archive.open(tmp_path / "s", write=True) as archive:
@@ -394,18 +486,24 @@ def test_what_is_written_follows_no_link(tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "victim").read_text() == "precious"
     assert not (tmp_path / "x.json").is_symlink()
     (tmp_path / ".tmp-1-y").symlink_to(tmp_path / "victim")
-    monkeypatch.setattr("sorvolo.store.atomic.temporary_beside", lambda path: path.with_name(".tmp-1-y"))
+    monkeypatch.setattr(
+        "sorvolo.store.atomic.temporary_beside", lambda path: path.with_name(".tmp-1-y")
+    )
     with pytest.raises(FileExistsError):
         atomic_write_bytes(tmp_path / "y", b"new")
     assert (tmp_path / "victim").read_text() == "precious"
 
 
-@pytest.mark.parametrize("name", ["DJI_0043", "Flug über Ötztal (2)", "e\u0301te\u0301", "地図", "a.b-c_d", "50% [x]"])
+@pytest.mark.parametrize(
+    "name", ["DJI_0043", "Flug über Ötztal (2)", "e\u0301te\u0301", "地図", "a.b-c_d", "50% [x]"]
+)
 def test_names_that_flights_have(name: str) -> None:
     assert is_plain_name(name)
 
 
-@pytest.mark.parametrize("name", ["", ".", "..", ".a", "-rf", "a/b", "a\\b", "a\nb", "a\0", "a\u202eb", "a" * 300])
+@pytest.mark.parametrize(
+    "name", ["", ".", "..", ".a", "-rf", "a/b", "a\\b", "a\nb", "a\0", "a\u202eb", "a" * 300]
+)
 def test_names_that_no_flight_has(name: str) -> None:
     assert not is_plain_name(name)
 

@@ -33,8 +33,16 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
 PROMISED = {
-    "frame", "time", "status", "reason", "camera_longitude_deg", "camera_latitude_deg", "camera_height_m",
-    "height_above_ground_m", "residual_px", "sigma_m",
+    "frame",
+    "time",
+    "status",
+    "reason",
+    "camera_longitude_deg",
+    "camera_latitude_deg",
+    "camera_height_m",
+    "height_above_ground_m",
+    "residual_px",
+    "sigma_m",
 }
 
 
@@ -52,14 +60,17 @@ def test_a_frame_is_the_ground_polygon_of_its_corners_in_order() -> None:
     back_m = SITE.frame.site_from_wgs84(
         np.array(ring)[:4, 1], np.array(ring)[:4, 0], np.full(4, ORIGIN.height_m)
     )
-    assert np.abs(back_m[:, :2] - placed.outline_m).max() < 1e-4  # 1e-10 deg is a hundredth of a millimetre
+    assert (
+        np.abs(back_m[:, :2] - placed.outline_m).max() < 1e-4
+    )  # 1e-10 deg is a hundredth of a millimetre
     assert max(len(str(number).split(".")[1]) for number in ring[0]) >= 9
 
 
 def test_a_frames_properties_state_where_its_camera_was() -> None:
     properties = feature(frames_geojson([frame(2)], SITE))["properties"]
     camera_m = SITE.frame.site_from_wgs84(
-        np.array([properties["camera_latitude_deg"]]), np.array([properties["camera_longitude_deg"]]),
+        np.array([properties["camera_latitude_deg"]]),
+        np.array([properties["camera_longitude_deg"]]),
         np.array([properties["camera_height_m"]]),
     )[0]
     assert np.abs(camera_m - [20.0, 5.0, 20.0]).max() < 0.001
@@ -76,7 +87,13 @@ def test_a_rejected_frame_has_a_reason_and_no_place() -> None:
     made = feature(frames_geojson([frame(3, Status.REJECTED)], SITE))
     assert made["geometry"] is None
     assert (made["properties"]["status"], made["properties"]["reason"]) == ("rejected", "blurred")
-    for name in ("camera_longitude_deg", "camera_height_m", "residual_px", "sigma_m", "camera_yaw_deg"):
+    for name in (
+        "camera_longitude_deg",
+        "camera_height_m",
+        "residual_px",
+        "sigma_m",
+        "camera_yaw_deg",
+    ):
         assert made["properties"][name] is None
 
 
@@ -107,20 +124,30 @@ def test_longitudes_do_not_jump_at_the_antimeridian() -> None:
     assert max(longitudes) > 180 > min(longitudes) > 179.99
 
 
-@pytest.mark.parametrize(("time_ns", "text"), [
-    (0, "1970-01-01T00:00:00.000000Z"),
-    (1_700_000_000_000_001_000, "2023-11-14T22:13:20.000001Z"),
-    (1_700_000_000_000_000_001, "2023-11-14T22:13:20.000000001Z"),
-    (-1_000, "1969-12-31T23:59:59.999999Z"),
-])
+@pytest.mark.parametrize(
+    ("time_ns", "text"),
+    [
+        (0, "1970-01-01T00:00:00.000000Z"),
+        (1_700_000_000_000_001_000, "2023-11-14T22:13:20.000001Z"),
+        (1_700_000_000_000_000_001, "2023-11-14T22:13:20.000000001Z"),
+        (-1_000, "1969-12-31T23:59:59.999999Z"),
+    ],
+)
 def test_times_are_utc_and_lose_nothing(time_ns: int, text: str) -> None:
     assert utc_text(time_ns) == text
 
 
 def test_a_feature_is_a_line_whatever_its_values_are() -> None:
-    values = ([1.5, "\u00e9"], [1.5, "\u00e9"]), (float("nan"), None), (np.float32(0.5), 0.5), (Status.VISION, "vision")
+    values = (
+        ([1.5, "\u00e9"], [1.5, "\u00e9"]),
+        (float("nan"), None),
+        (np.float32(0.5), 0.5),
+        (Status.VISION, "vision"),
+    )
     for plain, written in values:
-        lines = geojson_bytes({"name": "x", "features": [{"a": plain}, {"b": 1}]}).decode().splitlines()
+        lines = (
+            geojson_bytes({"name": "x", "features": [{"a": plain}, {"b": 1}]}).decode().splitlines()
+        )
         assert [json.loads(line.rstrip(",")) for line in lines[1:-1]] == [{"a": written}, {"b": 1}]
 
 
@@ -134,12 +161,20 @@ def test_plain_json_holds_what_json_can() -> None:
         FAST = "fast"
 
     value = {
-        "settings": Settings(np.float64(0.5), Path("a/b")), "kind": Kind.FAST, "nan": np.nan, 3: np.arange(2),
-        "flags": (True, None, np.bool_(False)), "inf": np.float32(np.inf),
+        "settings": Settings(np.float64(0.5), Path("a/b")),
+        "kind": Kind.FAST,
+        "nan": np.nan,
+        3: np.arange(2),
+        "flags": (True, None, np.bool_(False)),
+        "inf": np.float32(np.inf),
     }
     assert json.loads(json.dumps(plain_json(value), allow_nan=False)) == {
-        "settings": {"gsd_m": 0.5, "path": "a/b"}, "kind": "fast", "nan": None, "3": [0, 1],
-        "flags": [True, None, False], "inf": None,
+        "settings": {"gsd_m": 0.5, "path": "a/b"},
+        "kind": "fast",
+        "nan": None,
+        "3": [0, 1],
+        "flags": [True, None, False],
+        "inf": None,
     }
     with pytest.raises(TypeError, match="object"):
         plain_json(object())
@@ -213,7 +248,9 @@ def test_the_growing_map_is_shown_small_by_the_tiles_that_changed(tmp_path: Path
     del tiles[2, 0]
     preview.write(tiles, [(0, 0), (2, 0)], path)
     assert tiles.reads == 6
-    assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]], picture(tiles, 1024).rgba)
+    assert np.array_equal(
+        cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[..., [2, 1, 0, 3]], picture(tiles, 1024).rgba
+    )
 
 
 def test_a_picture_knows_how_much_ground_the_map_shows() -> None:
@@ -250,7 +287,10 @@ def test_small_maps_are_written_of_tiles_as_they_pass_by(tmp_path: Path) -> None
         small.take(index, tiles[index])
     write_small_maps(small, site_grid, "two fields", tmp_path / "small.png", tmp_path / "small.kmz")
     assert (tmp_path / "small.kmz").read_bytes() == (tmp_path / "two.kmz").read_bytes()
-    one, two = (cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED) for name in ("preview.png", "small.png"))
+    one, two = (
+        cv2.imread(str(tmp_path / name), cv2.IMREAD_UNCHANGED)
+        for name in ("preview.png", "small.png")
+    )
     assert np.abs(np.array(one.shape) - two.shape).max() <= 1 and max(two.shape) <= 2048
 
 
@@ -276,7 +316,9 @@ def test_a_kmz_lies_on_the_map(tmp_path: Path, origin: Geodetic) -> None:
                 continue
             found += 1
             x, y = (patch_centre(rgba) + 0.5) / rgba.shape[1::-1]
-            west, east, south, north = (float(text[side]) for side in ("west", "east", "south", "north"))
+            west, east, south, north = (
+                float(text[side]) for side in ("west", "east", "south", "north")
+            )
             assert abs(north + y * (south - north) - latitude[0]) * 111_000 < 0.1
             off_deg = (west + x * ((east - west) % 360) - longitude[0] + 180) % 360 - 180
             assert abs(off_deg) * 111_000 * np.cos(np.radians(latitude[0])) < 0.1
@@ -293,7 +335,9 @@ def test_the_same_map_gives_the_same_kmz(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 def test_a_site_states_what_its_height_is_counted_from() -> None:
-    above_takeoff = replace(SITE, origin=Geodetic(46.5, 13.25, 0.0), height_reference="above take-off")
+    above_takeoff = replace(
+        SITE, origin=Geodetic(46.5, 13.25, 0.0), height_reference="above take-off"
+    )
     properties = feature(frames_geojson([frame(0)], above_takeoff))["properties"]
     assert (properties["camera_height_m"], properties["height_reference"]) == (20, "above take-off")
 
@@ -320,7 +364,10 @@ def test_two_maps_are_shown_on_the_same_ground_and_common_tiles_are_read_once() 
 
 def test_documents_made_at_once_are_numbered_from_one_each() -> None:
     """A map's KMZ is made beside its objects' KML, and the same map gives the same bytes."""
-    places = [Placemark(f"place {k}", "", 12.5, 41.9, 0, ((12.5, 41.9), (12.6, 41.9), (12.6, 42.0))) for k in range(60)]
+    places = [
+        Placemark(f"place {k}", "", 12.5, 41.9, 0, ((12.5, 41.9), (12.6, 41.9), (12.6, 42.0)))
+        for k in range(60)
+    ]
     alone = kml_bytes("alone", places)
     with ThreadPoolExecutor(4) as threads:
         together = list(threads.map(lambda _: kml_bytes("alone", places), range(16)))

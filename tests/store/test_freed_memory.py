@@ -51,12 +51,17 @@ all_hold.wait()
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc has a pool of memory for each thread")
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc", reason="only glibc has a pool of memory for each thread"
+)
 @pytest.mark.parametrize(("shares", "most"), [(True, 2), (False, 99)])
 def test_threads_take_their_memory_from_two_pools(shares: bool, most: int) -> None:
     environment = {name: value for name, value in os.environ.items() if name != "MALLOC_ARENA_MAX"}
     found = subprocess.run(
-        [sys.executable, "-c", _THREADS_THAT_HOLD_MEMORY.format(shares=shares)], env=environment, check=True,
-        capture_output=True, text=True,
+        [sys.executable, "-c", _THREADS_THAT_HOLD_MEMORY.format(shares=shares)],
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
     )
     assert (1 if shares else 3) <= found.stdout.count("<heap nr=") <= most

@@ -52,7 +52,7 @@ def test_a_known_pixel_lies_in_its_place_to_a_millimetre(
     expected_m = site_grid.grid.projected_from_grid(np.array([pixel]))[0]
     assert np.abs(np.subtract(place_m, expected_m)).max() < 0.001
     # the same place through the site's own metres and WGS84, apart from the projection's code
-    east_north_m = (expected_m - site_grid.projected_from_site(np.zeros((1, 2)))[0])
+    east_north_m = expected_m - site_grid.projected_from_site(np.zeros((1, 2)))[0]
     assert np.abs(east_north_m - np.array(pixel) * [0.05, -0.05]).max() <= 0.025 + 1e-9
 
 
@@ -67,7 +67,7 @@ def test_it_is_a_cloud_optimized_geotiff(tmp_path: Path, site_grid: SiteGrid) ->
         assert mosaic.colorinterp[3] == ColorInterp.alpha
         picture = np.moveaxis(mosaic.read(), 0, 2)
         for (column, row), one in tiles.items():
-            window = picture[row * 512:row * 512 + 512, column * 512:column * 512 + 512]
+            window = picture[row * 512 : row * 512 + 512, column * 512 : column * 512 + 512]
             assert np.array_equal(window, one)
         assert not picture[512:, 512:1024].any()
     cogeo = pytest.importorskip("rio_cogeo")
@@ -79,12 +79,17 @@ def test_each_tile_is_read_once_and_passes_by(tmp_path: Path, site_grid: SiteGri
     tiles = {(column, row): tile(10 + column, 300) for column in range(3) for row in range(2)}
     passed: list[tuple[tuple[int, int], int]] = []
     write_cog(
-        tiles, site_grid, tmp_path / "mosaic.tif", pass_by=lambda index, one: passed.append((index, int(one.sum())))
+        tiles,
+        site_grid,
+        tmp_path / "mosaic.tif",
+        pass_by=lambda index, one: passed.append((index, int(one.sum()))),
     )
     assert sorted(passed) == [(index, int(tiles[index].sum())) for index in sorted(tiles)]
 
 
-def test_overviews_do_not_darken_the_rim_of_what_is_seen(tmp_path: Path, site_grid: SiteGrid) -> None:
+def test_overviews_do_not_darken_the_rim_of_what_is_seen(
+    tmp_path: Path, site_grid: SiteGrid
+) -> None:
     half = np.zeros((512, 512, 4), np.uint8)
     half[:, :255] = (200, 200, 200, 255)  # an odd edge: overview pixels mix seen and unseen
     write_cog({(0, 0): half, (1, 0): half, (2, 0): half}, site_grid, tmp_path / "mosaic.tif")
@@ -98,9 +103,14 @@ def test_a_map_as_jpeg_has_overviews_of_what_is_seen(tmp_path: Path, site_grid: 
     tiles = {(column, 0): tile(200) for column in range(3)}
     for compress in ("deflate", "jpeg"):
         write_cog(tiles, site_grid, tmp_path / f"{compress}.tif", compress=compress)
-    with rasterio.open(tmp_path / "deflate.tif") as exact, rasterio.open(tmp_path / "jpeg.tif") as small:
+    with (
+        rasterio.open(tmp_path / "deflate.tif") as exact,
+        rasterio.open(tmp_path / "jpeg.tif") as small,
+    ):
         assert small.overviews(1) == exact.overviews(1) == [2, 4]
-        halves = [each.read(1, out_shape=(each.height // 2, each.width // 2)) for each in (exact, small)]
+        halves = [
+            each.read(1, out_shape=(each.height // 2, each.width // 2)) for each in (exact, small)
+        ]
         assert np.abs(halves[0].astype(int) - halves[1]).mean() < 4
 
 
@@ -119,7 +129,9 @@ def test_what_is_empty_between_two_places_is_left_out_of_the_overviews_alone(
 
 
 @pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:4326", "EPSG:25833"])
-def test_another_crs_keeps_the_place_and_the_alpha(tmp_path: Path, site_grid: SiteGrid, crs: str) -> None:
+def test_another_crs_keeps_the_place_and_the_alpha(
+    tmp_path: Path, site_grid: SiteGrid, crs: str
+) -> None:
     pixel = (120, -77)
     write_cog(marked(pixel), site_grid, tmp_path / "mosaic.tif", crs=crs)
     to_utm = Transformer.from_crs(crs, site_grid.grid.crs, always_xy=True)
@@ -129,7 +141,9 @@ def test_another_crs_keeps_the_place_and_the_alpha(tmp_path: Path, site_grid: Si
         place_m = to_utm.transform(*(mosaic.transform @ (column + 0.5, row + 0.5)))
         alpha = mosaic.read(4)
     expected_m = site_grid.grid.projected_from_grid(np.array([pixel]))[0]
-    assert np.hypot(*np.subtract(place_m, expected_m)) < 0.02  # resampling spreads the pixel over four
+    assert (
+        np.hypot(*np.subtract(place_m, expected_m)) < 0.02
+    )  # resampling spreads the pixel over four
     assert (alpha == 255).mean() > 0.8
     if crs != "EPSG:25833":  # the same axes as the site's: nothing is turned, no corner stays empty
         assert (alpha == 0).any()
@@ -145,7 +159,9 @@ def test_a_local_map_has_no_crs(tmp_path: Path) -> None:
         write_cog({(0, 0): tile(1)}, local, tmp_path / "other.tif", crs="EPSG:3857")
 
 
-def test_what_cannot_be_written_is_named_and_leaves_nothing(tmp_path: Path, site_grid: SiteGrid) -> None:
+def test_what_cannot_be_written_is_named_and_leaves_nothing(
+    tmp_path: Path, site_grid: SiteGrid
+) -> None:
     with pytest.raises(StoreError, match="no tiles"):
         write_cog({}, site_grid, tmp_path / "mosaic.tif")
     with pytest.raises(SettingsError, match="EPSG:999999"):
@@ -201,8 +217,14 @@ def test_a_written_map_reads_back_thinned_in_its_place(tmp_path: Path, site_grid
 def write_plain(path: Path, bands: np.ndarray, **profile: object) -> None:
     defaults = {"crs": "EPSG:32633", "transform": rasterio.Affine(0.1, 0, 500, 0, -0.1, 900)}
     with rasterio.open(
-        path, "w", driver="GTiff", count=len(bands), height=bands.shape[1], width=bands.shape[2],
-        dtype=bands.dtype, **(defaults | profile),
+        path,
+        "w",
+        driver="GTiff",
+        count=len(bands),
+        height=bands.shape[1],
+        width=bands.shape[2],
+        dtype=bands.dtype,
+        **(defaults | profile),
     ) as sink:
         sink.write(bands)
 
@@ -217,12 +239,19 @@ def test_a_reference_map_may_be_grey_and_have_nodata(tmp_path: Path) -> None:
     assert not raster.rgba[:10, :, 3].any()
 
 
-@pytest.mark.parametrize(("profile", "dtype", "message"), [
-    ({"crs": "EPSG:4326", "transform": rasterio.Affine(1e-6, 0, 13, 0, -1e-6, 46)}, np.uint8, "degrees"),
-    ({"transform": rasterio.Affine(0.1, 0.02, 500, 0.02, -0.1, 900)}, np.uint8, "north-up"),
-    ({"transform": rasterio.Affine(0.1, 0, 500, 0, -0.2, 900)}, np.uint8, "square"),
-    ({}, np.uint16, "8-bit"),
-])
+@pytest.mark.parametrize(
+    ("profile", "dtype", "message"),
+    [
+        (
+            {"crs": "EPSG:4326", "transform": rasterio.Affine(1e-6, 0, 13, 0, -1e-6, 46)},
+            np.uint8,
+            "degrees",
+        ),
+        ({"transform": rasterio.Affine(0.1, 0.02, 500, 0.02, -0.1, 900)}, np.uint8, "north-up"),
+        ({"transform": rasterio.Affine(0.1, 0, 500, 0, -0.2, 900)}, np.uint8, "square"),
+        ({}, np.uint16, "8-bit"),
+    ],
+)
 def test_a_reference_map_that_cannot_be_used_is_named(
     tmp_path: Path, profile: dict[str, object], dtype: type, message: str
 ) -> None:

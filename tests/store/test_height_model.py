@@ -27,8 +27,16 @@ def plane_m(east_m: np.ndarray, north_m: np.ndarray) -> np.ndarray:
 def written(path: Path, crs: str, transform: Affine, heights: np.ndarray, **profile: Any) -> Path:
     bands = np.atleast_3d(heights.T).T
     with rasterio.open(
-        path, "w", driver="GTiff", width=bands.shape[2], height=bands.shape[1], count=len(bands), crs=crs,
-        dtype=bands.dtype.name, transform=transform, **profile,
+        path,
+        "w",
+        driver="GTiff",
+        width=bands.shape[2],
+        height=bands.shape[1],
+        count=len(bands),
+        crs=crs,
+        dtype=bands.dtype.name,
+        transform=transform,
+        **profile,
     ) as sink:
         sink.write(bands)
     return path
@@ -40,11 +48,15 @@ def slope(path: Path, step_m: float = 10.0, **profile: Any) -> Path:
     east_m = 299_500 + step_m * (np.arange(count) + 0.5)
     north_m = 4_642_500 - step_m * (np.arange(count) + 0.5)
     heights_m = plane_m(*np.meshgrid(east_m, north_m)).astype(np.float32)
-    return written(path, "EPSG:32633", Affine(step_m, 0, 299_500, 0, -step_m, 4_642_500), heights_m, **profile)
+    return written(
+        path, "EPSG:32633", Affine(step_m, 0, 299_500, 0, -step_m, 4_642_500), heights_m, **profile
+    )
 
 
 def truth_m() -> np.ndarray:
-    return plane_m(*Transformer.from_crs(4326, 32633, always_xy=True).transform(_LONGITUDES, _LATITUDES))
+    return plane_m(
+        *Transformer.from_crs(4326, 32633, always_xy=True).transform(_LONGITUDES, _LATITUDES)
+    )
 
 
 def test_between_pixels_a_slope_is_met_exactly(tmp_path: Path) -> None:
@@ -53,7 +65,9 @@ def test_between_pixels_a_slope_is_met_exactly(tmp_path: Path) -> None:
     assert np.isnan(model.at(np.array([12.7, np.nan]), np.array([41.895, 41.895]))).all()
 
 
-def test_a_large_model_is_read_coarser_and_gives_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_model_is_read_coarser_and_gives_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(height_model, "_MOST_PX", 40)
     model = read_height_model(slope(tmp_path / "fine.tif"), _BOUNDS_DEG)
     assert max(model.heights_m.shape) <= 40
@@ -71,25 +85,42 @@ def test_degrees_whole_numbers_and_holes(tmp_path: Path) -> None:
     assert np.isnan(model.at(np.array([12.605]), np.array([41.898]))[0])
 
 
-@pytest.mark.parametrize(("unit", "crs", "in_m"), [
-    ("metre", "EPSG:32633", 1.0), ("ft", "EPSG:32633", 0.3048), ("US survey foot", "EPSG:32633", 1200 / 3937),
-    ("", "EPSG:32633+5703", 1.0), ("", "EPSG:32633+6360", 1200 / 3937),  # NAVD88 in metres and in feet
-])
-def test_feet_are_read_as_feet_where_the_file_names_them(tmp_path: Path, unit: str, crs: str, in_m: float) -> None:
+@pytest.mark.parametrize(
+    ("unit", "crs", "in_m"),
+    [
+        ("metre", "EPSG:32633", 1.0),
+        ("ft", "EPSG:32633", 0.3048),
+        ("US survey foot", "EPSG:32633", 1200 / 3937),
+        ("", "EPSG:32633+5703", 1.0),
+        ("", "EPSG:32633+6360", 1200 / 3937),  # NAVD88 in metres and in feet
+    ],
+)
+def test_feet_are_read_as_feet_where_the_file_names_them(
+    tmp_path: Path, unit: str, crs: str, in_m: float
+) -> None:
     path = written(
-        tmp_path / "model.tif", crs, Affine(10, 0, 299_500, 0, -10, 4_642_500), np.full((300, 300), 330, np.float32)
+        tmp_path / "model.tif",
+        crs,
+        Affine(10, 0, 299_500, 0, -10, 4_642_500),
+        np.full((300, 300), 330, np.float32),
     )
     with rasterio.open(path, "r+") as file:
         file.units = (unit,)
-    assert read_height_model(path, _BOUNDS_DEG).at(_LONGITUDES, _LATITUDES) == pytest.approx(330 * in_m, abs=1e-3)
+    assert read_height_model(path, _BOUNDS_DEG).at(_LONGITUDES, _LATITUDES) == pytest.approx(
+        330 * in_m, abs=1e-3
+    )
 
 
 def test_heights_of_no_ground_on_earth_are_holes(tmp_path: Path) -> None:
     heights = np.full((300, 300), 55, np.float32)
     heights[:, :180] = -9999
     heights[:, 299:] = np.inf
-    path = written(tmp_path / "model.tif", "EPSG:32633", Affine(10, 0, 299_500, 0, -10, 4_642_500), heights)
-    found = read_height_model(path, _BOUNDS_DEG).at(np.array([12.602, 12.6095]), np.array([41.895, 41.895]))
+    path = written(
+        tmp_path / "model.tif", "EPSG:32633", Affine(10, 0, 299_500, 0, -10, 4_642_500), heights
+    )
+    found = read_height_model(path, _BOUNDS_DEG).at(
+        np.array([12.602, 12.6095]), np.array([41.895, 41.895])
+    )
     assert np.isnan(found[0]) and found[1] == pytest.approx(55)
 
 
@@ -99,25 +130,50 @@ def in_fathoms(path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("make", "words"), [
-    (in_fathoms, "heights in 'fathom'"),
-    (lambda path: written(path, "EPSG:4326", Affine(0.01, 0, 12, 0, -0.01, 42), np.zeros((2, 9, 9))), "terrain.tif"),
-    (lambda path: path, "no such file"),
-    (lambda path: path.write_text("heights") and path, "no readable GeoTIFF"),
-    (lambda path: written(path, "", Affine.scale(2.0, -2.0), np.zeros((9, 9), np.float32)), "coordinate reference"),
-    (lambda path: written(path, "EPSG:4326", Affine(0.01, 0, 12, 0, -0.01, 42), np.zeros((3, 9, 9))), "3 bands"),
-    (lambda path: written(path, "EPSG:4326", Affine(0.01, 0, -70, 0, -0.01, 42), np.zeros((9, 9))), "its ground"),
-])
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (in_fathoms, "heights in 'fathom'"),
+        (
+            lambda path: written(
+                path, "EPSG:4326", Affine(0.01, 0, 12, 0, -0.01, 42), np.zeros((2, 9, 9))
+            ),
+            "terrain.tif",
+        ),
+        (lambda path: path, "no such file"),
+        (lambda path: path.write_text("heights") and path, "no readable GeoTIFF"),
+        (
+            lambda path: written(path, "", Affine.scale(2.0, -2.0), np.zeros((9, 9), np.float32)),
+            "coordinate reference",
+        ),
+        (
+            lambda path: written(
+                path, "EPSG:4326", Affine(0.01, 0, 12, 0, -0.01, 42), np.zeros((3, 9, 9))
+            ),
+            "3 bands",
+        ),
+        (
+            lambda path: written(
+                path, "EPSG:4326", Affine(0.01, 0, -70, 0, -0.01, 42), np.zeros((9, 9))
+            ),
+            "its ground",
+        ),
+    ],
+)
 def test_what_is_no_model_of_this_ground(make: Any, words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=words):
         read_height_model(make(tmp_path / "model.tif"), _BOUNDS_DEG)
 
 
 def test_a_file_without_a_place_is_refused_in_one_line(tmp_path: Path) -> None:
-    with rasterio.open(tmp_path / "plain.tif", "w", driver="GTiff", width=9, height=9, count=1, dtype="uint8") as sink:
+    with rasterio.open(
+        tmp_path / "plain.tif", "w", driver="GTiff", width=9, height=9, count=1, dtype="uint8"
+    ) as sink:
         sink.write(np.ones((1, 9, 9), np.uint8))
     for read in (lambda path: read_height_model(path, _BOUNDS_DEG), BaseMap.open):
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # rasterio's warning names lines of Python, which help nobody
+            warnings.simplefilter(
+                "error"
+            )  # rasterio's warning names lines of Python, which help nobody
             with pytest.raises(InputError, match=r"coordinate reference|no place on Earth"):
                 read(tmp_path / "plain.tif")

@@ -12,13 +12,19 @@ import pytest
 from sorvolo.store.site.journal import Entry, RunJournal, content_sha256, is_journal_after
 
 _ENTRIES = [
-    Entry("a", {"x": float("inf"), "y": 1 / 3}, {"m": np.arange(6.0).reshape(2, 3), "none": np.zeros((0, 2))}),
+    Entry(
+        "a",
+        {"x": float("inf"), "y": 1 / 3},
+        {"m": np.arange(6.0).reshape(2, 3), "none": np.zeros((0, 2))},
+    ),
     Entry("b", {}, {"gray": np.full((3, 4), 200, np.uint8), "ids": np.array([1, -2])}),
     Entry("c", {"words": "Ötztal"}),
 ]
 
 
-def written(path: Path, entries: list[Entry] = _ENTRIES, key: str = "k", after: int = 3) -> RunJournal:
+def written(
+    path: Path, entries: list[Entry] = _ENTRIES, key: str = "k", after: int = 3
+) -> RunJournal:
     journal = RunJournal(path, key, after)
     for each in entries:
         journal.append(each)
@@ -31,11 +37,15 @@ def kinds(path: Path, key: str = "k", after: int = 3) -> list[str]:
 
 def test_entries_come_back_bit_by_bit(tmp_path: Path) -> None:
     written(tmp_path / "flight" / "j").close()
-    for found, wanted in zip(RunJournal(tmp_path / "flight" / "j", "k", 3).entries(), _ENTRIES, strict=True):
+    for found, wanted in zip(
+        RunJournal(tmp_path / "flight" / "j", "k", 3).entries(), _ENTRIES, strict=True
+    ):
         assert (found.kind, found.values) == (wanted.kind, wanted.values)
         assert list(found.arrays) == list(wanted.arrays)
         for name, array in wanted.arrays.items():
-            assert found.arrays[name].dtype == array.dtype and np.array_equal(found.arrays[name], array)
+            assert found.arrays[name].dtype == array.dtype and np.array_equal(
+                found.arrays[name], array
+            )
 
 
 def test_one_of_another_run_is_empty_and_written_over(tmp_path: Path) -> None:
@@ -49,7 +59,9 @@ def test_one_of_another_run_is_empty_and_written_over(tmp_path: Path) -> None:
     assert kinds(tmp_path / "j", "other") == ["c"] and kinds(tmp_path / "j") == []
 
 
-def test_the_disk_has_entries_after_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_disk_has_entries_after_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What a power cut may take; to wait for the disk each time would hold up every frame."""
     now_s, synced = [100.0], []
     monkeypatch.setattr("sorvolo.store.site.journal.time.monotonic", lambda: now_s[0])
@@ -98,14 +110,21 @@ def test_a_flipped_bit_ends_it(tmp_path: Path) -> None:
     assert kinds(tmp_path / "j") == ["a"]
 
 
-@pytest.mark.parametrize("head", [
-    {"kind": "x", "values": {}, "arrays": [["m", "<f8", [1 << 40]]]},
-    {"kind": "x", "values": {}, "arrays": [["m", "<f8", [-1]]]},
-    {"kind": "x", "values": {}, "arrays": [["m", "|O", [1]]]},
-    {"kind": "x", "values": {}, "arrays": [["m", "<f8", [True]]]},
-    {"kind": "x", "values": {}, "arrays": [["m", "|u1", [0] * 40]]},
-    {"kind": "x", "values": [], "arrays": []}, {"kind": 7, "values": {}, "arrays": []}, [], "[" * 100_000, 7,
-])
+@pytest.mark.parametrize(
+    "head",
+    [
+        {"kind": "x", "values": {}, "arrays": [["m", "<f8", [1 << 40]]]},
+        {"kind": "x", "values": {}, "arrays": [["m", "<f8", [-1]]]},
+        {"kind": "x", "values": {}, "arrays": [["m", "|O", [1]]]},
+        {"kind": "x", "values": {}, "arrays": [["m", "<f8", [True]]]},
+        {"kind": "x", "values": {}, "arrays": [["m", "|u1", [0] * 40]]},
+        {"kind": "x", "values": [], "arrays": []},
+        {"kind": 7, "values": {}, "arrays": []},
+        [],
+        "[" * 100_000,
+        7,
+    ],
+)
 def test_what_no_sorvolo_wrote_ends_it(tmp_path: Path, head: object) -> None:
     written(tmp_path / "j", _ENTRIES[:1]).close()
     text = head.encode() if isinstance(head, str) else json.dumps(head).encode()
@@ -133,7 +152,11 @@ def test_arrays_of_objects_are_not_written(tmp_path: Path) -> None:
 def test_content_is_one_number(tmp_path: Path) -> None:
     first = content_sha256({"b": 1, "a": np.arange(3)}, "x", None, tmp_path)
     assert first == content_sha256({"a": np.arange(3), "b": 1}, "x", None, tmp_path)
-    for other in ({"a": np.arange(3), "b": 1.0}, {"a": np.arange(3.0), "b": 1}, {"a": np.arange(4), "b": 1}):
+    for other in (
+        {"a": np.arange(3), "b": 1.0},
+        {"a": np.arange(3.0), "b": 1},
+        {"a": np.arange(4), "b": 1},
+    ):
         assert first != content_sha256(other, "x", None, tmp_path)
     assert content_sha256(["a", ["b"]]) != content_sha256([["a"], "b"])
     with pytest.raises(TypeError, match="content"):

@@ -40,7 +40,9 @@ class Outer:
 def outer(mask: Mask | None = None) -> Outer:
     gray = np.arange(35, dtype=np.uint8).reshape(5, 7)
     inner = Inner(np.array([1 / 3, np.nan]), "Ötztal")
-    return Outer(Colour.RED, True, float("inf"), mask, gray, inner, ((1, 0.5), (2, 1 / 3)), (inner, inner))
+    return Outer(
+        Colour.RED, True, float("inf"), mask, gray, inner, ((1, 0.5), (2, 1 / 3)), (inner, inner)
+    )
 
 
 def test_a_record_comes_back_bit_by_bit_through_the_file(tmp_path: Path) -> None:
@@ -58,12 +60,20 @@ def test_a_record_comes_back_bit_by_bit_through_the_file(tmp_path: Path) -> None
     assert [each.name for each in two.many] == ["Ötztal", "Ötztal"]
 
 
-@pytest.mark.parametrize("value", [
-    [1, 2], "text", None, ["blue", True, 1.0, None, "a0", None, [], []], ["red", 1, 1.0, None, "a0", None, [], []],
-    ["red", True, 1.0, ["a0", "|b1", 10**9, 10**9], "a0", None, [], []],
-    ["red", True, 1.0, ["a0", "|b1", 5, -7], "a0", None, [], []],
-    ["red", True, 1.0, ["a0", "|b1", 50, 70], "a0", None, [], []], ["red", True, 1.0, None, "none", None, [], []],
-])
+@pytest.mark.parametrize(
+    "value",
+    [
+        [1, 2],
+        "text",
+        None,
+        ["blue", True, 1.0, None, "a0", None, [], []],
+        ["red", 1, 1.0, None, "a0", None, [], []],
+        ["red", True, 1.0, ["a0", "|b1", 10**9, 10**9], "a0", None, [], []],
+        ["red", True, 1.0, ["a0", "|b1", 5, -7], "a0", None, [], []],
+        ["red", True, 1.0, ["a0", "|b1", 50, 70], "a0", None, [], []],
+        ["red", True, 1.0, None, "none", None, [], []],
+    ],
+)
 def test_what_no_packer_made_is_refused(value: object) -> None:
     with pytest.raises((KeyError, TypeError, ValueError, IndexError)):
         unpacked(Outer, value, {"a0": np.frombuffer(b"x\x9c\x03\x00\x00\x00\x00\x01", np.uint8)})

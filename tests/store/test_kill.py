@@ -11,10 +11,15 @@ import pytest
 from sorvolo.store.site.archive import Archive
 
 
-@pytest.mark.parametrize(("moments", "rounds", "kind"), [
-    ("steps", 3, "sqlite"), pytest.param("random", 5, "sqlite", marks=pytest.mark.long),
-    pytest.param("random", 3, "postgresql", marks=pytest.mark.long),
-], indirect=["kind"])
+@pytest.mark.parametrize(
+    ("moments", "rounds", "kind"),
+    [
+        ("steps", 3, "sqlite"),
+        pytest.param("random", 5, "sqlite", marks=pytest.mark.long),
+        pytest.param("random", 3, "postgresql", marks=pytest.mark.long),
+    ],
+    indirect=["kind"],
+)
 def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int, kind: str) -> None:
     folder = tmp_path / "site"
     program = [sys.executable, fake_flights.__file__, moments, str(folder), "1", str(rounds)]
@@ -29,7 +34,9 @@ def test_a_site_survives_being_killed(tmp_path: Path, moments: str, rounds: int,
         assert all(entry.complete for entry in archive.versions())
         named = {keyframe.image_path for keyframe in archive.keyframes()}
     fake_flights.check_whole(folder)
-    assert {str(path.relative_to(folder)) for path in folder.glob("flights/*/keyframes/*/*")} == named
+    assert {
+        str(path.relative_to(folder)) for path in folder.glob("flights/*/keyframes/*/*")
+    } == named
     assert not list(folder.rglob(".tmp-*"))
     assert not list(folder.glob("flights/*/staged"))
     for flight in folder.glob("flights/*"):

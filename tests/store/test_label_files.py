@@ -12,19 +12,34 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import InputError
 from sorvolo.store.datasets import read_dataset
-from sorvolo.store.exports.label_files import coco_document, picture_of_detections, write_coco, write_yolo, yolo_text
+from sorvolo.store.exports.label_files import (
+    coco_document,
+    picture_of_detections,
+    write_coco,
+    write_yolo,
+    yolo_text,
+)
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
 
 BOX = st.tuples(st.floats(0, 190), st.floats(0, 90), st.floats(1, 10), st.floats(1, 10)).map(
     lambda each: (each[0], each[1], each[0] + each[2], each[1] + each[3])
 )
-FEW = settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FEW = settings(
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 
 
 def picture_at(path, boxes, labels, ignored=(), group="flight 1"):
     return LabelledPicture(
-        str(path), 200, 100, group, np.array(boxes, np.float32), np.array(labels), np.array(ignored, np.float32), 0.031
+        str(path),
+        200,
+        100,
+        group,
+        np.array(boxes, np.float32),
+        np.array(labels),
+        np.array(ignored, np.float32),
+        0.031,
     )
 
 
@@ -60,7 +75,10 @@ def test_yolo_comes_back_as_it_was_written(tmp_path, boxes, data):
 def test_coco_s_own_tool_reads_what_is_written(tmp_path):
     from pycocotools.coco import COCO
 
-    pictures = (picture_at("images/a.jpg", [(10, 20, 30, 60)], [1], [(0, 0, 5, 5)]), picture_at("images/b.jpg", [], []))
+    pictures = (
+        picture_at("images/a.jpg", [(10, 20, 30, 60)], [1], [(0, 0, 5, 5)]),
+        picture_at("images/b.jpg", [], []),
+    )
     labelled = LabelledSet("s", ("person", "car"), pictures)
     write_coco(tmp_path / "boxes.json", labelled, [np.array([0.87654]), np.zeros(0)])
     with contextlib.redirect_stdout(io.StringIO()):
@@ -101,4 +119,6 @@ def test_what_a_detector_saw_becomes_labels():
     picture = picture_of_detections("images/a.jpg", 200, 100, "flight 2", seen)
     document = coco_document(LabelledSet("s", CLASSES, (picture,)), Path("."))
     (box,) = document["annotations"]
-    assert (box["category_id"], box["bbox"]) == (2, [1, 2, 2, 2]) and "m_per_px" not in document["images"][0]
+    assert (box["category_id"], box["bbox"]) == (2, [1, 2, 2, 2]) and "m_per_px" not in document[
+        "images"
+    ][0]

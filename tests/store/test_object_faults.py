@@ -19,9 +19,17 @@ from sorvolo.cli.main import main
 from sorvolo.errors import SettingsError, StoreError, UnavailableError
 from sorvolo.store.copies.bucket import BucketEnd
 from sorvolo.store.copies.folder import FolderEnd
-from sorvolo.store.copies.object_store import Objects, ObjectSettings, _kind_of, _words_of, open_objects
+from sorvolo.store.copies.object_store import (
+    Objects,
+    ObjectSettings,
+    _kind_of,
+    _words_of,
+    open_objects,
+)
 
-_QUICK = ObjectSettings(connect_s=1.0, request_s=1.0, retries=1, retry_s=2.0, tries=2, part_bytes=5 << 20)
+_QUICK = ObjectSettings(
+    connect_s=1.0, request_s=1.0, retries=1, retry_s=2.0, tries=2, part_bytes=5 << 20
+)
 
 
 @pytest.fixture(scope="module")
@@ -86,37 +94,57 @@ def _refused(words: str) -> None:
     assert SECRET not in shown and KEY not in shown and shown.endswith("True")
 
 
-@pytest.mark.parametrize(("status", "code", "words"), [
-    (403, "AccessDenied", r"no right to do this in the bucket: ask its owner .*\(AccessDenied\)"),
-    (403, "InvalidAccessKeyId", "the keys are not valid: check AWS_ACCESS_KEY_ID"),
-    (403, "SignatureDoesNotMatch", "the keys are not valid"),
-    (403, "RequestTimeTooSkewed", "clock is off: set it"),
-    (403, "ExpiredToken", "the session has ended"),
-    (404, "NoSuchBucket", "there is no such bucket"),
-    (400, "AuthorizationHeaderMalformed", "another region: set AWS_REGION"),
-    (301, "PermanentRedirect", "another region: set AWS_REGION"),
-    (503, "SlowDown", "the store is busy"),
-    (507, "XMinioStorageFull", "the store is full"),
-    (418, "Teapot", "the store answered 418 Teapot"),
-])
-def test_each_refusal_states_what_to_do(server: _Server, status: int, code: str, words: str) -> None:
+@pytest.mark.parametrize(
+    ("status", "code", "words"),
+    [
+        (
+            403,
+            "AccessDenied",
+            r"no right to do this in the bucket: ask its owner .*\(AccessDenied\)",
+        ),
+        (403, "InvalidAccessKeyId", "the keys are not valid: check AWS_ACCESS_KEY_ID"),
+        (403, "SignatureDoesNotMatch", "the keys are not valid"),
+        (403, "RequestTimeTooSkewed", "clock is off: set it"),
+        (403, "ExpiredToken", "the session has ended"),
+        (404, "NoSuchBucket", "there is no such bucket"),
+        (400, "AuthorizationHeaderMalformed", "another region: set AWS_REGION"),
+        (301, "PermanentRedirect", "another region: set AWS_REGION"),
+        (503, "SlowDown", "the store is busy"),
+        (507, "XMinioStorageFull", "the store is full"),
+        (418, "Teapot", "the store answered 418 Teapot"),
+    ],
+)
+def test_each_refusal_states_what_to_do(
+    server: _Server, status: int, code: str, words: str
+) -> None:
     server.answer = lambda request: request.refuse(status, code)
     _refused(words)
     assert server.asked <= 4  # 503 is asked again, within limits
 
 
-@pytest.mark.parametrize(("region", "clock_s", "words"), [
-    ("eu-west-1", 0.0, "another region: set AWS_REGION"),
-    ("eu-central-1", 3600.0, "clock is off: set it (by NTP)"),
-    ("eu-central-1", 0.0, "no site at"),
-])
+@pytest.mark.parametrize(
+    ("region", "clock_s", "words"),
+    [
+        ("eu-west-1", 0.0, "another region: set AWS_REGION"),
+        ("eu-central-1", 3600.0, "clock is off: set it (by NTP)"),
+        ("eu-central-1", 0.0, "no site at"),
+    ],
+)
 def test_a_wrong_region_and_a_wrong_clock_are_named_by_what_was_signed(
-    server: _Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, region: str,
-    clock_s: float, words: str,
+    server: _Server,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    region: str,
+    clock_s: float,
+    words: str,
 ) -> None:
     """As Amazon does: the region and the time that the client signed with are held against the server's own."""
+
     def checked(request: _Handler) -> None:
-        signed = datetime.strptime(request.headers["x-amz-date"], "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+        signed = datetime.strptime(request.headers["x-amz-date"], "%Y%m%dT%H%M%SZ").replace(
+            tzinfo=UTC
+        )
         if "/eu-central-1/s3/aws4_request" not in request.headers["authorization"]:
             request.refuse(400, "AuthorizationHeaderMalformed")
         elif abs((datetime.now(UTC) + timedelta(seconds=clock_s) - signed).total_seconds()) > 900:
@@ -132,11 +160,23 @@ def test_a_wrong_region_and_a_wrong_clock_are_named_by_what_was_signed(
     assert words in printed and SECRET not in printed and len(printed.splitlines()) == 1
 
 
-@pytest.mark.parametrize(("fault", "words"), [
-    ("Error performing PUT http://169.254.169.254/latest/api/token: status code: 403 Forbidden", "no keys were found"),
-    ("Error performing PUT http://169.254.169.254/latest/api/token: operation timed out", "no keys were found"),
-    ("error sending request https://store/x: error: InvalidCertificate(UnknownIssuer)", "certificate is not trusted"),
-])
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        (
+            "Error performing PUT http://169.254.169.254/latest/api/token: status code: 403 Forbidden",
+            "no keys were found",
+        ),
+        (
+            "Error performing PUT http://169.254.169.254/latest/api/token: operation timed out",
+            "no keys were found",
+        ),
+        (
+            "error sending request https://store/x: error: InvalidCertificate(UnknownIssuer)",
+            "certificate is not trusted",
+        ),
+    ],
+)
 def test_what_keeps_a_request_from_being_sent_is_not_waited_for(fault: str, words: str) -> None:
     """A batch tries again what may pass; missing keys and untrusted certificates do not."""
     assert words in _words_of(fault) and _kind_of(fault) is StoreError
@@ -203,7 +243,9 @@ def test_a_copy_that_loses_its_store_goes_on(one_flight: Path, tmp_path: Path) -
     stored = len(whole.sizes(""))
     assert stored == 5 and not BucketEnd(whole).has_site
     outcome = copied(FolderEnd(one_flight), BucketEnd(whole))
-    assert outcome.newest == 1 and outcome.copied < outcome.files  # what is there is not sent again, nor counted
+    assert (
+        outcome.newest == 1 and outcome.copied < outcome.files
+    )  # what is there is not sent again, nor counted
     with pytest.raises(StoreError, match="was cut"):
         copied(BucketEnd(_Failing(store, "memory://site")), FolderEnd(target))
     assert not (target / "site.db").exists()
@@ -212,7 +254,10 @@ def test_a_copy_that_loses_its_store_goes_on(one_flight: Path, tmp_path: Path) -
 
 
 def test_a_full_disk_is_announced_before_the_download(
-    one_flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    one_flight: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     with served_bucket():
         assert main(["site", "copy", str(one_flight), f"s3://{BUCKET}/full"]) == 0
@@ -227,9 +272,18 @@ def test_a_full_disk_is_announced_before_the_download(
         assert "there is no such bucket" in output and SECRET not in output and KEY not in output
 
 
-@pytest.mark.parametrize("address", [
-    "s3://", "s3:///x", "s3://UPPER/x", "s3://bucket/../x", "s3://bucket/a b", "s3://bucket/x?y=1", "s3://b/x",
-])
+@pytest.mark.parametrize(
+    "address",
+    [
+        "s3://",
+        "s3:///x",
+        "s3://UPPER/x",
+        "s3://bucket/../x",
+        "s3://bucket/a b",
+        "s3://bucket/x?y=1",
+        "s3://b/x",
+    ],
+)
 def test_addresses_that_name_no_place_are_refused(address: str) -> None:
     with pytest.raises(SettingsError, match="names no place in a store"):
         open_objects(address)
@@ -245,11 +299,15 @@ def test_keys_in_an_address_are_refused_and_not_repeated(monkeypatch: pytest.Mon
     assert SECRET not in str(caught.value)
 
 
-def test_keys_of_a_profile_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: _Server) -> None:
+def test_keys_of_a_profile_are_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: _Server
+) -> None:
     for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_REGION"):
         monkeypatch.delenv(name)
     (tmp_path / ".aws").mkdir()
-    (tmp_path / ".aws/credentials").write_text("[survey]\naws_access_key_id = OTHERKEY\naws_secret_access_key = x\n")
+    (tmp_path / ".aws/credentials").write_text(
+        "[survey]\naws_access_key_id = OTHERKEY\naws_secret_access_key = x\n"
+    )
     (tmp_path / ".aws/config").write_text("[profile survey]\nregion = eu-west-3\n")
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("AWS_PROFILE", "survey")

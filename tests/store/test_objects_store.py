@@ -19,17 +19,34 @@ from sorvolo.survey.map_objects import MapObject, ObjectSearch, SearchedFrames
 CROP = jpeg_from_image(image(3))
 
 
-def thing(object_id: str, east_m: float, north_m: float, label: str = "car", **others: object) -> MapObject:
+def thing(
+    object_id: str, east_m: float, north_m: float, label: str = "car", **others: object
+) -> MapObject:
     """A car, seen four times."""
     plain = MapObject(
-        object_id, label, 0.8, np.array([east_m, north_m]), 0.2, 4.4, 1.8, 4, 5, 1_700_000_000 * 10**9,
-        1_700_000_009 * 10**9, class_scores={label: 1.0}, best_frame="3", crop_jpeg=CROP,
+        object_id,
+        label,
+        0.8,
+        np.array([east_m, north_m]),
+        0.2,
+        4.4,
+        1.8,
+        4,
+        5,
+        1_700_000_000 * 10**9,
+        1_700_000_009 * 10**9,
+        class_scores={label: 1.0},
+        best_frame="3",
+        crop_jpeg=CROP,
     )
     return replace(plain, **others)
 
 
 def search(
-    objects: tuple[MapObject, ...], west_m: float = -50.0, east_m: float = 50.0, frames: int = 3,
+    objects: tuple[MapObject, ...],
+    west_m: float = -50.0,
+    east_m: float = 50.0,
+    frames: int = 3,
     classes: tuple[str, ...] = ("person", "car"),
 ) -> ObjectSearch:
     """A search of some frames over one rectangle of ground."""
@@ -57,24 +74,44 @@ def features(path: Path) -> dict[str, dict[str, object]]:
 @pytest.mark.usefixtures("kind")
 def test_files_of_a_flight_and_of_the_site(tmp_path: Path) -> None:
     """Both agree; the crops lie where they state."""
-    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0, "person", length_m=float("nan")))))
-    own, whole = features(tmp_path / "flights/a/objects.geojson"), features(tmp_path / "objects.geojson")
+    commit(
+        tmp_path,
+        "a",
+        search(
+            (thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0, "person", length_m=float("nan")))
+        ),
+    )
+    own, whole = (
+        features(tmp_path / "flights/a/objects.geojson"),
+        features(tmp_path / "objects.geojson"),
+    )
     assert list(own) == list(whole) == ["a-o1", "a-o2"]
     assert own["a-o1"]["class"] == "car"
     assert own["a-o2"]["length_m"] is None
     assert whole["a-o1"]["east_m"] == 3.0
     assert own["a-o1"]["first_seen"] == "2023-11-14T22:13:20.000000Z"
-    north = json.loads((tmp_path / "objects.geojson").read_text())["features"][0]["geometry"]["coordinates"][1]
+    north = json.loads((tmp_path / "objects.geojson").read_text())["features"][0]["geometry"][
+        "coordinates"
+    ][1]
     assert north == pytest.approx(46.5 + 4.0 / 111_170, abs=2e-6)
-    for crop in (tmp_path / str(whole["a-o1"]["crop"]), tmp_path / "flights/a" / str(own["a-o1"]["crop"])):
+    for crop in (
+        tmp_path / str(whole["a-o1"]["crop"]),
+        tmp_path / "flights/a" / str(own["a-o1"]["crop"]),
+    ):
         assert image_from_jpeg(crop.read_bytes(), "crop").shape == (54, 96, 3)
 
 
 @pytest.mark.usefixtures("kind")
 def test_a_later_flight_replaces_what_it_looked_at(tmp_path: Path) -> None:
     """Gone where two of its frames looked and found nothing, kept where none looked, older where it still stands."""
-    commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0), thing("a-o3", -30.0, 0.0))))
-    later = thing("b-o1", 3.3, 4.1, first_seen_ns=1_700_090_000 * 10**9, last_seen_ns=1_700_090_009 * 10**9)
+    commit(
+        tmp_path,
+        "a",
+        search((thing("a-o1", 3.0, 4.0), thing("a-o2", 9.0, -2.0), thing("a-o3", -30.0, 0.0))),
+    )
+    later = thing(
+        "b-o1", 3.3, 4.1, first_seen_ns=1_700_090_000 * 10**9, last_seen_ns=1_700_090_009 * 10**9
+    )
     commit(tmp_path, "b", search((later,), west_m=-10.0))
     site = features(tmp_path / "objects.geojson")
     assert list(site) == ["a-o3", "b-o1"]
@@ -105,10 +142,19 @@ def test_a_flight_replaces_only_the_classes_that_it_looked_for(tmp_path: Path) -
     assert list(features(tmp_path / "objects.geojson")) == ["a-o2"]
     both = {"car": np.array([True, True, True]), "person": np.array([False, True, False])}
     once = search(())
-    commit(tmp_path, "c", replace(once, frames=SearchedFrames(once.frames.outlines_m[:2], {
-        name: rows[:2] for name, rows in both.items()
-    })))
-    assert list(features(tmp_path / "objects.geojson")) == [], "one frame looked for people, and it was the only one"
+    commit(
+        tmp_path,
+        "c",
+        replace(
+            once,
+            frames=SearchedFrames(
+                once.frames.outlines_m[:2], {name: rows[:2] for name, rows in both.items()}
+            ),
+        ),
+    )
+    assert list(features(tmp_path / "objects.geojson")) == [], (
+        "one frame looked for people, and it was the only one"
+    )
     with Archive.open(tmp_path, write=False) as archive:
         stored = archive.searches()
     assert [len(each.frames.for_class("person")) for each in stored] == [3, 0, 1]
@@ -139,7 +185,9 @@ def test_a_site_of_format_2(tmp_path: Path) -> None:
     """It is read as having no objects, and brought up to date when it is written."""
     commit(tmp_path, "a", None)
     connection = sqlite3.connect(tmp_path / "site.db")
-    connection.executescript("DROP TABLE objects; DROP TABLE searches; DROP TABLE flown; PRAGMA user_version = 2;")
+    connection.executescript(
+        "DROP TABLE objects; DROP TABLE searches; DROP TABLE flown; PRAGMA user_version = 2;"
+    )
     connection.close()
     with Archive.open(tmp_path, write=False) as archive:
         assert archive.objects() == []
@@ -154,7 +202,9 @@ def test_a_site_of_format_4(tmp_path: Path) -> None:
     """Its searches count as searches for all classes; it is read as it is, and brought up to date when written."""
     commit(tmp_path, "a", search((thing("a-o1", 3.0, 4.0, "person"),), classes=("person",)))
     connection = sqlite3.connect(tmp_path / "site.db")
-    connection.executescript("ALTER TABLE searches DROP COLUMN searched_for; PRAGMA user_version = 4;")
+    connection.executescript(
+        "ALTER TABLE searches DROP COLUMN searched_for; PRAGMA user_version = 4;"
+    )
     connection.close()
     with Archive.open(tmp_path, write=False) as archive:
         assert [len(each.frames.for_class("car")) for each in archive.searches()] == [3]
@@ -177,7 +227,15 @@ def test_a_site_of_a_later_format_is_refused(tmp_path: Path) -> None:
 
 def test_section_of_the_report() -> None:
     """Text is escaped; without a model it states why nothing was looked for; old reports have no section."""
-    row = {"id": "a-o1", "class": "<i>", "score": 0.8, "east_m": 1.0, "north_m": 2.0, "sigma_m": None, "views": 3}
+    row = {
+        "id": "a-o1",
+        "class": "<i>",
+        "score": 0.8,
+        "east_m": 1.0,
+        "north_m": 2.0,
+        "sigma_m": None,
+        "views": 3,
+    }
     placed = {**row, "id": "a-o2", "sigma_m": 0.534}
     reported = {"model": "fast", "classes": {"<i>": 1}, "list": [row, placed]}
     page = objects_section({"objects": reported}, {"a-o1": CROP})
@@ -185,7 +243,13 @@ def test_section_of_the_report() -> None:
     assert "1 &lt;i&gt;" in page
     assert page.count(">+1.0, +2.0<") == 2 and ">0.5 m<" in page
     placed_page = objects_section({"objects": reported}, {}, SITE)
-    assert ">46.500018, 13.250013<" in placed_page and ">33T UM" in placed_page and ">UTM<" in placed_page
+    assert (
+        ">46.500018, 13.250013<" in placed_page
+        and ">33T UM" in placed_page
+        and ">UTM<" in placed_page
+    )
     assert "data:image/jpeg;base64," in page
-    assert "no model was wanted" in objects_section({"objects": {"model": None, "why_not": "no model was wanted"}}, {})
+    assert "no model was wanted" in objects_section(
+        {"objects": {"model": None, "why_not": "no model was wanted"}}, {}
+    )
     assert objects_section({}, {}) == ""

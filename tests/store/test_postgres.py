@@ -65,28 +65,44 @@ def content(site: Path) -> dict[str, bytes]:
 def test_the_folder_names_the_schema_and_no_secret(
     postgres: PostgresServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(VARIABLE, postgres.url.replace("sorvolo@", f"sorvolo:{PASSWORD}@"))  # this user needs none
+    monkeypatch.setenv(
+        VARIABLE, postgres.url.replace("sorvolo@", f"sorvolo:{PASSWORD}@")
+    )  # this user needs none
     with Archive.open(tmp_path / "Feld 3", write=True) as archive:
         archive.create_site(SITE)
     pointer = json.loads((tmp_path / "Feld 3" / POINTER).read_text())
     assert pointer["url"] == postgres.url.replace("sorvolo@", "")
-    assert pointer["schema"].startswith("sorvolo_feld_3_") and not (tmp_path / "Feld 3" / "site.db").exists()
+    assert (
+        pointer["schema"].startswith("sorvolo_feld_3_")
+        and not (tmp_path / "Feld 3" / "site.db").exists()
+    )
 
 
 def test_a_folder_connects_nowhere_that_its_user_did_not_name(
     site: Path, monkeypatch: pytest.MonkeyPatch, postgres: PostgresServer
 ) -> None:
-    monkeypatch.setattr(postgres_database, "create_engine", lambda *_, **__: pytest.fail("it would connect"))
+    monkeypatch.setattr(
+        postgres_database, "create_engine", lambda *_, **__: pytest.fail("it would connect")
+    )
     for trusted in ("", "sqlite", "postgresql://a.example/x postgresql://b.example/y"):
         monkeypatch.setenv(VARIABLE, trusted)
-        with pytest.raises(StoreError, match=rf"{VARIABLE}=postgresql://127\.0\.0\.1:{postgres.port}/postgres"):
+        with pytest.raises(
+            StoreError, match=rf"{VARIABLE}=postgresql://127\.0\.0\.1:{postgres.port}/postgres"
+        ):
             Archive.open(site, write=False)
 
 
-@pytest.mark.parametrize("content", [
-    "", "{}", '{"url": "sqlite", "schema": "a"}', '{"url": 3, "schema": 4}', "[" * 9999,
-    '{"url": "postgresql://127.0.0.1/x", "schema": "a; DROP SCHEMA public"}',
-])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{}",
+        '{"url": "sqlite", "schema": "a"}',
+        '{"url": 3, "schema": 4}',
+        "[" * 9999,
+        '{"url": "postgresql://127.0.0.1/x", "schema": "a; DROP SCHEMA public"}',
+    ],
+)
 def test_a_pointer_that_is_none_is_refused_and_left_alone(tmp_path: Path, content: str) -> None:
     (tmp_path / POINTER).write_text(content)
     for write in (True, False):
@@ -95,7 +111,9 @@ def test_a_pointer_that_is_none_is_refused_and_left_alone(tmp_path: Path, conten
     assert (tmp_path / POINTER).read_text() == content
 
 
-@pytest.mark.parametrize("words", ["postgresql://host", "mysql://host/db", "field", "postgresql://host:port/db"])
+@pytest.mark.parametrize(
+    "words", ["postgresql://host", "mysql://host/db", "field", "postgresql://host:port/db"]
+)
 def test_an_address_that_is_none_is_refused(words: str) -> None:
     with pytest.raises(SettingsError, match="postgresql://USER@HOST/DATABASE"):
         parsed_url(words)
@@ -112,11 +130,16 @@ def test_a_site_keeps_its_catalogue_where_it_is(
     with Archive.open(tmp_path / "file", write=True):
         pass
     monkeypatch.setenv(VARIABLE, postgres.url)
-    with Archive.open(tmp_path / "file", write=True), pytest.raises(SettingsError, match="in its folder already"):
+    with (
+        Archive.open(tmp_path / "file", write=True),
+        pytest.raises(SettingsError, match="in its folder already"),
+    ):
         chosen_catalogues(tmp_path / "file", postgres.url)
 
 
-def test_what_one_command_chooses_holds_for_no_other(postgres: PostgresServer, tmp_path: Path) -> None:
+def test_what_one_command_chooses_holds_for_no_other(
+    postgres: PostgresServer, tmp_path: Path
+) -> None:
     chosen = Catalogues.of_environment().choosing(postgres.url)
     for name, catalogues, file in (("chosen", chosen, POINTER), ("plain", None, CATALOGUE)):
         with Archive.open(tmp_path / name, write=True, catalogues=catalogues):
@@ -177,7 +200,9 @@ def test_a_killed_writer_s_lock_is_free_soon(site: Path) -> None:
         assert map_flight(archive, "b", 60, count=1) == 2  # the number of the killed one
 
 
-def test_a_server_that_restarts_between_two_steps_is_waited_for(site: Path, postgres: PostgresServer) -> None:
+def test_a_server_that_restarts_between_two_steps_is_waited_for(
+    site: Path, postgres: PostgresServer
+) -> None:
     with Archive.open(site, write=True) as archive, archive.begin_flight("b", "", {}) as writer:
         path = writer.save_image(0, image(0))
         writer.tiles[3, 3] = tile(9)
@@ -199,7 +224,9 @@ def test_a_server_that_is_gone_ends_a_flight_as_a_kill_does(
         journal = archive.journal("b", "key")
         journal.append(Entry("frame", {}))
         with (
-            pytest.raises(ConnectionLostError, match=r"run the same command again.*continues where it was"),
+            pytest.raises(
+                ConnectionLostError, match=r"run the same command again.*continues where it was"
+            ),
             archive.begin_flight("b", "", {}, journal=journal) as writer,
         ):
             writer.save_image(0, image(0))
@@ -209,14 +236,20 @@ def test_a_server_that_is_gone_ends_a_flight_as_a_kill_does(
             finally:
                 postgres.start()
     with Archive.open(site, write=True) as archive:  # for the run that goes on
-        assert archive.journal("b", "key").is_begun and list(site.glob("flights/b/keyframes/*/*.jpg"))
+        assert archive.journal("b", "key").is_begun and list(
+            site.glob("flights/b/keyframes/*/*.jpg")
+        )
         assert [each.id for each in archive.flights()] == ["a"] and len(archive.tiles()) == 2
         assert map_flight(archive, "b", 60, count=1) == 2
 
 
-def test_a_connection_cut_within_a_transaction_undoes_it_whole(site: Path, postgres: PostgresServer) -> None:
-    cut = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name = 'sorvolo' AND pid <> " \
+def test_a_connection_cut_within_a_transaction_undoes_it_whole(
+    site: Path, postgres: PostgresServer
+) -> None:
+    cut = (
+        "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name = 'sorvolo' AND pid <> "
         "pg_backend_pid()"
+    )
     with Archive.open(site, write=True) as archive:
         catalogue = archive._files.catalogue
         with pytest.raises(ConnectionLostError), catalogue.changing() as connection:
@@ -229,11 +262,15 @@ def test_a_connection_cut_within_a_transaction_undoes_it_whole(site: Path, postg
         assert archive.site().name == "whole"
 
 
-def test_a_writer_that_lost_its_lock_to_another_stops(site: Path, tmp_path: Path, postgres: PostgresServer) -> None:
+def test_a_writer_that_lost_its_lock_to_another_stops(
+    site: Path, tmp_path: Path, postgres: PostgresServer
+) -> None:
     other = tmp_path / "other machine"
     shutil.copytree(site, other)
     with Archive.open(site, write=True) as archive:
-        postgres.sql("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name = 'sorvolo'")
+        postgres.sql(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE application_name = 'sorvolo'"
+        )
         with Archive.open(other, write=True):
             pass
         with pytest.raises(StoreError, match="another process wrote"):
@@ -241,26 +278,36 @@ def test_a_writer_that_lost_its_lock_to_another_stops(site: Path, tmp_path: Path
 
 
 def test_a_wrong_password_is_named_and_never_shown(
-    site: Path, tmp_path: Path, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch,
+    site: Path,
+    tmp_path: Path,
+    postgres: PostgresServer,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     postgres.sql("DROP ROLE IF EXISTS guarded", f"CREATE ROLE guarded LOGIN PASSWORD '{PASSWORD}'")
     name = schema_of(site)
-    postgres.sql(f"GRANT USAGE ON SCHEMA {name} TO guarded", f"GRANT SELECT ON ALL TABLES IN SCHEMA {name} TO guarded")
+    postgres.sql(
+        f"GRANT USAGE ON SCHEMA {name} TO guarded",
+        f"GRANT SELECT ON ALL TABLES IN SCHEMA {name} TO guarded",
+    )
     url = f"postgresql://guarded@127.0.0.1:{postgres.port}/postgres"
     monkeypatch.setenv("PGPASSFILE", str(tmp_path / "none"))
     for wrong in (url.replace("guarded@", "guarded:wr0ng-horse@"), url):
         monkeypatch.setenv(VARIABLE, wrong)
         assert main(["--debug", "history", str(site)]) == 1
         printed = "".join(capsys.readouterr())
-        assert "~/.pgpass or PGPASSWORD" in printed.splitlines()[-1] and "wr0ng-horse" not in printed
+        assert (
+            "~/.pgpass or PGPASSWORD" in printed.splitlines()[-1] and "wr0ng-horse" not in printed
+        )
     monkeypatch.setenv(VARIABLE, url)
     monkeypatch.setenv("PGPASSWORD", PASSWORD)
     with Archive.open(site, write=False) as reader:
         assert len(reader.keyframes()) == 2
     # this role may read
     before = content(site)
-    with pytest.raises(StoreError, match=r"cannot be written or read by guarded \(permission denied"):
+    with pytest.raises(
+        StoreError, match=r"cannot be written or read by guarded \(permission denied"
+    ):
         Archive.open(site, write=True)
     with pytest.raises(StoreError, match="permission denied"):
         Archive.open(site.parent / "new", write=True)
@@ -275,7 +322,10 @@ def test_a_full_server_is_named(site: Path, postgres: PostgresServer) -> None:
         "$$ BEGIN RAISE EXCEPTION 'could not extend file: No space left on device' USING ERRCODE = '53100'; END $$",
         f"CREATE TRIGGER full_disk BEFORE INSERT ON {name}.keyframes EXECUTE FUNCTION {name}.full_disk()",
     )
-    with Archive.open(site, write=True) as archive, pytest.raises(StoreError, match=r"disk full.*on the server"):
+    with (
+        Archive.open(site, write=True) as archive,
+        pytest.raises(StoreError, match=r"disk full.*on the server"),
+    ):
         map_flight(archive, "b", 60, count=1)
     postgres.sql(f"DROP TRIGGER full_disk ON {name}.keyframes")
     with Archive.open(site, write=True) as archive:
@@ -283,7 +333,9 @@ def test_a_full_server_is_named(site: Path, postgres: PostgresServer) -> None:
         map_flight(archive, "b", 60, count=1)
 
 
-def test_a_standby_is_read_and_named_when_it_is_to_be_written(site: Path, postgres: PostgresServer) -> None:
+def test_a_standby_is_read_and_named_when_it_is_to_be_written(
+    site: Path, postgres: PostgresServer
+) -> None:
     postgres.stop()
     postgres.start(only_reads=True)
     try:
@@ -302,15 +354,19 @@ def test_a_standby_is_read_and_named_when_it_is_to_be_written(site: Path, postgr
         assert map_flight(archive, "b", 60, count=1) == 2
 
 
-def test_a_database_set_to_read_only_is_read_and_never_written(site: Path, postgres: PostgresServer) -> None:
+def test_a_database_set_to_read_only_is_read_and_never_written(
+    site: Path, postgres: PostgresServer
+) -> None:
     """As hosts set a database whose disk is full: any session could undo it, and would fill the rest."""
     postgres.sql("ALTER DATABASE postgres SET default_transaction_read_only = on")
     before = content(site)
     try:
         with Archive.open(site, write=False) as reader:
             assert [each.id for each in reader.flights()] == ["a"]
-        with pytest.raises(StoreError, match="as hosts do when a disk is full"), \
-                Archive.open(site, write=True) as archive:
+        with (
+            pytest.raises(StoreError, match="as hosts do when a disk is full"),
+            Archive.open(site, write=True) as archive,
+        ):
             map_flight(archive, "b", 60, count=1)
         assert content(site) == before
     finally:
@@ -324,14 +380,19 @@ def small_database(postgres: PostgresServer) -> Iterator[tuple[str, Path]]:
     """The address of a database on a file system of 24 MB, and that one's folder."""
     place = postgres.folder / "small"
     place.mkdir()
-    mounted = shutil.which("mount") and not subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(place)], capture_output=True
-    ).returncode
+    mounted = (
+        shutil.which("mount")
+        and not subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=24m", "tmpfs", str(place)], capture_output=True
+        ).returncode
+    )
     if not mounted:
         place.rmdir()
         pytest.skip("this user may not mount a small file system")
     shutil.chown(place, postgres.folder.owner())
-    postgres.sql(f"CREATE TABLESPACE small LOCATION '{place}'", "CREATE DATABASE small TABLESPACE small")
+    postgres.sql(
+        f"CREATE TABLESPACE small LOCATION '{place}'", "CREATE DATABASE small TABLESPACE small"
+    )
     yield postgres.url.replace("/postgres", "/small"), place
     postgres.sql("DROP DATABASE small WITH (FORCE)", "DROP TABLESPACE small")
     subprocess.run(["umount", "-l", str(place)], check=True)
@@ -350,7 +411,9 @@ def test_a_disk_of_the_server_that_fills_costs_one_flight(
         with open(filler, "wb", buffering=0) as file, suppress(OSError):
             while file.write(bytes(4096)):
                 pass
-        with pytest.raises(StoreError, match=r"disk full: .*No space left on device.*on the server"):
+        with pytest.raises(
+            StoreError, match=r"disk full: .*No space left on device.*on the server"
+        ):
             for number in range(200):  # what the pages that are there still hold is written
                 map_flight(archive, f"b{number}", 60, count=1)
         kept = [each.id for each in archive.flights()]
@@ -362,31 +425,61 @@ def test_a_disk_of_the_server_that_fills_costs_one_flight(
 def test_a_server_so_full_that_nobody_can_connect_is_named_as_full() -> None:
     url = parsed_url("postgresql://sorvolo@127.0.0.1/small")
     assert url is not None
-    error = PostgresDatabase(url, "sorvolo_x", write=True)._refused("FATAL:  could not write init file", ())
+    error = PostgresDatabase(url, "sorvolo_x", write=True)._refused(
+        "FATAL:  could not write init file", ()
+    )
     assert str(error).startswith("disk full: could not write postgresql://127.0.0.1/small")
 
 
 @pytest.mark.parametrize(
     ("user", "database", "more", "words"),
     [
-        ("nobody_x", "postgres", "", r'refused nobody_x .*"nobody_x" does not exist\); name another user'),
-        ("plain", "closed", "", r'permission denied for database "closed" .*ask for a role that may connect'),
+        (
+            "nobody_x",
+            "postgres",
+            "",
+            r'refused nobody_x .*"nobody_x" does not exist\); name another user',
+        ),
+        (
+            "plain",
+            "closed",
+            "",
+            r'permission denied for database "closed" .*ask for a role that may connect',
+        ),
         ("plain", "postgres", "sslmode=require", "does not support SSL.*correct sslmode"),
-        ("kept_out", "postgres", "", "pg_hba.conf.*have the server's administrator let this user and computer in"),
-        ("plain", "survey_x", "", r'"survey_x" does not exist.*make the database, or correct the address'),
+        (
+            "kept_out",
+            "postgres",
+            "",
+            "pg_hba.conf.*have the server's administrator let this user and computer in",
+        ),
+        (
+            "plain",
+            "survey_x",
+            "",
+            r'"survey_x" does not exist.*make the database, or correct the address',
+        ),
         ("guarded:wrong", "postgres", "", "password authentication failed.*give the password in"),
         ("guarded", "postgres", "", "no password supplied.*give the password in"),
     ],
 )
 @pytest.mark.parametrize("has_codes", [True, False])
 def test_who_is_not_let_in_is_an_error_and_not_waited_for(
-    user: str, database: str, more: str, words: str, has_codes: bool, tmp_path: Path, postgres: PostgresServer,
+    user: str,
+    database: str,
+    more: str,
+    words: str,
+    has_codes: bool,
+    tmp_path: Path,
+    postgres: PostgresServer,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     if not has_codes:  # as on a system where libpq has no trace
         monkeypatch.delattr(os, "memfd_create")
     _make_roles(postgres)
-    monkeypatch.setenv(VARIABLE, f"postgresql://{user}@127.0.0.1:{postgres.port}/{database}?{more}".rstrip("?"))
+    monkeypatch.setenv(
+        VARIABLE, f"postgresql://{user}@127.0.0.1:{postgres.port}/{database}?{more}".rstrip("?")
+    )
     with pytest.raises(StoreError, match=words) as caught:
         Archive.open(tmp_path / "site", write=True)
     assert not isinstance(caught.value, UnavailableError)
@@ -411,7 +504,10 @@ def test_what_a_server_refuses_for_another_reason_is_named_by_its_code(
 
 @pytest.mark.parametrize(
     ("more", "words"),
-    [("sslmod=require", 'invalid connection option "sslmod"'), ("sslmode=must", 'invalid sslmode value: "must"')],
+    [
+        ("sslmod=require", 'invalid connection option "sslmod"'),
+        ("sslmode=must", 'invalid sslmode value: "must"'),
+    ],
 )
 def test_an_option_of_an_address_that_nobody_knows_is_named(
     more: str, words: str, tmp_path: Path, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
@@ -426,14 +522,20 @@ def test_an_option_of_an_address_that_nobody_knows_is_named(
 def german() -> Iterator[PostgresServer]:
     """A server whose messages are German."""
     pytest.importorskip("psycopg")
-    with tempfile.TemporaryDirectory(prefix="sorvolo-locales-") as folder:  # pytest's own are closed to other users
+    with tempfile.TemporaryDirectory(
+        prefix="sorvolo-locales-"
+    ) as folder:  # pytest's own are closed to other users
         locales = Path(folder)
         locales.chmod(0o755)  # the server's own user reads it
         made = shutil.which("localedef") and subprocess.run(
-            ["localedef", "-i", "de_DE", "-f", "UTF-8", str(locales / "de_DE.UTF-8")], check=False, capture_output=True
+            ["localedef", "-i", "de_DE", "-f", "UTF-8", str(locales / "de_DE.UTF-8")],
+            check=False,
+            capture_output=True,
         )
         if program("initdb") is None or not made or not (locales / "de_DE.UTF-8").is_dir():
-            pytest.skip("PostgreSQL or the source of German locales is not installed (Debian: postgresql, locales)")
+            pytest.skip(
+                "PostgreSQL or the source of German locales is not installed (Debian: postgresql, locales)"
+            )
         server = PostgresServer(language="de_DE.UTF-8", locales=locales)
         _make_roles(server)
         yield server
@@ -451,7 +553,12 @@ def german() -> Iterator[PostgresServer]:
     ],
 )
 def test_a_server_that_speaks_another_language_is_understood(
-    user: str, database: str, german_words: str, advice: str, tmp_path: Path, german: PostgresServer,
+    user: str,
+    database: str,
+    german_words: str,
+    advice: str,
+    tmp_path: Path,
+    german: PostgresServer,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     from psycopg.pq import version
@@ -459,7 +566,9 @@ def test_a_server_that_speaks_another_language_is_understood(
     if version() < 180_000 and german_words in ("lehnt Verbindung ab", "fehlgeschlagen"):
         pytest.skip("libpq's trace has these codes since version 18")
     monkeypatch.setenv(VARIABLE, f"postgresql://{user}@127.0.0.1:{german.port}/{database}")
-    with pytest.raises(StoreError, match=rf"refused {user.partition(':')[0]} .*{german_words}.*{advice}") as caught:
+    with pytest.raises(
+        StoreError, match=rf"refused {user.partition(':')[0]} .*{german_words}.*{advice}"
+    ) as caught:
         Archive.open(tmp_path / "site", write=True)
     assert not isinstance(caught.value, UnavailableError)
 
@@ -470,10 +579,16 @@ def test_a_server_of_another_language_whose_connections_are_all_taken_is_waited_
     import psycopg
 
     # a role of its own: connections of others' tests may still be ending
-    german.sql("CREATE ROLE crowded LOGIN CONNECTION LIMIT 1", "GRANT CREATE ON DATABASE postgres TO crowded")
+    german.sql(
+        "CREATE ROLE crowded LOGIN CONNECTION LIMIT 1",
+        "GRANT CREATE ON DATABASE postgres TO crowded",
+    )
     address = f"postgresql://crowded@127.0.0.1:{german.port}/postgres"
     monkeypatch.setenv(VARIABLE, address)
-    with psycopg.connect(address), pytest.raises(ConnectionLostError, match="zu viele Verbindungen"):
+    with (
+        psycopg.connect(address),
+        pytest.raises(ConnectionLostError, match="zu viele Verbindungen"),
+    ):
         Archive.open(tmp_path / "site", write=True)
     german.sql("ALTER ROLE crowded CONNECTION LIMIT -1")
     with Archive.open(tmp_path / "site", write=True):
@@ -497,7 +612,9 @@ def test_a_server_that_is_not_there_or_never_answers_is_named(
         nobody = free.getsockname()[1]
     for port in (nobody, silent):
         monkeypatch.setenv(VARIABLE, f"postgresql://me@127.0.0.1:{port}/survey?connect_timeout=2")
-        with pytest.raises(ConnectionLostError, match=rf"no connection to postgresql://127\.0\.0\.1:{port}/survey"):
+        with pytest.raises(
+            ConnectionLostError, match=rf"no connection to postgresql://127\.0\.0\.1:{port}/survey"
+        ):
             Archive.open(tmp_path / "site", write=True)
     assert not (tmp_path / "site" / POINTER).exists()
 
@@ -523,12 +640,22 @@ def shape(url: str, name: str | None) -> dict[str, object]:
     engine = create_engine(url)
     about, found = inspect(engine), {}
     for table in sorted(set(about.get_table_names(name)) - {"alembic_version"}):
-        columns = [(each["name"], str(each["type"]), each["nullable"]) for each in about.get_columns(table, name)]
-        keys = [(each["constrained_columns"], each["referred_table"], each["options"])
-                for each in about.get_foreign_keys(table, name)]
+        columns = [
+            (each["name"], str(each["type"]), each["nullable"])
+            for each in about.get_columns(table, name)
+        ]
+        keys = [
+            (each["constrained_columns"], each["referred_table"], each["options"])
+            for each in about.get_foreign_keys(table, name)
+        ]
         unique = [each["column_names"] for each in about.get_unique_constraints(table, name)]
-        found[table] = (columns, about.get_pk_constraint(table, name)["constrained_columns"], keys, unique,
-                        sorted(str(each["column_names"]) for each in about.get_indexes(table, name)))
+        found[table] = (
+            columns,
+            about.get_pk_constraint(table, name)["constrained_columns"],
+            keys,
+            unique,
+            sorted(str(each["column_names"]) for each in about.get_indexes(table, name)),
+        )
     engine.dispose()
     return found
 
@@ -542,7 +669,10 @@ def test_migrations_from_nothing_end_with_today_s_tables(
     place: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     if place == "sqlite":
-        urls, names = [f"sqlite:///{tmp_path / each}" for each in ("migrated", "made")], [None, None]
+        urls, names = (
+            [f"sqlite:///{tmp_path / each}" for each in ("migrated", "made")],
+            [None, None],
+        )
     else:
         server = request.getfixturevalue("postgres")
         names = ["migrated", "made"]
@@ -571,21 +701,41 @@ def copied(source: Path, target: Path, scratch: Path) -> None:
 
 
 def test_a_site_of_today_moves_into_the_database(
-    postgres: PostgresServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    postgres: PostgresServer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     with Archive.open(tmp_path / "old", write=True) as archive:
         archive.create_site(SITE)
         map_flight(archive, "a", 20, count=2, compared=True)
-    words = ["site", "copy", str(tmp_path / "old"), str(tmp_path / "new"), "--catalogue", postgres.url]
+    words = [
+        "site",
+        "copy",
+        str(tmp_path / "old"),
+        str(tmp_path / "new"),
+        "--catalogue",
+        postgres.url,
+    ]
     assert main(words) == 0 and main(words) == 0, capsys.readouterr().err
     assert (tmp_path / "new" / POINTER).is_file() and not (tmp_path / "new" / "site.db").exists()
-    with pytest.raises(StoreError, match=f"set {VARIABLE}="):  # --catalogue was for that command alone
+    with pytest.raises(
+        StoreError, match=f"set {VARIABLE}="
+    ):  # --catalogue was for that command alone
         Archive.open(tmp_path / "new", write=False)
     monkeypatch.setenv(VARIABLE, postgres.url)
-    with Archive.open(tmp_path / "old", write=False) as old, Archive.open(tmp_path / "new", write=True) as new:
+    with (
+        Archive.open(tmp_path / "old", write=False) as old,
+        Archive.open(tmp_path / "new", write=True) as new,
+    ):
         assert new.flights() == old.flights() and len(new.changes()) == len(old.changes()) == 2
         assert map_flight(new, "b", 60, count=1) == 2
-    assert main(["site", "copy", str(tmp_path / "old"), "s3://bucket/new", "--catalogue", postgres.url]) == 1
+    assert (
+        main(
+            ["site", "copy", str(tmp_path / "old"), "s3://bucket/new", "--catalogue", postgres.url]
+        )
+        == 1
+    )
 
 
 def test_a_copy_s_catalogue_is_a_file_and_may_be_copied_back(site: Path, tmp_path: Path) -> None:
@@ -593,9 +743,14 @@ def test_a_copy_s_catalogue_is_a_file_and_may_be_copied_back(site: Path, tmp_pat
         map_flight(archive, "b", 60, count=1, compared=True)
     copied(site, tmp_path / "copy", tmp_path / "scratch")
     assert (tmp_path / "copy" / "site.db").is_file() and not (tmp_path / "copy" / POINTER).exists()
-    with Archive.open(site, write=False) as archive, Archive.open(tmp_path / "copy", write=True) as copy_of:
+    with (
+        Archive.open(site, write=False) as archive,
+        Archive.open(tmp_path / "copy", write=True) as copy_of,
+    ):
         assert copy_of.flights() == archive.flights() and copy_of.versions() == archive.versions()
-        assert [each.id for each in copy_of.changes()] == [each.id for each in archive.changes()] != []
+        assert (
+            [each.id for each in copy_of.changes()] == [each.id for each in archive.changes()] != []
+        )
         assert map_flight(copy_of, "c", 70, count=1) == 3
     copied(tmp_path / "copy", site, tmp_path / "again")
     with Archive.open(site, write=True) as archive:

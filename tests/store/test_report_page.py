@@ -26,12 +26,16 @@ def test_page_needs_nothing_else() -> None:
     page = report_page(fake_report(), fake_picture())
     checker = checked(page)
     assert "script" not in checker.names and "link" not in checker.names
-    assert len(checker.addresses) == 1 and checker.addresses[0].startswith("data:image/jpeg;base64,")
+    assert len(checker.addresses) == 1 and checker.addresses[0].startswith(
+        "data:image/jpeg;base64,"
+    )
     assert "http" not in page and "url(" not in page and "@import" not in page
 
 
 def test_a_later_flight_fits_the_map_and_made_none() -> None:
-    words = _words(report_page(fake_report() | {"comparison": {"against_version": 1}}, fake_picture()))
+    words = _words(
+        report_page(fake_report() | {"comparison": {"against_version": 1}}, fake_picture())
+    )
     assert re.search(r"\d+ of 60 frames matched the map", words) and "changes.html" in words
     assert "a frame and the map" in words
     alone = _words(report_page(fake_report(), fake_picture()))
@@ -52,16 +56,27 @@ def test_picture_is_the_map_on_grey() -> None:
 
 def test_large_pictures_are_made_to_fit() -> None:
     rng = np.random.default_rng(1)
-    noise = np.dstack([rng.integers(0, 256, (1600, 1600, 3)), np.full((1600, 1600), 255)]).astype(np.uint8)
+    noise = np.dstack([rng.integers(0, 256, (1600, 1600, 3)), np.full((1600, 1600), 255)]).astype(
+        np.uint8
+    )
     assert len(report_page(fake_report(), noise)) < 2_200_000
 
 
 def test_settings_are_words() -> None:
     thesis = {"bands": 5, "side_px": None}
-    wishes = {"overlap": 0.7, "crs": None, "checks": [], "classes": ["person", "car"], "thesis": thesis}
+    wishes = {
+        "overlap": 0.7,
+        "crs": None,
+        "checks": [],
+        "classes": ["person", "car"],
+        "thesis": thesis,
+    }
     words = _words(report_page(fake_report() | {"settings": wishes}, fake_picture()))
     for shown in (
-        "overlap 0.7", "crs chosen from the flight", "checks none", "classes person, car",
+        "overlap 0.7",
+        "crs chosen from the flight",
+        "checks none",
+        "classes person, car",
         "thesis bands 5, side_px chosen from the flight",
     ):
         assert shown in words
@@ -85,7 +100,8 @@ def _with_every_text(value: Any, text: str) -> Any:
     """The report with every text that a file or a person gave replaced; keys of reasons and settings, too."""
     if isinstance(value, dict):
         changed = {
-            key: each if key == "status" else _with_every_text(each, text) for key, each in value.items()
+            key: each if key == "status" else _with_every_text(each, text)
+            for key, each in value.items()
         }
         if "reasons" in changed:
             changed["reasons"] = {text: 1}
@@ -102,7 +118,9 @@ def test_marks_are_one_for_each_frame() -> None:
     classes = _classes_of_marks(plot)
     frames = report["frames"]
     assert (classes.count("vision"), classes.count("gps-only"), classes.count("rejected")) == (
-        frames["vision"], frames["gps-only"], frames["rejected"]
+        frames["vision"],
+        frames["gps-only"],
+        frames["rejected"],
     )
     plan = next(each for each in residuals if each.startswith("The track"))
     assert _classes_of_marks(plan).count("rejected") == 0
@@ -116,15 +134,38 @@ def _classes_of_marks(part: str) -> list[str]:
 def test_fix_lies_at_camera_less_residual() -> None:
     report = fake_report(8)
     report["track"] = [
-        {"frame": "a", "status": "vision", "east_m": 0.0, "north_m": 0.0, "up_m": 1.0, "residual_px": 1.0,
-         "sigma_m": 1.0, "gps_east_m": -10.0, "gps_north_m": 0.0, "gps_up_m": 0.0},
-        {"frame": "b", "status": "vision", "east_m": 0.0, "north_m": 10.0, "up_m": 1.0, "residual_px": 1.0,
-         "sigma_m": 1.0, "gps_east_m": 0.0, "gps_north_m": 0.0, "gps_up_m": 0.0},
+        {
+            "frame": "a",
+            "status": "vision",
+            "east_m": 0.0,
+            "north_m": 0.0,
+            "up_m": 1.0,
+            "residual_px": 1.0,
+            "sigma_m": 1.0,
+            "gps_east_m": -10.0,
+            "gps_north_m": 0.0,
+            "gps_up_m": 0.0,
+        },
+        {
+            "frame": "b",
+            "status": "vision",
+            "east_m": 0.0,
+            "north_m": 10.0,
+            "up_m": 1.0,
+            "residual_px": 1.0,
+            "sigma_m": 1.0,
+            "gps_east_m": 0.0,
+            "gps_north_m": 0.0,
+            "gps_up_m": 0.0,
+        },
     ]
     page = report_page(report, fake_picture(60, 40))
     plan = next(each for each in page.split("<h2>") if each.startswith("The track"))
     fixes, cameras = (
-        [(float(x), float(y)) for x, y in re.findall(rf'class="{name}" cx="([\d.]+)" cy="([\d.]+)"', plan)]
+        [
+            (float(x), float(y))
+            for x, y in re.findall(rf'class="{name}" cx="([\d.]+)" cy="([\d.]+)"', plan)
+        ]
         for name in ("fix", "vision")
     )
     assert fixes[0][0] > cameras[0][0] and fixes[0][1] == cameras[0][1]  # 10 m to the east
@@ -132,12 +173,18 @@ def test_fix_lies_at_camera_less_residual() -> None:
     assert fixes[0][0] - cameras[0][0] == pytest.approx(cameras[0][1] - cameras[1][1], abs=0.2)
 
 
-@pytest.mark.parametrize(("counts", "words"), [
-    ((60, 0, 0), "60 of 60 frames matched: a map of 3\u202f412 m\u00b2"),
-    ((55, 3, 2), "55 of 60 frames matched, 3 placed by GPS only, 2 not placed: a map of 3\u202f412 m\u00b2 at a "
-                 "ground resolution of 3 cm per pixel."),
-    ((0, 0, 60), "there is no map"),
-])
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        ((60, 0, 0), "60 of 60 frames matched: a map of 3\u202f412 m\u00b2"),
+        (
+            (55, 3, 2),
+            "55 of 60 frames matched, 3 placed by GPS only, 2 not placed: a map of 3\u202f412 m\u00b2 at a "
+            "ground resolution of 3 cm per pixel.",
+        ),
+        ((0, 0, 60), "there is no map"),
+    ],
+)
 def test_headline_is_honest(counts: tuple[int, int, int], words: str) -> None:
     report = fake_report()
     report["frames"] |= dict(zip(("vision", "gps-only", "rejected"), counts))
@@ -152,7 +199,9 @@ def test_local_map_promises_no_metres() -> None:
     assert "without metres and without north" in headline
     assert " m\u00b2" not in headline and "cm" not in headline and 'class="scale"' not in page
     words = _words(page)
-    assert "units" not in words and "GPS fix" not in words and "position accuracy" not in words.lower()
+    assert (
+        "units" not in words and "GPS fix" not in words and "position accuracy" not in words.lower()
+    )
 
 
 def test_scale_bar_is_as_long_as_it_states() -> None:
@@ -188,18 +237,35 @@ def test_any_part_may_be_missing(key: str) -> None:
     checked(report_page(report, fake_picture(60, 40)))
 
 
-@given(st.lists(
-    st.tuples(
-        st.sampled_from(["vision", "gps-only", "rejected"]),
-        st.lists(st.one_of(st.none(), st.floats(-1e7, 1e7), st.just(math.nan), st.just(math.inf)), min_size=8,
-                 max_size=8),
-    ), max_size=12,
-))
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["vision", "gps-only", "rejected"]),
+            st.lists(
+                st.one_of(st.none(), st.floats(-1e7, 1e7), st.just(math.nan), st.just(math.inf)),
+                min_size=8,
+                max_size=8,
+            ),
+        ),
+        max_size=12,
+    )
+)
 def test_any_track_can_be_drawn(rows: list[tuple[str, list[float | None]]]) -> None:
-    names = ("east_m", "north_m", "up_m", "residual_px", "sigma_m", "gps_east_m", "gps_north_m", "gps_up_m")
+    names = (
+        "east_m",
+        "north_m",
+        "up_m",
+        "residual_px",
+        "sigma_m",
+        "gps_east_m",
+        "gps_north_m",
+        "gps_up_m",
+    )
     report = fake_report(8)
-    report["track"] = [{"frame": str(k), "status": status, **dict(zip(names, numbers))}
-                       for k, (status, numbers) in enumerate(rows)]
+    report["track"] = [
+        {"frame": str(k), "status": status, **dict(zip(names, numbers))}
+        for k, (status, numbers) in enumerate(rows)
+    ]
     page = report_page(report, np.zeros((2, 2, 4), np.uint8))
     checked(page)
     drawn = "".join(re.findall("<svg.*?</svg>", page, re.DOTALL))
@@ -225,8 +291,11 @@ def test_ticks_lie_on_the_scale(low: float, span: float) -> None:
 @pytest.mark.parametrize("heading", [1, -1])
 def test_the_word_at_the_track_s_start_stands_clear_of_its_marks(heading: int) -> None:
     columns = {
-        "east_m": heading * np.arange(5.0) * 10, "north_m": np.zeros(5), "residual_px": np.ones(5),
-        "gps_east_m": np.full(5, 3.0 * heading), "gps_north_m": np.zeros(5),
+        "east_m": heading * np.arange(5.0) * 10,
+        "north_m": np.zeros(5),
+        "residual_px": np.ones(5),
+        "gps_east_m": np.full(5, 3.0 * heading),
+        "gps_north_m": np.zeros(5),
     }
     drawn = track_plan(TrackColumns(tuple("abcde"), ("vision",) * 5, columns), unit="m")
     marks = [float(each) for each in re.findall(r'cx="([0-9.]+)"', drawn)]

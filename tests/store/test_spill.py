@@ -21,7 +21,9 @@ def test_bytes_come_back_in_any_order_and_no_file_stays(tmp_path: Path) -> None:
     spill.close()
 
 
-def test_a_folder_that_cannot_be_written_is_one_clear_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_is_one_clear_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     def full(**_: object) -> None:
         raise OSError(28, "No space left on device")
 

@@ -11,7 +11,14 @@ from hypothesis import strategies as st
 
 from sorvolo.errors import StoreError
 from sorvolo.geometry.grid import TileIndex
-from sorvolo.store.images import ImageCache, image_from_jpeg, jpeg_from_image, png_from_rgba, rgba_from_png, weighted
+from sorvolo.store.images import (
+    ImageCache,
+    image_from_jpeg,
+    jpeg_from_image,
+    png_from_rgba,
+    rgba_from_png,
+    weighted,
+)
 from sorvolo.store.site.tiles import GrowingTiles, TileBlobs
 
 SIDE = 16
@@ -35,7 +42,9 @@ def flat(colour: int) -> np.ndarray:
 
 @settings(max_examples=60, deadline=None)
 @given(steps=STEPS, limit_tiles=st.integers(0, 4))
-def test_growing_tiles_are_a_dict(steps: list[tuple[str, TileIndex, int]], limit_tiles: int) -> None:
+def test_growing_tiles_are_a_dict(
+    steps: list[tuple[str, TileIndex, int]], limit_tiles: int
+) -> None:
     with tempfile.TemporaryDirectory() as folder:
         blobs = TileBlobs(Path(folder))
         base = {(0, 0): blobs.save(flat(1)), (1, 1): blobs.save(flat(2))}
@@ -58,7 +67,9 @@ def test_growing_tiles_are_a_dict(steps: list[tuple[str, TileIndex, int]], limit
                 rows = {**rows, **tiles.save()}
                 rows = {key: sha256 for key, sha256 in rows.items() if sha256 is not None}
                 blobs.remove(tiles.take_superseded() - set(base.values()))
-                assert {key: int(blobs.load(sha256)[0, 0, 0]) for key, sha256 in rows.items()} == truth
+                assert {
+                    key: int(blobs.load(sha256)[0, 0, 0]) for key, sha256 in rows.items()
+                } == truth
                 assert blobs.stored() == set(rows.values()) | set(base.values())
             assert set(tiles) == set(truth) and len(tiles) == len(truth)
         assert {key: int(tile[0, 0, 0]) for key, tile in tiles.items()} == truth
@@ -122,7 +133,9 @@ def test_what_is_released_is_read_again_from_the_disk(tmp_path: Path) -> None:
     assert (tiles[0, 0] == 9).all() and (tiles[0, 1] == 10).all()
 
 
-def test_no_more_tiles_are_kept_than_memory_is_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_more_tiles_are_kept_than_memory_is_given(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("sorvolo.store.site.tiles._CACHE_BYTES", 2 * flat(1).nbytes)
     blobs = TileBlobs(tmp_path)
     first, second, third = (blobs.save(flat(colour)) for colour in (1, 2, 3))
@@ -152,7 +165,9 @@ def test_an_enlarged_tile_is_kept_as_it_is_in_few_bytes() -> None:
     enlarged = small.repeat(4, axis=0).repeat(4, axis=1)
     data = png_from_rgba(enlarged)
     assert np.array_equal(rgba_from_png(data, "enlarged"), enlarged)
-    assert len(data) < 0.4 * len(png_from_rgba(np.roll(enlarged, 1, axis=0)))  # rows that repeat, but not in pairs
+    assert len(data) < 0.4 * len(
+        png_from_rgba(np.roll(enlarged, 1, axis=0))
+    )  # rows that repeat, but not in pairs
 
 
 def test_jpeg_keeps_colour_at_full_resolution() -> None:

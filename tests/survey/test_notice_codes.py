@@ -12,8 +12,14 @@ _DOCS = Path(__file__).resolve().parents[2] / "docs"
 
 def _codes() -> set[str]:
     source = "\n".join(path.read_text() for path in Path(sorvolo.__file__).parent.rglob("*.py"))
-    reported = set(re.findall(r'\b[Nn]otice\(\s*"(\w+)"', source)) | set(re.findall(r'\.notices\("(\w+)"\)', source))
-    return reported | {f"{name}_{end}" for name in RECEIVERS for end in ("failed", "dropped")} | set(FINDINGS)
+    reported = set(re.findall(r'\b[Nn]otice\(\s*"(\w+)"', source)) | set(
+        re.findall(r'\.notices\("(\w+)"\)', source)
+    )
+    return (
+        reported
+        | {f"{name}_{end}" for name in RECEIVERS for end in ("failed", "dropped")}
+        | set(FINDINGS)
+    )
 
 
 def test_every_code_is_documented() -> None:

@@ -22,9 +22,13 @@ def labelled(names_and_groups, name="set"):
 
 
 def videos(*sizes):
-    return labelled([
-        (f"v{video}_{index:04d}", f"v{video}") for video, size in enumerate(sizes) for index in range(size)
-    ])
+    return labelled(
+        [
+            (f"v{video}_{index:04d}", f"v{video}")
+            for video, size in enumerate(sizes)
+            for index in range(size)
+        ]
+    )
 
 
 def numbers(part):
@@ -46,14 +50,20 @@ def test_groups_stay_whole_and_nothing_is_lost(sizes, seed):
 
 def test_shares_are_met_as_closely_as_videos_allow():
     parts = split_by_group(videos(*[10] * 50), SHARES, 3)
-    assert {name: len(part) for name, part in parts.items()} == {"train": 350, "val": 50, "test": 100}
+    assert {name: len(part) for name, part in parts.items()} == {
+        "train": 350,
+        "val": 50,
+        "test": 100,
+    }
     one_large = split_by_group(videos(400, *[10] * 20), {"train": 0.7, "test": 0.3}, 1)
     assert abs(len(one_large["train"]) - 420) <= 10
 
 
 def test_the_seed_decides_and_the_order_does_not():
     def held_out(source, seed):
-        return frozenset(each.group for each in split_by_group(source, SHARES, seed)["test"].pictures)
+        return frozenset(
+            each.group for each in split_by_group(source, SHARES, seed)["test"].pictures
+        )
 
     whole = videos(*range(5, 25))
     assert held_out(whole, 1) == held_out(whole.only(whole.pictures[::-1]), 1)
@@ -69,7 +79,11 @@ def test_too_few_videos_and_impossible_shares_are_reported():
 
 
 @settings(max_examples=30, deadline=None)
-@given(ids=st.sets(st.integers(0, 2000), min_size=60, max_size=300), seed=st.integers(0, 5), gap=st.integers(0, 15))
+@given(
+    ids=st.sets(st.integers(0, 2000), min_size=60, max_size=300),
+    seed=st.integers(0, 5),
+    gap=st.integers(0, 15),
+)
 def test_no_neighbours_in_two_parts(ids, seed, gap):
     whole = labelled([(f"0_{each % 7}_{each:05d}", f"g{each % 7}") for each in sorted(ids)])
     parts = split_by_blocks(whole, SHARES, block=15, gap=gap, seed=seed)
@@ -88,11 +102,15 @@ def test_only_the_larger_part_gives_way_and_only_at_its_borders():
     assert len(test) == 100 and max(test) - min(test) == 99
     borders = (min(test) > 0) + (max(test) < 399)
     assert len(train) == 300 - 10 * borders
-    assert [(note.code, note.count) for note in parts["train"].notices] == [("left_out_at_borders", 10 * borders)]
+    assert [(note.code, note.count) for note in parts["train"].notices] == [
+        ("left_out_at_borders", 10 * borders)
+    ]
 
 
 def test_numbers_that_come_twice_make_a_sequence_of_each_video():
-    whole = labelled([(f"v{video}_{index:04d}", f"v{video}") for video in range(2) for index in range(40)])
+    whole = labelled(
+        [(f"v{video}_{index:04d}", f"v{video}") for video in range(2) for index in range(40)]
+    )
     parts = split_by_blocks(whole, {"train": 0.5, "test": 0.5}, block=40, gap=10)
     assert {len(part) for part in parts.values()} == {40}
     assert all(len({each.group for each in part.pictures}) == 1 for part in parts.values())
@@ -115,9 +133,16 @@ def test_a_video_in_two_sets_is_warned_of():
     assert shared_groups(first, labelled([("c_1", "c")])) == ()
 
 
-@pytest.mark.parametrize("name, number", [
-    ("1_130_40_0_03855.jpg", 3855), ("bb_V0014_I0003160_jpg.rf.9a81.jpg", 3160), ("Drone2_(90).jpg", 90),
-    ("x.jpg", None), ("clip3/frames/12.png", 12), ("DJI-00760-00001.jpg", 1),
-])
+@pytest.mark.parametrize(
+    "name, number",
+    [
+        ("1_130_40_0_03855.jpg", 3855),
+        ("bb_V0014_I0003160_jpg.rf.9a81.jpg", 3160),
+        ("Drone2_(90).jpg", 90),
+        ("x.jpg", None),
+        ("clip3/frames/12.png", 12),
+        ("DJI-00760-00001.jpg", 1),
+    ],
+)
 def test_frame_numbers(name, number):
     assert frame_number(name) == number

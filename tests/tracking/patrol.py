@@ -62,7 +62,10 @@ def waypoints(patrol: Patrol) -> np.ndarray:
         return np.array([[0.0, north_m / 2], [east_m, north_m / 2], [0.0, north_m / 2]])
     step_m = wide_m * (1 - patrol.overlap)
     rows = np.arange(max(1, int(np.ceil((north_m - wide_m) / step_m)) + 1)) * step_m + wide_m / 2
-    ends = [[(0.0, row), (east_m, row)][:: 1 if number % 2 == 0 else -1] for number, row in enumerate(rows)]
+    ends = [
+        [(0.0, row), (east_m, row)][:: 1 if number % 2 == 0 else -1]
+        for number, row in enumerate(rows)
+    ]
     return np.array([point for pair in ends for point in pair])
 
 
@@ -114,14 +117,26 @@ def fly(patrol: Patrol, objects: Things) -> Iterator[SeenFrame]:
         kinds = np.concatenate([objects.labels[seen], random.integers(0, 3, len(false))])
         confused = random.random(len(kinds)) < patrol.wrong_class
         labels = np.where(confused, random.integers(0, 3, len(kinds)), kinds)
-        scores = np.concatenate([random.beta(6, 2.5, len(seen)), random.uniform(0.25, 0.7, len(false))])
+        scores = np.concatenate(
+            [random.beta(6, 2.5, len(seen)), random.uniform(0.25, 0.7, len(false))]
+        )
         at = np.concatenate([local[seen], false]) + random.normal(0, patrol.own_m, (len(owners), 2))
         turn = np.radians(patrol.heading_deg)
         turned = at @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
         places = drone + shift + turned @ axes
         footprint = drone + shift + np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * half_m @ axes
         sightings = [
-            _sighting(patrol, number, time_s, place, spot, CLASSES[label], TYPICAL_SIZE_M[CLASSES[kind]], score, random)
+            _sighting(
+                patrol,
+                number,
+                time_s,
+                place,
+                spot,
+                CLASSES[label],
+                TYPICAL_SIZE_M[CLASSES[kind]],
+                score,
+                random,
+            )
             for place, spot, label, kind, score in zip(places, at, labels, kinds, scores)
         ]
         order = np.argsort([-each.score for each in sightings]) if sightings else np.zeros(0, int)
@@ -136,6 +151,14 @@ def _sighting(patrol, number, time_s, place, spot, name, sides_m, score, random)
     shared2 = patrol.gps_m**2 + patrol.jitter_m**2 + turned**2 / 2
     box_px = np.concatenate([middle_px - half_px, middle_px + half_px])
     return Sighting(
-        number, str(number), int(time_s * 1e9), name, float(score), box_px, place,
-        np.eye(2) * (patrol.own_m**2 + shared2), size_m, float(np.sqrt(shared2)),
+        number,
+        str(number),
+        int(time_s * 1e9),
+        name,
+        float(score),
+        box_px,
+        place,
+        np.eye(2) * (patrol.own_m**2 + shared2),
+        size_m,
+        float(np.sqrt(shared2)),
     )

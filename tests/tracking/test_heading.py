@@ -9,7 +9,12 @@ _M_PER_PX = 0.05
 
 
 def _fly(
-    headings_deg: np.ndarray, way_m: np.ndarray, *, gps_m: float = 0.0, wobble_px: float = 0.0, seed: int = 1
+    headings_deg: np.ndarray,
+    way_m: np.ndarray,
+    *,
+    gps_m: float = 0.0,
+    wobble_px: float = 0.0,
+    seed: int = 1,
 ) -> list[Heading]:
     """What is reported along a way (N, 2) of a camera with these headings, ten frames a second."""
     rng = np.random.default_rng(seed)
@@ -17,13 +22,21 @@ def _fly(
     finder, reported = HeadingFromMotion(), []
     for number, place_m in enumerate(way_m):
         outline_px = _outline(headings_deg[number], place_m, headings_deg[0], way_m[0])
-        reported.append(finder.add(number / 10, outline_px + rng.normal(0, wobble_px, 2), place_m + drift_m[number]))
+        reported.append(
+            finder.add(
+                number / 10, outline_px + rng.normal(0, wobble_px, 2), place_m + drift_m[number]
+            )
+        )
     return reported
 
 
-def _outline(heading_deg: float, place_m: np.ndarray, first_deg: float, first_m: np.ndarray) -> np.ndarray:
+def _outline(
+    heading_deg: float, place_m: np.ndarray, first_deg: float, first_m: np.ndarray
+) -> np.ndarray:
     """A picture of 400 x 300 px on the ground, in the pixels of the first one."""
-    corners = np.array([[-200.0, 150.0], [200.0, 150.0], [200.0, -150.0], [-200.0, -150.0]]) * _M_PER_PX
+    corners = (
+        np.array([[-200.0, 150.0], [200.0, 150.0], [200.0, -150.0], [-200.0, -150.0]]) * _M_PER_PX
+    )
     ground_m = corners @ _north_up(heading_deg).T + place_m
     seen = (ground_m - first_m) @ _north_up(first_deg) / _M_PER_PX
     return np.column_stack([200 + seen[:, 0], 150 - seen[:, 1]])
@@ -44,14 +57,21 @@ def test_a_straight_way_in_any_direction(heading_deg: float) -> None:
     way_m = np.outer(np.arange(60) * 0.5, [0.6, -0.8])  # the camera need not look where it flies
     reported = _fly(np.full(60, heading_deg), way_m)
     assert reported[3].sigma_deg == np.inf  # two metres are no way yet
-    assert _apart_deg(reported[-1].heading_deg, heading_deg) < 0.01 and reported[-1].sigma_deg == 4.0
+    assert (
+        _apart_deg(reported[-1].heading_deg, heading_deg) < 0.01 and reported[-1].sigma_deg == 4.0
+    )
 
 
 def test_turns_are_followed() -> None:
     headings_deg = np.concatenate([np.full(80, 90.0), np.linspace(90, 270, 40), np.full(40, 270.0)])
-    steps = np.column_stack([np.sin(np.radians(headings_deg)), np.cos(np.radians(headings_deg))]) * 0.6
+    steps = (
+        np.column_stack([np.sin(np.radians(headings_deg)), np.cos(np.radians(headings_deg))]) * 0.6
+    )
     reported = _fly(headings_deg, np.cumsum(steps, axis=0))
-    assert all(_apart_deg(each.heading_deg, true) < 0.1 for each, true in zip(reported[40:], headings_deg[40:]))
+    assert all(
+        _apart_deg(each.heading_deg, true) < 0.1
+        for each, true in zip(reported[40:], headings_deg[40:])
+    )
 
 
 def test_noise_is_within_the_stated_sigma() -> None:
@@ -73,7 +93,12 @@ def test_hovering_gives_nothing_and_a_cut_begins_anew() -> None:
         last = finder.add(number / 10, _outline(0.0, place_m, 0.0, np.zeros(2)), place_m)
     assert last.sigma_deg < 5
     finder.lose()
-    assert finder.add(6.0, _outline(0.0, np.zeros(2), 0.0, np.zeros(2)), np.array([0.0, 30.0])).sigma_deg == np.inf
+    assert (
+        finder.add(
+            6.0, _outline(0.0, np.zeros(2), 0.0, np.zeros(2)), np.array([0.0, 30.0])
+        ).sigma_deg
+        == np.inf
+    )
 
 
 @pytest.mark.parametrize("off_deg", [-4.0, 0.0, 3.0])

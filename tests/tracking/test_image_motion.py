@@ -16,7 +16,8 @@ WIDTH, HEIGHT = 640, 360
 def ground(seed=1, side=1600):
     random = np.random.default_rng(seed)
     picture = sum(
-        cv2.resize(random.random((side // step, side // step)), (side, side)) * step**0.5 for step in (4, 10, 40)
+        cv2.resize(random.random((side // step, side // step)), (side, side)) * step**0.5
+        for step in (4, 10, 40)
     )
     return np.uint8(255 * (picture - picture.min()) / np.ptp(picture))
 
@@ -33,13 +34,19 @@ def cut(picture, middle, turn_deg=0.0, scale=1.0):
 
 
 def at(points_px, side=16.0):
-    boxes = np.array([[x + 0.5 - side / 2, y + 0.5 - side / 2, x + 0.5 + side / 2, y + 0.5 + side / 2]
-                      for x, y in points_px]).reshape(-1, 4)
+    boxes = np.array(
+        [
+            [x + 0.5 - side / 2, y + 0.5 - side / 2, x + 0.5 + side / 2, y + 0.5 + side / 2]
+            for x, y in points_px
+        ]
+    ).reshape(-1, 4)
     return Detections(boxes, np.full(len(boxes), 0.9), np.zeros(len(boxes), np.int64), CLASSES)
 
 
 def view_from_ground(ground_from_view, point):
-    return np.linalg.solve(ground_from_view[:, :2], np.asarray(point, float) - ground_from_view[:, 2])
+    return np.linalg.solve(
+        ground_from_view[:, :2], np.asarray(point, float) - ground_from_view[:, 2]
+    )
 
 
 def fly(motion, picture, poses, target, start=0):
@@ -48,7 +55,9 @@ def fly(motion, picture, poses, target, start=0):
     for number, pose in enumerate(poses, start=start):
         image, ground_from_view = cut(picture, *pose)
         found = at([view_from_ground(ground_from_view, target)])
-        (sighting,), outline = motion.locate(found, Frame(number, str(number), number * 10**8, image), number * 10**8)
+        (sighting,), outline = motion.locate(
+            found, Frame(number, str(number), number * 10**8, image), number * 10**8
+        )
         places.append((sighting, outline))
     return places
 
@@ -59,7 +68,9 @@ def test_a_point_of_the_ground_stays_where_it_was():
     motion = ImageMotion()
     places = fly(motion, ground(), poses, (650.0, 550.0))
     _, first = cut(ground(), *poses[0])
-    errors = np.array([sighting.position_m - view_from_ground(first, (650.0, 550.0)) for sighting, _ in places])
+    errors = np.array(
+        [sighting.position_m - view_from_ground(first, (650.0, 550.0)) for sighting, _ in places]
+    )
     assert np.abs(errors).max() < 3.0
     assert motion.segments == 1 and motion.guessed == 0
     sighting, outline = places[-1]
@@ -72,7 +83,9 @@ def test_a_point_of_the_ground_stays_where_it_was():
 def test_a_cut_begins_anew_and_is_counted():
     motion = ImageMotion()
     before = fly(motion, ground(1), [((500 + 5 * k, 500),) for k in range(5)], (520.0, 500.0))
-    after = fly(motion, ground(2), [((900 + 5 * k, 800),) for k in range(5)], (920.0, 800.0), start=5)
+    after = fly(
+        motion, ground(2), [((900 + 5 * k, 800),) for k in range(5)], (920.0, 800.0), start=5
+    )
     assert motion.segments == 2
     assert after[0][1] == pytest.approx(before[0][1])  # the outline of a first picture, both
     assert after[0][0].shared_sigma_m == 0.0
@@ -100,7 +113,9 @@ def test_a_large_step_is_found():
 def test_an_object_that_the_camera_passes_is_one_track_that_stands():
     motion, tracker = ImageMotion(), Tracker(IN_PICTURES)
     way = np.concatenate([np.arange(0, 50), np.arange(50, 0, -1)])  # there and back
-    for sighting, outline in fly(motion, ground(), [((500 + 12 * k, 500),) for k in way], (600.0, 520.0)):
+    for sighting, outline in fly(
+        motion, ground(), [((500 + 12 * k, 500),) for k in way], (600.0, 520.0)
+    ):
         middle = (sighting.box_px[:2] + sighting.box_px[2:]) / 2
         seen = [sighting] if (middle > 0).all() and (middle < (WIDTH, HEIGHT)).all() else []
         tracker.update(seen, time_ns=sighting.time_ns, footprint_m=outline)
@@ -112,14 +127,21 @@ def test_an_object_that_the_camera_passes_is_one_track_that_stands():
 def test_a_car_that_drives_is_one_moving_track_beside_one_that_stands(step_px):
     """Without telemetry, from a camera that flies on and turns; one in five views of each is missed."""
     random = np.random.default_rng(5)
-    follower, picture, stands = PictureFollower(TrackerSettings(sure_score=0.3)), ground(), np.array([700.0, 430.0])
+    follower, picture, stands = (
+        PictureFollower(TrackerSettings(sure_score=0.3)),
+        ground(),
+        np.array([700.0, 430.0]),
+    )
     for number in range(40):
         image, ground_from_view = cut(picture, (560 + 6 * number, 500), turn_deg=0.4 * number)
         drives = np.array([620.0, 520.0]) + number * np.array(step_px)
         shown = [view_from_ground(ground_from_view, place) for place in (stands, drives)]
         shown = [
-            place for place in shown
-            if random.random() < 0.8 and (place > 10).all() and (place < (WIDTH - 10, HEIGHT - 10)).all()
+            place
+            for place in shown
+            if random.random() < 0.8
+            and (place > 10).all()
+            and (place < (WIDTH - 10, HEIGHT - 10)).all()
         ]
         found = at(shown, side=24.0)
         cars = Detections(found.boxes_px, found.scores, np.ones(len(found), np.int64), CLASSES)

@@ -46,7 +46,9 @@ def test_below_the_camera_lies_what_is_in_the_middle():
     half_m = 60 - TYPICAL_SIZE_M["car"][2] / 2
     assert sighting.size_m == pytest.approx([40 * half_m / CAMERA.fx_px] * 2)
     # 0.5 m of GPS with 0.5 degrees of tilt at 59.25 m, beside the box's own
-    assert sighting.shared_sigma_m == pytest.approx(np.hypot(0.5, np.radians(0.5) * half_m), rel=0.01)
+    assert sighting.shared_sigma_m == pytest.approx(
+        np.hypot(0.5, np.radians(0.5) * half_m), rel=0.01
+    )
     assert sighting.sigma_m > sighting.shared_sigma_m
 
 
@@ -58,7 +60,10 @@ def test_what_is_far_too_short_for_its_class_is_set_aside():
         (one([400.0, 300.0], side_px=5.0 * window_px), PRIOR),
         (one([400.0, 300.0], "person", window_px), PRIOR),
         (one([window_px / 2 - 0.5, 300.0], side_px=window_px), PRIOR),  # the picture's edge cuts it
-        (one([400.0, 300.0], side_px=window_px), replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 40.0]))),
+        (
+            one([400.0, 300.0], side_px=window_px),
+            replace(PRIOR, position_sigma_m=np.array([0.5, 0.5, 40.0])),
+        ),
     ):
         sighting, unlocated = place(found, prior)
         assert sighting is not None and not unlocated
@@ -96,13 +101,19 @@ def test_the_middle_of_an_object_stands_above_its_foot():
 
 
 @pytest.mark.parametrize("pitch_deg", [-90.0, -50.0])
-@pytest.mark.parametrize("what", ["east", "north", "up", "tilt x", "tilt y", "heading", "focal", "pixel"])
+@pytest.mark.parametrize(
+    "what", ["east", "north", "up", "tilt x", "tilt y", "heading", "focal", "pixel"]
+)
 def test_each_part_of_the_sigma_is_what_moving_that_part_does(pitch_deg, what):
     prior = replace(EXACT, rotation=site_from_gimbal_rotation(30.0, pitch_deg, 0.0))
     settings = LocateSettings(0.0, 0.0, 0.0)
     found, small = one([300.0, 400.0]), 1e-4 if what != "pixel" else 0.05  # boxes are float32
     before = place(found, prior, settings=settings)[0].position_m
-    axis = ["east", "north", "up", "tilt x", "tilt y", "heading"].index(what) if what not in ("focal", "pixel") else 0
+    axis = (
+        ["east", "north", "up", "tilt x", "tilt y", "heading"].index(what)
+        if what not in ("focal", "pixel")
+        else 0
+    )
     focal_sigma, camera = 0.0, CAMERA
     moved, known = prior, prior
     if what in ("east", "north", "up"):
@@ -118,17 +129,23 @@ def test_each_part_of_the_sigma_is_what_moving_that_part_does(pitch_deg, what):
         known = replace(prior, attitude_sigma_deg=np.degrees(small) * np.eye(3)[axis - 3])
     ((after,), _) = locate(found, 3, "3", 0, camera, moved, settings=settings)
     step_m = after.position_m - before
-    covariance = place(one([300.0, 400.0]), known, focal_sigma=focal_sigma, settings=settings)[0].covariance_m2
+    covariance = place(one([300.0, 400.0]), known, focal_sigma=focal_sigma, settings=settings)[
+        0
+    ].covariance_m2
     if what == "pixel":  # both directions err; the one that was moved lies within them
         assert step_m @ np.linalg.solve(covariance, step_m) == pytest.approx(1.0, rel=1e-2)
     else:
-        assert covariance == pytest.approx(np.outer(step_m, step_m), rel=1e-2, abs=1e-3 * (step_m @ step_m))
+        assert covariance == pytest.approx(
+            np.outer(step_m, step_m), rel=1e-2, abs=1e-3 * (step_m @ step_m)
+        )
 
 
 def test_what_the_pictures_edge_cuts_lies_farther_out_than_its_box():
     whole_px = np.array([-37.0, 250.0, 33.0, 280.0])  # a car of 4.4 m, half of it in the picture
     whole, cut = (
-        locate(Detections([box], [0.9], [CLASSES.index("car")], CLASSES), 0, "0", 0, CAMERA, EXACT)[0][0]
+        locate(Detections([box], [0.9], [CLASSES.index("car")], CLASSES), 0, "0", 0, CAMERA, EXACT)[
+            0
+        ][0]
         for box in (whole_px, np.clip(whole_px, 0, None))
     )
     box_m = 0.5 * 37 * whole.size_m[0] / 70  # by how much the middle of what is seen is off
@@ -137,7 +154,9 @@ def test_what_the_pictures_edge_cuts_lies_farther_out_than_its_box():
     assert off_m[0] ** 2 < 4 * cut.covariance_m2[0, 0]
     assert cut.covariance_m2[0, 0] > 4 * cut.covariance_m2[1, 1]
     inside_px = whole_px + np.array([60.0, 0.0, 60.0, 0.0])
-    inside = locate(Detections([inside_px], [0.9], [CLASSES.index("car")], CLASSES), 0, "0", 0, CAMERA, EXACT)[0][0]
+    inside = locate(
+        Detections([inside_px], [0.9], [CLASSES.index("car")], CLASSES), 0, "0", 0, CAMERA, EXACT
+    )[0][0]
     assert inside.covariance_m2 == pytest.approx(whole.covariance_m2, rel=0.3, abs=0.02)
 
 
@@ -169,18 +188,23 @@ def test_a_height_model_is_met_where_the_ray_meets_it():
     sighting, _ = place(one(right_px), EXACT, ground_height_m=slope_m)
     east_m = sighting.position_m[0] - 10.0
     assert east_m == pytest.approx(0.5 * (60 - 0.75 - 0.2 * east_m), abs=0.05)
-    nothing, unlocated = place(one(right_px), EXACT, ground_height_m=lambda places_m: np.full(len(places_m), np.nan))
+    nothing, unlocated = place(
+        one(right_px), EXACT, ground_height_m=lambda places_m: np.full(len(places_m), np.nan)
+    )
     assert nothing is None and "height model" in next(iter(unlocated))
 
 
-@pytest.mark.parametrize(("change", "words"), [
-    ({"position_sigma_m": np.array([np.inf, np.inf, 1.0])}, "no fix"),
-    ({"position_sigma_m": np.array([1.0, 1.0, np.inf])}, "height is not known"),
-    ({"attitude_sigma_deg": np.array([np.inf, 1.0, 1.0])}, "tilt is not known"),
-    ({"rotation": site_from_gimbal_rotation(0.0, 10.0, 0.0)}, "horizon"),
-    ({"rotation": site_from_gimbal_rotation(0.0, -2.0, 0.0)}, "no better than"),
-    ({"position_m": np.array([0.0, 0.0, -3.0])}, "not above the ground"),
-])
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"position_sigma_m": np.array([np.inf, np.inf, 1.0])}, "no fix"),
+        ({"position_sigma_m": np.array([1.0, 1.0, np.inf])}, "height is not known"),
+        ({"attitude_sigma_deg": np.array([np.inf, 1.0, 1.0])}, "tilt is not known"),
+        ({"rotation": site_from_gimbal_rotation(0.0, 10.0, 0.0)}, "horizon"),
+        ({"rotation": site_from_gimbal_rotation(0.0, -2.0, 0.0)}, "no better than"),
+        ({"position_m": np.array([0.0, 0.0, -3.0])}, "not above the ground"),
+    ],
+)
 def test_what_has_no_place_names_the_reason(change, words):
     sighting, unlocated = place(one([CAMERA.cx_px, CAMERA.cy_px]), replace(PRIOR, **change))
     assert sighting is None
@@ -204,9 +228,12 @@ def test_nothing_found_is_nothing_placed():
 def test_places_from_sixty_metres_are_as_good_as_they_state():
     """Boxes of a simulated flight, GPS of 1.5 m, gimbal of 0.5 degrees: at most 2 m rms, 90 to 99 % in 2 sigma."""
     settings = SimulationSettings(
-        seed=21, flights=1, scene=SceneSettings("dirt", people=12, cars=6, small_objects=6, has_scenery=False),
+        seed=21,
+        flights=1,
+        scene=SceneSettings("dirt", people=12, cars=6, small_objects=6, has_scenery=False),
         path=PathSettings(height_m=60, speed_m_s=10, length_m=120, strips=2, strip_spacing_m=40),
-        motion=MotionSettings(), imaging=ImagingSettings(960, 540, fps=1.0),
+        motion=MotionSettings(),
+        imaging=ImagingSettings(960, 540, fps=1.0),
     )
     flight = simulate_flight(settings)
     frames = range(len(flight))
@@ -216,23 +243,36 @@ def test_places_from_sixty_metres_are_as_good_as_they_state():
     errors_m, distances2 = [], []
     for index in frames:
         pose = flight.true_poses[index]
-        rows = [row for row in truth["annotations"] if row["image_id"] == index and row["visibility"] > 0.95]
+        rows = [
+            row
+            for row in truth["annotations"]
+            if row["image_id"] == index and row["visibility"] > 0.95
+        ]
         boxes = np.array([row["bbox"] for row in rows], float).reshape(-1, 4)
         boxes[:, 2:] += boxes[:, :2]
-        found = Detections(boxes, np.ones(len(rows)), np.array([row["category_id"] - 1 for row in rows]), CLASSES)
+        found = Detections(
+            boxes, np.ones(len(rows)), np.array([row["category_id"] - 1 for row in rows]), CLASSES
+        )
         prior = CameraPrior(
-            pose.translation_m + random.normal(0, 1.5, 3), np.full(3, 1.5),
-            pose.rotation @ rotation_from_vector(np.radians(random.normal(0, 0.5, 3))), np.full(3, 0.5),
+            pose.translation_m + random.normal(0, 1.5, 3),
+            np.full(3, 1.5),
+            pose.rotation @ rotation_from_vector(np.radians(random.normal(0, 0.5, 3))),
+            np.full(3, 0.5),
         )
         sightings, unlocated = locate(found, index, str(index), 0, flight.camera, prior)
         assert not unlocated
         for sighting, row in zip(sightings, rows):
-            error_m = sighting.position_m - things[row["object_id"]].place_m(float(flight.from_middle_s[index]))[:2]
+            error_m = (
+                sighting.position_m
+                - things[row["object_id"]].place_m(float(flight.from_middle_s[index]))[:2]
+            )
             errors_m.append(error_m)
             distances2.append(error_m @ np.linalg.solve(sighting.covariance_m2, error_m))
     assert len(errors_m) > 60
     rms_m = np.sqrt(np.mean(np.square(errors_m)))  # per axis
-    inside = np.mean(np.array(distances2) < 5.991)  # the ellipse that holds 95 % of a Gaussian's places
+    inside = np.mean(
+        np.array(distances2) < 5.991
+    )  # the ellipse that holds 95 % of a Gaussian's places
     print(f"rms {rms_m:.2f} m per axis, {100 * inside:.1f} % inside, {len(errors_m)} places")
     assert rms_m < 2.0
     assert 0.90 <= inside <= 0.99

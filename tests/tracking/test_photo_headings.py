@@ -12,7 +12,11 @@ from sorvolo.tracking.photo_headings import PhotoHeadings
 CAMERA = Camera(480, 360, 400.0, 400.0, 239.5, 179.5)
 HEIGHT_M, M_PER_PX = 40.0, 0.1  # the ground's picture is as fine as a photo
 RNG = np.random.default_rng(5)
-GROUND = cv2.resize(RNG.integers(0, 256, (220, 220, 3)).astype(np.uint8), (1760, 1760), interpolation=cv2.INTER_CUBIC)
+GROUND = cv2.resize(
+    RNG.integers(0, 256, (220, 220, 3)).astype(np.uint8),
+    (1760, 1760),
+    interpolation=cv2.INTER_CUBIC,
+)
 STRIP = [(-20.0 + 8.0 * k, -16.0 + 8.0 * k) for k in range(6)]
 
 
@@ -32,7 +36,9 @@ def prior(
     place_m: tuple[float, float], heading_deg: float, sigma_deg: float = 4.0, tilt_deg: float = 1.0
 ) -> CameraPrior:
     return CameraPrior(
-        np.array([*place_m, HEIGHT_M]), np.array([0.5, 0.5, 1.0]), site_from_gimbal_rotation(heading_deg, -90.0, 0.0),
+        np.array([*place_m, HEIGHT_M]),
+        np.array([0.5, 0.5, 1.0]),
+        site_from_gimbal_rotation(heading_deg, -90.0, 0.0),
         np.array([tilt_deg, tilt_deg, sigma_deg]),
     )
 
@@ -57,13 +63,19 @@ def test_a_strip_with_wrong_headings_is_turned_right(off_deg):
         wrong = off_deg if 2 <= number < 5 else 0.0
         seen = headings.take(photo(place_m, 45.0), prior(place_m, 45.0 + wrong))
         assert abs((heading_deg(seen) - 45 + 180) % 360 - 180) < 3
-        assert seen.attitude_sigma_deg[2] == 4.0 if not wrong else 4.0 < seen.attitude_sigma_deg[2] < 20
+        assert (
+            seen.attitude_sigma_deg[2] == 4.0
+            if not wrong
+            else 4.0 < seen.attitude_sigma_deg[2] < 20
+        )
     assert len(headings.turns_deg) == 3
 
 
 def test_a_photo_that_shows_nothing_shares_the_error_of_the_one_before():
     headings = PhotoHeadings(CAMERA)
-    headings.see(photo(STRIP[1], 45.0), prior(STRIP[1], 225.0))  # so that the first one is held against the second
+    headings.see(
+        photo(STRIP[1], 45.0), prior(STRIP[1], 225.0)
+    )  # so that the first one is held against the second
     for number, place_m in enumerate(STRIP[:4]):
         image = np.full((360, 480, 3), 90, np.uint8) if number == 2 else photo(place_m, 45.0)
         seen = headings.take(image, prior(place_m, 225.0))

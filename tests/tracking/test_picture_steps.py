@@ -28,19 +28,31 @@ def test_a_step_takes_the_ground_where_an_aslant_camera_shows_it():
     assert steps.add(0, seen(picture, aslant), FULL_WIDTH) is None
     step = steps.add(10**8, seen(picture, forward @ aslant), FULL_WIDTH)
     assert (step.from_ns, step.to_ns) == (0, 10**8)
-    points = np.array([[30.0, 30], [WIDTH - 30, 40], [WIDTH / 2, 180], [40, HEIGHT - 40], [WIDTH - 40, HEIGHT - 30]])
+    points = np.array(
+        [
+            [30.0, 30],
+            [WIDTH - 30, 40],
+            [WIDTH / 2, 180],
+            [40, HEIGHT - 40],
+            [WIDTH - 40, HEIGHT - 30],
+        ]
+    )
     expected = moved(np.linalg.inv(forward @ aslant) @ aslant, points)
     found = moved(step.to_from, 2 * points + 0.5)
     assert np.abs(found - (2 * expected + 0.5)).max() < 1.5
     assert np.abs(expected - points).max() > 10  # far more than the error
-    assert np.ptp(np.linalg.norm(expected - points, axis=1)) > 4  # near ground moves faster: no shift would do
+    assert (
+        np.ptp(np.linalg.norm(expected - points, axis=1)) > 4
+    )  # near ground moves faster: no shift would do
 
 
 def test_what_moves_on_the_ground_does_not_carry_it():
     steps = PictureSteps()
     for number in range(2):
         view = np.ascontiguousarray(cut(ground(), (700 + 6 * number, 700))[0][..., 0])
-        view[100 + 12 * number : 180 + 12 * number, 200:320] = ground(2)[:80, :120]  # a truck with a pattern
+        view[100 + 12 * number : 180 + 12 * number, 200:320] = ground(2)[
+            :80, :120
+        ]  # a truck with a pattern
         step = steps.add(number * 10**8, view, WIDTH)
     assert moved(step.to_from, np.array([[260.0, 150.0]]))[0] == pytest.approx([254, 150], abs=0.5)
 

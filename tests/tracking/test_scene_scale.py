@@ -23,17 +23,29 @@ def found(rows: Sequence[tuple[str, float, float, float, float]], score: float =
     """Boxes by class, middle x and y, width and height."""
     boxes = [[x - w / 2, y - h / 2, x + w / 2, y + h / 2] for _, x, y, w, h in rows]
     labels = [CLASSES.index(name) for name, *_ in rows]
-    return Detections(np.reshape(boxes, (-1, 4)), np.full(len(rows), score), np.array(labels, np.int64), CLASSES)
+    return Detections(
+        np.reshape(boxes, (-1, 4)), np.full(len(rows), score), np.array(labels, np.int64), CLASSES
+    )
 
 
 def street(px_per_m: float, growth: float = 0.0, seed: int = 1, count: int = 12) -> Detections:
     """Cars seen from above, turned any way; `growth` is by how much, in logarithms, they grow from top to bottom."""
     rng = np.random.default_rng(seed)
     rows = []
-    for x, y, turn in zip(rng.uniform(60, 580, count), rng.uniform(60, 420, count), rng.uniform(0, np.pi, count)):
+    for x, y, turn in zip(
+        rng.uniform(60, 580, count), rng.uniform(60, 420, count), rng.uniform(0, np.pi, count)
+    ):
         scale = px_per_m * np.exp(growth * (y / SIZE_PX[0] - 0.5))
         across, along = abs(np.cos(turn)), abs(np.sin(turn))
-        rows.append(("car", x, y, scale * (4.4 * across + 1.8 * along), scale * (1.8 * across + 4.4 * along)))
+        rows.append(
+            (
+                "car",
+                x,
+                y,
+                scale * (4.4 * across + 1.8 * along),
+                scale * (1.8 * across + 4.4 * along),
+            )
+        )
     return found(rows)
 
 
@@ -42,25 +54,44 @@ def test_cars_give_the_scale_and_show_what_is_no_car() -> None:
     assert scene.m_per_px() is None
     scene.see(street(10.0), SIZE_PX)
     assert scene.m_per_px() == pytest.approx(0.1, rel=0.1)
-    odd = found([
-        ("car", 300, 200, 12, 10), ("car", 300, 200, 44, 20), ("car", 300, 200, 200, 190), ("person", 300, 200, 7, 9),
-        ("person", 300, 200, 75, 70), ("car", 6, 200, 12, 10),
-    ])
-    assert scene.impossible(odd, SIZE_PX).tolist() == [True, False, True, False, True, False]  # the last one is cut
+    odd = found(
+        [
+            ("car", 300, 200, 12, 10),
+            ("car", 300, 200, 44, 20),
+            ("car", 300, 200, 200, 190),
+            ("person", 300, 200, 7, 9),
+            ("person", 300, 200, 75, 70),
+            ("car", 6, 200, 12, 10),
+        ]
+    )
+    assert scene.impossible(odd, SIZE_PX).tolist() == [
+        True,
+        False,
+        True,
+        False,
+        True,
+        False,
+    ]  # the last one is cut
 
 
 def test_an_aslant_view_shows_far_cars_smaller() -> None:
     scene = SceneScale()
     scene.see(street(10.0, growth=1.6, count=30), SIZE_PX)
     far, near = 10 * np.exp(-0.6), 10 * np.exp(0.6)
-    seen = found([("car", 300, 60, 4.4 * far, 20), ("car", 300, 420, 4.4 * near, 30), ("car", 300, 420, 12, 12)])
+    seen = found(
+        [
+            ("car", 300, 60, 4.4 * far, 20),
+            ("car", 300, 420, 4.4 * near, 30),
+            ("car", 300, 420, 12, 12),
+        ]
+    )
     assert scene.impossible(seen, SIZE_PX).tolist() == [False, False, True]
 
 
 def test_too_few_cars_or_sizes_of_all_kinds_show_nothing() -> None:
     few, mixed = SceneScale(), SceneScale()
     few.see(street(10.0, count=5), SIZE_PX)
-    mixed.see(found([("car", 300, 200, 2.0 ** k, 2.0 ** k) for k in range(1, 8)] * 2), SIZE_PX)
+    mixed.see(found([("car", 300, 200, 2.0**k, 2.0**k) for k in range(1, 8)] * 2), SIZE_PX)
     for scene in (few, mixed):
         assert scene.m_per_px() is None
         assert not scene.impossible(found([("car", 300, 200, 3, 3)]), SIZE_PX).any()
@@ -116,7 +147,9 @@ def test_a_watch_without_telemetry_sets_aside_what_its_cars_contradict() -> None
     cars = street(10.0)
     window = found([("car", 320, 240, 9, 9)])
     both = Detections(
-        np.vstack([cars.boxes_px, window.boxes_px]), np.full(len(cars) + 1, 0.9), np.ones(len(cars) + 1, np.int64),
+        np.vstack([cars.boxes_px, window.boxes_px]),
+        np.full(len(cars) + 1, 0.9),
+        np.ones(len(cars) + 1, np.int64),
         CLASSES,
     )
     taken = [follower.take(Frame(k, str(k), k * 10**8, picture), k * 10**8, both) for k in range(4)]

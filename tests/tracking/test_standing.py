@@ -24,10 +24,21 @@ def placed(
     index: int, east_m: float, north_m: float, *, yaw_deg: float = 90.0, pitch_deg: float = -88.0
 ) -> PlacedFrame:
     """A frame taken 30 m up, a second after the one before."""
-    pose = Pose(site_from_gimbal_rotation(yaw_deg, pitch_deg, 0.0), np.array([east_m, north_m, 30.0]))
+    pose = Pose(
+        site_from_gimbal_rotation(yaw_deg, pitch_deg, 0.0), np.array([east_m, north_m, 30.0])
+    )
     return PlacedFrame(
-        str(index), index, index * SECOND_NS, Status.VISION, "", CAMERA, pose, site_from_image_homography(CAMERA, pose),
-        footprint(CAMERA, pose), 0.2, 0.5,
+        str(index),
+        index,
+        index * SECOND_NS,
+        Status.VISION,
+        "",
+        CAMERA,
+        pose,
+        site_from_image_homography(CAMERA, pose),
+        footprint(CAMERA, pose),
+        0.2,
+        0.5,
     )
 
 
@@ -38,14 +49,26 @@ def survey() -> list[PlacedFrame]:
 
 
 def box_of(
-    frame: PlacedFrame, label: str, east_m: float, north_m: float, yaw_deg: float, *, least_shown: float = 1.0
+    frame: PlacedFrame,
+    label: str,
+    east_m: float,
+    north_m: float,
+    yaw_deg: float,
+    *,
+    least_shown: float = 1.0,
 ) -> np.ndarray | None:
     """The box around a body of its class's usual size, as far as the picture shows it; None where that is less of
     either side than `least_shown`."""
     length, width, height = TYPICAL_SIZE_M[label]
     turn = np.radians(yaw_deg)
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)]) * [length / 2, width / 2, height]
-    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)]) * [
+        length / 2,
+        width / 2,
+        height,
+    ]
+    rotation = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
     points = corners @ rotation.T + [east_m, north_m, 0.0]
     pose = frame.site_from_camera
     assert pose is not None
@@ -55,11 +78,18 @@ def box_of(
     if least_shown == 1.0 and ((low < 2).any() or (high > size_px - 2).any()):
         return None
     inside = np.clip([low, high], 0, size_px)
-    return None if ((inside[1] - inside[0]) < least_shown * (high - low)).any() else inside.reshape(4)
+    return (
+        None if ((inside[1] - inside[0]) < least_shown * (high - low)).any() else inside.reshape(4)
+    )
 
 
 def sightings(
-    frames: list[PlacedFrame], things: list[Thing], *, misses: float = 0.2, false_alarms: float = 0.0, seed: int = 1,
+    frames: list[PlacedFrame],
+    things: list[Thing],
+    *,
+    misses: float = 0.2,
+    false_alarms: float = 0.0,
+    seed: int = 1,
     least_shown: float = 1.0,
 ) -> list[LaidSighting]:
     """What a detector sees of things whose boxes' edges err by a pixel."""
@@ -70,7 +100,11 @@ def sightings(
         boxes, labels = [], []
         for label, east_m, north_m, yaw_deg, (east_m_s, north_m_s) in things:
             box = box_of(
-                frame, label, east_m + east_m_s * seconds, north_m + north_m_s * seconds, yaw_deg,
+                frame,
+                label,
+                east_m + east_m_s * seconds,
+                north_m + north_m_s * seconds,
+                yaw_deg,
                 least_shown=least_shown,
             )
             if box is not None and random.random() >= misses:
@@ -87,14 +121,19 @@ def sightings(
 
 
 THINGS = [
-    ("car", 12.0, 3.0, 30.0, (0.0, 0.0)), ("car", 12.8, 5.6, 30.0, (0.0, 0.0)), ("person", 20.0, 1.0, 0.0, (0.0, 0.0)),
-    ("person", 21.2, 1.0, 0.0, (0.0, 0.0)), ("small object", 26.0, 6.0, 60.0, (0.0, 0.0)),
+    ("car", 12.0, 3.0, 30.0, (0.0, 0.0)),
+    ("car", 12.8, 5.6, 30.0, (0.0, 0.0)),
+    ("person", 20.0, 1.0, 0.0, (0.0, 0.0)),
+    ("person", 21.2, 1.0, 0.0, (0.0, 0.0)),
+    ("small object", 26.0, 6.0, 60.0, (0.0, 0.0)),
 ]
 
 
 def nearest(fused: Fused, east_m: float, north_m: float) -> tuple[str, float]:
     """Class and distance of the object nearest to a place."""
-    distances_m = [float(np.hypot(*(each.position_m - [east_m, north_m]))) for each in fused.objects]
+    distances_m = [
+        float(np.hypot(*(each.position_m - [east_m, north_m]))) for each in fused.objects
+    ]
     best = int(np.argmin(distances_m))
     return fused.objects[best].label, distances_m[best]
 
@@ -130,7 +169,10 @@ def test_what_one_strip_only_cuts_is_no_second_object(yaw_deg: float) -> None:
 def test_what_every_frame_cuts_has_no_size_and_a_place_with_its_error() -> None:
     """A car beyond the rim of what was flown: reported once, its place within the stated sigma, its length unknown."""
     frames = survey()
-    fused = fuse(sightings(frames, [("car", 16.0, -18.0, 90.0, (0.0, 0.0))], misses=0.0, least_shown=0.2), frames)
+    fused = fuse(
+        sightings(frames, [("car", 16.0, -18.0, 90.0, (0.0, 0.0))], misses=0.0, least_shown=0.2),
+        frames,
+    )
     (car,) = fused.objects
     assert np.isnan(car.size_m).all() and not car.moves
     assert car.sigma_m > 0.3
@@ -143,7 +185,9 @@ def test_pieces_at_the_edge_that_others_show_to_be_nothing() -> None:
     boxes = {0: [300.0, 0.0, 360.0, 50.0], 1: [300.0, 0.0, 350.0, 60.0]}
     laid = []
     for index, box in boxes.items():
-        seen = Detections(np.array([box]), np.array([0.8]), np.array([CLASSES.index("car")]), CLASSES)
+        seen = Detections(
+            np.array([box]), np.array([0.8]), np.array([CLASSES.index("car")]), CLASSES
+        )
         laid += [each for each in lay_on_ground(seen, frames[index]) if each is not None]
     assert len(laid) == 2
     assert fuse(laid, frames).objects == ()
@@ -154,13 +198,19 @@ def test_what_is_far_too_short_for_its_class_is_not_laid() -> None:
     frame = placed(0, 0.0, 0.0, pitch_deg=-90.0)
     boxes = np.array([[400.0, 200.0, 427.0, 220.0]] * 2 + [[400.0, 0.0, 427.0, 20.0]])
     seen = Detections(boxes, np.full(3, 0.9), np.array([1, 2, 1]), CLASSES)
-    assert [each is None for each in lay_on_ground(seen, frame)] == [CLASSES[1] == "car", False, False]
+    assert [each is None for each in lay_on_ground(seen, frame)] == [
+        CLASSES[1] == "car",
+        False,
+        False,
+    ]
 
 
 @pytest.mark.parametrize(("score", "count"), [(0.95, 1), (0.6, 1), (0.5, 0)])
 def test_what_one_frame_alone_shows_counts_as_in_that_frame(score: float, count: int) -> None:
     frames = [placed(0, 0.0, 0.0), placed(1, 60.0, 0.0)]
-    seen = Detections(np.array([[400.0, 200.0, 416.0, 215.0]]), np.array([score]), np.array([2]), CLASSES)
+    seen = Detections(
+        np.array([[400.0, 200.0, 416.0, 215.0]]), np.array([score]), np.array([2]), CLASSES
+    )
     laid = [each for each in lay_on_ground(seen, frames[0]) if each is not None]
     assert len(fuse(laid, frames, {"small object": 0.55}).objects) == count
 
@@ -171,7 +221,9 @@ def seen_with(scores: list[float]) -> list[LaidSighting]:
     for frame in survey()[:10]:
         box = box_of(frame, "car", 18.0, 2.0, 90.0)
         if box is not None:
-            seen = Detections(box[None], np.array([scores[len(laid) % len(scores)]]), np.array([1]), CLASSES)
+            seen = Detections(
+                box[None], np.array([scores[len(laid) % len(scores)]]), np.array([1]), CLASSES
+            )
             laid += [each for each in lay_on_ground(seen, frame) if each is not None]
     assert len(laid) >= 4
     return laid
@@ -220,8 +272,14 @@ def test_a_walker_is_one_and_moves() -> None:
     (walker,) = fused.objects
     assert walker.moves
     assert np.hypot(*(walker.velocity_m_s - [1.3, -0.3])) < 0.3
-    last_s = max(frames[k].time_ns for k in range(10) if box_of(
-        frames[k], "person", 8.0 + 1.3 * k, 2.0 - 0.3 * k, 0.0) is not None) / SECOND_NS
+    last_s = (
+        max(
+            frames[k].time_ns
+            for k in range(10)
+            if box_of(frames[k], "person", 8.0 + 1.3 * k, 2.0 - 0.3 * k, 0.0) is not None
+        )
+        / SECOND_NS
+    )
     assert np.hypot(*(walker.position_m - [8.0 + 1.3 * last_s, 2.0 - 0.3 * last_s])) < 0.5
 
 
@@ -254,7 +312,9 @@ def test_two_classes_for_one_thing() -> None:
     for frame in frames:
         box = box_of(frame, "small object", 8.0, 1.0, 0.0)
         if box is not None:
-            seen = Detections(np.array([box, box + 1]), np.array([0.8, 0.5]), np.array([2, 0]), CLASSES)
+            seen = Detections(
+                np.array([box, box + 1]), np.array([0.8, 0.5]), np.array([2, 0]), CLASSES
+            )
             laid += [each for each in lay_on_ground(seen, frame) if each is not None]
     (only,) = fuse(laid, frames).objects
     assert only.label == "small object"
@@ -263,12 +323,17 @@ def test_two_classes_for_one_thing() -> None:
 
 def test_a_loose_outline_around_a_thing_is_no_second_one() -> None:
     """Of two boxes of one class and frame, one around the other, one object comes; of two side by side, two."""
-    for apart_px, count in ((np.array([-6.0, -6.0, 10.0, 24.0]), 1), (np.array([26.0, 0.0, 26.0, 0.0]), 2)):
+    for apart_px, count in (
+        (np.array([-6.0, -6.0, 10.0, 24.0]), 1),
+        (np.array([26.0, 0.0, 26.0, 0.0]), 2),
+    ):
         laid = []
         for frame in survey()[:4]:
             box = box_of(frame, "small object", 8.0, 1.0, 0.0)
             if box is not None:
-                seen = Detections(np.array([box, box + apart_px]), np.array([0.8, 0.6]), np.array([2, 2]), CLASSES)
+                seen = Detections(
+                    np.array([box, box + apart_px]), np.array([0.8, 0.6]), np.array([2, 2]), CLASSES
+                )
                 laid += [each for each in lay_on_ground(seen, frame) if each is not None]
         assert len(fuse(laid, survey()[:4]).objects) == count
 
@@ -277,7 +342,9 @@ def test_nothing_seen_and_no_place() -> None:
     """No sighting makes no object; a rejected frame lays nothing; above the horizon nothing lies on the ground."""
     assert fuse([], survey()).objects == ()
     level = placed(0, 0.0, 0.0, pitch_deg=0.0)
-    sky = Detections(np.array([[400.0, 10.0, 420.0, 30.0]]), np.array([0.9]), np.array([0]), CLASSES)
+    sky = Detections(
+        np.array([[400.0, 10.0, 420.0, 30.0]]), np.array([0.9]), np.array([0]), CLASSES
+    )
     assert lay_on_ground(sky, level) == [None]
 
 
@@ -286,4 +353,9 @@ def test_shows_only_what_is_whole_in_the_picture() -> None:
     frame = placed(0, 0.0, 0.0, pitch_deg=-90.0)
     edge_m = 30.0 * 270 / 800 - 0.3
     places_m = np.array([[0.0, 0.0], [edge_m, 0.0], [edge_m, 0.0], [40.0, 0.0]])
-    assert shows(frame, places_m, np.zeros(4), np.array([2.0, 0.05, 2.0, 0.1])).tolist() == [True, True, False, False]
+    assert shows(frame, places_m, np.zeros(4), np.array([2.0, 0.05, 2.0, 0.1])).tolist() == [
+        True,
+        True,
+        False,
+        False,
+    ]

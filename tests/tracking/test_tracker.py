@@ -18,8 +18,16 @@ def sighting(frame, place_m, label="person", score=0.8, own_m=0.2, shared_m=1.5)
     place_m = np.asarray(place_m, float)
     middle = place_m * 16 + 640
     return Sighting(
-        frame, str(frame), int(frame * 2e8), label, score, np.concatenate([middle - 5, middle + 5]), place_m,
-        np.eye(2) * (own_m**2 + shared_m**2), np.array([0.6, 0.5]), shared_m,
+        frame,
+        str(frame),
+        int(frame * 2e8),
+        label,
+        score,
+        np.concatenate([middle - 5, middle + 5]),
+        place_m,
+        np.eye(2) * (own_m**2 + shared_m**2),
+        np.array([0.6, 0.5]),
+        shared_m,
     )
 
 
@@ -53,7 +61,9 @@ def test_the_shared_error_is_averaged_only_as_fast_as_it_forgets_itself():
         tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
     (track,) = tracker.finish()  # five views, a minute apart
     plain_mean_m = 1.5 * np.sqrt(sum(np.exp(-abs(i - j)) for i in range(5) for j in range(5)) / 25)
-    assert 0.95 * plain_mean_m < track.sigma_m < 1.3  # more than a plain mean's: it may have stirred in between
+    assert (
+        0.95 * plain_mean_m < track.sigma_m < 1.3
+    )  # more than a plain mean's: it may have stirred in between
 
 
 def test_a_walker_moves_and_keeps_its_id():
@@ -88,7 +98,9 @@ def test_tracks_that_never_stand_together_become_one():
     tracker.update([sighting(0, [0.0, 0.0])], time_ns=0, footprint_m=AROUND_M)
     tracker.update([sighting(1, [0.0, 0.0])], time_ns=int(2e8), footprint_m=AROUND_M)
     merged = {}
-    for frame in range(2, 30):  # the box slips to another place of the same object, too far for the gate
+    for frame in range(
+        2, 30
+    ):  # the box slips to another place of the same object, too far for the gate
         seen = [sighting(frame, [2.8, 0.0], shared_m=0.1)]
         merged |= tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M).merged
     (track,) = tracker.finish()
@@ -98,7 +110,8 @@ def test_tracks_that_never_stand_together_become_one():
 
 def car(frame, place_m, own_m=0.2):
     return replace(
-        sighting(frame, place_m, "car", own_m=own_m, shared_m=0.3), size_m=np.array([4.4, 1.9]),
+        sighting(frame, place_m, "car", own_m=own_m, shared_m=0.3),
+        size_m=np.array([4.4, 1.9]),
     )
 
 
@@ -117,7 +130,9 @@ def test_a_glimpse_at_the_edge_is_the_car_that_then_drives_on():
     """Three sightings that hardly show where it is, a second without it, and then it moves from there."""
     tracker = Tracker()
     for frame in [0, 1, 2, *range(8, 20)]:
-        seen = [car(frame, [0.8 * frame if frame > 2 else 0.0, 0.0], own_m=1.5 if frame < 3 else 0.3)]
+        seen = [
+            car(frame, [0.8 * frame if frame > 2 else 0.0, 0.0], own_m=1.5 if frame < 3 else 0.3)
+        ]
         tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
     (track,) = tracker.finish()
     assert track.moving and track.velocity_m_s == pytest.approx([4.0, 0.0], abs=0.5)
@@ -127,7 +142,10 @@ def test_a_glimpse_at_the_edge_is_the_car_that_then_drives_on():
 def test_two_boxes_of_one_object_are_one_and_the_scores_choose_its_class():
     tracker = Tracker()
     for frame in range(6):
-        seen = [sighting(frame, [1.0, 1.0], "person", 0.8), sighting(frame, [1.01, 1.0], "small object", 0.5)]
+        seen = [
+            sighting(frame, [1.0, 1.0], "person", 0.8),
+            sighting(frame, [1.01, 1.0], "small object", 0.5),
+        ]
         update = tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
         assert len(set(update.track_ids)) == 1
     (track,) = tracker.finish()
@@ -136,7 +154,10 @@ def test_two_boxes_of_one_object_are_one_and_the_scores_choose_its_class():
 
 
 def test_a_box_within_or_around_one_of_its_class_is_no_second_object():
-    bag, loose = [100.0, 100.0, 140.0, 145.0], [95.0, 95.0, 150.0, 170.0]  # they overlap by less than half
+    bag, loose = (
+        [100.0, 100.0, 140.0, 145.0],
+        [95.0, 95.0, 150.0, 170.0],
+    )  # they overlap by less than half
     for boxes, labels, count in (
         ((bag, loose), ("small object", "small object"), 1),
         ((loose, bag), ("small object", "small object"), 1),
@@ -147,7 +168,9 @@ def test_a_box_within_or_around_one_of_its_class_is_no_second_object():
         tracker = Tracker()
         for frame in range(8):
             seen = [
-                replace(sighting(frame, [0.5 * row, 0.0], label, 0.9 - 0.1 * row), box_px=np.array(box))
+                replace(
+                    sighting(frame, [0.5 * row, 0.0], label, 0.9 - 0.1 * row), box_px=np.array(box)
+                )
                 for row, (box, label) in enumerate(zip(boxes, labels))
             ]
             tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
@@ -158,7 +181,15 @@ def test_what_is_taken_now_for_this_and_now_for_that_is_one():
     tracker = Tracker()
     for frame in range(24):
         label = "person" if frame % 3 else "small object"
-        seen = [sighting(frame, [0.1 if frame % 3 else 0.0, 0.0], label, 0.9 if frame % 3 else 0.6, own_m=0.05)]
+        seen = [
+            sighting(
+                frame,
+                [0.1 if frame % 3 else 0.0, 0.0],
+                label,
+                0.9 if frame % 3 else 0.6,
+                own_m=0.05,
+            )
+        ]
         tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M)
     (track,) = tracker.finish()
     assert track.label == "person"
@@ -170,7 +201,10 @@ def test_what_is_not_seen_where_it_should_be_ends_and_what_is_out_of_view_does_n
     elsewhere = AROUND_M + ASIDE_M
     for frame in range(5, 60):
         assert not tracker.update([], time_ns=int(frame * 2e8), footprint_m=elsewhere).ended
-    ended = [tracker.update([], time_ns=int(frame * 2e8), footprint_m=AROUND_M).ended for frame in range(60, 90)]
+    ended = [
+        tracker.update([], time_ns=int(frame * 2e8), footprint_m=AROUND_M).ended
+        for frame in range(60, 90)
+    ]
     assert [each for each in ended if each] == [(1,)]
     assert len(tracker.finish()) == 1  # it was there
 
@@ -185,13 +219,21 @@ ALONE = TrackerSettings(alone={"person": 0.7})
 """For photos, where one that alone shows a place is enough."""
 
 
-@pytest.mark.parametrize(("score", "then_m", "is_reported"), [
-    (0.8, ASIDE_M, True), (0.6, ASIDE_M, False),  # the next photo shows other ground
-    (0.8, np.zeros(2), False),  # it shows the place, and nothing there
-])
-def test_what_one_photo_alone_shows_is_reported_when_it_goes_out_of_view(score, then_m, is_reported):
+@pytest.mark.parametrize(
+    ("score", "then_m", "is_reported"),
+    [
+        (0.8, ASIDE_M, True),
+        (0.6, ASIDE_M, False),  # the next photo shows other ground
+        (0.8, np.zeros(2), False),  # it shows the place, and nothing there
+    ],
+)
+def test_what_one_photo_alone_shows_is_reported_when_it_goes_out_of_view(
+    score, then_m, is_reported
+):
     tracker = Tracker(ALONE)
-    assert not tracker.update([sighting(0, [3.0, 4.0], score=score)], time_ns=0, footprint_m=AROUND_M).new
+    assert not tracker.update(
+        [sighting(0, [3.0, 4.0], score=score)], time_ns=0, footprint_m=AROUND_M
+    ).new
     update = tracker.update([], time_ns=int(5e9), footprint_m=AROUND_M + then_m)
     assert len(update.new) == len(tracker.finish()) == is_reported
 
@@ -220,7 +262,9 @@ def test_appearance_shows_who_came_back():
         tracker.update(seen, time_ns=seen[0].time_ns, footprint_m=AROUND_M, appearance=looks[:2])
     tracker.update([], time_ns=int(20e9), footprint_m=AROUND_M + ASIDE_M)
     back = [sighting(600, [1.5, 0.0])]  # GPS has wandered: half way between both
-    assert tracker.update(back, time_ns=int(120e9), footprint_m=AROUND_M, appearance=looks[1:2]).track_ids == (2,)
+    assert tracker.update(
+        back, time_ns=int(120e9), footprint_m=AROUND_M, appearance=looks[1:2]
+    ).track_ids == (2,)
 
 
 @pytest.mark.parametrize("kind", ["lawnmower", "there and back"])
@@ -230,16 +274,25 @@ def test_patrols_count_each_object_once(kind):
     objects, tracker = things(patrol), Tracker()
     in_view, owners = np.zeros(len(objects.labels), int), {}
     for frame in fly(patrol, objects):
-        update = tracker.update(frame.sightings, time_ns=int(frame.time_s * 1e9), footprint_m=frame.footprint_m)
-        owners |= {number: owner for number, owner in zip(update.track_ids, frame.owners) if owner >= 0}
+        update = tracker.update(
+            frame.sightings, time_ns=int(frame.time_s * 1e9), footprint_m=frame.footprint_m
+        )
+        owners |= {
+            number: owner for number, owner in zip(update.track_ids, frame.owners) if owner >= 0
+        }
         in_view += frame.inside
     tracks, there = tracker.finish(), int((in_view >= 5).sum())
     assert there >= 10
     assert abs(len(tracks) - there) <= 1
     standing = [track for track in tracks if not objects.velocity_m_s[owners[track.id]].any()]
     assert sum(track.moving for track in standing) <= 1
-    errors_m = np.array([track.position_m - objects.start_m[owners[track.id]] for track in standing])
-    sigmas = [error @ np.linalg.solve(track.covariance_m2, error) for error, track in zip(errors_m, standing)]
+    errors_m = np.array(
+        [track.position_m - objects.start_m[owners[track.id]] for track in standing]
+    )
+    sigmas = [
+        error @ np.linalg.solve(track.covariance_m2, error)
+        for error, track in zip(errors_m, standing)
+    ]
     assert np.sqrt(np.mean(errors_m**2)) < 2.0
     assert np.mean(np.array(sigmas) < 5.991) >= 0.9
 
@@ -249,7 +302,9 @@ def test_the_same_frames_give_the_same_tracks():
         patrol = Patrol(seed=9, size_m=(80.0, 80.0))
         tracker = Tracker()
         return [
-            tracker.update(frame.sightings, time_ns=int(frame.time_s * 1e9), footprint_m=frame.footprint_m)
+            tracker.update(
+                frame.sightings, time_ns=int(frame.time_s * 1e9), footprint_m=frame.footprint_m
+            )
             for frame in fly(patrol, things(patrol))
         ]
 

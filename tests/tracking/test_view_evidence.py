@@ -39,7 +39,11 @@ def test_what_is_as_weak_as_usual_says_nothing() -> None:
 
 def test_a_weak_sighting_is_less_against_it_than_none() -> None:
     strong = [0.9, 0.9, 0.9]
-    assert score_from_views([*strong, 0.4], 4) > score_from_views(strong, 4) > score_from_views(strong, 6)
+    assert (
+        score_from_views([*strong, 0.4], 4)
+        > score_from_views(strong, 4)
+        > score_from_views(strong, 6)
+    )
 
 
 @pytest.mark.parametrize("score", [0.0, 1.0])

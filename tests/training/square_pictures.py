@@ -22,9 +22,11 @@ def labelled_squares(
             for label in range(len(names)):
                 side = int(rng.integers(22, 32))
                 x, y = int(rng.integers(0, _WIDTH - side)), int(rng.integers(0, _HEIGHT - side))
-                image[y:y + side, x:x + side] = (30, 220, 240) if label == 0 else (240, 60, 40)
-                rows.append(f"{label} {(x + side / 2) / _WIDTH} {(y + side / 2) / _HEIGHT} {side / _WIDTH} "
-                            f"{side / _HEIGHT}")
+                image[y : y + side, x : x + side] = (30, 220, 240) if label == 0 else (240, 60, 40)
+                rows.append(
+                    f"{label} {(x + side / 2) / _WIDTH} {(y + side / 2) / _HEIGHT} {side / _WIDTH} "
+                    f"{side / _HEIGHT}"
+                )
             name = f"flight{video}_{frame:04d}"
             cv2.imwrite(str(folder / "images" / f"{name}.png"), image)
             (folder / "labels" / f"{name}.txt").write_text("\n".join(rows))

@@ -8,16 +8,16 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sorvolo.errors import InputError, SettingsError  # noqa: E402
-from sorvolo.geometry.arrays import ImageRGB  # noqa: E402
-from sorvolo.survey.labels import LabelledPicture, LabelledSet  # noqa: E402
-from sorvolo.training.checkpoint import checkpoint_bytes, read_checkpoint, restore  # noqa: E402
-from sorvolo.training.drawing import batches_from, draws  # noqa: E402
-from sorvolo.training.four_steps import FourStepSettings, FourStepTraining  # noqa: E402
-from sorvolo.training.joint import JointSettings, JointTraining, Progress  # noqa: E402
-from sorvolo.training.presets import build  # noqa: E402
-from sorvolo.training.progress import Check, History, Learner, seconds_left  # noqa: E402
-from sorvolo.training.samples import Augmentation, Sample, Share  # noqa: E402
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
+from sorvolo.training.drawing import batches_from, draws
+from sorvolo.training.four_steps import FourStepSettings, FourStepTraining
+from sorvolo.training.joint import JointSettings, JointTraining, Progress
+from sorvolo.training.presets import build
+from sorvolo.training.progress import Check, History, Learner, seconds_left
+from sorvolo.training.samples import Augmentation, Sample, Share
 
 _CLASSES = ("person", "car")
 _SETTINGS = {"preset": "fast", "steps": 8, "seed": 3}
@@ -26,14 +26,19 @@ _SETTINGS = {"preset": "fast", "steps": 8, "seed": 3}
 def _picture(index: int) -> ImageRGB:
     rng = np.random.default_rng(index)
     image = rng.integers(60, 100, (80, 96, 3)).astype(np.uint8)
-    image[20:36, 10 + index:30 + index] = (200, 60, 60)
+    image[20:36, 10 + index : 30 + index] = (200, 60, 60)
     return image
 
 
 def _shares(count: int = 5) -> list[Share]:
     pictures = [
         LabelledPicture(
-            str(index), 96, 80, "", np.array([[10 + index, 20, 30 + index, 36]], np.float32), np.array([1]),
+            str(index),
+            96,
+            80,
+            "",
+            np.array([[10 + index, 20, 30 + index, 36]], np.float32),
+            np.array([1]),
             np.zeros((0, 4), np.float32),
         )
         for index in range(count)
@@ -44,7 +49,13 @@ def _shares(count: int = 5) -> list[Share]:
 
 def _batches(start: int = 0, threads: int = 1) -> Iterator[list[Sample]]:
     return batches_from(
-        _shares(), _CLASSES, lambda path: _picture(int(path)), Augmentation(side_px=64), seed=3, batch=2, start=start,
+        _shares(),
+        _CLASSES,
+        lambda path: _picture(int(path)),
+        Augmentation(side_px=64),
+        seed=3,
+        batch=2,
+        start=start,
         threads=threads,
     )
 
@@ -58,12 +69,19 @@ def _joint(steps: int = 8) -> Learner:
 def _four_steps(steps: int = 8) -> Learner:
     torch.manual_seed(0)
     return FourStepTraining(
-        build("fast", _CLASSES, "standard", None), FourStepSettings(steps=steps, rate=1e-2, regions=16, proposed=40), 3
+        build("fast", _CLASSES, "standard", None),
+        FourStepSettings(steps=steps, rate=1e-2, regions=16, proposed=40),
+        3,
     )
 
 
 def _losses(progress: Progress) -> tuple[float, ...]:
-    return progress.proposal_score, progress.proposal_box, progress.region_score, progress.region_box
+    return (
+        progress.proposal_score,
+        progress.proposal_box,
+        progress.region_score,
+        progress.region_box,
+    )
 
 
 @pytest.mark.parametrize("make", [_joint, _four_steps])
@@ -82,7 +100,9 @@ def test_a_resumed_run_has_the_losses_of_one_that_was_not_stopped(
     second = make()
     restore(second, read_checkpoint(saved, "checkpoint"), _SETTINGS)
     assert second.step == killed_after
-    found = [_losses(second.learn(batch)) for batch in islice(_batches(killed_after), 8 - killed_after)]
+    found = [
+        _losses(second.learn(batch)) for batch in islice(_batches(killed_after), 8 - killed_after)
+    ]
     assert found == wanted[killed_after:]
     for name, value in second.average.state_dict().items():
         assert torch.equal(value, whole.average.state_dict()[name]), name
@@ -90,7 +110,9 @@ def test_a_resumed_run_has_the_losses_of_one_that_was_not_stopped(
 
 def test_other_settings_are_refused_by_name() -> None:
     saved = read_checkpoint(checkpoint_bytes(_joint(), _SETTINGS, History()), "checkpoint")
-    with pytest.raises(SettingsError, match=r"seed was 3, is 4; steps was 8, is 9; give the earlier ones"):
+    with pytest.raises(
+        SettingsError, match=r"seed was 3, is 4; steps was 8, is 9; give the earlier ones"
+    ):
         restore(_joint(), saved, _SETTINGS | {"seed": 4, "steps": 9})
     other = JointTraining(build("fast", ("person",), "standard", None), JointSettings(steps=8), 3)
     with pytest.raises(InputError, match="does not fit this network"):
@@ -99,7 +121,9 @@ def test_other_settings_are_refused_by_name() -> None:
 
 @pytest.mark.parametrize("data", [b"", b"not a checkpoint", b"\x80\x04N.", b"junk"])
 def test_damaged_checkpoints_are_refused(data: bytes) -> None:
-    with pytest.raises(InputError, match=r"run/checkpoint\.pt is no checkpoint of sorvolo, or damaged"):
+    with pytest.raises(
+        InputError, match=r"run/checkpoint\.pt is no checkpoint of sorvolo, or damaged"
+    ):
         read_checkpoint(data, "run/checkpoint.pt")
 
 
@@ -125,9 +149,17 @@ def test_the_four_steps_train_what_they_should() -> None:
         for before, now in ((start, one), (one, two), (two, three), (three, four))
     ]
     # the second step begins again from the first weights, so its shared layers are neither
-    assert moved == [{"backbone", "neck", "proposals"}, {"backbone", "neck", "head"}, {"proposals"}, {"head"}]
+    assert moved == [
+        {"backbone", "neck", "proposals"},
+        {"backbone", "neck", "head"},
+        {"proposals"},
+        {"head"},
+    ]
     assert [(_losses(each[2])[0] > 0, _losses(each[2])[2] > 0) for each in after] == [
-        (True, False), (False, True), (True, False), (False, True)
+        (True, False),
+        (False, True),
+        (True, False),
+        (False, True),
     ]
 
 
@@ -153,7 +185,9 @@ def test_too_few_steps_for_four() -> None:
 def _copies(learner: FourStepTraining) -> dict[str, dict[str, "torch.Tensor"]]:
     parts = {"backbone", "neck", "proposals", "head"}
     return {
-        part: {name: value.clone() for name, value in getattr(learner.model, part).state_dict().items()}
+        part: {
+            name: value.clone() for name, value in getattr(learner.model, part).state_dict().items()
+        }
         for part in parts
     }
 
@@ -167,7 +201,7 @@ def test_draws_do_not_depend_on_where_they_start_and_take_all_pictures_in_turn()
     assert list(islice(draws(_shares(), 7, start=25), 35)) == whole[25:]
     first = [each.picture for each in whole if each.share == 0]
     for start in range(0, len(first) - 4, 5):
-        assert sorted(first[start:start + 5]) == [0, 1, 2, 3, 4]
+        assert sorted(first[start : start + 5]) == [0, 1, 2, 3, 4]
     assert 25 < len(first) < 55  # twice the weight of the other
     assert list(islice(draws(_shares(), 8), 60)) != whole
 
@@ -189,10 +223,20 @@ def test_history_means_rows_and_survives_json() -> None:
     history = History()
     for step in range(1, 8):
         history = history.after(Progress(step, step, 0, 1, 2, 0.0, 7), seconds=0.5 * step, every=3)
-    assert [(row.step, row.proposal_score, row.loss) for row in history.rows] == [(3, 2, 5), (6, 5, 8), (7, 7, 10)]
+    assert [(row.step, row.proposal_score, row.loss) for row in history.rows] == [
+        (3, 2, 5),
+        (6, 5, 8),
+        (7, 7, 10),
+    ]
     assert history.seconds == 3.5 and not history.pending
-    history = history.checked(Check(3, 0.4, 0.2, {"car": 0.4})).checked(Check(6, 0.3, 0.2, {"car": 0.3}))
+    history = history.checked(Check(3, 0.4, 0.2, {"car": 0.4})).checked(
+        Check(6, 0.3, 0.2, {"car": 0.3})
+    )
     assert history.best == history.checks[0]
-    assert history.is_worth_going_on(2) and not history.is_worth_going_on(1) and history.is_worth_going_on(0)
+    assert (
+        history.is_worth_going_on(2)
+        and not history.is_worth_going_on(1)
+        and history.is_worth_going_on(0)
+    )
     assert History.from_plain(history.plain()) == history
     assert seconds_left(10, 30, 5, 2.0) == 8.0 and np.isnan(seconds_left(0, 30, 0, 0.0))

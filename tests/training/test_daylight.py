@@ -7,9 +7,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sorvolo.detection.session import Session  # noqa: E402
-from sorvolo.survey.objects import CLASSES  # noqa: E402
-from sorvolo.training.daylight import (  # noqa: E402
+from sorvolo.detection.session import Session
+from sorvolo.survey.objects import CLASSES
+from sorvolo.training.daylight import (
     Calibration,
     Daylight,
     DaylightSettings,
@@ -18,13 +18,16 @@ from sorvolo.training.daylight import (  # noqa: E402
     odds_from_scores,
     one_hot,
 )
-from sorvolo.training.exported import load_exported  # noqa: E402
-from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead  # noqa: E402
-from sorvolo.training.onnx_export import onnx_from_module  # noqa: E402
-from sorvolo.training.presets import fast  # noqa: E402
+from sorvolo.training.exported import load_exported
+from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
+from sorvolo.training.onnx_export import onnx_from_module
+from sorvolo.training.presets import fast
 
 INFO = {
-    "name": "toy", "classes": list(CLASSES), "thresholds": dict.fromkeys(CLASSES, 0.5), "stride": 32,
+    "name": "toy",
+    "classes": list(CLASSES),
+    "thresholds": dict.fromkeys(CLASSES, 0.5),
+    "stride": 32,
     "best_px": {name: [12, 130] for name in CLASSES},
 }
 
@@ -66,10 +69,15 @@ def _silent_judge(answers: list[float]) -> Judge:
 
 
 def _model(
-    coco: _Coco, said_of_cars: float = 0.0, car: Calibration = PLAIN, person: Calibration = PLAIN,
+    coco: _Coco,
+    said_of_cars: float = 0.0,
+    car: Calibration = PLAIN,
+    person: Calibration = PLAIN,
     aerial_person: Calibration = PLAIN,
 ) -> Daylight:
-    return Daylight(_Aerial(), coco, _silent_judge([9, said_of_cars, 9]), {1: car}, person, aerial_person)
+    return Daylight(
+        _Aerial(), coco, _silent_judge([9, said_of_cars, 9]), {1: car}, person, aerial_person
+    )
 
 
 def _found(model: Daylight) -> dict[str, list[float]]:
@@ -88,23 +96,31 @@ def _sigmoid(odds: float) -> float:
 def test_a_judged_score_is_the_mean_of_both_opinions_and_unjudged_ones_stay() -> None:
     found = _found(_model(_Coco(ELSEWHERE, 0.5), said_of_cars=-3.0))
     assert found["car"] == pytest.approx([_sigmoid((np.log(4.0) - 3) / 2)], abs=1e-5)
-    assert found["small object"] == pytest.approx([0.7]) and found["person"] == pytest.approx([0.9, 0.5], abs=1e-5)
+    assert found["small object"] == pytest.approx([0.7]) and found["person"] == pytest.approx(
+        [0.9, 0.5], abs=1e-5
+    )
 
 
 def test_an_aerial_person_is_believed_as_nanodet_supports_it() -> None:
     supported = Calibration(1.0, -1.0, support=0.5)
     found = _found(_model(_Coco(ELSEWHERE, 0.5, support=-4.0), aerial_person=supported))
-    assert found["person"] == pytest.approx(sorted([0.5, _sigmoid(np.log(9.0) - 1 - 2)], reverse=True), abs=1e-4)
+    assert found["person"] == pytest.approx(
+        sorted([0.5, _sigmoid(np.log(9.0) - 1 - 2)], reverse=True), abs=1e-4
+    )
 
 
 def test_a_person_that_both_networks_find_is_one_with_the_better_score() -> None:
     assert _found(_model(_Coco(THE_SAME, 0.6)))["person"] == pytest.approx([0.9], abs=1e-5)
     strict = Calibration(1.0, -4.0)
-    assert _found(_model(_Coco(THE_SAME, 0.6), aerial_person=strict))["person"] == pytest.approx([0.6], abs=1e-5)
+    assert _found(_model(_Coco(THE_SAME, 0.6), aerial_person=strict))["person"] == pytest.approx(
+        [0.6], abs=1e-5
+    )
 
 
 def test_calibrations_are_of_their_own_class() -> None:
-    found = _found(_model(_Coco(ELSEWHERE, 0.5), person=Calibration(1.0, -2.0), car=Calibration(2.0, 1.0)))
+    found = _found(
+        _model(_Coco(ELSEWHERE, 0.5), person=Calibration(1.0, -2.0), car=Calibration(2.0, 1.0))
+    )
     assert found["person"] == pytest.approx([0.9, _sigmoid(-2)], abs=1e-5)
     assert found["car"] == pytest.approx([_sigmoid(2 * np.log(4.0) / 2 + 1)], abs=1e-5)
 
@@ -117,24 +133,34 @@ def test_odds_are_bounded_and_one_hot_marks_labels() -> None:
 
 def test_a_head_for_people_finds_them_and_nanodet_supports_it() -> None:
     head = NanoDetHead(1, deeper=True)
-    for layer, bias in zip(head.outputs, (-9.0, -9.0, 2.0)):  # sure of a person in each cell of 32 px
+    for layer, bias in zip(
+        head.outputs, (-9.0, -9.0, 2.0)
+    ):  # sure of a person in each cell of 32 px
         torch.nn.init.zeros_(layer.weight)
         torch.nn.init.constant_(layer.bias, bias)
     supported = Calibration(1.0, -1.0, support=0.5)
     model = _model(_Coco(THE_SAME, 0.99, support=-4.0), person=supported)
-    model.aerial.forward = lambda images: (torch.zeros(1, 4), torch.tensor([0.01]), torch.tensor([1]))
+    model.aerial.forward = lambda images: (
+        torch.zeros(1, 4),
+        torch.tensor([0.01]),
+        torch.tensor([1]),
+    )
     model.people = head
     assert _found(model)["person"] == pytest.approx([_sigmoid(2 - 1 - 2)], abs=1e-3)
 
 
 @pytest.mark.parametrize("has_people", [False, True])
-def test_its_onnx_file_gives_what_torch_gives_and_can_be_learnt_on_from(tmp_path: Path, has_people: bool) -> None:
+def test_its_onnx_file_gives_what_torch_gives_and_can_be_learnt_on_from(
+    tmp_path: Path, has_people: bool
+) -> None:
     torch.manual_seed(2)
     aerial = fast(CLASSES).eval()
     torch.nn.init.normal_(aerial.head.scores.weight, std=0.3)
     coco = CocoDetector(NanoDetBackbone(), NanoDetHead(), ((0,),))
     people = NanoDetHead(1, deeper=True) if has_people else None
-    model = Daylight(aerial, coco, Judge(3), {1: Calibration()}, Calibration(support=0.3), people=people).eval()
+    model = Daylight(
+        aerial, coco, Judge(3), {1: Calibration()}, Calibration(support=0.3), people=people
+    ).eval()
     path = tmp_path / "toy.onnx"
     path.write_bytes(onnx_from_module(model, INFO))
     picture = np.random.default_rng(1).integers(0, 256, (128, 192, 3), dtype=np.uint8)
@@ -175,7 +201,9 @@ def test_its_onnx_file_takes_a_picture_without_any_aerial_candidate(tmp_path: Pa
     assert set(by_night.labels.tolist()) <= {0}
 
 
-def test_a_softened_picture_keeps_its_size_and_level_up_to_its_edges_and_loses_its_finest_pattern() -> None:
+def test_a_softened_picture_keeps_its_size_and_level_up_to_its_edges_and_loses_its_finest_pattern() -> (
+    None
+):
     softened = Softened(DaylightSettings().softened_px)
     flat = torch.full((1, 3, 20, 32), 200, dtype=torch.uint8)
     torch.testing.assert_close(softened(flat), flat.float())

@@ -4,11 +4,11 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from torch.nn import functional  # noqa: E402
+from torch.nn import functional
 
-from sorvolo.training import depthwise as module  # noqa: E402
-from sorvolo.training.backbone import SamePadded  # noqa: E402
-from sorvolo.training.depthwise import Depthwise, depthwise  # noqa: E402
+from sorvolo.training import depthwise as module
+from sorvolo.training.backbone import SamePadded
+from sorvolo.training.depthwise import Depthwise, depthwise
 
 _CHANNELS = 6
 
@@ -19,7 +19,9 @@ def _inputs(kernel: int, *, seed: int = 1) -> tuple["torch.Tensor", "torch.Tenso
     """Features (2, C, 14, 18), weight (C, 1, k, k) and bias (C,)."""
     chance = torch.Generator().manual_seed(seed)
     shapes = (2, _CHANNELS, 14, 18), (_CHANNELS, 1, kernel, kernel), (_CHANNELS,)
-    features, weight, bias = (torch.randn(shape, generator=chance, requires_grad=True) for shape in shapes)
+    features, weight, bias = (
+        torch.randn(shape, generator=chance, requires_grad=True) for shape in shapes
+    )
     return features, weight, bias
 
 
@@ -38,10 +40,14 @@ def _taught(convolve, tensors, stride, padding):  # type: ignore[no-untyped-def]
 @pytest.mark.parametrize("with_bias", [False, True])
 @pytest.mark.parametrize(("kernel", "padding"), [(3, 1), (3, 0), (5, 2), (7, 3)])
 @pytest.mark.parametrize("stride", [1, 2])
-def test_output_and_gradients_are_torchs(stride: int, kernel: int, padding: int, with_bias: bool) -> None:
+def test_output_and_gradients_are_torchs(
+    stride: int, kernel: int, padding: int, with_bias: bool
+) -> None:
     features, weight, bias = _inputs(kernel)
     tensors = (features, weight, bias if with_bias else None)
-    for found, wanted in zip(_taught(depthwise, tensors, stride, padding), _taught(_own, tensors, stride, padding)):
+    for found, wanted in zip(
+        _taught(depthwise, tensors, stride, padding), _taught(_own, tensors, stride, padding)
+    ):
         torch.testing.assert_close(found, wanted)
 
 
@@ -49,7 +55,11 @@ def test_the_derivatives_are_those_of_small_steps() -> None:
     features, weight, bias = (each.detach().double().requires_grad_() for each in _inputs(3))
     # gradients are reckoned in float32, so the steps are larger and the tolerance is float32's
     assert torch.autograd.gradcheck(
-        lambda *each: depthwise(*each, 2, 1), (features[:1, :, :6, :6], weight, bias), eps=1e-3, atol=1e-3, rtol=1e-3
+        lambda *each: depthwise(*each, 2, 1),
+        (features[:1, :, :6, :6], weight, bias),
+        eps=1e-3,
+        atol=1e-3,
+        rtol=1e-3,
     )
 
 
@@ -57,7 +67,8 @@ def test_features_in_channels_last_are_the_same() -> None:
     features, weight, _ = _inputs(5)
     last = features.detach().contiguous(memory_format=torch.channels_last).requires_grad_()
     for found, wanted in zip(
-        _taught(depthwise, (last, weight, None), 1, 2), _taught(_own, (features, weight, None), 1, 2)
+        _taught(depthwise, (last, weight, None), 1, 2),
+        _taught(_own, (features, weight, None), 1, 2),
     ):
         torch.testing.assert_close(found, wanted)
 
@@ -75,7 +86,9 @@ def test_a_frozen_picture_or_weight_asks_for_the_other_gradient_only() -> None:
 
 
 @pytest.mark.parametrize("stride", [1, 2])
-def test_under_autocast_the_type_is_bfloat16_and_gradients_are_near_the_exact_ones(stride: int) -> None:
+def test_under_autocast_the_type_is_bfloat16_and_gradients_are_near_the_exact_ones(
+    stride: int,
+) -> None:
     features, weight, bias = _inputs(5)
     with torch.autocast("cpu", torch.bfloat16):
         found = _taught(depthwise, (features, weight, bias), stride, 2)
@@ -83,11 +96,15 @@ def test_under_autocast_the_type_is_bfloat16_and_gradients_are_near_the_exact_on
     exact = _taught(_own, (features, weight, bias), stride, 2)
     assert [each.dtype for each in found[1:]] == [torch.float32] * 3
     for mine, wanted in zip(found, exact):
-        torch.testing.assert_close(mine.float(), wanted, atol=0.03 * float(wanted.abs().max()), rtol=0.03)
+        torch.testing.assert_close(
+            mine.float(), wanted, atol=0.03 * float(wanted.abs().max()), rtol=0.03
+        )
 
 
 @pytest.mark.parametrize("frozen", [True, False])
-def test_where_nothing_is_learnt_torch_itself_is_asked(frozen: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_nothing_is_learnt_torch_itself_is_asked(
+    frozen: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def never(*_: object) -> None:
         raise AssertionError("the detour through autograd was taken")
 
@@ -95,7 +112,9 @@ def test_where_nothing_is_learnt_torch_itself_is_asked(frozen: bool, monkeypatch
     monkeypatch.setattr(module._Depthwise, "apply", never)
     wanted = _own(features, weight, bias, 2, 1)
     if frozen:
-        torch.testing.assert_close(depthwise(features.detach(), weight.detach(), bias, 2, 1), wanted)
+        torch.testing.assert_close(
+            depthwise(features.detach(), weight.detach(), bias, 2, 1), wanted
+        )
     else:
         with torch.no_grad():
             assert torch.equal(depthwise(features, weight, bias, 2, 1), wanted)

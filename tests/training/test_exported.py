@@ -8,18 +8,18 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-import onnx  # noqa: E402
-import onnxruntime  # noqa: E402
+import onnx
+import onnxruntime
 
-from sorvolo.detection.quantise import quantise  # noqa: E402
-from sorvolo.errors import InputError  # noqa: E402
-from sorvolo.geometry.arrays import ImageRGB  # noqa: E402
-from sorvolo.training.exported import load_exported  # noqa: E402
-from sorvolo.training.faster_rcnn import FasterRCNN  # noqa: E402
-from sorvolo.training.inception import Stem  # noqa: E402
-from sorvolo.training.onnx_export import check_export, export_onnx  # noqa: E402
-from sorvolo.training.presets import accurate, fast, thesis  # noqa: E402
-from sorvolo.training.resnet import ResNet50  # noqa: E402
+from sorvolo.detection.quantise import quantise
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.training.exported import load_exported
+from sorvolo.training.faster_rcnn import FasterRCNN
+from sorvolo.training.inception import Stem
+from sorvolo.training.onnx_export import check_export, export_onnx
+from sorvolo.training.presets import accurate, fast, thesis
+from sorvolo.training.resnet import ResNet50
 
 _CLASSES = ("person", "car")
 
@@ -43,7 +43,9 @@ def _model(rpn: Stem = "extended-residual", classes: tuple[str, ...] = _CLASSES)
     for each in model.modules():
         if isinstance(each, torch.nn.BatchNorm2d):
             for value, low, high in (
-                (each.running_mean, -0.3, 0.3), (each.running_var, 0.5, 2.0), (each.weight, 0.5, 1.5),
+                (each.running_mean, -0.3, 0.3),
+                (each.running_var, 0.5, 2.0),
+                (each.weight, 0.5, 1.5),
                 (each.bias, -0.2, 0.2),
             ):
                 torch.nn.init.uniform_(value, low, high)
@@ -52,8 +54,13 @@ def _model(rpn: Stem = "extended-residual", classes: tuple[str, ...] = _CLASSES)
 
 
 def _export(model: FasterRCNN, classes: tuple[str, ...] = _CLASSES) -> bytes:
-    reported = {"thresholds": dict.fromkeys(classes, 0.5), "best_px": dict.fromkeys(classes, (8, 90))}
-    return export_onnx(model, {"name": "own", "classes": list(classes), "preset": "fast", **reported})
+    reported = {
+        "thresholds": dict.fromkeys(classes, 0.5),
+        "best_px": dict.fromkeys(classes, (8, 90)),
+    }
+    return export_onnx(
+        model, {"name": "own", "classes": list(classes), "preset": "fast", **reported}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +98,9 @@ def test_other_proposal_networks_come_back_too(rpn: Stem) -> None:
     torch.testing.assert_close(found.offsets, wanted.offsets, atol=1e-3, rtol=1e-3)
 
 
-def test_on_the_pictures_that_settled_its_norms_it_sees_the_same_while_it_learns(exported: bytes) -> None:
+def test_on_the_pictures_that_settled_its_norms_it_sees_the_same_while_it_learns(
+    exported: bytes,
+) -> None:
     back = fast(_CLASSES)
     was_training = back.train().training
     load_exported(back, exported, _batch())
@@ -103,7 +112,9 @@ def test_on_the_pictures_that_settled_its_norms_it_sees_the_same_while_it_learns
         other = unsettled.proposals(unsettled.features(_batch()))
     spread = at_rest.scores.std()
     assert (learning.scores - at_rest.scores).abs().max() < 1e-3 * spread
-    assert (other.scores - at_rest.scores).abs().max() > 0.1 * spread  # norms that were not settled see something else
+    assert (
+        other.scores - at_rest.scores
+    ).abs().max() > 0.1 * spread  # norms that were not settled see something else
 
 
 def test_classes_of_the_same_name_keep_their_rows_and_others_start_anew(exported: bytes) -> None:
@@ -126,7 +137,9 @@ def test_classes_of_the_same_name_keep_their_rows_and_others_start_anew(exported
 def test_another_proposal_network_is_reported(exported: bytes) -> None:
     for rpn in ("standard", "extended"):
         torch.manual_seed(6)
-        with pytest.raises(InputError, match=r"does not fit the network: .*proposals.stems.*same preset, --rpn"):
+        with pytest.raises(
+            InputError, match=r"does not fit the network: .*proposals.stems.*same preset, --rpn"
+        ):
             load_exported(fast(_CLASSES, rpn), exported, _batch())
     with pytest.raises(InputError, match=r"does not fit the network: .*same preset, --rpn"):
         load_exported(fast(_CLASSES), _export(_model("standard")), _batch())
@@ -142,7 +155,9 @@ def test_norms_that_do_not_learn_are_reported() -> None:
     torch.manual_seed(5)
     model = _model()
     model.backbone = ResNet50(deep=True)
-    with pytest.raises(InputError, match=r"batch norm behind backbone\.conv1 stays.*--weights auto"):
+    with pytest.raises(
+        InputError, match=r"batch norm behind backbone\.conv1 stays.*--weights auto"
+    ):
         _load_layers_of(model)
 
 
@@ -155,10 +170,14 @@ def _load_layers_of(model: FasterRCNN) -> None:
             for index in range(len(dotted)):
                 scopes.append(".".join(dotted[: index + 1]))
             for part, shape in (("weight", layer.weight.shape), ("bias", layer.weight.shape[:1])):
-                values.append(onnx.numpy_helper.from_array(np.zeros(shape, np.float32), f"{name}.{part}"))
+                values.append(
+                    onnx.numpy_helper.from_array(np.zeros(shape, np.float32), f"{name}.{part}")
+                )
             kind = "Conv" if isinstance(layer, torch.nn.Conv2d) else "Gemm"
             inputs = ["image", f"{name}.weight", f"{name}.bias"]
-            nodes.append(onnx.helper.make_node(kind, inputs, [name], "/" + "/".join([*scopes, kind])))
+            nodes.append(
+                onnx.helper.make_node(kind, inputs, [name], "/" + "/".join([*scopes, kind]))
+            )
     file = onnx.helper.make_model(onnx.helper.make_graph(nodes, "own", [], [], values))
     entry = file.metadata_props.add()
     entry.key, entry.value = "sorvolo", json.dumps({"classes": _CLASSES})

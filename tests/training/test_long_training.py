@@ -12,19 +12,19 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from square_pictures import labelled_squares  # noqa: E402
+from square_pictures import labelled_squares
 
-from real_data import real_data  # noqa: E402
-from sorvolo.errors import InputError, SettingsError  # noqa: E402
-from sorvolo.store.datasets import read_dataset  # noqa: E402
-from sorvolo.store.exports.label_files import write_coco  # noqa: E402
-from sorvolo.survey.labels import LabelledSet  # noqa: E402
-from sorvolo.survey.objects import CLASSES  # noqa: E402
-from sorvolo.training.drawing import batches_from  # noqa: E402
-from sorvolo.training.joint import JointSettings, JointTraining  # noqa: E402
-from sorvolo.training.presets import accurate, fast  # noqa: E402
-from sorvolo.training.samples import Augmentation, Sample, Share  # noqa: E402
-from sorvolo.training.weights import ImageNetWeights  # noqa: E402
+from real_data import real_data
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.store.datasets import read_dataset
+from sorvolo.store.exports.label_files import write_coco
+from sorvolo.survey.labels import LabelledSet
+from sorvolo.survey.objects import CLASSES
+from sorvolo.training.drawing import batches_from
+from sorvolo.training.joint import JointSettings, JointTraining
+from sorvolo.training.presets import accurate, fast
+from sorvolo.training.samples import Augmentation, Sample, Share
+from sorvolo.training.weights import ImageNetWeights
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 _STEPS, _SIDE_PX = 4, 64
@@ -51,15 +51,27 @@ def shares(tmp_path_factory: pytest.TempPathFactory) -> list[Share]:
 
 
 @pytest.fixture(scope="module")
-def packed(shares: list[Share], recipe: Callable[[str], ModuleType], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def packed(
+    shares: list[Share],
+    recipe: Callable[[str], ModuleType],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Path:
     path = tmp_path_factory.mktemp("packed") / "new" / "data.zip"
-    weights = ImageNetWeights("lite0", {"stem": torch.arange(6.0).reshape(2, 3).T}, False, "ImageNet, a file")
-    recipe("training_archive").write_archive(path, shares, [weights], {"cars": "CC0", "people": "CC0"})
+    weights = ImageNetWeights(
+        "lite0", {"stem": torch.arange(6.0).reshape(2, 3).T}, False, "ImageNet, a file"
+    )
+    recipe("training_archive").write_archive(
+        path, shares, [weights], {"cars": "CC0", "people": "CC0"}
+    )
     return path
 
 
-def _batches(shares: Sequence[Share], read: Callable[[str], np.ndarray], start: int = 0) -> Iterator[list[Sample]]:
-    return batches_from(shares, CLASSES, read, Augmentation(side_px=_SIDE_PX), seed=1, batch=1, start=start)
+def _batches(
+    shares: Sequence[Share], read: Callable[[str], np.ndarray], start: int = 0
+) -> Iterator[list[Sample]]:
+    return batches_from(
+        shares, CLASSES, read, Augmentation(side_px=_SIDE_PX), seed=1, batch=1, start=start
+    )
 
 
 def test_an_archive_gives_the_samples_that_the_folders_give(
@@ -68,7 +80,9 @@ def test_an_archive_gives_the_samples_that_the_folders_give(
     reader, module = recipe("train_default_model").reader, recipe("training_archive")
     archive = module.TrainingArchive(packed)
     assert module.fingerprint(archive.shares) == module.fingerprint(shares)
-    assert module.fingerprint([replace(shares[0], weight=1.5), shares[1]]) != module.fingerprint(shares)
+    assert module.fingerprint([replace(shares[0], weight=1.5), shares[1]]) != module.fingerprint(
+        shares
+    )
     both = zip(_batches(shares, reader()), _batches(archive.shares, reader(archive.content)))
     for _ in range(12):
         for one, other in zip(*next(both)):
@@ -81,7 +95,9 @@ def test_an_archive_gives_the_samples_that_the_folders_give(
         archive.weights("resnet50")
 
 
-def test_what_is_no_archive_is_refused(tmp_path: Path, packed: Path, recipe: Callable[[str], ModuleType]) -> None:
+def test_what_is_no_archive_is_refused(
+    tmp_path: Path, packed: Path, recipe: Callable[[str], ModuleType]
+) -> None:
     (tmp_path / "cut.zip").write_bytes(packed.read_bytes()[:-300])
     with pytest.raises(InputError, match="no whole archive"):
         recipe("training_archive").TrainingArchive(tmp_path / "cut.zip")
@@ -90,15 +106,22 @@ def test_what_is_no_archive_is_refused(tmp_path: Path, packed: Path, recipe: Cal
 def test_a_long_training_goes_on_from_its_checkpoint_as_if_nothing_had_been(
     packed: Path, tmp_path: Path, recipe: Callable[[str], ModuleType]
 ) -> None:
-    module, archive = recipe("train_default_model"), recipe("training_archive").TrainingArchive(packed)
+    module, archive = (
+        recipe("train_default_model"),
+        recipe("training_archive").TrainingArchive(packed),
+    )
     run = {"preset": "fast", "frozen": False, "steps": _STEPS}
     read = module.reader(archive.content)
 
     def learning(out: Path, save_s: float, run: dict[str, object] = run) -> Iterator[object]:
         out.mkdir(exist_ok=True)
         torch.manual_seed(1)
-        training = JointTraining(module.started("fast", None), JointSettings(steps=_STEPS, batch=1), 1)
-        return module.learn(training, lambda start: _batches(archive.shares, read, start), out, run, save_s=save_s)
+        training = JointTraining(
+            module.started("fast", None), JointSettings(steps=_STEPS, batch=1), 1
+        )
+        return module.learn(
+            training, lambda start: _batches(archive.shares, read, start), out, run, save_s=save_s
+        )
 
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert [done.step for done in learning(whole, 1e9)] == [1, 2, 3, 4]  # type: ignore[attr-defined]
@@ -110,10 +133,17 @@ def test_a_long_training_goes_on_from_its_checkpoint_as_if_nothing_had_been(
     with pytest.raises(SettingsError, match="steps was 4, is 5"):
         next(learning(killed, 1e9, {**run, "steps": 5}))
     assert [done.step for done in learning(killed, 1e9)] == [3, 4]  # type: ignore[attr-defined]
-    assert sorted(each.name for each in killed.iterdir()) == ["checkpoint.pt", "log.jsonl", "run.json", "weights.pt"]
+    assert sorted(each.name for each in killed.iterdir()) == [
+        "checkpoint.pt",
+        "log.jsonl",
+        "run.json",
+        "weights.pt",
+    ]
     one, other = (torch.load(each / "weights.pt", weights_only=True) for each in (whole, killed))
     assert all(torch.equal(one[name], other[name]) for name in one)
-    logs = [(each / "log.jsonl").read_text().partition(', "seconds"')[0] for each in (whole, killed)]
+    logs = [
+        (each / "log.jsonl").read_text().partition(', "seconds"')[0] for each in (whole, killed)
+    ]
     assert logs[0] == logs[1] and logs[0].startswith('{"step": 4')
     module.network_of(run).load_state_dict(other)
 
@@ -122,8 +152,10 @@ def test_weights_fit_the_network_that_their_run_names(recipe: Callable[[str], Mo
     module = recipe("train_default_model")
     with torch.device("meta"):
         for preset, frozen, built in (
-            ("fast", True, fast(CLASSES)), ("fast", False, module.started("fast", None)),
-            ("accurate", True, accurate(CLASSES)), ("accurate", False, module.started("accurate", None)),
+            ("fast", True, fast(CLASSES)),
+            ("fast", False, module.started("fast", None)),
+            ("accurate", True, accurate(CLASSES)),
+            ("accurate", False, module.started("accurate", None)),
         ):
             again = module.network_of({"preset": preset, "original": True, "frozen": frozen})
             assert [*again.state_dict()] == [*built.state_dict()]
@@ -140,28 +172,55 @@ def test_only_sets_of_a_known_licence_are_packed(recipe: Callable[[str], ModuleT
             demand_licences([share("hituav"), share(name)])
 
 
-def test_only_the_publishers_own_cars_are_read(tmp_path: Path, recipe: Callable[[str], ModuleType]) -> None:
+def test_only_the_publishers_own_cars_are_read(
+    tmp_path: Path, recipe: Callable[[str], ModuleType]
+) -> None:
     """For every training, from a folder as from a pack: another's video is under another licence."""
     place = labelled_squares(tmp_path / "aerial_cars", 1, 5)
-    for old, new in zip(range(5), ("DJI_0005-0018", "harlem-0005", "DJI-007-01", "M", "DJI_0762-1")):
+    for old, new in zip(
+        range(5), ("DJI_0005-0018", "harlem-0005", "DJI-007-01", "M", "DJI_0762-1")
+    ):
         for part, end in (("images", ".png"), ("labels", ".txt")):
             (place / part / f"flight0_{old:04d}{end}").rename(place / part / f"{new}{end}")
     parts = recipe("detection_data").aerial_cars(tmp_path)
-    names = {part: [Path(each.path).stem for each in labelled.pictures] for part, labelled in parts.items()}
+    names = {
+        part: [Path(each.path).stem for each in labelled.pictures]
+        for part, labelled in parts.items()
+    }
     assert names == {"train": ["DJI-007-01", "DJI_0005-0018"], "val": [], "test": ["DJI_0762-1"]}
 
 
 def test_what_a_long_training_cannot_use_ends_it_with_one_line(
-    packed: Path, tmp_path: Path, recipe: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch
+    packed: Path,
+    tmp_path: Path,
+    recipe: Callable[[str], ModuleType],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("torch.set_flush_denormal", lambda _: True)  # it would hold for the tests after this one
+    monkeypatch.setattr(
+        "torch.set_flush_denormal", lambda _: True
+    )  # it would hold for the tests after this one
 
     def trained(data: Path, steps: str = "1") -> None:
-        words = ["--weights", "none", "--steps", steps, "--batch", "1", "--side", "64", "--device", "cpu"]
-        monkeypatch.setattr("sys.argv", ["train_default_model.py", str(data), str(tmp_path / "out"), *words])
+        words = [
+            "--weights",
+            "none",
+            "--steps",
+            steps,
+            "--batch",
+            "1",
+            "--side",
+            "64",
+            "--device",
+            "cpu",
+        ]
+        monkeypatch.setattr(
+            "sys.argv", ["train_default_model.py", str(data), str(tmp_path / "out"), *words]
+        )
         recipe("train_default_model").main()
 
-    with pytest.raises(SystemExit, match=r"error: there is no file .*none\.zip; make it by `make training-data"):
+    with pytest.raises(
+        SystemExit, match=r"error: there is no file .*none\.zip; make it by `make training-data"
+    ):
         trained(tmp_path / "none.zip")
     (tmp_path / "cut.zip").write_bytes(packed.read_bytes()[:-300])
     with pytest.raises(SystemExit, match=r"error: .* no whole archive"):
@@ -171,7 +230,9 @@ def test_what_a_long_training_cannot_use_ends_it_with_one_line(
         trained(packed, "2")
 
 
-def test_held_out_pictures_stay_out_of_the_pack(tmp_path: Path, recipe: Callable[[str], ModuleType]) -> None:
+def test_held_out_pictures_stay_out_of_the_pack(
+    tmp_path: Path, recipe: Callable[[str], ModuleType]
+) -> None:
     data = real_data("detection")
     sets, pack = recipe("detection_data"), recipe("pack_training_data")
     simulated = labelled_squares(tmp_path / "squares", 1, 1)
@@ -184,4 +245,6 @@ def test_held_out_pictures_stay_out_of_the_pack(tmp_path: Path, recipe: Callable
         assert paths >= {each.path for each in parts["train"].pictures}
         assert not paths & {each.path for name in ("val", "test") for each in parts[name].pictures}
     assert {share.labelled.name for share in packed} <= set(pack.LICENCES)
-    assert not any(name in path for path in paths for name in ("/cats/", "/sdd/", "/semantic_drone/"))
+    assert not any(
+        name in path for path in paths for name in ("/cats/", "/sdd/", "/semantic_drone/")
+    )

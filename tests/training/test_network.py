@@ -8,42 +8,44 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-import onnxruntime  # noqa: E402
-from hypothesis import given, settings  # noqa: E402
-from hypothesis import strategies as st  # noqa: E402
-from onnx import TensorProto, helper  # noqa: E402
+import onnxruntime
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from onnx import TensorProto, helper
 
-from sorvolo.errors import SettingsError  # noqa: E402
-from sorvolo.survey.labels import LabelledPicture, LabelledSet  # noqa: E402
-from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
-from sorvolo.training.boxes import (  # noqa: E402
+from sorvolo.errors import SettingsError
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.training.backbone import EfficientNetLite0
+from sorvolo.training.boxes import (
     boxes_from_offsets,
     iou_matrix,
     offsets_from_boxes,
     suppress,
     suppress_all_pairs,
 )
-from sorvolo.training.faster_rcnn import FasterRCNN, Reach  # noqa: E402
-from sorvolo.training.feature_pyramid import Pyramid  # noqa: E402
-from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align  # noqa: E402
-from sorvolo.training.inception import ExtendedStack, ResidualStack, proposal_stem  # noqa: E402
-from sorvolo.training.joint import JointSettings, JointTraining  # noqa: E402
-from sorvolo.training.losses import (  # noqa: E402
+from sorvolo.training.faster_rcnn import FasterRCNN, Reach
+from sorvolo.training.feature_pyramid import Pyramid
+from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align
+from sorvolo.training.inception import ExtendedStack, ResidualStack, proposal_stem
+from sorvolo.training.joint import JointSettings, JointTraining
+from sorvolo.training.losses import (
     Answer,
     joint_proposal_loss,
     match_boxes,
     region_loss,
     thesis_proposal_loss,
 )
-from sorvolo.training.onnx_export import check_export, export_onnx  # noqa: E402
-from sorvolo.training.presets import fast  # noqa: E402
-from sorvolo.training.proposals import AnchorSettings, ProposalNetwork, Proposed  # noqa: E402
-from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample  # noqa: E402
-from sorvolo.training.sprites import paste_small_objects  # noqa: E402
+from sorvolo.training.onnx_export import check_export, export_onnx
+from sorvolo.training.presets import fast
+from sorvolo.training.proposals import AnchorSettings, ProposalNetwork, Proposed
+from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample
+from sorvolo.training.sprites import paste_small_objects
 
 _SIDE_PX = 64
 
-torch.set_num_threads(1)  # threads that wait for each other cost more than they give on pictures this small
+torch.set_num_threads(
+    1
+)  # threads that wait for each other cost more than they give on pictures this small
 
 
 class _TinyBackbone(torch.nn.Module):
@@ -51,10 +53,14 @@ class _TinyBackbone(torch.nn.Module):
 
     def __init__(self):
         super().__init__()
+
         def step(inner, out):
             return torch.nn.Sequential(
-                torch.nn.Conv2d(inner, out, 3, 2, 1, bias=False), torch.nn.BatchNorm2d(out), torch.nn.ReLU()
+                torch.nn.Conv2d(inner, out, 3, 2, 1, bias=False),
+                torch.nn.BatchNorm2d(out),
+                torch.nn.ReLU(),
             )
+
         self.stem = torch.nn.Sequential(step(3, 12), step(12, 16))
         self.deep = step(16, 24)
 
@@ -69,12 +75,14 @@ def tiny(stem="extended-residual"):
     neck = Pyramid(backbone.channels, 16, light=True)
     anchors = (AnchorSettings((8, 14)), AnchorSettings((22, 32)))
     proposals = ProposalNetwork(neck.channels, backbone.strides, anchors, stem, 16, light=True)
-    return FasterRCNN(backbone, neck, proposals, TwoLayerHead(16, 32, 2), Reach(before=200, regions=60))
+    return FasterRCNN(
+        backbone, neck, proposals, TwoLayerHead(16, 32, 2), Reach(before=200, regions=60)
+    )
 
 
 def fours(samples):
     """The samples in batches of four."""
-    return (samples[index:index + 4] for index in range(0, len(samples), 4))
+    return (samples[index : index + 4] for index in range(0, len(samples), 4))
 
 
 def squares(count, seed):
@@ -89,9 +97,12 @@ def squares(count, seed):
             x, y = corner + rng.integers(0, 8, 2)
             side, label = int(rng.integers(10, 22)), int(rng.integers(2))
             if label == 0:
-                image[y:y + side, x:x + side] = 230
+                image[y : y + side, x : x + side] = 230
             else:
-                image[(rows - y - side / 2 + 0.5) ** 2 + (columns - x - side / 2 + 0.5) ** 2 < side**2 / 4] = 15
+                image[
+                    (rows - y - side / 2 + 0.5) ** 2 + (columns - x - side / 2 + 0.5) ** 2
+                    < side**2 / 4
+                ] = 15
             boxes.append((x, y, x + side, y + side))
             labels.append(label)
         known = np.ones(2, bool)
@@ -104,17 +115,23 @@ def _found_share(model, pictures):
     right = total = 0
     for each in pictures:
         with torch.no_grad():
-            boxes, scores, labels = model.eval()(torch.from_numpy(each.image.transpose(2, 0, 1))[None])
+            boxes, scores, labels = model.eval()(
+                torch.from_numpy(each.image.transpose(2, 0, 1))[None]
+            )
         overlap = iou_matrix(torch.from_numpy(each.boxes).float(), boxes).numpy()
         for row, label in enumerate(each.labels):
             total += 1
-            right += bool(((overlap[row] > 0.5) & (labels.numpy() == label) & (scores.numpy() > 0.5)).any())
+            right += bool(
+                ((overlap[row] > 0.5) & (labels.numpy() == label) & (scores.numpy() > 0.5)).any()
+            )
     return right / total
 
 
 @pytest.fixture(scope="module")
 def trained():
-    training = JointTraining(tiny(), JointSettings(steps=200, batch=4, rate=3e-3, averaging=0.9, warm_steps=10), 1)
+    training = JointTraining(
+        tiny(), JointSettings(steps=200, batch=4, rate=3e-3, averaging=0.9, warm_steps=10), 1
+    )
     stream = fours(squares(200 * 4, 1))
     losses = [training.learn(each).loss for each in islice(stream, 200)]
     return training, losses
@@ -140,7 +157,9 @@ def test_the_exported_graph_gives_what_torch_gives(trained):
 
 def test_an_order_of_equal_scores_is_no_difference_of_the_export():
     model = fast(["square", "disc"]).eval()
-    for layer in model.proposals.scores:  # all anchors are as likely: which are looked at is anyone's guess
+    for (
+        layer
+    ) in model.proposals.scores:  # all anchors are as likely: which are looked at is anyone's guess
         torch.nn.init.zeros_(layer.weight)
     pictures = [np.random.default_rng(3).integers(0, 255, (128, 160, 3), dtype=np.uint8)]
     check = check_export(model, export_onnx(model, {"classes": ["square", "disc"]}), pictures)
@@ -160,7 +179,8 @@ def test_an_export_looks_at_as_many_regions_as_its_settings_give(trained):
     model = trained[0].average
     pictures = [each.image for each in squares(4, 4)]
     whole, few = (
-        export_onnx(model, {"classes": ["square", "disc"], "name": "tiny"}, regions=count) for count in (None, 2)
+        export_onnx(model, {"classes": ["square", "disc"], "name": "tiny"}, regions=count)
+        for count in (None, 2)
     )
     checks = [check_export(model, each, pictures) for each in (whole, few)]
     assert all(each.is_good for each in checks), checks
@@ -195,7 +215,12 @@ def test_every_proposal_network_runs_and_learns_from_all_its_parts(stem):
 
 def test_the_thesis_stack_has_the_tables_layers():
     stack = ExtendedStack(1024)
-    filters = [[each for each in (64, 96, 64)]] * 2 + [[64, 96, 64, 224]] + [[192] * 3] * 4 + [[320] + [384] * 4] * 2
+    filters = (
+        [[each for each in (64, 96, 64)]] * 2
+        + [[64, 96, 64, 224]]
+        + [[192] * 3] * 4
+        + [[320] + [384] * 4] * 2
+    )
     assert [layer.channels for layer in stack.layers] == [sum(each) for each in filters]
     features = torch.zeros(1, 1024, 5, 7)
     assert stack.eval()(features).shape == (1, 1856, 5, 7)
@@ -226,10 +251,22 @@ def test_imagenet_weights_fold_to_the_same_function():
         layer, kind = name.rsplit(".", 1)
         if kind == "weight":
             weights[name] = torch.randn(value.shape, generator=generator) * 0.1
-        norm = {"_conv_stem": "_bn0", "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2"}
+        norm = {
+            "_conv_stem": "_bn0",
+            "_expand_conv": "_bn0",
+            "_depthwise_conv": "_bn1",
+            "_project_conv": "_bn2",
+        }
         base = ".".join([*layer.split(".")[:-1], norm[layer.split(".")[-1]]])
-        for part, low in (("weight", 0.5), ("bias", -0.5), ("running_mean", -0.5), ("running_var", 0.5)):
-            weights.setdefault(f"{base}.{part}", low + torch.rand(value.shape[0], generator=generator))
+        for part, low in (
+            ("weight", 0.5),
+            ("bias", -0.5),
+            ("running_mean", -0.5),
+            ("running_var", 0.5),
+        ):
+            weights.setdefault(
+                f"{base}.{part}", low + torch.rand(value.shape[0], generator=generator)
+            )
     net.load_imagenet(weights)
     image = torch.rand(1, 3, 32, 32, generator=generator) * 255
     padded = torch.nn.functional.pad((image - 127) / 128, (0, 1, 0, 1))
@@ -283,20 +320,34 @@ def test_suppression_over_all_pairs_keeps_the_same_in_the_same_order(boxes, seed
 
 def test_regions_are_cut_as_onnx_cuts_them():
     features = torch.randn(1, 3, 20, 24)
-    boxes = torch.tensor([[0.0, 0, 96, 80], [10.3, 7.7, 31.2, 60.1], [50, 20, 54, 23], [60, 60, 96, 80]])
+    boxes = torch.tensor(
+        [[0.0, 0, 96, 80], [10.3, 7.7, 31.2, 60.1], [50, 20, 54, 23], [60, 60, 96, 80]]
+    )
     node = helper.make_node(
-        "RoiAlign", ["x", "r", "b"], ["y"], output_height=7, output_width=7, sampling_ratio=2, spatial_scale=0.25,
-        mode="avg", coordinate_transformation_mode="half_pixel",
+        "RoiAlign",
+        ["x", "r", "b"],
+        ["y"],
+        output_height=7,
+        output_width=7,
+        sampling_ratio=2,
+        spatial_scale=0.25,
+        mode="avg",
+        coordinate_transformation_mode="half_pixel",
     )
     graph = helper.make_graph(
-        [node], "roi", [
+        [node],
+        "roi",
+        [
             helper.make_tensor_value_info("x", TensorProto.FLOAT, [1, 3, 20, 24]),
             helper.make_tensor_value_info("r", TensorProto.FLOAT, [4, 4]),
             helper.make_tensor_value_info("b", TensorProto.INT64, [4]),
-        ], [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
+        ],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(
+        model.SerializeToString(), providers=["CPUExecutionProvider"]
+    )
     feed = {"x": features.numpy(), "r": boxes.numpy(), "b": np.zeros(4, np.int64)}
     ours = roi_align(features, boxes, torch.zeros(4, dtype=torch.int64), 4, 7).numpy()
     assert np.abs(session.run(None, feed)[0] - ours).max() < 1e-4
@@ -311,16 +362,26 @@ def test_a_region_is_looked_at_on_the_level_of_its_size():
 
 def _answer(boxes, labels, ignored=(), known=(True, True)):
     return Answer(
-        torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4), torch.tensor(labels, dtype=torch.int64),
-        torch.tensor(ignored, dtype=torch.float32).reshape(-1, 4), torch.tensor(known),
+        torch.tensor(boxes, dtype=torch.float32).reshape(-1, 4),
+        torch.tensor(labels, dtype=torch.int64),
+        torch.tensor(ignored, dtype=torch.float32).reshape(-1, 4),
+        torch.tensor(known),
     )
 
 
 def test_ignored_regions_teach_nothing_and_true_boxes_always_have_an_anchor():
     anchors = torch.tensor([[0.0, 0, 10, 10], [40, 40, 50, 50], [80, 80, 90, 90]])
-    match = match_boxes(anchors, _answer([[0, 0, 24, 24]], [0], [[78, 78, 95, 95]]), over=0.5, under=0.4, best_too=True)
+    match = match_boxes(
+        anchors,
+        _answer([[0, 0, 24, 24]], [0], [[78, 78, 95, 95]]),
+        over=0.5,
+        under=0.4,
+        best_too=True,
+    )
     assert match.target.tolist() == [0, -1, -2]
-    strict = match_boxes(anchors, _answer([[0, 0, 24, 24]], [0]), over=0.5, under=0.4, best_too=False)
+    strict = match_boxes(
+        anchors, _answer([[0, 0, 24, 24]], [0]), over=0.5, under=0.4, best_too=False
+    )
     assert strict.target.tolist() == [-1, -1, -1]
 
 
@@ -328,7 +389,9 @@ def test_ignored_regions_teach_nothing_and_true_boxes_always_have_an_anchor():
 def test_the_thesis_learns_only_from_anchors_that_overlap_by_more_than_0_7(wide_px, is_positive):
     anchors = torch.tensor([[0.0, 0, 20, 20], [60, 60, 80, 80]])
     proposed = Proposed(torch.zeros(1, 2), torch.ones(1, 2, 4), anchors)
-    _, box = thesis_proposal_loss(proposed, [_answer([[0, 0, wide_px, 20]], [0])], torch.Generator().manual_seed(1))
+    _, box = thesis_proposal_loss(
+        proposed, [_answer([[0, 0, wide_px, 20]], [0])], torch.Generator().manual_seed(1)
+    )
     assert (float(box) > 0) is is_positive
 
 
@@ -354,7 +417,9 @@ def test_crops_carry_their_boxes_along():
     """A bright square on black is where its box lies, however the crop lies."""
     image = np.zeros((300, 400, 3), np.uint8)
     image[100:130, 200:250] = 255
-    picture = LabelledPicture("p", 400, 300, "g", np.array([[200, 100, 250, 130]]), np.array([0]), np.zeros((0, 4)))
+    picture = LabelledPicture(
+        "p", 400, 300, "g", np.array([[200, 100, 250, 130]]), np.array([0]), np.zeros((0, 4))
+    )
     share = Share(LabelledSet("s", ("car",), (picture,)), 1.0)
     calm = Augmentation(side_px=160, turns=False, blur=0, haze=0, grey=0, noise=0)
     rng = np.random.default_rng(8)

@@ -5,10 +5,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from numpy.typing import NDArray  # noqa: E402
+from numpy.typing import NDArray
 
-from sorvolo.training.keras_resnet import resnet50_from_keras  # noqa: E402
-from sorvolo.training.resnet import FrozenNorm, ResNet50, load_stage, resnet_stage  # noqa: E402
+from sorvolo.training.keras_resnet import resnet50_from_keras
+from sorvolo.training.resnet import FrozenNorm, ResNet50, load_stage, resnet_stage
 
 Array = NDArray[np.float32]
 _STAGES = {2: (64, 3), 3: (128, 4), 4: (256, 6), 5: (512, 3)}
@@ -25,7 +25,9 @@ def keras() -> dict[str, Array]:
     def add(conv: str, norm: str, kernel: int, channels: int, out: int) -> None:
         count = kernel * kernel * channels * out
         start = rng.integers(1 << 15)
-        values = np.resize(np.roll(noise, start), count) * np.sqrt(1.5 / (kernel * kernel * channels))
+        values = np.resize(np.roll(noise, start), count) * np.sqrt(
+            1.5 / (kernel * kernel * channels)
+        )
         layers[f"{conv}/kernel"] = values.reshape(kernel, kernel, channels, out).astype(np.float32)
         layers[f"{conv}/bias"] = rng.normal(0, 0.3, out).astype(np.float32)
         layers[f"{norm}/gamma"] = rng.uniform(0.5, 1.0, out).astype(np.float32)
@@ -60,16 +62,22 @@ def _convolved(x: Array, layers: dict[str, Array], conv: str, norm: str, stride:
     """(H, W, C), already padded -> convolution with bias, batch norm; Keras' "valid"."""
     kernel = layers[f"{conv}/kernel"].astype(np.float64)
     side = kernel.shape[0]
-    windows = np.lib.stride_tricks.sliding_window_view(x, (side, side), axis=(0, 1))[::stride, ::stride]
+    windows = np.lib.stride_tricks.sliding_window_view(x, (side, side), axis=(0, 1))[
+        ::stride, ::stride
+    ]
     y = np.tensordot(windows, kernel, axes=((3, 4, 2), (0, 1, 2))) + layers[f"{conv}/bias"]
-    scale = layers[f"{norm}/gamma"] / np.sqrt(layers[f"{norm}/moving_variance"].astype(np.float64) + _EPSILON)
+    scale = layers[f"{norm}/gamma"] / np.sqrt(
+        layers[f"{norm}/moving_variance"].astype(np.float64) + _EPSILON
+    )
     return (y - layers[f"{norm}/moving_mean"]) * scale + layers[f"{norm}/beta"]
 
 
 def _keras_features(rgb: Array, layers: dict[str, Array]) -> list[Array]:
     """res2 to res5 of Keras' ResNet-50 ("caffe" preprocessing), as its model.json draws them."""
     x = rgb[..., ::-1] - np.array([103.939, 116.779, 123.68])
-    x = np.maximum(_convolved(np.pad(x, ((3, 3), (3, 3), (0, 0))), layers, "conv1", "bn_conv1", 2), 0)
+    x = np.maximum(
+        _convolved(np.pad(x, ((3, 3), (3, 3), (0, 0))), layers, "conv1", "bn_conv1", 2), 0
+    )
     x = np.pad(x, ((1, 1), (1, 1), (0, 0)))
     x = np.lib.stride_tricks.sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max((3, 4))
     levels = []
@@ -87,7 +95,9 @@ def _keras_features(rgb: Array, layers: dict[str, Array]) -> list[Array]:
     return levels
 
 
-def test_keras_weights_compute_keras_function(keras: dict[str, Array], ours: dict[str, "torch.Tensor"]) -> None:
+def test_keras_weights_compute_keras_function(
+    keras: dict[str, Array], ours: dict[str, "torch.Tensor"]
+) -> None:
     picture = np.random.default_rng(1).integers(0, 256, (64, 96, 3)).astype(np.float32)
     wanted = _keras_features(picture, keras)
     images = torch.from_numpy(picture.transpose(2, 0, 1)[None].copy())
@@ -98,7 +108,10 @@ def test_keras_weights_compute_keras_function(keras: dict[str, Array], ours: dic
         with torch.no_grad():
             found = net(images)
         assert [tuple(each.shape[1:]) for each in found] == [
-            (256, 16, 24), (512, 8, 12), (1024, 4, 6), (2048, 2, 3)
+            (256, 16, 24),
+            (512, 8, 12),
+            (1024, 4, 6),
+            (2048, 2, 3),
         ]
         errors = [
             float(np.abs(each[0].permute(1, 2, 0).numpy() - level).max() / level.std())
@@ -131,10 +144,14 @@ def test_what_stays_as_it_is(ours: dict[str, "torch.Tensor"]) -> None:
     net.train()
     net(torch.rand(2, 3, 32, 32) * 255)[0].square().mean().backward()
     optimiser.step()
-    changed = {name for name, value in net.state_dict().items() if not torch.equal(value, before[name])}
+    changed = {
+        name for name, value in net.state_dict().items() if not torch.equal(value, before[name])
+    }
     assert changed
     for name in changed:
-        assert name.startswith(("layer2", "layer3")) and ("conv" in name or "downsample.0" in name), name
+        assert name.startswith(("layer2", "layer3")) and (
+            "conv" in name or "downsample.0" in name
+        ), name
 
 
 def test_norms_learn_if_asked() -> None:

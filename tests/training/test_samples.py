@@ -35,7 +35,8 @@ def test_what_is_up_stays_up_in_pictures_from_aslant(aslant: bool) -> None:
     image, share = _share(aslant=aslant)
     rng = np.random.default_rng(1)
     found = [
-        _downwards(cut_sample(image, share.labelled.pictures[0], share, CLASSES, PLAIN, rng).image) for _ in range(40)
+        _downwards(cut_sample(image, share.labelled.pictures[0], share, CLASSES, PLAIN, rng).image)
+        for _ in range(40)
     ]
     assert (min(found) > 0) is aslant
 
@@ -55,7 +56,9 @@ def test_another_tone_curve_changes_the_light_and_no_place() -> None:
     image, share = _share(aslant=True)
     picture = share.labelled.pictures[0]
     samples = [
-        cut_sample(image, picture, share, CLASSES, replace(PLAIN, tone=often), np.random.default_rng(5))
+        cut_sample(
+            image, picture, share, CLASSES, replace(PLAIN, tone=often), np.random.default_rng(5)
+        )
         for often in (0.0, 1.0)
     ]
     np.testing.assert_array_equal(samples[0].boxes, samples[1].boxes)

@@ -7,15 +7,18 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from sorvolo.detection.session import Session  # noqa: E402
-from sorvolo.survey.objects import CLASSES  # noqa: E402
-from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead  # noqa: E402
-from sorvolo.training.onnx_export import onnx_from_module  # noqa: E402
-from sorvolo.training.presets import fast  # noqa: E402
-from sorvolo.training.together import Together, TogetherSettings, fused  # noqa: E402
+from sorvolo.detection.session import Session
+from sorvolo.survey.objects import CLASSES
+from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
+from sorvolo.training.onnx_export import onnx_from_module
+from sorvolo.training.presets import fast
+from sorvolo.training.together import Together, TogetherSettings, fused
 
 INFO = {
-    "name": "toy", "classes": list(CLASSES), "thresholds": dict.fromkeys(CLASSES, 0.5), "stride": 32,
+    "name": "toy",
+    "classes": list(CLASSES),
+    "thresholds": dict.fromkeys(CLASSES, 0.5),
+    "stride": 32,
     "best_px": {name: [12, 130] for name in CLASSES},
 }
 UNSEEN = TogetherSettings().unseen_odds
@@ -32,29 +35,43 @@ def _odds(score: float) -> float:
 
 
 def test_what_both_see_gets_the_mean_of_their_log_odds_and_a_box_between_theirs() -> None:
-    boxes, scores, labels = fused(_found((10, 10, 30, 30, 0.9, 0)), _found((12, 10, 32, 30, 0.6, 0)))
+    boxes, scores, labels = fused(
+        _found((10, 10, 30, 30, 0.9, 0)), _found((12, 10, 32, 30, 0.6, 0))
+    )
     expected = 1 / (1 + np.exp(-(_odds(0.9) + _odds(0.6)) / 2))
     np.testing.assert_allclose(scores, [expected, expected], atol=1e-5)
     np.testing.assert_allclose(boxes, [[11, 10, 31, 30]] * 2)
     assert labels.tolist() == [0, 0]
 
 
-@pytest.mark.parametrize("other", [
-    (10, 10, 30, 30, 0.9, 1),  # another class
-    (25, 10, 45, 30, 0.9, 0),  # elsewhere
-])
-def test_what_one_alone_sees_is_weighed_against_the_others_silence(other: tuple[float, ...]) -> None:
+@pytest.mark.parametrize(
+    "other",
+    [
+        (10, 10, 30, 30, 0.9, 1),  # another class
+        (25, 10, 45, 30, 0.9, 0),  # elsewhere
+    ],
+)
+def test_what_one_alone_sees_is_weighed_against_the_others_silence(
+    other: tuple[float, ...],
+) -> None:
     boxes, scores, _ = fused(_found((10, 10, 30, 30, 0.9, 0)), _found(other))
-    np.testing.assert_allclose(scores, [1 / (1 + np.exp(-(_odds(0.9) + UNSEEN) / 2))] * 2, atol=1e-5)
+    np.testing.assert_allclose(
+        scores, [1 / (1 + np.exp(-(_odds(0.9) + UNSEEN) / 2))] * 2, atol=1e-5
+    )
     np.testing.assert_allclose(boxes, [[10, 10, 30, 30], other[:4]])
 
 
 def test_where_the_other_sees_nothing_at_all_its_silence_counts() -> None:
     nothing = _found()
-    for pair in ((_found((10, 10, 30, 30, 0.9, 0)), nothing), (nothing, _found((10, 10, 30, 30, 0.9, 0)))):
+    for pair in (
+        (_found((10, 10, 30, 30, 0.9, 0)), nothing),
+        (nothing, _found((10, 10, 30, 30, 0.9, 0))),
+    ):
         boxes, scores, labels = fused(*pair)
         assert boxes.tolist() == [[10, 10, 30, 30]] and labels.tolist() == [0]
-        assert float(scores[0]) == pytest.approx(1 / (1 + np.exp(-(_odds(0.9) + UNSEEN) / 2)), abs=1e-5)
+        assert float(scores[0]) == pytest.approx(
+            1 / (1 + np.exp(-(_odds(0.9) + UNSEEN) / 2)), abs=1e-5
+        )
     assert all(len(each) == 0 for each in fused(nothing, nothing))
 
 
@@ -96,7 +113,9 @@ def test_the_exported_graph_finds_what_torch_finds(tmp_path: Path) -> None:
             boxes, scores, _ = model(torch.from_numpy(picture.transpose(2, 0, 1).copy())[None])
         assert len(scores) and len(seen.scores) == len(scores)
         np.testing.assert_allclose(seen.scores, scores, atol=1e-4)
-        np.testing.assert_allclose(np.sort(seen.boxes_px, axis=0), np.sort(boxes, axis=0), atol=0.05)
+        np.testing.assert_allclose(
+            np.sort(seen.boxes_px, axis=0), np.sort(boxes, axis=0), atol=0.05
+        )
 
 
 def test_of_two_boxes_of_one_score_the_first_networks_stays_whatever_the_rounding(
@@ -108,7 +127,9 @@ def test_of_two_boxes_of_one_score_the_first_networks_stays_whatever_the_roundin
     every, all_scores, labels = fused(first(None), second(None))
     assert float(all_scores.max() - all_scores.min()) < 1e-6  # a tie of three, of different boxes
     assert len({tuple(each) for each in every.tolist()}) > 1
-    rounded = all_scores + torch.tensor([0.0, 1e-6, 0.0])  # as another order of the same sums may give
+    rounded = all_scores + torch.tensor(
+        [0.0, 1e-6, 0.0]
+    )  # as another order of the same sums may give
     monkeypatch.setattr("sorvolo.training.together.fused", lambda *_: (every, rounded, labels))
     boxes, *_ = Together(first, second)(torch.zeros(1, 3, 96, 96))
     np.testing.assert_allclose(boxes, every[:1])

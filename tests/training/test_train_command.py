@@ -13,16 +13,22 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from square_pictures import labelled_squares  # noqa: E402
+from square_pictures import labelled_squares
 
-from sorvolo.cli.main import main  # noqa: E402
-from sorvolo.detection.detector import Detector  # noqa: E402
-from sorvolo.errors import InputError, SettingsError  # noqa: E402
-from sorvolo.missions.train.detector import TrainingUpdate, train_detector  # noqa: E402
-from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets  # noqa: E402
-from sorvolo.missions.train.settings import TrainSettings  # noqa: E402
-from sorvolo.store.pages.training import training_page  # noqa: E402
-from sorvolo.training.checkpoint import read_checkpoint  # noqa: E402
+from sorvolo.cli.main import main
+from sorvolo.detection.detector import Detector
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.missions.train.detector import TrainingUpdate, train_detector
+from sorvolo.missions.train.sets import (
+    DataOptions,
+    TrainingSets,
+    read_labels,
+    simulate_samples,
+    training_sets,
+)
+from sorvolo.missions.train.settings import TrainSettings
+from sorvolo.store.pages.training import training_page
+from sorvolo.training.checkpoint import read_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -34,37 +40,66 @@ def _settings(**changes: object) -> TrainSettings:
     return TrainSettings(**({"weights": "none", "steps": 6, "batch": 2, "side_px": 64} | changes))  # type: ignore[arg-type]
 
 
-def _train(data: Path, out: Path, settings: TrainSettings, *, resume: bool = False) -> Iterator[TrainingUpdate]:
-    return train_detector([data], out, settings, DataOptions(val="0.25"), device="cpu", resume=resume)
+def _train(
+    data: Path, out: Path, settings: TrainSettings, *, resume: bool = False
+) -> Iterator[TrainingUpdate]:
+    return train_detector(
+        [data], out, settings, DataOptions(val="0.25"), device="cpu", resume=resume
+    )
 
 
 @pytest.mark.parametrize("ends_early", [True, False])
-def test_the_process_counts_as_before_when_a_training_has_ended(data: Path, tmp_path: Path, ends_early: bool) -> None:
+def test_the_process_counts_as_before_when_a_training_has_ended(
+    data: Path, tmp_path: Path, ends_early: bool
+) -> None:
     updates = _train(data, tmp_path / "run", _settings(steps=2))
     for update in updates:
         if ends_early and update.losses is not None:
             break
     updates.close()  # type: ignore[attr-defined]
-    assert (torch.tensor(1e-40) * torch.tensor(0.5)).item() > 0  # smaller than a normal number, not yet nothing
+    assert (
+        torch.tensor(1e-40) * torch.tensor(0.5)
+    ).item() > 0  # smaller than a normal number, not yet nothing
 
 
 def test_the_command_learns_and_writes_a_model_that_runs(data: Path, tmp_path: Path) -> None:
     out = tmp_path / "my-model"
-    options = ["--weights", "none", "--steps", "24", "--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu"]
+    options = [
+        "--weights",
+        "none",
+        "--steps",
+        "24",
+        "--batch",
+        "2",
+        "--side",
+        "64",
+        "--val",
+        "0.25",
+        "--device",
+        "cpu",
+    ]
     assert main(["train", str(data), "--out", str(out), *options, "--json"]) == 0
 
     report = json.loads((out / "training.json").read_text())
     assert report["held_out"]["ap50"] > 0.2  # chance finds nothing
-    first, last = ([row["region_score"] for row in report["losses"][part]] for part in (slice(5), slice(-5, None)))
+    first, last = (
+        [row["region_score"] for row in report["losses"][part]]
+        for part in (slice(5), slice(-5, None))
+    )
     assert sum(last) < 0.5 * sum(first)
     assert report["export"]["good"] and report["export"]["detections"] > 0
     assert [(each["part"], each["pictures"], each["videos"]) for each in report["sets"]] == [
-        ("learnt from", 15, 3), ("checked on", 5, 1)
+        ("learnt from", 15, 3),
+        ("checked on", 5, 1),
     ]
     assert (out / "training.html").read_text().count("<svg") == 1
 
     detector = Detector.load(out / "model.onnx")
-    assert (detector.classes, detector.info.preset, detector.info.thermal) == (("car",), "fast", False)
+    assert (detector.classes, detector.info.preset, detector.info.thermal) == (
+        ("car",),
+        "fast",
+        False,
+    )
     low, high = detector.info.best_px["car"]
     assert 20 <= low < high <= 34
     picture = cv2.cvtColor(cv2.imread(str(data / "images" / "flight0_0000.png")), cv2.COLOR_BGR2RGB)
@@ -80,10 +115,16 @@ def test_a_run_that_was_stopped_ends_as_one_that_was_not(data: Path, tmp_path: P
         if update.step == 4:
             stopped.close()  # type: ignore[attr-defined]
     assert not (tmp_path / "stopped" / "model.onnx").exists()
-    rest = [each for each in _train(data, tmp_path / "stopped", settings, resume=True) if each.losses is not None]
+    rest = [
+        each
+        for each in _train(data, tmp_path / "stopped", settings, resume=True)
+        if each.losses is not None
+    ]
     assert [each.step for each in rest] == [5, 6]
     assert [each.losses.loss for each in rest] == [each.losses.loss for each in whole[4:]]  # type: ignore[union-attr]
-    reports = [json.loads((tmp_path / name / "training.json").read_text()) for name in ("whole", "stopped")]
+    reports = [
+        json.loads((tmp_path / name / "training.json").read_text()) for name in ("whole", "stopped")
+    ]
     for report in reports:
         for row in report["losses"]:
             row.pop("seconds")
@@ -104,7 +145,19 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
 
     alarm = threading.Thread(target=interrupt, daemon=True)
     alarm.start()
-    options = ["--weights", "none", "--steps", "100000", "--batch", "1", "--side", "64", "--val", "0", "--json"]
+    options = [
+        "--weights",
+        "none",
+        "--steps",
+        "100000",
+        "--batch",
+        "1",
+        "--side",
+        "64",
+        "--val",
+        "0",
+        "--json",
+    ]
     assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 130
     alarm.join()
     printed = capsys.readouterr()
@@ -131,7 +184,9 @@ def test_checkpoints_come_between_checks_too(
     with pytest.raises(SettingsError, match="already holds a run; --resume continues it"):
         next(_train(data, tmp_path / "out", settings))
     other = _settings(schedule=schedule, rpn="standard", steps=400, seed=2)
-    with pytest.raises(SettingsError, match=r"cannot continue with other settings: .*seed was 1, is 2"):
+    with pytest.raises(
+        SettingsError, match=r"cannot continue with other settings: .*seed was 1, is 2"
+    ):
         list(_train(data, tmp_path / "out", other, resume=True))
 
 
@@ -153,7 +208,10 @@ def test_damaged_pictures_are_passed_over_and_reported(tmp_path: Path) -> None:
     options = DataOptions(val="0")
     list(train_detector([place], tmp_path / "out", _settings(steps=2), options, device="cpu"))
     report = json.loads((tmp_path / "out" / "training.json").read_text())
-    assert any(f"1 picture left out that cannot be read (first: {path}" in each for each in report["notices"])
+    assert any(
+        f"1 picture left out that cannot be read (first: {path}" in each
+        for each in report["notices"]
+    )
     assert any("nothing was held out" in each for each in report["notices"])
     assert report["held_out"] is None and report["model"]["thresholds"] == {"car": 0.5}
 
@@ -174,11 +232,24 @@ def test_what_was_remarked_is_reported_on_the_terminal_too(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = labelled_squares(tmp_path / "other", 2, 2, names=("car", "boat"))
-    options = ["--weights", "none", "--rpn", "standard", "--steps", "1", "--batch", "1", "--side", "64"]
+    options = [
+        "--weights",
+        "none",
+        "--rpn",
+        "standard",
+        "--steps",
+        "1",
+        "--batch",
+        "1",
+        "--side",
+        "64",
+    ]
     command = ["train", str(data), "--val", str(other), "--out", str(tmp_path / "out"), *options]
     assert main(command) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "note other: 4 boxes of classes that stand for none of ours left out: boat (4)" in printed
+    assert (
+        "note other: 4 boxes of classes that stand for none of ours left out: boat (4)" in printed
+    )
     assert "lie in both" in printed and "flight0" in printed
     notices = json.loads((tmp_path / "out" / "training.json").read_text())["notices"]
     assert all(" ".join(each.split()) in printed for each in notices)
@@ -192,9 +263,16 @@ def _greyed(place: Path, count: int) -> Path:
     return place
 
 
-@pytest.mark.parametrize(("thermal", "lights"), [
-    (0, (False, True)), (1, (False, True)), (6, (True, True)), (20, (True, True)), (40, (True, False)),
-])
+@pytest.mark.parametrize(
+    ("thermal", "lights"),
+    [
+        (0, (False, True)),
+        (1, (False, True)),
+        (6, (True, True)),
+        (20, (True, True)),
+        (40, (True, False)),
+    ],
+)
 def test_a_light_is_known_of_which_a_tenth_of_the_pictures_are(
     tmp_path: Path, thermal: int, lights: tuple[bool, bool]
 ) -> None:
@@ -203,15 +281,18 @@ def test_a_light_is_known_of_which_a_tenth_of_the_pictures_are(
     assert sets.lights == lights
     assert sum(len(share.labelled) for share in sets.shares) == 40
     if all(lights):
-        assert {share.labelled.name: (len(share.labelled), share.thermal) for share in sets.shares} == {
-            "squares": (40 - thermal, False), "squares, thermal": (thermal, True)
-        }
+        assert {
+            share.labelled.name: (len(share.labelled), share.thermal) for share in sets.shares
+        } == {"squares": (40 - thermal, False), "squares, thermal": (thermal, True)}
 
 
 def test_one_video_is_split_by_blocks_and_the_score_called_too_good(tmp_path: Path) -> None:
     sets = _sets(labelled_squares(tmp_path / "one", 1, 40))
     assert 0 < len(sets.held_out[0]) < 20 < len(sets.shares[0].labelled)
-    assert any("frames of one video look alike, so the score will be too good" in each for each in sets.notices)
+    assert any(
+        "frames of one video look alike, so the score will be too good" in each
+        for each in sets.notices
+    )
 
 
 def test_a_video_in_both_parts_is_warned_of(data: Path, tmp_path: Path) -> None:
@@ -221,7 +302,9 @@ def test_a_video_in_both_parts_is_warned_of(data: Path, tmp_path: Path) -> None:
     assert any("lie in both" in each and "flight0" in each for each in sets.notices)
 
 
-def test_classes_that_a_set_knows_nothing_of_are_unlabelled_there(data: Path, tmp_path: Path) -> None:
+def test_classes_that_a_set_knows_nothing_of_are_unlabelled_there(
+    data: Path, tmp_path: Path
+) -> None:
     people = labelled_squares(tmp_path / "people", 4, 2, names=("person", "car"))
     sets = _sets(data, people)
     assert sets.classes == ("person", "car")
@@ -231,8 +314,13 @@ def test_classes_that_a_set_knows_nothing_of_are_unlabelled_there(data: Path, tm
 
 
 def test_simulated_pictures_are_mixed_in(data: Path, tmp_path: Path) -> None:
-    assert list(simulate_samples(tmp_path / "simulated", 1, seed=1))[-1] == "simulating pictures: 4 of 4"
-    assert not list(simulate_samples(tmp_path / "simulated", 1, seed=1))  # kept for a run that goes on
+    assert (
+        list(simulate_samples(tmp_path / "simulated", 1, seed=1))[-1]
+        == "simulating pictures: 4 of 4"
+    )
+    assert not list(
+        simulate_samples(tmp_path / "simulated", 1, seed=1)
+    )  # kept for a run that goes on
     labels = read_labels([data], DataOptions(), synthetic=0.4, seed=1)
     sets = training_sets(labels, synthetic=0.4, simulated=tmp_path / "simulated")
     assert sets.classes == ("person", "car", "small object")
@@ -247,11 +335,17 @@ def test_simulated_pictures_are_mixed_in(data: Path, tmp_path: Path) -> None:
 def test_labels_are_checked_before_anything_is_simulated(data: Path, tmp_path: Path) -> None:
     options = DataOptions(classes={"Boat": "boat"})
     with pytest.raises(InputError, match="none of its class names"):
-        list(train_detector([data], tmp_path / "out", _settings(synthetic=0.5), options, device="cpu"))
+        list(
+            train_detector(
+                [data], tmp_path / "out", _settings(synthetic=0.5), options, device="cpu"
+            )
+        )
     assert not (tmp_path / "out" / "simulated").exists()
 
 
-def test_bad_input_is_reported(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_reported(
+    data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     def words(*arguments: str) -> str:
         assert main(["train", *arguments, "--out", str(tmp_path / "new" / "out")]) == 1
         assert not (tmp_path / "new").exists()
@@ -269,8 +363,12 @@ def test_bad_input_is_reported(data: Path, tmp_path: Path, capsys: pytest.Captur
     assert "device must be auto, cpu or cuda, got 'tpu'" in words(place, "--device", "tpu")
     assert "device must be auto, cpu or cuda, got 'cudaa'" in words(place, "--device", "cudaa")
     assert "THEIRS=OURS" in words(place, "--classes", "=car")
-    assert "ignore: 'Bicycle' is no name in the labels; there are: car" in words(place, "--ignore", "Bicycle")
-    assert "unlabelled: 'persn' is no class; there are: person, car" in words(place, "--unlabelled", "persn")
+    assert "ignore: 'Bicycle' is no name in the labels; there are: car" in words(
+        place, "--ignore", "Bicycle"
+    )
+    assert "unlabelled: 'persn' is no class; there are: person, car" in words(
+        place, "--unlabelled", "persn"
+    )
     assert "none of its class names" in (printed := words(place, "--classes", "Boat=boat"))
     assert "such as --classes " in printed and "=person" in printed
     if not torch.cuda.is_available():
@@ -281,7 +379,9 @@ def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
     place = labelled_squares(tmp_path / "squares", 2, 2)
     for path in (place / "labels").glob("*.txt"):
         path.write_text("")
-    with pytest.raises(InputError, match="none of the pictures to learn from has a labelled object"):
+    with pytest.raises(
+        InputError, match="none of the pictures to learn from has a labelled object"
+    ):
         _sets(place)
     for path in (place / "labels").glob("*.txt"):
         path.write_text("0 1.5 1.5 0.1 0.1\n")
@@ -297,28 +397,69 @@ def test_pictures_without_any_object_teach_nothing(tmp_path: Path) -> None:
 def test_a_model_that_finds_nothing_is_warned_of(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = ["--weights", "none", "--steps", "1", "--batch", "1", "--side", "64", "--val", "0.25", "--device", "cpu"]
+    options = [
+        "--weights",
+        "none",
+        "--steps",
+        "1",
+        "--batch",
+        "1",
+        "--side",
+        "64",
+        "--val",
+        "0.25",
+        "--device",
+        "cpu",
+    ]
     assert main(["train", str(data), "--out", str(tmp_path / "out"), *options]) == 0
     words = "the model finds next to nothing: its AP50 on the held-out pictures is 0.0"
     assert words in " ".join(capsys.readouterr().out.split())
     report = json.loads((tmp_path / "out" / "training.json").read_text())
     assert any(words in each for each in report["notices"])
-    assert report["found_px"] == {} and report["model"]["best_px"]["car"][0] > 20  # of those learnt from
+    assert (
+        report["found_px"] == {} and report["model"]["best_px"]["car"][0] > 20
+    )  # of those learnt from
     page = (tmp_path / "out" / "training.html").read_text()
     assert words in page and "too few found" in page
 
 
 def test_names_in_the_report_are_text() -> None:
     report = {
-        "model": {"name": "<b>"}, "found_px": {"<i>": (1, 2)}, "held_out": {"ap50": 0.5, "classes": {"<i>": 0.5}},
-        "reported": {"<i>": {"score": 0.5, "precision": None, "recall": 0.25}}, "stopped_early": True, "step": 2,
-        "steps": 5, "seconds": 3.0, "device": "cpu", "notices": ["<script>"], "losses": [],
-        "checks": [{"step": k, "ap50": 0.1 * k, "classes": {"<i>": None}} for k in (1, 2)], "best_step": 2,
-        "sets": [{"name": "<s>", "part": "learnt from", "pictures": 1, "videos": 1, "boxes": {"<i>": 3},
-                  "unlabelled": []}],
-        "settings": {"preset": "fast"}, "weights": "none",
-        "export": {"box_px": 0.0, "score": 0.0, "detections": 3, "undecided": 0, "bytes": 5_000_000},
+        "model": {"name": "<b>"},
+        "found_px": {"<i>": (1, 2)},
+        "held_out": {"ap50": 0.5, "classes": {"<i>": 0.5}},
+        "reported": {"<i>": {"score": 0.5, "precision": None, "recall": 0.25}},
+        "stopped_early": True,
+        "step": 2,
+        "steps": 5,
+        "seconds": 3.0,
+        "device": "cpu",
+        "notices": ["<script>"],
+        "losses": [],
+        "checks": [{"step": k, "ap50": 0.1 * k, "classes": {"<i>": None}} for k in (1, 2)],
+        "best_step": 2,
+        "sets": [
+            {
+                "name": "<s>",
+                "part": "learnt from",
+                "pictures": 1,
+                "videos": 1,
+                "boxes": {"<i>": 3},
+                "unlabelled": [],
+            }
+        ],
+        "settings": {"preset": "fast"},
+        "weights": "none",
+        "export": {
+            "box_px": 0.0,
+            "score": 0.0,
+            "detections": 3,
+            "undecided": 0,
+            "bytes": 5_000_000,
+        },
     }
     page = training_page(report)
-    assert "<i>" not in page and "<script>" not in page and "<s>" not in page and "&lt;i&gt;" in page
+    assert (
+        "<i>" not in page and "<script>" not in page and "<s>" not in page and "&lt;i&gt;" in page
+    )
     assert "then its checks no longer got better" in page and page.count("<polyline") == 1

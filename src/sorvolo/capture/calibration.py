@@ -73,7 +73,9 @@ def guess_camera(
     make, model = _clean(make), _clean(model)
     label = (model if model.startswith(make) else f"{make} {model}").strip() or "camera"
     presets = [
-        each for each in find_presets(model) or find_presets(label) if _fits(each, width_px, focal_length_mm)
+        each
+        for each in find_presets(model) or find_presets(label)
+        if _fits(each, width_px, focal_length_mm)
     ]
     if presets:
         return _camera_of_preset(presets[0], width_px, height_px, focal_length_mm)
@@ -102,16 +104,27 @@ def stated_camera(lens: StatedLens, width_px: int, height_px: int) -> CameraMode
     if not (_known(focal_px) and _is_lens(focal_px, width_px)):
         return None
     cx_px, cy_px = (width_px - 1) / 2 + lens.cx_px * scale, (height_px - 1) / 2 + lens.cy_px * scale
-    words = "the photo's own XMP: " + ("calibrated" if lens.is_calibrated else "as the lens was designed")
+    words = "the photo's own XMP: " + (
+        "calibrated" if lens.is_calibrated else "as the lens was designed"
+    )
     try:
         camera = Camera(
-            width_px, height_px, focal_px, lens.fy_px * scale, cx_px, cy_px, np.array(lens.distortion)
+            width_px,
+            height_px,
+            focal_px,
+            lens.fy_px * scale,
+            cx_px,
+            cy_px,
+            np.array(lens.distortion),
         )
         check_lens("XMP", camera)
     except (GeometryError, InputError):
         return None
-    return CameraModel(camera, f"{words} ({camera.angle_of_view_deg[0]:.1f} deg across)",
-                       0.005 if lens.is_calibrated else 0.01)
+    return CameraModel(
+        camera,
+        f"{words} ({camera.angle_of_view_deg[0]:.1f} deg across)",
+        0.005 if lens.is_calibrated else 0.01,
+    )
 
 
 def camera_from_option(option: str, width_px: int, height_px: int) -> CameraModel:
@@ -140,7 +153,9 @@ def camera_from_option(option: str, width_px: int, height_px: int) -> CameraMode
 def _camera_of_preset(
     preset: CameraPreset, width_px: int, height_px: int, focal_length_mm: float
 ) -> CameraModel:
-    focal_mm = focal_length_mm if preset.changes_lens and _known(focal_length_mm) else preset.focal_mm
+    focal_mm = (
+        focal_length_mm if preset.changes_lens and _known(focal_length_mm) else preset.focal_mm
+    )
     # a picture of another shape is taken as the largest cut of that shape from the sensor
     focal_px = max(
         focal_mm / preset.sensor_width_mm * width_px,
@@ -148,7 +163,9 @@ def _camera_of_preset(
     )
     words = f"preset {preset.name}: {focal_mm:g} mm lens, sensor {preset.sensor_width_mm:g} mm wide"
     if preset.changes_lens and not _known(focal_length_mm):
-        return _plain_camera(width_px, height_px, focal_px, f"{words}; the lens is a GUESS, {_BETTER}", 0.2)
+        return _plain_camera(
+            width_px, height_px, focal_px, f"{words}; the lens is a GUESS, {_BETTER}", 0.2
+        )
     if width_px == preset.width_px:
         return _plain_camera(width_px, height_px, focal_px, words, preset.focal_sigma)
     words += f"; not a full photo of {preset.width_px} px, and video may use less of the sensor"
@@ -161,7 +178,9 @@ def _camera_of_number(key: str, text: str, width_px: int, height_px: int) -> Cam
     except ValueError as error:
         raise InputError(f"--camera {key}={text}: {text!r} is not a number") from error
     if key == "aov":
-        focal_px = 0.5 * width_px / math.tan(math.radians(number) / 2) if 0 < number < 180 else math.nan
+        focal_px = (
+            0.5 * width_px / math.tan(math.radians(number) / 2) if 0 < number < 180 else math.nan
+        )
     elif key == "focal_px":
         focal_px = number
     elif key == "focal_35mm":
@@ -173,10 +192,16 @@ def _camera_of_number(key: str, text: str, width_px: int, height_px: int) -> Cam
     return _plain_camera(width_px, height_px, focal_px, f"given as {key}={number:g}", 0.03)
 
 
-def _plain_camera(width_px: int, height_px: int, focal_px: float, words: str, sigma: float) -> CameraModel:
-    camera = Camera(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
+def _plain_camera(
+    width_px: int, height_px: int, focal_px: float, words: str, sigma: float
+) -> CameraModel:
+    camera = Camera(
+        width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2
+    )
     aov_deg = camera.angle_of_view_deg[0]
-    return CameraModel(camera, f"{words} ({aov_deg:.1f} deg across, lens distortion unknown)", sigma)
+    return CameraModel(
+        camera, f"{words} ({aov_deg:.1f} deg across, lens distortion unknown)", sigma
+    )
 
 
 def _fits(preset: CameraPreset, width_px: int, focal_length_mm: float) -> bool:
@@ -186,7 +211,9 @@ def _fits(preset: CameraPreset, width_px: int, focal_length_mm: float) -> bool:
     """
     if _known(focal_length_mm):
         return preset.changes_lens or abs(focal_length_mm / preset.focal_mm - 1) < 0.1
-    return preset == _nearest_in_size(find_presets(preset.codes[0] if preset.codes else preset.name), width_px)
+    return preset == _nearest_in_size(
+        find_presets(preset.codes[0] if preset.codes else preset.name), width_px
+    )
 
 
 def _nearest_in_size(presets: Sequence[CameraPreset], width_px: int) -> CameraPreset:

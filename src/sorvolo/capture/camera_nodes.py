@@ -22,7 +22,9 @@ from sorvolo.geometry.arrays import Floats
 Node: TypeAlias = float | str | Floats
 
 _MOST_BYTES = 4_000_000  # a camera file has kilobytes; by choice
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.?(?:inf|nan)", re.IGNORECASE)
+_NUMBER = re.compile(
+    r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?\.?(?:inf|nan)", re.IGNORECASE
+)
 
 
 def read_nodes(path: Path) -> Mapping[str, Node]:
@@ -39,7 +41,9 @@ def read_nodes(path: Path) -> Mapping[str, Node]:
     else:
         nodes = _from_yaml(path, text)
     if not nodes:
-        raise InputError(f"{path}: not a camera file: neither XML, YAML nor JSON with named values was found")
+        raise InputError(
+            f"{path}: not a camera file: neither XML, YAML nor JSON with named values was found"
+        )
     return nodes
 
 
@@ -72,7 +76,10 @@ def _from_json(path: Path, text: str) -> dict[str, Node]:
     nodes: dict[str, Node] = {}
     try:
         _flatten_json(path, json.loads(text), nodes)
-    except (ValueError, RecursionError) as error:  # a whole number of thousands of digits is a plain ValueError
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # a whole number of thousands of digits is a plain ValueError
         raise InputError(f"{path}: broken JSON: {error}") from error
     return nodes
 
@@ -116,13 +123,17 @@ def _matrix(path: Path, name: str, children: Mapping[str, str]) -> Floats:
     """An OpenCV matrix as (rows, cols); raises InputError when its data do not fill it."""
     kind = children.get("dt", "d").strip().strip('"')
     if kind not in ("d", "f", "i"):
-        raise InputError(f"{path}: {name} holds values of type {kind!r}; numbers (d, f or i) are needed")
+        raise InputError(
+            f"{path}: {name} holds values of type {kind!r}; numbers (d, f or i) are needed"
+        )
     numbers = np.array([_number(each) for each in _NUMBER.findall(children["data"])])
     rows = children.get("rows", "1").strip()
     columns = children.get("cols", str(len(numbers))).strip()
     is_shape = all(re.fullmatch(r"[0-9]{1,6}", each) for each in (rows, columns))
     if not (is_shape and int(rows) * int(columns) == len(numbers)):
-        raise InputError(f"{path}: {name} should hold {rows[:20]} x {columns[:20]} numbers but has {len(numbers)}")
+        raise InputError(
+            f"{path}: {name} should hold {rows[:20]} x {columns[:20]} numbers but has {len(numbers)}"
+        )
     return numbers.reshape(int(rows), int(columns))
 
 
@@ -130,7 +141,9 @@ def _array(path: Path, name: str, values: list[Any]) -> Floats:
     try:
         return np.array(values, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{path}: {name} is not a list of numbers that a camera can have") from error
+        raise InputError(
+            f"{path}: {name} is not a list of numbers that a camera can have"
+        ) from error
 
 
 def _scalar_or_array(text: str) -> Node:

@@ -30,14 +30,18 @@ class CameraPreset:
 
 CAMERA_PRESETS = (
     # 1/2.3 inch sensors with 1.55 um pixels: 4000 x 1.55 um = 6.2 mm
-    CameraPreset("Phantom 3", ("FC300X", "FC300S", "FC300C", "FC300SE"), 6.2, 4.65, 3.61, 4000, 3000),
+    CameraPreset(
+        "Phantom 3", ("FC300X", "FC300S", "FC300C", "FC300SE"), 6.2, 4.65, 3.61, 4000, 3000
+    ),
     CameraPreset("Zenmuse X3", ("FC350",), 6.2, 4.65, 3.61, 4000, 3000),
     CameraPreset("Phantom 4", ("FC330",), 6.2, 4.65, 3.61, 4000, 3000),
     CameraPreset("Mavic Pro", ("FC220",), 6.2, 4.65, 4.73, 4000, 3000),
     CameraPreset("Mavic Air", ("FC2103",), 6.29, 4.71, 4.5, 4056, 3040, 0.03),
     CameraPreset("Mavic Mini", ("FC7203",), 6.3, 4.73, 4.49, 4000, 3000, 0.03),
     CameraPreset("Mini 2", ("FC7303",), 6.3, 4.73, 4.49, 4000, 3000, 0.03),
-    CameraPreset("Mavic 2 Zoom", ("FC2204",), 6.2, 4.65, 4.386, 4000, 3000, 0.03, changes_lens=True),
+    CameraPreset(
+        "Mavic 2 Zoom", ("FC2204",), 6.2, 4.65, 4.386, 4000, 3000, 0.03, changes_lens=True
+    ),
     CameraPreset("Phantom 4 Multispectral", ("FC6360",), 4.87, 3.96, 5.74, 1600, 1300),
     # 1 inch
     CameraPreset("Phantom 4 Pro", ("FC6310", "FC6310S"), 13.2, 8.8, 8.8, 5472, 3648),
@@ -65,7 +69,9 @@ CAMERA_PRESETS = (
     CameraPreset("Mavic 3E", ("M3E", "M3M"), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
     CameraPreset("Matrice 4E", ("M4E", "M4D"), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
     CameraPreset("Zenmuse L2", (), 17.3, 13.0, 12.29, 5280, 3956, 0.03),
-    CameraPreset("Zenmuse X5", ("FC550", "FC550RAW"), 17.3, 13.0, 15.0, 4608, 3456, changes_lens=True),
+    CameraPreset(
+        "Zenmuse X5", ("FC550", "FC550RAW"), 17.3, 13.0, 15.0, 4608, 3456, changes_lens=True
+    ),
     CameraPreset("Zenmuse X5S", ("FC6520",), 17.3, 13.0, 15.0, 5280, 3956, changes_lens=True),
     CameraPreset("Zenmuse X7", ("FC6540",), 23.5, 15.7, 24.0, 6016, 4008, changes_lens=True),
     CameraPreset("Zenmuse P1", ("ZenmuseP1",), 35.9, 24.0, 35.0, 8192, 5460, changes_lens=True),
@@ -74,10 +80,20 @@ CAMERA_PRESETS = (
     CameraPreset(
         "Skydio 2", ("Skydio 2+", "Skydio X2", "Skydio X2 WIDE"), 6.315, 4.733, 3.7, 4056, 3040
     ),
-    CameraPreset("Skydio X2 narrow", ("X2E", "X2D", "Skydio X2 NARROW"), 6.275, 4.718, 7.5, 4056, 3040),
-    CameraPreset("Skydio X10 wide", ("VT300-L_93", "V100-L_93"), 13.107, 9.83, 7.74, 8192, 6144, 0.03),
     CameraPreset(
-        "Skydio X10 narrow", ("VT300-Z_50", "VT300-L_50", "V100-L_50"), 7.213, 5.44, 9.88, 9248, 6944
+        "Skydio X2 narrow", ("X2E", "X2D", "Skydio X2 NARROW"), 6.275, 4.718, 7.5, 4056, 3040
+    ),
+    CameraPreset(
+        "Skydio X10 wide", ("VT300-L_93", "V100-L_93"), 13.107, 9.83, 7.74, 8192, 6144, 0.03
+    ),
+    CameraPreset(
+        "Skydio X10 narrow",
+        ("VT300-Z_50", "VT300-L_50", "V100-L_50"),
+        7.213,
+        5.44,
+        9.88,
+        9248,
+        6944,
     ),
     # unverified, from memory (docs/formats-in.md): focal lengths that an angle of view or a length at 35 mm gives
     CameraPreset("Autel EVO II", ("XT701",), 6.4, 4.8, 4.74, 8000, 6000, 0.06),
@@ -88,7 +104,9 @@ CAMERA_PRESETS = (
     CameraPreset("Autel EVO Max 4T", (), 9.8, 7.35, 6.6, 8192, 6144, 0.06),
     CameraPreset("Parrot ANAFI Ai", ("AnafiAi",), 6.4, 4.8, 4.4, 8000, 6000, 0.06),
     # lenses far from a pinhole: a calibration is worth much more than the preset
-    CameraPreset("Parrot ANAFI", ("Anafi", "AnafiUSA", "AnafiThermal"), 5.985, 4.498, 4.0, 5344, 4016, 0.05),
+    CameraPreset(
+        "Parrot ANAFI", ("Anafi", "AnafiUSA", "AnafiThermal"), 5.985, 4.498, 4.0, 5344, 4016, 0.05
+    ),
     CameraPreset("GoPro HERO4", ("HERO4 Black", "HERO4 Silver"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
     CameraPreset("GoPro HERO5", ("HERO5 Black", "HERO6 Black"), 6.17, 4.63, 2.92, 4000, 3000, 0.1),
     # multispectral and thermal, beside the colour camera of the same name: the focal length in EXIF distinguishes them
@@ -97,8 +115,12 @@ CAMERA_PRESETS = (
     CameraPreset("Matrice 30T thermal", ("M30T",), 7.68, 6.144, 9.1, 640, 512, 0.04),
     CameraPreset("Matrice 4T thermal", ("M4T", "M4TD"), 7.68, 6.144, 12.05, 640, 512, 0.05),
     CameraPreset("Zenmuse H20T thermal", ("ZH20T",), 7.68, 6.144, 13.5, 640, 512, 0.04),
-    CameraPreset("Skydio X10 thermal", ("VT300-Z_40", "VT300-L_40"), 7.68, 6.144, 13.6, 640, 512, 0.03),
-    CameraPreset("Autel EVO II Dual 640T thermal", ("XT709", "XL709"), 7.68, 6.144, 13.0, 640, 512, 0.05),
+    CameraPreset(
+        "Skydio X10 thermal", ("VT300-Z_40", "VT300-L_40"), 7.68, 6.144, 13.6, 640, 512, 0.03
+    ),
+    CameraPreset(
+        "Autel EVO II Dual 640T thermal", ("XT709", "XL709"), 7.68, 6.144, 13.0, 640, 512, 0.05
+    ),
     CameraPreset("Autel EVO Max 4T thermal", (), 7.68, 6.144, 9.1, 640, 512, 0.05),
     CameraPreset("Zenmuse H30T thermal", ("H30T",), 15.36, 12.288, 24.0, 1280, 1024, 0.04),
 )
@@ -121,7 +143,8 @@ def find_presets(name: str) -> list[CameraPreset]:
 def preset_names() -> str:
     """Every preset with its EXIF codes, for a message."""
     return ", ".join(
-        f"{preset.name} ({', '.join(preset.codes)})" if preset.codes else preset.name for preset in CAMERA_PRESETS
+        f"{preset.name} ({', '.join(preset.codes)})" if preset.codes else preset.name
+        for preset in CAMERA_PRESETS
     )
 
 

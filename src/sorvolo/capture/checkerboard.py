@@ -14,8 +14,12 @@ from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 
 FEWEST_VIEWS = 8  # views of the board; all six by choice
 MOST_VIEWS = 40  # views: more cost time alone
-LEAST_TILT_SPREAD_DEG = 10.0  # between the boards' tilts: boards that all lie alike fix no focal length
-LEAST_COVERAGE = 0.4  # share of the picture that the boards fill together: distortion shows at its rim
+LEAST_TILT_SPREAD_DEG = (
+    10.0  # between the boards' tilts: boards that all lie alike fix no focal length
+)
+LEAST_COVERAGE = (
+    0.4  # share of the picture that the boards fill together: distortion shows at its rim
+)
 LARGEST_ERROR_PX = 2.0  # rms of the corners
 LARGEST_FOCAL_SIGMA = 0.02  # relative
 
@@ -42,7 +46,9 @@ class Board:
 
     def __post_init__(self) -> None:
         if self.columns < 3 or self.rows < 3 or self.columns > 60 or self.rows > 60:
-            raise SettingsError(f"a board needs 3 to 60 inner corners a side, got {self.columns}x{self.rows}")
+            raise SettingsError(
+                f"a board needs 3 to 60 inner corners a side, got {self.columns}x{self.rows}"
+            )
         if not (np.isfinite(self.square_mm) and self.square_mm > 0):
             raise SettingsError(f"the side of a square must be positive, got {self.square_mm} mm")
 
@@ -50,7 +56,9 @@ class Board:
     def corners_mm(self) -> PointsM:
         """(columns * rows, 3) inner corners on the board, row by row."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
-        return self.square_mm * np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(np.float64)
+        return self.square_mm * np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]).astype(
+            np.float64
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +99,11 @@ def find_board(name: str, image: ImageRGB, board: Board) -> BoardView | NoBoard:
     """The board's inner corners in a picture, to a fraction of a pixel (Duda and Frese 2018)."""
     gray = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
     scale = min(1.0, _SEARCH_PX / max(gray.shape))
-    small = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) if scale < 1 else gray
+    small = (
+        cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        if scale < 1
+        else gray
+    )
     size = (board.columns, board.rows)
     flags = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_ACCURACY
     found, corners = cv2.findChessboardCornersSB(small, size, flags=flags)
@@ -100,7 +112,9 @@ def find_board(name: str, image: ImageRGB, board: Board) -> BoardView | NoBoard:
     corners_px = (corners.reshape(-1, 2).astype(np.float64) + 0.5) / scale - 0.5
     # on drawn boards the search alone is 0.10-0.16 px rms off, refined 0.03 px
     corners_px = _refined(gray, corners_px, board)
-    sharpness = cv2.estimateChessboardSharpness(gray, size, corners_px.astype(np.float32).reshape(-1, 1, 2))
+    sharpness = cv2.estimateChessboardSharpness(
+        gray, size, corners_px.astype(np.float32).reshape(-1, 1, 2)
+    )
     return BoardView(name, corners_px, float(np.ravel(sharpness[0])[0]))
 
 
@@ -119,14 +133,19 @@ def select_views(views: Sequence[BoardView], width_px: int, height_px: int) -> l
     return chosen
 
 
-def calibrate(views: Sequence[BoardView], board: Board, width_px: int, height_px: int) -> Calibration:
+def calibrate(
+    views: Sequence[BoardView], board: Board, width_px: int, height_px: int
+) -> Calibration:
     """The camera that explains the views, or an InputError that names what is missing.
 
     Refused are fewer than 8 views that differ, boards that leave most of the picture empty, boards without a
     variety of tilts (the focal length is then not determined), and a fit that is bad or uncertain.
     """
     used = select_views(views, width_px, height_px)
-    _need(len(used) >= FEWEST_VIEWS, f"{len(used)} different views of the board, {FEWEST_VIEWS} are needed")
+    _need(
+        len(used) >= FEWEST_VIEWS,
+        f"{len(used)} different views of the board, {FEWEST_VIEWS} are needed",
+    )
     coverage = _coverage(used, board, width_px, height_px)
     _need(
         coverage >= LEAST_COVERAGE,
@@ -144,8 +163,14 @@ def calibrate(views: Sequence[BoardView], board: Board, width_px: int, height_px
         f"the boards are tilted by no more than {spread_deg:.1f} deg against each other, "
         f"{LEAST_TILT_SPREAD_DEG:.0f} deg are needed",
     )
-    _need(fit.error_px <= LARGEST_ERROR_PX, f"the corners miss the camera by {fit.error_px:.1f} px rms")
-    _need(fit.focal_sigma <= LARGEST_FOCAL_SIGMA, f"the focal length is uncertain by {fit.focal_sigma:.1%}")
+    _need(
+        fit.error_px <= LARGEST_ERROR_PX,
+        f"the corners miss the camera by {fit.error_px:.1f} px rms",
+    )
+    _need(
+        fit.focal_sigma <= LARGEST_FOCAL_SIGMA,
+        f"the focal length is uncertain by {fit.focal_sigma:.1%}",
+    )
     check_lens("these views", fit.camera)
     errors_px = {view.name: float(error) for view, error in zip(used, fit.view_errors_px)}
     return Calibration(
@@ -168,8 +193,15 @@ def _fit(views: Sequence[BoardView], board: Board, width_px: int, height_px: int
     image_points = [view.corners_px.astype(np.float32).reshape(-1, 1, 2) for view in views]
     for flags in (0, cv2.CALIB_FIX_K3):
         try:
-            error_px, matrix, distortion, turns, _, deviations, _, view_errors = cv2.calibrateCameraExtended(
-                board_points, image_points, (width_px, height_px), np.eye(3), np.zeros(5), flags=flags
+            error_px, matrix, distortion, turns, _, deviations, _, view_errors = (
+                cv2.calibrateCameraExtended(
+                    board_points,
+                    image_points,
+                    (width_px, height_px),
+                    np.eye(3),
+                    np.zeros(5),
+                    flags=flags,
+                )
             )
         except cv2.error as error:
             raise InputError(f"the views determine no camera; {_ADVICE}") from error
@@ -178,7 +210,9 @@ def _fit(views: Sequence[BoardView], board: Board, width_px: int, height_px: int
             break
     (fx, _, cx), (_, fy, cy), _ = matrix
     try:
-        camera = Camera(width_px, height_px, fx, fy, cx, cy, np.ravel(distortion).astype(np.float64)[:5])
+        camera = Camera(
+            width_px, height_px, fx, fy, cx, cy, np.ravel(distortion).astype(np.float64)[:5]
+        )
     except GeometryError as error:
         raise InputError(f"the views determine no plausible camera ({error}); {_ADVICE}") from error
     sigma = max(0.001, 3 * float(np.max(deviations.ravel()[:2] / (fx, fy))))
@@ -190,7 +224,9 @@ def _outliers(view_errors_px: Floats) -> list[int]:
     """Views that fit far worse than the usual one: a bent board, motion blur, a wrong corner."""
     middle = float(np.median(view_errors_px))
     spread = SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(view_errors_px - middle)))
-    return [int(index) for index in np.flatnonzero(view_errors_px > middle + max(4 * spread, middle))]
+    return [
+        int(index) for index in np.flatnonzero(view_errors_px > middle + max(4 * spread, middle))
+    ]
 
 
 def _tilt_spread_deg(rotation_vectors_rad: Floats) -> float:
@@ -222,7 +258,8 @@ def _refined(gray: ImageGray, corners_px: PointsPx, board: Board) -> PointsPx:
     stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 0.01)
     points = corners_px.astype(np.float32).reshape(-1, 1, 2)
     return np.asarray(
-        cv2.cornerSubPix(gray, points, (window, window), (-1, -1), stop).reshape(-1, 2), dtype=np.float64
+        cv2.cornerSubPix(gray, points, (window, window), (-1, -1), stop).reshape(-1, 2),
+        dtype=np.float64,
     )
 
 

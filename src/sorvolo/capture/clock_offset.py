@@ -56,11 +56,18 @@ class OffsetEstimate:
 
     def refined(self, found: "OffsetEstimate", applied_s: float) -> "OffsetEstimate":
         """This estimate after another search, which began at `applied_s` and found so much more."""
-        return OffsetEstimate(applied_s + found.offset_s, found.sigma_s, self.rms_at_zero_m, found.rms_m)
+        return OffsetEstimate(
+            applied_s + found.offset_s, found.sigma_s, self.rms_at_zero_m, found.rms_m
+        )
 
 
 def estimate_offset(
-    track: Track, times_s: Floats, seen_m: PointsM, *, reach_s: float, settings: OffsetSettings = OffsetSettings()
+    track: Track,
+    times_s: Floats,
+    seen_m: PointsM,
+    *,
+    reach_s: float,
+    settings: OffsetSettings = OffsetSettings(),
 ) -> OffsetEstimate:
     """The clock offset that makes telemetry's path fit the path seen in the pictures (N, 2), up to a similarity.
 
@@ -83,7 +90,10 @@ def estimate_offset(
         inside = (at >= path_s[0]) & (at <= path_s[-1])
         fixes = np.column_stack([np.interp(at[inside], path_s, path_m[:, k]) for k in range(2)])
         seen = seen_m[inside]
-        if inside.sum() < max(settings.least_frames, 0.6 * len(at)) or np.ptp(seen, axis=0).max() <= 0:
+        if (
+            inside.sum() < max(settings.least_frames, 0.6 * len(at))
+            or np.ptp(seen, axis=0).max() <= 0
+        ):
             return times_s[:0], fixes[:0], seen[:0]
         change = fit_similarity(fixes, seen)
         return times_s[inside], fixes, seen @ change[:2, :2].T + change[:2, 2]
@@ -117,7 +127,11 @@ def _outlying_m(miss_m: Floats) -> float:
 
 
 def _smooth_path(
-    fix_s: Floats, fixes_m: PointsM, interval_s: float, within_s: tuple[float, float], settings: OffsetSettings
+    fix_s: Floats,
+    fixes_m: PointsM,
+    interval_s: float,
+    within_s: tuple[float, float],
+    settings: OffsetSettings,
 ) -> tuple[Floats, PointsM]:
     """Fixes as a path, (M,) s and (M, 2), from the one to the other time: by a parabola through the fixes around
     each moment, weighted by nearness; as they are where these are few, and of photos, which carry one each.
@@ -166,19 +180,25 @@ def _offset_sigma_s(
     at_s, places, misses = times_s[rows], places_m[rows], (fixes_m - places_m)[rows].T.ravel()
     similar = _similarity_rows(places)
     taken_up, *_ = np.linalg.lstsq(similar, velocity_m_s.T.ravel(), rcond=None)
-    motion = velocity_m_s.T.ravel() - similar @ taken_up  # m/s, that no similarity of the path can stand in for
+    motion = (
+        velocity_m_s.T.ravel() - similar @ taken_up
+    )  # m/s, that no similarity of the path can stand in for
     if motion @ motion <= 1e-9 * len(rows) or len(motion) <= similar.shape[1] + 1:
         return float("inf")
     model = np.column_stack([similar, motion])
     apart_s = np.abs(at_s[:, None] - at_s)
     likelihoods, variances = [], []
-    for memory_s in np.geomspace(float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], settings.memories):
+    for memory_s in np.geomspace(
+        float(np.median(np.diff(at_s))), at_s[-1] - at_s[0], settings.memories
+    ):
         for share in settings.shares:
             alike = (1 - share) * np.eye(len(at_s)) + share * np.exp(-apart_s / memory_s)
             likelihood, noise = _restricted_likelihood(alike, model, misses)
             likelihoods.append(likelihood)
             pull = motion.reshape(2, -1)
-            variances.append(noise * float(np.sum(pull * (pull @ alike))) / float(motion @ motion) ** 2)
+            variances.append(
+                noise * float(np.sum(pull * (pull @ alike))) / float(motion @ motion) ** 2
+            )
     weights = np.exp(np.array(likelihoods) - max(likelihoods))
     return float(np.sqrt(np.average(variances, weights=weights)))
 
@@ -187,10 +207,14 @@ def _similarity_rows(places_m: PointsM) -> Floats:
     """(2N, 4) how N places, all their easts before their norths, move with a similarity of their plane."""
     east, north = (places_m - places_m.mean(axis=0)).T
     one, zero = np.ones(len(places_m)), np.zeros(len(places_m))
-    return np.column_stack([
-        np.concatenate([one, zero]), np.concatenate([zero, one]), np.concatenate([east, north]),
-        np.concatenate([-north, east]),
-    ])
+    return np.column_stack(
+        [
+            np.concatenate([one, zero]),
+            np.concatenate([zero, one]),
+            np.concatenate([east, north]),
+            np.concatenate([-north, east]),
+        ]
+    )
 
 
 def _restricted_likelihood(alike: Floats, model: Floats, misses: Floats) -> tuple[float, float]:

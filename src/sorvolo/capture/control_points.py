@@ -24,10 +24,36 @@ LEAST_POINTS = 3
 
 _KIND, _NEEDED = "control point file", "a CRS in the first line, then x y z px py image a line"
 _MOST_BYTES = 10_000_000  # some hundred thousand lines; by choice
-_PROJ_KEYS = frozenset({
-    "proj", "zone", "south", "ellps", "datum", "units", "to_meter", "no_defs", "type", "lat_0", "lon_0", "lat_1",
-    "lat_2", "lat_ts", "k", "k_0", "x_0", "y_0", "a", "b", "rf", "towgs84", "axis", "gamma", "alpha", "lonc",
-})
+_PROJ_KEYS = frozenset(
+    {
+        "proj",
+        "zone",
+        "south",
+        "ellps",
+        "datum",
+        "units",
+        "to_meter",
+        "no_defs",
+        "type",
+        "lat_0",
+        "lon_0",
+        "lat_1",
+        "lat_2",
+        "lat_ts",
+        "k",
+        "k_0",
+        "x_0",
+        "y_0",
+        "a",
+        "b",
+        "rf",
+        "towgs84",
+        "axis",
+        "gamma",
+        "alpha",
+        "lonc",
+    }
+)
 """Of a proj string: those of map projections. Grids and pipelines would read files."""
 
 
@@ -76,15 +102,27 @@ class ControlFile:
 
     def _mistakes(self) -> Iterator[tuple[str, _Reading]]:
         own = _Reading(self.crs_words)
-        yield "x and y are exchanged (easting or longitude comes first)", replace(own, swaps_xy=True)
-        yield "px and py are exchanged (the column comes before the row)", replace(own, swaps_px=True)
-        yield "x and y are exchanged, and px and py as well", replace(own, swaps_xy=True, swaps_px=True)
+        yield (
+            "x and y are exchanged (easting or longitude comes first)",
+            replace(own, swaps_xy=True),
+        )
+        yield (
+            "px and py are exchanged (the column comes before the row)",
+            replace(own, swaps_px=True),
+        )
+        yield (
+            "x and y are exchanged, and px and py as well",
+            replace(own, swaps_xy=True, swaps_px=True),
+        )
         crs = _parsed_crs(self.crs_words, self.path)
         if not crs.is_projected:
             return
         degrees = _Reading("WGS84")
         yield "x and y are degrees (longitude, latitude): the CRS is WGS84", degrees
-        yield "x and y are degrees, latitude before longitude: the CRS is WGS84", replace(degrees, swaps_xy=True)
+        yield (
+            "x and y are degrees, latitude before longitude: the CRS is WGS84",
+            replace(degrees, swaps_xy=True),
+        )
         unit_m = _height_unit_m(crs)
         if unit_m == 1.0:
             yield "x, y and z are in feet: give them in metres", replace(own, units=FOOT_M)
@@ -107,7 +145,9 @@ class ControlFile:
         for line in self.lines:
             x, y = (line.y, line.x) if reading.swaps_xy else (line.x, line.y)
             if line.label not in points:
-                longitude_deg, latitude_deg = transformer.transform(x * reading.units, y * reading.units)
+                longitude_deg, latitude_deg = transformer.transform(
+                    x * reading.units, y * reading.units
+                )
                 if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 360):
                     raise InputError(
                         f"{self.path}, line {line.number}: {line.x:g} {line.y:g} is no place in {crs_words} "
@@ -117,7 +157,9 @@ class ControlFile:
                 points[line.label] = ControlPoint(line.label, latitude_deg, longitude_deg, height_m)
             x_px, y_px = (line.y_px, line.x_px) if reading.swaps_px else (line.x_px, line.y_px)
             marks.append(ControlMark(line.label, line.image, x_px, y_px))
-        return GroundControl(self.path.name, f"{crs_words} ({crs.name})", tuple(points.values()), tuple(marks))
+        return GroundControl(
+            self.path.name, f"{crs_words} ({crs.name})", tuple(points.values()), tuple(marks)
+        )
 
 
 def read_control_points(path: Path) -> ControlFile:
@@ -129,7 +171,8 @@ def read_control_points(path: Path) -> ControlFile:
     """
     text = text_of(path, read_small_file(path, _KIND, _MOST_BYTES), _KIND, _NEEDED)
     numbered = [
-        (number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)
+        (number, line.strip())
+        for number, line in enumerate(text.splitlines(), start=1)
         if line.strip() and not line.strip().startswith("#")
     ]
     if not numbered:
@@ -143,7 +186,9 @@ def read_control_points(path: Path) -> ControlFile:
     return ControlFile(path, crs_words, tuple(lines))
 
 
-def marks_in_frames(control: GroundControl, source: Source) -> tuple[GroundControl, tuple[Notice, ...]]:
+def marks_in_frames(
+    control: GroundControl, source: Source
+) -> tuple[GroundControl, tuple[Notice, ...]]:
     """The control with its marks in the pixels of the flight's frames, those of other pictures left out and counted.
 
     Names match without regard to case and ending. Raises InputError where a mark lies beside its picture, and where
@@ -156,7 +201,9 @@ def marks_in_frames(control: GroundControl, source: Source) -> tuple[GroundContr
         if frame is None:
             elsewhere.add(mark.frame)
             continue
-        kept.append(_scaled(control, replace(mark, frame=frame), sizes[frame], source.camera.camera))
+        kept.append(
+            _scaled(control, replace(mark, frame=frame), sizes[frame], source.camera.camera)
+        )
     if not kept:
         raise InputError(
             f"{control.name}: none of its pictures ({', '.join(sorted(elsewhere)[:3])} ...) is one of this flight's "
@@ -178,10 +225,14 @@ def _original_sizes(source: Source) -> dict[str, tuple[int, int]]:
     """Each frame's name with the size, width and height, in whose pixels a person marks it."""
     if isinstance(source, PhotoSource):
         return {
-            photo.path.name: photo.metadata.shown_size_px for photo in source.album.photos if photo.metadata.width_px
+            photo.path.name: photo.metadata.shown_size_px
+            for photo in source.album.photos
+            if photo.metadata.width_px
         }
     camera = source.camera.camera
-    return {str(number): (camera.width_px, camera.height_px) for number in range(source.frame_count)}
+    return {
+        str(number): (camera.width_px, camera.height_px) for number in range(source.frame_count)
+    }
 
 
 def _matching(name: str, sizes: Mapping[str, tuple[int, int]]) -> str | None:
@@ -191,7 +242,9 @@ def _matching(name: str, sizes: Mapping[str, tuple[int, int]]) -> str | None:
     return next((each for each in sizes if Path(each).stem.casefold() == stem), None)
 
 
-def _scaled(control: GroundControl, mark: ControlMark, size_px: tuple[int, int], camera: Camera) -> ControlMark:
+def _scaled(
+    control: GroundControl, mark: ControlMark, size_px: tuple[int, int], camera: Camera
+) -> ControlMark:
     """A mark of a picture of this size in the frames' pixels; raises InputError for one beside the picture."""
     width_px, height_px = size_px
     if not (-1 <= mark.x_px <= width_px and -1 <= mark.y_px <= height_px):
@@ -212,9 +265,13 @@ def _line(path: Path, number: int, text: str) -> _Line:
             f"{path}, line {number}: {len(fields)} columns, {text[:60]!r}; x y z px py image was needed"
         )
     numbers = [_number(each) for each in fields[:5]]
-    wrong = [fields[at] for at in (0, 1, 3, 4) if not isfinite(numbers[at])]  # a height may be missing: NaN
+    wrong = [
+        fields[at] for at in (0, 1, 3, 4) if not isfinite(numbers[at])
+    ]  # a height may be missing: NaN
     if wrong:
-        raise InputError(f"{path}, line {number}: {wrong[0]!r} is no number; x y z px py image was needed")
+        raise InputError(
+            f"{path}, line {number}: {wrong[0]!r} is no number; x y z px py image was needed"
+        )
     x, y, z, x_px, y_px = numbers
     image = fields[5].replace("\\", "/").rpartition("/")[2]
     return _Line(number, x, y, z, x_px, y_px, image, fields[6] if len(fields) > 6 else "")
@@ -224,7 +281,9 @@ def _labelled(lines: Sequence[_Line]) -> list[_Line]:
     """The lines, those without a label named "point N" by their coordinates."""
     names: dict[tuple[float, float], str] = {}
     return [
-        line if line.label else replace(line, label=names.setdefault((line.x, line.y), f"point {len(names) + 1}"))
+        line
+        if line.label
+        else replace(line, label=names.setdefault((line.x, line.y), f"point {len(names) + 1}"))
         for line in lines
     ]
 
@@ -240,7 +299,9 @@ def _check_labels(path: Path, lines: Sequence[_Line]) -> None:
                 "each point one place"
             )
         if (line.label, line.image) in marked:
-            raise InputError(f"{path}, line {line.number}: {line.label} is marked twice in {line.image}; keep one mark")
+            raise InputError(
+                f"{path}, line {line.number}: {line.label} is marked twice in {line.image}; keep one mark"
+            )
         marked.add((line.label, line.image))
 
 
@@ -250,7 +311,9 @@ def _parsed_crs(words: str, path: Path) -> CRS:
     if words.startswith("+"):
         keys = {part.lstrip("+").partition("=")[0] for part in words.split()}
         if strange := keys - _PROJ_KEYS:
-            raise InputError(f"{path}: +{sorted(strange)[0]} in its first line is not read; give the CRS as EPSG:code")
+            raise InputError(
+                f"{path}: +{sorted(strange)[0]} in its first line is not read; give the CRS as EPSG:code"
+            )
     elif not re.fullmatch(r"EPSG:[1-9][0-9]{0,8}", words, re.IGNORECASE):
         raise InputError(
             f"{path}: {words[:60]!r} in its first line is no CRS; give EPSG:32632, WGS84 UTM 32N, WGS84, or a proj "
@@ -259,9 +322,13 @@ def _parsed_crs(words: str, path: Path) -> CRS:
     try:
         crs = CRS.from_user_input(words)
     except CRSError as error:
-        raise InputError(f"{path}: unknown CRS {words[:60]!r} in its first line; give one as EPSG:32632") from error
+        raise InputError(
+            f"{path}: unknown CRS {words[:60]!r} in its first line; give one as EPSG:32632"
+        ) from error
     if not (crs.is_projected or crs.is_geographic):
-        raise InputError(f"{path}: {words} ({crs.name}) is no CRS of a map; give a projected one as EPSG:32632")
+        raise InputError(
+            f"{path}: {words} ({crs.name}) is no CRS of a map; give a projected one as EPSG:32632"
+        )
     return crs
 
 
@@ -280,7 +347,11 @@ def _utm_zone(crs: CRS) -> tuple[int, str] | None:
 
 def _height_unit_m(crs: CRS) -> float:
     """Metres in a unit of the points' heights: that of their other coordinates, where those are lengths."""
-    return float(crs.axis_info[0].unit_conversion_factor) if crs.is_projected and crs.axis_info else 1.0
+    return (
+        float(crs.axis_info[0].unit_conversion_factor)
+        if crs.is_projected and crs.axis_info
+        else 1.0
+    )
 
 
 def _no_place(crs: CRS) -> str:

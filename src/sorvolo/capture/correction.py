@@ -50,7 +50,8 @@ def path_fit(priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_sigma_s
     fixes, seen, speeds = (
         np.array([each[k][:2] for k in placed]) @ np.array([1, 1j])
         for each in (
-            [prior.position_m for prior in priors], [pose.translation_m for pose in poses],
+            [prior.position_m for prior in priors],
+            [pose.translation_m for pose in poses],
             [prior.velocity_m_s for prior in priors],
         )
     )
@@ -79,13 +80,21 @@ def fitted(poses: Sequence[Pose], path: PathFit) -> list[Pose]:
     middle_m = np.append(np.mean([each.translation_m[:2] for each in poses], axis=0), 0.0)
     turn = Rotation.from_euler("z", path.sure_turn_deg, degrees=True).as_matrix()
     return [
-        Pose(turn @ each.rotation, middle_m + path.sure_scale * turn @ (each.translation_m - middle_m))
+        Pose(
+            turn @ each.rotation,
+            middle_m + path.sure_scale * turn @ (each.translation_m - middle_m),
+        )
         for each in poses
     ]
 
 
 def telemetry_faults(
-    priors: Sequence[CameraPrior], poses: Sequence[Pose], clock_s: Bias, path: PathFit, *, knows_height: bool,
+    priors: Sequence[CameraPrior],
+    poses: Sequence[Pose],
+    clock_s: Bias,
+    path: PathFit,
+    *,
+    knows_height: bool,
     settings: CompassSettings = CompassSettings(),
 ) -> TelemetryFaults:
     """How far telemetry's cameras, at the corrected clock, were off from the solved ones of the same frames.
@@ -100,7 +109,9 @@ def telemetry_faults(
         [_heading_and_tilt(prior.rotation, pose) for prior, pose in zip(priors, poses)]
     ).reshape(-1, 3)[knows_heading]
     placed = np.array([each.knows_place for each in priors], bool)
-    moved = np.array([prior.position_m - pose.translation_m for prior, pose in zip(priors, poses)]).reshape(-1, 3)
+    moved = np.array(
+        [prior.position_m - pose.translation_m for prior, pose in zip(priors, poses)]
+    ).reshape(-1, 3)
     scatter_m = _together([_bias(moved[placed, k]) for k in range(2)]).scatter / float(np.sqrt(2))
     beside_deg = _beside_usual(off_deg, settings.outlying_deg)
     near = beside_deg <= settings.outlying_deg
@@ -112,18 +123,26 @@ def telemetry_faults(
     outlying = turned & ~is_misplaced
     tilt_deg = _together([_bias(off_deg[near, k]) for k in (1, 2)])
     return TelemetryFaults(
-        clock_s, _heading(off_deg[:, 0], near, path, settings),
+        clock_s,
+        _heading(off_deg[:, 0], near, path, settings),
         tilt_deg if _agree(near, settings) else replace(tilt_deg, sigma=inf),
         _height(moved[placed, 2], poses, path.scale) if knows_height else _UNKNOWN,
-        Bias(0.0, float("nan"), scatter_m), path, tuple(np.flatnonzero(outlying).tolist()),
+        Bias(0.0, float("nan"), scatter_m),
+        path,
+        tuple(np.flatnonzero(outlying).tolist()),
         float(np.median(beside_deg[outlying[knows_heading]])) if outlying.any() else 0.0,
-        tuple(misplaced.tolist()), tuple(apart_m[misplaced].tolist()),
-        tuple(apart.tolist()), tuple(apart_m[apart].tolist()),
+        tuple(misplaced.tolist()),
+        tuple(apart_m[misplaced].tolist()),
+        tuple(apart.tolist()),
+        tuple(apart_m[apart].tolist()),
     )
 
 
 def corrected_poses(
-    times_s: Sequence[float], priors: Sequence[CameraPrior], key_s: Sequence[float], key_priors: Sequence[CameraPrior],
+    times_s: Sequence[float],
+    priors: Sequence[CameraPrior],
+    key_s: Sequence[float],
+    key_priors: Sequence[CameraPrior],
     key_poses: Sequence[Pose],
 ) -> list[Pose]:
     """The cameras at any moments between the solved frames, by telemetry and what it was off at these frames.
@@ -133,26 +152,35 @@ def corrected_poses(
     frame before or after it, the solved cameras themselves are interpolated: what stands there is a guess.
     """
     knows_heading, knows_place = (
-        _known_around(times_s, [knows(each) for each in priors], key_s, [knows(each) for each in key_priors])
+        _known_around(
+            times_s, [knows(each) for each in priors], key_s, [knows(each) for each in key_priors]
+        )
         for knows in (_knows_heading, lambda each: each.knows_place)
     )
     solved = np.array([each.rotation for each in key_poses])
     turns = _turning(key_s, solved @ np.array([each.rotation.T for each in key_priors]), times_s)
     rotations = np.where(
-        knows_heading[:, None, None], turns @ np.array([each.rotation for each in priors]),
+        knows_heading[:, None, None],
+        turns @ np.array([each.rotation for each in priors]),
         _turning(key_s, solved, times_s),
     )
     solved_m = np.array([each.translation_m for each in key_poses])
-    shifts_m = _moving(key_s, solved_m - np.array([each.position_m for each in key_priors]), times_s)
+    shifts_m = _moving(
+        key_s, solved_m - np.array([each.position_m for each in key_priors]), times_s
+    )
     places_m = np.where(
-        knows_place[:, None], np.array([each.position_m for each in priors]) + shifts_m,
+        knows_place[:, None],
+        np.array([each.position_m for each in priors]) + shifts_m,
         _moving(key_s, solved_m, times_s),
     )
     return [Pose(_orthonormal(rotation), place_m) for rotation, place_m in zip(rotations, places_m)]
 
 
 def headings_deg(
-    stated_deg: Floats, compass: Bias, times_s: Sequence[float], poses: Sequence[Pose],
+    stated_deg: Floats,
+    compass: Bias,
+    times_s: Sequence[float],
+    poses: Sequence[Pose],
     settings: CourseSettings = CourseSettings(),
 ) -> list[float]:
     """The aircraft's heading at these moments, clockwise from north: as stated, (N,), less what the compass was surely
@@ -184,7 +212,10 @@ def _knows_heading(prior: CameraPrior) -> bool:
 
 
 def _known_around(
-    times_s: Sequence[float], known: Sequence[bool], key_s: Sequence[float], key_known: Sequence[bool]
+    times_s: Sequence[float],
+    known: Sequence[bool],
+    key_s: Sequence[float],
+    key_known: Sequence[bool],
 ) -> Mask:
     """(N,) whether something is known at each moment, and at the solved frames before and after it."""
     after = np.clip(np.searchsorted(key_s, times_s), 0, len(key_s) - 1)
@@ -198,7 +229,9 @@ def _turning(key_s: Sequence[float], rotations: Floats, times_s: Sequence[float]
     if len(key_s) == 1:
         return np.repeat(rotations, len(times_s), axis=0)
     within_s = np.clip(times_s, key_s[0], key_s[-1])
-    return np.asarray(Slerp(key_s, Rotation.from_matrix(rotations))(within_s).as_matrix(), np.float64)
+    return np.asarray(
+        Slerp(key_s, Rotation.from_matrix(rotations))(within_s).as_matrix(), np.float64
+    )
 
 
 def _moving(key_s: Sequence[float], places_m: PointsM, times_s: Sequence[float]) -> PointsM:
@@ -211,7 +244,9 @@ def _courses(
 ) -> tuple[NDArray[np.complex128], Mask]:
     """The velocity over ground, north and east as a complex number, m/s, at those moments of a path, (N, 2), where the
     aircraft moves; and which these are, (N,)."""
-    before, after = (np.searchsorted(times_s, times_s + side * settings.around_s) for side in (-1, 1))
+    before, after = (
+        np.searchsorted(times_s, times_s + side * settings.around_s) for side in (-1, 1)
+    )
     after = np.minimum(after, len(times_s) - 1)
     passed_s = np.maximum(times_s[after] - times_s[before], 1e-6)
     velocity = (path_m[after] - path_m[before]) @ np.array([1j, 1]) / passed_s
@@ -270,7 +305,9 @@ def _beside_usual(off_deg: Floats, outlying_deg: float) -> Floats:
         return np.zeros(0)
     heading_deg = _wrapped(off_deg[:, 0] - _usual_angle(off_deg[:, 0], outlying_deg))
     alike = np.abs(heading_deg) <= outlying_deg
-    return np.hypot(heading_deg, np.linalg.norm(off_deg[:, 1:] - np.median(off_deg[alike, 1:], axis=0), axis=1))
+    return np.hypot(
+        heading_deg, np.linalg.norm(off_deg[:, 1:] - np.median(off_deg[alike, 1:], axis=0), axis=1)
+    )
 
 
 def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
@@ -281,7 +318,9 @@ def _usual_angle(angles_deg: Floats, outlying_deg: float) -> float:
     ordered_deg = np.sort(angles_deg % 360.0)
     around_deg = np.concatenate([ordered_deg - 360.0, ordered_deg, ordered_deg + 360.0])
     first, last = (
-        np.searchsorted(around_deg, ordered_deg + side * outlying_deg, "left" if side < 0 else "right")
+        np.searchsorted(
+            around_deg, ordered_deg + side * outlying_deg, "left" if side < 0 else "right"
+        )
         for side in (-1, 1)
     )
     large_deg = _wrapped(ordered_deg[2 * (last - first) >= np.max(last - first)])
@@ -313,7 +352,9 @@ def _apart_m(priors: Sequence[CameraPrior], moved_m: PointsM) -> Floats:
         known = np.isfinite(stated_m[:, axis])
         usual = _bias(moved_m[known, axis])
         beside_m[known, axis] = np.abs(moved_m[known, axis] - usual.value)
-        far[known] |= beside_m[known, axis] > _FAR_SIGMAS * np.maximum(stated_m[known, axis], usual.scatter)
+        far[known] |= beside_m[known, axis] > _FAR_SIGMAS * np.maximum(
+            stated_m[known, axis], usual.scatter
+        )
     return np.where(far, np.linalg.norm(beside_m, axis=1), 0.0)
 
 

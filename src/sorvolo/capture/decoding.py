@@ -14,7 +14,9 @@ from PIL import Image, UnidentifiedImageError
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
 
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".png", ".heic", ".heif", ".hif", ".dng"})
+PHOTO_SUFFIXES = frozenset(
+    {".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".png", ".heic", ".heif", ".hif", ".dng"}
+)
 
 LARGEST_PHOTO_PX = 160_000_000
 """A larger picture is refused by its header: kilobytes can claim gigabytes. Survey cameras make 151 megapixels."""
@@ -27,15 +29,31 @@ A mission holds three frames at once, 0.2 GB each at this size; drones' own came
 Image.MAX_IMAGE_PIXELS = LARGEST_PHOTO_PX
 
 BROKEN_PICTURE = (
-    OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError,
-    ZeroDivisionError, EOFError, RuntimeError, MemoryError, struct.error, Image.DecompressionBombError,
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    AttributeError,
+    OverflowError,
+    ZeroDivisionError,
+    EOFError,
+    RuntimeError,
+    MemoryError,
+    struct.error,
+    Image.DecompressionBombError,
 )
 """What Pillow raises, by accident or on purpose, on damaged files."""
 
 _JPEG_START = b"\xff\xd8\xff"
 _HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1", b"avif")
 # the reduced kinds exist with blue first only
-_JPEG_FLAGS = {1: cv2.IMREAD_COLOR_RGB, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4}
+_JPEG_FLAGS = {
+    1: cv2.IMREAD_COLOR_RGB,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+}
 
 
 def is_heif(head: bytes) -> bool:
@@ -60,7 +78,11 @@ def check_size(name: str, width_px: int, height_px: int, *, is_jpeg: bool) -> No
 
 def reduction_of(width_px: int, height_px: int) -> int:
     """By which divisor, 1, 2 or 4, a photo of this size is used."""
-    return next(step for step in (1, 2, 4) if width_px * height_px <= LARGEST_FRAME_PX * step**2 or step == 4)
+    return next(
+        step
+        for step in (1, 2, 4)
+        if width_px * height_px <= LARGEST_FRAME_PX * step**2 or step == 4
+    )
 
 
 def reduced_size_px(width_px: int, height_px: int) -> tuple[int, int]:
@@ -85,11 +107,15 @@ def decode_photo(data: bytes, name: str, reduction: int = 1) -> ImageRGB:
         with open_picture(BytesIO(data), name) as picture:
             check_size(name, *picture.size, is_jpeg=is_jpeg)
             if picture.mode in ("I", "F", "I;16", "I;16B", "I;16L"):
-                gray = np.clip(np.asarray(picture).astype(np.float32) / 257, 0, 255).astype(np.uint8)
+                gray = np.clip(np.asarray(picture).astype(np.float32) / 257, 0, 255).astype(
+                    np.uint8
+                )
                 return np.repeat(gray[:, :, None], 3, axis=2)
             return np.array(picture.convert("RGB"))
     except BROKEN_PICTURE as error:
-        raise InputError(f"{name} is damaged or cut ({reason_in_words(error)}); copy it again") from error
+        raise InputError(
+            f"{name} is damaged or cut ({reason_in_words(error)}); copy it again"
+        ) from error
 
 
 def open_picture(file: Path | BytesIO, name: str) -> Image.Image:
@@ -135,7 +161,9 @@ def reason_in_words(error: BaseException) -> str:
 def _decode_jpeg(data: bytes, reduction: int) -> ImageRGB | None:
     """By OpenCV, which needs half of Pillow's time and, since version 5, refuses cut files too; None for those."""
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), _JPEG_FLAGS[reduction] | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = cv2.imdecode(
+            np.frombuffer(data, np.uint8), _JPEG_FLAGS[reduction] | cv2.IMREAD_IGNORE_ORIENTATION
+        )
         if image is not None and reduction > 1:
             image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
     except cv2.error:
@@ -147,11 +175,17 @@ def _decode_dng(data: bytes, name: str) -> ImageRGB:
     raw = _open_dng(data, name)
     try:
         check_size(name, int(raw.sizes.width), int(raw.sizes.height), is_jpeg=False)
-        return np.asarray(raw.postprocess(use_camera_wb=True, user_flip=0, output_bps=8), dtype=np.uint8)
+        return np.asarray(
+            raw.postprocess(use_camera_wb=True, user_flip=0, output_bps=8), dtype=np.uint8
+        )
     except BROKEN_PICTURE as error:
-        raise InputError(f"{name} is damaged or cut ({reason_in_words(error)}); copy it again") from error
+        raise InputError(
+            f"{name} is damaged or cut ({reason_in_words(error)}); copy it again"
+        ) from error
     except Exception as error:  # LibRawError, whose class is known only where rawpy is installed
-        raise InputError(f"{name} is damaged or cut (its raw data cannot be developed); copy it again") from error
+        raise InputError(
+            f"{name} is damaged or cut (its raw data cannot be developed); copy it again"
+        ) from error
     finally:
         raw.close()
 
@@ -166,8 +200,12 @@ def _open_dng(data: bytes, name: str) -> Any:
         ) from error
     try:
         return rawpy.imread(BytesIO(data))
-    except Exception as error:  # LibRawError has many children, and OSError for what is no raw picture
-        raise InputError(f"{name} is damaged or no raw picture that is known; copy it again") from error
+    except (
+        Exception
+    ) as error:  # LibRawError has many children, and OSError for what is no raw picture
+        raise InputError(
+            f"{name} is damaged or no raw picture that is known; copy it again"
+        ) from error
 
 
 def _heif_module(name: str) -> ModuleType:

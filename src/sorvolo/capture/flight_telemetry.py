@@ -19,10 +19,15 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
-_SLOWEST_M_S = 0.3  # of a flight: the speed of one that hovers would ask for no second frame; by choice
+_SLOWEST_M_S = (
+    0.3  # of a flight: the speed of one that hovers would ask for no second frame; by choice
+)
 _LOWEST_M = 2.0  # above ground: a height of zero, as before take-off, would divide by nothing
 _PLACES_ASKED = 200  # of a flight
-_SEARCHED_SIGMAS, _SEARCHED_AGAIN_S = 4, 1.0  # how far a clock offset is searched, first and after one was found
+_SEARCHED_SIGMAS, _SEARCHED_AGAIN_S = (
+    4,
+    1.0,
+)  # how far a clock offset is searched, first and after one was found
 _LARGELY = 0.5  # share of samples that have a height: then it is the one that the flight counts in
 
 
@@ -44,18 +49,30 @@ class FlightTelemetry:
     lay two hours anew for each frame takes 20 ms, and ever more memory. What concerns the whole flight asks for all.
     """
 
-    def __init__(self, source: Source, samples: Telemetry, frame: LocalFrame, wishes: TelemetryWishes) -> None:
+    def __init__(
+        self, source: Source, samples: Telemetry, frame: LocalFrame, wishes: TelemetryWishes
+    ) -> None:
         self._source, self._frame = source, frame
         self.samples, self.offset_s = samples, wishes.offset_s or 0.0
         self.version = source.telemetry_version if isinstance(source, LiveSource) else 0
         self._ground_m = wishes.ground_elevation_m
         if self._ground_m is None and np.isfinite(source.ground_elevation_m):
             self._ground_m = source.ground_elevation_m
-        self.clock = _live_clock(source, samples) if isinstance(source, LiveSource) else tie_clocks(
-            samples, kind=source.kind, start_ns=source.start_ns, duration_s=duration_s(source),
-            offset_given=wishes.offset_s is not None, strict=wishes.is_named,
+        self.clock = (
+            _live_clock(source, samples)
+            if isinstance(source, LiveSource)
+            else tie_clocks(
+                samples,
+                kind=source.kind,
+                start_ns=source.start_ns,
+                duration_s=duration_s(source),
+                offset_given=wishes.offset_s is not None,
+                strict=wishes.is_named,
+            )
         )
-        self.track, notices = track_from_telemetry(samples, self.clock, frame, ground_elevation_m=self._ground_m)
+        self.track, notices = track_from_telemetry(
+            samples, self.clock, frame, ground_elevation_m=self._ground_m
+        )
         if wishes.offset_s is not None:
             self.track = shifted(self.track, wishes.offset_s)
         self.notices: tuple[Notice, ...] = (*self.clock.notices, *notices)
@@ -73,16 +90,24 @@ class FlightTelemetry:
             return
         self.version, self.samples = source.telemetry_version, source.latest_telemetry
         if np.isfinite(self.samples["latitude_deg"]).mean() < _LARGELY:
-            self.samples = source.telemetry  # fixes failed for minutes: heights are tied to what was before
+            self.samples = (
+                source.telemetry
+            )  # fixes failed for minutes: heights are tied to what was before
         self.clock = _live_clock(source, self.samples)
-        found, _ = track_from_telemetry(self.samples, self.clock, self._frame, ground_elevation_m=self._ground_m)
+        found, _ = track_from_telemetry(
+            self.samples, self.clock, self._frame, ground_elevation_m=self._ground_m
+        )
         self.track = _continued(self.track, shifted(found, self.offset_s))
 
     def covers(self, seconds: float) -> bool:
         """Whether any fix lies within a video of this many seconds, or nearly."""
         track, known = self.track, self._known
         margin_s = 1.5 * track.interval_s + 0.5
-        return bool(((track.sample_s[known] >= -margin_s) & (track.sample_s[known] <= seconds + margin_s)).any())
+        return bool(
+            (
+                (track.sample_s[known] >= -margin_s) & (track.sample_s[known] <= seconds + margin_s)
+            ).any()
+        )
 
     @property
     def height_m(self) -> float:
@@ -104,13 +129,18 @@ class FlightTelemetry:
         """The speed that three quarters of the flight stay below, over steps of a second or more."""
         return _speed_m_s(self.track.sample_s[self._known], self.track.east_north_m[self._known])
 
-    def offset_seen(self, seconds: Sequence[float], seen_m: PointsM, applied_s: float) -> OffsetEstimate:
+    def offset_seen(
+        self, seconds: Sequence[float], seen_m: PointsM, applied_s: float
+    ) -> OffsetEstimate:
         """The clock offset, beyond `applied_s`, that makes the fixes fit the path seen in the pictures: places (N, 2+)
         at N seconds of the video, NaN where a picture has none. See `estimate_offset`."""
         tied = np.isfinite(seen_m[:, 0])
         reach_s = _SEARCHED_AGAIN_S if applied_s else _SEARCHED_SIGMAS * self.clock.sigma_s
         return estimate_offset(
-            shifted(self._whole(), applied_s), np.array(seconds)[tied], seen_m[tied, :2], reach_s=reach_s
+            shifted(self._whole(), applied_s),
+            np.array(seconds)[tied],
+            seen_m[tied, :2],
+            reach_s=reach_s,
         )
 
     def prior(self, seconds: float, smooth_s: float) -> CameraPrior:
@@ -118,7 +148,9 @@ class FlightTelemetry:
         track = self.track if seconds >= self.track.sample_s[0] else self._whole()
         return track.prior(seconds, smooth_s=smooth_s)
 
-    def priors(self, seconds: Sequence[float], offset_s: float, smooth_s: float) -> list[CameraPrior]:
+    def priors(
+        self, seconds: Sequence[float], offset_s: float, smooth_s: float
+    ) -> list[CameraPrior]:
         """What telemetry gives of the camera at these seconds of the video, under another clock offset."""
         moved = shifted(self._whole(), offset_s)
         return [moved.prior(each, smooth_s=smooth_s) for each in seconds]
@@ -137,7 +169,10 @@ class FlightTelemetry:
     def ground_height(self, ground_up_m: float) -> tuple[float, str]:
         """The height of ground that lies at `ground_up_m` by the track's heights, in telemetry's reference; which that
         is. 0 "above ground" where telemetry has heights above take-off alone."""
-        for column, stated in (("ellipsoidal_height_m", "ellipsoidal"), ("orthometric_height_m", "orthometric")):
+        for column, stated in (
+            ("ellipsoidal_height_m", "ellipsoidal"),
+            ("orthometric_height_m", "orthometric"),
+        ):
             heights = self.samples[column]
             if np.isfinite(heights).mean() > _LARGELY:
                 return float(np.nanmedian(heights - self.track.up_m)) + ground_up_m, stated
@@ -151,7 +186,9 @@ class FlightTelemetry:
     def _whole(self) -> Track:
         """The track of all samples so far, its heights counted from the same zero."""
         source = self._source
-        if not isinstance(source, LiveSource) or len(samples := source.telemetry) == len(self.samples):
+        if not isinstance(source, LiveSource) or len(samples := source.telemetry) == len(
+            self.samples
+        ):
             return self.track
         found, _ = track_from_telemetry(
             samples, _live_clock(source, samples), self._frame, ground_elevation_m=self._ground_m
@@ -199,7 +236,10 @@ def _speed_m_s(path_s: Floats, path_m: PointsM) -> float:
 def _live_clock(source: LiveSource, telemetry: Telemetry) -> Clock:
     """A live source ties its telemetry to its frames itself."""
     return Clock(
-        (telemetry.time_ns - source.start_ns) / 1e9, source.telemetry_tie, source.telemetry_sigma_s, source.start_ns
+        (telemetry.time_ns - source.start_ns) / 1e9,
+        source.telemetry_tie,
+        source.telemetry_sigma_s,
+        source.start_ns,
     )
 
 
@@ -207,6 +247,9 @@ def _continued(before: Track, now: Track) -> Track:
     """The track as it is known now, its heights counted from the same zero as before."""
     same_m = np.interp(before.sample_s, now.sample_s, now.up_m)
     return replace(
-        now, up_m=now.up_m + np.median(before.up_m - same_m), height_words=before.height_words,
-        vertical_sigma_m=before.vertical_sigma_m, altitude_offset_sigma_m=before.altitude_offset_sigma_m,
+        now,
+        up_m=now.up_m + np.median(before.up_m - same_m),
+        height_words=before.height_words,
+        vertical_sigma_m=before.vertical_sigma_m,
+        altitude_offset_sigma_m=before.altitude_offset_sigma_m,
     )

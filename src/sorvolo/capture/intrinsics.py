@@ -16,24 +16,64 @@ OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3")
 THESIS_ORDER = ("k1", "k2", "k3", "p1", "p2")
 """How section 2.3 of the thesis lists them, and the UMCD dataset's file with it."""
 
-_MATRIX_KEYS = ("cameramatrix", "intrinsicmatrix", "intrinsics", "intrinsic", "mtx", "k", "m1", "cm")
+_MATRIX_KEYS = (
+    "cameramatrix",
+    "intrinsicmatrix",
+    "intrinsics",
+    "intrinsic",
+    "mtx",
+    "k",
+    "m1",
+    "cm",
+)
 _DISTORTION_KEYS = (
-    "distortioncoefficients", "distortioncoeffs", "distcoeffs", "distcoeff", "distcoefs", "distortion",
-    "dist", "d", "d1",
+    "distortioncoefficients",
+    "distortioncoeffs",
+    "distcoeffs",
+    "distcoeff",
+    "distcoefs",
+    "distortion",
+    "dist",
+    "d",
+    "d1",
 )
 _WIDTH_KEYS = ("imagewidth", "imgwidth", "framewidth", "widthpx", "width")
 _HEIGHT_KEYS = ("imageheight", "imgheight", "frameheight", "heightpx", "height")
 _SIZE_KEYS = ("imagesize", "imgsize", "framesize", "size", "resolution")
 # of cameras and videos on the market; a guessed size is rounded to one
 _COMMON_WIDTHS_PX = (
-    640, 720, 800, 848, 960, 1024, 1280, 1440, 1600, 1920, 2000, 2048, 2704, 2720, 3840, 4000, 4032, 4056,
-    4096, 5280, 5472, 6016, 8000, 8192,
+    640,
+    720,
+    800,
+    848,
+    960,
+    1024,
+    1280,
+    1440,
+    1600,
+    1920,
+    2000,
+    2048,
+    2704,
+    2720,
+    3840,
+    4000,
+    4032,
+    4056,
+    4096,
+    5280,
+    5472,
+    6016,
+    8000,
+    8192,
 )
 
 _LARGEST_TANGENTIAL = 0.02
 """Lenses are centred well enough that |p1| and |p2| stay below this; a third coefficient above it is a k3."""
 
-_CALIBRATED_SIGMA = 0.003  # relative, of a calibrated focal length, where the file states none; by choice
+_CALIBRATED_SIGMA = (
+    0.003  # relative, of a calibrated focal length, where the file states none; by choice
+)
 _RESIZED_SIGMA = 0.01
 """A video mode may use a part of the sensor of the same shape, which no file states."""
 
@@ -116,7 +156,9 @@ def _checked_matrix(file_name: str, matrix: Matrix3) -> Matrix3:
             "transposed?"
         )
     if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]):
-        raise InputError(f"{file_name}: the camera matrix has a skew of {matrix[0, 1]:g} px; 0 is needed")
+        raise InputError(
+            f"{file_name}: the camera matrix has a skew of {matrix[0, 1]:g} px; 0 is needed"
+        )
     return matrix
 
 
@@ -144,11 +186,13 @@ def _distortion(file_name: str, nodes: Mapping[str, Node]) -> tuple[Floats, str]
     return reordered, f"distortion read as {' '.join(order)} ({why})"
 
 
-def _order(file_name: str, nodes: Mapping[str, Node], numbers: Floats) -> tuple[tuple[str, ...], str]:
+def _order(
+    file_name: str, nodes: Mapping[str, Node], numbers: Floats
+) -> tuple[tuple[str, ...], str]:
     stated = nodes.get("distortionorder")
     if isinstance(stated, str) and stated.strip():
         order = tuple(stated.replace(",", " ").lower().split())
-        if sorted(order) != sorted(OPENCV_ORDER[:len(numbers)]):
+        if sorted(order) != sorted(OPENCV_ORDER[: len(numbers)]):
             raise InputError(
                 f"{file_name}: distortion_order {stated!r} does not name its {len(numbers)} coefficients"
             )
@@ -157,12 +201,18 @@ def _order(file_name: str, nodes: Mapping[str, Node], numbers: Floats) -> tuple[
         return OPENCV_ORDER[:4], "OpenCV's order"
     third, _, fifth = np.abs(numbers[2:])
     if third > _LARGEST_TANGENTIAL >= fifth:
-        return THESIS_ORDER, f"the UMCD dataset's order: a third coefficient of {numbers[2]:g} can only be k3"
+        return (
+            THESIS_ORDER,
+            f"the UMCD dataset's order: a third coefficient of {numbers[2]:g} can only be k3",
+        )
     if third > _LARGEST_TANGENTIAL:
         return OPENCV_ORDER, "OpenCV's order, though neither order looks plausible: check the file"
     if fifth > _LARGEST_TANGENTIAL:
         return OPENCV_ORDER, "OpenCV's order, the only plausible one"
-    return OPENCV_ORDER, "OpenCV's order assumed; name it in a node distortion_order if it is k1 k2 k3 p1 p2"
+    return (
+        OPENCV_ORDER,
+        "OpenCV's order assumed; name it in a node distortion_order if it is k1 k2 k3 p1 p2",
+    )
 
 
 def _finite(file_name: str, numbers: Floats) -> Floats:
@@ -176,12 +226,19 @@ def _size(nodes: Mapping[str, Node]) -> tuple[int, int] | None:
     both = _first(nodes, _SIZE_KEYS)
     if isinstance(both, np.ndarray) and both.size == 2:
         width, height = (float(each) for each in both.ravel())
-    if isinstance(width, float) and isinstance(height, float) and 1 <= width < 1e5 and 1 <= height < 1e5:
+    if (
+        isinstance(width, float)
+        and isinstance(height, float)
+        and 1 <= width < 1e5
+        and 1 <= height < 1e5
+    ):
         return int(width), int(height)
     return None
 
 
-def _size_from_centre(file_name: str, matrix: Matrix3, width_px: int, height_px: int) -> tuple[int, int]:
+def _size_from_centre(
+    file_name: str, matrix: Matrix3, width_px: int, height_px: int
+) -> tuple[int, int]:
     """The size of a file that states none: the optical centre lies near the middle of the picture."""
     guess = 2 * matrix[0, 2] + 1, 2 * matrix[1, 2] + 1
     if abs(guess[0] / width_px - 1) <= 0.2 and abs(guess[1] / height_px - 1) <= 0.2:
@@ -212,7 +269,9 @@ def check_lens(file_name: str, camera: Camera) -> None:
         way_px = camera.pixels_from_points(rays).reshape(*ideal.shape) - centre_px
         reach_px = np.linalg.norm(way_px, axis=2)
         wanted_px = np.linalg.norm(borders_px - centre_px, axis=1)
-        is_good = (np.diff(reach_px, axis=1) > 0).all() and (np.abs(reach_px[:, -1] - wanted_px) < 0.5).all()
+        is_good = (np.diff(reach_px, axis=1) > 0).all() and (
+            np.abs(reach_px[:, -1] - wanted_px) < 0.5
+        ).all()
     except np.linalg.LinAlgError:
         is_good = False
     if not is_good:
@@ -227,7 +286,9 @@ def check_lens(file_name: str, camera: Camera) -> None:
 
 def _sigma(nodes: Mapping[str, Node]) -> float:
     stated = nodes.get("focalsigma")
-    return float(stated) if isinstance(stated, float) and 1e-4 < stated <= 0.5 else _CALIBRATED_SIGMA
+    return (
+        float(stated) if isinstance(stated, float) and 1e-4 < stated <= 0.5 else _CALIBRATED_SIGMA
+    )
 
 
 def _first(nodes: Mapping[str, Node], keys: tuple[str, ...]) -> Node | None:

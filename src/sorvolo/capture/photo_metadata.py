@@ -93,15 +93,25 @@ def read_photo_metadata(path: Path) -> PhotoMetadata:
         except (ElementTree.ParseError, ValueError, RecursionError):
             unreadable = (*unreadable, "XMP")
     main, detail, gps = header.tags
-    full_width_px = _whole(detail.get(ExifTags.Base.ExifImageWidth)) or max(header.width_px, header.height_px)
+    full_width_px = _whole(detail.get(ExifTags.Base.ExifImageWidth)) or max(
+        header.width_px, header.height_px
+    )
     full_height_px = round(full_width_px * header.height_px / header.width_px)
     return PhotoMetadata(
-        header.width_px, header.height_px, _orientation(main), _text(main.get(ExifTags.Base.Make)),
-        _text(main.get(ExifTags.Base.Model)), _positive(detail.get(ExifTags.Base.FocalLength)),
-        _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm)), _focal_plane_px_per_mm(detail),
-        full_width_px, _utc_ns(main, detail, gps, properties), _camera_clock_ns(main, detail),
+        header.width_px,
+        header.height_px,
+        _orientation(main),
+        _text(main.get(ExifTags.Base.Make)),
+        _text(main.get(ExifTags.Base.Model)),
+        _positive(detail.get(ExifTags.Base.FocalLength)),
+        _positive(detail.get(ExifTags.Base.FocalLengthIn35mmFilm)),
+        _focal_plane_px_per_mm(detail),
+        full_width_px,
+        _utc_ns(main, detail, gps, properties),
+        _camera_clock_ns(main, detail),
         _telemetry_columns(gps, properties),
-        unreadable, photo_xmp.stated_lens(properties, full_width_px, full_height_px),
+        unreadable,
+        photo_xmp.stated_lens(properties, full_width_px, full_height_px),
     )
 
 
@@ -118,7 +128,10 @@ class _Header:
 
 def _picture_header(path: Path) -> _Header:
     try:
-        with warnings.catch_warnings(record=True) as caught, open_picture(path, path.name) as picture:
+        with (
+            warnings.catch_warnings(record=True) as caught,
+            open_picture(path, path.name) as picture,
+        ):
             warnings.simplefilter("always")
             (width_px, height_px), mode = picture.size, picture.mode
             # first: for EXIF that stands behind a PNG's pixels, Pillow decodes them
@@ -126,9 +139,13 @@ def _picture_header(path: Path) -> _Header:
             tags, unreadable = _exif_of(picture.getexif)
             xmp = picture.info.get("xmp") or picture.info.get("XML:com.adobe.xmp") or b""
     except BROKEN_PICTURE as error:
-        raise InputError(f"{path.name} is not a readable picture: {reason_in_words(error)}; copy it again") from error
+        raise InputError(
+            f"{path.name} is not a readable picture: {reason_in_words(error)}; copy it again"
+        ) from error
     if mode == "F":
-        raise InputError(f"{path.name} holds floating-point numbers (an elevation map?), not a photo")
+        raise InputError(
+            f"{path.name} holds floating-point numbers (an elevation map?), not a photo"
+        )
     if caught and not unreadable:  # Pillow leaves damaged tags out and warns
         unreadable = ("EXIF",)
     packet = xmp if isinstance(xmp, bytes) else str(xmp).encode()
@@ -140,7 +157,9 @@ def _dng_header(path: Path) -> _Header:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise InputError(f"{path.name} is not a readable picture: {reason_in_words(error)}") from error
+        raise InputError(
+            f"{path.name} is not a readable picture: {reason_in_words(error)}"
+        ) from error
     width_px, height_px = dng_size_px(data, path.name)
     check_size(path.name, width_px, height_px, is_jpeg=False)
 
@@ -219,7 +238,9 @@ def _parse_ns(text: str, pattern: str) -> int:
         moment = datetime.strptime(text, pattern).replace(tzinfo=UTC)
     except ValueError:
         return 0
-    return (moment - _EPOCH) // timedelta(microseconds=1) * 1000 if 1990 <= moment.year <= 2200 else 0
+    return (
+        (moment - _EPOCH) // timedelta(microseconds=1) * 1000 if 1990 <= moment.year <= 2200 else 0
+    )
 
 
 def _camera_clock_ns(main: _Tags, detail: _Tags) -> int:
@@ -251,11 +272,17 @@ def _receiver_utc_ns(gps: _Tags) -> int:
         return 0
     hours, minutes, seconds = (_number(part) for part in clock)
     since_midnight_s = hours * 3600 + minutes * 60 + seconds
-    return day_ns + round(since_midnight_s * 1000) * 1_000_000 if 0 <= since_midnight_s <= 86_401 else 0
+    return (
+        day_ns + round(since_midnight_s * 1000) * 1_000_000
+        if 0 <= since_midnight_s <= 86_401
+        else 0
+    )
 
 
 def _zoned_clock_ns(main: _Tags, detail: _Tags) -> int:
-    offset = _text(detail.get(ExifTags.Base.OffsetTimeOriginal) or detail.get(ExifTags.Base.OffsetTime))
+    offset = _text(
+        detail.get(ExifTags.Base.OffsetTimeOriginal) or detail.get(ExifTags.Base.OffsetTime)
+    )
     zone = re.fullmatch(r"([+-])(\d\d):?(\d\d)", offset.replace("Z", "+00:00"))
     clock_ns = _camera_clock_ns(main, detail)
     if not clock_ns or zone is None:
@@ -275,7 +302,9 @@ def _telemetry_columns(gps: _Tags, properties: Mapping[str, str]) -> dict[str, f
     }
     columns |= _finite(photo_xmp.telemetry_columns(properties))
     if "sensefly:Heading" in properties:
-        columns["course_deg"] = nan  # its GPSTrack repeats the heading, from which wind turns the course
+        columns["course_deg"] = (
+            nan  # its GPSTrack repeats the heading, from which wind turns the course
+        )
     place = _finite(_exif_place(gps))
     place = place if len(place) == 2 else _finite(photo_xmp.place_columns(properties))
     if abs(place.get("latitude_deg", nan)) <= 90 and abs(place.get("longitude_deg", nan)) <= 180:
@@ -288,8 +317,12 @@ def _exif_place(gps: _Tags) -> dict[str, float]:
     if _text(gps.get(ExifTags.GPS.GPSStatus)) == "V":
         return {}
     return {
-        "latitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef)),
-        "longitude_deg": _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef)),
+        "latitude_deg": _degrees(
+            gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef)
+        ),
+        "longitude_deg": _degrees(
+            gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef)
+        ),
     }
 
 
@@ -300,12 +333,18 @@ def _finite(columns: Mapping[str, float]) -> dict[str, float]:
 def _horizontal_sigma_m(gps: _Tags) -> float:
     """The receiver's own estimate, else one from its dilution of precision."""
     stated_m = _positive(gps.get(ExifTags.GPS.GPSHPositioningError))
-    return stated_m if isfinite(stated_m) else sigma_from_hdop_m(_positive(gps.get(ExifTags.GPS.GPSDOP)))
+    return (
+        stated_m
+        if isfinite(stated_m)
+        else sigma_from_hdop_m(_positive(gps.get(ExifTags.GPS.GPSDOP)))
+    )
 
 
 def _degrees(parts: Any, reference: Any) -> float:
     """Signed degrees of degrees, minutes, seconds and N, S, E or W; NaN if any part is missing."""
-    numbers = [_number(part) for part in parts] if isinstance(parts, (tuple, list)) else [_number(parts)]
+    numbers = (
+        [_number(part) for part in parts] if isinstance(parts, (tuple, list)) else [_number(parts)]
+    )
     if not 1 <= len(numbers) <= 3:
         return nan
     angle_deg = sum(number / 60**power for power, number in enumerate(numbers))

@@ -17,27 +17,48 @@ from sorvolo.geometry.pose import gimbal_angles_from_rotation, site_from_body_na
 
 _DECLARATION = re.compile(rb"""xmlns:([\w.-]+)\s*=\s*["']([^"']+)["']""")
 _MAKER_OF_PREFIX = {
-    "drone-dji": "dji", "drone-parrot": "parrot", "drone-skydio": "skydio", "drone": "autel", "sensefly": "sensefly",
+    "drone-dji": "dji",
+    "drone-parrot": "parrot",
+    "drone-skydio": "skydio",
+    "drone": "autel",
+    "sensefly": "sensefly",
     "camera": "camera",
 }
 # programs that rewrite XMP choose prefixes of their own
 _MAKER_OF_ADDRESS = (
-    ("drone-dji", "dji"), ("dji.com", "dji"), ("parrot.com/drone", "parrot"), ("drone-skydio", "skydio"),
-    ("sensefly.com/camera", "camera"), ("sensefly.com", "sensefly"), ("pix4d.com/camera", "camera"),
+    ("drone-dji", "dji"),
+    ("dji.com", "dji"),
+    ("parrot.com/drone", "parrot"),
+    ("drone-skydio", "skydio"),
+    ("sensefly.com/camera", "camera"),
+    ("sensefly.com", "sensefly"),
+    ("pix4d.com/camera", "camera"),
 )
 _RTK_FLAGS = range(17, 51)  # 16 is a single receiver's fix, 17 to 50 are corrected ones
 _GIMBAL = {
-    axis: (f"dji:Gimbal{axis}Degree", f"autel:Gimbal{axis}Degree", f"parrot:Camera{axis}Degree",
-           f"skydio:CameraOrientationNED.{axis}")
+    axis: (
+        f"dji:Gimbal{axis}Degree",
+        f"autel:Gimbal{axis}Degree",
+        f"parrot:Camera{axis}Degree",
+        f"skydio:CameraOrientationNED.{axis}",
+    )
     for axis in ("Yaw", "Pitch", "Roll")
 }
 _BODY = {
-    axis: (f"dji:Flight{axis}Degree", f"autel:Flight{axis}Degree", f"parrot:Drone{axis}Degree",
-           f"skydio:VehicleOrientationNED.{axis}", "sensefly:Heading" if axis == "Yaw" else f"sensefly:{axis}Angle")
+    axis: (
+        f"dji:Flight{axis}Degree",
+        f"autel:Flight{axis}Degree",
+        f"parrot:Drone{axis}Degree",
+        f"skydio:VehicleOrientationNED.{axis}",
+        "sensefly:Heading" if axis == "Yaw" else f"sensefly:{axis}Angle",
+    )
     for axis in ("Yaw", "Pitch", "Roll")
 }
 _ABOVE_TAKEOFF = (
-    "dji:RelativeAltitude", "autel:RelativeAltitude", "skydio:RelativeAltitude", "sensefly:Height",
+    "dji:RelativeAltitude",
+    "autel:RelativeAltitude",
+    "skydio:RelativeAltitude",
+    "sensefly:Height",
     "camera:AboveGroundAltitude",
 )
 _ABOVE_SEA = ("sensefly:AltitudeAMSL", "skydio:AbsoluteAltitude")
@@ -65,7 +86,9 @@ def stated_lens(properties: Mapping[str, str], width_px: int, height_px: int) ->
 
     The size is that of the photo as the camera wrote it, whose pixels the numbers count.
     """
-    numbers = [_finite(text) for text in properties.get("dji:DewarpData", "").rpartition(";")[2].split(",")]
+    numbers = [
+        _finite(text) for text in properties.get("dji:DewarpData", "").rpartition(";")[2].split(",")
+    ]
     if len(numbers) == 9 and all(map(isfinite, numbers)):
         fx_px, fy_px, cx_px, cy_px, k1, k2, p1, p2, k3 = numbers
         is_undistorted = number(properties, "dji:DewarpFlag") == 1
@@ -74,12 +97,20 @@ def stated_lens(properties: Mapping[str, str], width_px: int, height_px: int) ->
     fx_px = _first(properties, "dji:CalibratedFocalLength", "skydio:CalibratedFocalLength.X")
     fy_px = _first(properties, "skydio:CalibratedFocalLength.Y")
     centre_px = [
-        _first(properties, f"dji:CalibratedOpticalCenter{axis}", f"skydio:CalibratedOpticalCenter.{axis}") - 0.5 * size
+        _first(
+            properties,
+            f"dji:CalibratedOpticalCenter{axis}",
+            f"skydio:CalibratedOpticalCenter.{axis}",
+        )
+        - 0.5 * size
         for axis, size in (("X", width_px), ("Y", height_px))
     ]
     is_near = all(isfinite(each) and abs(each) < 0.1 * width_px for each in centre_px)
     return StatedLens(
-        width_px, fx_px, fy_px if isfinite(fy_px) else fx_px, *(centre_px if is_near else (0.0, 0.0)),
+        width_px,
+        fx_px,
+        fy_px if isfinite(fy_px) else fx_px,
+        *(centre_px if is_near else (0.0, 0.0)),
     )
 
 
@@ -99,7 +130,10 @@ def telemetry_columns(properties: Mapping[str, str]) -> dict[str, float]:
     """The telemetry columns (survey.flight.TELEMETRY_COLUMNS) that the properties state, NaN for the others."""
     columns = {
         "height_above_takeoff_m": _first(properties, *_ABOVE_TAKEOFF),
-        **{f"camera_{axis.lower()}_deg": _first(properties, *names) for axis, names in _GIMBAL.items()},
+        **{
+            f"camera_{axis.lower()}_deg": _first(properties, *names)
+            for axis, names in _GIMBAL.items()
+        },
         **{f"body_{axis.lower()}_deg": _first(properties, *names) for axis, names in _BODY.items()},
         **_velocity_columns(properties),
         **_sigma_columns(properties),
@@ -112,21 +146,39 @@ def telemetry_columns(properties: Mapping[str, str]) -> dict[str, float]:
 def place_columns(properties: Mapping[str, str]) -> dict[str, float]:
     """Latitude and longitude as XMP states them, for photos whose EXIF has none."""
     return {
-        "latitude_deg": _first(properties, "dji:GpsLatitude", "sensefly:Latitude", "skydio:Latitude",
-                               "autel:GpsLatitude"),
+        "latitude_deg": _first(
+            properties,
+            "dji:GpsLatitude",
+            "sensefly:Latitude",
+            "skydio:Latitude",
+            "autel:GpsLatitude",
+        ),
         # DJI's firmware spells it "GpsLongtitude" as often as not
-        "longitude_deg": _first(properties, "dji:GpsLongitude", "dji:GpsLongtitude", "sensefly:Longitude",
-                                "skydio:Longitude", "autel:GpsLongitude", "autel:GpsLongtitude"),
+        "longitude_deg": _first(
+            properties,
+            "dji:GpsLongitude",
+            "dji:GpsLongtitude",
+            "sensefly:Longitude",
+            "skydio:Longitude",
+            "autel:GpsLongitude",
+            "autel:GpsLongtitude",
+        ),
     }
 
 
-def height_columns(properties: Mapping[str, str], exif_m: float, *, exif_is_ellipsoidal: bool) -> dict[str, float]:
+def height_columns(
+    properties: Mapping[str, str], exif_m: float, *, exif_is_ellipsoidal: bool
+) -> dict[str, float]:
     """Heights above the sea and above the ellipsoid, from XMP and EXIF's altitude, NaN where not stated.
 
     EXIF's own reference is often wrong: RTK drones of DJI's and Autel's write ellipsoidal heights as heights above the
     sea, and so does senseFly. A property that names its reference goes before EXIF.
     """
-    exif_m = exif_m if isfinite(exif_m) else _first(properties, "dji:AbsoluteAltitude", "autel:AbsoluteAltitude")
+    exif_m = (
+        exif_m
+        if isfinite(exif_m)
+        else _first(properties, "dji:AbsoluteAltitude", "autel:AbsoluteAltitude")
+    )
     above_sea_m = _first(properties, *_ABOVE_SEA)
     above_ellipsoid_m = _first(properties, "sensefly:AltitudeWGS84")
     if exif_is_ellipsoidal or _states_ellipsoid(properties):
@@ -156,7 +208,9 @@ def _makers_by_address(packet: bytes) -> dict[str, str]:
     return makers
 
 
-def _collect(element: Element, owner: str, makers: Mapping[str, str], properties: dict[str, str]) -> None:
+def _collect(
+    element: Element, owner: str, makers: Mapping[str, str], properties: dict[str, str]
+) -> None:
     """Add an element's properties and those below it; `owner` is the structure, "Name.", that it stands in."""
     maker, name = _qualified(element.tag, makers)
     content = " ".join("".join(element.itertext()).split())
@@ -192,7 +246,9 @@ def _velocity_columns(properties: Mapping[str, str]) -> dict[str, float]:
     east_m_s = _first(properties, "dji:FlightYSpeed", "autel:FlightYSpeed")
     speed_m_s = hypot(north_m_s, east_m_s)
     return {
-        "speed_m_s": speed_m_s if isfinite(speed_m_s) else _first(properties, "sensefly:GroundSpeed"),
+        "speed_m_s": speed_m_s
+        if isfinite(speed_m_s)
+        else _first(properties, "sensefly:GroundSpeed"),
         "course_deg": degrees(atan2(east_m_s, north_m_s)) % 360 if north_m_s or east_m_s else nan,
     }
 
@@ -202,13 +258,20 @@ def _sigma_columns(properties: Mapping[str, str]) -> dict[str, float]:
     horizontal_m = _first(properties, "camera:GPSXYAccuracy")
     vertical_m = _first(properties, "camera:GPSZAccuracy")
     for maker in ("dji", "autel"):
-        east_m, north_m = number(properties, f"{maker}:RtkStdLon"), number(properties, f"{maker}:RtkStdLat")
+        east_m, north_m = (
+            number(properties, f"{maker}:RtkStdLon"),
+            number(properties, f"{maker}:RtkStdLat"),
+        )
         if isfinite(east_m) and isfinite(north_m):
             horizontal_m = hypot(east_m, north_m) / 2**0.5
             vertical_m = number(properties, f"{maker}:RtkStdHgt")
-    pitch_deg, roll_deg = number(properties, "camera:IMUPitchAccuracy"), number(properties, "camera:IMURollAccuracy")
+    pitch_deg, roll_deg = (
+        number(properties, "camera:IMUPitchAccuracy"),
+        number(properties, "camera:IMURollAccuracy"),
+    )
     columns = {
-        "horizontal_sigma_m": horizontal_m, "vertical_sigma_m": vertical_m,
+        "horizontal_sigma_m": horizontal_m,
+        "vertical_sigma_m": vertical_m,
         "tilt_sigma_deg": hypot(pitch_deg, roll_deg) / 2**0.5,
         "heading_sigma_deg": number(properties, "camera:IMUYawAccuracy"),
     }

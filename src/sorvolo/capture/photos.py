@@ -19,13 +19,25 @@ from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import clean, notice
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.survey.flight import TELEMETRY_COLUMNS, CameraModel, Frame, LostFrame, Notice, Telemetry, no_telemetry
+from sorvolo.survey.flight import (
+    TELEMETRY_COLUMNS,
+    CameraModel,
+    Frame,
+    LostFrame,
+    Notice,
+    Telemetry,
+    no_telemetry,
+)
 
 _LOOK_AHEAD = 1  # photos decoded while one is worked on; each takes tens of megabytes
 _STEP_NS = 1_000_000  # between photos of the same second
-_UNTIMED_STEP_NS = 1_000_000_000  # between photos that state no time: their order is kept, a second each by choice
+_UNTIMED_STEP_NS = (
+    1_000_000_000  # between photos that state no time: their order is kept, a second each by choice
+)
 _QUARTER_TURN = 6  # EXIF's number for clockwise
-_EDGE_BYTES = 65_536  # of a photo's beginning and end, by which a copy of it is recognised; by choice
+_EDGE_BYTES = (
+    65_536  # of a photo's beginning and end, by which a copy of it is recognised; by choice
+)
 _EXIF_UTC = "UTC in the photos' EXIF"
 
 
@@ -63,7 +75,12 @@ class PhotoSource:
     frame_rate_hz = ground_elevation_m = float("nan")
 
     def __init__(
-        self, name: str, fingerprint: str, album: Album, camera: CameraModel, telemetry: Telemetry,
+        self,
+        name: str,
+        fingerprint: str,
+        album: Album,
+        camera: CameraModel,
+        telemetry: Telemetry,
         notices: Sequence[Notice] = (),
     ) -> None:
         self.name, self.fingerprint, self.album = name, fingerprint, album
@@ -76,7 +93,9 @@ class PhotoSource:
 
     def notices(self) -> tuple[Notice, ...]:
         """What was found so far; complete when `frames` is exhausted."""
-        found = notice("corrupt_photo", len(self._corrupt), "damaged photos that could not be decoded: {}")
+        found = notice(
+            "corrupt_photo", len(self._corrupt), "damaged photos that could not be decoded: {}"
+        )
         return (*self._notices, *found)
 
     def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
@@ -107,7 +126,9 @@ class PhotoSource:
             return LostFrame(index, photo.path.name, photo.time_ns, photo.problem)
         try:
             image = decode_photo(photo.path.read_bytes(), photo.path.name, photo.metadata.reduction)
-            fitted = _fit(image, photo.metadata.orientation, self.album.width_px, self.album.height_px)
+            fitted = _fit(
+                image, photo.metadata.orientation, self.album.width_px, self.album.height_px
+            )
         except (InputError, OSError) as error:
             return LostFrame(index, photo.path.name, photo.time_ns, f"corrupt: {error}")
         return Frame(index, photo.path.name, photo.time_ns, fitted)
@@ -129,7 +150,9 @@ def read_album(paths: Sequence[Path]) -> Album:
 
     Raises InputError when none of the files is a readable picture.
     """
-    found = [_read(path) for path in sorted(paths, key=lambda path: (_natural(path.stem), path.name))]
+    found = [
+        _read(path) for path in sorted(paths, key=lambda path: (_natural(path.stem), path.name))
+    ]
     if all(photo.problem for photo in found):
         raise InputError(
             f"none of the {len(found)} pictures can be read; the first: {found[0].problem.removeprefix('corrupt: ')}"
@@ -139,13 +162,19 @@ def read_album(paths: Sequence[Path]) -> Album:
     width_px, height_px = _usual_size(distinct)
     photos = [_check_size(photo, width_px, height_px) for photo in distinct]
     typical = next(
-        photo.metadata for photo in photos
+        photo.metadata
+        for photo in photos
         if not photo.problem and photo.metadata.used_size_px == (width_px, height_px)
     )
     telemetry, gps_notices = _telemetry_of(photos)
     return Album(
-        tuple(photos), width_px, height_px, typical, telemetry,
-        0 if start_origin.startswith("unknown") else photos[0].time_ns, start_origin,
+        tuple(photos),
+        width_px,
+        height_px,
+        typical,
+        telemetry,
+        0 if start_origin.startswith("unknown") else photos[0].time_ns,
+        start_origin,
         (*time_notices, *gps_notices, *_picture_notices(photos, width_px, height_px)),
     )
 
@@ -161,7 +190,8 @@ def _natural(name: str) -> list[tuple[int, int, str]]:
     """A sort key under which IMG_2 comes before IMG_10."""
     return [
         (0, int(part), "") if part.isdecimal() else (1, 0, part)
-        for part in re.split(r"(\d+)", name.lower()) if part
+        for part in re.split(r"(\d+)", name.lower())
+        if part
     ]
 
 
@@ -189,7 +219,8 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
     utc_ns = [photo.metadata.utc_ns for photo in photos]
     local_ns = [photo.metadata.local_ns for photo in photos]
     untimed = notice(
-        "photo_without_time", sum(not (utc or local) for utc, local in zip(utc_ns, local_ns)),
+        "photo_without_time",
+        sum(not (utc or local) for utc, local in zip(utc_ns, local_ns)),
         "photos without a time, placed by their names: {}",
     )
     if any(utc and local for utc, local in zip(utc_ns, local_ns)):
@@ -200,11 +231,16 @@ def _best_times(photos: Sequence[Photo]) -> tuple[list[int], str, list[Notice]]:
     if any(local_ns):
         origin = "EXIF time of the camera's clock, its time zone unknown and taken as UTC"
         zone = notice(
-            "time_zone_unknown", sum(map(bool, local_ns)),
+            "time_zone_unknown",
+            sum(map(bool, local_ns)),
             "photos with the camera's clock but no time zone, taken as UTC: {}",
         )
         return local_ns, origin, [*zone, *untimed]
-    return utc_ns, "unknown: no photo has a time; they are taken to be one second apart, by name", untimed
+    return (
+        utc_ns,
+        "unknown: no photo has a time; they are taken to be one second apart, by name",
+        untimed,
+    )
 
 
 def _times_of_two_clocks(utc_ns: list[int], local_ns: list[int]) -> tuple[list[int], str]:
@@ -219,8 +255,13 @@ def _times_of_two_clocks(utc_ns: list[int], local_ns: list[int]) -> tuple[list[i
         utc == next_utc != 0 and 0 != local != next_local != 0
         for (utc, local), (next_utc, next_local) in pairwise(both)
     )
-    times_ns = [local + offset_ns if local and (stands_still or not utc) else utc for utc, local in both]
-    return times_ns, "the camera's clock, set by the photos' GPS time" if stands_still else _EXIF_UTC
+    times_ns = [
+        local + offset_ns if local and (stands_still or not utc) else utc for utc, local in both
+    ]
+    return (
+        times_ns,
+        "the camera's clock, set by the photos' GPS time" if stands_still else _EXIF_UTC,
+    )
 
 
 def _mark_duplicates(photos: Sequence[Photo]) -> list[Photo]:
@@ -292,14 +333,19 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
     """One sample a photo that states its place or attitude, and is no duplicate, at exactly the photo's time."""
     readable = [photo for photo in photos if photo.metadata.width_px and not _is_duplicate(photo)]
     placed = sum("latitude_deg" in photo.metadata.columns for photo in readable)
-    missing = notice("photo_without_gps", len(readable) - placed, "photos without a GPS position: {}")
+    missing = notice(
+        "photo_without_gps", len(readable) - placed, "photos without a GPS position: {}"
+    )
     if not placed:
         return no_telemetry(), missing
     sampled = [photo for photo in readable if photo.metadata.columns]
     columns = {
-        name: [photo.metadata.columns.get(name, np.nan) for photo in sampled] for name in TELEMETRY_COLUMNS
+        name: [photo.metadata.columns.get(name, np.nan) for photo in sampled]
+        for name in TELEMETRY_COLUMNS
     }
-    cleaned = clean("exif", sampled[0].path.parent.name, [photo.time_ns for photo in sampled], columns)
+    cleaned = clean(
+        "exif", sampled[0].path.parent.name, [photo.time_ns for photo in sampled], columns
+    )
     if not cleaned.has_fixes:
         return no_telemetry(), [*missing, *cleaned.notices]
     return replace(cleaned, notices=(*missing, *cleaned.notices)), []
@@ -308,13 +354,22 @@ def _telemetry_of(photos: Sequence[Photo]) -> tuple[Telemetry, list[Notice]]:
 def _picture_notices(photos: Sequence[Photo], width_px: int, height_px: int) -> list[Notice]:
     used = [photo.metadata for photo in photos if not photo.problem]
     return [
-        *notice("duplicate_photo", sum(map(_is_duplicate, photos)),
-                "photos that are exact copies of others, not used twice: {}"),
-        *notice("unreadable_photo", sum(not photo.metadata.width_px for photo in photos),
-                "files named like pictures that cannot be read: {}"),
+        *notice(
+            "duplicate_photo",
+            sum(map(_is_duplicate, photos)),
+            "photos that are exact copies of others, not used twice: {}",
+        ),
+        *notice(
+            "unreadable_photo",
+            sum(not photo.metadata.width_px for photo in photos),
+            "files named like pictures that cannot be read: {}",
+        ),
         *_size_notices(photos, used, (width_px, height_px)),
-        *notice("unreadable_metadata", sum(bool(metadata.unreadable) for metadata in used),
-                "photos with damaged EXIF or XMP, which is not used: {}"),
+        *notice(
+            "unreadable_metadata",
+            sum(bool(metadata.unreadable) for metadata in used),
+            "photos with damaged EXIF or XMP, which is not used: {}",
+        ),
         *_camera_notices(used),
     ]
 
@@ -326,13 +381,23 @@ def _size_notices(
     turned = other.count(size_px[::-1])
     shown = f"{size_px[0]}x{size_px[1]}"
     return [
-        *notice("other_size", sum(photo.problem.startswith("size") for photo in photos),
-                f"photos of another shape than the flight's {shown}, not used (map another camera's photos as a flight "
-                "of their own): {}"),
+        *notice(
+            "other_size",
+            sum(photo.problem.startswith("size") for photo in photos),
+            f"photos of another shape than the flight's {shown}, not used (map another camera's photos as a flight "
+            "of their own): {}",
+        ),
         *notice("rotated_photo", turned, "photos that lay across the others, turned by 90 deg: {}"),
-        *notice("resized_photo", len(other) - turned, f"photos of another size, resampled to {shown}: {{}}"),
-        *notice("reduced_photo", sum(metadata.reduction > 1 for metadata in used),
-                f"photos of more than {LARGEST_FRAME_PX // 1_000_000} megapixels, used at half their size: {{}}"),
+        *notice(
+            "resized_photo",
+            len(other) - turned,
+            f"photos of another size, resampled to {shown}: {{}}",
+        ),
+        *notice(
+            "reduced_photo",
+            sum(metadata.reduction > 1 for metadata in used),
+            f"photos of more than {LARGEST_FRAME_PX // 1_000_000} megapixels, used at half their size: {{}}",
+        ),
     ]
 
 
@@ -340,10 +405,16 @@ def _camera_notices(used: Sequence[PhotoMetadata]) -> list[Notice]:
     cameras = {(metadata.make, metadata.model) for metadata in used}
     focal_mm = {metadata.focal_length_mm for metadata in used if metadata.focal_length_mm > 0}
     return [
-        *notice("mixed_cameras", len(cameras) if len(cameras) > 1 else 0,
-                "different cameras, mapped as if they were one: {}"),
-        *notice("zoom", len(focal_mm) if len(focal_mm) > 1 else 0,
-                "different focal lengths, mapped as if they were one: {}"),
+        *notice(
+            "mixed_cameras",
+            len(cameras) if len(cameras) > 1 else 0,
+            "different cameras, mapped as if they were one: {}",
+        ),
+        *notice(
+            "zoom",
+            len(focal_mm) if len(focal_mm) > 1 else 0,
+            "different focal lengths, mapped as if they were one: {}",
+        ),
     ]
 
 

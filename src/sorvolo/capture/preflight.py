@@ -97,17 +97,37 @@ def frame_facts(source: Source, samples: Sequence[Frame]) -> FrameFacts:
     if isinstance(source, VideoSource):
         info = source.info
         return FrameFacts(
-            info.frame_count, info.frame_rate_hz, math.nan, info.duration_s, camera.width_px,
-            camera.height_px, info.codec, info.container, info.path.stat().st_size, info.start_ns,
-            info.start_origin, sharp, texture, _shared_view(samples),
+            info.frame_count,
+            info.frame_rate_hz,
+            math.nan,
+            info.duration_s,
+            camera.width_px,
+            camera.height_px,
+            info.codec,
+            info.container,
+            info.path.stat().st_size,
+            info.start_ns,
+            info.start_origin,
+            sharp,
+            texture,
+            _shared_view(samples),
         )
     suffixes, container, size = _file_facts(source)
     times_s = _times_s(source, samples)
     return FrameFacts(
-        source.frame_count, source.frame_rate_hz,
+        source.frame_count,
+        source.frame_rate_hz,
         median_or_nan(np.diff(times_s)) if source.kind == "photos" else math.nan,
-        float(np.ptp(times_s)) if len(times_s) else math.nan, camera.width_px, camera.height_px,
-        suffixes, container, size, source.start_ns, source.start_origin, sharp, texture,
+        float(np.ptp(times_s)) if len(times_s) else math.nan,
+        camera.width_px,
+        camera.height_px,
+        suffixes,
+        container,
+        size,
+        source.start_ns,
+        source.start_origin,
+        sharp,
+        texture,
         math.nan,
     )
 
@@ -155,10 +175,15 @@ def telemetry_facts(source: Source, frames: FrameFacts) -> TelemetryFacts:
     steps_s = np.diff(placed) / SECOND_NS
     tie, covered_s = _tie(source, frames)
     return TelemetryFacts(
-        telemetry.format, len(telemetry), len(placed),
-        1 / float(np.median(steps_s)) if len(steps_s) else math.nan, float(steps_s.max(initial=0.0)),
+        telemetry.format,
+        len(telemetry),
+        len(placed),
+        1 / float(np.median(steps_s)) if len(steps_s) else math.nan,
+        float(steps_s.max(initial=0.0)),
         int(telemetry.time_ns[0]) if len(telemetry) else 0,
-        int(telemetry.time_ns[-1]) if len(telemetry) else 0, tie, covered_s,
+        int(telemetry.time_ns[-1]) if len(telemetry) else 0,
+        tie,
+        covered_s,
     )
 
 
@@ -173,7 +198,9 @@ def _tie(source: Source, frames: FrameFacts) -> tuple[str, float]:
         return "in each photo", frames.duration_s
     tied_ns = telemetry.video_time_ns[telemetry.video_time_ns >= 0]
     if len(tied_ns) and source.kind == "video":
-        return "by time since the video's start", max(0.0, min(frames.duration_s, tied_ns[-1] / SECOND_NS))
+        return "by time since the video's start", max(
+            0.0, min(frames.duration_s, tied_ns[-1] / SECOND_NS)
+        )
     if any(notice.code == "no_date" for notice in telemetry.notices):
         return "unknown: the telemetry has no date", math.nan
     if not source.start_ns:
@@ -193,13 +220,17 @@ def while_filming(source: Source, frames: FrameFacts) -> Telemetry:
     if source.kind != "video" or not np.isfinite(telemetry["latitude_deg"][during]).any():
         return telemetry
     columns = {name: values[during] for name, values in telemetry.columns.items()}
-    return Telemetry(telemetry.format, telemetry.time_ns[during], columns, notices=telemetry.notices)
+    return Telemetry(
+        telemetry.format, telemetry.time_ns[during], columns, notices=telemetry.notices
+    )
 
 
 def common_ns(telemetry: Telemetry, start_ns: int, duration_s: float) -> int:
     """For how long telemetry and frames from `start_ns` on run both."""
     end_ns = start_ns + round(duration_s * SECOND_NS)
-    return max(0, min(end_ns, int(telemetry.time_ns[-1])) - max(start_ns, int(telemetry.time_ns[0])))
+    return max(
+        0, min(end_ns, int(telemetry.time_ns[-1])) - max(start_ns, int(telemetry.time_ns[0]))
+    )
 
 
 def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> FlightFacts:
@@ -213,7 +244,10 @@ def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> Fl
     interval_s = forward = side = math.nan
     strips = find_strips(points_m)
     if height_m > 0.5:
-        footprint_m, gsd_m = footprint_size_m(camera, height_m), 1 / px_per_m(height_m, camera.fx_px)
+        footprint_m, gsd_m = (
+            footprint_size_m(camera, height_m),
+            1 / px_per_m(height_m, camera.fx_px),
+        )
         across_m, along_m = _across_and_along(footprint_m, telemetry, strips.bearing_deg)
         if speed_m_s > _MOVING_M_S:
             interval_s = 1 / minimum_frame_rate(speed_m_s, along_m, WANTED_OVERLAP)
@@ -222,8 +256,18 @@ def flight_facts(telemetry: Telemetry, camera: Camera, frames: FrameFacts) -> Fl
             forward = max(0.0, 1 - float(np.median(steps_m)) / along_m)
         side = max(0.0, 1 - strips.spacing_m / across_m) if strips.spacing_m > 0 else math.nan
     return FlightFacts(
-        height_m, spread_m, reference, speed_m_s, length_m(points_m), gsd_m, footprint_m, forward, interval_s,
-        strips.count, side, median_or_nan(telemetry["camera_pitch_deg"]),
+        height_m,
+        spread_m,
+        reference,
+        speed_m_s,
+        length_m(points_m),
+        gsd_m,
+        footprint_m,
+        forward,
+        interval_s,
+        strips.count,
+        side,
+        median_or_nan(telemetry["camera_pitch_deg"]),
     )
 
 
@@ -240,7 +284,10 @@ def _height(telemetry: Telemetry) -> tuple[float, float, str]:
     above_takeoff_m = telemetry["height_above_takeoff_m"]
     if np.isfinite(above_takeoff_m).any():
         return median_or_nan(above_takeoff_m), _spread(above_takeoff_m), "above take-off"
-    for column, words in (("orthometric_height_m", "sea level"), ("ellipsoidal_height_m", "the ellipsoid")):
+    for column, words in (
+        ("orthometric_height_m", "sea level"),
+        ("ellipsoidal_height_m", "the ellipsoid"),
+    ):
         if np.isfinite(telemetry[column]).any():
             usual_m = median_or_nan(telemetry[column])
             text = f"unknown: telemetry gives heights above {words} only, median {usual_m:.1f} m"
@@ -251,7 +298,9 @@ def _height(telemetry: Telemetry) -> tuple[float, float, str]:
 def _speed(telemetry: Telemetry, points_m: PointsM, times_s: Floats) -> float:
     """Median speed while moving; from positions where telemetry lacks it."""
     logged = telemetry["speed_m_s"]
-    speeds = logged[np.isfinite(logged)] if np.isfinite(logged).any() else speeds_m_s(points_m, times_s)
+    speeds = (
+        logged[np.isfinite(logged)] if np.isfinite(logged).any() else speeds_m_s(points_m, times_s)
+    )
     moving = speeds[speeds > _MOVING_M_S]
     return float(np.median(moving)) if len(moving) else (0.0 if len(speeds) else math.nan)
 

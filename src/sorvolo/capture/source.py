@@ -29,7 +29,12 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream, open_stream
 from sorvolo.capture.photo_metadata import PhotoMetadata
 from sorvolo.capture.photos import PhotoSource, read_album
-from sorvolo.capture.telemetry import find_telemetry_beside, is_telemetry, read_telemetry, unusable_files_beside
+from sorvolo.capture.telemetry import (
+    find_telemetry_beside,
+    is_telemetry,
+    read_telemetry,
+    unusable_files_beside,
+)
 from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.gpmf import read_gpmf_file
 from sorvolo.capture.video import VIDEO_SUFFIXES, VideoInfo, VideoSource, read_video_info
@@ -102,9 +107,14 @@ class Source(Protocol):
 
 
 def open_sources(
-    inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
-    known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
-    until: threading.Event | None = None, better_camera: BetterCamera | None = None,
+    inputs: Sequence[Path | str],
+    telemetry: Path | str | None = None,
+    camera: Path | str | None = None,
+    known: Mapping[str, str] = MappingProxyType({}),
+    *,
+    live: LiveSettings = LiveSettings(),
+    until: threading.Event | None = None,
+    better_camera: BetterCamera | None = None,
 ) -> list[Source]:
     """Each video, each folder of photos, all photos given one by one together, and each live source, as a flight.
 
@@ -118,16 +128,26 @@ def open_sources(
     Raises InputError for what cannot be read, naming the file and what to do.
     """
     if not inputs:
-        raise InputError("no input; give a video file, a folder of photos, photos, or a live stream's address")
+        raise InputError(
+            "no input; give a video file, a folder of photos, photos, or a live stream's address"
+        )
     addresses = [live_address(text) for text in map(str, inputs) if is_live_address(text)]
     videos, albums = _sort_inputs(_recorded(inputs))
-    names = _distinct_names([*(path.resolve() for path in videos), *(album.place for album in albums)])
+    names = _distinct_names(
+        [*(path.resolve() for path in videos), *(album.place for album in albums)]
+    )
     _demand_one_flight(telemetry, len(names) + len(addresses))
     log = _telemetry_file(telemetry, is_live=bool(addresses))
     sources: list[VideoSource | PhotoSource | LiveSource] = [
         *(_open_video(path, name, log, camera) for path, name in zip(videos, names)),
-        *(_open_photos(album, name, log, camera) for album, name in zip(albums, names[len(videos):])),
-        *(_open_live(address, telemetry, camera, live, until or threading.Event()) for address in addresses),
+        *(
+            _open_photos(album, name, log, camera)
+            for album, name in zip(albums, names[len(videos) :])
+        ),
+        *(
+            _open_live(address, telemetry, camera, live, until or threading.Event())
+            for address in addresses
+        ),
     ]
     _give_names(sources, known)
     _use_better_cameras(sources, better_camera)
@@ -143,7 +163,9 @@ def _demand_one_flight(telemetry: Path | str | None, flights: int) -> None:
         )
 
 
-def _use_better_cameras(sources: Sequence[VideoSource | PhotoSource | LiveSource], better: BetterCamera | None) -> None:
+def _use_better_cameras(
+    sources: Sequence[VideoSource | PhotoSource | LiveSource], better: BetterCamera | None
+) -> None:
     if better is not None:
         for each in sources:
             each.camera = better(each.camera)
@@ -159,12 +181,19 @@ def _recorded(inputs: Sequence[Path | str]) -> list[Path]:
 
 @contextmanager
 def opened_sources(
-    inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None,
-    known: Mapping[str, str] = MappingProxyType({}), *, live: LiveSettings = LiveSettings(),  # noqa: B008 (frozen)
-    until: threading.Event | None = None, better_camera: BetterCamera | None = None,
+    inputs: Sequence[Path | str],
+    telemetry: Path | str | None = None,
+    camera: Path | str | None = None,
+    known: Mapping[str, str] = MappingProxyType({}),
+    *,
+    live: LiveSettings = LiveSettings(),
+    until: threading.Event | None = None,
+    better_camera: BetterCamera | None = None,
 ) -> Iterator[list[Source]]:
     """The same as `open_sources`; live sources are closed at the end, however it comes."""
-    sources = open_sources(inputs, telemetry, camera, known, live=live, until=until, better_camera=better_camera)
+    sources = open_sources(
+        inputs, telemetry, camera, known, live=live, until=until, better_camera=better_camera
+    )
     try:
         yield sources
     finally:
@@ -237,12 +266,18 @@ def _nothing_at(text: str) -> str:
 
 
 def _nothing_in(folder: Path, files: int) -> str:
-    folders = sorted(each.name for each in folder.iterdir() if each.is_dir() and each.name[0] != ".")
-    hint = f"it has folders: name the one with the pictures ({', '.join(folders[:5])})" if folders else (
-        "name the folder that has them, or a video file"
+    folders = sorted(
+        each.name for each in folder.iterdir() if each.is_dir() and each.name[0] != "."
+    )
+    hint = (
+        f"it has folders: name the one with the pictures ({', '.join(folders[:5])})"
+        if folders
+        else ("name the folder that has them, or a video file")
     )
     wanted = ", ".join(sorted(PHOTO_SUFFIXES))
-    return f"{folder} holds no pictures or videos among {files} files ({wanted} are pictures); {hint}"
+    return (
+        f"{folder} holds no pictures or videos among {files} files ({wanted} are pictures); {hint}"
+    )
 
 
 def _distinct_names(places: Sequence[Path]) -> list[str]:
@@ -253,11 +288,15 @@ def _distinct_names(places: Sequence[Path]) -> list[str]:
         for name, place in zip(names, places)
     ]
     if twice := [name for name in names if names.count(name) > 1]:
-        raise InputError(f"two flights would be named {twice[0]}; rename one, or map them one by one")
+        raise InputError(
+            f"two flights would be named {twice[0]}; rename one, or map them one by one"
+        )
     return names
 
 
-def _give_names(sources: Sequence["VideoSource | PhotoSource | LiveSource"], known: Mapping[str, str]) -> None:
+def _give_names(
+    sources: Sequence["VideoSource | PhotoSource | LiveSource"], known: Mapping[str, str]
+) -> None:
     """Names that are safe as folders and no other flight has, by their fingerprints."""
     taken = dict(known)
     for each in sources:
@@ -271,11 +310,17 @@ def _free_name(name: str, fingerprint: str, taken: Mapping[str, str]) -> str:
     return next(each for each in candidates if taken.get(each, fingerprint) == fingerprint)
 
 
-def _open_video(path: Path, name: str, telemetry: Path | None, camera: Path | str | None) -> VideoSource:
+def _open_video(
+    path: Path, name: str, telemetry: Path | None, camera: Path | str | None
+) -> VideoSource:
     info = _video_info(path)
     inside = _metadata_inside(path, info.container)
     found, notices = _video_telemetry(path, telemetry, inside)
-    stated = None if inside is None or inside.lens is None else camera_of(inside.lens, info.width_px, info.height_px)
+    stated = (
+        None
+        if inside is None or inside.lens is None
+        else camera_of(inside.lens, info.width_px, info.height_px)
+    )
     if camera is None:
         model = stated or _video_camera(info)
     else:
@@ -313,14 +358,18 @@ def _telemetry_file(telemetry: Path | str | None, *, is_live: bool) -> Path | No
     if is_link(str(telemetry)) != is_live:
         raise InputError(
             f"--telemetry {telemetry}: a live source takes its telemetry from a receiver that is on: give {LINK_FORMS}"
-            if is_live else f"--telemetry {telemetry}: a recorded flight's telemetry is a file"
+            if is_live
+            else f"--telemetry {telemetry}: a recorded flight's telemetry is a file"
         )
     return None if is_live else Path(telemetry)
 
 
 def _open_live(
-    address: StreamAddress | FollowedPath, telemetry: Path | str | None, camera: Path | str | None,
-    settings: LiveSettings, until: threading.Event,
+    address: StreamAddress | FollowedPath,
+    telemetry: Path | str | None,
+    camera: Path | str | None,
+    settings: LiveSettings,
+    until: threading.Event,
 ) -> LiveSource:
     def chosen(width_px: int, height_px: int) -> CameraModel | None:
         return None if camera is None else camera_from_option(str(camera), width_px, height_px)
@@ -349,7 +398,9 @@ def _open_photos(
     else:
         model = camera_from_option(str(camera), album.width_px, album.height_px)
     found = album.telemetry if telemetry is None else read_telemetry(telemetry)
-    ignored = notice("ignored_file", source.others, "files in the folder that are no photos, ignored: {}")
+    ignored = notice(
+        "ignored_file", source.others, "files in the folder that are no photos, ignored: {}"
+    )
     fingerprint = _fingerprint(sorted(source.photos)[0])
     return PhotoSource(name, fingerprint, album, model, found, ignored)
 
@@ -387,24 +438,39 @@ def _video_camera(info: VideoInfo) -> CameraModel:
     shown_width_px = max(1, round(info.width_px * info.pixel_aspect))
     words = PhotoMetadata(0, 0, make=info.make, model=info.model)
     model = _guess(shown_width_px, info.height_px, words)
-    return CameraModel(model.camera.resized(info.width_px, info.height_px), model.origin, model.focal_sigma)
+    return CameraModel(
+        model.camera.resized(info.width_px, info.height_px), model.origin, model.focal_sigma
+    )
 
 
 def _guess(width_px: int, height_px: int, words: PhotoMetadata) -> CameraModel:
     """The lens that a photo states, else the guess; sensors lie, so for pictures that stand it is made lying."""
-    if width_px >= height_px and (stated := stated_camera(words.lens, width_px, height_px)) is not None:
+    if (
+        width_px >= height_px
+        and (stated := stated_camera(words.lens, width_px, height_px)) is not None
+    ):
         return stated
     model = guess_camera(
-        max(width_px, height_px), min(width_px, height_px), make=words.make, model=words.model,
-        focal_length_mm=words.focal_length_mm, focal_length_35mm=words.focal_length_35mm,
-        focal_plane_px_per_mm=words.focal_plane_px_per_mm, full_width_px=words.full_width_px,
+        max(width_px, height_px),
+        min(width_px, height_px),
+        make=words.make,
+        model=words.model,
+        focal_length_mm=words.focal_length_mm,
+        focal_length_35mm=words.focal_length_35mm,
+        focal_plane_px_per_mm=words.focal_plane_px_per_mm,
+        full_width_px=words.full_width_px,
     )
     lying = model.camera
     if width_px >= height_px:
         return model
     k1, k2, p1, p2, k3 = lying.distortion
     standing = Camera(
-        width_px, height_px, lying.fy_px, lying.fx_px, lying.cy_px, lying.cx_px,
+        width_px,
+        height_px,
+        lying.fy_px,
+        lying.fx_px,
+        lying.cy_px,
+        lying.cx_px,
         np.array([k1, k2, p2, p1, k3]),
     )
     return CameraModel(standing, model.origin, model.focal_sigma)

@@ -9,7 +9,11 @@ import numpy as np
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows, Vector3
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.geometry.pose import rotation_between, site_from_body_nadir_rotation, site_from_gimbal_rotation
+from sorvolo.geometry.pose import (
+    rotation_between,
+    site_from_body_nadir_rotation,
+    site_from_gimbal_rotation,
+)
 from sorvolo.geometry.summary import median_or_nan
 from sorvolo.survey.flight import CameraPrior, Notice, Telemetry
 
@@ -20,7 +24,9 @@ FIX_DELAY_S = 0.25
 Measured on a senseFly survey of 2013: 0.35 s, which is 3 to 5 m at its speed.
 """
 DEFAULT_HORIZONTAL_SIGMA_M = 1.5  # the thesis's DJI Phantom 3, section 2.2
-_OTHER_FLIGHT_S = 24 * 3600.0  # clocks are set to a wrong zone by up to 14 h; a day apart is another flight
+_OTHER_FLIGHT_S = (
+    24 * 3600.0
+)  # clocks are set to a wrong zone by up to 14 h; a day apart is another flight
 DATED_NS = 3650 * 86_400 * 10**9
 """Ten years after 1970: an earlier clock was never set."""
 _HEIGHTS = (
@@ -51,7 +57,13 @@ class Clock:
 
 
 def tie_clocks(
-    telemetry: Telemetry, *, kind: str, start_ns: int, duration_s: float, offset_given: bool, strict: bool
+    telemetry: Telemetry,
+    *,
+    kind: str,
+    start_ns: int,
+    duration_s: float,
+    offset_given: bool,
+    strict: bool,
 ) -> Clock:
     """Put telemetry's samples on the frames' clock.
 
@@ -67,7 +79,12 @@ def tie_clocks(
     if (telemetry.video_time_ns >= 0).all():
         zero_ns = int(np.median(telemetry.time_ns - telemetry.video_time_ns))
         zero_ns = start_ns if zero_ns < DATED_NS else zero_ns  # without a date, as below
-        return Clock(telemetry.video_time_ns / 1e9, "telemetry counts from the video's first frame", 0.5, zero_ns)
+        return Clock(
+            telemetry.video_time_ns / 1e9,
+            "telemetry counts from the video's first frame",
+            0.5,
+            zero_ns,
+        )
     dated = min(first_ns, start_ns) > DATED_NS
     if dated:
         lead_s = (first_ns - start_ns) / 1e9
@@ -81,9 +98,20 @@ def tie_clocks(
                 "give the right file with --telemetry, or --offset 0 to tie their starts all the same"
             )
         words = f"the video's clock and the telemetry's are {apart_s / 3600:.1f} h apart: their starts were tied"
-        return Clock(utc_s, "first sample tied to first frame", 3.0, first_ns, (Notice("clocks_apart", 1, words),))
+        return Clock(
+            utc_s,
+            "first sample tied to first frame",
+            3.0,
+            first_ns,
+            (Notice("clocks_apart", 1, words),),
+        )
     # a log without a date is stamped from 1970: then the video's own start dates it
-    return Clock(utc_s, "first sample tied to first frame", 3.0, start_ns if first_ns < DATED_NS else first_ns)
+    return Clock(
+        utc_s,
+        "first sample tied to first frame",
+        3.0,
+        start_ns if first_ns < DATED_NS else first_ns,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +158,16 @@ class Track:
         """
         place, sigma_m, velocity = self._place(time_s, smooth_s)
         rotation, sigma_deg, words = self._attitude(time_s, velocity)
-        known = np.isfinite(place) & ~(self._is_below_ground(place[2]) & np.array([False, False, True]))
+        known = np.isfinite(place) & ~(
+            self._is_below_ground(place[2]) & np.array([False, False, True])
+        )
         sigma = np.where(known, sigma_m, np.inf)
         return CameraPrior(
-            np.where(known, place, self._nearest(time_s)), sigma, rotation, sigma_deg, np.nan_to_num(velocity),
+            np.where(known, place, self._nearest(time_s)),
+            sigma,
+            rotation,
+            sigma_deg,
+            np.nan_to_num(velocity),
             f"{'GPS' if known[0] else 'no fix'}, {words}",
         )
 
@@ -155,9 +189,15 @@ class Track:
         values = np.column_stack([self.east_north_m[rows], self.up_m[rows]])
         place, velocity, gain = _line(times[chosen] - time_s, values)
         sigma_h = float(np.median(self.horizontal_sigma_m[rows]))
-        if smooth_s == 0 and times[before] < time_s < times[after] and times[after] - times[before] > 1.5:
+        if (
+            smooth_s == 0
+            and times[before] < time_s < times[after]
+            and times[after] - times[before] > 1.5
+        ):
             # between fixes that lie far apart the path is a guess, and between photos there may be a turn
-            sigma_h += (0.15 if self.interval_s else 0.4) * float(np.linalg.norm(np.diff(values[[0, -1], :2], axis=0)))
+            sigma_h += (0.15 if self.interval_s else 0.4) * float(
+                np.linalg.norm(np.diff(values[[0, -1], :2], axis=0))
+            )
         # neighbouring fixes err alike, so averaging many never helps by more than a factor of two
         shrink = max(gain, 0.5)
         return place, np.array([sigma_h, sigma_h, self.vertical_sigma_m]) * shrink, velocity
@@ -180,7 +220,9 @@ class Track:
             return np.array([0.0, 0.0, 40.0])
         row = good[int(np.argmin(np.abs(self.sample_s[good] - time_s)))]
         above = self.up_m[self.up_m > 0]
-        usual_m = float(np.median(above)) if self._is_below_ground(self.up_m[row]) and len(above) else 1.0
+        usual_m = (
+            float(np.median(above)) if self._is_below_ground(self.up_m[row]) and len(above) else 1.0
+        )
         return np.array([*self.east_north_m[row], max(self.up_m[row], usual_m)])
 
     def _is_below_ground(self, up_m: float) -> bool:
@@ -198,7 +240,11 @@ class Track:
         if np.isfinite(velocity_m_s[:2]).all() and np.hypot(*velocity_m_s[:2]) > 0.5:
             course_deg = float(np.degrees(np.arctan2(velocity_m_s[0], velocity_m_s[1])))
             words += ", image top taken as the course"
-        return site_from_gimbal_rotation(course_deg, -90.0, 0.0), np.array([12.0, 12.0, np.inf]), words
+        return (
+            site_from_gimbal_rotation(course_deg, -90.0, 0.0),
+            np.array([12.0, 12.0, np.inf]),
+            words,
+        )
 
     def _stated_rotation(self, time_s: float) -> Matrix3:
         """site_from_camera between the stated samples, by the shortest turn; beyond them that of the nearest.
@@ -209,10 +255,16 @@ class Track:
         known, times = self._stated
         after = min(int(np.searchsorted(times, time_s)), len(known) - 1)
         before = max(after - 1, 0)
-        turned = site_from_gimbal_rotation if self.attitude == "gimbal" else site_from_body_nadir_rotation
+        turned = (
+            site_from_gimbal_rotation
+            if self.attitude == "gimbal"
+            else site_from_body_nadir_rotation
+        )
         last = turned(*self.angles_deg[known[after]])
         passed_s = times[after] - times[before]
-        share = float(np.clip((time_s - times[before]) / passed_s, 0.0, 1.0)) if passed_s > 0 else 1.0
+        share = (
+            float(np.clip((time_s - times[before]) / passed_s, 0.0, 1.0)) if passed_s > 0 else 1.0
+        )
         if share == 1.0:
             return last
         return rotation_between(turned(*self.angles_deg[known[before]]), last, share)
@@ -233,7 +285,11 @@ class Track:
 
 
 def track_from_telemetry(
-    telemetry: Telemetry, clock: Clock, frame: LocalFrame, *, ground_elevation_m: float | None = None,
+    telemetry: Telemetry,
+    clock: Clock,
+    frame: LocalFrame,
+    *,
+    ground_elevation_m: float | None = None,
 ) -> tuple[Track, tuple[Notice, ...]]:
     """Telemetry in the site frame. `ground_elevation_m` is the ground's height in telemetry's own height reference."""
     up_m, words, vertical_sigma_m, offset_sigma_m, notices = _heights(telemetry, ground_elevation_m)
@@ -250,9 +306,13 @@ def track_from_telemetry(
     times = clock.sample_s[known]
     interval_s = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     changes = np.any(np.diff(east_north[known], axis=0) != 0, axis=1)
-    if not clock.is_per_photo and changes.any():  # a 1 Hz fix repeated at frame rate is still a 1 Hz fix
+    if (
+        not clock.is_per_photo and changes.any()
+    ):  # a 1 Hz fix repeated at frame rate is still a 1 Hz fix
         moments = times[1:][changes]
-        interval_s = max(interval_s, float(np.median(np.diff(moments))) if len(moments) > 1 else interval_s)
+        interval_s = max(
+            interval_s, float(np.median(np.diff(moments))) if len(moments) > 1 else interval_s
+        )
         keep = np.flatnonzero(known)[1:][~changes]
         if interval_s > 1.8 * float(np.median(np.diff(times))):
             east_north[keep] = np.nan
@@ -260,8 +320,18 @@ def track_from_telemetry(
     if clock.is_per_photo:
         interval_s = 0.0
     track = Track(
-        clock.sample_s, east_north, up_m, sigma, vertical_sigma_m, offset_sigma_m, words, angles, attitude,
-        (median_or_nan(telemetry["tilt_sigma_deg"]), median_or_nan(telemetry["heading_sigma_deg"])), interval_s, gap_s,
+        clock.sample_s,
+        east_north,
+        up_m,
+        sigma,
+        vertical_sigma_m,
+        offset_sigma_m,
+        words,
+        angles,
+        attitude,
+        (median_or_nan(telemetry["tilt_sigma_deg"]), median_or_nan(telemetry["heading_sigma_deg"])),
+        interval_s,
+        gap_s,
     )
     return track, notices
 
@@ -276,7 +346,8 @@ def shifted(track: Track, offset_s: float) -> Track:
         return replace(track, sample_s=track.sample_s - offset_s)
     velocities_m_s, spread_m_s = _velocities(track)
     return replace(
-        track, east_north_m=track.east_north_m + offset_s * velocities_m_s,
+        track,
+        east_north_m=track.east_north_m + offset_s * velocities_m_s,
         horizontal_sigma_m=np.hypot(track.horizontal_sigma_m, offset_s * spread_m_s),
     )
 
@@ -288,7 +359,10 @@ def _velocities(track: Track) -> tuple[PointsM, Floats]:
     if len(known) >= 2:
         legs = np.diff(track.east_north_m[known], axis=0) / np.diff(track.sample_s[known])[:, None]
         before, after = np.vstack([legs[:1], legs]), np.vstack([legs, legs[-1:]])
-        velocities[known], spread[known] = (before + after) / 2, np.linalg.norm(after - before, axis=1) / 2
+        velocities[known], spread[known] = (
+            (before + after) / 2,
+            np.linalg.norm(after - before, axis=1) / 2,
+        )
     return velocities, spread
 
 
@@ -299,7 +373,9 @@ def site_origin(telemetry: Telemetry) -> Geodetic | None:
         return None
     middle = known[0]
     return Geodetic(
-        round(float(telemetry["latitude_deg"][middle]), 7), round(float(telemetry["longitude_deg"][middle]), 7), 0.0
+        round(float(telemetry["latitude_deg"][middle]), 7),
+        round(float(telemetry["longitude_deg"][middle]), 7),
+        0.0,
     )
 
 
@@ -326,31 +402,64 @@ def _heights(
         sigma_m = float(np.nanmedian(stated)) if np.isfinite(stated).any() else sigma_m
         filled = np.interp(np.arange(len(values)), np.flatnonzero(known), values[known])
         if ground_elevation_m is not None:
-            return filled - ground_elevation_m, f"{words}, ground given", sigma_m, 0.5, tuple(notices)
+            return (
+                filled - ground_elevation_m,
+                f"{words}, ground given",
+                sigma_m,
+                0.5,
+                tuple(notices),
+            )
         if column == "height_above_takeoff_m":
             if float(np.median(filled)) < 0.5:
                 text = f"height above take-off is {np.median(filled):.1f} m for most of the flight: not used"
                 notices.append(Notice("height_of_zero", int(known.sum()), text))
                 continue
-            return filled, f"{words}, ground taken to be at take-off level", sigma_m, 1.0, tuple(notices)
+            return (
+                filled,
+                f"{words}, ground taken to be at take-off level",
+                sigma_m,
+                1.0,
+                tuple(notices),
+            )
         first = float(np.median(filled[: max(1, min(5, len(filled)))]))
         if float(np.median(filled)) - first > 4.0 and first - float(filled.min()) < 2.0:
             words = f"{words}, ground taken to be where the telemetry begins"
             return filled - first, words, sigma_m, 2.0, tuple(notices)
-        notices.append(Notice(
-            "ground_unknown", 1,
-            f"heights are {words} and the ground's is unknown: the height above ground is found from the pictures",
-        ))
+        notices.append(
+            Notice(
+                "ground_unknown",
+                1,
+                f"heights are {words} and the ground's is unknown: the height above ground is found from the pictures",
+            )
+        )
         typical = float(np.median(filled))
-        return filled - typical + 40.0, f"{words}, ground found from the pictures", sigma_m, np.inf, tuple(notices)
-    notices.append(Notice("height_unknown", 1, "telemetry has no height: it is found from the pictures and GPS"))
-    return np.full(len(telemetry), 40.0), "none, found from the pictures", np.inf, np.inf, tuple(notices)
+        return (
+            filled - typical + 40.0,
+            f"{words}, ground found from the pictures",
+            sigma_m,
+            np.inf,
+            tuple(notices),
+        )
+    notices.append(
+        Notice(
+            "height_unknown", 1, "telemetry has no height: it is found from the pictures and GPS"
+        )
+    )
+    return (
+        np.full(len(telemetry), 40.0),
+        "none, found from the pictures",
+        np.inf,
+        np.inf,
+        tuple(notices),
+    )
 
 
 def _angles(telemetry: Telemetry) -> tuple[str, Floats]:
     """Whose angles are stated, and these: (N, 3) yaw, pitch, roll, deg; NaN where a sample states none."""
     for kind, prefix in (("gimbal", "camera"), ("body", "body")):
-        angles = np.column_stack([telemetry[f"{prefix}_{name}_deg"] for name in ("yaw", "pitch", "roll")])
+        angles = np.column_stack(
+            [telemetry[f"{prefix}_{name}_deg"] for name in ("yaw", "pitch", "roll")]
+        )
         known = np.isfinite(angles[:, :2]).all(axis=1)
         if len(telemetry) and known.mean() > 0.5:
             angles[:, 2] = np.where(np.isfinite(angles[:, 2]), angles[:, 2], 0.0)

@@ -28,10 +28,32 @@ from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
 
-VIDEO_SUFFIXES = frozenset({
-    ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".ts", ".mts", ".m2ts", ".mpg", ".mpeg", ".avi", ".wmv", ".flv",
-    ".3gp", ".h264", ".264", ".h265", ".265", ".hevc", ".lrv", ".insv", ".ogv",
-})
+VIDEO_SUFFIXES = frozenset(
+    {
+        ".mp4",
+        ".m4v",
+        ".mov",
+        ".mkv",
+        ".webm",
+        ".ts",
+        ".mts",
+        ".m2ts",
+        ".mpg",
+        ".mpeg",
+        ".avi",
+        ".wmv",
+        ".flv",
+        ".3gp",
+        ".h264",
+        ".264",
+        ".h265",
+        ".265",
+        ".hevc",
+        ".lrv",
+        ".insv",
+        ".ogv",
+    }
+)
 """How videos in a folder are recognised; a file given by name may have any name."""
 
 _FALLBACK_RATE_HZ = 25.0  # of a video that states none: PAL's
@@ -79,7 +101,12 @@ class VideoSource:
     ground_elevation_m = float("nan")
 
     def __init__(
-        self, name: str, fingerprint: str, info: VideoInfo, camera: CameraModel, telemetry: Telemetry,
+        self,
+        name: str,
+        fingerprint: str,
+        info: VideoInfo,
+        camera: CameraModel,
+        telemetry: Telemetry,
         notices: Sequence[Notice] = (),
     ) -> None:
         self.name, self.fingerprint, self.info = name, fingerprint, info
@@ -110,7 +137,9 @@ class VideoSource:
             yield from self._all_frames(wanted)
             return
         clock, sizes, damage = VideoClock(self.info.frame_rate_hz), _Sizes(), DecodingDamage()
-        timed = replace(sparse, wanted=lambda index, time_ns: sparse.wanted(index, self.start_ns + time_ns))
+        timed = replace(
+            sparse, wanted=lambda index, time_ns: sparse.wanted(index, self.start_ns + time_ns)
+        )
 
         def deliver(decoded: av.VideoFrame, index: int, time_ns: int) -> Frame | LostFrame:
             return self._delivered(decoded, index, self.start_ns + time_ns, sizes, damage)
@@ -121,7 +150,9 @@ class VideoSource:
                 self.reading = Reading("", video.decoded, max(0, video.pictures - video.decoded))
                 yield each
             self.reading = Reading("", video.decoded, max(0, video.pictures - video.decoded))
-            self._found = self._damage_notices(self._ends_before(video.last_ns), damage, sizes, clock)
+            self._found = self._damage_notices(
+                self._ends_before(video.last_ns), damage, sizes, clock
+            )
         except UnevenStreamError as reason:
             self.reading = Reading(str(reason), video.decoded)
             yield from self._all_frames(wanted, *video.passed)
@@ -147,10 +178,18 @@ class VideoSource:
         return self.info.is_cut or missing_s > max(1.0, 0.05 * self.info.duration_s)
 
     def _delivered(
-        self, decoded: av.VideoFrame, index: int, time_ns: int, sizes: "_Sizes", damage: DecodingDamage
+        self,
+        decoded: av.VideoFrame,
+        index: int,
+        time_ns: int,
+        sizes: "_Sizes",
+        damage: DecodingDamage,
     ) -> Frame | LostFrame:
         """A decoded picture as a frame; what is odd of it is counted."""
-        own_px, flight_px = _upright_size_px(decoded, self.info.turn), (self.info.width_px, self.info.height_px)
+        own_px, flight_px = (
+            _upright_size_px(decoded, self.info.turn),
+            (self.info.width_px, self.info.height_px),
+        )
         if not is_same_shape(own_px, flight_px):
             sizes.lost += 1
             return LostFrame(index, str(index), time_ns, other_size(own_px, flight_px))
@@ -174,7 +213,10 @@ class VideoSource:
         if self.info.turn[0]:
             width_px, height_px = height_px, width_px
         return upright(
-            np.asarray(decoded.to_ndarray(format="rgb24", width=width_px, height=height_px), np.uint8), self.info.turn
+            np.asarray(
+                decoded.to_ndarray(format="rgb24", width=width_px, height=height_px), np.uint8
+            ),
+            self.info.turn,
         )
 
     def sample_frames(self, count: int) -> list[Frame]:
@@ -197,7 +239,9 @@ class VideoSource:
                     continue  # a sample at a damaged place is of no use; `frames` counts the damage
                 time_s = max(0.0, decoded.time - first_s) if decoded.time is not None else 0.0
                 index = round(time_s * self.info.frame_rate_hz)
-                found.append(Frame(index, str(index), self.start_ns + round(time_s * SECOND_NS), image))
+                found.append(
+                    Frame(index, str(index), self.start_ns + round(time_s * SECOND_NS), image)
+                )
         return found
 
 
@@ -216,7 +260,9 @@ def read_video_info(path: Path) -> VideoInfo:
                 f"{path.name}: frames of {size_px[0]}x{size_px[1]} px; at most "
                 f"{PIXEL_LIMIT // 1_000_000} megapixels are read; convert the video to a smaller size"
             )
-        metadata = {key.lower(): text for key, text in {**stream.metadata, **container.metadata}.items()}
+        metadata = {
+            key.lower(): text for key, text in {**stream.metadata, **container.metadata}.items()
+        }
         rate_hz = float(stream.average_rate or stream.guessed_rate or _FALLBACK_RATE_HZ)
         if stream.duration and stream.time_base:
             duration_s = float(stream.duration * stream.time_base)
@@ -235,8 +281,18 @@ def read_video_info(path: Path) -> VideoInfo:
     pixel_aspect = float(aspect) if aspect else 1.0
     start_ns, start_origin = _start_of(metadata)
     return VideoInfo(
-        path, container_name, codec, width_px, height_px, turn, 1 / pixel_aspect if turn[0] else pixel_aspect,
-        rate_hz, count or round(duration_s * rate_hz), max(0.0, duration_s), start_ns, start_origin,
+        path,
+        container_name,
+        codec,
+        width_px,
+        height_px,
+        turn,
+        1 / pixel_aspect if turn[0] else pixel_aspect,
+        rate_hz,
+        count or round(duration_s * rate_hz),
+        max(0.0, duration_s),
+        start_ns,
+        start_origin,
         _first_of(metadata, "com.apple.quicktime.make", "make", "com.android.manufacturer"),
         _first_of(metadata, "com.apple.quicktime.model", "model", "com.android.model"),
         ends_early(path, container_name),
@@ -268,7 +324,11 @@ class _Sizes:
 
     def notices(self) -> list[Notice]:
         return [
-            *notice("size_changed", self.fitted, "frames of another size, brought to the first one's: {}"),
+            *notice(
+                "size_changed",
+                self.fitted,
+                "frames of another size, brought to the first one's: {}",
+            ),
             *notice("other_shape", self.lost, "frames of another shape, not used: {}"),
         ]
 
@@ -282,7 +342,9 @@ def _check_file(path: Path) -> None:
         raise InputError(f"{path.name} is empty (0 bytes); copy it again from the drone")
     with path.open("rb") as file:
         if is_heif(file.read(12)):
-            raise InputError(f"{path.name} is a HEIC picture, not a video; rename it to {path.stem}.heic")
+            raise InputError(
+                f"{path.name} is a HEIC picture, not a video; rename it to {path.stem}.heic"
+            )
 
 
 def _turn_of(frame: av.VideoFrame) -> tuple[bool, bool, bool]:
@@ -316,4 +378,6 @@ def _first_of(metadata: dict[str, str], *keys: str) -> str:
 
 
 def _cut_notice(is_cut: bool) -> list[Notice]:
-    return notice("truncated", int(is_cut), "the video is cut: it is shorter than its header states")
+    return notice(
+        "truncated", int(is_cut), "the video is cut: it is shorter than its header states"
+    )

@@ -63,13 +63,18 @@ class SparseVideo:
     """
 
     def __init__(
-        self, path: Path, clock: VideoClock, sparse: SparseReading,
+        self,
+        path: Path,
+        clock: VideoClock,
+        sparse: SparseReading,
         deliver: Callable[[av.VideoFrame, int, int], Frame | LostFrame],
     ) -> None:
         self._path, self._clock, self._sparse, self._deliver = path, clock, sparse, deliver
         self.decoded = self.pictures = self.last_ns = 0
         self.passed = -1, -1
-        self._key: tuple[int, Frame | LostFrame] | None = None  # the key frame that was decoded last, by its number
+        self._key: tuple[int, Frame | LostFrame] | None = (
+            None  # the key frame that was decoded last, by its number
+        )
 
     def frames(self) -> Iterator[Frame | LostFrame]:
         """The wanted frames, in order. Raises UnevenStreamError where only a full reading gives them."""
@@ -109,7 +114,11 @@ class SparseVideo:
         """A frame each step between the span's key frames, where they are not enough."""
         step_ns = round(self._sparse.step_s * 1e9)
         due_ns, until_ns = span.first.time_ns + step_ns, self._until_ns(span, step_ns)
-        if due_ns >= until_ns or not any(map(self._is_wanted, span.between)) or self._is_enough(span, stream):
+        if (
+            due_ns >= until_ns
+            or not any(map(self._is_wanted, span.between))
+            or self._is_enough(span, stream)
+        ):
             return
         for stamp, decoded in self._decoded_between(span, stream):
             if not due_ns <= stamp.time_ns < until_ns:
@@ -125,7 +134,9 @@ class SparseVideo:
             return span.next.time_ns - step_ns // 2
         return span.between[-1].time_ns + 1 if span.between else 0
 
-    def _decoded_between(self, span: Span, stream: av.VideoStream) -> Iterator[tuple[Stamp, av.VideoFrame]]:
+    def _decoded_between(
+        self, span: Span, stream: av.VideoStream
+    ) -> Iterator[tuple[Stamp, av.VideoFrame]]:
         """The pictures between the key frames, but for those that no other refers to."""
         stamps = {each.pts: each for each in span.between}
         for decoded in _decoded(stream, span.packets, skip="NONREF"):
@@ -136,10 +147,19 @@ class SparseVideo:
     def _is_enough(self, span: Span, stream: av.VideoStream) -> bool:
         if span.next is None:
             return False
-        before, after = self._key_frame(span, span.first, stream), self._key_frame(span, span.next, stream)
-        return isinstance(before, Frame) and isinstance(after, Frame) and self._sparse.is_enough(before, after)
+        before, after = (
+            self._key_frame(span, span.first, stream),
+            self._key_frame(span, span.next, stream),
+        )
+        return (
+            isinstance(before, Frame)
+            and isinstance(after, Frame)
+            and self._sparse.is_enough(before, after)
+        )
 
-    def _spans(self, container: av.container.InputContainer, stream: av.VideoStream) -> Iterator[Span]:
+    def _spans(
+        self, container: av.container.InputContainer, stream: av.VideoStream
+    ) -> Iterator[Span]:
         """From one key frame to the next that is a step later, or more."""
         first: Stamp | None = None
         between: list[Stamp] = []
@@ -149,7 +169,10 @@ class SparseVideo:
             between += [self._stamp(each) for each in _in_order(group, ahead)]
             packets += [*(group[1:] if packets else group), *ahead]
             following = self._stamp(ahead[0]) if ahead else None
-            if following is not None and following.time_ns - first.time_ns < self._sparse.step_s * 1e9:
+            if (
+                following is not None
+                and following.time_ns - first.time_ns < self._sparse.step_s * 1e9
+            ):
                 between.append(following)
                 continue
             yield Span(first, between, following, packets)
@@ -199,7 +222,9 @@ def _packets(
             if key_pts is None:
                 raise UnevenStreamError("the video does not begin with a key frame")
             if (_pts(packet) - key_pts) * unit_s > longest_s:
-                raise UnevenStreamError(f"key frames of the stream lie more than {longest_s:g} s apart")
+                raise UnevenStreamError(
+                    f"key frames of the stream lie more than {longest_s:g} s apart"
+                )
             yield packet
     except (av.FFmpegError, IndexError) as error:
         raise UnevenStreamError("the stream is damaged") from error
@@ -226,7 +251,9 @@ def _in_order(group: "Sequence[_Packet]", ahead: "Sequence[_Packet]") -> "list[_
     return shown
 
 
-def _decoded(stream: av.VideoStream, packets: "Sequence[_Packet]", skip: str = "DEFAULT") -> Iterator[av.VideoFrame]:
+def _decoded(
+    stream: av.VideoStream, packets: "Sequence[_Packet]", skip: str = "DEFAULT"
+) -> Iterator[av.VideoFrame]:
     """The pictures of these packets, the first of which is a key frame's; `skip` as FFmpeg names what is left out."""
     context = stream.codec_context
     context.flush_buffers()

@@ -54,7 +54,11 @@ class VideoClock:
             time_ns = stamp_ns - self._origin_ns
             former_ns = stamp_ns - self._former_origin_ns
             returned = abs(former_ns - expected_ns) < abs(time_ns - expected_ns)
-            if self._since_backward <= _CLOCK_RETURNS_WITHIN and former_ns > self._last_ns and returned:
+            if (
+                self._since_backward <= _CLOCK_RETURNS_WITHIN
+                and former_ns > self._last_ns
+                and returned
+            ):
                 time_ns, self._origin_ns = former_ns, self._former_origin_ns
         if (gap_ns := time_ns - self._last_ns) > max(_GAP_S * SECOND_NS, 5 * self._step_ns):
             self._gaps += 1
@@ -66,9 +70,17 @@ class VideoClock:
         """What was wrong with the time stamps so far."""
         longest_s = self._longest_gap_ns / SECOND_NS
         return [
-            *notice("missing_pts", self._missing, "frames without a time stamp, set by the usual step: {}"),
-            *notice("backward_pts", self._backward, "times that the video's clock runs backward: {}"),
-            *notice("video_gap", self._gaps, f"gaps in the video: {{}}, the longest {longest_s:.1f} s"),
+            *notice(
+                "missing_pts",
+                self._missing,
+                "frames without a time stamp, set by the usual step: {}",
+            ),
+            *notice(
+                "backward_pts", self._backward, "times that the video's clock runs backward: {}"
+            ),
+            *notice(
+                "video_gap", self._gaps, f"gaps in the video: {{}}, the longest {longest_s:.1f} s"
+            ),
         ]
 
 
@@ -85,7 +97,11 @@ class DecodingDamage:
         """What was damaged so far."""
         return [
             *notice("decode_error", self.packets, "damaged places in the video, skipped: {}"),
-            *notice("damaged_frame", self.corrupt_frames + self.unconverted, "frames damaged in part: {}"),
+            *notice(
+                "damaged_frame",
+                self.corrupt_frames + self.unconverted,
+                "frames damaged in part: {}",
+            ),
         ]
 
 
@@ -133,7 +149,9 @@ def opened_video(path: Path) -> av.container.InputContainer:
     try:
         return av.open(f"file:{path}", options={"protocol_whitelist": "file"})
     except av.FFmpegError as error:
-        raise InputError(f"{path.name} cannot be read as a video: {_why_unreadable(path, error)}") from error
+        raise InputError(
+            f"{path.name} cannot be read as a video: {_why_unreadable(path, error)}"
+        ) from error
     except (ValueError, MemoryError) as error:
         raise InputError(f"{path.name} cannot be read as a video: {error}") from error
 
@@ -159,8 +177,12 @@ def video_stream(container: av.container.InputContainer, path: Path) -> av.Video
     streams = [stream for stream in container.streams.video if not stream.disposition & cover]
     if not streams:
         kinds = ", ".join(sorted({stream.type for stream in container.streams})) or "nothing"
-        raise InputError(f"{path.name} has no video in it, only {kinds}; give the drone's video file")
+        raise InputError(
+            f"{path.name} has no video in it, only {kinds}; give the drone's video file"
+        )
     # PyAV's type does not state that an unknown codec leaves no context
     if cast(object, streams[0].codec_context) is None:
-        raise InputError(f"{path.name}: the video's codec is unknown to FFmpeg, or its header is damaged")
+        raise InputError(
+            f"{path.name}: the video's codec is unknown to FFmpeg, or its header is damaged"
+        )
     return streams[0]

@@ -12,10 +12,23 @@ from sorvolo.change.local_fit import LocalFit, fit_locally
 from sorvolo.change.map_search import MapSearch, SearchSettings
 from sorvolo.change.reference import HeldWindow, ReferenceMap, normalised, resized
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGB, Mask, Matrix3, PointsM, PointsPx, Vector3
+from sorvolo.geometry.arrays import (
+    Floats,
+    ImageGray,
+    ImageRGB,
+    Mask,
+    Matrix3,
+    PointsM,
+    PointsPx,
+    Vector3,
+)
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
+from sorvolo.geometry.homography import (
+    apply_homography,
+    pose_from_homography,
+    site_from_image_homography,
+)
 from sorvolo.geometry.pose import Pose
 from sorvolo.registration.camera_fit import PosePrior, fit_camera
 from sorvolo.registration.features import (
@@ -54,18 +67,34 @@ class AlignmentSettings:
 
     side_px: int = 640  # longest side at which frames are aligned
     least_known: float = 0.1  # share of the frame that must lie on known ground
-    most_residual_px: float = 2.2  # of the registered image: worse, and what differs is the fit, not the ground
-    doubtful_px: float = 1.5  # a fit that leaves more is checked: a predicted one by features, others by the search
-    least_spread: float = 0.6  # share of a frame's cells with points: with less a homography may swing
-    cells: tuple[int, int] = (4, 3)  # across and down
-    searched_misses: int = 8  # frames in a row that fit nowhere: of later ones every fifth is searched for
-    confirms_rest: float = 0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
-    settled_px: float = 1.2  # a fit that leaves more is followed by a local one
-    most_features: int = 60_000  # of the whole map, to look for a frame whose place is not known at all
-    links: LinkSettings = field(
-        default_factory=lambda: LinkSettings(FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150)
+    most_residual_px: float = (
+        2.2  # of the registered image: worse, and what differs is the fit, not the ground
     )
-    search: SearchSettings = field(default_factory=SearchSettings)  # for frames that no homography places
+    doubtful_px: float = (
+        1.5  # a fit that leaves more is checked: a predicted one by features, others by the search
+    )
+    least_spread: float = (
+        0.6  # share of a frame's cells with points: with less a homography may swing
+    )
+    cells: tuple[int, int] = (4, 3)  # across and down
+    searched_misses: int = (
+        8  # frames in a row that fit nowhere: of later ones every fifth is searched for
+    )
+    confirms_rest: float = (
+        0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
+    )
+    settled_px: float = 1.2  # a fit that leaves more is followed by a local one
+    most_features: int = (
+        60_000  # of the whole map, to look for a frame whose place is not known at all
+    )
+    links: LinkSettings = field(
+        default_factory=lambda: LinkSettings(
+            FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150
+        )
+    )
+    search: SearchSettings = field(
+        default_factory=SearchSettings
+    )  # for frames that no homography places
     moving: MovingSettings = MovingSettings()
 
 
@@ -187,7 +216,10 @@ class Aligner:
     """Lays the frames of one flight over a map, in order of time. Only `align` and `recall` change it."""
 
     def __init__(
-        self, reference: ReferenceMap, site_grid: SiteGrid, settings: AlignmentSettings = AlignmentSettings()
+        self,
+        reference: ReferenceMap,
+        site_grid: SiteGrid,
+        settings: AlignmentSettings = AlignmentSettings(),
     ) -> None:
         self._reference, self._site_grid, self._settings = reference, site_grid, settings
         self._fits: list[_Fit] = []
@@ -200,7 +232,12 @@ class Aligner:
         """What the last frame left."""
 
     def align(
-        self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, place: FlightPlace | None = None,
+        self,
+        image: ImageRGB,
+        camera: Camera,
+        prior: CameraPrior,
+        time_ns: int,
+        place: FlightPlace | None = None,
         caution: Caution = Caution.NEVER,
     ) -> Aligned | NotAligned:
         """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map. `place` is where its
@@ -210,9 +247,15 @@ class Aligner:
         small_camera = camera.resized(*size)
         new = self._keyframe(small_camera, normalise_contrast(gray))
         by_telemetry = self._telemetry_pose(prior)
-        telemetry_homography = None if by_telemetry is None else _homography_of(small_camera, by_telemetry)
+        telemetry_homography = (
+            None if by_telemetry is None else _homography_of(small_camera, by_telemetry)
+        )
         share = _Share(
-            lambda: 1.0 if telemetry_homography is None else self._share_known(telemetry_homography, small_camera)
+            lambda: (
+                1.0
+                if telemetry_homography is None
+                else self._share_known(telemetry_homography, small_camera)
+            )
         )
 
         def telemetry_inside() -> Matrix3 | None:
@@ -220,7 +263,9 @@ class Aligner:
 
         frame = _Frame(image, camera, gray, new, prior)
         placed: Place | NotAligned
-        is_cautious = caution is Caution.ALWAYS or (caution is Caution.AT_FIRST and not self._is_found)
+        is_cautious = caution is Caution.ALWAYS or (
+            caution is Caution.AT_FIRST and not self._is_found
+        )
         if place is not None:
             placed = _as_known(place, camera, small_camera)
         elif is_cautious:
@@ -228,22 +273,34 @@ class Aligner:
         else:
             placed = self._by_homographies(new, prior, time_ns, telemetry_inside)
             if self._is_doubtful(placed, prior) and self._may_search():
-                placed = self._by_search(frame, by_telemetry, is_inside=telemetry_inside() is not None) or placed
+                placed = (
+                    self._by_search(frame, by_telemetry, is_inside=telemetry_inside() is not None)
+                    or placed
+                )
         if isinstance(placed, NotAligned):
             is_outside = share.known < self._settings.least_known
             reason = self._beside() if is_outside else placed.reason
             self.step = AlignStep(None, self._misses, self._reference.windows)
-            return NotAligned(reason, placed.residual_px / scale, is_outside, is_cautious and not is_outside)
+            return NotAligned(
+                reason, placed.residual_px / scale, is_outside, is_cautious and not is_outside
+            )
         moved = self._settled(frame, placed)
         self._remember(time_ns, moved.place, prior, new)
         self.step = AlignStep(moved.place, self._misses, self._reference.windows)
         small_from_full = resized(size[0] / image.shape[1], size[1] / image.shape[0])
         return Aligned(
-            moved.place.site_from_image @ small_from_full, moved.place.pose.translation_m, placed.residual_px / scale,
-            placed.followed, moved.left, moved.size_m, with_flight=place is not None,
+            moved.place.site_from_image @ small_from_full,
+            moved.place.pose.translation_m,
+            placed.residual_px / scale,
+            placed.followed,
+            moved.left,
+            moved.size_m,
+            with_flight=place is not None,
         )
 
-    def recall(self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, step: AlignStep) -> None:
+    def recall(
+        self, image: ImageRGB, camera: Camera, prior: CameraPrior, time_ns: int, step: AlignStep
+    ) -> None:
         """Take a frame that an earlier process aligned as it did."""
         size, gray = self._small(image)
         new = self._keyframe(camera.resized(*size), normalise_contrast(gray))
@@ -259,10 +316,16 @@ class Aligner:
         """The size (width, height) at which a frame is aligned, and its gray there."""
         scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
         size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
-        return size, np.asarray(cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8)
+        return size, np.asarray(
+            cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8
+        )
 
     def _surely(
-        self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None]
+        self,
+        new: Keyframe,
+        prior: CameraPrior,
+        time_ns: int,
+        telemetry_inside: Callable[[], Matrix3 | None],
     ) -> Place | NotAligned:
         """The frame placed by what is cheap, beyond doubt; misses of frames that come again do not count."""
         misses = self._misses
@@ -273,20 +336,34 @@ class Aligner:
         return placed
 
     def _by_homographies(
-        self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None], *,
+        self,
+        new: Keyframe,
+        prior: CameraPrior,
+        time_ns: int,
+        telemetry_inside: Callable[[], Matrix3 | None],
+        *,
         is_cheap: bool = False,
     ) -> Place | NotAligned:
         """The frame placed by the first guess that its points confirm to a part of a pixel, or why none is."""
         nearest = NotAligned("its features are found nowhere in the map where it could be", np.nan)
-        for guess, followed in self._guesses(new, prior, time_ns, telemetry_inside, is_cheap=is_cheap):
-            found = self._fit(new, guess, self._settings.doubtful_px if followed else self._settings.most_residual_px)
+        for guess, followed in self._guesses(
+            new, prior, time_ns, telemetry_inside, is_cheap=is_cheap
+        ):
+            found = self._fit(
+                new,
+                guess,
+                self._settings.doubtful_px if followed else self._settings.most_residual_px,
+            )
             if isinstance(found, NotAligned):
                 nearest = _nearer(nearest, found)
                 continue
             pose = pose_from_homography(found[0], new.camera)
             if pose is not None:
                 return Place(found[0], pose, found[1], followed, np.inf if found[2] else 0.0)
-            nearest = _nearer(nearest, NotAligned("the fit is none that a camera above the ground could have", np.nan))
+            nearest = _nearer(
+                nearest,
+                NotAligned("the fit is none that a camera above the ground could have", np.nan),
+            )
         return nearest
 
     def _is_doubtful(self, placed: Place | NotAligned, prior: CameraPrior) -> bool:
@@ -299,7 +376,9 @@ class Aligner:
         """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
         return self._misses < self._settings.searched_misses or self._misses % 5 == 1
 
-    def _by_search(self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool) -> Place | None:
+    def _by_search(
+        self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool
+    ) -> Place | None:
         """The frame placed by learned features, telemetry and its neighbours; what these leave in doubt, or what lies
         far from where telemetry was right so far, a local fit must confirm. Without telemetry's place the search begins
         at the last frame's."""
@@ -312,7 +391,9 @@ class Aligner:
         found = self.search.find(frame.gray, frame.even.gray, frame.even.camera, frame.prior, start)
         if found is None:
             return None
-        place = Place(found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio)
+        place = Place(
+            found.fit.site_from_image, found.fit.pose, found.fit.residual_px, False, found.ratio
+        )
         if found.is_sure and not self.search.is_odd(place.pose, frame.prior):
             return place
         local = self._local(frame, place)
@@ -321,7 +402,9 @@ class Aligner:
     def _settled(self, frame: "_Frame", placed: Place) -> "_Moved":
         """The place moved as a camera by what a local fit finds where the last fit leaves much, and what is left."""
         moved = _Moved(placed, None, 0.0)
-        if placed.residual_px <= self._settings.settled_px and (placed.followed or np.isinf(placed.ratio)):
+        if placed.residual_px <= self._settings.settled_px and (
+            placed.followed or np.isinf(placed.ratio)
+        ):
             return moved
         moving = self._settings.moving
         for _ in range(moving.rounds):
@@ -330,8 +413,14 @@ class Aligner:
                 break
             fine = _fine(frame.camera, moving.side_px)
             size_m = float(local.median_px * moved.place.pose.translation_m[2] / fine.fx_px)
-            place, left = _as_camera(moved.place, local, fine, _small_from(fine, frame.even.camera), moving)
-            moved = _Moved(place, left.resized(frame.camera.width_px / fine.width_px), max(size_m, moved.size_m))
+            place, left = _as_camera(
+                moved.place, local, fine, _small_from(fine, frame.even.camera), moving
+            )
+            moved = _Moved(
+                place,
+                left.resized(frame.camera.width_px / fine.width_px),
+                max(size_m, moved.size_m),
+            )
             if size_m < moving.far_m:
                 break
         return moved
@@ -363,7 +452,12 @@ class Aligner:
         return Pose(prior.rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
 
     def _guesses(
-        self, new: Keyframe, prior: CameraPrior, time_ns: int, telemetry_inside: Callable[[], Matrix3 | None], *,
+        self,
+        new: Keyframe,
+        prior: CameraPrior,
+        time_ns: int,
+        telemetry_inside: Callable[[], Matrix3 | None],
+        *,
         is_cheap: bool,
     ) -> Iterator[tuple[Matrix3, bool]]:
         """site_from_image good to a few pixels, the cheapest first; telemetry is asked where the past is no help."""
@@ -373,14 +467,22 @@ class Aligner:
         by_telemetry = telemetry_inside()
         features = orb_features(new.gray, self._settings.links.features)
         self._misses += 1
-        for attempt in self._tries(new, features, prior, predicted, by_telemetry, is_cheap=is_cheap):
+        for attempt in self._tries(
+            new, features, prior, predicted, by_telemetry, is_cheap=is_cheap
+        ):
             found = attempt()
             if found is not None:
                 yield found, False
 
     def _tries(
-        self, new: Keyframe, features: Features, prior: CameraPrior, predicted: Matrix3 | None,
-        by_telemetry: Matrix3 | None, *, is_cheap: bool,
+        self,
+        new: Keyframe,
+        features: Features,
+        prior: CameraPrior,
+        predicted: Matrix3 | None,
+        by_telemetry: Matrix3 | None,
+        *,
+        is_cheap: bool,
     ) -> Iterator[Callable[[], Matrix3 | None]]:
         """What may find a frame by its features, the cheapest first: around each place that it could have, then
         anywhere. The dear searches come every fifth time: a video's next frame may be found by its telemetry again."""
@@ -414,7 +516,9 @@ class Aligner:
             rotation = prior.rotation @ last.telemetry_rotation.T @ rotation
         place_m = last.pose.translation_m + velocity_m_s * since_s
         try:
-            ideal = site_from_image_homography(camera, Pose(rotation, np.array([*place_m[:2], max(place_m[2], 0.5)])))
+            ideal = site_from_image_homography(
+                camera, Pose(rotation, np.array([*place_m[:2], max(place_m[2], 0.5)]))
+            )
         except GeometryError:
             return None
         return ideal @ np.linalg.inv(last.seen_from_ideal)
@@ -424,12 +528,18 @@ class Aligner:
         ideal = site_from_image_homography(new.camera, placed.pose)
         seen_from_ideal = np.linalg.inv(placed.site_from_image) @ ideal
         fit = _Fit(
-            time_ns, placed.pose, prior.rotation, seen_from_ideal / seen_from_ideal[2, 2], placed.site_from_image
+            time_ns,
+            placed.pose,
+            prior.rotation,
+            seen_from_ideal / seen_from_ideal[2, 2],
+            placed.site_from_image,
         )
         self._fits = [*self._fits[-1:], fit]
         self._misses = 0
         self._is_found |= bool(np.isinf(placed.ratio))
-        self.search.remember(new.gray, new.camera, prior, placed.pose, placed.site_from_image, placed.ratio)
+        self.search.remember(
+            new.gray, new.camera, prior, placed.pose, placed.site_from_image, placed.ratio
+        )
 
     def _on_grid(self, site_from_image: Matrix3, camera: Camera) -> Matrix3 | None:
         """grid_from_image of a guess; None when the image's centre sees no ground."""
@@ -438,7 +548,9 @@ class Aligner:
             return None
         return self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0) @ site_from_image
 
-    def _seen(self, site_from_image: Matrix3, camera: Camera, shrink: int = 1) -> tuple[ImageRGB, Mask] | None:
+    def _seen(
+        self, site_from_image: Matrix3, camera: Camera, shrink: int = 1
+    ) -> tuple[ImageRGB, Mask] | None:
         grid_from_image = self._on_grid(site_from_image, camera)
         if grid_from_image is None:
             return None
@@ -457,10 +569,18 @@ class Aligner:
         (dx, dy), response = cv2.phaseCorrelate(old, fresh, window)
         if response < 0.05 or abs(dx) > 0.4 * size[0] or abs(dy) > 0.4 * size[1]:
             return site_from_image
-        return site_from_image @ np.array([[1.0, 0.0, -step_x * dx], [0.0, 1.0, -step_y * dy], [0.0, 0.0, 1.0]])
+        return site_from_image @ np.array(
+            [[1.0, 0.0, -step_x * dx], [0.0, 1.0, -step_y * dy], [0.0, 0.0, 1.0]]
+        )
 
     def _by_features(
-        self, new: Keyframe, features: Features, site_from_image: Matrix3, prior: CameraPrior, *, is_free: bool
+        self,
+        new: Keyframe,
+        features: Features,
+        site_from_image: Matrix3,
+        prior: CameraPrior,
+        *,
+        is_free: bool,
     ) -> Matrix3 | None:
         """The guess corrected by the map's features around it; `is_free`: turned and shifted by them."""
         grid_from_image = self._on_grid(site_from_image, new.camera)
@@ -468,11 +588,19 @@ class Aligner:
             return None
         sigma_m = float(np.nan_to_num(prior.position_sigma_m[:2].max(), posinf=10.0))
         metres_per_px = abs(np.linalg.det(site_from_image[:2, :2] / site_from_image[2, 2])) ** 0.5
-        search_px = min(0.25 * max(new.gray.shape) + 3 * sigma_m / max(metres_per_px, 1e-6), 1.5 * max(new.gray.shape))
-        old = self._reference.features_under(
-            grid_from_image, new.camera.width_px, new.camera.height_px, search_px / max(new.gray.shape)
+        search_px = min(
+            0.25 * max(new.gray.shape) + 3 * sigma_m / max(metres_per_px, 1e-6),
+            1.5 * max(new.gray.shape),
         )
-        return self._matched(features, old, grid_from_image, 0.0 if is_free else search_px, site_from_image)
+        old = self._reference.features_under(
+            grid_from_image,
+            new.camera.width_px,
+            new.camera.height_px,
+            search_px / max(new.gray.shape),
+        )
+        return self._matched(
+            features, old, grid_from_image, 0.0 if is_free else search_px, site_from_image
+        )
 
     def _by_sift(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3 | None:
         """The guess corrected by SIFT on the view that it foresees: slow, for ground that ORB is lost on."""
@@ -482,7 +610,9 @@ class Aligner:
         settings = self._settings.links.features
         old, found = sift_features(normalised(*seen), settings), sift_features(new.gray, settings)
         pairs = match(found, old, None, 0.0)
-        return self._corrected(found.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], site_from_image)
+        return self._corrected(
+            found.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], site_from_image
+        )
 
     def _anywhere(self, features: Features) -> Matrix3 | None:
         """A frame of unknown place, looked for in the whole map at the frame's own scale and those beside it."""
@@ -492,9 +622,13 @@ class Aligner:
                 continue
             centre_px = old.points_px.mean(axis=0)
             scale = float(1 << level)
-            grid_from_image = np.array([[scale, 0.0, centre_px[0]], [0.0, scale, centre_px[1]], [0.0, 0.0, 1.0]])
+            grid_from_image = np.array(
+                [[scale, 0.0, centre_px[0]], [0.0, scale, centre_px[1]], [0.0, 0.0, 1.0]]
+            )
             site_from_grid = self._site_from_grid(centre_px)
-            found = self._matched(features, old, grid_from_image, 0.0, site_from_grid @ grid_from_image)
+            found = self._matched(
+                features, old, grid_from_image, 0.0, site_from_grid @ grid_from_image
+            )
             if found is not None:
                 return found
         return None
@@ -505,7 +639,12 @@ class Aligner:
         return np.asarray(np.linalg.inv(self._site_grid.grid_from_site_affine(near_m, 50.0)))
 
     def _matched(
-        self, features: Features, old: Features, grid_from_image: Matrix3, search_px: float, site_from_image: Matrix3
+        self,
+        features: Features,
+        old: Features,
+        grid_from_image: Matrix3,
+        search_px: float,
+        site_from_image: Matrix3,
     ) -> Matrix3 | None:
         """The guess corrected by matched features; `search_px` 0: wherever they lie."""
         image_from_grid: Matrix3 = np.linalg.inv(grid_from_image).astype(np.float64)
@@ -514,7 +653,9 @@ class Aligner:
         ahead = np.isfinite(guessed).all(axis=1)
         return self._corrected(features.points_px[pairs[ahead, 0]], guessed[ahead], site_from_image)
 
-    def _corrected(self, new_px: PointsPx, guessed_px: PointsPx, site_from_image: Matrix3) -> Matrix3 | None:
+    def _corrected(
+        self, new_px: PointsPx, guessed_px: PointsPx, site_from_image: Matrix3
+    ) -> Matrix3 | None:
         """The guess corrected by points where they are and where it put them; None where no plane fits them."""
         if len(new_px) < self._settings.links.min_inliers // 2:
             return None
@@ -531,7 +672,9 @@ class Aligner:
         seen = self._seen(site_from_image, camera)
         return 0.0 if seen is None else float(seen[1].mean())
 
-    def _fit(self, new: Keyframe, guess: Matrix3, most_residual_px: float) -> tuple[Matrix3, float, bool] | NotAligned:
+    def _fit(
+        self, new: Keyframe, guess: Matrix3, most_residual_px: float
+    ) -> tuple[Matrix3, float, bool] | NotAligned:
         """site_from_image to a part of a pixel, its residual, and whether points all over the frame hold it; or why
         not."""
         seen = self._seen(guess, new.camera)
@@ -591,7 +734,9 @@ def _spread_of(points_px: PointsPx, known: Mask, across_down: tuple[int, int]) -
     return float((held & on_map).sum() / max(1, on_map.sum()))
 
 
-def _stiffened(site_from_image: Matrix3, link: Link, site_from_old: Matrix3, camera: Camera) -> Matrix3:
+def _stiffened(
+    site_from_image: Matrix3, link: Link, site_from_old: Matrix3, camera: Camera
+) -> Matrix3:
     """The fit as a camera over level ground sees it, six degrees of freedom, where that explains the pairs as well.
 
     A free homography has two more, and swings at the corners where pairs lie in one part of the image only.
@@ -634,7 +779,11 @@ def _small_from(fine: Camera, small: Camera) -> Matrix3:
 
 
 def _as_camera(
-    placed: Place, local: LocalFit, camera: Camera, small_from_image: Matrix3, settings: MovingSettings
+    placed: Place,
+    local: LocalFit,
+    camera: Camera,
+    small_from_image: Matrix3,
+    settings: MovingSettings,
 ) -> tuple[Place, LocalFit]:
     """The place moved as a local fit in this camera's pixels has it, as far as a camera over level ground can; and what
     is left of the fit. `small_from_image` leads to the place's own pixels."""
@@ -643,7 +792,9 @@ def _as_camera(
     ground_m = apply_homography(placed.site_from_image @ small_from_image, old_px)
     known = local.is_known.ravel()
     prior = PosePrior(
-        placed.pose, np.full(3, settings.place_sigma_m), np.radians(np.full(3, settings.turn_sigma_deg))
+        placed.pose,
+        np.full(3, settings.place_sigma_m),
+        np.radians(np.full(3, settings.turn_sigma_deg)),
     )
     found = fit_camera(new_px[known], ground_m[known], camera, prior, start_px=6.0, band_px=3.0)
     if found is None:

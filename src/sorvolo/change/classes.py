@@ -18,10 +18,14 @@ class ClassSettings:
     """When an object, a sighting or a detection names what a change is."""
 
     beside_m: float = 0.4  # an object's place may lie so far outside of the outline, beside a part of its own length
-    longest_s: float = 5.0  # before or after the time at which a moving change was where its outline is
+    longest_s: float = (
+        5.0  # before or after the time at which a moving change was where its outline is
+    )
     turn: float = 0.4  # of the way it goes meanwhile: people turn
     least_side_px: int = 160  # of a picture that a detector is shown
-    least_share: float = 0.5  # of the box or of the change, whichever is smaller, that both have in common
+    least_share: float = (
+        0.5  # of the box or of the change, whichever is smaller, that both have in common
+    )
     like_lengths: float = 1.6  # times the other's, at most
     lenient: float = 0.4  # times each class's score: that something is there is known already
 
@@ -30,10 +34,16 @@ def stands_in(change: Change, thing: MapObject, settings: ClassSettings = ClassS
     """Whether an object that does not move stands in a change's outline and is about as long."""
     if thing.moving or _outside_m(change.outline_m, thing.position_m) > 0:
         return False
-    return change.length_m / settings.like_lengths <= thing.length_m <= change.length_m * settings.like_lengths
+    return (
+        change.length_m / settings.like_lengths
+        <= thing.length_m
+        <= change.length_m * settings.like_lengths
+    )
 
 
-def object_at(change: Change, objects: Sequence[MapObject], settings: ClassSettings = ClassSettings()) -> str:
+def object_at(
+    change: Change, objects: Sequence[MapObject], settings: ClassSettings = ClassSettings()
+) -> str:
     """The class of the object that stands in a change's outline, or nearly, and is nearest to it in place and size.
 
     "" where there is none; what moves is left out.
@@ -49,13 +59,17 @@ def object_at(change: Change, objects: Sequence[MapObject], settings: ClassSetti
         if outside_m > reach_m:
             continue
         ratio = float(np.log(max(length_m, 0.1) / max(change.length_m, 0.1)))
-        cost = float(np.hypot(*(each.position_m - centre_m))) / max(change.length_m, 0.5) + abs(ratio)
+        cost = float(np.hypot(*(each.position_m - centre_m))) / max(change.length_m, 0.5) + abs(
+            ratio
+        )
         if cost < best_cost:
             best, best_cost = each.label, cost
     return best
 
 
-def seen_at(change: Change, sightings: Sequence[Sighting], settings: ClassSettings = ClassSettings()) -> str:
+def seen_at(
+    change: Change, sightings: Sequence[Sighting], settings: ClassSettings = ClassSettings()
+) -> str:
     """The class of a flight's sightings in a change's outline, by their summed scores; "" where there is none.
 
     What moves is looked for where it was at each sighting's time.
@@ -67,7 +81,9 @@ def seen_at(change: Change, sightings: Sequence[Sighting], settings: ClassSettin
         if change.kind is ChangeKind.MOVING and abs(after_s) > settings.longest_s:
             continue
         meanwhile_m: Floats = change.velocity_m_s * after_s if speed_m_s else np.zeros(2)
-        reach_m = settings.beside_m + each.size_m[0] / 4 + settings.turn * float(np.hypot(*meanwhile_m))
+        reach_m = (
+            settings.beside_m + each.size_m[0] / 4 + settings.turn * float(np.hypot(*meanwhile_m))
+        )
         outside_m = _outside_m(change.outline_m, each.position_m - meanwhile_m)
         if outside_m <= reach_m:
             sums[each.label] += each.score / (1.0 + max(outside_m, 0.0))
@@ -79,7 +95,9 @@ def can_show(patch: Patch, rgba: ImageRGBA) -> bool:
     return bool(patch.changed.any()) and bool((rgba[..., 3] > 0).any())
 
 
-def enlarged(rgba: ImageRGBA, settings: ClassSettings = ClassSettings()) -> tuple[ImageRGB, tuple[int, int]]:
+def enlarged(
+    rgba: ImageRGBA, settings: ClassSettings = ClassSettings()
+) -> tuple[ImageRGB, tuple[int, int]]:
     """The picture without alpha, wide enough for a detector; how far it begins to the right of and below its corner.
 
     What is unknown gets the mean colour of what is known, what lies around is mirrored.
@@ -94,7 +112,10 @@ def enlarged(rgba: ImageRGBA, settings: ClassSettings = ClassSettings()) -> tupl
 
 
 def class_of_change(
-    patch: Patch, seen: Detections, thresholds: Mapping[str, float], offset_px: tuple[int, int],
+    patch: Patch,
+    seen: Detections,
+    thresholds: Mapping[str, float],
+    offset_px: tuple[int, int],
     settings: ClassSettings = ClassSettings(),
 ) -> str:
     """The class of the surest detection that covers the patch's change, in a picture that begins `offset_px` right of

@@ -52,7 +52,10 @@ class EarlierPictures:
     """
 
     def __init__(
-        self, pictures: Sequence[EarlierPicture], load: Callable[[int], ImageRGBA], relief: Relief | None = None
+        self,
+        pictures: Sequence[EarlierPicture],
+        load: Callable[[int], ImageRGBA],
+        relief: Relief | None = None,
     ) -> None:
         self._pictures, self._load, self._relief = pictures, load, relief
         places = []
@@ -72,7 +75,12 @@ class EarlierPictures:
                 continue
             picture, site_from_picture = found
             seen = self._rendered(
-                picture, site_from_picture, self._cameras_m[index], site_from_image, camera_m, (width_px, height_px)
+                picture,
+                site_from_picture,
+                self._cameras_m[index],
+                site_from_image,
+                camera_m,
+                (width_px, height_px),
             )
             bgr = np.asarray(cv2.cvtColor(seen, cv2.COLOR_RGBA2BGR), np.uint8)
             yield bgr, np.asarray(cv2.extractChannel(seen, 3) == 255)
@@ -97,9 +105,13 @@ class EarlierPictures:
 
     def time_ns(self, outline_m: PointsM) -> int | None:
         """When the newest picture that shows an outline, (N, 2), was taken, UTC; None where none shows it."""
-        return max((each.time_ns for each in self._pictures if _shows(each, outline_m)), default=None)
+        return max(
+            (each.time_ns for each in self._pictures if _shows(each, outline_m)), default=None
+        )
 
-    def laid(self, vantage: Vantage, window: PatchWindow, settings: LevelSettings) -> list[LaidPicture]:
+    def laid(
+        self, vantage: Vantage, window: PatchWindow, settings: LevelSettings
+    ) -> list[LaidPicture]:
         """A few of the pictures that show a place, taken apart from each other, laid on a window of level ground."""
         found: list[LaidPicture] = []
         for index in apart(self._cameras_m, vantage.shows, settings):
@@ -107,10 +119,18 @@ class EarlierPictures:
             if picture is not None:
                 rgba, site_from_picture = picture
                 patch_from_picture = np.linalg.inv(window.site_from_patch) @ site_from_picture
-                seen = np.asarray(cv2.warpPerspective(rgba, patch_from_picture, window.size_px), np.uint8)
-                found.append(LaidPicture.of(
-                    seen[..., :3], seen[..., 3] == 255, window, self._cameras_m[index], self._pictures[index].time_ns
-                ))
+                seen = np.asarray(
+                    cv2.warpPerspective(rgba, patch_from_picture, window.size_px), np.uint8
+                )
+                found.append(
+                    LaidPicture.of(
+                        seen[..., :3],
+                        seen[..., 3] == 255,
+                        window,
+                        self._cameras_m[index],
+                        self._pictures[index].time_ns,
+                    )
+                )
         return found
 
     def _as_coarse(self, index: int, site_from_other: Matrix3) -> tuple[ImageRGBA, Matrix3] | None:
@@ -130,17 +150,29 @@ class EarlierPictures:
         return picture, site_from_picture
 
     def _rendered(
-        self, picture: ImageRGBA, site_from_picture: Matrix3, earlier_m: Vector3, site_from_image: Matrix3,
-        camera_m: Vector3, size: tuple[int, int],
+        self,
+        picture: ImageRGBA,
+        site_from_picture: Matrix3,
+        earlier_m: Vector3,
+        site_from_image: Matrix3,
+        camera_m: Vector3,
+        size: tuple[int, int],
     ) -> ImageRGBA:
         """A picture in an image's pixels, (h, w, 4): over what stands on the ground where that is known."""
         picture_from_site: Matrix3 = np.asarray(np.linalg.inv(site_from_picture), np.float64)
-        found = None if self._relief is None else self._relief.find_in_earlier(
-            site_from_image, camera_m, picture_from_site, earlier_m, size
+        found = (
+            None
+            if self._relief is None
+            else self._relief.find_in_earlier(
+                site_from_image, camera_m, picture_from_site, earlier_m, size
+            )
         )
         if found is None:
             image_from_picture = np.linalg.inv(site_from_image) @ site_from_picture
-            return np.asarray(cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR), np.uint8)
+            return np.asarray(
+                cv2.warpPerspective(picture, image_from_picture, size, flags=cv2.INTER_LINEAR),
+                np.uint8,
+            )
         x, y, sees = found
         seen = np.asarray(cv2.remap(picture, x, y, cv2.INTER_LINEAR), np.uint8)
         seen[~sees] = 0
@@ -171,7 +203,9 @@ def _shows(picture: EarlierPicture, outline_m: PointsM) -> bool:
     inner_m = middle_m + _INNER * (outline_m - middle_m)
     x, y = apply_homography(np.linalg.inv(picture.site_from_image), inner_m).T
     with np.errstate(invalid="ignore"):
-        inside = (x >= 0) & (x < picture.camera.width_px) & (y >= 0) & (y < picture.camera.height_px)
+        inside = (
+            (x >= 0) & (x < picture.camera.width_px) & (y >= 0) & (y < picture.camera.height_px)
+        )
     return bool(inside.all())
 
 

@@ -26,18 +26,30 @@ class FlightOnMapSettings:
     margin: float = 0.1  # of a photo's size: map searched beyond each side
     reach_px: float = 73.0  # pairs of points lie so far apart at most (10 m from 100 m up) ...
     shift_px: float = 58.0  # ... and all photos in common: what GPS errs by on both dates
-    most_scale: float = 0.1  # by which the flight, laid by its GPS, is larger or smaller than the map
-    most_turn_deg: float = 10.0  # by which it is turned; both, as far as that moves its rim by the most shift
-    least_rim_px: float = 146.0  # of its ground, from the middle: less fits too many places within what GPS errs
+    most_scale: float = (
+        0.1  # by which the flight, laid by its GPS, is larger or smaller than the map
+    )
+    most_turn_deg: float = (
+        10.0  # by which it is turned; both, as far as that moves its rim by the most shift
+    )
+    least_rim_px: float = (
+        146.0  # of its ground, from the middle: less fits too many places within what GPS errs
+    )
     step_px: float = 3.5  # at its rim, between scales and turns that are tried
     least_likeness: float = 0.7  # of a pair's descriptors: likeness beyond that is its vote
     ground_px: float = 28.0  # side of the squares of ground that vote once for a shift
     cell_px: float = 1.2  # of the raster of shifts on which pairs vote
-    spread_px: float = 2.5  # one sigma of what right pairs scatter: another light, and maps are distorted
-    least_ratio: float = 7.0  # of the votes of one place over the mean one's: other ground leaves up to 7.2, ...
+    spread_px: float = (
+        2.5  # one sigma of what right pairs scatter: another light, and maps are distorted
+    )
+    least_ratio: float = (
+        7.0  # of the votes of one place over the mean one's: other ground leaves up to 7.2, ...
+    )
     least_agree: int = 100  # ... of 40 pairs within the band: few in all stand out by chance
     own_share: float = 0.25  # of a photo's pairs on another place, and twice those on the flight's: it lies elsewhere
-    least_spread: float = 1.4  # times the squares that chance would leave; other ground has about one
+    least_spread: float = (
+        1.4  # times the squares that chance would leave; other ground has about one
+    )
     rounds: int = 10  # of the least squares that follow, over the pairs within ...
     band_px: float = 7.0  # ... this, about three sigmas
 
@@ -78,7 +90,9 @@ class _Pairs:
     @classmethod
     def joined(cls, parts: Sequence["_Pairs"]) -> "_Pairs":
         """Those of several photos."""
-        return cls(*(np.concatenate([getattr(each, name) for each in parts]) for name in vars(parts[0])))
+        return cls(
+            *(np.concatenate([getattr(each, name) for each in parts]) for name in vars(parts[0]))
+        )
 
     def of(self, rows: Rows) -> "_Pairs":
         """Some of them."""
@@ -97,7 +111,10 @@ class _Raster:
     @classmethod
     def of(cls, px_m: float, settings: FlightOnMapSettings) -> "_Raster":
         """That of pairs as far apart as they may be."""
-        side, cell_m = 2 * int(np.ceil(settings.reach_px / settings.cell_px)), settings.cell_px * px_m
+        side, cell_m = (
+            2 * int(np.ceil(settings.reach_px / settings.cell_px)),
+            settings.cell_px * px_m,
+        )
         middles_m: Floats = (np.arange(side, dtype=np.float64) - side // 2 + 0.5) * cell_m
         is_sought = np.hypot(*np.meshgrid(middles_m, middles_m)) < settings.shift_px * px_m
         return cls(cell_m, settings.spread_px / settings.cell_px, middles_m, is_sought)
@@ -108,17 +125,27 @@ class _Raster:
         side = len(self.middles_m)
         cells = np.floor(apart_m / self.cell_m).astype(np.int64) + side // 2
         inside = ((cells >= 0) & (cells < side)).all(axis=1)
-        of_cell = np.bincount(cells[inside, 0] * side + cells[inside, 1], votes[inside], side * side)
-        smooth = cv2.GaussianBlur(of_cell.reshape(side, side), (0, 0), self.blur, borderType=cv2.BORDER_CONSTANT)
-        east, north = np.unravel_index(int(np.argmax(np.where(self.is_sought, smooth, -1.0))), smooth.shape)
+        of_cell = np.bincount(
+            cells[inside, 0] * side + cells[inside, 1], votes[inside], side * side
+        )
+        smooth = cv2.GaussianBlur(
+            of_cell.reshape(side, side), (0, 0), self.blur, borderType=cv2.BORDER_CONSTANT
+        )
+        east, north = np.unravel_index(
+            int(np.argmax(np.where(self.is_sought, smooth, -1.0))), smooth.shape
+        )
         mean = max(float(smooth[self.is_sought].mean()), 1e-9)
-        return np.array([self.middles_m[east], self.middles_m[north]]), float(smooth[east, north]) / mean
+        return np.array([self.middles_m[east], self.middles_m[north]]), float(
+            smooth[east, north]
+        ) / mean
 
 
 class FlightOnMap:
     """Looks for the photos of one flight on the map that `search` knows."""
 
-    def __init__(self, search: MapSearch, settings: FlightOnMapSettings = FlightOnMapSettings()) -> None:
+    def __init__(
+        self, search: MapSearch, settings: FlightOnMapSettings = FlightOnMapSettings()
+    ) -> None:
         self._search, self._settings = search, settings
 
     def features(self, image: ImageRGB, camera: Camera) -> PhotoFeatures:
@@ -128,7 +155,9 @@ class FlightOnMap:
         gray: ImageGray = cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         return PhotoFeatures(camera.resized(*size), learned_features(gray, self._settings.points))
 
-    def find(self, photos: Mapping[int, PhotoFeatures], poses: Mapping[int, Pose]) -> FlightFit | None:
+    def find(
+        self, photos: Mapping[int, PhotoFeatures], poses: Mapping[int, Pose]
+    ) -> FlightFit | None:
         """Where the flight lies on the map, by photos of it and where their cameras are beside each other (by index);
         None where no place has many more votes than chance leaves."""
         settings = self._settings
@@ -136,7 +165,14 @@ class FlightOnMap:
         seen = [each for each in parts if each is not None]
         if not seen:
             return None
-        px_m = float(np.median([poses[index].translation_m[2] / each.camera.fx_px for index, each in photos.items()]))
+        px_m = float(
+            np.median(
+                [
+                    poses[index].translation_m[2] / each.camera.fx_px
+                    for index, each in photos.items()
+                ]
+            )
+        )
         pairs = _once(_Pairs.joined(seen), px_m, settings)
         if _rim_m(pairs) < settings.least_rim_px * px_m:
             return None
@@ -160,7 +196,8 @@ class FlightOnMap:
         votes = likeness - settings.least_likeness
         kept = pairs[votes > 0]
         return _Pairs(
-            np.full(len(kept), index), apply_homography(site_from_image, new.points_px[kept[:, 0]]),
+            np.full(len(kept), index),
+            apply_homography(site_from_image, new.points_px[kept[:, 0]]),
             apply_homography(site_from_image, old.points_px[kept[:, 1]]),
             votes[votes > 0],
         )
@@ -196,7 +233,9 @@ def _most_votes(pairs: _Pairs, px_m: float, settings: FlightOnMapSettings) -> tu
     for scale in scales:
         for turn in turns:
             linear = np.array([[1 + scale, -turn], [turn, 1 + scale]])
-            shift_m, own_ratio = raster.most_voted(pairs.map_m - middle_m - arms_m @ linear.T, pairs.votes)
+            shift_m, own_ratio = raster.most_voted(
+                pairs.map_m - middle_m - arms_m @ linear.T, pairs.votes
+            )
             if own_ratio > ratio:
                 ratio, best = own_ratio, np.eye(3)
                 best[:2, :2], best[:2, 2] = linear, middle_m + shift_m - linear @ middle_m
@@ -221,7 +260,11 @@ def _refined(
             break
         found = fit_similarity(pairs.map_m[agree], pairs.flight_m[agree])
     return FlightFit(
-        found, ratio, int(agree.sum()), _spread(pairs, agree, px_m, settings), _photos_miss_m(pairs, found, agree),
+        found,
+        ratio,
+        int(agree.sum()),
+        _spread(pairs, agree, px_m, settings),
+        _photos_miss_m(pairs, found, agree),
         _elsewhere(pairs, found, px_m, settings),
     )
 
@@ -232,7 +275,9 @@ def _elsewhere(
     """The photos of which many pairs agree on another place than the flight's."""
     apart_m = apply_homography(map_from_flight, pairs.flight_m) - pairs.map_m
     beside = int(np.ceil(settings.reach_px / (2 * settings.band_px)))
-    edges_m = np.arange(-beside - 0.5, beside + 1) * 2 * settings.band_px * px_m  # the flight's place is in the middle
+    edges_m = (
+        np.arange(-beside - 0.5, beside + 1) * 2 * settings.band_px * px_m
+    )  # the flight's place is in the middle
     result = set()
     for photo in np.unique(pairs.photo):
         own_m = apart_m[pairs.photo == photo]

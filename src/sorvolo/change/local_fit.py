@@ -18,13 +18,19 @@ class LocalFitSettings:
     most_m: float = 1.5  # relief and errors of maps move ground by so much
     most_px: int = 6  # no displacement is searched beyond
     cell_px: int = 15  # agreement is gathered in cells of this side
-    window_cells: float = 3.0  # sigma of the window that looks for its displacement: things are much smaller
+    window_cells: float = (
+        3.0  # sigma of the window that looks for its displacement: things are much smaller
+    )
     smooth_cells: float = 2.5  # sigma over which displacements are made smooth
     band_px: float = 0.7  # windows that differ more from those around them have little weight
-    flat_levels2: float = 1.0  # grey levels squared: gradients of the sensor's noise get no full voice
+    flat_levels2: float = (
+        1.0  # grey levels squared: gradients of the sensor's noise get no full voice
+    )
     even_px: int = 31  # window in which gradients are made even
     hardly: float = 1e-3  # of the largest weight: pulls to no displacement where nothing is known
-    most_rest: float = 0.65  # of what cells held back moved by, squared, is left; 0.8 to 1.4 over other ground
+    most_rest: float = (
+        0.65  # of what cells held back moved by, squared, is left; 0.8 to 1.4 over other ground
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +49,11 @@ class LocalFit:
     @property
     def median_px(self) -> float:
         """Its size where there is ground."""
-        return float(np.median(np.linalg.norm(self.moved_px[self.is_known], axis=1))) if self.is_known.any() else 0.0
+        return (
+            float(np.median(np.linalg.norm(self.moved_px[self.is_known], axis=1)))
+            if self.is_known.any()
+            else 0.0
+        )
 
     def places_px(self, width_px: int, height_px: int) -> PointsPx:
         """(rows x columns, 2) where in pictures of this size the displacements are."""
@@ -57,7 +67,9 @@ class LocalFit:
         They may be larger or smaller than the pictures that were fitted were: `resized` comes first.
         """
         height, width = valid.shape
-        moved = cv2.resize(self.moved_px.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+        moved = cv2.resize(
+            self.moved_px.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR
+        )
         x = moved[..., 0] + np.arange(width, dtype=np.float32)
         y = moved[..., 1] + np.arange(height, dtype=np.float32)[:, None]
         image = cv2.remap(query, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -70,7 +82,10 @@ class LocalFit:
 
 
 def fit_locally(
-    reference: ImageGray, query: ImageGray, known: Mask, m_per_px: float,
+    reference: ImageGray,
+    query: ImageGray,
+    known: Mask,
+    m_per_px: float,
     settings: LocalFitSettings = LocalFitSettings(),
 ) -> LocalFit | None:
     """The displacement between two aligned pictures (H, W) of one size, None where it is not confirmed.
@@ -89,7 +104,9 @@ def fit_locally(
     if min(cells) < 4 or min(size) < 4 * reach:
         return None
     share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-    seen = cv2.erode((share > 0.99).astype(np.float32), np.ones((5, 5), np.uint8))  # no gradients of the map's rim
+    seen = cv2.erode(
+        (share > 0.99).astype(np.float32), np.ones((5, 5), np.uint8)
+    )  # no gradients of the map's rim
     on_map = np.asarray(cv2.resize(seen, cells, interpolation=cv2.INTER_AREA), np.float32)
     still, moving = (_even_gradients(image, size, settings) for image in (reference, query))
     agreement = _agreement((still[0] * seen, still[1] * seen), moving, reach, cells)
@@ -101,7 +118,9 @@ def fit_locally(
     return LocalFit(_bounded(moved, most_px) / scale, on_map > 0.5, rest)
 
 
-def _even_gradients(image: ImageGray, size: tuple[int, int], settings: LocalFitSettings) -> tuple[MatLike, MatLike]:
+def _even_gradients(
+    image: ImageGray, size: tuple[int, int], settings: LocalFitSettings
+) -> tuple[MatLike, MatLike]:
     """Gradients in x and y, (h, w) each, of a small copy, of like strength everywhere: light falls out of them."""
     gray = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     across, down = (cv2.Scharr(gray, cv2.CV_32F, 1 - axis, axis, scale=1 / 16) for axis in (0, 1))
@@ -112,18 +131,23 @@ def _even_gradients(image: ImageGray, size: tuple[int, int], settings: LocalFitS
 
 
 def _agreement(
-    still: tuple[MatLike, MatLike], moving: tuple[MatLike, MatLike], reach: int, cells: tuple[int, int]
+    still: tuple[MatLike, MatLike],
+    moving: tuple[MatLike, MatLike],
+    reach: int,
+    cells: tuple[int, int],
 ) -> Floats32:
     """((2 reach + 1)^2, rows, columns): how well gradients agree, by displacement (y first) and cell."""
     height, width = still[0].shape
-    padded = [cv2.copyMakeBorder(each, reach, reach, reach, reach, cv2.BORDER_CONSTANT) for each in moving]
+    padded = [
+        cv2.copyMakeBorder(each, reach, reach, reach, reach, cv2.BORDER_CONSTANT) for each in moving
+    ]
     side = 2 * reach + 1
     result = np.empty((side * side, cells[1], cells[0]), np.float32)
     across, down = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     for index in range(side * side):
         y, x = divmod(index, side)
-        cv2.multiply(still[0], padded[0][y:y + height, x:x + width], dst=across)
-        cv2.multiply(still[1], padded[1][y:y + height, x:x + width], dst=down)
+        cv2.multiply(still[0], padded[0][y : y + height, x : x + width], dst=across)
+        cv2.multiply(still[1], padded[1][y : y + height, x : x + width], dst=down)
         cv2.add(across, down, dst=across)
         result[index] = cv2.resize(across, cells, interpolation=cv2.INTER_AREA)
     return result
@@ -140,7 +164,9 @@ def _rest(
     _, moved, sure = _field(agreement, halves[1], reach, settings)
     if not sure.any():
         return 1.0
-    before, after = (float(_capped(each, settings.band_px) @ sure.ravel()) for each in (moved, moved - field))
+    before, after = (
+        float(_capped(each, settings.band_px) @ sure.ravel()) for each in (moved, moved - field)
+    )
     return after / max(before, 1e-9)
 
 
@@ -162,13 +188,24 @@ def _field(
     best = gathered.argmax(axis=0)
     y, x = np.divmod(best, side)
     top, spread = gathered.max(axis=0), gathered.std(axis=0) + 1e-6
-    moved: Floats = np.stack([_peak(gathered, best, x, side, 1), _peak(gathered, best, y, side, side)], axis=2) - reach
+    moved: Floats = (
+        np.stack([_peak(gathered, best, x, side, 1), _peak(gathered, best, y, side, side)], axis=2)
+        - reach
+    )
     is_inside = (x > 0) & (y > 0) & (x < side - 1) & (y < side - 1)
-    sure: Floats = np.maximum(0, (top - gathered.mean(axis=0)) / spread - 2) * np.maximum(0, top) * is_inside
+    sure: Floats = (
+        np.maximum(0, (top - gathered.mean(axis=0)) / spread - 2) * np.maximum(0, top) * is_inside
+    )
     weight, field = sure, moved
     for _ in range(5):
-        total = _smooth(weight[None], settings.smooth_cells)[0] + settings.hardly * sure.max() + 1e-12
-        field = np.moveaxis(_smooth(np.moveaxis(moved * weight[..., None], 2, 0), settings.smooth_cells) / total, 0, 2)
+        total = (
+            _smooth(weight[None], settings.smooth_cells)[0] + settings.hardly * sure.max() + 1e-12
+        )
+        field = np.moveaxis(
+            _smooth(np.moveaxis(moved * weight[..., None], 2, 0), settings.smooth_cells) / total,
+            0,
+            2,
+        )
         apart = np.linalg.norm(moved - field, axis=2)
         weight = sure / (1 + (apart / settings.band_px) ** 2) ** 2
     return field, moved, sure
@@ -176,6 +213,7 @@ def _field(
 
 def _peak(planes: Floats32, best: Rows, along: Rows, side: int, step: int) -> Floats:
     """(rows, columns) the place of the highest plane along one axis, to a part of a step by a parabola."""
+
     def value(offset: int) -> Floats32:
         index = np.clip(best + offset, 0, len(planes) - 1)
         return np.take_along_axis(planes, index[None], axis=0)[0]
@@ -183,13 +221,17 @@ def _peak(planes: Floats32, best: Rows, along: Rows, side: int, step: int) -> Fl
     before, here, after = value(-step), value(0), value(step)
     bend = before - 2 * here + after
     part = np.where(bend < 0, 0.5 * (before - after) / np.minimum(bend, -1e-9), 0.0)
-    return along.astype(np.float64) + np.where((along > 0) & (along < side - 1), np.clip(part, -0.5, 0.5), 0.0)
+    return along.astype(np.float64) + np.where(
+        (along > 0) & (along < side - 1), np.clip(part, -0.5, 0.5), 0.0
+    )
 
 
 def _smooth(planes: Floats | Floats32, sigma_cells: float) -> Floats32:
     """(N, rows, columns) each plane smoothed; the rim counts what is there."""
     _, rows, columns = planes.shape
-    smoothed: Floats32 = _blur(rows, sigma_cells) @ planes.astype(np.float32) @ _blur(columns, sigma_cells).T
+    smoothed: Floats32 = (
+        _blur(rows, sigma_cells) @ planes.astype(np.float32) @ _blur(columns, sigma_cells).T
+    )
     return smoothed
 
 

@@ -11,11 +11,21 @@ from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import ImageGray, Matrix3, PointsM, PointsPx, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.geometry.homography import apply_homography, pose_from_homography, site_from_image_homography
+from sorvolo.geometry.homography import (
+    apply_homography,
+    pose_from_homography,
+    site_from_image_homography,
+)
 from sorvolo.geometry.pose import Pose, rotation_from_vector
 from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.registration.camera_fit import CameraFit, PosePrior, fit_camera, similar
-from sorvolo.registration.features import FeatureSettings, filled, gray_from_rgb, known_only, orb_features
+from sorvolo.registration.features import (
+    FeatureSettings,
+    filled,
+    gray_from_rgb,
+    known_only,
+    orb_features,
+)
 from sorvolo.registration.learned import LEARNED, learned_features, match_learned
 from sorvolo.registration.matching import match
 from sorvolo.registration.robust_fit import fit_homography
@@ -41,12 +51,18 @@ class SearchSettings:
     least_pairs: int = 20  # that agree; chance leaves fewer
     weak_pairs: int = 10  # of a place that something else must confirm ...
     weak_ratio: float = 1.6  # ... and its least ratio
-    first_ratio: float = 4.0  # times the pairs that chance leaves in the band; other ground leaves 0.3 to 2.8
+    first_ratio: float = (
+        4.0  # times the pairs that chance leaves in the band; other ground leaves 0.3 to 2.8
+    )
     least_ratio: float = 2.5  # the same once the flight is known to lie on this map
-    least_surplus: float = 3.0  # beside a neighbour, whose place is known: standard deviations above chance
+    least_surplus: float = (
+        3.0  # beside a neighbour, whose place is known: standard deviations above chance
+    )
     neighbours: int = 3  # placed frames nearest in time, beside which a frame is tried
     most_kept: int = 200  # frames remembered: 0.2 MB each
-    strong_ratio: float = 5.0  # frames that correct the flight's telemetry have so many times chance's pairs
+    strong_ratio: float = (
+        5.0  # frames that correct the flight's telemetry have so many times chance's pairs
+    )
     least_strong: int = 3  # frames; by choice
     odd: float = 4.0  # sigmas off telemetry: a homography that swings
 
@@ -59,7 +75,9 @@ class Found:
     new_px: PointsPx
     ground_m: PointsM
     ratio: float
-    is_sure: bool = True  # False: too few pairs agree to believe it unless something else confirms it
+    is_sure: bool = (
+        True  # False: too few pairs agree to believe it unless something else confirms it
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +109,8 @@ class _Pairs:
 
     def joined(self, other: "_Pairs") -> "_Pairs":
         return _Pairs(
-            np.concatenate([self.image_px, other.image_px]), np.concatenate([self.ground_m, other.ground_m])
+            np.concatenate([self.image_px, other.image_px]),
+            np.concatenate([self.ground_m, other.ground_m]),
         )
 
     def __len__(self) -> int:
@@ -105,25 +124,46 @@ class MapSearch:
     """Searches one flight's frames on a map; knows where earlier ones were placed. Only `remember` changes it."""
 
     def __init__(
-        self, reference: ReferenceMap, site_grid: SiteGrid, settings: SearchSettings = SearchSettings(),
+        self,
+        reference: ReferenceMap,
+        site_grid: SiteGrid,
+        settings: SearchSettings = SearchSettings(),
         features: FeatureSettings = _FEATURES,
     ) -> None:
-        self._reference, self._site_grid, self._settings, self._features = reference, site_grid, settings, features
+        self._reference, self._site_grid, self._settings, self._features = (
+            reference,
+            site_grid,
+            settings,
+            features,
+        )
         self._placed: list[_Placed] = []
         self._orb: dict[int, Features] = {}
 
     def remember(
-        self, even: ImageGray, camera: Camera, prior: CameraPrior, pose: Pose, site_from_image: Matrix3, ratio: float
+        self,
+        even: ImageGray,
+        camera: Camera,
+        prior: CameraPrior,
+        pose: Pose,
+        site_from_image: Matrix3,
+        ratio: float,
     ) -> None:
         """Note a frame that was placed; `even` is its gray, contrast normalised, `ratio` how sure, infinite by ORB."""
         off_m = pose.translation_m - prior.position_m if prior.knows_place else np.full(3, np.nan)
         turn, _ = cv2.Rodrigues(prior.rotation.T @ pose.rotation)
         is_strong = ratio >= self._settings.strong_ratio
-        place = _Placed(even, camera, site_from_image, pose.translation_m, off_m, float(turn[2, 0]), is_strong)
-        self._placed = [*self._placed[1 - self._settings.most_kept:], place]
+        place = _Placed(
+            even, camera, site_from_image, pose.translation_m, off_m, float(turn[2, 0]), is_strong
+        )
+        self._placed = [*self._placed[1 - self._settings.most_kept :], place]
 
     def find(
-        self, gray: ImageGray, even: ImageGray, camera: Camera, prior: CameraPrior, by_telemetry: Pose
+        self,
+        gray: ImageGray,
+        even: ImageGray,
+        camera: Camera,
+        prior: CameraPrior,
+        by_telemetry: Pose,
     ) -> Found | None:
         """Where a frame lies, or None. `by_telemetry` is where telemetry has its camera, or, without it, where a
         frame that was placed before had its own; `even` is its gray, contrast normalised.
@@ -149,7 +189,12 @@ class MapSearch:
         usual_m = np.median(off_m, axis=0)
         spread_m = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(off_m - usual_m), axis=0)
         sigma_m = np.maximum(np.clip(prior.position_sigma_m, 1.0, 1e3), spread_m)
-        return bool((np.abs(pose.translation_m - prior.position_m - usual_m) > self._settings.odd * sigma_m).any())
+        return bool(
+            (
+                np.abs(pose.translation_m - prior.position_m - usual_m)
+                > self._settings.odd * sigma_m
+            ).any()
+        )
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -170,7 +215,10 @@ class MapSearch:
         if not turned:
             return quarters
         last = turned[-1]
-        return [last, *(each for each in quarters if abs(np.angle(np.exp(1j * (each - last)))) > np.pi / 8)]
+        return [
+            last,
+            *(each for each in quarters if abs(np.angle(np.exp(1j * (each - last)))) > np.pi / 8),
+        ]
 
     def _prior(self, sought: _Sought, pose: Pose) -> PosePrior:
         """What is known of the camera: telemetry, less what it was off by where this flight's frames were placed."""
@@ -187,25 +235,35 @@ class MapSearch:
 
     def _strong_off_m(self) -> PointsM:
         """(N, 3) what telemetry was off by where frames of this flight were placed for sure, the last hundred."""
-        off_m = np.array([each.off_m for each in self._placed if each.is_strong][-100:]).reshape(-1, 3)
+        off_m = np.array([each.off_m for each in self._placed if each.is_strong][-100:]).reshape(
+            -1, 3
+        )
         return off_m[np.isfinite(off_m).all(axis=1)]
 
     def _around(self, sought: _Sought, features: Features, turn_rad: float) -> Found | None:
         """The frame looked for around telemetry's place with the heading turned."""
         settings, prior = self._settings, sought.prior
         start = self._prior(sought, sought.pose).pose
-        start = Pose(start.rotation @ rotation_from_vector(np.array([0.0, 0.0, turn_rad])), start.translation_m)
+        start = Pose(
+            start.rotation @ rotation_from_vector(np.array([0.0, 0.0, turn_rad])),
+            start.translation_m,
+        )
         seen = self.map_features(sought.camera, start, settings.margin)
         if seen is None:
             return None
         site_from_start, old = seen
         m_per_px = start.translation_m[2] / sought.camera.fx_px
         sigma_rad = np.radians(min(float(prior.attitude_sigma_deg[:2].max()), 15.0))
-        reach_px = 3 * (float(np.clip(prior.position_sigma_m[:2].max(), 1.5, 50)) / m_per_px
-                        + np.tan(sigma_rad) * sought.camera.fx_px)
+        reach_px = 3 * (
+            float(np.clip(prior.position_sigma_m[:2].max(), 1.5, 50)) / m_per_px
+            + np.tan(sigma_rad) * sought.camera.fx_px
+        )
         pairs = match_learned(features, old, np.eye(3), reach_px)
         coarse = similar(
-            features.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings.coarse_px, settings.most_scale
+            features.points_px[pairs[:, 0]],
+            old.points_px[pairs[:, 1]],
+            settings.coarse_px,
+            settings.most_scale,
         )
         if coarse is None:
             return None
@@ -214,7 +272,11 @@ class MapSearch:
             return None
         near = self._near(features, old, site_from_start, coarse[0])
         fit = fit_camera(
-            near.image_px, near.ground_m, sought.camera, self._prior(sought, pose), start_px=20.0,
+            near.image_px,
+            near.ground_m,
+            sought.camera,
+            self._prior(sought, pose),
+            start_px=20.0,
             band_px=settings.band_px,
         )
         is_known = len(self._strong_off_m()) >= settings.least_strong
@@ -233,7 +295,12 @@ class MapSearch:
             return None
         prior = self._prior(sought, pose)
         first = fit_camera(
-            beside.image_px, beside.ground_m, sought.camera, prior, start_px=10.0, band_px=settings.band_px
+            beside.image_px,
+            beside.ground_m,
+            sought.camera,
+            prior,
+            start_px=10.0,
+            band_px=settings.band_px,
         )
         seen = None if first is None else self.map_features(sought.camera, first.pose, 0.1)
         if first is None or seen is None:
@@ -241,12 +308,16 @@ class MapSearch:
         near = self._near(features, seen[1], seen[0], np.eye(3))
         joined = near.joined(beside)
         fit = fit_camera(
-            joined.image_px, joined.ground_m, sought.camera, self._prior(sought, first.pose), start_px=10.0,
+            joined.image_px,
+            joined.ground_m,
+            sought.camera,
+            self._prior(sought, first.pose),
+            start_px=10.0,
             band_px=settings.band_px,
         )
         if fit is None:
             return None
-        of_map = CameraFit(fit.pose, fit.site_from_image, fit.agree[:len(near)], fit.residual_px)
+        of_map = CameraFit(fit.pose, fit.site_from_image, fit.agree[: len(near)], fit.residual_px)
         chance = len(near) * (settings.band_px / settings.near_px) ** 2
         return self._judged(of_map, near, 1 + settings.least_surplus / max(np.sqrt(chance), 1.0))
 
@@ -260,11 +331,18 @@ class MapSearch:
         is_sure = bool(agree.sum() >= settings.least_pairs and ratio >= least_ratio)
         return Found(fit, pairs.image_px[agree], pairs.ground_m[agree], ratio, is_sure)
 
-    def _near(self, features: Features, old: Features, site_from_old: Matrix3, new_from_old: Matrix3) -> _Pairs:
+    def _near(
+        self, features: Features, old: Features, site_from_old: Matrix3, new_from_old: Matrix3
+    ) -> _Pairs:
         pairs = match_learned(features, old, new_from_old, self._settings.near_px)
-        return _Pairs(features.points_px[pairs[:, 0]], apply_homography(site_from_old, old.points_px[pairs[:, 1]]))
+        return _Pairs(
+            features.points_px[pairs[:, 0]],
+            apply_homography(site_from_old, old.points_px[pairs[:, 1]]),
+        )
 
-    def map_features(self, camera: Camera, pose: Pose, margin: float) -> tuple[Matrix3, Features] | None:
+    def map_features(
+        self, camera: Camera, pose: Pose, margin: float
+    ) -> tuple[Matrix3, Features] | None:
         """site_from_image of a frame at this pose, and the map's learned features there, in that frame's pixels."""
         try:
             site_from_image = site_from_image_homography(camera, pose)
@@ -278,7 +356,9 @@ class MapSearch:
             return None
         grid_from_site = self._site_grid.grid_from_site_affine(centre[:2] / centre[2], 50.0)
         rgb, known = self._reference.seen_from(
-            grid_from_site @ site_from_image @ image_from_large, int(width + 2 * spare[0]), int(height + 2 * spare[1])
+            grid_from_site @ site_from_image @ image_from_large,
+            int(width + 2 * spare[0]),
+            int(height + 2 * spare[1]),
         )
         if not known.any():
             return None
@@ -305,7 +385,12 @@ class MapSearch:
         """The nearest placed frames that may show some of the same ground."""
         if not self._placed:
             return
-        away_m = np.array([np.linalg.norm(each.place_m[:2] - sought.pose.translation_m[:2]) for each in self._placed])
+        away_m = np.array(
+            [
+                np.linalg.norm(each.place_m[:2] - sought.pose.translation_m[:2])
+                for each in self._placed
+            ]
+        )
         reach_m = sought.camera.width_px / sought.camera.fx_px * sought.pose.translation_m[2]
         for index in np.argsort(away_m, kind="stable")[: self._settings.neighbours]:
             if away_m[index] < reach_m:

@@ -18,8 +18,12 @@ class PaintSettings:
 
     grown_px: int = 6  # beyond the outline: covers the thing's blurred rim
     feather_px: int = 4  # over which old and new mix: no seam
-    most_gain: float = 1.6  # times brighter or darker, each channel: more is another surface, not another light
-    least_ring_px: int = 50  # of unchanged ground around, in px of the patch: of fewer no gain is taken
+    most_gain: float = (
+        1.6  # times brighter or darker, each channel: more is another surface, not another light
+    )
+    least_ring_px: int = (
+        50  # of unchanged ground around, in px of the patch: of fewer no gain is taken
+    )
 
 
 def is_painted(change: Change) -> bool:
@@ -47,18 +51,25 @@ def paint_changes(
 
 
 def grown_m2(
-    outlines_m: Iterable[PointsM], before: Mapping[TileIndex, ImageRGBA], after: Mapping[TileIndex, ImageRGBA],
+    outlines_m: Iterable[PointsM],
+    before: Mapping[TileIndex, ImageRGBA],
+    after: Mapping[TileIndex, ImageRGBA],
     site_grid: SiteGrid,
 ) -> float:
     """Ground in the tiles under these outlines that the map shows `after` and did not show `before`."""
     outlines = [site_grid.grid_from_site(each) for each in outlines_m]
-    touched = frozenset[TileIndex]().union(*(site_grid.grid.tiles_touched(outline) for outline in outlines))
+    touched = frozenset[TileIndex]().union(
+        *(site_grid.grid.tiles_touched(outline) for outline in outlines)
+    )
     grown = sum(_seen_px(after, each) - _seen_px(before, each) for each in touched)
     return grown * site_grid.grid.m_per_px**2
 
 
 def patched(
-    tile_rgba: ImageRGBA, tile_window: tuple[int, int, int, int], grid_from_site: Matrix3, patch: Patch,
+    tile_rgba: ImageRGBA,
+    tile_window: tuple[int, int, int, int],
+    grid_from_site: Matrix3,
+    patch: Patch,
     settings: PaintSettings = PaintSettings(),
 ) -> ImageRGBA:
     """The tile with the patch's changed region as the flight saw it; the very same tile if nothing of it changes.
@@ -76,12 +87,18 @@ def patched(
     weight = _weight(patch, grow, max(1, round(settings.feather_px / scale)))
     size = (x1 - x0, y1 - y0)
     laid_weight = cv2.warpAffine(weight, tile_from_patch, size, flags=cv2.INTER_LINEAR)
-    known = cv2.warpAffine(patch.after[..., 3], tile_from_patch, size, flags=cv2.INTER_LINEAR) >= 250
+    known = (
+        cv2.warpAffine(patch.after[..., 3], tile_from_patch, size, flags=cv2.INTER_LINEAR) >= 250
+    )
     touched = (laid_weight > 1 / 512) & known
     if not touched.any():
         return tile_rgba
     laid = cv2.warpAffine(
-        patch.after[..., :3], tile_from_patch, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        patch.after[..., :3],
+        tile_from_patch,
+        size,
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
     ).astype(np.float32)
     laid *= _gains(patch, grow, settings)
     share = laid_weight[..., None].copy()
@@ -97,7 +114,9 @@ def _seen_px(tiles: Mapping[TileIndex, ImageRGBA], index: TileIndex) -> int:
     return int(np.count_nonzero(tiles[index][..., 3])) if index in tiles else 0
 
 
-def _weight(patch: Patch, grow: int, feather: int) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def _weight(
+    patch: Patch, grow: int, feather: int
+) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
     """(height, width) 1 in the changed region and a little around, falling to 0 over the feather."""
     outside = np.where(patch.changed, 0, 1).astype(np.uint8)
     if outside.all():
@@ -109,7 +128,9 @@ def _weight(patch: Patch, grow: int, feather: int) -> np.ndarray[tuple[int, int]
     return weight
 
 
-def _gains(patch: Patch, grow: int, settings: PaintSettings) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+def _gains(
+    patch: Patch, grow: int, settings: PaintSettings
+) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
     """(3,) what the later picture's channels are multiplied with to look like the map's ground around the change."""
     size = 2 * grow + 1
     near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((size, size), np.uint8)) > 0

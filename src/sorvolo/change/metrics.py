@@ -37,7 +37,10 @@ class Counts:
 
     def __add__(self, other: "Counts") -> "Counts":
         return Counts(
-            self.tp + other.tp, self.fp + other.fp, self.fn + other.fn, self.tn + other.tn,
+            self.tp + other.tp,
+            self.fp + other.fp,
+            self.fn + other.fn,
+            self.tn + other.tn,
             self.unknown + other.unknown,
         )
 
@@ -71,10 +74,14 @@ def pixel_counts(found: Mask, truth: Mask, unknown: Mask | None = None) -> Count
     judged = int(np.count_nonzero(known))
     tp = int(np.count_nonzero(found & truth & known))
     positives, there = int(np.count_nonzero(found & known)), int(np.count_nonzero(truth & known))
-    return Counts(tp, positives - tp, there - tp, judged - positives - there + tp, found.size - judged)
+    return Counts(
+        tp, positives - tp, there - tp, judged - positives - there + tp, found.size - judged
+    )
 
 
-def frame_counts(found: Mask, truth: Mask, unknown: Mask | None = None, least_px: int = 1) -> Counts:
+def frame_counts(
+    found: Mask, truth: Mask, unknown: Mask | None = None, least_px: int = 1
+) -> Counts:
     """One frame as a whole: positive when at least `least_px` of its known pixels are changed.
 
     A frame whose true change has some pixels, but fewer than `least_px`, and a frame of which nothing is known, are
@@ -82,7 +89,9 @@ def frame_counts(found: Mask, truth: Mask, unknown: Mask | None = None, least_px
     for `least_px` under 1.
     """
     if least_px < 1:
-        raise SettingsError(f"a changed frame has at least 1 changed pixel, got a least of {least_px}")
+        raise SettingsError(
+            f"a changed frame has at least 1 changed pixel, got a least of {least_px}"
+        )
     found, truth, known = _checked(found, truth, unknown)
     there = int(np.count_nonzero(truth & known))
     if 0 < there < least_px or not known.any():
@@ -237,7 +246,9 @@ class EventScores:
 
 
 def match_events(
-    found: Sequence[FoundEvent], true: Sequence[TrueEvent], settings: EventSettings = EventSettings()
+    found: Sequence[FoundEvent],
+    true: Sequence[TrueEvent],
+    settings: EventSettings = EventSettings(),
 ) -> EventMatch:
     """Pair reports with true events, each used once: those of the same kind first, then the nearest.
 
@@ -246,11 +257,16 @@ def match_events(
     report's outline.
     """
     offsets = [[_offset_m(each, truth) for truth in true] for each in found]
-    near = np.array([
-        [_is_near(each, truth, offsets[i][j], settings) for j, truth in enumerate(true)] for i, each in enumerate(found)
-    ], bool).reshape(len(found), len(true))
+    near = np.array(
+        [
+            [_is_near(each, truth, offsets[i][j], settings) for j, truth in enumerate(true)]
+            for i, each in enumerate(found)
+        ],
+        bool,
+    ).reshape(len(found), len(true))
     of_found = _paired(
-        (found[i].kind != true[j].kind, float(np.hypot(*offsets[i][j])), i, j) for i, j in np.argwhere(near).tolist()
+        (found[i].kind != true[j].kind, float(np.hypot(*offsets[i][j])), i, j)
+        for i, j in np.argwhere(near).tolist()
     )
     must_find = np.array([truth.must_find for truth in true], bool)
     is_matched, is_paired = np.zeros(len(true), bool), np.zeros(len(found), bool)
@@ -262,10 +278,14 @@ def match_events(
     is_found[[i for i, _ in needed]] = True
     return EventMatch(
         tuple(
-            EventPair(true[j], found[i], offsets[i][j], _delay_s(found[i], true[j], settings.views)) for i, j in needed
+            EventPair(true[j], found[i], offsets[i][j], _delay_s(found[i], true[j], settings.views))
+            for i, j in needed
         ),
-        _chosen(true, must_find & ~is_matched), _chosen(true, ~must_find), _chosen(found, is_twice),
-        _chosen(found, is_false), _chosen(found, ~(is_twice | is_false | is_found)),
+        _chosen(true, must_find & ~is_matched),
+        _chosen(true, ~must_find),
+        _chosen(found, is_twice),
+        _chosen(found, is_false),
+        _chosen(found, ~(is_twice | is_false | is_found)),
     )
 
 
@@ -292,14 +312,21 @@ def score_events(
     delays_s = np.array([pair.delay_s for pair in match.pairs])
     errors_m = [pair.error_m for pair in still]
     return EventScores(
-        must_find=len(match.pairs) + len(match.missed), found=len(match.pairs),
-        judged_late=int(np.isfinite(delays_s).sum()), late=_late(match.pairs, settings),
-        twice=len(match.twice), false=len(match.false), optional=len(match.optional),
-        named_right=_named_right(match.pairs), compared_m2=compared_m2,
+        must_find=len(match.pairs) + len(match.missed),
+        found=len(match.pairs),
+        judged_late=int(np.isfinite(delays_s).sum()),
+        late=_late(match.pairs, settings),
+        twice=len(match.twice),
+        false=len(match.false),
+        optional=len(match.optional),
+        named_right=_named_right(match.pairs),
+        compared_m2=compared_m2,
         error_median_m=_percentile(errors_m, 50),
         error_p95_m=_percentile(errors_m, 95),
-        sigma_median_m=_sigma_median_m(on_map), within_two_sigma=_within_two_sigma(on_map),
-        world_sigma_median_m=_sigma_median_m(in_world), world_within_two_sigma=_within_two_sigma(in_world),
+        sigma_median_m=_sigma_median_m(on_map),
+        within_two_sigma=_within_two_sigma(on_map),
+        world_sigma_median_m=_sigma_median_m(in_world),
+        world_within_two_sigma=_within_two_sigma(in_world),
         by_kind={str(kind): _kind_score(match, kind, settings) for kind in ChangeKind},
     )
 
@@ -310,7 +337,9 @@ def _sigma_median_m(offsets: Sequence[tuple[Floats, float]]) -> float:
 
 def _within_two_sigma(offsets: Sequence[tuple[Floats, float]]) -> float:
     """The share of the axes of offsets, (2,) each, that are under twice the sigma stated with it."""
-    within = [np.abs(offset_m) <= 2 * sigma_m for offset_m, sigma_m in offsets if math.isfinite(sigma_m)]
+    within = [
+        np.abs(offset_m) <= 2 * sigma_m for offset_m, sigma_m in offsets if math.isfinite(sigma_m)
+    ]
     return float(np.mean(within)) if within else math.nan
 
 
@@ -369,9 +398,12 @@ def compared_ground(views_m: Sequence[PointsM], known_m: Sequence[PointsM]) -> C
 def _kind_score(match: EventMatch, kind: ChangeKind, settings: EventSettings) -> KindScore:
     pairs = [pair for pair in match.pairs if pair.true.kind == kind]
     return KindScore(
-        len(pairs) + sum(truth.kind == kind for truth in match.missed), len(pairs),
-        _named_right(pairs), _late(pairs, settings),
-        sum(each.kind == kind for each in match.twice), sum(each.kind == kind for each in match.false),
+        len(pairs) + sum(truth.kind == kind for truth in match.missed),
+        len(pairs),
+        _named_right(pairs),
+        _late(pairs, settings),
+        sum(each.kind == kind for each in match.twice),
+        sum(each.kind == kind for each in match.false),
     )
 
 
@@ -403,7 +435,9 @@ def _offset_m(found: FoundEvent, truth: TrueEvent) -> Floats:
     return np.asarray(offsets[np.argmin((offsets**2).sum(axis=1))])
 
 
-def _is_near(found: FoundEvent, truth: TrueEvent, offset_m: Floats, settings: EventSettings) -> bool:
+def _is_near(
+    found: FoundEvent, truth: TrueEvent, offset_m: Floats, settings: EventSettings
+) -> bool:
     if np.hypot(*offset_m) <= max(settings.tolerance_m, truth.length_m / 2):
         return True
     if len(truth.path_m):
@@ -445,9 +479,13 @@ def _checked(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
     if found.shape != truth.shape or (unknown is not None and unknown.shape != truth.shape):
         sizes = " and ".join(
-            "x".join(str(side) for side in mask.shape[::-1]) for mask in (found, truth, unknown) if mask is not None
+            "x".join(str(side) for side in mask.shape[::-1])
+            for mask in (found, truth, unknown)
+            if mask is not None
         )
-        raise InputError(f"masks of one frame have one size, got {sizes} pixels; compare masks of the same pictures")
+        raise InputError(
+            f"masks of one frame have one size, got {sizes} pixels; compare masks of the same pictures"
+        )
     known = np.ones(truth.shape, bool) if unknown is None else ~unknown.astype(bool)
     return found.astype(bool), truth.astype(bool), known
 

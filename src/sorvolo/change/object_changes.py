@@ -17,11 +17,14 @@ class SearchedGround:
     searches: Sequence[SearchedFrames] = ()
 
 
-def on_one_date(before: SearchedGround, after: SearchedGround) -> Iterator[tuple[ChangeKind, MapObject]]:
+def on_one_date(
+    before: SearchedGround, after: SearchedGround
+) -> Iterator[tuple[ChangeKind, MapObject]]:
     """The objects that stood on one date and not on the other, where that was searched for their class as well:
     appeared or disappeared. What moves, or has no known size, is left out."""
     for kind, own, other in (
-        (ChangeKind.APPEARED, after, before), (ChangeKind.DISAPPEARED, before, after),
+        (ChangeKind.APPEARED, after, before),
+        (ChangeKind.DISAPPEARED, before, after),
     ):
         standing = [each for each in own.objects if not each.moving and np.isfinite(each.length_m)]
         places_m = np.array([each.position_m for each in standing]).reshape(-1, 2)

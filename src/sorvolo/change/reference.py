@@ -12,7 +12,12 @@ from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Mask, Matrix3, PointsPx
 from sorvolo.geometry.grid import Grid, TileIndex
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.registration.features import FeatureSettings, gray_from_rgb, normalise_contrast, orb_features
+from sorvolo.registration.features import (
+    FeatureSettings,
+    gray_from_rgb,
+    normalise_contrast,
+    orb_features,
+)
 from sorvolo.survey.mosaic import Features
 
 _BLOCK_PX = 512  # features are found in blocks of this side
@@ -45,7 +50,9 @@ class ReferenceMap:
     `tiles` is any mapping from tile to RGBA; level n of the map has pixels of 2^n grid pixels.
     """
 
-    def __init__(self, tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, cache_bytes: int = 192 * 2**20) -> None:
+    def __init__(
+        self, tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, cache_bytes: int = 192 * 2**20
+    ) -> None:
         self._tiles, self._grid = tiles, grid
         self._cache: OrderedDict[tuple[int, TileIndex], ImageRGBA | None] = OrderedDict()
         self._cache_tiles = max(8, cache_bytes // (4 * grid.tile_px**2))
@@ -62,7 +69,8 @@ class ReferenceMap:
     def windows(self) -> tuple[HeldWindow, ...]:
         """Those held now, in the order in which they came."""
         return tuple(
-            HeldWindow(level, x, y, window.shape[1], window.shape[0]) for level, (x, y, window) in self._windows.items()
+            HeldWindow(level, x, y, window.shape[1], window.shape[0])
+            for level, (x, y, window) in self._windows.items()
         )
 
     def hold(self, windows: Sequence[HeldWindow]) -> None:
@@ -75,7 +83,9 @@ class ReferenceMap:
                 continue
             self._shrunk.pop(each.level, None)
             self._windows[each.level] = (
-                each.x, each.y, self._assembled(each.level, each.x, each.y, each.width_px, each.height_px)
+                each.x,
+                each.y,
+                self._assembled(each.level, each.x, each.y, each.width_px, each.height_px),
             )
 
     def seen_from(
@@ -94,26 +104,41 @@ class ReferenceMap:
         level = level_for(grid_from_image, width_px, height_px)
         level_from_image = _level_from_grid(level) @ grid_from_image
         outline = apply_homography(_level_from_grid(level), outline)
-        low, high = np.floor(outline.min(axis=0)).astype(int) - 2, np.ceil(outline.max(axis=0)).astype(int) + 3
+        low, high = (
+            np.floor(outline.min(axis=0)).astype(int) - 2,
+            np.ceil(outline.max(axis=0)).astype(int) + 3,
+        )
         if np.prod((high - low).astype(float)) > _MOST_PX:
             return nothing
-        x, y, window = self._window_around(level, (int(low[0]), int(low[1]), int(high[0]), int(high[1])))
-        window_from_image = np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]]) @ level_from_image
+        x, y, window = self._window_around(
+            level, (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+        )
+        window_from_image = (
+            np.array([[1.0, 0.0, -x], [0.0, 1.0, -y], [0.0, 0.0, 1.0]]) @ level_from_image
+        )
         if shrink > 1:
             window = self._shrunk_window(level, shrink)
             image_from_small = resized(width_px / size[0], height_px / size[1])
-            window_from_image = resized(1 / shrink, 1 / shrink) @ window_from_image @ image_from_small
-        seen = cv2.warpPerspective(window, window_from_image, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+            window_from_image = (
+                resized(1 / shrink, 1 / shrink) @ window_from_image @ image_from_small
+            )
+        seen = cv2.warpPerspective(
+            window, window_from_image, size, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        )
         return cv2.cvtColor(seen, cv2.COLOR_RGBA2RGB), cv2.extractChannel(seen, 3) == 255  # type: ignore[return-value]
 
-    def features_under(self, grid_from_image: Matrix3, width_px: int, height_px: int, margin: float) -> Features:
+    def features_under(
+        self, grid_from_image: Matrix3, width_px: int, height_px: int, margin: float
+    ) -> Features:
         """ORB features of the map under an image and `margin` of its size around it, `points_px` on the grid."""
         outline = outline_on_grid(grid_from_image, width_px, height_px)
         if outline is None:
             return _NOTHING
         level = level_for(grid_from_image, width_px, height_px)
         centre = outline.mean(axis=0)
-        outline = apply_homography(_level_from_grid(level), centre + (outline - centre) * (1 + 2 * margin))
+        outline = apply_homography(
+            _level_from_grid(level), centre + (outline - centre) * (1 + 2 * margin)
+        )
         blocks = Grid((0.0, 0.0), 1.0, _BLOCK_PX).tiles_touched(outline)
         if len(blocks) > 400:
             return _NOTHING
@@ -124,17 +149,23 @@ class ReferenceMap:
         side = self._grid.tile_px << level
         blocks: set[TileIndex] = set()
         per_block = _BLOCK_PX << level
-        for column, row in {(c * self._grid.tile_px // side, r * self._grid.tile_px // side) for c, r in self._tiles}:
+        for column, row in {
+            (c * self._grid.tile_px // side, r * self._grid.tile_px // side) for c, r in self._tiles
+        }:
             first = column * side // per_block, row * side // per_block
             last = ((column + 1) * side - 1) // per_block, ((row + 1) * side - 1) // per_block
-            blocks |= {(c, r) for c in range(first[0], last[0] + 1) for r in range(first[1], last[1] + 1)}
+            blocks |= {
+                (c, r) for c in range(first[0], last[0] + 1) for r in range(first[1], last[1] + 1)
+            }
         if len(blocks) * _FEATURES.orb_count > most:
             return _NOTHING
         return _joined([self._block(level, each) for each in sorted(blocks)])
 
     def brightness_of(self, image: ImageRGB) -> float:
         """How many times as bright as the map a picture is, by the middle grey of either."""
-        return float(np.median(image[::_LEVEL_STEP_PX, ::_LEVEL_STEP_PX])) / max(self._middle_grey, 1.0)
+        return float(np.median(image[::_LEVEL_STEP_PX, ::_LEVEL_STEP_PX])) / max(
+            self._middle_grey, 1.0
+        )
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -147,7 +178,9 @@ class ReferenceMap:
         levels = np.concatenate([tile[tile[..., 3] > 0][:, :3].ravel() for tile in some])
         return float(np.median(levels)) if len(levels) else 0.0
 
-    def _window_around(self, level: int, box: tuple[int, int, int, int]) -> tuple[int, int, ImageRGBA]:
+    def _window_around(
+        self, level: int, box: tuple[int, int, int, int]
+    ) -> tuple[int, int, ImageRGBA]:
         if level in self._windows:
             x, y, window = self._windows[level]
             height, width = window.shape[:2]
@@ -158,7 +191,10 @@ class ReferenceMap:
         window = self._assembled(level, x, y, box[2] + spare - x, box[3] + spare - y)
         self._windows[level] = x, y, window
         self._shrunk.pop(level, None)
-        while sum(each[2].nbytes for each in self._windows.values()) > 4 * _MOST_PX and len(self._windows) > 1:
+        while (
+            sum(each[2].nbytes for each in self._windows.values()) > 4 * _MOST_PX
+            and len(self._windows) > 1
+        ):
             other = next(each for each in self._windows if each != level)
             self._windows.pop(other)
             self._shrunk.pop(other, None)
@@ -171,7 +207,9 @@ class ReferenceMap:
             window = self._windows[level][2]
             height, width = window.shape[0] // shrink, window.shape[1] // shrink
             small = cv2.resize(
-                window[: height * shrink, : width * shrink], (width, height), interpolation=cv2.INTER_AREA
+                window[: height * shrink, : width * shrink],
+                (width, height),
+                interpolation=cv2.INTER_AREA,
             )
             self._shrunk[level] = held = shrink, np.asarray(small, np.uint8)
         return held[1]
@@ -186,8 +224,8 @@ class ReferenceMap:
                     continue
                 x0, y0 = max(x, column * side), max(y, row * side)
                 x1, y1 = min(x + width, (column + 1) * side), min(y + height, (row + 1) * side)
-                result[y0 - y:y1 - y, x0 - x:x1 - x] = tile[
-                    y0 - row * side:y1 - row * side, x0 - column * side:x1 - column * side
+                result[y0 - y : y1 - y, x0 - x : x1 - x] = tile[
+                    y0 - row * side : y1 - row * side, x0 - column * side : x1 - column * side
                 ]
         return result
 
@@ -205,14 +243,16 @@ class ReferenceMap:
             return self._tiles.get(index)
         side = self._grid.tile_px
         children = {
-            (dx, dy): self._tile(level - 1, (2 * index[0] + dx, 2 * index[1] + dy)) for dx in (0, 1) for dy in (0, 1)
+            (dx, dy): self._tile(level - 1, (2 * index[0] + dx, 2 * index[1] + dy))
+            for dx in (0, 1)
+            for dy in (0, 1)
         }
         if all(each is None for each in children.values()):
             return None
         large = np.zeros((2 * side, 2 * side, 4), np.uint8)
         for (dx, dy), child in children.items():
             if child is not None:
-                large[dy * side:(dy + 1) * side, dx * side:(dx + 1) * side] = child
+                large[dy * side : (dy + 1) * side, dx * side : (dx + 1) * side] = child
         small = np.asarray(cv2.resize(large, (side, side), interpolation=cv2.INTER_AREA), np.uint8)
         small[small[..., 3] < 255] = 0  # half-known pixels are darkened by the unknown half
         return small
@@ -231,10 +271,16 @@ class ReferenceMap:
             return _NOTHING
         found = orb_features(normalised(cv2.cvtColor(rgba, cv2.COLOR_RGBA2RGB), known), _FEATURES)  # type: ignore[arg-type]
         near = np.rint(found.points_px).astype(int).clip(0, side - 1)
-        inner = ((found.points_px >= _APRON_PX - 0.5) & (found.points_px < side - _APRON_PX - 0.5)).all(axis=1)
-        safe = cv2.erode(known.view(np.uint8), np.ones((31, 31), np.uint8))  # no corners of the map's rim
+        inner = (
+            (found.points_px >= _APRON_PX - 0.5) & (found.points_px < side - _APRON_PX - 0.5)
+        ).all(axis=1)
+        safe = cv2.erode(
+            known.view(np.uint8), np.ones((31, 31), np.uint8)
+        )  # no corners of the map's rim
         keep = inner & (safe[near[:, 1], near[:, 0]] > 0)
-        grid_px = apply_homography(np.linalg.inv(_level_from_grid(level)), found.points_px[keep] + [x, y])
+        grid_px = apply_homography(
+            np.linalg.inv(_level_from_grid(level)), found.points_px[keep] + [x, y]
+        )
         return Features(found.kind, grid_px, found.descriptors[keep])
 
 
@@ -253,7 +299,9 @@ def normalised(rgb: ImageRGB, known: Mask) -> ImageGray:
 def outline_on_grid(grid_from_image: Matrix3, width_px: int, height_px: int) -> PointsPx | None:
     """(4, 2) the image's corners on the grid; None where one lies at or beyond the horizon."""
     w, h = width_px - 0.5, height_px - 0.5
-    outline = apply_homography(grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
+    outline = apply_homography(
+        grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
+    )
     return outline if np.isfinite(outline).all() and np.abs(outline).max() < 1e9 else None
 
 
@@ -279,6 +327,7 @@ def _joined(parts: list[Features]) -> Features:
     if not parts:
         return _NOTHING
     return Features(
-        parts[0].kind, np.concatenate([each.points_px for each in parts]),
+        parts[0].kind,
+        np.concatenate([each.points_px for each in parts]),
         np.concatenate([each.descriptors for each in parts]),
     )

@@ -52,7 +52,11 @@ class Relief:
         return found
 
     def find_in_earlier(
-        self, site_from_image: Matrix3, camera_m: Vector3, picture_from_site: Matrix3, earlier_m: Vector3,
+        self,
+        site_from_image: Matrix3,
+        camera_m: Vector3,
+        picture_from_site: Matrix3,
+        earlier_m: Vector3,
         size: tuple[int, int],
     ) -> tuple[Floats32, Floats32, Mask] | None:
         """Where an image's pixels lie in an earlier picture, x and y (h, w), and whether the earlier camera saw there
@@ -72,13 +76,19 @@ class Relief:
         sees = cv2.resize(hidden.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) == 0
         places = _raised(_grounds(site_from_image, size, size), camera_m, fine_up_m)
         places = _lowered(places, earlier_m, fine_up_m)
-        at = apply_homography(picture_from_site, places.reshape(-1, 2)).reshape(places.shape).astype(np.float32)
+        at = (
+            apply_homography(picture_from_site, places.reshape(-1, 2))
+            .reshape(places.shape)
+            .astype(np.float32)
+        )
         return at[..., 0], at[..., 1], sees
 
     def _at(self, places_m: PointsM) -> Floats32:
         affine = self.cells_from_site
         x, y = ((places_m @ row[:2] + row[2]).astype(np.float32) for row in affine[:2])
-        return np.asarray(cv2.remap(self.above_m, x, y, cv2.INTER_LINEAR, borderValue=0.0), np.float32)
+        return np.asarray(
+            cv2.remap(self.above_m, x, y, cv2.INTER_LINEAR, borderValue=0.0), np.float32
+        )
 
 
 def _grounds(site_from_image: Matrix3, size: tuple[int, int], asked: tuple[int, int]) -> PointsM:

@@ -13,7 +13,13 @@ from sorvolo.change.coverage.planting import Planted, Planting
 from sorvolo.change.earlier_pictures import EarlierPictures
 from sorvolo.change.frame_pixels import FramePixels, comparison_camera
 from sorvolo.change.map_search import MapSearch
-from sorvolo.change.pair.corroboration import CorroborationSettings, Difference, believed, is_whole, unwitnessed
+from sorvolo.change.pair.corroboration import (
+    CorroborationSettings,
+    Difference,
+    believed,
+    is_whole,
+    unwitnessed,
+)
 from sorvolo.change.pair.flight_tuning import FlightTuning, PairMeasures
 from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.change.pair.shade import shade_of_view
@@ -35,12 +41,18 @@ _ALL_CHANGED_REASON = "more than half of it looks changed (water, snow, ploughin
 class ViewSettings:
     """Which frames are compared, and with how many earlier pictures (0007, 0009)."""
 
-    least_known: float = 0.1  # share of a frame on known ground: with less there is nothing to compare
+    least_known: float = (
+        0.1  # share of a frame on known ground: with less there is nothing to compare
+    )
     witnesses: int = 2  # earlier pictures asked about a difference: one from each side
     further: int = 3  # pictures asked besides where those do not show all of it
     coarser: float = 1.25  # times the map's pixels: views less coarse than that have its pixels
-    all_changed: float = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
-    turned_sigma_deg: float = 3.0  # of a camera's angles as it fits the map: tilt and place are seen together
+    all_changed: float = (
+        0.5  # share of a view: more is snow, a flood or another place, not a list of changes
+    )
+    turned_sigma_deg: float = (
+        3.0  # of a camera's angles as it fits the map: tilt and place are seen together
+    )
     corroboration: CorroborationSettings = field(default_factory=CorroborationSettings)
 
 
@@ -142,8 +154,13 @@ class ViewMaker:
     """
 
     def __init__(
-        self, flight: FlightCamera, reference: ReferenceMap, site_grid: SiteGrid, thesis: ThesisOptions | None,
-        pictures: EarlierPictures | None, settings: ViewSettings = ViewSettings(),
+        self,
+        flight: FlightCamera,
+        reference: ReferenceMap,
+        site_grid: SiteGrid,
+        thesis: ThesisOptions | None,
+        pictures: EarlierPictures | None,
+        settings: ViewSettings = ViewSettings(),
     ) -> None:
         self._settings = settings
         self._flight, self._reference, self._site_grid = flight, reference, site_grid
@@ -175,8 +192,13 @@ class ViewMaker:
         if not isinstance(aligned, Aligned):
             status = ViewStatus.OUTSIDE if aligned.is_outside else ViewStatus.NOT_ALIGNED
             return ViewOutcome(
-                status, aligned.reason, aligned.residual_px * to_full, 0.0, brightness=self.brightness,
-                traces=ViewTraces(self._aligner.step, None, None), comes_again=aligned.comes_again,
+                status,
+                aligned.reason,
+                aligned.residual_px * to_full,
+                0.0,
+                brightness=self.brightness,
+                traces=ViewTraces(self._aligner.step, None, None),
+                comes_again=aligned.comes_again,
             )
         residual_px = aligned.residual_px * to_full
         site_from_full = aligned.site_from_image @ self.pixels.small_from_full
@@ -185,24 +207,42 @@ class ViewMaker:
         if share < self._settings.least_known:
             reason = f"less than {self._settings.least_known:.0%} of it lies on the map"
             return ViewOutcome(
-                ViewStatus.OUTSIDE, reason, residual_px, share, site_from_full, brightness=self.brightness,
+                ViewStatus.OUTSIDE,
+                reason,
+                residual_px,
+                share,
+                site_from_full,
+                brightness=self.brightness,
                 traces=ViewTraces(self._aligner.step, aligned, None),
             )
         image, valid = _laid(aligned, image, known)
         query = as_bgr(image)
         found, measured = self._difference(as_bgr(reference), query, valid)
         outcome = ViewOutcome(
-            ViewStatus.COMPARED, "", residual_px, share, site_from_full, brightness=self.brightness,
-            local_m=aligned.local_m, with_flight=aligned.with_flight,
+            ViewStatus.COMPARED,
+            "",
+            residual_px,
+            share,
+            site_from_full,
+            brightness=self.brightness,
+            local_m=aligned.local_m,
+            with_flight=aligned.with_flight,
             traces=ViewTraces(self._aligner.step, aligned, measured),
         )
-        return OneSided(posed, aligned, image, reference, query, valid, found, self._settings_now(), outcome)
+        return OneSided(
+            posed, aligned, image, reference, query, valid, found, self._settings_now(), outcome
+        )
 
     def corroborate(self, compared: ViewOutcome | OneSided) -> ViewOutcome:
         """Keep the differences that earlier pictures of the ground confirm: how the frame's comparison ended."""
         if isinstance(compared, ViewOutcome):
             return compared
-        frame, aligned, valid, outcome = compared.posed.frame, compared.aligned, compared.valid, compared.outcome
+        frame, aligned, valid, outcome = (
+            compared.posed.frame,
+            compared.aligned,
+            compared.valid,
+            compared.outcome,
+        )
         found, leans = self._corroborated(compared)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
         if changed > self._settings.all_changed:
@@ -216,7 +256,9 @@ class ViewMaker:
         """The outcome of a frame that an earlier process compared; `image` is that frame `undistorted`."""
         outcome, traces = record.outcome, record.outcome.traces
         assert traces is not None  # a comparison leaves them
-        self._aligner.recall(image, self._lens.camera, posed.prior, posed.frame.time_ns, traces.step)
+        self._aligner.recall(
+            image, self._lens.camera, posed.prior, posed.frame.time_ns, traces.step
+        )
         if traces.measured is not None and self._tuning is not None:
             self._tuning.observe(traces.measured)
         aligned, boxes, scores = traces.aligned, record.boxes, record.scores
@@ -227,7 +269,9 @@ class ViewMaker:
         reference, known = self._map_under(aligned)
         image, valid = _laid(aligned, image, known)
         found = Difference(np.where(record.changed, np.uint8(255), np.uint8(0)), boxes, scores)
-        return replace(outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found))
+        return replace(
+            outcome, view=self._view(posed.frame, aligned, (image, reference, valid), found)
+        )
 
     @property
     def search(self) -> MapSearch:
@@ -246,8 +290,12 @@ class ViewMaker:
     def placed(self, posed: PosedFrame, outcome: ViewOutcome, map_sigma_m: float) -> PlacedFrame:
         """The frame's record: placed by the map it fits, or rejected with the reason."""
         return self.pixels.placed(
-            posed, self._flight.utc_ns(posed.frame.time_ns), outcome.site_from_image, outcome.reason,
-            outcome.residual_px, map_sigma_m,
+            posed,
+            self._flight.utc_ns(posed.frame.time_ns),
+            outcome.site_from_image,
+            outcome.reason,
+            outcome.residual_px,
+            map_sigma_m,
         )
 
     def turned_as_found(self, posed: PosedFrame, outcome: ViewOutcome) -> PosedFrame:
@@ -256,7 +304,9 @@ class ViewMaker:
         if pose is None:
             return posed
         sigma_deg = np.full(3, self._settings.turned_sigma_deg)
-        return replace(posed, prior=replace(posed.prior, rotation=pose.rotation, attitude_sigma_deg=sigma_deg))
+        return replace(
+            posed, prior=replace(posed.prior, rotation=pose.rotation, attitude_sigma_deg=sigma_deg)
+        )
 
     def chosen(self) -> dict[str, Any]:
         """What the robust method's parameters set themselves to on this flight; nothing for method thesis."""
@@ -269,7 +319,11 @@ class ViewMaker:
         """
         map_m_per_px = self._site_grid.grid.m_per_px
         views_m_per_px = float(np.fmin(self._m_per_px, first.m_per_px))
-        return views_m_per_px if views_m_per_px > self._settings.coarser * map_m_per_px else map_m_per_px
+        return (
+            views_m_per_px
+            if views_m_per_px > self._settings.coarser * map_m_per_px
+            else map_m_per_px
+        )
 
     def brightness_beside_map(self, posed: PosedFrame, outcome: ViewOutcome) -> float:
         """How many times as bright as the map a frame is. Where no ground was compared in its light yet (and method
@@ -314,14 +368,27 @@ class ViewMaker:
         return reference, known & self._lens_sees
 
     def _view(
-        self, frame: Frame, aligned: Aligned, pictures: tuple[ImageRGB, ImageRGB, Mask], found: Difference
+        self,
+        frame: Frame,
+        aligned: Aligned,
+        pictures: tuple[ImageRGB, ImageRGB, Mask],
+        found: Difference,
     ) -> ComparedView:
         """The compared view: `pictures` are the frame, the map and where both are valid."""
         image, reference, valid = pictures
         shade = shade_of_view(reference, image, valid) if len(found.boxes) else found.mask
         return ComparedView(
-            frame.index, frame.name, self._flight.utc_ns(frame.time_ns), aligned.site_from_image, aligned.camera_m,
-            *pictures, found.mask, found.boxes, found.scores, aligned.residual_px, shade,
+            frame.index,
+            frame.name,
+            self._flight.utc_ns(frame.time_ns),
+            aligned.site_from_image,
+            aligned.camera_m,
+            *pictures,
+            found.mask,
+            found.boxes,
+            found.scores,
+            aligned.residual_px,
+            shade,
         )
 
     def _corroborated(self, compared: OneSided) -> tuple[Difference, Mask | None]:
@@ -333,21 +400,30 @@ class ViewMaker:
         leans, level = np.zeros((height, width), bool), level_of(as_bgr(compared.reference))
         earlier: list[tuple[Difference, Mask]] = []
         pictures = self._pictures.seen_from(
-            compared.aligned.site_from_image, compared.aligned.camera_m, width, height,
+            compared.aligned.site_from_image,
+            compared.aligned.camera_m,
+            width,
+            height,
             settings.witnesses + settings.further,
         )
         for number in range(settings.witnesses + settings.further):
             is_further = number >= settings.witnesses
             seen = [each for _, each in earlier]
-            open_parts = unwitnessed(compared.found, seen, settings.corroboration) if is_further else []
+            open_parts = (
+                unwitnessed(compared.found, seen, settings.corroboration) if is_further else []
+            )
             if is_further and not open_parts:
                 break
-            picture, sees = next(pictures, (None, None))  # made only now: most views need no further ones
+            picture, sees = next(
+                pictures, (None, None)
+            )  # made only now: most views need no further ones
             if picture is None or sees is None:
                 break
             sees &= self._lens_sees
             mask = compared.found.mask
-            if is_further and not any(is_whole(mask, each, sees, settings.corroboration) for each in open_parts):
+            if is_further and not any(
+                is_whole(mask, each, sees, settings.corroboration) for each in open_parts
+            ):
                 continue
             found = compare_robust(picture, compared.query, sees, compared.settings)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
@@ -361,7 +437,10 @@ class ViewMaker:
         sure, reference = self._settings.corroboration.sure, as_bgr(compared.reference)
         settings = replace(compared.settings, least_score=sure)
         return self._planting.plant(
-            view, lambda picture: compare_robust(reference, as_bgr(picture), compared.valid, settings).mask > 0
+            view,
+            lambda picture: (
+                compare_robust(reference, as_bgr(picture), compared.valid, settings).mask > 0
+            ),
         )
 
     def _difference(
@@ -370,7 +449,9 @@ class ViewMaker:
         """What differs from the map; the flight's tuning learns of it, by what was measured."""
         settings = self._settings_now()
         if self._tuning is None or settings is None:
-            thesis = compare_thesis(reference, query, valid, self._thesis.settings, self._thesis.threads)
+            thesis = compare_thesis(
+                reference, query, valid, self._thesis.settings, self._thesis.threads
+            )
             return Difference(thesis.mask, thesis.boxes, np.full(len(thesis.boxes), 0.5)), None
         found = compare_robust(reference, query, valid, settings)
         measured = PairMeasures.of(found)
@@ -380,7 +461,11 @@ class ViewMaker:
     def _settings_now(self) -> RobustSettings | None:
         """Those of the robust method as the flight has set them so far; None for method thesis."""
         least_score = self._settings.corroboration.least_score
-        return None if self._tuning is None else replace(self._tuning.settings(), least_score=least_score)
+        return (
+            None
+            if self._tuning is None
+            else replace(self._tuning.settings(), least_score=least_score)
+        )
 
 
 def _laid(aligned: Aligned, image: ImageRGB, known: Mask) -> tuple[ImageRGB, Mask]:

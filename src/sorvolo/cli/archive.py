@@ -39,7 +39,9 @@ def index_command(
     root: Root,
     catalogue: Annotated[
         str,
-        typer.Option(help="Where a new index lies: postgresql://USER@HOST/DATABASE with PostGIS. Without it: a file."),
+        typer.Option(
+            help="Where a new index lies: postgresql://USER@HOST/DATABASE with PostGIS. Without it: a file."
+        ),
     ] = "",
     as_json: AsJson = False,
 ) -> None:
@@ -53,7 +55,9 @@ def index_command(
 
     outcome = shown_work(
         index_archive(root, catalogue),
-        lambda progress, update: progress.show("reading sites", update.sites_done, update.sites, update.site),
+        lambda progress, update: progress.show(
+            "reading sites", update.sites_done, update.sites, update.site
+        ),
     )
     if as_json:
         typer.echo(json.dumps({"root": str(root), **asdict(outcome)}, indent=1))
@@ -78,9 +82,14 @@ def find_command(
     first: Annotated[str, typer.Option("--from", help="From this date or time (UTC) on.")] = "",
     last: Annotated[str, typer.Option("--to", help="Up to this date or time (UTC).")] = "",
     classes: Annotated[
-        str | None, typer.Option("--class", help="Only flights that found one of these there, such as car,appeared.")
+        str | None,
+        typer.Option(
+            "--class", help="Only flights that found one of these there, such as car,appeared."
+        ),
     ] = None,
-    within: Annotated[float, typer.Option(help="How near a finding must be to count as there, m.")] = 2.0,
+    within: Annotated[
+        float, typer.Option(help="How near a finding must be to count as there, m.")
+    ] = 2.0,
     as_json: AsJson = False,
 ) -> None:
     """List the flights that saw a place, in order of time, and what they found there.
@@ -92,9 +101,18 @@ def find_command(
     from sorvolo.missions.archive.find import find_place
     from sorvolo.store.exports.plain import plain_json
 
-    found = find_place(root, at, first=first, last=last, classes=wanted_classes(classes, "--class"), within_m=within)
+    found = find_place(
+        root,
+        at,
+        first=first,
+        last=last,
+        classes=wanted_classes(classes, "--class"),
+        within_m=within,
+    )
     if as_json:
-        typer.echo(json.dumps({"root": str(root), "at": at, "flights": plain_json(found)}, indent=1))
+        typer.echo(
+            json.dumps({"root": str(root), "at": at, "flights": plain_json(found)}, indent=1)
+        )
     else:
         _show(found, Console())
 
@@ -110,8 +128,13 @@ def _show(found: Sequence["FoundFlight"], console: Console) -> None:
         table.add_column(name, overflow="fold")
     for each in found:
         table.add_row(
-            time_words(each.first_ns)[:19], escape(each.site), escape(each.flight), each.kind, f"{each.frames:,}",
-            escape(each.best_frame), "\n".join(_words(thing) for thing in each.things),
+            time_words(each.first_ns)[:19],
+            escape(each.site),
+            escape(each.flight),
+            each.kind,
+            f"{each.frames:,}",
+            escape(each.best_frame),
+            "\n".join(_words(thing) for thing in each.things),
         )
     console.print(table)
 

@@ -14,7 +14,9 @@ from sorvolo.survey.wording import counted_list
 
 
 def export_command(
-    root: Annotated[str, typer.Argument(help="The folder that holds the site folders, or s3://BUCKET/PREFIX.")],
+    root: Annotated[
+        str, typer.Argument(help="The folder that holds the site folders, or s3://BUCKET/PREFIX.")
+    ],
     out: Annotated[Path, typer.Option(help="The file to write: NAME.parquet.")],
     as_json: AsJson = False,
 ) -> None:
@@ -29,7 +31,9 @@ def export_command(
 
     outcome = shown_work(
         export_archive(root, out),
-        lambda progress, update: progress.show("reading sites", update.done, update.sites or None, update.site),
+        lambda progress, update: progress.show(
+            "reading sites", update.done, update.sites or None, update.site
+        ),
     )
     if as_json:
         typer.echo(json.dumps({"root": root, "file": str(out), **asdict(outcome)}, indent=1))

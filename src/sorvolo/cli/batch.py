@@ -41,7 +41,13 @@ if TYPE_CHECKING:
 
 _MOST_ROWS = 40  # of a table on a terminal; longer ones show what failed first; by choice
 _STORE_HANGS_S = 300.0  # two requests of `ObjectSettings.request_s`
-_COLOURS = {"done": "green", "known": "green", "doubtful": "yellow", "duplicate": "blue", "skipped": "blue"}
+_COLOURS = {
+    "done": "green",
+    "known": "green",
+    "doubtful": "yellow",
+    "duplicate": "blue",
+    "skipped": "blue",
+}
 
 
 class MissionName(StrEnum):
@@ -62,9 +68,13 @@ class SiteByName(StrEnum):
 
 Places = Annotated[
     list[str],
-    typer.Argument(help="Folders with flights, however deep; or live sources, as ADDRESS or SITE=ADDRESS."),
+    typer.Argument(
+        help="Folders with flights, however deep; or live sources, as ADDRESS or SITE=ADDRESS."
+    ),
 ]
-Root = Annotated[Path, typer.Option(help="Folder for the results: one folder for each site, or for each watch.")]
+Root = Annotated[
+    Path, typer.Option(help="Folder for the results: one folder for each site, or for each watch.")
+]
 MissionOption = Annotated[MissionName, typer.Option(help="What to do with each flight.")]
 SiteByOption = Annotated[
     SiteByName | None,
@@ -75,23 +85,37 @@ SiteByOption = Annotated[
 ]
 ExecutorName = Annotated[
     str,
-    typer.Option(help="local: this machine. ray://HOST:PORT: a Ray cluster. ray: this machine's Ray, or a new one."),
+    typer.Option(
+        help="local: this machine. ray://HOST:PORT: a Ray cluster. ray: this machine's Ray, or a new one."
+    ),
 ]
 Workers = Annotated[
     int | None, typer.Option(help="Flights at once, at most.", show_default="one for each core")
 ]
 Resolution = Annotated[
-    float | None, typer.Option(help="Ground resolution of new maps, m a pixel. Without it: the frames' own.")
+    float | None,
+    typer.Option(help="Ground resolution of new maps, m a pixel. Without it: the frames' own."),
 ]
 Model = Annotated[
-    str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
+    str,
+    typer.Option(
+        help="Detector for people, cars and small objects: a model's name, a file, or none."
+    ),
 ]
 Receivers = Annotated[
     list[str] | None,
-    typer.Option("--telemetry", help="A live source's receiver, as SITE=ADDRESS: udp://:10110, serial:/dev/ttyUSB0."),
+    typer.Option(
+        "--telemetry",
+        help="A live source's receiver, as SITE=ADDRESS: udp://:10110, serial:/dev/ttyUSB0.",
+    ),
 ]
-Tries = Annotated[int, typer.Option(help="Set a flight aside when it ended its process so many times.")]
-Stall = Annotated[float, typer.Option(help="End a process that neither answers nor computes for this many seconds.")]
+Tries = Annotated[
+    int, typer.Option(help="Set a flight aside when it ended its process so many times.")
+]
+Stall = Annotated[
+    float,
+    typer.Option(help="End a process that neither answers nor computes for this many seconds."),
+]
 Blocks = Annotated[
     int,
     typer.Option(help="Divide each flight into this many blocks of ground, joined to one map."),
@@ -100,15 +124,21 @@ Shares = Annotated[
     bool | None,
     typer.Option(
         "--share-detector/--own-detectors",
-        help="One detector for all flights of a machine, or one for each.", show_default="shared by live sources",
+        help="One detector for all flights of a machine, or one for each.",
+        show_default="shared by live sources",
     ),
 ]
 Gpus = Annotated[
     float,
-    typer.Option(help="Share of a graphics card that a machine's shared detector takes in a Ray cluster: 0.25, 1."),
+    typer.Option(
+        help="Share of a graphics card that a machine's shared detector takes in a Ray cluster: 0.25, 1."
+    ),
 ]
 CopyTo = Annotated[
-    str, typer.Option(help="Copy each flight's site to this place as well: a folder, or s3://BUCKET/PREFIX.")
+    str,
+    typer.Option(
+        help="Copy each flight's site to this place as well: a folder, or s3://BUCKET/PREFIX."
+    ),
 ]
 Retry = Annotated[bool, typer.Option("--retry", help="Also try flights again that were set aside.")]
 
@@ -163,11 +193,23 @@ def batch(
     context.obj.stop_words = f"stopped; run the same command to continue: {root} holds what is done"
     place, wanted = _place(copy_to, root), wanted_classes(classes)
     watch = WatchWish(
-        wanted, least_score, fps, save.value, cot, _whole(cot_ca), _whole(cot_cert), alert_command, alert_url,
+        wanted,
+        least_score,
+        fps,
+        save.value,
+        cot,
+        _whole(cot_ca),
+        _whole(cot_cert),
+        alert_command,
+        alert_url,
     )
-    wish = FlightWish(Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch, place)
+    wish = FlightWish(
+        Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch, place
+    )
     settings = BatchSettings(wish, _site_by(site_by, mission), tries, stall, retry, blocks)
-    report = _run(places, telemetry or (), root, settings, _Running(executor, workers, share_detector, gpus))
+    report = _run(
+        places, telemetry or (), root, settings, _Running(executor, workers, share_detector, gpus)
+    )
     if as_json:
         typer.echo(json.dumps(_plain(report, root), indent=1))
     else:
@@ -201,7 +243,11 @@ class _Running:
 
 
 def _run(
-    places: Sequence[str], receivers: Sequence[str], root: Path, settings: "BatchSettings", wish: _Running
+    places: Sequence[str],
+    receivers: Sequence[str],
+    root: Path,
+    settings: "BatchSettings",
+    wish: _Running,
 ) -> "BatchReport":
     """The batch of folders, or of live sources, with its progress."""
     from sorvolo.cluster.batch import run_batch
@@ -215,16 +261,20 @@ def _run(
     if live:  # one that waits for its drone does nothing, and gives up by itself
         settings = replace(settings, stall_s=settings.stall_s + settings.wish.give_up_s)
         wish = replace(
-            wish, workers=wish.workers or len(live),
+            wish,
+            workers=wish.workers or len(live),
             shares_detector=len(live) > 1 if wish.shares_detector is None else wish.shares_detector,
         )
     executors = _executor_of(wish, settings)
     if receivers and not live:
-        raise SettingsError("--telemetry is for live sources; a recorded flight's log is found beside it")
+        raise SettingsError(
+            "--telemetry is for live sources; a recorded flight's log is found beside it"
+        )
     streams = streams_of(live, receivers)
     with ended_by_signal([each.address for each in streams]) as until:
         running = (
-            run_streams(streams, root, settings, executors, until) if streams
+            run_streams(streams, root, settings, executors, until)
+            if streams
             else run_batch([Path(each) for each in places], root, settings, executors)
         )
         # closed even when the bar is stopped: then the workers are ended
@@ -232,10 +282,14 @@ def _run(
             return _show_progress(running, Console(stderr=True))
 
 
-def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None, blocks: int) -> None:
+def _check_live(
+    live: Sequence[str], places: Sequence[str], workers: int | None, blocks: int
+) -> None:
     """Raise SettingsError for live sources beside folders, and for fewer workers than live sources."""
     if live and len(live) < len(places):
-        raise SettingsError("give folders of flights or live sources, not both: they are two batches with two roots")
+        raise SettingsError(
+            "give folders of flights or live sources, not both: they are two batches with two roots"
+        )
     if live and blocks > 1:
         raise SettingsError("--blocks divides recorded flights; live sources are mapped whole")
     if live and workers is not None and workers < len(live):
@@ -250,7 +304,9 @@ def _absolute(name: str) -> str:
 def _place(text: str, root: Path) -> str:
     """The place that sites are copied to, a folder by its whole path. Raises SettingsError for a root in a store."""
     if str(root).startswith("s3:"):
-        raise SettingsError(f"--root {root}: a batch works in a folder; give one, and --copy-to s3://BUCKET/PREFIX")
+        raise SettingsError(
+            f"--root {root}: a batch works in a folder; give one, and --copy-to s3://BUCKET/PREFIX"
+        )
     if not text or "://" in text:
         return text.rstrip("/")
     if Path(text).resolve() == root.resolve():
@@ -275,7 +331,9 @@ def _executor_of(
         raise SettingsError(f"--workers {workers}: at least 1 is needed")
     if name == "local":
         if wish.gpus:
-            raise SettingsError("--gpus divides the graphics cards of a Ray cluster: give --executor ray as well")
+            raise SettingsError(
+                "--gpus divides the graphics cards of a Ray cluster: give --executor ray as well"
+            )
         count, is_shared = workers or default_workers(), sharing.is_shared
         return lambda table: LocalExecutor(
             count, settings.stall_s, table.lock, settings.costs, shares_detector=is_shared
@@ -287,7 +345,9 @@ def _executor_of(
     raise SettingsError(f"--executor {name}: give local, ray, or ray://HOST:PORT")
 
 
-def _show_progress(running: "Generator[BatchUpdate, None, BatchReport]", console: Console) -> "BatchReport":
+def _show_progress(
+    running: "Generator[BatchUpdate, None, BatchReport]", console: Console
+) -> "BatchReport":
     report: list[BatchReport] = []
 
     def noted() -> "Iterator[BatchUpdate]":
@@ -297,7 +357,8 @@ def _show_progress(running: "Generator[BatchUpdate, None, BatchReport]", console
         for update in noted():
             if update.row is not None and update.found:
                 console.print(
-                    f"    [bold]found[/bold]  {escape(update.row.site)}: {escape(update.found)}", highlight=False,
+                    f"    [bold]found[/bold]  {escape(update.row.site)}: {escape(update.found)}",
+                    highlight=False,
                     soft_wrap=True,
                 )
             elif update.row is not None:
@@ -309,10 +370,16 @@ def _show_progress(running: "Generator[BatchUpdate, None, BatchReport]", console
 
 def _show_row(row: "Row", is_known: bool, console: Console) -> None:
     state = _state(row, is_known)
-    words = f"try {row.tries} failed: {row.words}" if row.state == "waiting" and row.tries else row.words
+    words = (
+        f"try {row.tries} failed: {row.words}"
+        if row.state == "waiting" and row.tries
+        else row.words
+    )
     colour = _COLOURS.get(state, "red")
     console.print(
-        f"[{colour}]{state:>9}[/{colour}]  {escape(row.source)}: {escape(words)}", highlight=False, soft_wrap=True
+        f"[{colour}]{state:>9}[/{colour}]  {escape(row.source)}: {escape(words)}",
+        highlight=False,
+        soft_wrap=True,
     )
 
 
@@ -325,16 +392,24 @@ def _state(row: "Row", is_known: bool) -> str:
 def _plain(report: "BatchReport", root: Path) -> dict[str, Any]:
     rows = [{**asdict(row), "is_known": row.key in report.known} for row in report.rows]
     return {
-        "root": str(root), "counts": report.counts(), "seconds": report.seconds,
-        "cpu_s": round(sum(row.cpu_s for row in report.rows if row.key not in report.known), 3), "tries": report.tries,
-        "crashes": report.crashes, "flights": rows,
+        "root": str(root),
+        "counts": report.counts(),
+        "seconds": report.seconds,
+        "cpu_s": round(sum(row.cpu_s for row in report.rows if row.key not in report.known), 3),
+        "tries": report.tries,
+        "crashes": report.crashes,
+        "flights": rows,
     }
 
 
 def _label(source: str, places: Sequence[Path]) -> str:
     """A flight's path below the folder that was given."""
     path = Path(source)
-    below = [path.relative_to(place.resolve()).as_posix() for place in places if path.is_relative_to(place.resolve())]
+    below = [
+        path.relative_to(place.resolve()).as_posix()
+        for place in places
+        if path.is_relative_to(place.resolve())
+    ]
     return min((each for each in below if each != "."), key=len, default=path.name)
 
 
@@ -348,18 +423,29 @@ def _show(report: "BatchReport", places: Sequence[Path], root: Path, console: Co
         rows = tuple(row for row in rows if row.state != "done")
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for name in ("flight", "folder", "state", "tries", "s", "CPU s", "MB", ""):
-        table.add_column(name, justify="right" if name in ("tries", "s", "CPU s", "MB") else "left", overflow="fold")
+        table.add_column(
+            name,
+            justify="right" if name in ("tries", "s", "CPU s", "MB") else "left",
+            overflow="fold",
+        )
     for row in rows[:_MOST_ROWS]:
         state = _state(row, row.key in report.known)
         table.add_row(
-            escape(_label(row.source, places)), escape(row.site), f"[{_COLOURS.get(state, 'red')}]{state}",
-            str(row.tries), f"{row.seconds:.1f}", f"{row.cpu_s:.1f}", f"{row.peak_memory_mb:.0f}", escape(row.words),
+            escape(_label(row.source, places)),
+            escape(row.site),
+            f"[{_COLOURS.get(state, 'red')}]{state}",
+            str(row.tries),
+            f"{row.seconds:.1f}",
+            f"{row.cpu_s:.1f}",
+            f"{row.peak_memory_mb:.0f}",
+            escape(row.words),
         )
     if rows:
         console.print(table)
     if len(rows) > _MOST_ROWS:
         console.print(f"and {len(rows) - _MOST_ROWS:,} more", highlight=False)
     console.print(
-        f"tries: {report.tries}, of which {report.crashes} crashed; {report.seconds:.1f} s", highlight=False
+        f"tries: {report.tries}, of which {report.crashes} crashed; {report.seconds:.1f} s",
+        highlight=False,
     )
     show_path("table", root / TABLE, console)

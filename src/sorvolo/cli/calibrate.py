@@ -16,9 +16,15 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    inputs: Annotated[list[Path], typer.Argument(help="Photos of the board, a folder of photos, or a video.")],
-    board: Annotated[str, typer.Option(help="Inner corners of the board, such as 9x6 for 10 x 7 squares.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Camera file to write.")] = Path("camera.xml"),
+    inputs: Annotated[
+        list[Path], typer.Argument(help="Photos of the board, a folder of photos, or a video.")
+    ],
+    board: Annotated[
+        str, typer.Option(help="Inner corners of the board, such as 9x6 for 10 x 7 squares.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Camera file to write.")] = Path(
+        "camera.xml"
+    ),
     square: Annotated[float, typer.Option(help="Side of a square, mm.")] = 25.0,
     as_json: AsJson = False,
 ) -> None:
@@ -27,7 +33,12 @@ def calibrate(
     Example: sorvolo calibrate board_video.mp4 --board 9x6 -o camera.xml
     """
     from sorvolo.capture.checkerboard import BoardView
-    from sorvolo.missions.calibrate_camera import calibrate_camera, find_views, parse_board, write_calibration
+    from sorvolo.missions.calibrate_camera import (
+        calibrate_camera,
+        find_views,
+        parse_board,
+        write_calibration,
+    )
 
     chessboard = parse_board(board, square)
     looked = []

@@ -48,7 +48,13 @@ if TYPE_CHECKING:
     from sorvolo.missions.flight.settings import CompareSettings
     from sorvolo.survey.findings import Change, CompareUpdate
 
-_COLOURS = {"appeared": "green", "disappeared": "red", "replaced": "yellow", "area": "blue", "moving": "cyan"}
+_COLOURS = {
+    "appeared": "green",
+    "disappeared": "red",
+    "replaced": "yellow",
+    "area": "blue",
+    "moving": "cyan",
+}
 _MOST_ROWS, _MOST_REASONS = 40, 6
 _LEAST_SHOWN = 0.01  # of the compared ground: gaps smaller than that are in the report alone
 
@@ -61,20 +67,29 @@ class ChangeMethod(StrEnum):
 
 
 LaterFlights = Annotated[
-    list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight.")
+    list[str],
+    typer.Argument(help="Videos, folders of photos, photos, or live sources of a later flight."),
 ]
 ComparedSite = Annotated[
     str, typer.Option(help="Folder of the map that an earlier flight made, or s3://BUCKET/NAME.")
 ]
 MethodOption = Annotated[
-    ChangeMethod, typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline.")
+    ChangeMethod,
+    typer.Option(help="robust: copes with light, shadows and wind. thesis: the baseline."),
 ]
-ViewsPerSecond = Annotated[float, typer.Option(help="Frames of a video compared per second of flight.")]
-Votes = Annotated[int, typer.Option(help="How many views must show a change before it is announced ...")]
+ViewsPerSecond = Annotated[
+    float, typer.Option(help="Frames of a video compared per second of flight.")
+]
+Votes = Annotated[
+    int, typer.Option(help="How many views must show a change before it is announced ...")
+]
 Voters = Annotated[int, typer.Option(help="... and of how many, the last ones of that ground.")]
-WritesMasks = Annotated[bool, typer.Option("--masks", help="Also write each frame's change mask and boxes.")]
+WritesMasks = Annotated[
+    bool, typer.Option("--masks", help="Also write each frame's change mask and boxes.")
+]
 StepsFolder = Annotated[
-    Path | None, typer.Option(help="Folder for pictures of method thesis's eight steps (4-8 MB a view).")
+    Path | None,
+    typer.Option(help="Folder for pictures of method thesis's eight steps (4-8 MB a view)."),
 ]
 ThesisValues = Annotated[
     list[str] | None,
@@ -84,15 +99,21 @@ ThesisValues = Annotated[
     ),
 ]
 UpdatesMap = Annotated[
-    bool, typer.Option("--update/--no-update", help="Update the map where the ground changed or is new.")
+    bool,
+    typer.Option("--update/--no-update", help="Update the map where the ground changed or is new."),
 ]
 TrustsMap = Annotated[
     bool, typer.Option("--trust-map", help="Compare even with a map that contradicts itself.")
 ]
 NamedClasses = Annotated[
-    str | None, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
+    str | None,
+    typer.Option(
+        help="What to look for, with commas.", show_default="what the model usually reports"
+    ),
 ]
-NamingModel = Annotated[str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")]
+NamingModel = Annotated[
+    str, typer.Option(help="Detector that names what changed: a model's name, a file, or none.")
+]
 
 
 def compare(
@@ -133,14 +154,32 @@ def compare(
     from sorvolo.missions.flight.settings import CompareSettings
 
     settings = CompareSettings(
-        method.value, views_per_second, votes, voters, offset, ground_elevation, updates_map=update, writes_masks=masks,
-        model=model, thesis=thesis_options(thesis or []), trusts_map=trust_map,
+        method.value,
+        views_per_second,
+        votes,
+        voters,
+        offset,
+        ground_elevation,
+        updates_map=update,
+        writes_masks=masks,
+        model=model,
+        thesis=thesis_options(thesis or []),
+        trusts_map=trust_map,
         classes=wanted_classes(classes),
     )
     with opened_site(site, writes=True) as place:
         results = compare_and_read_results(
-            inputs, place.folder, settings, telemetry=telemetry, camera=camera or None, area=area, steps=steps,
-            live=LiveSettings(keeps_all=True, give_up_s=give_up), form=coordinates, again=again, sent=place.sent,
+            inputs,
+            place.folder,
+            settings,
+            telemetry=telemetry,
+            camera=camera or None,
+            area=area,
+            steps=steps,
+            live=LiveSettings(keeps_all=True, give_up_s=give_up),
+            form=coordinates,
+            again=again,
+            sent=place.sent,
         )
         if as_json:
             typer.echo(json.dumps({"site": str(place.folder), "flights": results}, indent=1))
@@ -151,9 +190,17 @@ def compare(
 
 
 def compare_and_read_results(
-    inputs: Sequence[Path | str], site: Path, settings: "CompareSettings", *, telemetry: Path | str | None = None,
-    camera: str | None = None, area: Path | None = None, steps: Path | None = None,
-    live: "LiveSettings | None" = None, form: PlaceFormat = PlaceFormat.LATLON, again: bool = False,
+    inputs: Sequence[Path | str],
+    site: Path,
+    settings: "CompareSettings",
+    *,
+    telemetry: Path | str | None = None,
+    camera: str | None = None,
+    area: Path | None = None,
+    steps: Path | None = None,
+    live: "LiveSettings | None" = None,
+    form: PlaceFormat = PlaceFormat.LATLON,
+    again: bool = False,
     sent: Passing = not_sent,
 ) -> list[dict[str, Any]]:
     """Compare with progress and announcements on stderr; report and changes of each flight, in order.
@@ -166,10 +213,20 @@ def compare_and_read_results(
 
     before = newest_version(site)
     with ended_by_signal(inputs) as until:
-        comparing = sent(compare_flights(
-            inputs, site, settings, telemetry=telemetry, camera=camera, area=area, steps=steps,
-            live=live or LiveSettings(keeps_all=True), until=until, again=again,
-        ))
+        comparing = sent(
+            compare_flights(
+                inputs,
+                site,
+                settings,
+                telemetry=telemetry,
+                camera=camera,
+                area=area,
+                steps=steps,
+                live=live or LiveSettings(keeps_all=True),
+                until=until,
+                again=again,
+            )
+        )
         known: list[AlreadyDone] = []
 
         def noted() -> "Iterator[CompareUpdate]":
@@ -180,13 +237,18 @@ def compare_and_read_results(
             announced = _show_progress(noted(), site, Console(stderr=True), form)
     show_done(known, "compared")
     with Archive.open(site, write=False) as archive:
-        compared = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        compared = [
+            each.flight_id for each in archive.versions() if each.complete and each.id > before
+        ]
         compared += [each.flight for each in known]
         return [_result(archive.flight_folder(flight_id), announced) for flight_id in compared]
 
 
 def show_results(
-    results: Sequence[Mapping[str, Any]], site: Path, console: Console, form: PlaceFormat = PlaceFormat.LATLON
+    results: Sequence[Mapping[str, Any]],
+    site: Path,
+    console: Console,
+    form: PlaceFormat = PlaceFormat.LATLON,
 ) -> None:
     """Print what changed, what could not be compared, and where the files are."""
     from sorvolo.store.exports.plain import features_path
@@ -217,7 +279,9 @@ def _show_progress(
             compared = f"{update.compared:,} of {counted(update.views, 'view')} compared"
             doing = "looking for the flight, frame" if update.comes_again else "comparing, frame"
             progress.show(
-                doing, update.frames_read, max(update.frames_expected, update.frames_read),
+                doing,
+                update.frames_read,
+                max(update.frames_expected, update.frames_read),
                 f"{rate_words(update.frames_read, update.seconds)}{compared}, {counted(len(announced), 'change')}",
             )
         resumed.end()
@@ -254,11 +318,21 @@ def _result(folder: Path, announced: Sequence[str]) -> dict[str, Any]:
     report = read_json(folder / "report.json")
     changes = read_json(features_path(folder, "changes"))
     kept = {feature["properties"]["id"] for feature in changes["features"]}
-    withdrawn = [each for each in announced if each.rpartition("-")[0] == report["flight"] and each not in kept]
+    withdrawn = [
+        each
+        for each in announced
+        if each.rpartition("-")[0] == report["flight"] and each not in kept
+    ]
     return {
-        "flight": report["flight"], "method": report["method"], "comparison": report["comparison"],
-        "frames": report["frames"], "seconds": report["seconds"]["total"], "peak_memory_mb": report["peak_memory_mb"],
-        "warnings": report["warnings"], "notices": report["notices"], "changes": changes,
+        "flight": report["flight"],
+        "method": report["method"],
+        "comparison": report["comparison"],
+        "frames": report["frames"],
+        "seconds": report["seconds"]["total"],
+        "peak_memory_mb": report["peak_memory_mb"],
+        "warnings": report["warnings"],
+        "notices": report["notices"],
+        "changes": changes,
         "withdrawn": withdrawn,
     }
 
@@ -267,7 +341,9 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     comparison, features = result["comparison"], result["changes"]["features"]
     dark = " (too dark: most changes would be missed)" if comparison.get("most_missed") else ""
     console.print(
-        f"Flight {escape(result['flight'])}: {comparison['headline']['text']}{dark}", style="bold", highlight=False
+        f"Flight {escape(result['flight'])}: {comparison['headline']['text']}{dark}",
+        style="bold",
+        highlight=False,
     )
     is_local = result["changes"].get("crs", "WGS84") is None  # no place on Earth, no metres
     if features:
@@ -275,7 +351,8 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     views = comparison["views"]
     console.print(
         f"{views['compared']:,} of {counted(sum(views.values()), 'view')} compared in {result['seconds']:.1f} s; "
-        f"memory at most {result['peak_memory_mb']:,.0f} MB", highlight=False,
+        f"memory at most {result['peak_memory_mb']:,.0f} MB",
+        highlight=False,
     )
     _show_coverage(comparison["coverage"], console, is_local=is_local)
     extension = comparison.get("extension") or {}
@@ -283,13 +360,18 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
         more = extension["shown_as_well"]
         console.print(
             f"the map grew by {extension['area_m2']:,.0f} m2 from {counted(extension['frames'], 'frame')}"
-            + (f"; {counted(more, 'more frame')} {plural('shows', more)} the same ground" if more else ""),
+            + (
+                f"; {counted(more, 'more frame')} {plural('shows', more)} the same ground"
+                if more
+                else ""
+            ),
             highlight=False,
         )
     if result["withdrawn"]:
         console.print(
             f"withdrawn (not confirmed by the whole flight): {', '.join(result['withdrawn'])}",
-            highlight=False, markup=False,
+            highlight=False,
+            markup=False,
         )
     for reason, count in list(comparison["reasons"].items())[:_MOST_REASONS]:
         console.print(f"  {counted(count, 'view')}: {escape(reason)}", highlight=False)
@@ -300,11 +382,20 @@ def _show_coverage(coverage: Mapping[str, Any], console: Console, *, is_local: b
     """What kept ground from being compared, and how small a thing would have been found on the rest."""
     from sorvolo.survey.coverage import GAP_WORDS, Gap
 
-    gaps = {name: area for name, area in coverage["gaps_m2"].items() if area >= _LEAST_SHOWN * coverage["compared_m2"]}
+    gaps = {
+        name: area
+        for name, area in coverage["gaps_m2"].items()
+        if area >= _LEAST_SHOWN * coverage["compared_m2"]
+    }
     for name, area in gaps.items():
-        console.print(f"  not compared: {area_text(area, is_local=is_local)}, {GAP_WORDS[Gap(name)]}", highlight=False)
+        console.print(
+            f"  not compared: {area_text(area, is_local=is_local)}, {GAP_WORDS[Gap(name)]}",
+            highlight=False,
+        )
     if not is_local:
-        console.print(f"test objects drawn into these views: {_size_words(coverage)}", highlight=False)
+        console.print(
+            f"test objects drawn into these views: {_size_words(coverage)}", highlight=False
+        )
 
 
 def _size_words(coverage: Mapping[str, Any]) -> str:
@@ -320,7 +411,9 @@ def _size_words(coverage: Mapping[str, Any]) -> str:
     return f"on half of the ground, plain ones are found from {plain:g} m; {faint_words}"
 
 
-def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool) -> None:
+def _show_changes(
+    features: Sequence[Any], console: Console, form: PlaceFormat, *, is_local: bool
+) -> None:
     from sorvolo.geometry.coordinates import Coordinates, place_text
 
     unit = "units" if is_local else "m"
@@ -328,24 +421,37 @@ def _show_changes(features: Sequence[Any], console: Console, form: PlaceFormat, 
     place_name = place_heading(is_local, form)
     for name in ("id", "kind", f"length {unit}", place_name, f"accuracy {unit}", "views", "score"):
         table.add_column(
-            name, no_wrap=name in ("id", "kind", place_name), overflow="fold", min_width=max(map(len, name.split()))
+            name,
+            no_wrap=name in ("id", "kind", place_name),
+            overflow="fold",
+            min_width=max(map(len, name.split())),
         )
     for feature in features[:_MOST_ROWS]:
         each = feature["properties"]
         x, y = _middle(feature["geometry"]["coordinates"][0])
         what = _class_words(each["class_before"], each["class_after"])
         table.add_row(
-            escape(each["id"]), f"{each['kind']}\n{what}" if what else str(each["kind"]), f"{each['length_m']:.2f}",
+            escape(each["id"]),
+            f"{each['kind']}\n{what}" if what else str(each["kind"]),
+            f"{each['length_m']:.2f}",
             f"{x:.1f}, {y:.1f}" if is_local else place_text(y, x, Coordinates(form.value)),
-            f"{each['sigma_m']:.2f}", str(each["views"]), f"{each['score']:.2f}",
+            f"{each['sigma_m']:.2f}",
+            str(each["views"]),
+            f"{each['score']:.2f}",
         )
     console.print(table)
     if len(features) > _MOST_ROWS:
         console.print(f"and {len(features) - _MOST_ROWS:,} more in changes.geojson")
     single = sum(bool(each["properties"].get("single_view")) for each in features)
-    alone = f"; {counted(single, 'change')} by one view alone, where no other saw the ground" if single else ""
+    alone = (
+        f"; {counted(single, 'change')} by one view alone, where no other saw the ground"
+        if single
+        else ""
+    )
     console.print(
-        f"accuracy: 1 sigma; views: how many show it{alone}; score: 0 to 1, how sure", style="dim", highlight=False
+        f"accuracy: 1 sigma; views: how many show it{alone}; score: 0 to 1, how sure",
+        style="dim",
+        highlight=False,
     )
 
 

@@ -40,7 +40,9 @@ def demo(
     console = Console()
     settings = preset("demo")
     if _is_simulated(simulation, settings):
-        console.print(f"using the flights of an earlier demo: {simulation}", soft_wrap=True, highlight=False)
+        console.print(
+            f"using the flights of an earlier demo: {simulation}", soft_wrap=True, highlight=False
+        )
     else:
         console.print(f"simulating two flights: {simulation}", soft_wrap=True, highlight=False)
         _simulate(simulation, settings)
@@ -93,7 +95,9 @@ def _simulate(folder: Path, settings: "SimulationSettings") -> None:
         progress.show("simulating the site")
         for step in simulate_site(folder, settings):
             if step.stage == "frames":
-                progress.show(f"simulating {step.flight}, frame", step.frames_done, step.frames_total)
+                progress.show(
+                    f"simulating {step.flight}, frame", step.frames_done, step.frames_total
+                )
 
 
 def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
@@ -103,7 +107,10 @@ def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
 
     try:
         mark = json.loads((folder / MARK).read_text(encoding="utf-8"))
-        same = mark["settings"] == plain_json(asdict(settings)) and mark["versions"]["sorvolo"] == __version__
+        same = (
+            mark["settings"] == plain_json(asdict(settings))
+            and mark["versions"]["sorvolo"] == __version__
+        )
     except (OSError, ValueError, KeyError, TypeError):
         return False
     return bool(same) and (folder / _FLIGHT).is_file()

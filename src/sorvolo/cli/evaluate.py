@@ -34,9 +34,12 @@ def evaluate() -> None:
 def mosaic(
     site: SiteArgument,
     truth: Annotated[Path | None, typer.Option(help="Folder that `sorvolo simulate` made.")] = None,
-    reference: Annotated[Path | None, typer.Option(help="A reference map: a GeoTIFF of the same ground.")] = None,
+    reference: Annotated[
+        Path | None, typer.Option(help="A reference map: a GeoTIFF of the same ground.")
+    ] = None,
     positions: Annotated[
-        Path | None, typer.Option(help="CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m].")
+        Path | None,
+        typer.Option(help="CSV of camera positions: frame,longitude_deg,latitude_deg[,height_m]."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -50,7 +53,9 @@ def mosaic(
     from sorvolo.store.exports.plain import plain_json
 
     with opened_site(site) as place:
-        measured = evaluate_mosaic(place.folder, truth=truth, reference=reference, positions=positions)
+        measured = evaluate_mosaic(
+            place.folder, truth=truth, reference=reference, positions=positions
+        )
     if as_json:
         typer.echo(json.dumps(plain_json(measured), indent=1))
     else:
@@ -60,9 +65,14 @@ def mosaic(
 @evaluate_app.command()
 def changes(
     found: Annotated[
-        str, typer.Argument(help="Folder of a map that was compared, or s3://BUCKET/NAME; or a folder of masks.")
+        str,
+        typer.Argument(
+            help="Folder of a map that was compared, or s3://BUCKET/NAME; or a folder of masks."
+        ),
     ],
-    truth: Annotated[Path, typer.Option(help="Folder that `sorvolo simulate` made, or a folder of masks.")],
+    truth: Annotated[
+        Path, typer.Option(help="Folder that `sorvolo simulate` made, or a folder of masks.")
+    ],
     flight: Annotated[str | None, typer.Option(help="Only this compared flight.")] = None,
     least_px: Annotated[
         int, typer.Option(help="Changed pixels that make a frame positive; 1 as in the thesis.")
@@ -121,14 +131,16 @@ def _show_objects(console: Console, measured: "FlightObjects") -> None:
     console.print(table)
     console.print(
         f"{measured.flight}: count error {measured.count_error:+.1%}; {measured.moving} of the objects found move; "
-        f"moving or standing is right for {measured.moving_right}", highlight=False,
+        f"moving or standing is right for {measured.moving_right}",
+        highlight=False,
     )
     if math.isfinite(measured.rms_m):
         console.print(
             f"{measured.flight}: position error {measured.rms_m:.2f} m rms, {measured.p95_m:.2f} m at 95 %, "
             f"{measured.own_rms_m:.2f} m rms without the map's own shift of {measured.map_shift_m:.2f} m; "
             f"{_share(measured.within_two_sigma)} within twice the reported accuracy (1 sigma, median "
-            f"{measured.sigma_median_m:.2f} m); length error {measured.length_error_m:.2f} m median", highlight=False,
+            f"{measured.sigma_median_m:.2f} m); length error {measured.length_error_m:.2f} m median",
+            highlight=False,
         )
     for each in measured.missed:
         console.print(f"{measured.flight}: missed {each}", highlight=False)
@@ -144,7 +156,8 @@ def show_changes(console: Console, measured: "FlightChanges") -> None:
         classes = measured.classes
         console.print(
             f"{measured.flight}: class before and after, of the events of the right kind: {classes.right} right, "
-            f"{classes.wrong} wrong, {classes.unnamed} without a class", highlight=False,
+            f"{classes.wrong} wrong, {classes.unnamed} without a class",
+            highlight=False,
         )
     for remark in measured.remarks:
         console.print(f"{measured.flight}: {remark}")
@@ -154,14 +167,19 @@ def _show_masks(console: Console, flight: str, masks: "MaskScores") -> None:
     table = Table("per", "pixel", "frame")
     both = masks.pixels, masks.frames
     for name in ("tp", "fp", "fn", "tn", "unknown"):
-        table.add_row(name.upper() if len(name) < 3 else name, *(f"{getattr(each, name):,}" for each in both))
+        table.add_row(
+            name.upper() if len(name) < 3 else name, *(f"{getattr(each, name):,}" for each in both)
+        )
     for name in ("precision", "recall", "accuracy", "f1"):
-        table.add_row("F1" if name == "f1" else name, *(_share(getattr(each, name), 2) for each in both))
+        table.add_row(
+            "F1" if name == "f1" else name, *(_share(getattr(each, name), 2) for each in both)
+        )
     console.print(table)
     console.print(
         f"{flight}: {counted(masks.compared, 'mask')} compared; without truth: {masks.only_found}; true "
         f"masks without a found one: {masks.only_true}; a frame is positive from "
-        f"{counted(masks.least_px, 'changed pixel')} on", highlight=False,
+        f"{counted(masks.least_px, 'changed pixel')} on",
+        highlight=False,
     )
 
 
@@ -172,22 +190,39 @@ def _show_events(console: Console, flight: str, scores: "EventScores", map_shift
         if any(numbers):
             table.add_row(name, *map(str, numbers))
     table.add_section()
-    table.add_row("all", *map(str, (
-        scores.must_find, scores.found, scores.named_right, scores.late, scores.twice, scores.false
-    )))
+    table.add_row(
+        "all",
+        *map(
+            str,
+            (
+                scores.must_find,
+                scores.found,
+                scores.named_right,
+                scores.late,
+                scores.twice,
+                scores.false,
+            ),
+        ),
+    )
     console.print(table)
     console.print(
         f"{flight}: found {_share(scores.found_share)}; {scores.false_per_hectare:.2f} false per hectare "
         f"({scores.compared_m2:,.0f} m2 compared); {scores.twice} reported twice; {scores.late} of "
-        f"{scores.judged_late} late", highlight=False,
+        f"{scores.judged_late} late",
+        highlight=False,
     )
     if math.isfinite(scores.error_median_m):
-        shift = f" (the map's own shift of {map_shift_m:.2f} m taken out)" if math.isfinite(map_shift_m) else ""
+        shift = (
+            f" (the map's own shift of {map_shift_m:.2f} m taken out)"
+            if math.isfinite(map_shift_m)
+            else ""
+        )
         console.print(
             f"{flight}: position error {scores.error_median_m:.2f} m median, {scores.error_p95_m:.2f} m at "
             f"95 %{shift}; {_share(scores.within_two_sigma)} within twice the reported accuracy on the map (1 sigma, "
             f"median {scores.sigma_median_m:.2f} m), {_share(scores.world_within_two_sigma)} in the world (median "
-            f"{scores.world_sigma_median_m:.2f} m)", highlight=False,
+            f"{scores.world_sigma_median_m:.2f} m)",
+            highlight=False,
         )
 
 
@@ -199,9 +234,10 @@ def _show(measured: "MosaicEvaluation") -> None:
     console = Console()
     frames = Table("flight", "selected", "matched", "by GPS alone", "left out", "without truth")
     for each in measured.flights:
-        frames.add_row(each.flight, *map(str, (
-            each.selected, each.vision, each.gps_only, each.rejected, each.unmatched
-        )))
+        frames.add_row(
+            each.flight,
+            *map(str, (each.selected, each.vision, each.gps_only, each.rejected, each.unmatched)),
+        )
     console.print(frames)
     errors = Table("against", "rms m", "p95 m", "max m", "rms px", "points")
     for truth in measured.truth:
@@ -220,7 +256,9 @@ def _show(measured: "MosaicEvaluation") -> None:
         console.print(errors)
     for truth in measured.truth:
         if math.isfinite(truth.corners.over_floor):
-            console.print(f"{truth.flight}: absolute error is {truth.corners.over_floor:.2f} times its floor")
+            console.print(
+                f"{truth.flight}: absolute error is {truth.corners.over_floor:.2f} times its floor"
+            )
     deviation = measured.deviation
     if deviation.frames:
         console.print(
@@ -240,6 +278,10 @@ def _show(measured: "MosaicEvaluation") -> None:
 def _add(table: Table, name: str, spread: "Spread") -> None:
     if spread.count:
         table.add_row(
-            name, f"{spread.rms_m:.3f}", f"{spread.p95_m:.3f}", f"{spread.max_m:.3f}", f"{spread.rms_px:.2f}",
+            name,
+            f"{spread.rms_m:.3f}",
+            f"{spread.p95_m:.3f}",
+            f"{spread.max_m:.3f}",
+            f"{spread.rms_px:.2f}",
             str(spread.count),
         )

@@ -23,30 +23,56 @@ if TYPE_CHECKING:
     from sorvolo.survey.labels import LabelledSet
 
 MeasuredModels = Annotated[
-    str, typer.Argument(help="A model's name or file, or detections.json; several seeds separated by commas.")
+    str,
+    typer.Argument(
+        help="A model's name or file, or detections.json; several seeds separated by commas."
+    ),
 ]
-LabelledPictures = Annotated[list[Path], typer.Argument(help="Labelled pictures: folders or label files.")]
+LabelledPictures = Annotated[
+    list[Path], typer.Argument(help="Labelled pictures: folders or label files.")
+]
 ComparedModels = Annotated[
-    list[str] | None, typer.Option(help="Another model to compare on the same pictures. Can be repeated.")
+    list[str] | None,
+    typer.Option(help="Another model to compare on the same pictures. Can be repeated."),
 ]
-LabelFormat = Annotated[str | None, typer.Option(help="Label format: coco, yolo, voc ...", show_default="recognised")]
+LabelFormat = Annotated[
+    str | None, typer.Option(help="Label format: coco, yolo, voc ...", show_default="recognised")
+]
 ClassNames = Annotated[
-    str | None, typer.Option(help="Class names of the set as ours, such as 'Pedestrian=person,Van=car'.")
+    str | None,
+    typer.Option(help="Class names of the set as ours, such as 'Pedestrian=person,Van=car'."),
 ]
 IgnoredClasses = Annotated[str, typer.Option(help="Class names whose boxes are ignored.")]
-UnlabelledClasses = Annotated[str, typer.Option(help="Our classes that may be there without a label.")]
-VideoPattern = Annotated[str, typer.Option(help="Regular expression: use only pictures of matching videos.")]
+UnlabelledClasses = Annotated[
+    str, typer.Option(help="Our classes that may be there without a label.")
+]
+VideoPattern = Annotated[
+    str, typer.Option(help="Regular expression: use only pictures of matching videos.")
+]
 HeldOutShare = Annotated[
-    float, typer.Option(help="Use only the share that `sorvolo train --val SHARE` with the same seed holds out.")
+    float,
+    typer.Option(
+        help="Use only the share that `sorvolo train --val SHARE` with the same seed holds out."
+    ),
 ]
 Tiles = Annotated[
-    str, typer.Option(help="How pictures are shown: auto (as photos in watch), none (as they are), pixels of a tile.")
+    str,
+    typer.Option(
+        help="How pictures are shown: auto (as photos in watch), none (as they are), pixels of a tile."
+    ),
 ]
 FromAbove = Annotated[
-    bool, typer.Option("--from-above", help="The pictures look straight down: models that want it look twice.")
+    bool,
+    typer.Option(
+        "--from-above", help="The pictures look straight down: models that want it look twice."
+    ),
 ]
-ReportFolder = Annotated[Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")]
-BootstrapDraws = Annotated[int, typer.Option(min=20, help="Bootstrap draws for the confidence intervals.")]
+ReportFolder = Annotated[
+    Path | None, typer.Option(help="Folder for detector.html, detector.json, detections.json.")
+]
+BootstrapDraws = Annotated[
+    int, typer.Option(min=20, help="Bootstrap draws for the confidence intervals.")
+]
 Seed = Annotated[int, typer.Option(help="Random seed of the bootstrap and of what is held out.")]
 AsJsonReport = Annotated[bool, typer.Option("--json", help="Print detector.json.")]
 
@@ -89,14 +115,28 @@ def detector(
     settings = EvaluationSettings(_tiles(tiles), draws, seed, from_above)
     arms = [list(names(each)) for each in (model, *(compare or ()))]
     labelled = read_sets(
-        data, form=form, classes=class_names(classes), ignore=names(ignore), unlabelled=names(unlabelled),
-        group_pattern=group_pattern, videos=videos, held_out=held_out, seed=seed, known=known_classes(arms),
+        data,
+        form=form,
+        classes=class_names(classes),
+        ignore=names(ignore),
+        unlabelled=names(unlabelled),
+        group_pattern=group_pattern,
+        videos=videos,
+        held_out=held_out,
+        seed=seed,
+        known=known_classes(arms),
     )
     measured = _measured(arms, labelled, settings)
     notices = _notices(labelled, measured)
     description = {
-        "sorvolo": __version__, "data": ", ".join(map(str, data)), "arms": "; ".join(", ".join(arm) for arm in arms),
-        "videos": videos or "all", "held_out": held_out or "all", "tiles": tiles, "draws": draws, "seed": seed,
+        "sorvolo": __version__,
+        "data": ", ".join(map(str, data)),
+        "arms": "; ".join(", ".join(arm) for arm in arms),
+        "videos": videos or "all",
+        "held_out": held_out or "all",
+        "tiles": tiles,
+        "draws": draws,
+        "seed": seed,
         "from_above": from_above,
         "notices": "; ".join(notices),
     }
@@ -116,7 +156,9 @@ def _measured(
 
     with ProgressReport(Console(stderr=True)) as progress:
         return evaluate_detector(
-            arms, labelled, settings,
+            arms,
+            labelled,
+            settings,
             lambda step: progress.show(
                 f"{step.model} on {step.set_name}, picture", step.pictures_done, step.pictures_total
             ),
@@ -157,13 +199,24 @@ def _show(console: Console, scores: "SetScores") -> None:
         table.add_column(name, no_wrap=True, justify="left" if name == "class" else "right")
     for row in scores.classes:
         table.add_row(
-            row.label, str(row.labels), _between(scores.intervals[f"AP {row.label}"]),
-            _between(scores.intervals[f"AP50 {row.label}"]), _share(row.reported.precision),
-            _share(row.reported.recall), f"{row.reported.score:.2f}", _share(row.thesis_ap),
+            row.label,
+            str(row.labels),
+            _between(scores.intervals[f"AP {row.label}"]),
+            _between(scores.intervals[f"AP50 {row.label}"]),
+            _share(row.reported.precision),
+            _share(row.reported.recall),
+            f"{row.reported.score:.2f}",
+            _share(row.thesis_ap),
         )
     table.add_section()
     table.add_row(
-        "mean", "", _between(scores.intervals["AP"]), _between(scores.intervals["AP50"]), "", "", "",
+        "mean",
+        "",
+        _between(scores.intervals["AP"]),
+        _between(scores.intervals["AP50"]),
+        "",
+        "",
+        "",
         _share(scores.thesis_map),
     )
     console.print(table)
@@ -179,7 +232,9 @@ def _show(console: Console, scores: "SetScores") -> None:
 def _show_comparison(console: Console, each: "SetComparison") -> None:
     first = each.arms[0].name
     head = [arm.name for arm in each.arms] + [f"{arm.name} less {first}" for arm in each.arms[1:]]
-    table = Table("measure", *head, title=f"side by side: {each.name} (differences in percentage points)")
+    table = Table(
+        "measure", *head, title=f"side by side: {each.name} (differences in percentage points)"
+    )
     for name, value in each.arms[0].mean.items():
         if not math.isfinite(value):
             continue
@@ -197,7 +252,11 @@ def _difference(found: "Difference") -> str:
 
 
 def _between(interval: "Interval") -> str:
-    bounds = f"\n{100 * interval.low:.1f}-{100 * interval.high:.1f}" if math.isfinite(interval.low) else ""
+    bounds = (
+        f"\n{100 * interval.low:.1f}-{100 * interval.high:.1f}"
+        if math.isfinite(interval.low)
+        else ""
+    )
     return _share(interval.value) + bounds
 
 

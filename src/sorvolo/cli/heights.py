@@ -22,9 +22,14 @@ if TYPE_CHECKING:
 
 def heights(
     site: SiteArgument,
-    flight: Annotated[str, typer.Option(help="Which flight. Without it: that of the newest map.")] = "",
+    flight: Annotated[
+        str, typer.Option(help="Which flight. Without it: that of the newest map.")
+    ] = "",
     cell: Annotated[
-        float | None, typer.Option(help="Side of the height model's cells, m. Without it: 3 to 6 pixels of the map.")
+        float | None,
+        typer.Option(
+            help="Side of the height model's cells, m. Without it: 3 to 6 pixels of the map."
+        ),
     ] = None,
     orthophoto: Annotated[bool, typer.Option(help="Also make a true orthophoto.")] = True,
     as_json: AsJson = False,
@@ -48,7 +53,11 @@ def heights(
 
 
 def make_and_read(
-    site: Path, flight: str = "", cell_m: float | None = None, *, has_orthophoto: bool = True,
+    site: Path,
+    flight: str = "",
+    cell_m: float | None = None,
+    *,
+    has_orthophoto: bool = True,
     catalogues: "Catalogues | None" = None,
 ) -> Mapping[str, Any]:
     """Make a flight's heights with progress on stderr; their report."""
@@ -59,7 +68,9 @@ def make_and_read(
     with ProgressReport(Console(stderr=True)) as progress:
         progress.show("heights")
         for update in make_heights(
-            site, HeightSettings(cell_m=cell_m, has_orthophoto=has_orthophoto), flight=flight or None,
+            site,
+            HeightSettings(cell_m=cell_m, has_orthophoto=has_orthophoto),
+            flight=flight or None,
             catalogues=catalogues,
         ):
             flight_id = update.flight_id
@@ -72,17 +83,29 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
     from sorvolo.store.site.files import HeightFile
 
     cameras, surface = report["cameras"], report["surface"]
-    table = Table(title=f"Heights of {escape(report['flight'])}", show_header=False, title_justify="left")
+    table = Table(
+        title=f"Heights of {escape(report['flight'])}", show_header=False, title_justify="left"
+    )
     rows = [
         ("photos", f"{cameras['views']} with {cameras['points']:,} points in space"),
         ("match error", f"{cameras['residual_rms_px']:.2f} px (root mean square)"),
-        ("cells", f"{100 * report['cell_m']:.1f} cm, {surface['covered_m2']:,.0f} m2 seen by two photos"),
+        (
+            "cells",
+            f"{100 * report['cell_m']:.1f} cm, {surface['covered_m2']:,.0f} m2 seen by two photos",
+        ),
         ("holes", f"{surface['holes_share']:.1%} of the ground that two photos see"),
-        ("height error", "" if surface["sigma_median_m"] is None else
-         f"{surface['sigma_median_m']:.2f} m (1 sigma, median; without the error shared by all GPS fixes)"),
+        (
+            "height error",
+            ""
+            if surface["sigma_median_m"] is None
+            else f"{surface['sigma_median_m']:.2f} m (1 sigma, median; without the error shared by all GPS fixes)",
+        ),
         ("judged by", _judged(surface["own_points"])),
         ("bare ground", f"{surface['ground_share']:.0%} of the cells"),
-        ("took", f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB"),
+        (
+            "took",
+            f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB",
+        ),
     ]
     for name, text in rows:
         if text:
@@ -92,7 +115,9 @@ def show_heights(site: Path, report: Mapping[str, Any], console: Console) -> Non
         console.print(f"[yellow]warning[/yellow] {escape(warning)}", highlight=False)
     folder = site / "flights" / report["flight"]
     for name, file in (
-        ("heights", HeightFile.SURFACE), ("bare ground", HeightFile.GROUND), ("orthophoto", HeightFile.ORTHOPHOTO),
+        ("heights", HeightFile.SURFACE),
+        ("bare ground", HeightFile.GROUND),
+        ("orthophoto", HeightFile.ORTHOPHOTO),
         ("picture", HeightFile.PICTURE),
     ):
         if (folder / file).is_file():

@@ -23,11 +23,15 @@ if TYPE_CHECKING:
 def history(
     site: SiteArgument,
     at: Annotated[
-        str | None, typer.Option(help="Version number, or a date or time (UTC): the newest version by then.")
+        str | None,
+        typer.Option(help="Version number, or a date or time (UTC): the newest version by then."),
     ] = None,
-    export: Annotated[Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")] = None,
+    export: Annotated[
+        Path | None, typer.Option(help="Write the map as it was: FILE.tif, .png or .kmz.")
+    ] = None,
     compress: Annotated[
-        Compression, typer.Option(help="Of a .tif: deflate (without loss) or jpeg (a fraction of the size).")
+        Compression,
+        typer.Option(help="Of a .tif: deflate (without loss) or jpeg (a fraction of the size)."),
     ] = Compression.DEFLATE,
     coordinates: PlaceFormatOption = PlaceFormat.LATLON,
     as_json: AsJson = False,
@@ -39,7 +43,9 @@ def history(
     Example: sorvolo history field --at 2026-05-31 --export may.tif
     """
     if at is not None and export is None:
-        raise SettingsError("--at chooses the map to write: give --export FILE.tif, FILE.png or FILE.kmz as well")
+        raise SettingsError(
+            "--at chooses the map to write: give --export FILE.tif, FILE.png or FILE.kmz as well"
+        )
     with opened_site(site) as place:
         if export is None:
             _list(place.folder, coordinates, as_json=as_json)
@@ -60,7 +66,9 @@ def _list(site: Path, coordinates: PlaceFormat, *, as_json: bool) -> None:
         _show_place(site, coordinates, Console())
 
 
-def _export(site: Path, at: str | None, export: Path, compress: Compression, *, as_json: bool) -> None:
+def _export(
+    site: Path, at: str | None, export: Path, compress: Compression, *, as_json: bool
+) -> None:
     from sorvolo.missions.site.history import export_version, site_history
     from sorvolo.store.exports.plain import plain_json
 
@@ -68,9 +76,15 @@ def _export(site: Path, at: str | None, export: Path, compress: Compression, *, 
     version = export_version(site, at, export, compress=compress.value)
     if as_json:
         entry = next(each for each in entries if each.version == version.id)
-        typer.echo(json.dumps({"site": str(site), "file": str(export), "version": plain_json(entry)}, indent=1))
+        typer.echo(
+            json.dumps(
+                {"site": str(site), "file": str(export), "version": plain_json(entry)}, indent=1
+            )
+        )
     else:
-        typer.echo(f"{export}: version {version.id}, flight {version.flight_id}, {version.created_utc}")
+        typer.echo(
+            f"{export}: version {version.id}, flight {version.flight_id}, {version.created_utc}"
+        )
 
 
 def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
@@ -78,16 +92,30 @@ def _show(entries: Sequence["HistoryEntry"], console: Console) -> None:
         console.print("no map yet: sorvolo map makes one")
         return
     table = Table(box=SIMPLE_HEAD, padding=0)  # 80 letters hold it
-    for name in ("no", "flown", "complete (UTC)", "flight", "by", "tiles", "MB", "changes", "reviewed"):
+    for name in (
+        "no",
+        "flown",
+        "complete (UTC)",
+        "flight",
+        "by",
+        "tiles",
+        "MB",
+        "changes",
+        "reviewed",
+    ):
         # folded between words, never within: "2 disappeared", "2026-11-22"
         table.add_column(
-            name, no_wrap=name in ("no", "flown", "tiles", "MB"), overflow="fold",
+            name,
+            no_wrap=name in ("no", "flown", "tiles", "MB"),
+            overflow="fold",
             min_width={"complete (UTC)": 10, "changes": 13, "reviewed": 11, "by": 7}.get(name),
         )
     for each in entries:
         table.add_row(*_cells(each))
     console.print(table)
-    console.print("tiles: new or changed, of all; MB: written for this version", style="dim", highlight=False)
+    console.print(
+        "tiles: new or changed, of all; MB: written for this version", style="dim", highlight=False
+    )
 
 
 def _cells(entry: "HistoryEntry") -> tuple[str, ...]:
@@ -97,9 +125,13 @@ def _cells(entry: "HistoryEntry") -> tuple[str, ...]:
     verdicts = ("confirmed", entry.confirmed), ("rejected", entry.rejected)
     again = " (repeated later)" if entry.is_replaced else ""
     return (
-        str(entry.version), entry.flown_utc[:10] or "-", entry.date_utc[:16].replace("T", " "),
-        escape(entry.flight) + again, entry.kind,
-        f"{entry.tiles_changed}/{entry.tiles}{removed}", f"{entry.bytes_changed / 1e6:.1f}",
+        str(entry.version),
+        entry.flown_utc[:10] or "-",
+        entry.date_utc[:16].replace("T", " "),
+        escape(entry.flight) + again,
+        entry.kind,
+        f"{entry.tiles_changed}/{entry.tiles}{removed}",
+        f"{entry.bytes_changed / 1e6:.1f}",
         changes or ("none" if entry.kind == "compare" else ""),
         "\n".join(f"{count} {word}" for word, count in verdicts if count),
     )
@@ -111,5 +143,7 @@ def _show_place(folder: Path, form: PlaceFormat, console: Console) -> None:
 
     site = site_of(folder)
     if not site.is_local:
-        written = place_text(site.origin.latitude_deg, site.origin.longitude_deg, Coordinates(form.value))
+        written = place_text(
+            site.origin.latitude_deg, site.origin.longitude_deg, Coordinates(form.value)
+        )
         console.print(f"the map's origin lies at {written}", highlight=False)

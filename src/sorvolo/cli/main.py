@@ -45,10 +45,24 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 _COMMANDS: dict[str, Callable[..., None]] = {
-    "inspect": inspect, "plan": plan, "map": map_command, "compare": compare, "watch": watch_command,
-    "search": search_command, "telemetry": telemetry_command, "simulate": simulate, "train": train,
-    "calibrate": calibrate, "demo": demo, "history": history, "review": review,
-    "heights": heights, "serve": serve, "stream": stream, "token": token, "batch": batch,
+    "inspect": inspect,
+    "plan": plan,
+    "map": map_command,
+    "compare": compare,
+    "watch": watch_command,
+    "search": search_command,
+    "telemetry": telemetry_command,
+    "simulate": simulate,
+    "train": train,
+    "calibrate": calibrate,
+    "demo": demo,
+    "history": history,
+    "review": review,
+    "heights": heights,
+    "serve": serve,
+    "stream": stream,
+    "token": token,
+    "batch": batch,
     "reproduce": reproduce,
 }
 _ASKED_AGAIN_S = 0.02  # an end that C code swallowed is asked for again so soon; by choice
@@ -79,7 +93,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))
     try:
         with _interrupts_repeated(), _warnings_in_one_line():
-            app(args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes)
+            app(
+                args=None if arguments is None else list(arguments), prog_name="sorvolo", obj=wishes
+            )
     except SystemExit as stop:
         code = stop.code if isinstance(stop.code, int) else 0 if stop.code is None else FAILED
         if code == STOPPED:
@@ -126,7 +142,11 @@ def _warnings_in_one_line() -> Iterator[None]:
         before = warnings.showwarning
 
         def show(
-            message: Warning | str, category: type[Warning], filename: str, lineno: int, file: TextIO | None = None,
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
             line: str | None = None,
         ) -> None:
             if issubclass(category, SorvoloWarning):
@@ -149,7 +169,9 @@ def options(
     context: typer.Context,
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop."),
+        typer.Option(
+            "--version", callback=_print_version, is_eager=True, help="Print the version and stop."
+        ),
     ] = False,
     debug: Annotated[
         bool, typer.Option("--debug", help="Show where in the program an error occurred.")

@@ -31,7 +31,13 @@ from sorvolo.cli.options import (
 )
 from sorvolo.cli.places_of_sites import Passing, not_sent, opened_site
 from sorvolo.cli.progress import show_progress
-from sorvolo.cli.shown import newest_version, read_json, show_done, show_notices_and_warnings, show_path
+from sorvolo.cli.shown import (
+    newest_version,
+    read_json,
+    show_done,
+    show_notices_and_warnings,
+    show_path,
+)
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
@@ -63,20 +69,31 @@ MappedSite = Annotated[
     str, typer.Option(help="Folder of the map, or s3://BUCKET/NAME; an existing map is extended.")
 ]
 Resolution = Annotated[
-    float | None, typer.Option(help="Ground resolution of a new map, m a pixel. Without it: the frames' own.")
+    float | None,
+    typer.Option(help="Ground resolution of a new map, m a pixel. Without it: the frames' own."),
 ]
 CoordinateSystem = Annotated[
-    str, typer.Option(help="Coordinate system of mosaic.tif, such as EPSG:25832. Without it: the UTM zone.")
+    str,
+    typer.Option(
+        help="Coordinate system of mosaic.tif, such as EPSG:25832. Without it: the UTM zone."
+    ),
 ]
 ControlPoints = Annotated[
-    Path | None, typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it.")
+    Path | None,
+    typer.Option(help="Ground control points: a gcp_list.txt, as OpenDroneMap reads it."),
 ]
-ControlAccuracy = Annotated[float, typer.Option(help="Accuracy of the control points, m (1 sigma).")]
+ControlAccuracy = Annotated[
+    float, typer.Option(help="Accuracy of the control points, m (1 sigma).")
+]
 BaseMap = Annotated[
-    Path | None, typer.Option(help="Tie the map to this one: a GeoTIFF, or the folder of an earlier map.")
+    Path | None,
+    typer.Option(help="Tie the map to this one: a GeoTIFF, or the folder of an earlier map."),
 ]
 CheckPoints = Annotated[
-    str, typer.Option(help="Control points held back to measure the map: labels with commas; CP* for a prefix.")
+    str,
+    typer.Option(
+        help="Control points held back to measure the map: labels with commas; CP* for a prefix."
+    ),
 ]
 MapCompression = Annotated[
     Compression | None,
@@ -88,16 +105,25 @@ MapCompression = Annotated[
 TransformOption = Annotated[Transform, typer.Option(help="What --method thesis fits.")]
 StitchingValues = Annotated[
     list[str] | None,
-    typer.Option(help="A value of method thesis, such as features=3000. Can be repeated. See docs/thesis.md."),
+    typer.Option(
+        help="A value of method thesis, such as features=3000. Can be repeated. See docs/thesis.md."
+    ),
 ]
 HowRegistered = Annotated[
-    Method, typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame.")
+    Method,
+    typer.Option(help="planar: all frames fitted together. thesis: the baseline, frame by frame."),
 ]
 Model = Annotated[
-    str, typer.Option(help="Detector for people, cars and small objects: a model's name, a file, or none.")
+    str,
+    typer.Option(
+        help="Detector for people, cars and small objects: a model's name, a file, or none."
+    ),
 ]
 SearchedClasses = Annotated[
-    str | None, typer.Option(help="What to look for, with commas.", show_default="what the model usually reports")
+    str | None,
+    typer.Option(
+        help="What to look for, with commas.", show_default="what the model usually reports"
+    ),
 ]
 Memory = Annotated[
     float | None,
@@ -122,12 +148,17 @@ Refly = Annotated[
     ),
 ]
 WithHeights = Annotated[
-    bool, typer.Option("--heights/--flat", help="Also make heights and a true orthophoto of each flight.")
+    bool,
+    typer.Option(
+        "--heights/--flat", help="Also make heights and a true orthophoto of each flight."
+    ),
 ]
 
 
 def map_command(
-    inputs: Annotated[list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")],
+    inputs: Annotated[
+        list[str], typer.Argument(help="Videos, folders of photos, photos, or live sources.")
+    ],
     site: MappedSite,
     telemetry: LiveTelemetry = None,
     camera: Camera = "",
@@ -173,16 +204,36 @@ def map_command(
     from sorvolo.mosaic.roi_stitching import stitching_settings
 
     settings = MapSettings(
-        method.value, gsd, overlap, offset, ground_elevation, crs or None, compress.value if compress else None,
-        model=model, thesis=stitching_settings(thesis or [], transform=transform.value),
-        control_sigma_m=gcp_accuracy, checks=names(check), memory_mb=memory, classes=wanted_classes(classes),
+        method.value,
+        gsd,
+        overlap,
+        offset,
+        ground_elevation,
+        crs or None,
+        compress.value if compress else None,
+        model=model,
+        thesis=stitching_settings(thesis or [], transform=transform.value),
+        control_sigma_m=gcp_accuracy,
+        checks=names(check),
+        memory_mb=memory,
+        classes=wanted_classes(classes),
     )
     with opened_site(site, writes=True) as place:
         catalogues = _catalogues(site, place.folder, catalogue)
         reports = map_and_read_reports(
-            inputs, place.folder, settings, telemetry=telemetry, camera=camera or None, area=area,
-            live=LiveSettings(keeps_all=True, give_up_s=give_up), control=gcp, base=base, again=again, sent=place.sent,
-            refly=refly or (), catalogues=catalogues,
+            inputs,
+            place.folder,
+            settings,
+            telemetry=telemetry,
+            camera=camera or None,
+            area=area,
+            live=LiveSettings(keeps_all=True, give_up_s=give_up),
+            control=gcp,
+            base=base,
+            again=again,
+            sent=place.sent,
+            refly=refly or (),
+            catalogues=catalogues,
         )
         _print(reports, place.folder, catalogues, with_heights=heights, as_json=as_json)
     _exit_by(reports)
@@ -204,26 +255,47 @@ def _catalogues(site: str, folder: Path, address: str) -> "Catalogues":
 
 
 def _print(
-    reports: Sequence[Mapping[str, Any]], site: Path, catalogues: "Catalogues", *, with_heights: bool, as_json: bool
+    reports: Sequence[Mapping[str, Any]],
+    site: Path,
+    catalogues: "Catalogues",
+    *,
+    with_heights: bool,
+    as_json: bool,
 ) -> None:
     """Print what became of the flights; with heights, make and print them, too."""
     if not as_json:
         show_reports(reports, site, Console())
-    heights = [make_and_read(site, each["flight"], catalogues=catalogues) for each in reports if with_heights]
+    heights = [
+        make_and_read(site, each["flight"], catalogues=catalogues)
+        for each in reports
+        if with_heights
+    ]
     if as_json:
         plain = [{key: value for key, value in each.items() if key != "track"} for each in reports]
         files = {path.name.replace(".", "_"): str(path) for path in _map_files(site).values()}
-        typer.echo(json.dumps({"site": str(site), **files, "flights": plain, "heights": heights}, indent=1))
+        typer.echo(
+            json.dumps({"site": str(site), **files, "flights": plain, "heights": heights}, indent=1)
+        )
         return
     for each in heights:
         show_heights(site, each, Console())
 
 
 def map_and_read_reports(
-    inputs: Sequence[Path | str], site: Path, settings: "MapSettings", *, telemetry: Path | str | None = None,
-    camera: str | None = None, area: Path | None = None,
-    live: "LiveSettings | None" = None, control: Path | None = None, base: Path | None = None, again: bool = False,
-    sent: Passing = not_sent, refly: Sequence[Path] = (), catalogues: "Catalogues | None" = None,
+    inputs: Sequence[Path | str],
+    site: Path,
+    settings: "MapSettings",
+    *,
+    telemetry: Path | str | None = None,
+    camera: str | None = None,
+    area: Path | None = None,
+    live: "LiveSettings | None" = None,
+    control: Path | None = None,
+    base: Path | None = None,
+    again: bool = False,
+    sent: Passing = not_sent,
+    refly: Sequence[Path] = (),
+    catalogues: "Catalogues | None" = None,
     search: "SearchWhileFlying | None" = None,
 ) -> list[dict[str, Any]]:
     """Map with progress on stderr; the reports of the flights, in order, and of those that were mapped already.
@@ -236,11 +308,24 @@ def map_and_read_reports(
 
     before = newest_version(site, catalogues)
     with ended_by_signal(inputs) as until:
-        mapping = sent(map_flights(
-            inputs, site, settings, telemetry=telemetry, camera=camera, area=area,
-            live=live or LiveSettings(keeps_all=True), until=until, control=control, base=base, again=again,
-            refly=refly, catalogues=catalogues, search=search,
-        ))
+        mapping = sent(
+            map_flights(
+                inputs,
+                site,
+                settings,
+                telemetry=telemetry,
+                camera=camera,
+                area=area,
+                live=live or LiveSettings(keeps_all=True),
+                until=until,
+                control=control,
+                base=base,
+                again=again,
+                refly=refly,
+                catalogues=catalogues,
+                search=search,
+            )
+        )
         known: list[AlreadyDone] = []
 
         def noted() -> Iterator["MosaicUpdate"]:
@@ -251,7 +336,9 @@ def map_and_read_reports(
             show_progress(noted(), Console(stderr=True))
     show_done(known, "mapped")
     with Archive.open(site, write=False, catalogues=catalogues) as archive:
-        mapped = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        mapped = [
+            each.flight_id for each in archive.versions() if each.complete and each.id > before
+        ]
         mapped += [each.flight for each in known]
         return [read_json(archive.flight_folder(flight_id) / "report.json") for flight_id in mapped]
 
@@ -294,7 +381,9 @@ def show_reports(reports: Sequence[Mapping[str, Any]], site: Path, console: Cons
 
 
 def _show_report(report: Mapping[str, Any], console: Console) -> None:
-    table = Table(title=f"Flight {escape(report['flight'])}", show_header=False, title_justify="left")
+    table = Table(
+        title=f"Flight {escape(report['flight'])}", show_header=False, title_justify="left"
+    )
     for name, text in (*_frame_rows(report["frames"]), *_quality_rows(report)):
         if text:
             table.add_row(name, text)
@@ -306,25 +395,42 @@ def _show_report(report: Mapping[str, Any], console: Console) -> None:
 def _frame_rows(frames: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("frames", f"{frames['selected']:,} selected of {frames['total']:,}"),
-        ("[green]matched[/green]", f"{frames['vision']:,} of {counted(frames['selected'], 'frame')}"),
-        ("[yellow]by GPS alone[/yellow]", counted(frames["gps-only"], "frame") if frames["gps-only"] else ""),
+        (
+            "[green]matched[/green]",
+            f"{frames['vision']:,} of {counted(frames['selected'], 'frame')}",
+        ),
+        (
+            "[yellow]by GPS alone[/yellow]",
+            counted(frames["gps-only"], "frame") if frames["gps-only"] else "",
+        ),
         ("[red]left out[/red]", counted(frames["rejected"], "frame") if frames["rejected"] else ""),
     ]
     reasons = list(frames["reasons"].items())[:_MOST_REASONS]
-    return rows + [("", escape(f"{counted(count, 'frame')}: {reason}")) for reason, count in reasons]
+    return rows + [
+        ("", escape(f"{counted(count, 'frame')}: {reason}")) for reason, count in reasons
+    ]
 
 
 def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """How well frames fit each other and, where the map has metres, the Earth."""
     residual_px = report["residual_px"]["median"]
-    rows = [("match error", _with_unit("{:.2f} px (median distance of matched points)", residual_px))]
+    rows = [
+        ("match error", _with_unit("{:.2f} px (median distance of matched points)", residual_px))
+    ]
     if report["georeferenced"]:
         rows += [
             ("flight height", _height_by_known_ground(report)),
-            ("distance to GPS", _with_unit("{:.2f} m (median)", report["gps_residual_m"]["median"])),
-            ("position accuracy", _with_unit(
-                f"{{:.2f}} m (1 sigma, including the error shared by all {_placed_by(report)})", report["sigma_m"]
-            )),
+            (
+                "distance to GPS",
+                _with_unit("{:.2f} m (median)", report["gps_residual_m"]["median"]),
+            ),
+            (
+                "position accuracy",
+                _with_unit(
+                    f"{{:.2f}} m (1 sigma, including the error shared by all {_placed_by(report)})",
+                    report["sigma_m"],
+                ),
+            ),
         ]
     return [
         *rows,
@@ -334,7 +440,10 @@ def _quality_rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("ground seen", _seen(report.get("seen"), has_metres=report["georeferenced"])),
         ("objects found", _objects(report.get("objects") or {})),
         ("clock offset", _clock_offset(report["time_offset"])),
-        ("took", f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB"),
+        (
+            "took",
+            f"{report['seconds']['total']:.1f} s, memory at most {report['peak_memory_mb']:,.0f} MB",
+        ),
     ]
 
 
@@ -352,8 +461,14 @@ def _seen(seen: Mapping[str, Any] | None, *, has_metres: bool) -> str:
     words = f"{seen['one_view_m2'] / seen['seen_m2']:.0%} of it by one picture alone"
     if not seen["holes"]:
         return f"{words}, no holes"
-    planned = f"; waypoints in {', '.join(seen['refly'])}" if seen["refly"] else "; --refly plans a flight over them"
-    return escape(f"{words}, {counted(seen['holes'], 'hole')} of {seen['holes_m2']:,.0f} m2{planned}")
+    planned = (
+        f"; waypoints in {', '.join(seen['refly'])}"
+        if seen["refly"]
+        else "; --refly plans a flight over them"
+    )
+    return escape(
+        f"{words}, {counted(seen['holes'], 'hole')} of {seen['holes_m2']:,.0f} m2{planned}"
+    )
 
 
 def _placed_by(report: Mapping[str, Any]) -> str:
@@ -381,9 +496,17 @@ def _control_rows(control: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     for role, name in words.items():
         count = sum(each["role"] == role for each in control["points"])
         rms_m = control[f"{role}_rms_m"]
-        rows.append((name, f"{count}, {rms_m:.3f} m off (root mean square)" if rms_m is not None else ""))
+        rows.append(
+            (name, f"{count}, {rms_m:.3f} m off (root mean square)" if rms_m is not None else "")
+        )
     left_out = ", ".join(escape(each) for each in control["excluded"])
-    return [*rows, ("[red]left out[/red]", f"{left_out}: contradict the other control points" if left_out else "")]
+    return [
+        *rows,
+        (
+            "[red]left out[/red]",
+            f"{left_out}: contradict the other control points" if left_out else "",
+        ),
+    ]
 
 
 def _size(report: Mapping[str, Any]) -> str:
@@ -400,9 +523,13 @@ def _objects(found: Mapping[str, Any]) -> str:
 
 
 def _clock_offset(offset: Mapping[str, Any]) -> str:
-    parts = [] if offset["origin"] == "none" else [f"{offset['applied_s']:+.2f} s ({offset['origin']})"]
+    parts = (
+        [] if offset["origin"] == "none" else [f"{offset['applied_s']:+.2f} s ({offset['origin']})"]
+    )
     if offset["estimate_s"] is not None:
-        parts.append(f"estimated from the motion: {offset['estimate_s']:+.2f} s (1 sigma {offset['sigma_s']:.2f} s)")
+        parts.append(
+            f"estimated from the motion: {offset['estimate_s']:+.2f} s (1 sigma {offset['sigma_s']:.2f} s)"
+        )
     return "; ".join(parts)
 
 
@@ -414,5 +541,7 @@ def _map_files(site: Path) -> dict[str, Path]:
     from sorvolo.store.exports.plain import features_path
 
     named = {"picture": "preview.png", "GeoTIFF": "mosaic.tif", "KMZ": "mosaic.kmz"}
-    paths = {name: site / file for name, file in named.items()} | {"objects": features_path(site, "objects")}
+    paths = {name: site / file for name, file in named.items()} | {
+        "objects": features_path(site, "objects")
+    }
     return {name: path for name, path in paths.items() if path.is_file()}

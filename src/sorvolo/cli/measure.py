@@ -21,7 +21,10 @@ if TYPE_CHECKING:
 measure_app = typer.Typer(no_args_is_help=True)
 
 _Site = Annotated[
-    str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME; its flights need heights: sorvolo heights.")
+    str,
+    typer.Argument(
+        help="Folder of the map, or s3://BUCKET/NAME; its flights need heights: sorvolo heights."
+    ),
 ]
 _Flight = Annotated[str, typer.Option(help="Which flight. Without it: that of the newest map.")]
 
@@ -34,9 +37,14 @@ def measure() -> None:
 @measure_app.command()
 def volume(
     site: _Site,
-    area: Annotated[Path, typer.Option(help="Area to measure: GeoJSON, KML, KMZ or a list of corners.")],
+    area: Annotated[
+        Path, typer.Option(help="Area to measure: GeoJSON, KML, KMZ or a list of corners.")
+    ],
     since: Annotated[
-        str, typer.Option(help="Earlier flight to compare with. Without it: above the ground around the area.")
+        str,
+        typer.Option(
+            help="Earlier flight to compare with. Without it: above the ground around the area."
+        ),
     ] = "",
     flight: _Flight = "",
     as_json: AsJson = False,
@@ -63,8 +71,12 @@ def volume(
 @measure_app.command()
 def profile(
     site: _Site,
-    at: Annotated[list[str], typer.Option(help="A place of the line, LAT,LON in degrees; give two or more.")],
-    step: Annotated[float, typer.Option(min=0.0, help="Distance between points, m; 0: a cell of the heights.")] = 0.0,
+    at: Annotated[
+        list[str], typer.Option(help="A place of the line, LAT,LON in degrees; give two or more.")
+    ],
+    step: Annotated[
+        float, typer.Option(min=0.0, help="Distance between points, m; 0: a cell of the heights.")
+    ] = 0.0,
     flight: _Flight = "",
 ) -> None:
     """Print heights along a line as CSV: way, place, surface with its sigma, and bare ground, m.
@@ -79,10 +91,14 @@ def profile(
     writer.writerow(["way_m", "latitude_deg", "longitude_deg", "surface_m", "sigma_m", "ground_m"])
     for row in rows:
         numbers = (row.surface_m, row.sigma_m, row.ground_m)
-        writer.writerow([
-            f"{row.way_m:.3f}", f"{row.latitude_deg:.8f}", f"{row.longitude_deg:.8f}",
-            *("" if each != each else f"{each:.3f}" for each in numbers),  # NaN: a hole
-        ])
+        writer.writerow(
+            [
+                f"{row.way_m:.3f}",
+                f"{row.latitude_deg:.8f}",
+                f"{row.longitude_deg:.8f}",
+                *("" if each != each else f"{each:.3f}" for each in numbers),  # NaN: a hole
+            ]
+        )
 
 
 @measure_app.command()
@@ -91,7 +107,9 @@ def contours(
     out: Annotated[Path, typer.Option(help="GeoJSON file to write.")],
     interval: Annotated[float, typer.Option(help="Difference in height between lines, m.")] = 1.0,
     flight: _Flight = "",
-    surface: Annotated[bool, typer.Option("--surface", help="Of the surface, not of the bare ground.")] = False,
+    surface: Annotated[
+        bool, typer.Option("--surface", help="Of the surface, not of the bare ground.")
+    ] = False,
 ) -> None:
     """Write contour lines of the bare ground.
 
@@ -107,15 +125,24 @@ def contours(
 def _show(found: "MeasuredVolume", console: Console) -> None:
     measured = found.volume
     since = f"since {found.earlier}" if found.earlier else "above the ground around the area"
-    table = Table(title=f"Volume of {escape(found.flight)}, {escape(since)}", show_header=False, title_justify="left")
+    table = Table(
+        title=f"Volume of {escape(found.flight)}, {escape(since)}",
+        show_header=False,
+        title_justify="left",
+    )
     table.add_row("came" if found.earlier else "above", f"{measured.fill_m3:,.1f} m3")
     table.add_row("taken away" if found.earlier else "below", f"{measured.cut_m3:,.1f} m3")
-    table.add_row("difference", f"{measured.net_m3:,.1f} m3, accuracy {measured.sigma_m3:,.1f} m3 (1 sigma)")
-    table.add_row("area", f"{measured.area_m2:,.1f} m2, {measured.known_share:.0%} of it with heights")
+    table.add_row(
+        "difference", f"{measured.net_m3:,.1f} m3, accuracy {measured.sigma_m3:,.1f} m3 (1 sigma)"
+    )
+    table.add_row(
+        "area", f"{measured.area_m2:,.1f} m2, {measured.known_share:.0%} of it with heights"
+    )
     if found.tied is not None:
         east, north, up = found.tied.shift_m
         table.add_row(
-            "flights tied", f"moved by {east:.2f}, {north:.2f}, {up:.2f} m (east, north, up); the ground outside the "
-            f"area then differs by {found.tied.spread_m:.2f} m (1 sigma)"
+            "flights tied",
+            f"moved by {east:.2f}, {north:.2f}, {up:.2f} m (east, north, up); the ground outside the "
+            f"area then differs by {found.tied.spread_m:.2f} m (1 sigma)",
         )
     console.print(table)

@@ -61,8 +61,12 @@ def _show_rows(rows: Sequence[Mapping[str, Any]]) -> None:
         table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(
-            escape(row["name"]), escape(row["preset"]), escape(", ".join(_classes(row))),
-            _light(row), row["precision"], f"{row['bytes'] / 1e6:.1f}",
+            escape(row["name"]),
+            escape(row["preset"]),
+            escape(", ".join(_classes(row))),
+            _light(row),
+            row["precision"],
+            f"{row['bytes'] / 1e6:.1f}",
             "with the package" if row["is_packaged"] else escape(row["path"]),
         )
     if rows:
@@ -73,7 +77,9 @@ def _show_hidden() -> None:
     from sorvolo.detection.models import hidden_models
 
     for each in hidden_models():
-        typer.echo(f"{each.path} is not used: '{each.name}' is the name of a packaged model; rename the file")
+        typer.echo(
+            f"{each.path} is not used: '{each.name}' is the name of a packaged model; rename the file"
+        )
 
 
 @models_app.command()
@@ -97,14 +103,28 @@ def show(
     table = Table(title=escape(info.name), show_header=False, title_justify="left")
     table.add_column()
     table.add_column(overflow="fold")
-    for name in ("preset", "version", "precision", "licence", "trained_on", "created", "path", "sha256"):
+    for name in (
+        "preset",
+        "version",
+        "precision",
+        "licence",
+        "trained_on",
+        "created",
+        "path",
+        "sha256",
+    ):
         table.add_row(name.replace("_", " "), escape(str(facts[name])))
     table.add_row("light", _light(facts))
     if info.second_only:
-        table.add_row("use", "looks again at what other models report; it cannot search whole pictures (--model)")
+        table.add_row(
+            "use",
+            "looks again at what other models report; it cannot search whole pictures (--model)",
+        )
     for each in info.classes:
         least_px, most_px = info.best_px[each]
-        reported = "reported only where asked for (--classes)," if each in info.on_request else "reported"
+        reported = (
+            "reported only where asked for (--classes)," if each in info.on_request else "reported"
+        )
         sizes = f"found well from {least_px:g} to {most_px:g} px"
         words = f"{reported} from score {info.thresholds[each]:.2f} on; {sizes}"
         table.add_row(escape(each), words)
@@ -120,9 +140,14 @@ def show(
 
 @models_app.command()
 def fetch(
-    source: Annotated[str, typer.Argument(help="Web address or file of a model, or its name in $SORVOLO_MODELS_URL.")],
+    source: Annotated[
+        str,
+        typer.Argument(help="Web address or file of a model, or its name in $SORVOLO_MODELS_URL."),
+    ],
     sha256: Annotated[str, typer.Option(help="SHA-256 of the file, from whoever provides it.")],
-    name: Annotated[str, typer.Option(help="Name to install it under.", show_default="the file's name")] = "",
+    name: Annotated[
+        str, typer.Option(help="Name to install it under.", show_default="the file's name")
+    ] = "",
 ) -> None:
     """Install a model if its hash matches; otherwise nothing changes.
 
@@ -140,8 +165,12 @@ def fetch(
 
 @models_app.command()
 def verify(
-    model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.", show_default="all installed")] = "",
-    sha256: Annotated[str, typer.Option(help="Expected SHA-256.", show_default="the recorded one")] = "",
+    model: Annotated[
+        str, typer.Argument(help="A model's name, or a .onnx file.", show_default="all installed")
+    ] = "",
+    sha256: Annotated[
+        str, typer.Option(help="Expected SHA-256.", show_default="the recorded one")
+    ] = "",
 ) -> None:
     """Check that models are complete, unchanged and can run. The exit code is 1 if one fails.
 
@@ -171,7 +200,9 @@ def _chosen(model: str) -> Sequence["InstalledModel"]:
     if not model:
         return installed_models()
     path = find_model(model)
-    return [each for each in installed_models() if each.path == path] or [InstalledModel(path.stem, path, False)]
+    return [each for each in installed_models() if each.path == path] or [
+        InstalledModel(path.stem, path, False)
+    ]
 
 
 def _verify_each(models: Sequence["InstalledModel"], sha256: str) -> bool:
@@ -187,18 +218,24 @@ def _verify_each(models: Sequence["InstalledModel"], sha256: str) -> bool:
 @models_app.command()
 def quantise(
     model: Annotated[str, typer.Argument(help="A model's name, or a .onnx file.")],
-    pictures: Annotated[Path, typer.Option(help="Folder of pictures like those it will see, in all kinds of light.")],
+    pictures: Annotated[
+        Path, typer.Option(help="Folder of pictures like those it will see, in all kinds of light.")
+    ],
     out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
     most: Annotated[int, typer.Option(min=8, help="Use at most this many pictures.")] = 64,
     float_parts: Annotated[
         list[str] | None,
         typer.Option(
-            "--float", help="Leave a part in float: backbone, neck, proposals, backbone/_blocks.0; in a model of two "
-            "networks aerial/neck. Can be repeated."
+            "--float",
+            help="Leave a part in float: backbone, neck, proposals, backbone/_blocks.0; in a model of two "
+            "networks aerial/neck. Can be repeated.",
         ),
     ] = None,
     weight_bits: Annotated[
-        int, typer.Option(min=7, max=8, help="7 cannot overflow on CPUs without VNNI, and rounds a little more.")
+        int,
+        typer.Option(
+            min=7, max=8, help="7 cannot overflow on CPUs without VNNI, and rounds a little more."
+        ),
     ] = 8,
 ) -> None:
     """Make a smaller and faster model with 8-bit integers. Measure both before you trust it.
@@ -211,7 +248,11 @@ def quantise(
     from sorvolo.missions.model_files import quantise_model
 
     made = quantise_model(
-        find_model(model), pictures, out, most=most, float_parts=float_parts or (),
+        find_model(model),
+        pictures,
+        out,
+        most=most,
+        float_parts=float_parts or (),
         weight_bits=7 if weight_bits == 7 else 8,
     )
     typer.echo(
@@ -235,20 +276,29 @@ def _measured(sets: Any, by: str) -> Table | None:
     title = f"measured on pictures held out{f', by {escape(by)}' if by else ''}"
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0), title=title, title_justify="left")
     for name in ("set", "class", "labels", "AP50 %", "AP %"):
-        table.add_column(name, justify="left" if name in ("set", "class") else "right", overflow="fold")
+        table.add_column(
+            name, justify="left" if name in ("set", "class") else "right", overflow="fold"
+        )
     for name, classes in sets.items() if isinstance(sets, Mapping) else ():
         for label, row in classes.items() if isinstance(classes, Mapping) else ():
             if isinstance(row, Mapping):
                 table.add_row(
-                    escape(name.replace("_", " ")), escape(label), str(row.get("labels", "-")),
-                    _interval(row.get("AP50")), _interval(row.get("AP")),
+                    escape(name.replace("_", " ")),
+                    escape(label),
+                    str(row.get("labels", "-")),
+                    _interval(row.get("AP50")),
+                    _interval(row.get("AP")),
                 )
     return table if table.rows else None
 
 
 def _interval(share: Any) -> str:
     """ "62.2 (42.3-77.3)" of a share with its interval, "-" where it is not known."""
-    numbers = [share.get(key) for key in ("value", "low", "high")] if isinstance(share, Mapping) else [share]
+    numbers = (
+        [share.get(key) for key in ("value", "low", "high")]
+        if isinstance(share, Mapping)
+        else [share]
+    )
     known = [f"{100 * each:.1f}" for each in numbers if isinstance(each, int | float)]
     return f"{known[0]} ({known[1]}-{known[2]})" if len(known) == 3 else known[0] if known else "-"
 
@@ -256,9 +306,17 @@ def _interval(share: Any) -> str:
 def _row(model: "InstalledModel") -> dict[str, Any]:
     from sorvolo.detection.session import read_info
 
-    row: dict[str, Any] = {"name": model.name, "path": str(model.path), "is_packaged": model.is_packaged}
+    row: dict[str, Any] = {
+        "name": model.name,
+        "path": str(model.path),
+        "is_packaged": model.is_packaged,
+    }
     try:
-        return row | _facts(read_info(model.path)) | {"name": model.name, "bytes": model.path.stat().st_size}
+        return (
+            row
+            | _facts(read_info(model.path))
+            | {"name": model.name, "bytes": model.path.stat().st_size}
+        )
     except InputError as error:
         return row | {"error": str(error)}
 
@@ -273,7 +331,9 @@ def _classes(facts: Mapping[str, Any]) -> list[str]:
     """The classes of a model, with a word on those that are not reported in every picture."""
     if facts["second_only"]:
         return [f"{name} (in other models' reports)" for name in facts["classes"]]
-    return [f"{name} (on request)" if name in facts["on_request"] else name for name in facts["classes"]]
+    return [
+        f"{name} (on request)" if name in facts["on_request"] else name for name in facts["classes"]
+    ]
 
 
 def _meaning(info: "ModelInfo") -> str:
@@ -309,7 +369,10 @@ def _verdict(model: "InstalledModel", sha256: str) -> tuple[str, bool]:
             state = integrity(model)
         if state is Integrity.CHANGED:
             expected = "the given" if sha256 else "the recorded"
-            return f"CHANGED: its SHA-256 is not {expected} one; do not use it, fetch it again", True
+            return (
+                f"CHANGED: its SHA-256 is not {expected} one; do not use it, fetch it again",
+                True,
+            )
         read_info(model.path)
     except InputError as error:
         return f"BAD: {error}", True

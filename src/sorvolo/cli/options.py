@@ -9,32 +9,50 @@ import typer
 from sorvolo.errors import SettingsError
 
 Camera = Annotated[
-    str, typer.Option(help="Camera: a calibration file, a drone's name such as 'Mavic 2 Pro', or aov=DEGREES.")
+    str,
+    typer.Option(
+        help="Camera: a calibration file, a drone's name such as 'Mavic 2 Pro', or aov=DEGREES."
+    ),
 ]
 Again = Annotated[
-    bool, typer.Option("--again", help="Do it anew, though the site has the flight already or a run was stopped.")
+    bool,
+    typer.Option(
+        "--again", help="Do it anew, though the site has the flight already or a run was stopped."
+    ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of tables.")]
 AsJsonSteps = Annotated[bool, typer.Option("--json", help="Print one JSON object per step.")]
 GroupPattern = Annotated[
-    str | None, typer.Option(help="Regular expression; its group is the video's name in a picture's path.")
+    str | None,
+    typer.Option(help="Regular expression; its group is the video's name in a picture's path."),
 ]
 Area = Annotated[
-    Path | None, typer.Option(help="Outline of the area: GeoJSON, KML, KMZ. Frames outside it are not used.")
+    Path | None,
+    typer.Option(help="Outline of the area: GeoJSON, KML, KMZ. Frames outside it are not used."),
 ]
 LiveTelemetry = Annotated[
     str | None,
-    typer.Option(help="The flight's log if it is not beside the video; for a live source, the receiver's address."),
+    typer.Option(
+        help="The flight's log if it is not beside the video; for a live source, the receiver's address."
+    ),
 ]
 Offset = Annotated[
-    float | None, typer.Option(help="Telemetry time minus video time, s. Without it: estimated from the motion.")
+    float | None,
+    typer.Option(help="Telemetry time minus video time, s. Without it: estimated from the motion."),
 ]
 GroundElevation = Annotated[
-    float | None, typer.Option(help="Elevation of the ground, m, in the telemetry's own height reference.")
+    float | None,
+    typer.Option(help="Elevation of the ground, m, in the telemetry's own height reference."),
 ]
-CotAuthority = Annotated[Path | None, typer.Option(help="For tls://: the authority of the server's certificate, PEM.")]
-CotCertificate = Annotated[Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")]
-GiveUp = Annotated[float, typer.Option(help="End a live source after this many seconds without a picture.")]
+CotAuthority = Annotated[
+    Path | None, typer.Option(help="For tls://: the authority of the server's certificate, PEM.")
+]
+CotCertificate = Annotated[
+    Path | None, typer.Option(help="For tls://: own certificate and its key in one PEM file.")
+]
+GiveUp = Annotated[
+    float, typer.Option(help="End a live source after this many seconds without a picture.")
+]
 
 
 class PlaceFormat(StrEnum):
@@ -79,7 +97,9 @@ def wanted_classes(text: str | None, option: str = "--classes") -> tuple[str, ..
     """
     found = names(text or "")
     if text is not None and not found:
-        raise SettingsError(f"{option} {text!r} names no class; give some, separated by commas, or leave {option} out")
+        raise SettingsError(
+            f"{option} {text!r} names no class; give some, separated by commas, or leave {option} out"
+        )
     return found
 
 

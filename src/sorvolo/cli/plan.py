@@ -37,31 +37,52 @@ class Facing(StrEnum):
 FocalLength = Annotated[float, typer.Option(help="Focal length, mm.", show_default="of --camera")]
 PixelSize = Annotated[float, typer.Option(help="Sensor pixel, um.", show_default="of --camera")]
 TaskOption = Annotated[
-    Purpose, typer.Option(help="detection: something is there. recognition: it is a person. identification: who.")
+    Purpose,
+    typer.Option(
+        help="detection: something is there. recognition: it is a person. identification: who."
+    ),
 ]
 FacingOption = Annotated[
-    Facing, typer.Option(help="Side of a person that the camera sees: bottom is from straight above.")
+    Facing,
+    typer.Option(help="Side of a person that the camera sees: bottom is from straight above."),
 ]
 CriticalDimension = Annotated[
-    float, typer.Option(help="Smallest side of another object to be made out, m.", show_default="a person's")
+    float,
+    typer.Option(
+        help="Smallest side of another object to be made out, m.", show_default="a person's"
+    ),
 ]
-FlightHeight = Annotated[float, typer.Option(help="Flight height above ground, m.", show_default="as high as allowed")]
-HighestFlight = Annotated[float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")]
-PeopleDetector = Annotated[str, typer.Option(help="Detector that must find people: a name, a file, or none.")]
+FlightHeight = Annotated[
+    float, typer.Option(help="Flight height above ground, m.", show_default="as high as allowed")
+]
+HighestFlight = Annotated[
+    float, typer.Option(help="Highest flight allowed, m: the law's in most countries.")
+]
+PeopleDetector = Annotated[
+    str, typer.Option(help="Detector that must find people: a name, a file, or none.")
+]
 GroundSpeed = Annotated[float, typer.Option(help="Ground speed, m/s.")]
 ForwardOverlap = Annotated[float, typer.Option(help="Overlap of consecutive pictures, 0 to 0.95.")]
 SideOverlap = Annotated[float, typer.Option(help="Overlap of neighbouring strips, 0 to 0.95.")]
 StripBearing = Annotated[
-    float, typer.Option(help="Direction of the strips, deg from north.", show_default="along the area")
+    float,
+    typer.Option(help="Direction of the strips, deg from north.", show_default="along the area"),
 ]
 PictureSize = Annotated[str, typer.Option(help="Picture size, such as 1920x1080.")]
-AreaToCover = Annotated[Path | None, typer.Option(help="Area to cover: GeoJSON, KML, KMZ, or a list of corners.")]
+AreaToCover = Annotated[
+    Path | None, typer.Option(help="Area to cover: GeoJSON, KML, KMZ, or a list of corners.")
+]
 WaypointFiles = Annotated[
     list[Path] | None,
-    typer.Option(help="File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."),
+    typer.Option(
+        help="File to write: .plan (QGroundControl), .kmz (DJI), .geojson or .kml. Can be repeated."
+    ),
 ]
 DjiDrone = Annotated[
-    str, typer.Option(help="For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td.")
+    str,
+    typer.Option(
+        help="For a .kmz: fly (DJI Fly), m300, m350, m30, m30t, m3e, m3t, m3m, m3d, m3td."
+    ),
 ]
 
 
@@ -98,8 +119,16 @@ def plan(
     from sorvolo.missions import plan_flight as planning
 
     settings = planning.PlanSettings(
-        Task(task.value), planning.critical_dimension_m(facing.value, critical_m), height, max_height, model,
-        planning.seen_person_m(facing.value, critical_m), speed, overlap, side_overlap, bearing,
+        Task(task.value),
+        planning.critical_dimension_m(facing.value, critical_m),
+        height,
+        max_height,
+        model,
+        planning.seen_person_m(facing.value, critical_m),
+        speed,
+        overlap,
+        side_overlap,
+        bearing,
     )
     if out and area is None:
         raise SettingsError("--out writes waypoints over an area: give --area FILE as well")
@@ -121,13 +150,21 @@ def _show(
 ) -> None:
     console = Console()
     table = Table("", "", title="Flight plan", show_header=False, title_justify="left")
-    for row in (*_camera_rows(answers), *_height_rows(answers, settings), *_rate_rows(answers, settings)):
+    for row in (
+        *_camera_rows(answers),
+        *_height_rows(answers, settings),
+        *_rate_rows(answers, settings),
+    ):
         table.add_row(*row)
     if flight is not None:
-        table.add_row("passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back")
+        table.add_row(
+            "passes", f"{len(flight.passes_m)}, at {flight.strip_bearing_deg:.0f} deg and back"
+        )
         table.add_row("photos", f"{flight.photo_count:,}")
         minutes = flight.duration_s / 60
-        table.add_row("path", f"{flight.distance_m:,.0f} m, {minutes:.1f} min without take-off and return")
+        table.add_row(
+            "path", f"{flight.distance_m:,.0f} m, {minutes:.1f} min without take-off and return"
+        )
     for path in out:
         table.add_row("written", str(path))
     console.print(table)
@@ -139,7 +176,10 @@ def _camera_rows(answers: "FlightAnswers") -> list[tuple[str, str]]:
     camera = answers.camera.camera
     return [
         ("camera", answers.camera.origin),
-        ("picture size", f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.0f} px"),
+        (
+            "picture size",
+            f"{camera.width_px} x {camera.height_px} px, focal length {camera.fx_px:.0f} px",
+        ),
         ("angle of view", "{:.1f} x {:.1f} deg".format(*answers.angle_of_view_deg)),
     ]
 
@@ -147,17 +187,28 @@ def _camera_rows(answers: "FlightAnswers") -> list[tuple[str, str]]:
 def _height_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple[str, str]]:
     rows = []
     for name, highest_m in answers.maximum_heights_m.items():
-        by_resolution = f"{highest_m:,.2f} m by resolution alone, {answers.required_px_per_m[name]:.2f} px/m"
+        by_resolution = (
+            f"{highest_m:,.2f} m by resolution alone, {answers.required_px_per_m[name]:.2f} px/m"
+        )
         bounded_m = min(highest_m, settings.max_height_m)
         rows.append((f"height for {name}", f"at most {bounded_m:,.2f} m ({by_resolution})"))
     detector_m = answers.height_bounds_m.get("detector")
     if detector_m is not None:
-        rows.append(("height for the detector", f"at most {detector_m:,.2f} m (model {settings.model}, for people)"))
+        rows.append(
+            (
+                "height for the detector",
+                f"at most {detector_m:,.2f} m (model {settings.model}, for people)",
+            )
+        )
     reasons = {
-        "asked": "as asked", "task": f"the most for {settings.task.value}", "detector": "the most for the detector",
+        "asked": "as asked",
+        "task": f"the most for {settings.task.value}",
+        "detector": "the most for the detector",
         "ceiling": "the highest flight allowed",
     }
-    rows.append(("flight height", f"{answers.height_m:,.2f} m above ground ({reasons[answers.bounded_by]})"))
+    rows.append(
+        ("flight height", f"{answers.height_m:,.2f} m above ground ({reasons[answers.bounded_by]})")
+    )
     return rows
 
 
@@ -170,7 +221,10 @@ def _rate_rows(answers: "FlightAnswers", settings: "PlanSettings") -> list[tuple
         ("ground resolution", f"{100 * answers.ground_sampling_m:.2f} cm a pixel"),
         ("a picture covers", "{:.1f} x {:.1f} m".format(*answers.footprint_m)),
         ("picture rate", rate),
-        ("strips", f"{answers.strip_spacing_m:.1f} m apart for {settings.side_overlap:.0%} overlap"),
+        (
+            "strips",
+            f"{answers.strip_spacing_m:.1f} m apart for {settings.side_overlap:.0%} overlap",
+        ),
     ]
 
 
@@ -185,7 +239,9 @@ def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
         )
     detector_m = answers.height_bounds_m.get("detector", math.inf)
     if answers.height_m > detector_m:
-        warnings.append(f"from {answers.height_m:.1f} m the detector will miss people; fly at most {detector_m:.1f} m")
+        warnings.append(
+            f"from {answers.height_m:.1f} m the detector will miss people; fly at most {detector_m:.1f} m"
+        )
     if settings.max_height_m > LEGAL_CEILING_M:
         warnings.append(
             f"the law of most countries allows small drones {LEGAL_CEILING_M:.0f} m above ground: to fly higher, get a "
@@ -193,11 +249,15 @@ def _warnings(answers: "FlightAnswers", settings: "PlanSettings") -> list[str]:
         )
     if answers.camera.focal_sigma > 0.1:
         sigma = answers.camera.focal_sigma
-        warnings.append(f"the focal length is a guess, uncertain by {sigma:.0%}, so are the heights; calibrate once")
+        warnings.append(
+            f"the focal length is a guess, uncertain by {sigma:.0%}, so are the heights; calibrate once"
+        )
     return warnings
 
 
-def _as_json(answers: "FlightAnswers", flight: "FlightPlan | None", out: list[Path]) -> dict[str, Any]:
+def _as_json(
+    answers: "FlightAnswers", flight: "FlightPlan | None", out: list[Path]
+) -> dict[str, Any]:
     camera = answers.camera
     result = asdict(answers) | {
         "camera": {

@@ -34,8 +34,13 @@ class ProgressReport:
         self._last_s = clock()
         self._task = ""
         self._bar = Progress(
-            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=30),
-            TextColumn("{task.fields[words]}"), TimeRemainingColumn(), console=console, transient=not stays,
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=30),
+            TextColumn("{task.fields[words]}"),
+            TimeRemainingColumn(),
+            console=console,
+            transient=not stays,
             disable=not self._is_live,  # rich itself ends bars that nobody sees with an empty line
         )
 
@@ -44,7 +49,10 @@ class ProgressReport:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._bar.stop()
 
@@ -99,7 +107,9 @@ class Resumed:
 
     def _announce(self, words: str) -> None:
         if self._count:
-            self._console.print(f"{words} {counted(self._count, 'frame')} of a stopped run", highlight=False)
+            self._console.print(
+                f"{words} {counted(self._count, 'frame')} of a stopped run", highlight=False
+            )
             self._count = 0
 
 

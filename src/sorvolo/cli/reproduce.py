@@ -23,19 +23,35 @@ if TYPE_CHECKING:
 
 _DEFAULT_OUT = Path("reproduction")
 
-Dataset = Annotated[Path | None, typer.Argument(help="The UMCD dataset's folder, in the thesis's layout.")]
+Dataset = Annotated[
+    Path | None, typer.Argument(help="The UMCD dataset's folder, in the thesis's layout.")
+]
 OutFolder = Annotated[Path, typer.Option(help="Folder for tables, figures, maps and models.")]
-Simulated = Annotated[bool, typer.Option("--simulated", help="Simulate a dataset in the same layout instead.")]
+Simulated = Annotated[
+    bool, typer.Option("--simulated", help="Simulate a dataset in the same layout instead.")
+]
 Quick = Annotated[bool, typer.Option("--quick", help="Only a try: one short path, small pictures.")]
-VideoCount = Annotated[int | None, typer.Option(help="At most this many videos of each environment and part.")]
-PathLength = Annotated[float, typer.Option(help="With --simulated: length of each path, m; 0: as in Tables 2.1, 2.3.")]
+VideoCount = Annotated[
+    int | None, typer.Option(help="At most this many videos of each environment and part.")
+]
+PathLength = Annotated[
+    float, typer.Option(help="With --simulated: length of each path, m; 0: as in Tables 2.1, 2.3.")
+]
 PictureSize = Annotated[str, typer.Option(help="With --simulated: picture size, such as 1280x720.")]
 ViewRate = Annotated[float, typer.Option(help="Frames compared per second of video.")]
-Okutama = Annotated[Path | None, typer.Option(help="Okutama-Action's folder, for its column of Table 4.6.")]
-Npu = Annotated[Path | None, typer.Option(help="The NPU Drone-Map dataset's folder, for Table 4.1.")]
+Okutama = Annotated[
+    Path | None, typer.Option(help="Okutama-Action's folder, for its column of Table 4.6.")
+]
+Npu = Annotated[
+    Path | None, typer.Option(help="The NPU Drone-Map dataset's folder, for Table 4.1.")
+]
 TrainSteps = Annotated[int, typer.Option(help="Steps of each network of Table 4.6; 0: train none.")]
-NetworkPreset = Annotated[Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")]
-Weights = Annotated[str, typer.Option(help="Weights to start from: auto (ImageNet), none, or a file.")]
+NetworkPreset = Annotated[
+    Preset, typer.Option(help="Network of Table 4.6: fast, accurate, or the thesis's own.")
+]
+Weights = Annotated[
+    str, typer.Option(help="Weights to start from: auto (ImageNet), none, or a file.")
+]
 Device = Annotated[str, typer.Option(help="Where the networks are trained: auto, cpu or cuda.")]
 Seed = Annotated[int, typer.Option(help="Random seed.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print reproduction.json.")]
@@ -77,7 +93,10 @@ def reproduce(
     from sorvolo.missions.reproduce.settings import quick as quick_sizes
 
     settings = ReproductionSettings(
-        videos, views_per_second, seed=seed, detector=DetectorSettings(train_steps, preset.value, weights, device)
+        videos,
+        views_per_second,
+        seed=seed,
+        detector=DetectorSettings(train_steps, preset.value, weights, device),
     )
     simulation = SimulatedSize(length or None, size_px(size) or (1280, 720))
     if quick:
@@ -104,11 +123,18 @@ def _simulate(place: Path, size: "SimulatedSize", settings: "ReproductionSetting
     with ProgressReport(Console(stderr=True)) as progress:
         for name, step in simulated_dataset(place, size, settings):
             if step.stage == "frames":
-                progress.show(f"simulating {name}, {step.flight}, frame", step.frames_done, step.frames_total)
+                progress.show(
+                    f"simulating {name}, {step.flight}, frame", step.frames_done, step.frames_total
+                )
 
 
 def _rows(
-    place: Path, out: Path, settings: "ReproductionSettings", others: "dict[str, Path | None]", *, is_whole: bool
+    place: Path,
+    out: Path,
+    settings: "ReproductionSettings",
+    others: "dict[str, Path | None]",
+    *,
+    is_whole: bool,
 ) -> "list[Row]":
     from sorvolo.missions.reproduce.run import reproduce as reproduced
 
@@ -126,7 +152,11 @@ def _rows(
 
 
 def _written(
-    out: Path, rows: "list[Row]", place: Path, settings: "ReproductionSettings", size: "SimulatedSize | None"
+    out: Path,
+    rows: "list[Row]",
+    place: Path,
+    settings: "ReproductionSettings",
+    size: "SimulatedSize | None",
 ) -> dict[str, Any]:
     from sorvolo.missions.reproduce.report import write_reproduction
 
@@ -140,7 +170,9 @@ def _show(document: dict[str, Any], page: Path) -> None:
     console = Console()
     if missing := document["missing"]:
         words = f"{len(missing)} of {counted(len(missing) + len(document['rows']), 'row')} could not be made"
-        console.print(f"{words}; {page} has the reasons", style="yellow", highlight=False, soft_wrap=True)
+        console.print(
+            f"{words}; {page} has the reasons", style="yellow", highlight=False, soft_wrap=True
+        )
     for sheet in reproduction_sheets(document["tables"]):
         if sheet.rows:
             table = Table(*map(escape, sheet.columns), title=escape(sheet.title), box=SIMPLE_HEAD)

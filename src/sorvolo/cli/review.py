@@ -28,11 +28,17 @@ def review(
     site: SiteArgument,
     ids: Annotated[
         list[str] | None,
-        typer.Argument(help="Changes to judge: their ids, or numbers with --flight.", show_default="list all changes"),
+        typer.Argument(
+            help="Changes to judge: their ids, or numbers with --flight.",
+            show_default="list all changes",
+        ),
     ] = None,
     confirm: Annotated[bool, typer.Option("--confirm", help="These changes are real.")] = False,
     reject: Annotated[
-        bool, typer.Option("--reject", help="These are no changes; later flights will not report them again.")
+        bool,
+        typer.Option(
+            "--reject", help="These are no changes; later flights will not report them again."
+        ),
     ] = False,
     note: Annotated[str, typer.Option(help="Why, in your own words.")] = "",
     flight: Annotated[str | None, typer.Option(help="Only changes of this flight.")] = None,
@@ -73,41 +79,79 @@ def _demand_whole_verdict(ids: list[str] | None, confirm: bool, reject: bool, no
         raise SettingsError("which changes? give the ids that `sorvolo review SITE` lists")
 
 
-def _show(changes: Sequence["StoredChange"], site: "Site", form: PlaceFormat, console: Console) -> None:
+def _show(
+    changes: Sequence["StoredChange"], site: "Site", form: PlaceFormat, console: Console
+) -> None:
     from sorvolo.store.exports.plain import time_words
 
     if not changes:
-        console.print("no changes: none were found, or no flight was compared yet (sorvolo compare)")
+        console.print(
+            "no changes: none were found, or no flight was compared yet (sorvolo compare)"
+        )
         return
-    table, place = Table(box=SIMPLE_HEAD, padding=0), place_words(site, form)  # 80 letters hold it, no word cut
+    table, place = (
+        Table(box=SIMPLE_HEAD, padding=0),
+        place_words(site, form),
+    )  # 80 letters hold it, no word cut
     place_name = place_heading(site.is_local, form)
-    for name in ("id", "kind", place_name, f"length {unit_of(site)}", "score", "first seen (UTC)", "verdict"):
+    for name in (
+        "id",
+        "kind",
+        place_name,
+        f"length {unit_of(site)}",
+        "score",
+        "first seen (UTC)",
+        "verdict",
+    ):
         table.add_column(
-            name, no_wrap=name in ("id", "kind", place_name), overflow="fold",
+            name,
+            no_wrap=name in ("id", "kind", place_name),
+            overflow="fold",
             min_width={"first seen (UTC)": 10, "verdict": 9}.get(name),
         )
     for each in changes:
         verdict = ""
         if each.verdict is not None:
             colour = _COLOURS[each.verdict]
-            verdict = f"[{colour}]{each.verdict.value}[/{colour}]" + (f": {escape(each.note)}" if each.note else "")
+            verdict = f"[{colour}]{each.verdict.value}[/{colour}]" + (
+                f": {escape(each.note)}" if each.note else ""
+            )
         table.add_row(
-            escape(each.id), each.kind.value, place(each.centre_m), f"{each.length_m:.2f}", f"{each.score:.2f}",
-            time_words(each.first_seen_ns), verdict,
+            escape(each.id),
+            each.kind.value,
+            place(each.centre_m),
+            f"{each.length_m:.2f}",
+            f"{each.score:.2f}",
+            time_words(each.first_seen_ns),
+            verdict,
         )
     console.print(table)
     judged = sum(each.verdict is not None for each in changes)
-    console.print(f"{counted(len(changes), 'change')}, {judged} reviewed; score: 0 to 1, how sure", style="dim")
+    console.print(
+        f"{counted(len(changes), 'change')}, {judged} reviewed; score: 0 to 1, how sure",
+        style="dim",
+    )
 
 
 def _plain(change: "StoredChange", site: "Site") -> dict[str, Any]:
     from sorvolo.store.exports.plain import utc_text
 
     latitude, longitude, _ = site.frame.wgs84_from_site(change.centre_m[None])
-    on_earth = {} if site.is_local else {"latitude": float(latitude[0]), "longitude": float(longitude[0])}
+    on_earth = (
+        {} if site.is_local else {"latitude": float(latitude[0]), "longitude": float(longitude[0])}
+    )
     return {
-        "id": change.id, "flight": change.flight_id, "number": change.number, "kind": change.kind.value,
-        "score": change.score, "first_seen": utc_text(change.first_seen_ns), "last_seen": utc_text(change.last_seen_ns),
-        "views": change.views, "east_m": float(change.centre_m[0]), "north_m": float(change.centre_m[1]), **on_earth,
-        "review": None if change.verdict is None else change.verdict.value, "note": change.note,
+        "id": change.id,
+        "flight": change.flight_id,
+        "number": change.number,
+        "kind": change.kind.value,
+        "score": change.score,
+        "first_seen": utc_text(change.first_seen_ns),
+        "last_seen": utc_text(change.last_seen_ns),
+        "views": change.views,
+        "east_m": float(change.centre_m[0]),
+        "north_m": float(change.centre_m[1]),
+        **on_earth,
+        "review": None if change.verdict is None else change.verdict.value,
+        "note": change.note,
     }

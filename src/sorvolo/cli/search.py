@@ -29,32 +29,50 @@ Inputs = Annotated[
         help="The folder of a map, or s3://BUCKET/NAME; or flights (videos, photos, a live source) to map into --site."
     ),
 ]
-SiteFolder = Annotated[str, typer.Option(help="Folder of the map that flights go into, or s3://BUCKET/NAME.")]
+SiteFolder = Annotated[
+    str, typer.Option(help="Folder of the map that flights go into, or s3://BUCKET/NAME.")
+]
 Flights = Annotated[
-    list[str] | None, typer.Option(help="Flight to measure. Can be repeated. Without it: all of the map's.")
+    list[str] | None,
+    typer.Option(help="Flight to measure. Can be repeated. Without it: all of the map's."),
 ]
 SearchedArea = Annotated[
-    Path | None, typer.Option(help="Area that was to be searched: GeoJSON, KML, KMZ. Without it: what was flown.")
+    Path | None,
+    typer.Option(
+        help="Area that was to be searched: GeoJSON, KML, KMZ. Without it: what was flown."
+    ),
 ]
 Segments = Annotated[
-    Path | None, typer.Option(help="Segments as GeoJSON polygons with the property poa (probability of area).")
+    Path | None,
+    typer.Option(help="Segments as GeoJSON polygons with the property poa (probability of area)."),
 ]
 DetectorName = Annotated[str, typer.Option(help="Detector: a model's name or a file.")]
 PlantedClasses = Annotated[
     str | None, typer.Option(help="Classes, with commas.", show_default="those it usually reports")
 ]
-Plants = Annotated[int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")]
+Plants = Annotated[
+    int, typer.Option(help="People, and cars, to plant: more take longer and are surer.")
+]
 Enough = Annotated[float, typer.Option(help="Ground with a lower probability is a hole.")]
 ThroughCrowns = Annotated[
-    float, typer.Option(help="Share of a body that crowns leave free: 0 counts ground under trees as not seen.")
+    float,
+    typer.Option(
+        help="Share of a body that crowns leave free: 0 counts ground under trees as not seen."
+    ),
 ]
-Sun = Annotated[str, typer.Option(help="Azimuth,elevation of the sun, deg.", show_default="by time and place")]
+Sun = Annotated[
+    str, typer.Option(help="Azimuth,elevation of the sun, deg.", show_default="by time and place")
+]
 ReflyFiles = Annotated[
     list[Path] | None,
-    typer.Option(help="Waypoints over the holes: .plan, .kmz (DJI), .geojson or .kml. Can be repeated."),
+    typer.Option(
+        help="Waypoints over the holes: .plan, .kmz (DJI), .geojson or .kml. Can be repeated."
+    ),
 ]
 DjiDrone = Annotated[str, typer.Option(help="For a .kmz: fly (DJI Fly), m300, m350, m30, m3e ...")]
-ResultsFolder = Annotated[Path | None, typer.Option(help="Folder for results.", show_default="SITE-search")]
+ResultsFolder = Annotated[
+    Path | None, typer.Option(help="Folder for results.", show_default="SITE-search")
+]
 Seed = Annotated[int, typer.Option(help="Other plants at other places.")]
 
 
@@ -94,16 +112,31 @@ def search_command(
     """
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 
-    if not site and (unused := [name for name, value in (("--camera", camera), ("--telemetry", telemetry)) if value]):
-        raise SettingsError(f"{unused[0]} is for flights that are mapped now; give --site FOLDER, or leave it out")
-    settings = SearchSettings(plants, wanted_classes(classes), model, enough, through_crowns, _sun(sun), seed)
+    if not site and (
+        unused := [
+            name for name, value in (("--camera", camera), ("--telemetry", telemetry)) if value
+        ]
+    ):
+        raise SettingsError(
+            f"{unused[0]} is for flights that are mapped now; give --site FOLDER, or leave it out"
+        )
+    settings = SearchSettings(
+        plants, wanted_classes(classes), model, enough, through_crowns, _sun(sun), seed
+    )
     with opened_site(site or _map_of(inputs), writes=bool(site)) as place:
         outputs = SearchOutputs(
-            out or place.results("search"), area, poa, tuple(flight or ()), tuple(refly or ()), dji_drone
+            out or place.results("search"),
+            area,
+            poa,
+            tuple(flight or ()),
+            tuple(refly or ()),
+            dji_drone,
         )
         if site:
             if flight:
-                raise SettingsError("--flight names flights that the map has; flights that are mapped now are measured")
+                raise SettingsError(
+                    "--flight names flights that the map has; flights that are mapped now are measured"
+                )
             _map_all(inputs, place, settings, outputs, telemetry, camera, give_up)
         report = _measured(place.folder, settings, outputs)
     if as_json:
@@ -115,8 +148,13 @@ def search_command(
 
 
 def _map_all(
-    inputs: Sequence[str], place: "OpenedSite", settings: "SearchSettings", outputs: "SearchOutputs",
-    telemetry: str | None, camera: str, give_up_s: float,
+    inputs: Sequence[str],
+    place: "OpenedSite",
+    settings: "SearchSettings",
+    outputs: "SearchOutputs",
+    telemetry: str | None,
+    camera: str,
+    give_up_s: float,
 ) -> None:
     """Map the flights; a live one is measured meanwhile."""
     from sorvolo.capture.live.addresses import is_live_address
@@ -129,16 +167,28 @@ def _map_all(
     flying = None
     if live := sum(is_live_address(each) for each in inputs):
         if live > 1:
-            raise SettingsError(f"one live flight is measured while it is on, not {live}; search them one by one")
+            raise SettingsError(
+                f"one live flight is measured while it is on, not {live}; search them one by one"
+            )
         flying = SearchWhileFlying(settings, outputs)
         area = flying.area
-        show_path("page, once the flight is on", outputs.folder / "search.html", Console(stderr=True))
+        show_path(
+            "page, once the flight is on", outputs.folder / "search.html", Console(stderr=True)
+        )
     else:
-        area = prepare_search(settings, outputs).area  # mapping takes long: what cannot be used is refused before
+        area = prepare_search(
+            settings, outputs
+        ).area  # mapping takes long: what cannot be used is refused before
     check_area_of(place.folder, area)
     map_and_read_reports(
-        list(inputs), place.folder, MapSettings(model=settings.model), telemetry=telemetry, camera=camera or None,
-        live=LiveSettings(keeps_all=True, give_up_s=give_up_s), sent=place.sent, search=flying,
+        list(inputs),
+        place.folder,
+        MapSettings(model=settings.model),
+        telemetry=telemetry,
+        camera=camera or None,
+        live=LiveSettings(keeps_all=True, give_up_s=give_up_s),
+        sent=place.sent,
+        search=flying,
     )
 
 
@@ -146,24 +196,35 @@ def _map_of(inputs: Sequence[str]) -> str:
     """The only input, where it is a map. Raises SettingsError for anything else."""
     if len(inputs) == 1 and ("://" in inputs[0] or Path(inputs[0]).is_dir()):
         return inputs[0]
-    found = f"{len(inputs)} inputs" if len(inputs) > 1 else (
-        f"{inputs[0]} is a file" if Path(inputs[0]).exists() else f"there is no {inputs[0]}"
+    found = (
+        f"{len(inputs)} inputs"
+        if len(inputs) > 1
+        else (f"{inputs[0]} is a file" if Path(inputs[0]).exists() else f"there is no {inputs[0]}")
     )
-    raise SettingsError(f"{found}; give the folder of a map, or flights and --site FOLDER to map them into")
+    raise SettingsError(
+        f"{found}; give the folder of a map, or flights and --site FOLDER to map them into"
+    )
 
 
-def _measured(site: Path, settings: "SearchSettings", outputs: "SearchOutputs") -> Mapping[str, Any]:
+def _measured(
+    site: Path, settings: "SearchSettings", outputs: "SearchOutputs"
+) -> Mapping[str, Any]:
     """The report of a measured search, with progress on stderr."""
     from sorvolo.missions.search.flights import search_site
 
     report: Mapping[str, Any] = {}
-    with ProgressReport(Console(stderr=True)) as progress, closing(search_site(site, settings, outputs)) as measuring:
+    with (
+        ProgressReport(Console(stderr=True)) as progress,
+        closing(search_site(site, settings, outputs)) as measuring,
+    ):
         for each in measuring:
             if isinstance(each, dict):
                 report = each
             else:
                 words = f"{each.found} of {each.planted} found" if each.planted else ""
-                progress.show(f"searching planted pictures of {each.flight},", each.done, each.total, words)
+                progress.show(
+                    f"searching planted pictures of {each.flight},", each.done, each.total, words
+                )
     return report
 
 
@@ -173,25 +234,38 @@ def _sun(text: str) -> tuple[float, float] | None:
     try:
         azimuth, elevation = (float(each) for each in text.split(","))
     except ValueError as error:
-        raise SettingsError(f"--sun {text!r}: give azimuth,elevation in degrees, such as 215,48") from error
+        raise SettingsError(
+            f"--sun {text!r}: give azimuth,elevation in degrees, such as 215,48"
+        ) from error
     return azimuth, elevation
 
 
-def _show(report: Mapping[str, Any], folder: Path, refly: tuple[Path, ...], console: Console) -> None:
+def _show(
+    report: Mapping[str, Any], folder: Path, refly: tuple[Path, ...], console: Console
+) -> None:
     text = report["headline"]["text"]
-    console.print(escape(text[:1].upper() + text[1:]), style="bold", highlight=False, soft_wrap=True)
+    console.print(
+        escape(text[:1].upper() + text[1:]), style="bold", highlight=False, soft_wrap=True
+    )
     table = Table("class", "POD", "90 % interval", "area", "seen", "sweep width", "coverage")
     for label, row in report["classes"].items():
         width = "" if row["sweep_width_m"] is None else f"{row['sweep_width_m']:.1f} m"
         table.add_row(
-            escape(label), f"{row['pod']:.2f}", f"{row['pod_low']:.2f} to {row['pod_high']:.2f}",
-            f"{row['area_m2']:,.0f} m2", f"{row['seen_m2']:,.0f} m2", width, f"{row['coverage']:.2f}",
+            escape(label),
+            f"{row['pod']:.2f}",
+            f"{row['pod_low']:.2f} to {row['pod_high']:.2f}",
+            f"{row['area_m2']:,.0f} m2",
+            f"{row['seen_m2']:,.0f} m2",
+            width,
+            f"{row['coverage']:.2f}",
         )
     console.print(table)
     if report["segments"]:
         segments = Table("segment", "POA", "POD", "POS", "left")
         for each in report["segments"]:
-            segments.add_row(escape(each["name"]), *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left")))
+            segments.add_row(
+                escape(each["name"]), *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left"))
+            )
         console.print(segments)
     show_notices_and_warnings(report, console)
     for name, file in (("page", "search.html"), ("GeoTIFF", "pod.tif"), ("areas", "pod.geojson")):

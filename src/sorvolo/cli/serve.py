@@ -26,62 +26,116 @@ if TYPE_CHECKING:
 _NEEDED = ("fastapi", "uvicorn", "websockets", "titiler.core", "prometheus_client", "paho.mqtt")
 
 Root = Annotated[
-    str, typer.Argument(help="Folder that holds the sites, or s3://BUCKET/PREFIX; a site itself will do.")
+    str,
+    typer.Argument(
+        help="Folder that holds the sites, or s3://BUCKET/PREFIX; a site itself will do."
+    ),
 ]
 Host = Annotated[
-    str, typer.Option(help="Address to listen at; others than this machine's own need TLS and tokens.")
+    str,
+    typer.Option(help="Address to listen at; others than this machine's own need TLS and tokens."),
 ]
 Port = Annotated[int, typer.Option(help="Port to listen at.")]
 Certificate = Annotated[Path | None, typer.Option(help="TLS certificate, PEM.")]
 Key = Annotated[Path | None, typer.Option(help="TLS key, PEM.")]
-InsecureLan = Annotated[bool, typer.Option("--insecure-lan", help="Listen without TLS in a network that you trust.")]
-Names = Annotated[list[str] | None, typer.Option("--name", help="A host name that browsers use. Can be repeated.")]
-PublicUrl = Annotated[
-    str, typer.Option(help="Address of a TLS proxy on this machine before the station, such as https://maps.example.")
+InsecureLan = Annotated[
+    bool, typer.Option("--insecure-lan", help="Listen without TLS in a network that you trust.")
 ]
-BaseMap = Annotated[Path | None, typer.Option(help="Base map that pages show below the maps, PMTiles.")]
+Names = Annotated[
+    list[str] | None, typer.Option("--name", help="A host name that browsers use. Can be repeated.")
+]
+PublicUrl = Annotated[
+    str,
+    typer.Option(
+        help="Address of a TLS proxy on this machine before the station, such as https://maps.example."
+    ),
+]
+BaseMap = Annotated[
+    Path | None, typer.Option(help="Base map that pages show below the maps, PMTiles.")
+]
 Missions = Annotated[int, typer.Option(help="Missions that may run at the same time.")]
-StopWithin = Annotated[float, typer.Option(help="Seconds after which a mission that was stopped is killed.")]
+StopWithin = Annotated[
+    float, typer.Option(help="Seconds after which a mission that was stopped is killed.")
+]
 StreamFrom = Annotated[
     list[str] | None,
-    typer.Option(help="Network whose cameras the station may connect to, such as 192.168.1.0/24. Can be repeated."),
+    typer.Option(
+        help="Network whose cameras the station may connect to, such as 192.168.1.0/24. Can be repeated."
+    ),
 ]
-FreeFloor = Annotated[float, typer.Option(help="Disk space to leave free, GB; with less, nothing new is accepted.")]
+FreeFloor = Annotated[
+    float, typer.Option(help="Disk space to leave free, GB; with less, nothing new is accepted.")
+]
 UploadMost = Annotated[float, typer.Option(help="Largest upload, GB.")]
 Opens = Annotated[bool, typer.Option("--open", help="Open the page in a browser.")]
 Webhooks = Annotated[
     list[str] | None,
-    typer.Option("--webhook", help="Web address to post new objects and changes to. Can be repeated."),
+    typer.Option(
+        "--webhook", help="Web address to post new objects and changes to. Can be repeated."
+    ),
 ]
 WebhookSecret = Annotated[
-    str, typer.Option(envvar="SORVOLO_WEBHOOK_SECRET", help="Signs what is posted (HMAC).", show_default="not signed")
+    str,
+    typer.Option(
+        envvar="SORVOLO_WEBHOOK_SECRET",
+        help="Signs what is posted (HMAC).",
+        show_default="not signed",
+    ),
 ]
 Mqtt = Annotated[
     str,
-    typer.Option(help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER@HOST."),
+    typer.Option(
+        help="MQTT broker: mqtt://HOST:PORT/PREFIX (port, prefix optional), mqtts://USER@HOST."
+    ),
 ]
 MqttPassword = Annotated[
     Path | None,
     typer.Option(
-        help="File with the password of the MQTT user, readable by you alone.", show_default="SORVOLO_MQTT_PASSWORD"
+        help="File with the password of the MQTT user, readable by you alone.",
+        show_default="SORVOLO_MQTT_PASSWORD",
     ),
 ]
-MqttAuthority = Annotated[Path | None, typer.Option(help="For mqtts://: the authority of the broker, PEM.")]
-LogJson = Annotated[bool, typer.Option("--log-json", help="Log each request and fault as a line of JSON on stderr.")]
-TokenName = Annotated[str, typer.Argument(help="Who it is for, such as a person's name.", show_default="list tokens")]
-TokenRole = Annotated[str, typer.Option(help="view, review (also judge), or operate (also run missions).")]
+MqttAuthority = Annotated[
+    Path | None, typer.Option(help="For mqtts://: the authority of the broker, PEM.")
+]
+LogJson = Annotated[
+    bool, typer.Option("--log-json", help="Log each request and fault as a line of JSON on stderr.")
+]
+TokenName = Annotated[
+    str, typer.Argument(help="Who it is for, such as a person's name.", show_default="list tokens")
+]
+TokenRole = Annotated[
+    str, typer.Option(help="view, review (also judge), or operate (also run missions).")
+]
 Days = Annotated[float | None, typer.Option(help="Days until it expires.", show_default="never")]
 Revoke = Annotated[bool, typer.Option("--revoke", help="Revoke the token of this name.")]
 
 
 def serve(
-    root: Root, host: Host = "127.0.0.1", port: Port = 8750, tls_cert: Certificate = None, tls_key: Key = None,
-    insecure_lan: InsecureLan = False, name: Names = None, stream_from: StreamFrom = None, free_floor: FreeFloor = 2.0,
-    upload_most: UploadMost = 64.0, public_url: PublicUrl = "", base_map: BaseMap = None, most_missions: Missions = 4,
-    stop_within: StopWithin = 30.0, open_page: Opens = False, webhook: Webhooks = None,
-    webhook_secret: WebhookSecret = "", mqtt: Mqtt = "", mqtt_password_file: MqttPassword = None,
-    mqtt_ca: MqttAuthority = None, cot: Cot = "",
-    cot_ca: CotAuthority = None, cot_cert: CotCertificate = None, log_json: LogJson = False,
+    root: Root,
+    host: Host = "127.0.0.1",
+    port: Port = 8750,
+    tls_cert: Certificate = None,
+    tls_key: Key = None,
+    insecure_lan: InsecureLan = False,
+    name: Names = None,
+    stream_from: StreamFrom = None,
+    free_floor: FreeFloor = 2.0,
+    upload_most: UploadMost = 64.0,
+    public_url: PublicUrl = "",
+    base_map: BaseMap = None,
+    most_missions: Missions = 4,
+    stop_within: StopWithin = 30.0,
+    open_page: Opens = False,
+    webhook: Webhooks = None,
+    webhook_secret: WebhookSecret = "",
+    mqtt: Mqtt = "",
+    mqtt_password_file: MqttPassword = None,
+    mqtt_ca: MqttAuthority = None,
+    cot: Cot = "",
+    cot_ca: CotAuthority = None,
+    cot_cert: CotCertificate = None,
+    log_json: LogJson = False,
 ) -> None:
     """Serve a folder of sites to browsers: the map while it grows, changes, objects, and what to do with them.
 
@@ -102,16 +156,33 @@ def serve(
     from sorvolo.station.settings import StationLimits, StationSettings
 
     receivers = OutwardSettings(
-        tuple(webhook or ()), webhook_secret, mqtt, _mqtt_password(mqtt_password_file) if mqtt else "", mqtt_ca, cot,
+        tuple(webhook or ()),
+        webhook_secret,
+        mqtt,
+        _mqtt_password(mqtt_password_file) if mqtt else "",
+        mqtt_ca,
+        cot,
         CotTls(cot_ca, cot_cert),
     )
     with _served_folder(root) as folder:
         settings = StationSettings(
-            folder, host, port, tls_cert, tls_key, insecure_lan, tuple(name or ()), tuple(stream_from or ()),
-            free_floor, upload_most, public_url, base_map,
+            folder,
+            host,
+            port,
+            tls_cert,
+            tls_key,
+            insecure_lan,
+            tuple(name or ()),
+            tuple(stream_from or ()),
+            free_floor,
+            upload_most,
+            public_url,
+            base_map,
             StationLimits(most_missions=most_missions, stop_within_s=stop_within),
         )
-        run_station(settings, lambda: _announce(settings, opens=open_page), receivers, logs_json=log_json)
+        run_station(
+            settings, lambda: _announce(settings, opens=open_page), receivers, logs_json=log_json
+        )
 
 
 @contextmanager
@@ -138,7 +209,11 @@ def _served_folder(root: str) -> Iterator[Path]:
 
 
 def token(
-    root: Root, name: TokenName = "", role: TokenRole = "view", days: Days = None, revoke: Revoke = False,
+    root: Root,
+    name: TokenName = "",
+    role: TokenRole = "view",
+    days: Days = None,
+    revoke: Revoke = False,
     as_json: AsJson = False,
 ) -> None:
     """Make a token for a person or a program, list the tokens, or revoke one.
@@ -153,7 +228,9 @@ def token(
     from sorvolo.station.tokens import list_tokens, make_token, revoke_token
 
     if revoke and not name:
-        raise SettingsError("--revoke: of which token? give its name; without a name, tokens are listed")
+        raise SettingsError(
+            "--revoke: of which token? give its name; without a name, tokens are listed"
+        )
     state = StationState.open(_folder_of(root) / STATE_FOLDER)
     try:
         if revoke:
@@ -163,8 +240,13 @@ def token(
             made = make_token(state, name, role, days)
             typer.echo(json.dumps({"name": name, "role": role, "token": made}) if as_json else made)
         else:
-            _show_tokens([(each.name, each.role.lower(), each.made_at, each.expires_at) for each in list_tokens(state)],
-                         as_json=as_json)
+            _show_tokens(
+                [
+                    (each.name, each.role.lower(), each.made_at, each.expires_at)
+                    for each in list_tokens(state)
+                ],
+                as_json=as_json,
+            )
     finally:
         state.close()
 
@@ -183,17 +265,28 @@ def _folder_of(root: str) -> Path:
 
 def _announce(settings: "StationSettings", *, opens: bool) -> None:
     console = Console(stderr=True)
-    where = settings.address if not settings.public_url else f"{settings.public_url} (proxy to {settings.address})"
+    where = (
+        settings.address
+        if not settings.public_url
+        else f"{settings.public_url} (proxy to {settings.address})"
+    )
     console.print(f"station at {where}", soft_wrap=True, highlight=False, markup=False)
     if not settings.is_loopback and settings.tls_cert is None:
-        console.print("[yellow]warning[/yellow]  without TLS: who listens in this network can read tokens and maps")
+        console.print(
+            "[yellow]warning[/yellow]  without TLS: who listens in this network can read tokens and maps"
+        )
     if opens:
         webbrowser.open(settings.address)
 
 
 def _show_tokens(rows: list[tuple[str, str, str, str | None]], *, as_json: bool) -> None:
     if as_json:
-        typer.echo(json.dumps([dict(zip(("name", "role", "made_at", "expires_at"), row)) for row in rows], indent=1))
+        typer.echo(
+            json.dumps(
+                [dict(zip(("name", "role", "made_at", "expires_at"), row)) for row in rows],
+                indent=1,
+            )
+        )
         return
     if not rows:
         typer.echo("no tokens: only this machine reaches the station, and needs none")
@@ -215,10 +308,14 @@ def _mqtt_password(file: Path | None) -> str:
         return os.environ.get("SORVOLO_MQTT_PASSWORD", "")
     try:
         if file.stat().st_mode & 0o077:
-            raise SettingsError(f"--mqtt-password-file {file}: others may read it; make it yours: chmod 600 {file}")
+            raise SettingsError(
+                f"--mqtt-password-file {file}: others may read it; make it yours: chmod 600 {file}"
+            )
         return file.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(f"--mqtt-password-file {file}: a file with a password was needed ({error})") from error
+        raise SettingsError(
+            f"--mqtt-password-file {file}: a file with a password was needed ({error})"
+        ) from error
 
 
 def _demand_folder(root: Path) -> None:
@@ -234,4 +331,6 @@ def demand_extra() -> None:
         except ModuleNotFoundError:
             is_there = False
         if not is_there:
-            raise SettingsError("the station needs more packages; install them: pip install 'sorvolo[station]'")
+            raise SettingsError(
+                "the station needs more packages; install them: pip install 'sorvolo[station]'"
+            )

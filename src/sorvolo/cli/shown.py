@@ -36,7 +36,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
-        raise StoreError(f"{path} cannot be read ({error}); run the command on this flight again") from error
+        raise StoreError(
+            f"{path} cannot be read ({error}); run the command on this flight again"
+        ) from error
 
 
 def newest_version(site: Path, catalogues: "Catalogues | None" = None) -> int:
@@ -67,4 +69,6 @@ def show_done(flights: "Sequence[AlreadyDone]", done: str) -> None:
     """Print on stderr which flights the site has already: "mapped" or "compared"."""
     for each in flights:
         moment = each.done_utc[:16].replace("T", " ")
-        typer.echo(f"{each.flight} is {done} already ({moment} UTC); --again does it anew", err=True)
+        typer.echo(
+            f"{each.flight} is {done} already ({moment} UTC); --again does it anew", err=True
+        )

@@ -19,22 +19,41 @@ if TYPE_CHECKING:
     from sorvolo.simulation.pictures import PictureSettings
     from sorvolo.simulation.settings import SimulationSettings
 
-SimulationFolder = Annotated[Path, typer.Argument(help="Folder to make; an earlier simulation in it is replaced.")]
-PresetName = Annotated[str, typer.Option("--preset", help="What to simulate; --list-presets lists them.")]
-SeedOption = Annotated[int | None, typer.Option(help="Random seed; the same seed gives the same flights.")]
-Ground = Annotated[str, typer.Option(help="Ground: dirt, countryside, urban, sand, or an orthophoto's file.")]
+SimulationFolder = Annotated[
+    Path, typer.Argument(help="Folder to make; an earlier simulation in it is replaced.")
+]
+PresetName = Annotated[
+    str, typer.Option("--preset", help="What to simulate; --list-presets lists them.")
+]
+SeedOption = Annotated[
+    int | None, typer.Option(help="Random seed; the same seed gives the same flights.")
+]
+Ground = Annotated[
+    str, typer.Option(help="Ground: dirt, countryside, urban, sand, or an orthophoto's file.")
+]
 GroundResolution = Annotated[
     float | None, typer.Option(help="Ground resolution of an orthophoto without a CRS, m a pixel.")
 ]
 ReliefHeight = Annotated[
-    float | None, typer.Option("--relief", help="Hills, from the lowest to the highest ground, m. Without it: level.")
+    float | None,
+    typer.Option(
+        "--relief", help="Hills, from the lowest to the highest ground, m. Without it: level."
+    ),
 ]
-FlightCount = Annotated[int | None, typer.Option(help="Number of flights; between them things change.")]
+FlightCount = Annotated[
+    int | None, typer.Option(help="Number of flights; between them things change.")
+]
 GpsNoise = Annotated[float | None, typer.Option(help="GPS noise of each fix and axis, m rms.")]
-GpsRate = Annotated[float | None, typer.Option(help="GPS fixes a second.", show_default="the format's own")]
+GpsRate = Annotated[
+    float | None, typer.Option(help="GPS fixes a second.", show_default="the format's own")
+]
 ClockOffset = Annotated[float | None, typer.Option(help="Telemetry clock minus video clock, s.")]
-TelemetryFormat = Annotated[str, typer.Option(help="Telemetry format: csv, srt, nmea, gpx, all or none.")]
-FaultCount = Annotated[int, typer.Option(help="Number of gaps, jumps, 0/0 fixes and bad checksums each.")]
+TelemetryFormat = Annotated[
+    str, typer.Option(help="Telemetry format: csv, srt, nmea, gpx, all or none.")
+]
+FaultCount = Annotated[
+    int, typer.Option(help="Number of gaps, jumps, 0/0 fixes and bad checksums each.")
+]
 FlightHeight = Annotated[float | None, typer.Option(help="Flight height above ground, m.")]
 GroundSpeed = Annotated[float | None, typer.Option(help="Ground speed, m/s.")]
 StripLength = Annotated[float | None, typer.Option(help="Length of a strip, m.")]
@@ -42,12 +61,18 @@ StripCount = Annotated[int | None, typer.Option(help="Number of strips.")]
 Tilt = Annotated[float | None, typer.Option(help="Roll and pitch of the drone, deg rms.")]
 FrameRate = Annotated[float | None, typer.Option(help="Video frames a second.")]
 PictureSize = Annotated[str, typer.Option(help="Picture size, such as 1280x720.")]
-AsPhotos = Annotated[bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")]
+AsPhotos = Annotated[
+    bool, typer.Option("--photos", help="Write geo-tagged JPEG photos instead of a video.")
+]
 PictureCount = Annotated[
     int | None,
-    typer.Option(help="Make this many single labelled pictures (COCO) of different sites instead of flights."),
+    typer.Option(
+        help="Make this many single labelled pictures (COCO) of different sites instead of flights."
+    ),
 ]
-ThermalShare = Annotated[float, typer.Option(help="With --pictures: share of thermal pictures, 0 to 1.")]
+ThermalShare = Annotated[
+    float, typer.Option(help="With --pictures: share of thermal pictures, 0 to 1.")
+]
 
 
 def _print_presets(wanted: bool) -> None:
@@ -59,7 +84,10 @@ def _print_presets(wanted: bool) -> None:
 
 
 ListPresets = Annotated[
-    bool, typer.Option("--list-presets", callback=_print_presets, is_eager=True, help="List the presets and stop.")
+    bool,
+    typer.Option(
+        "--list-presets", callback=_print_presets, is_eager=True, help="List the presets and stop."
+    ),
 ]
 
 
@@ -102,22 +130,39 @@ def simulate(
     ground_file = _ground_file(ground)
     ground_kind = ground if ground_file is None else "orthophoto"
     if pictures is None and thermal:
-        raise SettingsError("--thermal is for single pictures: give their number with --pictures as well")
+        raise SettingsError(
+            "--thermal is for single pictures: give their number with --pictures as well"
+        )
     if pictures is not None:
-        _refuse_options_of_flights({
-            "--preset": preset_name != "demo", "--relief": relief, "--flights": flights, "--gps-noise": gps_noise,
-            "--gps-rate": gps_rate, "--clock-offset": clock_offset, "--telemetry": telemetry, "--speed": speed,
-            "--faults": faults or None, "--length": length, "--strips": strips, "--tilt": tilt, "--fps": fps,
-            "--size": size, "--photos": photos,
-        })
+        _refuse_options_of_flights(
+            {
+                "--preset": preset_name != "demo",
+                "--relief": relief,
+                "--flights": flights,
+                "--gps-noise": gps_noise,
+                "--gps-rate": gps_rate,
+                "--clock-offset": clock_offset,
+                "--telemetry": telemetry,
+                "--speed": speed,
+                "--faults": faults or None,
+                "--length": length,
+                "--strips": strips,
+                "--tilt": tilt,
+                "--fps": fps,
+                "--size": size,
+                "--photos": photos,
+            }
+        )
         asked = _picture_settings(pictures, seed, ground_kind, thermal, height)
         _simulate_pictures(folder, asked, ground_file, ground_gsd, as_json)
         return
     settings = _with_options(
         preset(preset_name),
-        top={"seed": seed, "flights": flights}, scene={"ground": ground_kind or None, "relief_m": relief},
+        top={"seed": seed, "flights": flights},
+        scene={"ground": ground_kind or None, "relief_m": relief},
         path={"height_m": height, "speed_m_s": speed, "length_m": length, "strips": strips},
-        motion={"tilt_rms_deg": tilt}, imaging={"fps": fps, **_size(size)},
+        motion={"tilt_rms_deg": tilt},
+        imaging={"fps": fps, **_size(size)},
         sensor=_sensor_options(gps_noise, gps_rate, clock_offset, faults),
         output={"telemetry": telemetry or None, "photos": photos or None},
     )
@@ -137,9 +182,15 @@ def _ground_file(ground: str) -> Path | None:
 
 def _refuse_options_of_flights(options: Mapping[str, object]) -> None:
     """Raises SettingsError where one was given: None, False and no text are options that were not given."""
-    given = [name for name, value in options.items() if value is not None and value is not False and value != ""]
+    given = [
+        name
+        for name, value in options.items()
+        if value is not None and value is not False and value != ""
+    ]
     if given:
-        raise SettingsError(f"--pictures makes single pictures, not flights: leave out {', '.join(given)}")
+        raise SettingsError(
+            f"--pictures makes single pictures, not flights: leave out {', '.join(given)}"
+        )
 
 
 def _picture_settings(
@@ -152,7 +203,11 @@ def _picture_settings(
 
 
 def _simulate_pictures(
-    folder: Path, settings: "PictureSettings", ground_file: Path | None, ground_gsd: float | None, as_json: bool
+    folder: Path,
+    settings: "PictureSettings",
+    ground_file: Path | None,
+    ground_gsd: float | None,
+    as_json: bool,
 ) -> None:
     from sorvolo.missions.simulate.pictures import simulate_pictures
 
@@ -165,11 +220,19 @@ def _simulate_pictures(
         typer.echo(json.dumps(asdict(last)))
     elif last is not None:
         pictures, boxes = counted(last.pictures_done, "picture"), counted(last.boxes, "box")
-        console.print(f"{pictures} with {boxes} in {last.seconds:.0f} s: {folder}", highlight=False, soft_wrap=True)
+        console.print(
+            f"{pictures} with {boxes} in {last.seconds:.0f} s: {folder}",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def _simulate_flights(
-    folder: Path, settings: "SimulationSettings", ground_file: Path | None, ground_gsd: float | None, as_json: bool
+    folder: Path,
+    settings: "SimulationSettings",
+    ground_file: Path | None,
+    ground_gsd: float | None,
+    as_json: bool,
 ) -> None:
     from sorvolo.missions.simulate.site import simulate_site
 
@@ -188,8 +251,10 @@ def _sensor_options(
     """The fields of SensorSettings; None for an option that was not given."""
     kinds = ("gaps", "jumps", "zero_fixes", "bad_checksums") if faults else ()
     return {
-        "noise_m": None if gps_noise_m is None else (gps_noise_m,) * 3, "rate_hz": gps_rate_hz,
-        "clock_offset_s": clock_offset_s, **dict.fromkeys(kinds, faults),
+        "noise_m": None if gps_noise_m is None else (gps_noise_m,) * 3,
+        "rate_hz": gps_rate_hz,
+        "clock_offset_s": clock_offset_s,
+        **dict.fromkeys(kinds, faults),
     }
 
 
@@ -213,9 +278,13 @@ def _show(steps: Iterator["SimulationProgress"], folder: Path) -> None:
     with ProgressReport(Console(stderr=True), stays=True) as progress:
         for last in steps:
             if last.stage == "frames":
-                progress.show(f"simulating {last.flight}, frame", last.frames_done, last.frames_total)
+                progress.show(
+                    f"simulating {last.flight}, frame", last.frames_done, last.frames_total
+                )
     if last is not None:
         made = counted(last.frames_done, "frame")
         console.print(f"{made} in {last.seconds:.0f} s: {folder}", highlight=False, soft_wrap=True)
         truth, camera = folder / "truth", folder / "camera.xml"
-        console.print(f"the truth is in {truth}; the camera is in {camera}", highlight=False, soft_wrap=True)
+        console.print(
+            f"the truth is in {truth}; the camera is in {camera}", highlight=False, soft_wrap=True
+        )

@@ -27,10 +27,18 @@ def site() -> None:
 @site_app.command("copy")
 def copy_command(
     source: Annotated[str, typer.Argument(help="Folder of the map, or s3://BUCKET/NAME.")],
-    target: Annotated[str, typer.Argument(help="A new or empty folder or s3:// place, or that of an earlier copy.")],
-    verify: Annotated[bool, typer.Option("--verify", help="Copy nothing: compare the copy with the map.")] = False,
+    target: Annotated[
+        str,
+        typer.Argument(help="A new or empty folder or s3:// place, or that of an earlier copy."),
+    ],
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Copy nothing: compare the copy with the map.")
+    ] = False,
     catalogue: Annotated[
-        str, typer.Option(help="Where a new copy's catalogue lies: postgresql://USER@HOST/DATABASE; else in the copy.")
+        str,
+        typer.Option(
+            help="Where a new copy's catalogue lies: postgresql://USER@HOST/DATABASE; else in the copy."
+        ),
     ] = "",
     as_json: AsJson = False,
 ) -> None:
@@ -59,7 +67,9 @@ def copy_command(
 @site_app.command("prune")
 def prune_command(
     place: Annotated[str, typer.Argument(help="The site in a store: s3://BUCKET/NAME.")],
-    keep_days: Annotated[float, typer.Option(min=0.0, help="Keep what was stored less than this many days ago.")] = 7.0,
+    keep_days: Annotated[
+        float, typer.Option(min=0.0, help="Keep what was stored less than this many days ago.")
+    ] = 7.0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Remove nothing: count.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -90,7 +100,9 @@ def _print(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:
     )
     if outcome.left_out:
         names = ", ".join(outcome.left_out[:_MOST_FAULTS])
-        typer.echo(f"not copied, not part of the map: {names}{', ...' if len(outcome.left_out) > _MOST_FAULTS else ''}")
+        typer.echo(
+            f"not copied, not part of the map: {names}{', ...' if len(outcome.left_out) > _MOST_FAULTS else ''}"
+        )
     for path, fault in list(outcome.faults.items())[:_MOST_FAULTS]:
         typer.echo(f"{path}: {fault}", err=True)
     if len(outcome.faults) > _MOST_FAULTS:
@@ -98,4 +110,7 @@ def _print(outcome: "CopyOutcome", target: str, *, verified: bool) -> None:
     if not outcome.faults:
         typer.echo("every file matches" if verified else "the copy is complete")
     elif not verified:
-        typer.echo("the rest was copied; restore these files of the map from another copy, or map again", err=True)
+        typer.echo(
+            "the rest was copied; restore these files of the map from another copy, or map again",
+            err=True,
+        )

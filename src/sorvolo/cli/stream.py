@@ -26,29 +26,50 @@ if TYPE_CHECKING:
     from sorvolo.station.footage import Footage
     from sorvolo.station.spool import Spool
 
-StreamInput = Annotated[str, typer.Argument(help="A video, or the camera's address, such as rtsp://192.168.1.10/live.")]
-To = Annotated[str, typer.Option(help="The station's address, such as https://station.example:8750.")]
+StreamInput = Annotated[
+    str, typer.Argument(help="A video, or the camera's address, such as rtsp://192.168.1.10/live.")
+]
+To = Annotated[
+    str, typer.Option(help="The station's address, such as https://station.example:8750.")
+]
 StreamName = Annotated[
-    str, typer.Option("--stream", help="The stream's name at the station.", show_default="the input's")
+    str,
+    typer.Option("--stream", help="The stream's name at the station.", show_default="the input's"),
 ]
 Token = Annotated[
     str,
-    typer.Option(envvar="SORVOLO_TOKEN", help="Token of the role operate; others cannot see it in SORVOLO_TOKEN."),
+    typer.Option(
+        envvar="SORVOLO_TOKEN",
+        help="Token of the role operate; others cannot see it in SORVOLO_TOKEN.",
+    ),
 ]
 StreamTelemetry = Annotated[
-    str, typer.Option(help="The flight's log if not beside the video; for a live source, a receiver's address.")
+    str,
+    typer.Option(
+        help="The flight's log if not beside the video; for a live source, a receiver's address."
+    ),
 ]
-Speed = Annotated[float, typer.Option(help="Of a recording: 1 as it was flown, 0 as fast as the link takes it.")]
-Latency = Annotated[float, typer.Option(help="On a slow link pictures older than this are dropped, s.")]
+Speed = Annotated[
+    float, typer.Option(help="Of a recording: 1 as it was flown, 0 as fast as the link takes it.")
+]
+Latency = Annotated[
+    float, typer.Option(help="On a slow link pictures older than this are dropped, s.")
+]
 KeepAll = Annotated[bool, typer.Option("--keep-all", help="Drop no picture, however late.")]
-SpoolFolder = Annotated[Path | None, typer.Option(help="Folder for what waits.", show_default="in the user's cache")]
+SpoolFolder = Annotated[
+    Path | None, typer.Option(help="Folder for what waits.", show_default="in the user's cache")
+]
 SpoolMb = Annotated[float, typer.Option(help="Most that waits through an outage, MB.")]
 StreamGiveUp = Annotated[
     float | None,
-    typer.Option(help="End when the camera sent nothing for so long, or all is taken and there is no link, s.",
-                 show_default="30 for the camera, never for the link"),
+    typer.Option(
+        help="End when the camera sent nothing for so long, or all is taken and there is no link, s.",
+        show_default="30 for the camera, never for the link",
+    ),
 ]
-Authority = Annotated[Path | None, typer.Option(help="Authority of the station's certificate, PEM.")]
+Authority = Annotated[
+    Path | None, typer.Option(help="Authority of the station's certificate, PEM.")
+]
 
 
 def stream(
@@ -82,8 +103,11 @@ def stream(
 
     forever = float("inf")
     settings = StreamSettings(
-        speed, forever if keep_all else latency, round(spool_mb * 1e6),
-        give_up_s=forever if give_up is None else give_up, authority=ca,
+        speed,
+        forever if keep_all else latency,
+        round(spool_mb * 1e6),
+        give_up_s=forever if give_up is None else give_up,
+        authority=ca,
     )
     stop = threading.Event()
     with _stopped_by_signals(stop):
@@ -96,8 +120,13 @@ def stream(
 
 
 def _send(
-    footage: "Footage", folder: Path, station: tuple[str, str, str], settings: "StreamSettings", stop: threading.Event,
-    *, is_quiet: bool,
+    footage: "Footage",
+    folder: Path,
+    station: tuple[str, str, str],
+    settings: "StreamSettings",
+    stop: threading.Event,
+    *,
+    is_quiet: bool,
 ) -> "list[StreamReport]":
     """Send what an earlier run left, where that was another flight, then this one; the report of each."""
     from sorvolo.station.client import StreamClient, remains_of, stream_url
@@ -121,6 +150,7 @@ def _send(
 
 def _run(sending: Any, waiting: "Spool", console: Console, *, is_quiet: bool) -> "StreamReport":
     with ProgressReport(console) as progress:
+
         def show(report: "StreamReport") -> None:
             if not is_quiet:
                 progress.show("sending, frame", report.frames, words=_words(report))
@@ -150,13 +180,19 @@ def _words(report: "StreamReport") -> str:
     return ", ".join(words)
 
 
-def _show_end(reports: "list[StreamReport]", footage: "Footage", console: Console, *, as_json: bool) -> None:
+def _show_end(
+    reports: "list[StreamReport]", footage: "Footage", console: Console, *, as_json: bool
+) -> None:
     if as_json:
         flights = [_result(each) for each in reports]
         typer.echo(json.dumps({"flights": flights, "notices": list(footage.notices())}, indent=1))
         return
     for report in reports:
-        console.print(f"Sent as {escape(report.stream)}: {_words_of_end(report)}", highlight=False, soft_wrap=True)
+        console.print(
+            f"Sent as {escape(report.stream)}: {_words_of_end(report)}",
+            highlight=False,
+            soft_wrap=True,
+        )
     for text in footage.notices():
         console.print(f"  {escape(text)}", highlight=False, soft_wrap=True)
 
@@ -171,16 +207,24 @@ def _words_of_end(report: "StreamReport") -> str:
     if report.outages:
         words.append(f"{counted(report.outages, 'outage')}, {report.outage_s:.1f} s in all")
     if report.spooled:
-        words.append(f"{counted(report.spooled, 'frame')} still waiting; the same command sends them")
+        words.append(
+            f"{counted(report.spooled, 'frame')} still waiting; the same command sends them"
+        )
     return "; ".join(words)
 
 
 def _result(report: "StreamReport") -> dict[str, Any]:
     delays_s = sorted(report.delays_s)
     return {
-        "stream": report.stream, "frames": report.frames, "samples": report.samples, "sent_mb": report.sent_bytes / 1e6,
-        "dropped_late": report.late, "dropped_spool_full": report.overflowed, "waiting": report.spooled,
-        "outages": report.outages, "outage_s": round(report.outage_s, 2),
+        "stream": report.stream,
+        "frames": report.frames,
+        "samples": report.samples,
+        "sent_mb": report.sent_bytes / 1e6,
+        "dropped_late": report.late,
+        "dropped_spool_full": report.overflowed,
+        "waiting": report.spooled,
+        "outages": report.outages,
+        "outage_s": round(report.outage_s, 2),
         "delay_median_s": delays_s[len(delays_s) // 2] if delays_s else None,
         "delay_p95_s": delays_s[len(delays_s) * 95 // 100] if delays_s else None,
     }
@@ -191,7 +235,9 @@ def _warn_of_plain_token(url: str, token: str, console: Console) -> None:
 
     parts = urlsplit(url)
     if token and parts.scheme == "ws" and parts.hostname not in ("127.0.0.1", "::1", "localhost"):
-        console.print("[yellow]warning[/yellow]  without TLS (https://) who listens in this network can read the token")
+        console.print(
+            "[yellow]warning[/yellow]  without TLS (https://) who listens in this network can read the token"
+        )
 
 
 def _cache() -> Path:

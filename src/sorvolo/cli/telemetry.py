@@ -21,20 +21,30 @@ if TYPE_CHECKING:
     from sorvolo.missions.watch.cot_sender import CotTls
 
 _Site = Annotated[
-    str, typer.Option(help="Folder of the map that the flight is in or is mapped into first, or s3://BUCKET/NAME.")
+    str,
+    typer.Option(
+        help="Folder of the map that the flight is in or is mapped into first, or s3://BUCKET/NAME."
+    ),
 ]
 _Flight = Annotated[str, typer.Option(help="Flight of the map.", show_default="its only one")]
 _Log = Annotated[str, typer.Option(help="The flight's log if it is not beside the video.")]
 _Cot = Annotated[
-    str, typer.Option(help="Send the track to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port.")
+    str,
+    typer.Option(
+        help="Send the track to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port."
+    ),
 ]
-_Out = Annotated[Path | None, typer.Option(help="Folder for results.", show_default="SITE-telemetry/FLIGHT")]
+_Out = Annotated[
+    Path | None, typer.Option(help="Folder for results.", show_default="SITE-telemetry/FLIGHT")
+]
 
 
 def telemetry_command(
     source: Annotated[
         str,
-        typer.Argument(help="A flight (video, folder of photos), with --site; or a map's folder, or s3://BUCKET/NAME."),
+        typer.Argument(
+            help="A flight (video, folder of photos), with --site; or a map's folder, or s3://BUCKET/NAME."
+        ),
     ],
     site: _Site = "",
     flight: _Flight = "",
@@ -68,8 +78,13 @@ def telemetry_command(
         chosen = chosen_flight(place.folder, of_source)
         target = out or place.results("telemetry") / chosen
         report = correct_telemetry(
-            place.folder, target, flight=chosen, source=Path(source) if site else None,
-            telemetry=telemetry or None, camera=camera or None, cot=receiver,
+            place.folder,
+            target,
+            flight=chosen,
+            source=Path(source) if site else None,
+            telemetry=telemetry or None,
+            camera=camera or None,
+            cot=receiver,
         )
     _print(report, target, as_json=as_json)
 
@@ -86,7 +101,9 @@ def _check_source(source: str, site: str, *, has_own_options: bool) -> None:
     with it was what belongs to a flight."""
     from sorvolo.store.site.catalogue_place import is_site
 
-    ways = "give a flight's video or folder of photos with --site FOLDER, or the folder of a map alone"
+    ways = (
+        "give a flight's video or folder of photos with --site FOLDER, or the folder of a map alone"
+    )
     scheme = source.partition("://")[0] if "://" in source else ""
     if scheme and scheme not in ("s3", "file"):
         raise SettingsError(
@@ -130,7 +147,10 @@ def _show(report: Mapping[str, Any], target: Path, console: Console) -> None:
     for warning in report["warnings"]:
         console.print(f"[yellow]warning[/yellow]  {escape(warning)}", highlight=False)
     if report["cot_sent"] is not None:
-        console.print(f"  {report['cot_sent']} of {report['frames']} Cursor on Target events sent", highlight=False)
+        console.print(
+            f"  {report['cot_sent']} of {report['frames']} Cursor on Target events sent",
+            highlight=False,
+        )
     for name in report["files"]:
         show_path("kept" if report["diagnosed_before"] else "written", target / name, console)
 
@@ -154,13 +174,22 @@ def _map_if_new(source: Path, place: OpenedSite, wanted: str, telemetry: str, ca
                 f"and {source} is mapped into it"
             )
         return wanted
-    with opened_sources([source], telemetry or None, camera or None, known_flights(place.folder)) as sources:
-        name = next((each for each, mark in mapped.items() if mark == sources[0].fingerprint), sources[0].name)
+    with opened_sources(
+        [source], telemetry or None, camera or None, known_flights(place.folder)
+    ) as sources:
+        name = next(
+            (each for each, mark in mapped.items() if mark == sources[0].fingerprint),
+            sources[0].name,
+        )
         if name not in mapped:
             _check_fixes(sources[0], source)
     if name not in mapped:
         map_and_read_reports(
-            [source], place.folder, MapSettings(model="none"), telemetry=telemetry or None, camera=camera or None,
+            [source],
+            place.folder,
+            MapSettings(model="none"),
+            telemetry=telemetry or None,
+            camera=camera or None,
             sent=place.sent,
         )
     return name

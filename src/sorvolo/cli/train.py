@@ -45,31 +45,52 @@ class Schedule(StrEnum):
     FOUR_STEPS = "four-steps"
 
 
-LabelledSets = Annotated[list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")]
-RunFolder = Annotated[Path, typer.Option(help="Folder for the model, the report and the checkpoints.")]
+LabelledSets = Annotated[
+    list[Path] | None, typer.Argument(help="Labelled sets: folders, or their label files.")
+]
+RunFolder = Annotated[
+    Path, typer.Option(help="Folder for the model, the report and the checkpoints.")
+]
 PresetOption = Annotated[
-    Preset, typer.Option(help="fast: laptops. accurate: GPUs. thesis: ResNet-50 with the nine modules.")
+    Preset,
+    typer.Option(help="fast: laptops. accurate: GPUs. thesis: ResNet-50 with the nine modules."),
 ]
 RpnOption = Annotated[
-    Rpn | None, typer.Option(help="Proposal network.", show_default="extended-residual; thesis: extended")
+    Rpn | None,
+    typer.Option(help="Proposal network.", show_default="extended-residual; thesis: extended"),
 ]
-ScheduleOption = Annotated[Schedule, typer.Option(help="joint: everything at once. four-steps: as the thesis does.")]
-CheckedOn = Annotated[str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")]
+ScheduleOption = Annotated[
+    Schedule, typer.Option(help="joint: everything at once. four-steps: as the thesis does.")
+]
+CheckedOn = Annotated[
+    str, typer.Option(help="A labelled set to check on, or the share of videos to hold out.")
+]
 StartingWeights = Annotated[
-    str, typer.Option(help="Start from ImageNet (auto, or a file), nothing (none), or a model: name or .onnx."),
+    str,
+    typer.Option(
+        help="Start from ImageNet (auto, or a file), nothing (none), or a model: name or .onnx."
+    ),
 ]
 StepCount = Annotated[int, typer.Option(help="Number of batches.")]
 BatchSize = Annotated[int, typer.Option(help="Samples per batch.")]
 SampleSide = Annotated[int, typer.Option(help="Side of the samples cut from the pictures, px.")]
 Seed = Annotated[int, typer.Option(help="Random seed.")]
 SyntheticShare = Annotated[float, typer.Option(help="Share of simulated samples, 0 to 1.")]
-Patience = Annotated[int, typer.Option(help="Stop after this many of the 20 checks without a better AP50; 0: never.")]
+Patience = Annotated[
+    int, typer.Option(help="Stop after this many of the 20 checks without a better AP50; 0: never.")
+]
 Device = Annotated[str, typer.Option(help="auto, cpu or cuda.")]
 Resume = Annotated[bool, typer.Option("--resume", help="Continue the run in --out.")]
 LabelFormat = Annotated[str | None, typer.Option(help="Label format.", show_default="recognised")]
-ClassNames = Annotated[str | None, typer.Option(help="Class names of the labels as ours: Pedestrian=person,Van=car.")]
-IgnoredClasses = Annotated[str, typer.Option(help="Class names whose boxes are ignored: Bicycle,DontCare.")]
-UnlabelledClasses = Annotated[str, typer.Option(help="Classes that may be in the pictures without a label: person.")]
+ClassNames = Annotated[
+    str | None, typer.Option(help="Class names of the labels as ours: Pedestrian=person,Van=car.")
+]
+IgnoredClasses = Annotated[
+    str, typer.Option(help="Class names whose boxes are ignored: Bicycle,DontCare.")
+]
+UnlabelledClasses = Annotated[
+    str, typer.Option(help="Classes that may be in the pictures without a label: person.")
+]
 
 
 def train(
@@ -110,7 +131,16 @@ def train(
 
     chosen = rpn or (Rpn.EXTENDED if preset == Preset.THESIS else Rpn.RESIDUAL)
     settings = TrainSettings(
-        preset.value, chosen.value, schedule.value, weights, steps, batch, side, seed, synthetic, patience
+        preset.value,
+        chosen.value,
+        schedule.value,
+        weights,
+        steps,
+        batch,
+        side,
+        seed,
+        synthetic,
+        patience,
     )
     try:
         from sorvolo.missions.train.detector import CHECKPOINT, train_detector
@@ -119,17 +149,23 @@ def train(
         raise SettingsError(
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"
         ) from error
-    options = DataOptions(val, form, class_names(classes), names(ignore), names(unlabelled), group_pattern)
+    options = DataOptions(
+        val, form, class_names(classes), names(ignore), names(unlabelled), group_pattern
+    )
     updates = train_detector(data or [], out, settings, options, device=device, resume=resume)
     with _stopped_between_steps() as stop:
         (_print_json if as_json else _show)(updates, stop)
         if stop.is_there:
             cast(Generator[Any], updates).close()  # leaves a checkpoint, once it has learnt at all
             if (out / CHECKPOINT).is_file():
-                context.obj.stop_words = f"stopped; the same command with --resume continues the run in {out}"
+                context.obj.stop_words = (
+                    f"stopped; the same command with --resume continues the run in {out}"
+                )
             raise KeyboardInterrupt
     if not as_json:
-        typer.echo(f"report: {out / 'training.html'}; sorvolo evaluate detector measures the model on other pictures")
+        typer.echo(
+            f"report: {out / 'training.html'}; sorvolo evaluate detector measures the model on other pictures"
+        )
 
 
 def _print_json(updates: "Iterator[TrainingUpdate]", stop: "_StopRequest") -> None:
@@ -150,15 +186,20 @@ def _show(updates: "Iterator[TrainingUpdate]", stop: "_StopRequest") -> None:
             for notice in update.notices:
                 console.print(f"[blue]note[/blue]     {escape(notice)}", highlight=False)
             progress.show(
-                f"{update.words}, step" if update.step else update.words, update.step, update.steps,
+                f"{update.words}, step" if update.step else update.words,
+                update.step,
+                update.steps,
                 _losses(update) if update.losses is not None else "",
             )
             if update.check is not None:
-                each = ", ".join(f"{escape(name)} {_number(ap50)}" for name, ap50 in update.check.classes.items())
+                each = ", ".join(
+                    f"{escape(name)} {_number(ap50)}" for name, ap50 in update.check.classes.items()
+                )
                 at = "step" if update.losses is not None else "the model as written, from step"
                 console.print(
                     f"{at} {update.check.step}: AP50 {_number(update.check.ap50)} ({each}), "
-                    f"AP {_number(update.check.ap)}", highlight=False,
+                    f"AP {_number(update.check.ap)}",
+                    highlight=False,
                 )
             if stop.is_there:
                 return

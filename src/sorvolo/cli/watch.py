@@ -39,7 +39,9 @@ if TYPE_CHECKING:
     from sorvolo.survey.objects import Track
 
 _MOST_ROWS = 40  # of a table on a terminal; by choice
-_COLUMNS_EXPLAINED = "score: 0 to 1, about the share that is right; accuracy: 1 sigma; views: frames that show it"
+_COLUMNS_EXPLAINED = (
+    "score: 0 to 1, about the share that is right; accuracy: 1 sigma; views: frames that show it"
+)
 
 
 class Save(StrEnum):
@@ -50,22 +52,40 @@ class Save(StrEnum):
     PICTURES = "pictures"
 
 
-WatchSource = Annotated[str, typer.Argument(help="A video, a folder of photos, or a live stream's address.")]
+WatchSource = Annotated[
+    str, typer.Argument(help="A video, a folder of photos, or a live stream's address.")
+]
 WatchTelemetry = Annotated[
-    str, typer.Option(help="The flight's log if not beside the video; for a live source, a receiver's address.")
+    str,
+    typer.Option(
+        help="The flight's log if not beside the video; for a live source, a receiver's address."
+    ),
 ]
-Model = Annotated[str, typer.Option(help="Detector: a model's name (sorvolo models list), or a file.")]
+Model = Annotated[
+    str, typer.Option(help="Detector: a model's name (sorvolo models list), or a file.")
+]
 SearchedClasses = Annotated[
-    str | None, typer.Option(help="Classes to search for, such as person,car.", show_default="all but those on request")
+    str | None,
+    typer.Option(
+        help="Classes to search for, such as person,car.", show_default="all but those on request"
+    ),
 ]
-ResultsFolder = Annotated[Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")]
+ResultsFolder = Annotated[
+    Path | None, typer.Option(help="Folder for the results.", show_default="SOURCE-watch")
+]
 SaveOption = Annotated[Save, typer.Option(help="Keep the frames with the objects drawn in.")]
-Labels = Annotated[str, typer.Option(help="Write labels to correct and train with: coco, yolo or coco,yolo.")]
+Labels = Annotated[
+    str, typer.Option(help="Write labels to correct and train with: coco, yolo or coco,yolo.")
+]
 Cot = Annotated[
-    str, typer.Option(help="Send objects to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port.")
+    str,
+    typer.Option(
+        help="Send objects to a TAK server or team: udp://host:port, tcp://host:port, tls://host:port."
+    ),
 ]
 CotType = Annotated[
-    list[str] | None, typer.Option(help="Cursor on Target type of a class, such as person=a-f-G. Can be repeated.")
+    list[str] | None,
+    typer.Option(help="Cursor on Target type of a class, such as person=a-f-G. Can be repeated."),
 ]
 AlertCommand = Annotated[
     str,
@@ -77,19 +97,31 @@ AlertUrl = Annotated[str, typer.Option(help="Post each new object to this web ad
 EveryNth = Annotated[int | None, typer.Option(help="Search every N-th frame only.")]
 SearchRate = Annotated[
     float | None,
-    typer.Option(help="Frames searched per second of flight.", show_default="10; live: as many as possible"),
+    typer.Option(
+        help="Frames searched per second of flight.", show_default="10; live: as many as possible"
+    ),
 ]
 Tiles = Annotated[
-    str, typer.Option(help="Cut large pictures into tiles: auto (by ground resolution), pixels a side, or none.")
+    str,
+    typer.Option(
+        help="Cut large pictures into tiles: auto (by ground resolution), pixels a side, or none."
+    ),
 ]
 LeastScore = Annotated[
-    float | None, typer.Option(help="Lowest score to report, 0 to 1.", show_default="each class's own")
+    float | None,
+    typer.Option(help="Lowest score to report, 0 to 1.", show_default="each class's own"),
 ]
 WatchOffset = Annotated[
-    float | None, typer.Option(help="Telemetry time minus video time, s.", show_default="as their clocks have it")
+    float | None,
+    typer.Option(
+        help="Telemetry time minus video time, s.", show_default="as their clocks have it"
+    ),
 ]
 HeightModel = Annotated[
-    str, typer.Option(help="GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground")
+    str,
+    typer.Option(
+        help="GeoTIFF of ground heights in the telemetry's reference.", show_default="level ground"
+    ),
 ]
 
 
@@ -136,23 +168,44 @@ def watch_command(
     from sorvolo.store.exports.cursor_on_target import COT_TYPES
 
     settings = WatchSettings(
-        model, wanted_classes(classes), least_score, _tiles(tiles), every, fps, offset, ground_elevation, height_model
+        model,
+        wanted_classes(classes),
+        least_score,
+        _tiles(tiles),
+        every,
+        fps,
+        offset,
+        ground_elevation,
+        height_model,
     )
     outputs = WatchOutputs(
-        out, save.value, names(labels), cot, {**COT_TYPES, **_types(cot_type or [])}, alert_command=alert_command,
-        alert_url=alert_url, cot_tls=CotTls(cot_ca, cot_cert),
+        out,
+        save.value,
+        names(labels),
+        cot,
+        {**COT_TYPES, **_types(cot_type or [])},
+        alert_command=alert_command,
+        alert_url=alert_url,
+        cot_tls=CotTls(cot_ca, cot_cert),
     )
     warn_of_interpreted(alert_command)
     stop = _Stop()
     watching = watch(
-        source, settings, outputs, telemetry=telemetry or None, camera=camera or None,
-        live=LiveSettings(give_up_s=give_up), until=stop.until,
+        source,
+        settings,
+        outputs,
+        telemetry=telemetry or None,
+        camera=camera or None,
+        live=LiveSettings(give_up_s=give_up),
+        until=stop.until,
     )
     folders = _folders_watched(watching, stop, coordinates, is_quiet=as_json)
     _show_results([_result(folder) for folder in folders], coordinates, as_json=as_json)
 
 
-def _show_results(results: Sequence[Mapping[str, Any]], coordinates: PlaceFormat, *, as_json: bool) -> None:
+def _show_results(
+    results: Sequence[Mapping[str, Any]], coordinates: PlaceFormat, *, as_json: bool
+) -> None:
     if as_json:
         typer.echo(json.dumps({"watches": results}, indent=1))
     else:
@@ -167,7 +220,9 @@ def warn_of_interpreted(alert_command: str) -> None:
     from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
 
     if name := interpreted_placeholder(alert_command):
-        Console(stderr=True).print(f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True)
+        Console(stderr=True).print(
+            f"[yellow]warning[/yellow]  {escape(interpreted_words(name))}", soft_wrap=True
+        )
 
 
 class _Stop:
@@ -184,7 +239,9 @@ class _Stop:
     @contextmanager
     def on_signals(self) -> Iterator[None]:
         """Take the signals for the length of a block."""
-        before = {number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        before = {
+            number: signal.signal(number, self._stop) for number in (signal.SIGINT, signal.SIGTERM)
+        }
         try:
             yield
         finally:
@@ -223,7 +280,8 @@ def _show_progress(
                 console.print(_words_of(track, update.site, form), highlight=False, soft_wrap=True)
             delay = f"{1000 * update.latency_s:.0f} ms delay"
             progress.show(
-                "watching, frame", update.frames_read,
+                "watching, frame",
+                update.frames_read,
                 max(update.frames_expected, update.frames_read) if update.frames_expected else None,
                 f"{rate_words(update.frames_detected, update.seconds)}{delay}, {counted_list(update.counts)}",
             )
@@ -250,16 +308,20 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
     tracks = [each["properties"] for each in result["tracks"]["features"]]
     console.print(
         f"Watch of {escape(result['flight'])}: {escape(counted_list(result['objects']['by_class']))} found",
-        style="bold", highlight=False,
+        style="bold",
+        highlight=False,
     )
     if tracks:
         _show_tracks(tracks, console, form, on_ground=result["georeferenced"])
     frames, latency = result["frames"], result["latency_s"]
-    skipped = f", {frames['skipped']:,} skipped to keep up with the source" if frames["skipped"] else ""
+    skipped = (
+        f", {frames['skipped']:,} skipped to keep up with the source" if frames["skipped"] else ""
+    )
     console.print(
         f"{frames['detected']:,} of {counted(frames['read'], 'frame')} searched at "
         f"{result['frames_per_second'] or 0.0:.1f} frames/s{skipped}; delay {1000 * (latency['median'] or 0):.0f} ms "
-        f"(median), {1000 * (latency['max'] or 0):.0f} ms at most", highlight=False,
+        f"(median), {1000 * (latency['max'] or 0):.0f} ms at most",
+        highlight=False,
     )
     show_notices_and_warnings(result, console)
     folder = Path(result["folder"])
@@ -271,17 +333,32 @@ def _show_result(result: Mapping[str, Any], console: Console, form: PlaceFormat)
         console.print(f"  {result['tracks']['note']}", style="dim", highlight=False)
 
 
-def _show_tracks(tracks: Sequence[Any], console: Console, form: PlaceFormat, *, on_ground: bool) -> None:
+def _show_tracks(
+    tracks: Sequence[Any], console: Console, form: PlaceFormat, *, on_ground: bool
+) -> None:
     has_cuts = len({each.get("segment") for each in tracks}) > 1
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     in_picture = "segment: x, y px" if has_cuts else "x, y px"
     place_name = place_heading(False, form) if on_ground else in_picture
-    for name in ("id", "class", "score", place_name, f"accuracy {'m' if on_ground else 'px'}", "views", "moves"):
+    for name in (
+        "id",
+        "class",
+        "score",
+        place_name,
+        f"accuracy {'m' if on_ground else 'px'}",
+        "views",
+        "moves",
+    ):
         table.add_column(name, no_wrap=name in ("id", place_name), overflow="fold")
     for each in tracks[:_MOST_ROWS]:
         table.add_row(
-            str(each["id"]), escape(each["class"]), f"{each['score']:.2f}", _place(each, form, on_ground, has_cuts),
-            f"{each['sigma_m']:.1f}", str(each["views"]), "yes" if each["moving"] else "",
+            str(each["id"]),
+            escape(each["class"]),
+            f"{each['score']:.2f}",
+            _place(each, form, on_ground, has_cuts),
+            f"{each['sigma_m']:.1f}",
+            str(each["views"]),
+            "yes" if each["moving"] else "",
         )
     console.print(table)
     if len(tracks) > _MOST_ROWS:
@@ -315,6 +392,8 @@ def _types(pairs: list[str]) -> dict[str, str]:
     for pair in pairs:
         name, equals, kind = pair.partition("=")
         if not (name and equals and kind):
-            raise SettingsError(f"--cot-type {pair}: give a class and its type, such as person=a-f-G")
+            raise SettingsError(
+                f"--cot-type {pair}: give a class and its type, such as person=a-f-G"
+            )
         types[name] = kind
     return types

@@ -16,7 +16,13 @@ from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, 
 from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
 from sorvolo.cluster.sites import Placed, SiteBy, existing_site, existing_sites, sites_of
 from sorvolo.cluster.table import FINAL, BatchTable, Row, State
-from sorvolo.cluster.watches import ENDING, existing_watches, is_watched, watch_outputs, watch_settings
+from sorvolo.cluster.watches import (
+    ENDING,
+    existing_watches,
+    is_watched,
+    watch_outputs,
+    watch_settings,
+)
 from sorvolo.detection.models import demand_searching, find_model
 from sorvolo.detection.session import read_info
 from sorvolo.errors import SettingsError
@@ -30,9 +36,13 @@ if TYPE_CHECKING:
 class RestartSettings:
     """When the process of a live stream that died is started again, and a flight whose database was out of reach."""
 
-    settled_s: float = 60.0  # one that lived so long did not die of its beginning: its tries are counted anew
+    settled_s: float = (
+        60.0  # one that lived so long did not die of its beginning: its tries are counted anew
+    )
     longest_wait_s: float = 60.0  # before the next start; the waits are 1 s, 2 s, 4 s and so on
-    patience_s: float = 900.0  # a database or store that is restored from its backup; then the flight has failed
+    patience_s: float = (
+        900.0  # a database or store that is restored from its backup; then the flight has failed
+    )
 
     def wait_s(self, starts: int) -> float:
         """The wait after this many starts in a row that ended badly."""
@@ -49,7 +59,9 @@ class BatchSettings:
     stall_s: float = 300.0  # without an answer or any work: the worker is ended
     retries: bool = False  # flights that were set aside before are tried again
     blocks: int = 1  # into which each flight is divided
-    near_m: float = 50.0  # from a site's ground: a drone sees no less than half of that beside its track
+    near_m: float = (
+        50.0  # from a site's ground: a drone sees no less than half of that beside its track
+    )
     costs: CostSettings = CostSettings()  # noqa: RUF009 (frozen)
     restarts: RestartSettings = RestartSettings()
 
@@ -59,7 +71,9 @@ class BatchSettings:
         if self.blocks < 1:
             raise SettingsError(f"--blocks {self.blocks}: at least 1 is needed")
         if self.blocks > 1 and self.wish.mission is not Mission.MAP:
-            raise SettingsError(f"--blocks divides flights to be mapped; --mission {self.wish.mission} takes none")
+            raise SettingsError(
+                f"--blocks divides flights to be mapped; --mission {self.wish.mission} takes none"
+            )
         if not self.stall_s > 0:
             raise SettingsError(f"--stall {self.stall_s:g}: more than 0 seconds are needed")
         self._check_watch()
@@ -122,13 +136,16 @@ class BatchReport:
     def counts(self) -> dict[str, int]:
         """How many flights ended in each state; "known" are those that were finished before."""
         found = Counter(
-            "known" if row.key in self.known and row.state is State.DONE else row.state.value for row in self.rows
+            "known" if row.key in self.known and row.state is State.DONE else row.state.value
+            for row in self.rows
         )
         return {name: found[name] for name in ("known", *State) if found[name]}
 
 
 def run_batch(
-    places: Sequence[Path], root: Path, settings: BatchSettings,
+    places: Sequence[Path],
+    root: Path,
+    settings: BatchSettings,
     executor_of: Callable[[BatchTable], AbstractContextManager[Executor]],
 ) -> Generator[BatchUpdate, None, BatchReport]:
     """Do the mission over all flights in these folders, each in a site below `root`; yields what happens.
@@ -151,7 +168,10 @@ def run_batch(
                 yield run.update(row, is_known=row.key in known)
         yield from run.through()
         return BatchReport(
-            tuple(run.rows[row.key] for row in rows), known, round(time.monotonic() - started_s, 3), run.tries,
+            tuple(run.rows[row.key] for row in rows),
+            known,
+            round(time.monotonic() - started_s, 3),
+            run.tries,
             run.crashes,
         )
 
@@ -203,15 +223,18 @@ class _Run:
     def _next(self) -> Row | None:
         """The flight to begin, if there is room for it."""
         due = self._due()
-        has_room = bool(due) and self._executor.has_room(cost_of(due[0], self._table, self._settings.costs))
+        has_room = bool(due) and self._executor.has_room(
+            cost_of(due[0], self._table, self._settings.costs)
+        )
         return due[0] if has_room else None
 
     def _due(self) -> list[Row]:
-        """The next flight of each site that nobody writes and that is in reach, that with most frames before it first.
-        """
+        """The next flight of each site that nobody writes and that is in reach, that with most frames before it first."""
         busy = {self.rows[key].site for key in self._executor.running}
         free = [
-            queue for site, queue in self._waiting.items() if site not in busy and self._late.is_due(queue[0].key)
+            queue
+            for site, queue in self._waiting.items()
+            if site not in busy and self._late.is_due(queue[0].key)
         ]
         return [queue[0] for queue in sorted(free, key=_all_frames, reverse=True)]
 
@@ -223,7 +246,12 @@ class _Run:
             return cost_of(replace(row, crashes=crashes), self._table, self._settings.costs)
 
         running = map_divided(
-            row.key, self._order(row), self._settings.blocks, self._executor, cost, self._settings.most_tries
+            row.key,
+            self._order(row),
+            self._settings.blocks,
+            self._executor,
+            cost,
+            self._settings.most_tries,
         )
         try:
             ending = yield from self._shown(running)
@@ -232,7 +260,9 @@ class _Run:
             ending = Ending(Outcome.CRASHED, str(error))
         yield self.update(self._end(row, ending))
 
-    def _shown(self, running: "Generator[Progress, None, Ending]") -> Generator[BatchUpdate, None, Ending]:
+    def _shown(
+        self, running: "Generator[Progress, None, Ending]"
+    ) -> Generator[BatchUpdate, None, Ending]:
         """What becomes of a flight in blocks, as updates of the batch."""
         with closing(running):
             while True:
@@ -253,7 +283,10 @@ class _Run:
 
     def _order(self, row: Row) -> Order:
         return Order(
-            row.source, str((self._table.root / row.site).resolve()), self._settings.wish, self._executor.cache_mb
+            row.source,
+            str((self._table.root / row.site).resolve()),
+            self._settings.wish,
+            self._executor.cache_mb,
         )
 
     def _start(self, row: Row) -> None:
@@ -329,20 +362,28 @@ def _listed(
     """The flights as rows, in the order found: looked into where that is new, each as it is asked for now."""
     seen = {(row.source, row.stamp): row.scouted for row in table if row.scouted is not None}
     new = [
-        each.path for each in found
-        if not each.why_not and (str(each.path), each.stamp) not in seen and not _is_set_aside(table, each, settings)
+        each.path
+        for each in found
+        if not each.why_not
+        and (str(each.path), each.stamp) not in seen
+        and not _is_set_aside(table, each, settings)
     ]
     yield BatchUpdate("looking into flights", 0, len(new))
     answers = dict(zip(new, scout(new, settings.wish.camera, settings.most_tries, [table.lock])))
     rows = [
-        _row_of(each, answers.get(each.path) or seen.get((str(each.path), each.stamp)), table, settings)
+        _row_of(
+            each, answers.get(each.path) or seen.get((str(each.path), each.stamp)), table, settings
+        )
         for each in found
     ]
     return _without_duplicates(rows, table)
 
 
 def _row_of(
-    found: FoundFlight, answer: Scouted | Unreadable | None, table: BatchTable, settings: BatchSettings
+    found: FoundFlight,
+    answer: Scouted | Unreadable | None,
+    table: BatchTable,
+    settings: BatchSettings,
 ) -> Row:
     """A flight's row: the one to go on with, or a new one; None for an answer if nobody looked into it again."""
     scouted = answer if isinstance(answer, Scouted) else None
@@ -368,7 +409,11 @@ def _is_set_aside(table: BatchTable, found: FoundFlight, settings: BatchSettings
 def _request(found: FoundFlight, wish: FlightWish) -> str:
     """What is asked for of a flight, as one number: files, options and program."""
     camera = Path(wish.camera)
-    stamp = (camera.stat().st_size, camera.stat().st_mtime_ns) if wish.camera and camera.is_file() else None
+    stamp = (
+        (camera.stat().st_size, camera.stat().st_mtime_ns)
+        if wish.camera and camera.is_file()
+        else None
+    )
     text = repr((sorvolo.__version__, software(), found.stamp, wish, stamp))
     return hashlib.sha256(text.encode("utf-8", "surrogateescape")).hexdigest()[:32]
 
@@ -419,7 +464,17 @@ def _named(row: Row, own: Row, sources: Set[str], table: BatchTable) -> Row:
         return row
     frames = f", which has {_frames(own)} frames" if _frames(row) < _frames(own) else ""
     words = f"the same flight as {own.source}{frames}"
-    return table.put(Row(row.source, row.mission, row.stamp, row.request, None, state=State.DUPLICATE, words=words))
+    return table.put(
+        Row(
+            row.source,
+            row.mission,
+            row.stamp,
+            row.request,
+            None,
+            state=State.DUPLICATE,
+            words=words,
+        )
+    )
 
 
 def _rank(row: Row, table: BatchTable) -> tuple[bool, int]:
@@ -449,7 +504,8 @@ def _with_sites(rows: Sequence[Row], table: BatchTable, settings: BatchSettings)
 def _placed_before(table: BatchTable, *, are_watches: bool) -> dict[str, str]:
     """The sites, or the folders of watches, of flights that the table knows, by the flight's fingerprint."""
     return {
-        row.scouted.fingerprint: row.site for row in table
+        row.scouted.fingerprint: row.site
+        for row in table
         if row.scouted is not None and row.site and (row.mission == Mission.WATCH) == are_watches
     }
 

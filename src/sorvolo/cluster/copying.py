@@ -26,4 +26,6 @@ def copy_result(site: Path, place: str, alive: Callable[..., None] = lambda: Non
         raise kind(f"the flight is in {site}, but was not copied: {error}") from error
     if faults:
         lost = ", ".join(sorted(faults)[:3])
-        raise StoreError(f"the flight is in {site}, but files of the site are damaged or gone: {lost}")
+        raise StoreError(
+            f"the flight is in {site}, but files of the site are damaged or gone: {lost}"
+        )

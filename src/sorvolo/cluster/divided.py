@@ -35,7 +35,12 @@ class PartFailed(SorvoloError):
 
 
 def map_divided(
-    key: Key, order: Order, count: int, executor: Executor, cost_of: Callable[[int], Cost], most_tries: int
+    key: Key,
+    order: Order,
+    count: int,
+    executor: Executor,
+    cost_of: Callable[[int], Cost],
+    most_tries: int,
 ) -> Generator[Progress, None, Ending]:
     """Map a flight in `count` blocks; yields how far it is.
 
@@ -56,34 +61,45 @@ def map_divided(
         ending = Ending(Outcome.of(error), str(error))
     own_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return ending.with_effort(
-        round(time.monotonic() - started_s, 3), round(parts.cpu_s + time.process_time() - cpu_s, 3),
-        max(parts.peak_memory_mb, round(own_mb, 1)), socket.gethostname(),
+        round(time.monotonic() - started_s, 3),
+        round(parts.cpu_s + time.process_time() - cpu_s, 3),
+        max(parts.peak_memory_mb, round(own_mb, 1)),
+        socket.gethostname(),
     )
 
 
-def _mapped(order: Order, count: int, parts: "_Parts") -> Generator[Progress, None, tuple[str, str, bool]]:
+def _mapped(
+    order: Order, count: int, parts: "_Parts"
+) -> Generator[Progress, None, tuple[str, str, bool]]:
     """The flight's name in the site, its headline, and whether it is a map to use."""
     site, camera = Path(order.site), order.wish.camera or None
-    settings = MapSettings(m_per_px=order.wish.m_per_px, model=order.wish.model, memory_mb=order.memory_mb)
+    settings = MapSettings(
+        m_per_px=order.wish.m_per_px, model=order.wish.model, memory_mb=order.memory_mb
+    )
     folder = site.with_name(f".{site.name}.blocks")
     division = plan_blocks(Path(order.source), site, settings, camera, count, folder)
     if isinstance(division, AlreadyDone):
         return division.flight, *reported_headline(site, division.flight)
     folder.mkdir(exist_ok=True)
     if division.is_video and division.chosen() is None:
-        yield from parts.through("frames chosen", [Part(PartKind.FRAMES, 0, 1, str(folder), division.key)], 1)
+        yield from parts.through(
+            "frames chosen", [Part(PartKind.FRAMES, 0, 1, str(folder), division.key)], 1
+        )
     waiting = [
         Part(PartKind.BLOCK, number, division.count, str(folder), division.key)
-        for number in range(division.count) if not division.is_done(number)
+        for number in range(division.count)
+        if not division.is_done(number)
     ]
     yield from parts.through("blocks", waiting, division.count)
 
     def painted(plan: PaintPlan) -> Iterator[tuple[TileIndex, bytes]]:
         write_plan(plan, folder)
         shares = len(plan.shares(division.count))
-        for _ in parts.through("tiles", [
-            Part(PartKind.TILES, number, division.count, str(folder)) for number in range(shares)
-        ], shares):
+        for _ in parts.through(
+            "tiles",
+            [Part(PartKind.TILES, number, division.count, str(folder)) for number in range(shares)],
+            shares,
+        ):
             pass
         blobs = tile_blobs(folder)
         for number in range(shares):
@@ -110,7 +126,12 @@ class _Parts:
     """Parts of one flight on their way, each tried until it is through. `through` changes what they took."""
 
     def __init__(
-        self, key: Key, order: Order, executor: Executor, cost_of: Callable[[int], Cost], most_tries: int
+        self,
+        key: Key,
+        order: Order,
+        executor: Executor,
+        cost_of: Callable[[int], Cost],
+        most_tries: int,
     ) -> None:
         self.cpu_s = self.peak_memory_mb = 0.0
         self._key, self._order, self._executor, self._cost_of = key, order, executor, cost_of
@@ -140,7 +161,9 @@ class _Parts:
         key = (self._key[0], f"{self._key[1]} {part.kind} {part.number}")
         self._running[key] = part
         self._executor.start(
-            key, replace(self._order, part=part, memory_mb=self._executor.cache_mb), self._cost(part)
+            key,
+            replace(self._order, part=part, memory_mb=self._executor.cache_mb),
+            self._cost(part),
         )
 
     def _ended(self) -> Part | None:

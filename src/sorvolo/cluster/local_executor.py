@@ -26,11 +26,18 @@ class LocalExecutor:
     """
 
     def __init__(
-        self, workers: int, stall_s: float, lock: int, costs: CostSettings = CostSettings(), *,  # noqa: B008
+        self,
+        workers: int,
+        stall_s: float,
+        lock: int,
+        costs: CostSettings = CostSettings(),
+        *,
         shares_detector: bool = False,
     ) -> None:
         self.workers, self._costs = workers, costs
-        silent_s = min(SharingSettings.silent_s, stall_s / 3)  # before those who wait for it count as hanging
+        silent_s = min(
+            SharingSettings.silent_s, stall_s / 3
+        )  # before those who wait for it count as hanging
         self._detector = SharedDetector(silent_s) if shares_detector else None
         self._stall_s, self._lock = stall_s, lock
         self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
@@ -63,8 +70,7 @@ class LocalExecutor:
         return len(self._running) < self.workers and taken_mb + cost.memory_mb <= most_mb
 
     def _memory_mb(self, key: Key) -> float:
-        """What a running try is budgeted: what it was given; a live one, which may never end, what it needs if known.
-        """
+        """What a running try is budgeted: what it was given; a live one, which may never end, what it needs if known."""
         worker, cost = self._running[key]
         if key not in self._live or worker.seconds < self._costs.settled_s:
             return cost.memory_mb
@@ -90,7 +96,9 @@ class LocalExecutor:
         self._running[key] = (worker, cost)
         if is_live_address(order.source):
             self._live.add(key)
-        threading.Thread(target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}").start()
+        threading.Thread(
+            target=self._wait, args=(key, worker), daemon=True, name=f"flight {key[1][:8]}"
+        ).start()
 
     def finish(self, key: Key) -> None:
         """End a live flight, and have its map or watch finished."""

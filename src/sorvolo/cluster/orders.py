@@ -28,7 +28,9 @@ class Outcome(StrEnum):
     """How one try at a flight ended."""
 
     DONE = "done"
-    DOUBTFUL = "doubtful"  # the flight was used, its result is to be checked: exit code 3 of the mission
+    DOUBTFUL = (
+        "doubtful"  # the flight was used, its result is to be checked: exit code 3 of the mission
+    )
     FAILED = "failed"  # the flight cannot be used as it is; another try would end alike
     CRASHED = "crashed"  # its process was killed, ran out of memory, stood still or broke
     WAITS = "waits"  # its database, store or site was out of reach: another try may end well

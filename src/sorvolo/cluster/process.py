@@ -33,8 +33,12 @@ class WorkerProcess:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (until `end`)
         self._started_s = time.monotonic()
         self._process = subprocess.Popen(
-            python_command(WORKER), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=self._log, start_new_session=True, pass_fds=tuple(held),
+            python_command(WORKER),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            start_new_session=True,
+            pass_fds=tuple(held),
         )
         assert self._process.stdin is not None
         try:
@@ -100,14 +104,18 @@ class WorkerProcess:
         with self._log:
             ending = self._ending(last, code)
         return ending.with_effort(
-            round(self.seconds, 3), round(usage.ru_utime + usage.ru_stime, 3),
-            round(usage.ru_maxrss / (_MB_BYTES if sys.platform == "darwin" else _MB), 1), socket.gethostname(),
+            round(self.seconds, 3),
+            round(usage.ru_utime + usage.ru_stime, 3),
+            round(usage.ru_maxrss / (_MB_BYTES if sys.platform == "darwin" else _MB), 1),
+            socket.gethostname(),
         )
 
     def _ending(self, last: tuple[str, dict[str, Any]] | None, code: int) -> Ending:
         if last is not None and last[0] == "ended":
             answer = last[1]
-            return Ending(Outcome(answer["outcome"]), str(answer["words"]), str(answer.get("flight", "")))
+            return Ending(
+                Outcome(answer["outcome"]), str(answer["words"]), str(answer.get("flight", ""))
+            )
         if self._stalled_s:
             words = f"its process hung for {self._stalled_s:.0f} s and was killed"
         elif code == -signal.SIGKILL:
@@ -146,7 +154,9 @@ class _Life:
         return time.monotonic() - self._shown_s > self._stall_s
 
 
-def run_order(worker: WorkerProcess, stall_s: float, found: Callable[[str], None] = lambda _: None) -> Ending:
+def run_order(
+    worker: WorkerProcess, stall_s: float, found: Callable[[str], None] = lambda _: None
+) -> Ending:
     """Wait until a worker has done its order; `found` gets what a watch found, in words."""
     last = None
     for answer in worker.answers(stall_s):

@@ -26,8 +26,12 @@ class WaitSettings:
     start_s: float = 90.0  # a head that has just started: Ray gives the process that serves a client 30 s, and fails
     probe_s: float = 90.0  # the first task on every machine: Ray starts a process for it before
     again_s: float = 0.5  # between two questions which machines are there
-    ending_s: float = 2.0  # in one wait for a try to end, between which Ctrl-C and a dead head are noticed
-    head_s: float = 10.0  # for a head that stopped answering; Ray itself would end this process after 60 s
+    ending_s: float = (
+        2.0  # in one wait for a try to end, between which Ctrl-C and a dead head are noticed
+    )
+    head_s: float = (
+        10.0  # for a head that stopped answering; Ray itself would end this process after 60 s
+    )
     cancel_s: float = 10.0  # tasks that are cancelled
 
 
@@ -120,10 +124,14 @@ def _demand_reachable(name: str) -> None:
     address = name.removeprefix(SCHEME)
     host, colon, port = address.rpartition(":")
     if not (host and colon and port.isdecimal()):
-        raise SettingsError(f"--executor {name}: give ray://HOST:PORT, such as ray://192.168.1.10:10001")
+        raise SettingsError(
+            f"--executor {name}: give ray://HOST:PORT, such as ray://192.168.1.10:10001"
+        )
     _demand_listening(name, address)
     try:
-        with grpc.insecure_channel(address) as channel:  # it may be something else that listens there
+        with grpc.insecure_channel(
+            address
+        ) as channel:  # it may be something else that listens there
             grpc.channel_ready_future(channel).result(timeout=WAITS.reach_s)
     except grpc.FutureTimeoutError:
         raise SettingsError(f"--executor {name}: {address} is not a Ray cluster") from None
@@ -143,7 +151,9 @@ def demand_head(address: str) -> None:
             return
         except OSError as error:
             if time.monotonic() > end_s:
-                raise ConnectionError(f"its head at {address} does not answer: {first_line(error)}") from error
+                raise ConnectionError(
+                    f"its head at {address} does not answer: {first_line(error)}"
+                ) from error
             time.sleep(WAITS.again_s)
 
 
@@ -160,7 +170,8 @@ def _demand_listening(name: str, address: str) -> None:
     except (OSError, OverflowError, ValueError) as error:
         port = address.rpartition(":")[2]
         how = (
-            f"start one on that machine: ray start --head --ray-client-server-port {port}" if name.startswith(SCHEME)
+            f"start one on that machine: ray start --head --ray-client-server-port {port}"
+            if name.startswith(SCHEME)
             else "`ray start` noted it, or RAY_ADDRESS names it: `ray stop` forgets one that is gone"
         )
         raise SettingsError(
@@ -202,7 +213,9 @@ def _answers_of_machines(path: str, word: str) -> list[tuple[str, str, bool]]:
     while waiting:
         asked = {
             node: probe.options(
-                num_cpus=0, max_retries=0, scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False)
+                num_cpus=0,
+                max_retries=0,
+                scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False),
             ).remote()
             for node in waiting
         }

@@ -47,7 +47,11 @@ Key = tuple[str, str]
 
 @contextmanager
 def ray_executor(
-    name: str, workers: int | None, stall_s: float, root: Path, sharing: SharingSettings = SharingSettings()  # noqa: B008
+    name: str,
+    workers: int | None,
+    stall_s: float,
+    root: Path,
+    sharing: SharingSettings = SharingSettings(),
 ) -> "Iterator[RayExecutor]":
     """The executor on the cluster at `ray://HOST:PORT`, or for "ray" on this machine's, which is started if need be.
 
@@ -56,12 +60,18 @@ def ray_executor(
     where a machine of the cluster does not share `root`.
     """
     if importlib.util.find_spec("ray") is None or importlib.util.find_spec("grpc") is None:
-        raise SettingsError(f"--executor {name} needs Ray; install it: pip install 'sorvolo[fleet]'")
+        raise SettingsError(
+            f"--executor {name} needs Ray; install it: pip install 'sorvolo[fleet]'"
+        )
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
-    os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")  # what asks a cluster that is gone would start another one
+    os.environ.setdefault(
+        "RAY_ENABLE_AUTO_CONNECT", "0"
+    )  # what asks a cluster that is gone would start another one
     os.environ.setdefault("RAY_CLIENT_MAX_CONNECTION_TIMEOUT_S", "5")  # thrice: it listens
     if name == "ray" and not started_cluster():
-        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # its own listens on loopback alone
+        os.environ.setdefault(
+            "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0"
+        )  # its own listens on loopback alone
     connect(name, workers)
     import ray
 
@@ -80,15 +90,26 @@ class RayExecutor:
     """Tries as tasks of the cluster that this process is connected to; see `ray_executor`."""
 
     def __init__(
-        self, name: str, workers: int | None, stall_s: float, root: Path,
-        sharing: SharingSettings = SharingSettings(),  # noqa: B008 (frozen)
+        self,
+        name: str,
+        workers: int | None,
+        stall_s: float,
+        root: Path,
+        sharing: SharingSettings = SharingSettings(),
     ) -> None:
         import ray
 
         self._ray: Any = ray
-        self._name, self._workers, self._stall_s, self._root = name, workers, stall_s, str(root.resolve())
+        self._name, self._workers, self._stall_s, self._root = (
+            name,
+            workers,
+            stall_s,
+            str(root.resolve()),
+        )
         self._running: dict[Key, Any] = {}
-        self._begun = root.resolve() / f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-begun"  # on the shared disk
+        self._begun = (
+            root.resolve() / f"{TEMPORARY_PREFIX}{secrets.token_hex(6)}-begun"
+        )  # on the shared disk
         self._begun.mkdir()
         self._signs: dict[Key, SignOfLife] = {}  # there: of Ray's workers
         self._hung: set[Key] = set()  # whose worker was killed because it hung
@@ -118,7 +139,9 @@ class RayExecutor:
         if self._workers is not None and len(self._running) >= self._workers:
             return False
         machines = self._asked(self._machines)
-        slots = sum(int(each["CPU"] / min(cost.cpus, each["CPU"]) + 1e-6) for each in machines)  # 1.0 // 0.2 is 4
+        slots = sum(
+            int(each["CPU"] / min(cost.cpus, each["CPU"]) + 1e-6) for each in machines
+        )  # 1.0 // 0.2 is 4
         return len(self._running) < slots
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
@@ -141,7 +164,9 @@ class RayExecutor:
             while not ended:
                 wait_s = timeout_s or WAITS.ending_s
                 demand_head(self._head)
-                ended, _ = self._ray.wait(list(self._running.values()), num_returns=1, timeout=wait_s)
+                ended, _ = self._ray.wait(
+                    list(self._running.values()), num_returns=1, timeout=wait_s
+                )
                 if not ended and (lost := self._asked(self._lost)) is not None:
                     self._forget(lost, [])
                     return lost, Ending(Outcome.CRASHED, "its machine does not answer any more")
@@ -150,7 +175,9 @@ class RayExecutor:
             key = next(each for each, task in self._running.items() if task == ended[0])
         ending, found = self._asked(lambda: self._ending(ended[0]))
         if key in self._hung and ending.outcome is Outcome.CRASHED:
-            ending = replace(ending, words=f"Ray's worker hung for {self._stall_s:g} s and was killed")
+            ending = replace(
+                ending, words=f"Ray's worker hung for {self._stall_s:g} s and was killed"
+            )
         self._forget(key, found)
         return key, ending
 
@@ -162,7 +189,7 @@ class RayExecutor:
             sign.path.unlink(missing_ok=True)
         if (actor := self._actors.pop(key, None)) is not None:
             self._asked_found.pop(key, None)
-            self._last_found += [(key, words) for words in found[self._taken.pop(key):]]
+            self._last_found += [(key, words) for words in found[self._taken.pop(key) :]]
             self._ray.kill(actor)
 
     def end(self) -> None:
@@ -179,26 +206,41 @@ class RayExecutor:
             for key, task in self._running.items():
                 if key not in self._actors:
                     self._ray.cancel(task, force=True)
-            self._ray.wait(list(self._running.values()), num_returns=len(self._running), timeout=WAITS.cancel_s)
+            self._ray.wait(
+                list(self._running.values()), num_returns=len(self._running), timeout=WAITS.cancel_s
+            )
 
     def _submit(self, key: Key, order: Order, cost: Cost) -> None:
         machines = self._machines()
-        shared = self._detectors.addresses() if self._detectors is not None and searches(order) else {}
+        shared = (
+            self._detectors.addresses() if self._detectors is not None and searches(order) else {}
+        )
         taken = self._detectors.memory_bytes if self._detectors is not None else 0.0
         most = max(each["memory"] - min(taken, each["memory"]) for each in machines)
         asked = {
             "num_cpus": min(cost.cpus, max(each["CPU"] for each in machines)),
-            "memory": int(min(cost.memory_mb * 1e6, most)), "scheduling_strategy": "SPREAD",
+            "memory": int(min(cost.memory_mb * 1e6, most)),
+            "scheduling_strategy": "SPREAD",
         }
         sign = self._begun / secrets.token_hex(6)
         self._signs[key] = SignOfLife(sign)
         given = (order, self._stall_s, self._root, sorvolo.__version__, shared, str(sign))
         if is_live_address(order.source):
-            actor = self._ray.remote(_LiveTry).options(max_concurrency=3, max_restarts=0, **asked).remote()
-            self._actors[key], self._running[key], self._taken[key] = actor, actor.run.remote(*given), 0
+            actor = (
+                self._ray.remote(_LiveTry)
+                .options(max_concurrency=3, max_restarts=0, **asked)
+                .remote()
+            )
+            self._actors[key], self._running[key], self._taken[key] = (
+                actor,
+                actor.run.remote(*given),
+                0,
+            )
             return
         name = f"sorvolo {Path(order.source).name}"
-        self._running[key] = self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
+        self._running[key] = (
+            self._ray.remote(_try).options(max_retries=0, name=name, **asked).remote(*given)
+        )
 
     def _lost(self) -> Key | None:
         """A try on a machine that Ray counts as dead; workers that hang are killed, and then noticed by Ray.
@@ -237,7 +279,9 @@ class RayExecutor:
             ending, found = self._ray.get(task)
         except (StoreError, InputError) as error:  # what every flight would meet on that machine
             raise getattr(error, "cause", error) from None  # Ray's own holds a whole traceback
-        except self._ray.exceptions.RayTaskError as error:  # raised by the task itself, before or after its process
+        except (
+            self._ray.exceptions.RayTaskError
+        ) as error:  # raised by the task itself, before or after its process
             cause = f"{type(error.cause).__name__}: {first_line(error.cause)}"
             return Ending(Outcome.CRASHED, f"its task could not be run ({cause})"), []
         except self._ray.exceptions.RayError as error:
@@ -299,7 +343,9 @@ class MachineDetectors:
     machine has so much of one, and runs on the processor of any other; and for the memory that flights then do without.
     """
 
-    def __init__(self, ray: Any, gpus: float, memory_mb: float = CostSettings().detector_mb) -> None:
+    def __init__(
+        self, ray: Any, gpus: float, memory_mb: float = CostSettings().detector_mb
+    ) -> None:
         self._ray, self._gpus, self.memory_bytes = ray, gpus, 1e6 * memory_mb
         self._actors: dict[str, Any] = {}  # by the machine's id
         self._pids: dict[str, int] = {}  # of those that have answered
@@ -315,13 +361,20 @@ class MachineDetectors:
         there = {each["NodeID"]: each["Resources"] for each in working_machines(self._ray)}
         self._actors = {node: actor for node, actor in self._actors.items() if node in there}
         for node in there.keys() - self._actors.keys():
-            self._actors[node] = self._ray.remote(_Detector).options(
-                num_cpus=0, num_gpus=self._gpus if there[node].get("GPU", 0) >= self._gpus else 0,
-                memory=int(min(self.memory_bytes, there[node].get("memory", 0.0))),
-                scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False),
-            ).remote()
+            self._actors[node] = (
+                self._ray.remote(_Detector)
+                .options(
+                    num_cpus=0,
+                    num_gpus=self._gpus if there[node].get("GPU", 0) >= self._gpus else 0,
+                    memory=int(min(self.memory_bytes, there[node].get("memory", 0.0))),
+                    scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False),
+                )
+                .remote()
+            )
         asked = {node: actor.address.remote() for node, actor in self._actors.items()}
-        return {node: address for node, task in asked.items() if (address := self._answer(node, task))}
+        return {
+            node: address for node, task in asked.items() if (address := self._answer(node, task))
+        }
 
     def _answer(self, node: str, task: Any) -> str:
         """The socket on a machine; "" where its actor was lost or hangs, which the next flight there has anew."""
@@ -359,7 +412,11 @@ def _with_detector(order: Order, shared: Mapping[str, str]) -> Order:
     """The order with the socket of this machine's detector, by machine; with its own where it has none yet."""
     import ray
 
-    return replace(order, detector=shared.get(ray.get_runtime_context().get_node_id(), "")) if shared else order
+    return (
+        replace(order, detector=shared.get(ray.get_runtime_context().get_node_id(), ""))
+        if shared
+        else order
+    )
 
 
 class _LiveTry:
@@ -370,7 +427,13 @@ class _LiveTry:
         self._found: list[str] = []  # grows only
 
     def run(
-        self, order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str], sign: str
+        self,
+        order: Order,
+        stall_s: float,
+        root: str,
+        version: str,
+        shared: Mapping[str, str],
+        sign: str,
     ) -> tuple[Ending, list[str]]:
         """The try in a process of its own, which ends with this one: how it ended, and all that its watch found."""
         import ray
@@ -402,7 +465,9 @@ def _try(
     _demand_fit(root, version)
     if not Path(order.source).exists():
         host = socket.gethostname()
-        raise StoreError(f"the machine {host} does not have {order.source}; flights need the same path on all machines")
+        raise StoreError(
+            f"the machine {host} does not have {order.source}; flights need the same path on all machines"
+        )
     with shown_alive(Path(sign), ray.get_runtime_context().get_node_id(), stall_s):
         return run_order(WorkerProcess(_with_detector(order, shared)), stall_s), []
 

@@ -98,7 +98,10 @@ def _stamp(files: Sequence[Path]) -> str:
 
 
 def scout(
-    paths: Sequence[Path], camera: str, most_tries: int, held: Sequence[int] = (),
+    paths: Sequence[Path],
+    camera: str,
+    most_tries: int,
+    held: Sequence[int] = (),
     seen: Callable[[int], None] = lambda _: None,
 ) -> list[Scouted | Unreadable]:
     """Inspect each flight in a separate process: a file that crashes a decoder does not crash the batch.
@@ -108,7 +111,7 @@ def scout(
     found: list[Scouted | Unreadable] = []
     crashes: Counter[int] = Counter()
     while len(found) < len(paths):
-        worker = WorkerProcess(ScoutOrder(tuple(map(str, paths[len(found):])), camera), held)
+        worker = WorkerProcess(ScoutOrder(tuple(map(str, paths[len(found) :])), camera), held)
         try:
             for kind, data in worker.answers(_STALL_S):
                 if kind == "scouted":

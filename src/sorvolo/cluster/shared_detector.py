@@ -21,13 +21,17 @@ class SharingSettings:
 
     is_shared: bool = False
     gpus: float = 0.0
-    silent_s: float = 60.0  # without an answer of its process, which takes milliseconds: it hangs. By choice
+    silent_s: float = (
+        60.0  # without an answer of its process, which takes milliseconds: it hangs. By choice
+    )
 
     def __post_init__(self) -> None:
         if not 0 <= self.gpus <= 1:
             raise SettingsError(f"--gpus {self.gpus:g}: give a share of one graphics card, 0 to 1")
         if self.gpus and not self.is_shared:
-            raise SettingsError("--gpus is for the detector that flights share: give --share-detector as well")
+            raise SettingsError(
+                "--gpus is for the detector that flights share: give --share-detector as well"
+            )
 
 
 def searches(order: Order) -> bool:
@@ -82,8 +86,11 @@ class SharedDetector:
     def _start(self) -> None:
         self._starts += 1
         self._process = subprocess.Popen(
-            python_command("sorvolo.detection.shared_process", self._socket()), stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, start_new_session=True,
+            python_command("sorvolo.detection.shared_process", self._socket()),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
         assert self._process.stdout is not None
         if self._process.stdout.readline() != READY:
@@ -93,7 +100,9 @@ class SharedDetector:
                 "folder of this machine with a short path, or give --own-detectors"
             )
         threading.Thread(
-            target=_end_where_it_hangs, args=(self._process, self._socket(), self._silent_s), daemon=True
+            target=_end_where_it_hangs,
+            args=(self._process, self._socket(), self._silent_s),
+            daemon=True,
         ).start()
 
     def _stop(self) -> None:

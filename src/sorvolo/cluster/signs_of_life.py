@@ -24,7 +24,9 @@ def shown_alive(path: Path, node: str, stall_s: float) -> Iterator[None]:
     def show() -> None:
         count = 0
         while True:
-            with suppress(OSError, StoreError):  # of a batch that has ended, or of a disk that is away for a moment
+            with suppress(
+                OSError, StoreError
+            ):  # of a batch that has ended, or of a disk that is away for a moment
                 atomic_write_bytes(path, f"{node} {os.getpid()} {count}".encode(), durable=False)
             count += 1
             if is_over.wait(stall_s / _SIGNS):

@@ -33,8 +33,13 @@ class Placed:
 
 
 def sites_of(
-    flights: Sequence[Placed], by: SiteBy, known: Mapping[str, str], ground: Mapping[str, Box],
-    taken: Sequence[str] = (), near_m: float = 50.0, ending: str = "",
+    flights: Sequence[Placed],
+    by: SiteBy,
+    known: Mapping[str, str],
+    ground: Mapping[str, Box],
+    taken: Sequence[str] = (),
+    near_m: float = 50.0,
+    ending: str = "",
 ) -> dict[str, str]:
     """The site of each flight, by the flight's fingerprint.
 
@@ -49,7 +54,9 @@ def sites_of(
     for each in flights:  # where they already belong, their ground counts
         if (site := found.get(each.scouted.fingerprint)) is not None:
             _extend(grounds, site, each.scouted.box)
-    for each in sorted((each for each in flights if each.scouted.fingerprint not in found), key=_moment):
+    for each in sorted(
+        (each for each in flights if each.scouted.fingerprint not in found), key=_moment
+    ):
         box = each.scouted.box
         near = _near(box, grounds, near_m) if by is SiteBy.PLACE and box is not None else ""
         site = near or _new_name(each.path, used, ending)
@@ -61,7 +68,9 @@ def sites_of(
 
 def _near(box: Box, grounds: Mapping[str, Box], near_m: float) -> str:
     """The first site by name whose ground lies near; "" for none."""
-    return next((name for name, other in sorted(grounds.items()) if _are_near(box, other, near_m)), "")
+    return next(
+        (name for name, other in sorted(grounds.items()) if _are_near(box, other, near_m)), ""
+    )
 
 
 def _moment(flight: Placed) -> tuple[int, str]:
@@ -78,7 +87,9 @@ class ExistingSite:
 
 def existing_sites(root: Path, *, with_ground: bool) -> dict[str, ExistingSite]:
     """The sites in a folder by name; their ground only if it is asked for, which takes longer."""
-    found = {path.name: existing_site(path, with_ground=with_ground) for path in sorted(root.iterdir())}
+    found = {
+        path.name: existing_site(path, with_ground=with_ground) for path in sorted(root.iterdir())
+    }
     return {name: site for name, site in found.items() if site is not None}
 
 
@@ -96,7 +107,9 @@ def existing_site(folder: Path, *, with_ground: bool = False) -> ExistingSite | 
 
 def _ground(archive: Archive) -> Box | None:
     """Where a site's map is; None without a place on Earth, and without a map."""
-    from sorvolo.missions.flight.setup import known_ground_m  # only by place, as it takes long to import
+    from sorvolo.missions.flight.setup import (
+        known_ground_m,
+    )  # only by place, as it takes long to import
 
     if not archive.has_site or (site := archive.site()).is_local:
         return None
@@ -104,7 +117,12 @@ def _ground(archive: Archive) -> Box | None:
     if ground_m is None:
         return None
     latitudes, longitudes, _ = site.frame.wgs84_from_site(ground_m)
-    return float(latitudes.min()), float(longitudes.min()), float(latitudes.max()), float(longitudes.max())
+    return (
+        float(latitudes.min()),
+        float(longitudes.min()),
+        float(latitudes.max()),
+        float(longitudes.max()),
+    )
 
 
 def _are_near(one: Box, other: Box, near_m: float) -> bool:
@@ -112,8 +130,10 @@ def _are_near(one: Box, other: Box, near_m: float) -> bool:
     north = near_m / M_PER_DEG_LATITUDE
     east = north / max(0.01, math.cos(math.radians(one[0])))
     return (
-        one[0] - north <= other[2] and other[0] - north <= one[2]
-        and one[1] - east <= other[3] and other[1] - east <= one[3]
+        one[0] - north <= other[2]
+        and other[0] - north <= one[2]
+        and one[1] - east <= other[3]
+        and other[1] - east <= one[3]
     )
 
 
@@ -121,7 +141,12 @@ def _extend(grounds: dict[str, Box], site: str, box: Box | None) -> None:
     """Have a site's ground reach over a box as well."""
     if box is not None:
         one = grounds.get(site, box)
-        grounds[site] = (min(one[0], box[0]), min(one[1], box[1]), max(one[2], box[2]), max(one[3], box[3]))
+        grounds[site] = (
+            min(one[0], box[0]),
+            min(one[1], box[1]),
+            max(one[2], box[2]),
+            max(one[3], box[3]),
+        )
 
 
 def _new_name(path: Path, used: set[str], ending: str) -> str:

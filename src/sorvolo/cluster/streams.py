@@ -37,7 +37,9 @@ class Stream:
     @property
     def shown(self) -> str:
         """The address as it may be printed and kept."""
-        return shown_address(self.address).partition("?")[0] if "://" in self.address else self.address
+        return (
+            shown_address(self.address).partition("?")[0] if "://" in self.address else self.address
+        )
 
 
 def streams_of(texts: Sequence[str], receivers: Sequence[str] = ()) -> list[Stream]:
@@ -56,9 +58,13 @@ def streams_of(texts: Sequence[str], receivers: Sequence[str] = ()) -> list[Stre
         found.append(Stream(address, site, telemetry.pop(site, "")))
     sites = [each.site for each in found]
     if twice := next((each for each in sites if sites.count(each) > 1), ""):
-        raise SettingsError(f"two streams would be mapped into the site {twice}; name the site of each: SITE=ADDRESS")
+        raise SettingsError(
+            f"two streams would be mapped into the site {twice}; name the site of each: SITE=ADDRESS"
+        )
     if telemetry:
-        raise SettingsError(f"--telemetry {next(iter(telemetry))}=...: there are streams of {', '.join(sites)}")
+        raise SettingsError(
+            f"--telemetry {next(iter(telemetry))}=...: there are streams of {', '.join(sites)}"
+        )
     return found
 
 
@@ -68,7 +74,9 @@ def _receivers(texts: Sequence[str]) -> dict[str, str]:
     for text in texts:
         site, equals, address = text.partition("=")
         if not (equals and site and address) or site in found:
-            raise SettingsError(f"--telemetry {text}: give each stream's receiver once, as SITE=ADDRESS")
+            raise SettingsError(
+                f"--telemetry {text}: give each stream's receiver once, as SITE=ADDRESS"
+            )
         if not is_link(address):
             raise SettingsError(f"--telemetry {text}: {address} is no receiver; give {LINK_FORMS}")
         found[site] = address
@@ -87,8 +95,11 @@ def is_stream(text: str) -> bool:
 
 
 def run_streams(
-    streams: Sequence[Stream], root: Path, settings: BatchSettings,
-    executor_of: Callable[[BatchTable], AbstractContextManager[Executor]], until: threading.Event,
+    streams: Sequence[Stream],
+    root: Path,
+    settings: BatchSettings,
+    executor_of: Callable[[BatchTable], AbstractContextManager[Executor]],
+    until: threading.Event,
 ) -> Generator[BatchUpdate, None, BatchReport]:
     """Map, compare or watch each stream until it ends or `until` is set; then its flight is finished like any other's.
 
@@ -106,7 +117,11 @@ def run_streams(
         run = _Streams(streams, table, settings, executor, until)
         yield from run.through()
         return BatchReport(
-            tuple(run.rows.values()), frozenset(), round(time.monotonic() - started_s, 3), run.tries, run.crashes
+            tuple(run.rows.values()),
+            frozenset(),
+            round(time.monotonic() - started_s, 3),
+            run.tries,
+            run.crashes,
         )
 
 
@@ -114,14 +129,20 @@ class _Streams:
     """The streams while they run."""
 
     def __init__(
-        self, streams: Sequence[Stream], table: BatchTable, settings: BatchSettings, executor: Executor,
+        self,
+        streams: Sequence[Stream],
+        table: BatchTable,
+        settings: BatchSettings,
+        executor: Executor,
         until: threading.Event,
     ) -> None:
         self._table, self._settings, self._executor, self._until = table, settings, executor, until
         rows = [_row(each, settings) for each in streams]
         self.rows = {row.key: row for row in rows}
         self._streams = {row.key: each for row, each in zip(rows, streams)}
-        self._due_s: dict[Key, float] = dict.fromkeys(self.rows, 0.0)  # those that wait for their start
+        self._due_s: dict[Key, float] = dict.fromkeys(
+            self.rows, 0.0
+        )  # those that wait for their start
         self._put_off: Counter[Key] = Counter()  # how often in a row it was out of reach
         self._is_finishing = False
         self.tries = self.crashes = 0
@@ -163,7 +184,11 @@ class _Streams:
             self.tries += 1
             stream = self._streams[key]
             order = Order(
-                stream.address, site, self._settings.wish, self._executor.cache_mb, telemetry=stream.telemetry
+                stream.address,
+                site,
+                self._settings.wish,
+                self._executor.cache_mb,
+                telemetry=stream.telemetry,
             )
             self._executor.start(key, order, cost)
             yield self._update(row)
@@ -172,12 +197,17 @@ class _Streams:
         row = self.rows[key]
         if ending.outcome is Outcome.WAITS:
             self._put_off[key] += 1
-            return self._start_later(row.after(ending, State.WAITING, ending.words), self._put_off[key])
+            return self._start_later(
+                row.after(ending, State.WAITING, ending.words), self._put_off[key]
+            )
         del self._put_off[key]
         if ending.outcome is not Outcome.CRASHED:
             return self._keep(row.after(ending, State(ending.outcome.value), ending.words))
         self.crashes += 1
-        row = replace(row, crashes=1 if ending.seconds > self._settings.restarts.settled_s else row.crashes + 1)
+        row = replace(
+            row,
+            crashes=1 if ending.seconds > self._settings.restarts.settled_s else row.crashes + 1,
+        )
         if row.crashes >= self._settings.most_tries:
             words = f"set aside after {row.crashes} tries: {ending.words}"
             return self._keep(row.after(ending, State.SET_ASIDE, words))
@@ -195,7 +225,9 @@ class _Streams:
 
     def _update(self, row: Row) -> BatchUpdate:
         running = tuple(self.rows[key].site for key in self._executor.running)
-        through = sum(each.state not in (State.WAITING, State.RUNNING) for each in self.rows.values())
+        through = sum(
+            each.state not in (State.WAITING, State.RUNNING) for each in self.rows.values()
+        )
         return BatchUpdate("streams", through, len(self.rows), row, running=running)
 
 

@@ -79,9 +79,14 @@ class Row:
     def after(self, ending: Ending, state: State, words: str) -> Self:
         """The row after a try."""
         return replace(
-            self, state=state, words=words, flight=ending.flight or self.flight,
-            seconds=round(self.seconds + ending.seconds, 3), cpu_s=round(self.cpu_s + ending.cpu_s, 3),
-            peak_memory_mb=max(self.peak_memory_mb, ending.peak_memory_mb), host=ending.host,
+            self,
+            state=state,
+            words=words,
+            flight=ending.flight or self.flight,
+            seconds=round(self.seconds + ending.seconds, 3),
+            cpu_s=round(self.cpu_s + ending.cpu_s, 3),
+            peak_memory_mb=max(self.peak_memory_mb, ending.peak_memory_mb),
+            host=ending.host,
         )
 
     @classmethod
@@ -112,7 +117,10 @@ class BatchTable:
         lock = _locked(root)
         try:
             rows = _read(root / TABLE)
-            lines = [_line({"made_by": "sorvolo batch", "format": _FORMAT}), *map(_row_line, rows.values())]
+            lines = [
+                _line({"made_by": "sorvolo batch", "format": _FORMAT}),
+                *map(_row_line, rows.values()),
+            ]
             atomic_write_bytes(root / TABLE, b"".join(lines))
             return cls(root, lock, rows)
         except BaseException:
@@ -150,7 +158,9 @@ class BatchTable:
 
 def _make(root: Path) -> None:
     if is_site(root):
-        raise StoreError(f"{root} is a site itself; a batch makes several: name the folder above it, or a new one")
+        raise StoreError(
+            f"{root} is a site itself; a batch makes several: name the folder above it, or a new one"
+        )
     try:
         with writing(root):
             root.mkdir(parents=True, exist_ok=True)
@@ -170,12 +180,16 @@ def _locked(root: Path) -> int:
         if _is_alive(holder) or waited_s > _ENDING_S:
             os.close(lock)
             who = holder or "its name is not known"
-            raise StoreError(f"another batch is running in {root}: {who}; wait until it ends, or stop it")
+            raise StoreError(
+                f"another batch is running in {root}: {who}; wait until it ends, or stop it"
+            )
         if waited_s > _PATIENCE_S:
             _kill_orphans(path)
         time.sleep(0.1)
     os.ftruncate(lock, 0)
-    os.pwrite(lock, f"process {os.getpid()} on {socket.gethostname()}, since {utc_now()}".encode(), 0)
+    os.pwrite(
+        lock, f"process {os.getpid()} on {socket.gethostname()}, since {utc_now()}".encode(), 0
+    )
     return lock
 
 
@@ -232,13 +246,17 @@ def _read(path: Path) -> dict[tuple[str, str], Row]:
         except (ValueError, TypeError, KeyError) as error:
             if number >= len(lines) - 1:
                 break
-            raise StoreError(f"{path}: line {number + 1} is no row of a batch ({error}); move the file away") from error
+            raise StoreError(
+                f"{path}: line {number + 1} is no row of a batch ({error}); move the file away"
+            ) from error
     return rows
 
 
 def _demand_format(path: Path, head: Any) -> None:
     if not isinstance(head, dict) or head.get("made_by") != "sorvolo batch":
-        raise StoreError(f"{path} is not a table of sorvolo batch; move it away, or choose another --root")
+        raise StoreError(
+            f"{path} is not a table of sorvolo batch; move it away, or choose another --root"
+        )
     if head.get("format") != _FORMAT:
         raise StoreError(
             f"{path} has format {head.get('format')}, this version reads {_FORMAT}; use the version that wrote it"

@@ -25,10 +25,15 @@ _UNSENT = ("cot", "alert")
 
 def watch_settings(model: str, wish: WatchWish) -> "WatchSettings":
     """What is searched for. Raises SettingsError for what is out of range."""
-    from sorvolo.missions.watch.settings import WatchSettings  # with what it imports, which takes long
+    from sorvolo.missions.watch.settings import (
+        WatchSettings,
+    )  # with what it imports, which takes long
 
     return WatchSettings(
-        model=model, classes=wish.classes, least_score=wish.least_score, frames_per_second=wish.frames_per_second
+        model=model,
+        classes=wish.classes,
+        least_score=wish.least_score,
+        frames_per_second=wish.frames_per_second,
     )
 
 
@@ -40,10 +45,17 @@ def watch_outputs(wish: WatchWish, folder: Path, *, is_live: bool = False) -> "W
     from sorvolo.missions.watch.cot_sender import CotTls
     from sorvolo.missions.watch.settings import WatchOutputs
 
-    tls = CotTls(Path(wish.cot_ca) if wish.cot_ca else None, Path(wish.cot_cert) if wish.cot_cert else None)
+    tls = CotTls(
+        Path(wish.cot_ca) if wish.cot_ca else None, Path(wish.cot_cert) if wish.cot_cert else None
+    )
     return WatchOutputs(
-        folder=None if is_live else folder, below=folder if is_live else None, save=wish.save, cot=wish.cot,
-        alert_command=wish.alert_command, alert_url=wish.alert_url, cot_tls=tls,
+        folder=None if is_live else folder,
+        below=folder if is_live else None,
+        save=wish.save,
+        cot=wish.cot,
+        alert_command=wish.alert_command,
+        alert_url=wish.alert_url,
+        cot_tls=tls,
     )
 
 
@@ -63,7 +75,10 @@ def is_watched(folder: Path, fingerprint: str) -> bool:
 
 
 def watch_flight(
-    order: Order, detector: "ObjectDetector | None", alive: Callable[..., None], announce: Callable[[str], None],
+    order: Order,
+    detector: "ObjectDetector | None",
+    alive: Callable[..., None],
+    announce: Callable[[str], None],
     until: Event,
 ) -> tuple[str, str]:
     """Watch the order's flight: its name, and what was found. `announce` gets each new object in words."""
@@ -74,8 +89,14 @@ def watch_flight(
     outputs = watch_outputs(wish.watch, Path(order.site), is_live=is_live_address(order.source))
     folder: Path | None = None
     updates = watch(
-        order.source, watch_settings(wish.model, wish.watch), outputs, telemetry=order.telemetry or None,
-        camera=wish.camera or None, detector=detector, live=LiveSettings(give_up_s=wish.give_up_s), until=until,
+        order.source,
+        watch_settings(wish.model, wish.watch),
+        outputs,
+        telemetry=order.telemetry or None,
+        camera=wish.camera or None,
+        detector=detector,
+        live=LiveSettings(give_up_s=wish.give_up_s),
+        until=until,
     )
     with closing(updates):
         for update in updates:

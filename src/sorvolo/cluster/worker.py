@@ -18,7 +18,16 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.reconnect import LiveSettings
-from sorvolo.cluster.orders import FINISH, Mission, Order, Outcome, Part, PartKind, Scouted, answer_line
+from sorvolo.cluster.orders import (
+    FINISH,
+    Mission,
+    Order,
+    Outcome,
+    Part,
+    PartKind,
+    Scouted,
+    answer_line,
+)
 from sorvolo.errors import SorvoloError
 
 if TYPE_CHECKING:
@@ -56,7 +65,9 @@ class Answers:
 def main() -> int:
     """Do the one order of standard input. 0 also for a flight that cannot be used: that is an answer."""
     answers = Answers()
-    with os.fdopen(os.dup(sys.stdin.fileno()), "rb", buffering=0) as line:  # what follows it is another's to read
+    with os.fdopen(
+        os.dup(sys.stdin.fileno()), "rb", buffering=0
+    ) as line:  # what follows it is another's to read
         content = json.loads(line.readline())
     until = threading.Event()
     threading.Thread(target=_follow_input, args=(until,), daemon=True).start()
@@ -68,7 +79,10 @@ def main() -> int:
     try:
         flight, words, is_good = _done(order, answers, until)
     except SorvoloError as error:
-        answers.add("ended", {"outcome": Outcome.of(error), "words": without_secret(str(error), order.source)})
+        answers.add(
+            "ended",
+            {"outcome": Outcome.of(error), "words": without_secret(str(error), order.source)},
+        )
         return 0
     outcome = Outcome.DONE if is_good else Outcome.DOUBTFUL
     answers.add("ended", {"outcome": outcome, "words": words, "flight": flight})
@@ -112,7 +126,9 @@ def _tiles(order: Order, part: Part, alive: Callable[..., None]) -> None:
     from sorvolo.missions.flight.memory import memory_budget_bytes
     from sorvolo.missions.map.tile_shares import paint_share
 
-    paint_share(Path(part.folder), part.number, part.count, memory_budget_bytes(order.memory_mb), alive)
+    paint_share(
+        Path(part.folder), part.number, part.count, memory_budget_bytes(order.memory_mb), alive
+    )
 
 
 def _follow_input(until: threading.Event) -> None:
@@ -133,7 +149,9 @@ def _scout(source: str, camera: str, answers: Answers) -> None:
     try:
         found = open_sources([source], camera=camera or None)
         if len(found) != 1:
-            raise SorvoloError(f"{source} holds {len(found)} flights, one was expected; files came or went meanwhile")
+            raise SorvoloError(
+                f"{source} holds {len(found)} flights, one was expected; files came or went meanwhile"
+            )
         flight = found[0]
     except SorvoloError as error:
         answers.add("unreadable", {"words": str(error)})
@@ -142,7 +160,8 @@ def _scout(source: str, camera: str, answers: Answers) -> None:
     box = None
     if samples.has_fixes:
         latitudes, longitudes = (
-            [each for each in samples[name].tolist() if each == each] for name in ("latitude_deg", "longitude_deg")
+            [each for each in samples[name].tolist() if each == each]
+            for name in ("latitude_deg", "longitude_deg")
         )
         box = (min(latitudes), min(longitudes), max(latitudes), max(longitudes))
     start_ns = flight.start_ns or (int(samples.time_ns[0]) if len(samples) else 0)
@@ -169,14 +188,22 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
     site, wish = Path(order.site), order.wish
     settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
     updates = map_flights(
-        [order.source], site, settings, telemetry=order.telemetry or None, camera=wish.camera or None,
-        detector=_detector(order), live=_live(order), until=until,
+        [order.source],
+        site,
+        settings,
+        telemetry=order.telemetry or None,
+        camera=wish.camera or None,
+        detector=_detector(order),
+        live=_live(order),
+        until=until,
     )
     flight = _run(updates, site, alive)
     return flight, *reported_headline(site, flight)
 
 
-def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
+def _compare(
+    order: Order, alive: Callable[..., None], until: threading.Event
+) -> tuple[str, str, bool]:
     """Compare the flight with the site's map; the first flight over a site is mapped."""
     from sorvolo.missions.compare.flights import compare_flights
     from sorvolo.missions.flight.settings import CompareSettings
@@ -187,8 +214,14 @@ def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -
     if not founder or _is_flight(order.source, site, founder):
         return _map(order, alive, until)
     updates = compare_flights(
-        [order.source], site, CompareSettings(model=wish.model), telemetry=order.telemetry or None,
-        camera=wish.camera or None, detector=_detector(order), live=_live(order), until=until,
+        [order.source],
+        site,
+        CompareSettings(model=wish.model),
+        telemetry=order.telemetry or None,
+        camera=wish.camera or None,
+        detector=_detector(order),
+        live=_live(order),
+        until=until,
     )
     flight = _run(updates, site, alive)
     with Archive.open(site, write=False) as archive:
@@ -197,7 +230,9 @@ def _compare(order: Order, alive: Callable[..., None], until: threading.Event) -
     return flight, str(head.get("text", "")), head.get("quality") == "compared"
 
 
-def _search(order: Order, alive: Callable[..., None], until: threading.Event) -> tuple[str, str, bool]:
+def _search(
+    order: Order, alive: Callable[..., None], until: threading.Event
+) -> tuple[str, str, bool]:
     """Map the flight if the site has it not yet; measure what a search of it would have found."""
     from sorvolo.missions.search.flights import search_site
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
@@ -239,7 +274,9 @@ def _run(updates: Generator[Any, None, Any], site: Path, alive: Callable[..., No
     if known:
         return str(known[0].flight)
     with Archive.open(site, write=False) as archive:
-        return next(each.flight_id for each in archive.versions() if each.complete and each.id > before)
+        return next(
+            each.flight_id for each in archive.versions() if each.complete and each.id > before
+        )
 
 
 def _newest(site: Path) -> int:

@@ -24,7 +24,9 @@ class BatchingSettings:
     """How pictures are gathered to a batch. Chosen, not measured: no graphics card was at hand."""
 
     most_pictures: int = 8  # of one batch: more need memory and win little
-    gather_s: float = 0.01  # that the first picture of a batch waits for others; only for a model that takes many
+    gather_s: float = (
+        0.01  # that the first picture of a batch waits for others; only for a model that takes many
+    )
     most_waiting: int = 32  # pictures; an asker beyond waits before its picture is taken
 
 
@@ -71,7 +73,9 @@ class Batcher:
     def _gathered(self, first: _Waiting) -> tuple[list[_Waiting], bool]:
         """What is answered next, and whether nothing follows."""
         batch, end_s = [first], time.monotonic() + self._settings.gather_s
-        while self._engine.takes_many and len(batch) < min(self._settings.most_pictures, self._askers):
+        while self._engine.takes_many and len(batch) < min(
+            self._settings.most_pictures, self._askers
+        ):
             try:
                 more = self._waiting.get(timeout=max(0.0, end_s - time.monotonic()))
             except queue.Empty:
@@ -100,7 +104,9 @@ class Batcher:
         *found, pictures = outputs
         if any(len(each) != len(pictures) for each in found):
             sizes = ", ".join(str(each.shape) for each in outputs)
-            raise InputError(f"the model '{self._engine.info.name}' answers with outputs of {sizes}: export it again")
+            raise InputError(
+                f"the model '{self._engine.info.name}' answers with outputs of {sizes}: export it again"
+            )
         return [tuple(each[pictures == number] for each in found) for number in range(len(group))]
 
 

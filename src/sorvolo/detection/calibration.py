@@ -56,11 +56,15 @@ def in_own_scale(info: ModelInfo) -> dict[str, float]:
     """The model's thresholds in its networks' own scale: what reports as much where nothing is calibrated."""
     return {
         name: float(platt_scaled(least, Calibration(1 / how.slope, -how.shift / how.slope)))
-        if (how := info.calibration.get(name)) else least for name, least in info.thresholds.items()
+        if (how := info.calibration.get(name))
+        else least
+        for name, least in info.thresholds.items()
     }
 
 
-def scaled_thresholds(own: Mapping[str, float], calibration: Mapping[str, Calibration]) -> dict[str, float]:
+def scaled_thresholds(
+    own: Mapping[str, float], calibration: Mapping[str, Calibration]
+) -> dict[str, float]:
     """Thresholds in a model's own scale as they are after its calibration: `in_own_scale` the other way round."""
     return {
         name: float(platt_scaled(least, calibration[name])) if name in calibration else least

@@ -13,15 +13,31 @@ import numpy as np
 
 from sorvolo.child_process import python_command
 from sorvolo.detection.contract import METADATA_KEY, info_from_metadata
-from sorvolo.detection.engine import CUDA, Engine, Planes, Provider, Run, describe, open_engine, output_names
-from sorvolo.detection.process_messages import outputs_from, read_message, write_message, write_outputs
+from sorvolo.detection.engine import (
+    CUDA,
+    Engine,
+    Planes,
+    Provider,
+    Run,
+    describe,
+    open_engine,
+    output_names,
+)
+from sorvolo.detection.process_messages import (
+    outputs_from,
+    read_message,
+    write_message,
+    write_outputs,
+)
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Numbers
 
 MOST_BYTES = 6 << 30
 """Of memory that such a process may map on Linux: twice what the package's own models take for the largest tile."""
 
-_PER_THREAD_BYTES = 160 << 20  # that a thread maps and hardly uses: its stack and its share of the heap
+_PER_THREAD_BYTES = (
+    160 << 20
+)  # that a thread maps and hardly uses: its stack and its share of the heap
 ERRORS = {"InputError": InputError, "SettingsError": SettingsError}
 """Those that opening and running a model raise, as they are named between processes."""
 
@@ -64,8 +80,11 @@ class _Process:
         package = str(Path(__file__).parents[2])
         paths = [package, *filter(None, [os.environ.get("PYTHONPATH")])]
         self._child = subprocess.Popen(
-            python_command(__name__), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
+            python_command(__name__),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
         )
         self.end = weakref.finalize(self, _end, self._child)
         self._send(wish.__dict__, model)
@@ -82,7 +101,9 @@ class _Process:
         try:
             return outputs_from(head, data, self._names)
         except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{self._wish.where} answers with no boxes, scores and labels ({error})") from error
+            raise InputError(
+                f"{self._wish.where} answers with no boxes, scores and labels ({error})"
+            ) from error
 
     def _send(self, head: dict[str, Any], data: bytes) -> None:
         assert self._child.stdin is not None
@@ -112,7 +133,9 @@ class _Process:
 def about_engine(engine: Engine) -> dict[str, Any]:
     """What another process has to know of an engine."""
     return {
-        "provider": engine.provider, "metadata": engine.metadata, "fixed_px": engine.fixed_px,
+        "provider": engine.provider,
+        "metadata": engine.metadata,
+        "fixed_px": engine.fixed_px,
         "takes_many": engine.takes_many,
     }
 
@@ -122,9 +145,12 @@ def engine_from(about: Mapping[str, Any], where: str, run: Run) -> Engine:
     that breaks the contract."""
     fixed = about["fixed_px"]
     return Engine(
-        run, str(about["provider"]), str(about["metadata"]),
+        run,
+        str(about["provider"]),
+        str(about["metadata"]),
         info_from_metadata({METADATA_KEY: str(about["metadata"])}, where),
-        None if fixed is None else (int(fixed[0]), int(fixed[1])), bool(about["takes_many"]),
+        None if fixed is None else (int(fixed[0]), int(fixed[1])),
+        bool(about["takes_many"]),
     )
 
 
@@ -146,7 +172,8 @@ def serve(source: IO[bytes], sink: IO[bytes]) -> None:
     try:
         _limit(wish)
         engine = (
-            describe(model, wish.where) if wish.describes
+            describe(model, wish.where)
+            if wish.describes
             else open_engine(model, wish.where, wish.provider, wish.threads)
         )
         write_message(sink, about_engine(engine))

@@ -15,7 +15,9 @@ METADATA_KEY = "sorvolo"
 FORMAT = 2
 """The newest contract that this version reads; docs/detector.md lists its fields. 2 brought `calibration`."""
 
-_FALLBACK_STRIDE = 32  # px: what a picture's sides are multiples of, in a model whose file does not state it
+_FALLBACK_STRIDE = (
+    32  # px: what a picture's sides are multiples of, in a model whose file does not state it
+)
 _NEEDED = ("name", "classes", "thresholds", "best_px")
 _TEXTS = ("thermal_by", "preset", "version", "precision", "licence", "trained_on", "created")
 
@@ -164,11 +166,19 @@ def _info(fields: Mapping[str, Any]) -> ModelInfo:
         raise ValueError(f"its on_request must be some of its classes, not {list(on_request)}")
     texts = {each: _words(fields[each]) for each in _TEXTS if each in fields}
     return ModelInfo(
-        str(fields["name"]), classes, MappingProxyType(thresholds), MappingProxyType(best_px), stride,
-        bool(fields.get("thermal", False)), bool(fields.get("daylight", True)), on_request=on_request,
-        turned=MappingProxyType(turned), second_look=MappingProxyType(_second_look(fields, classes)),
+        str(fields["name"]),
+        classes,
+        MappingProxyType(thresholds),
+        MappingProxyType(best_px),
+        stride,
+        bool(fields.get("thermal", False)),
+        bool(fields.get("daylight", True)),
+        on_request=on_request,
+        turned=MappingProxyType(turned),
+        second_look=MappingProxyType(_second_look(fields, classes)),
         pyramid=MappingProxyType(_pyramid(fields, classes)),
-        calibration=MappingProxyType(_calibration(fields, classes)), second_only=bool(fields.get("second_only", False)),
+        calibration=MappingProxyType(_calibration(fields, classes)),
+        second_only=bool(fields.get("second_only", False)),
         **texts,
     )
 
@@ -188,7 +198,10 @@ def _thresholds(fields: Mapping[str, Any], key: str, classes: Sequence[str]) -> 
 
 
 def _best_px(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, tuple[float, float]]:
-    best_px = {each: (float(fields["best_px"][each][0]), float(fields["best_px"][each][1])) for each in classes}
+    best_px = {
+        each: (float(fields["best_px"][each][0]), float(fields["best_px"][each][1]))
+        for each in classes
+    }
     if not all(0 < least < most for least, most in best_px.values()):
         raise ValueError(f"its best_px must be smallest and largest side, not {best_px}")
     return best_px
@@ -199,8 +212,14 @@ def _pyramid(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str, Pyr
     for name, each in fields.get("pyramid", {}).items():
         times = tuple(float(one) for one in each["times"])
         known_px, octaves, shift = (float(each[key]) for key in ("known_px", "octaves", "shift"))
-        if name not in classes or not times or not all(0 < one <= MOST_LARGER and one != 1 for one in times):
-            raise ValueError(f"its pyramid must name classes and times up to {MOST_LARGER}, not {name} {list(times)}")
+        if (
+            name not in classes
+            or not times
+            or not all(0 < one <= MOST_LARGER and one != 1 for one in times)
+        ):
+            raise ValueError(
+                f"its pyramid must name classes and times up to {MOST_LARGER}, not {name} {list(times)}"
+            )
         closer = tuple(float(one) for one in each.get("closer", ()))
         if not all(1 < one <= MOST_CLOSER and one not in times for one in closer):
             raise ValueError(
@@ -219,15 +238,27 @@ def _second_look(fields: Mapping[str, Any], classes: Sequence[str]) -> dict[str,
     for name, each in fields.get("second_look", {}).items():
         weights = [float(each[key]) for key in ("own", "again", "shift", "least", "enlarged")]
         looks_px = tuple(float(side_px) for side_px in each["looks_px"])
-        if name not in classes or not looks_px or not all(0 < side_px < math.inf for side_px in looks_px):
-            raise ValueError(f"its second_look must name classes and sizes of theirs, not {name} {list(looks_px)}")
+        if (
+            name not in classes
+            or not looks_px
+            or not all(0 < side_px < math.inf for side_px in looks_px)
+        ):
+            raise ValueError(
+                f"its second_look must name classes and sizes of theirs, not {name} {list(looks_px)}"
+            )
         if not all(map(math.isfinite, weights)) or not 0 <= weights[3] <= 1:
-            raise ValueError(f"its second_look must have finite weights and a least score, not {weights}")
+            raise ValueError(
+                f"its second_look must have finite weights and a least score, not {weights}"
+            )
         positions = int(each.get("positions", 1))
         if not 1 <= positions <= len(POSITIONS):
-            raise ValueError(f"its second_look must have 1 to {len(POSITIONS)} positions, not {positions}")
+            raise ValueError(
+                f"its second_look must have 1 to {len(POSITIONS)} positions, not {positions}"
+            )
         own, again, shift, least, enlarged = weights
-        found[name] = SecondLook(looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions)
+        found[name] = SecondLook(
+            looks_px, own, again, shift, least, enlarged, str(each.get("by", "")), positions
+        )
     return found
 
 

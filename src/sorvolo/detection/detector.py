@@ -40,10 +40,20 @@ class Detector:
     """A model that is ready to look at pictures. `load` opens one; `detect` is called after, by any threads."""
 
     def __init__(
-        self, session: Session, *, provider: Provider = "auto", threads: int | None = None, stand_in: bool = True,
+        self,
+        session: Session,
+        *,
+        provider: Provider = "auto",
+        threads: int | None = None,
+        stand_in: bool = True,
         shared: str = "",
     ) -> None:
-        self._session, self._wanted_provider, self._threads, self._shared = session, provider, threads, shared
+        self._session, self._wanted_provider, self._threads, self._shared = (
+            session,
+            provider,
+            threads,
+            shared,
+        )
         self._any_may_stand_in = stand_in
         self._at_night: Session | None = None
         self._night_was_sought = False
@@ -54,8 +64,13 @@ class Detector:
 
     @classmethod
     def load(
-        cls, name_or_path: str | Path = "default", *, provider: Provider = "auto", threads: int | None = None,
-        stand_in: bool = True, shared: str = "",
+        cls,
+        name_or_path: str | Path = "default",
+        *,
+        provider: Provider = "auto",
+        threads: int | None = None,
+        stand_in: bool = True,
+        shared: str = "",
     ) -> "Detector":
         """Open an installed model by its name (`sorvolo models list`), or a model file.
 
@@ -84,7 +99,10 @@ class Detector:
     def others(self) -> tuple[tuple[ModelInfo, int], ...]:
         """The models that looked at pictures in its place, or a second time, and how often each has."""
         sessions = [] if self._at_night is None else [self._at_night]
-        looks = [(each.info, self._looks[each.info.name]) for each in (*sessions, *self._opinions.values())]
+        looks = [
+            (each.info, self._looks[each.info.name])
+            for each in (*sessions, *self._opinions.values())
+        ]
         return tuple((info, count) for info, count in looks if count)
 
     @property
@@ -98,11 +116,19 @@ class Detector:
         own, notices = self.info.name, []
         if (count := self._thermal_frames) and self._at_night is not None:
             night = self._at_night.info.name
-            why = "which was trained for them" if self.info.thermal else f"since '{own}' knows only daylight"
+            why = (
+                "which was trained for them"
+                if self.info.thermal
+                else f"since '{own}' knows only daylight"
+            )
             text = f"{count} thermal frames were seen by the model '{night}', {why}"
             notices.append(Notice("thermal_model", count, text))
         elif count and not self.info.thermal:
-            known = "daylight and no installed one on thermal frames" if self._any_may_stand_in else "daylight alone"
+            known = (
+                "daylight and no installed one on thermal frames"
+                if self._any_may_stand_in
+                else "daylight alone"
+            )
             text = (
                 f"{count} frames are thermal, but the model '{own}' was trained on {known}: what it "
                 "finds in them is unreliable"
@@ -124,22 +150,45 @@ class Detector:
 
     @overload
     def detect(
-        self, image: Picture, *, tiles: Tiles = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, early: Early | None = None, is_part: bool = False,
+        self,
+        image: Picture,
+        *,
+        tiles: Tiles = None,
+        m_per_px: float | None = None,
+        least_score: float | None = None,
+        classes: Sequence[str] | None = None,
+        from_above: bool = False,
+        overlapping: bool = False,
+        early: Early | None = None,
+        is_part: bool = False,
     ) -> Detections: ...
 
     @overload
     def detect(
-        self, image: Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, is_part: bool = False,
+        self,
+        image: Sequence[Picture],
+        *,
+        tiles: Tiles = None,
+        m_per_px: float | None = None,
+        least_score: float | None = None,
+        classes: Sequence[str] | None = None,
+        from_above: bool = False,
+        overlapping: bool = False,
+        is_part: bool = False,
     ) -> list[Detections]: ...
 
     def detect(
-        self, image: Picture | Sequence[Picture], *, tiles: Tiles = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, early: Early | None = None, is_part: bool = False,
+        self,
+        image: Picture | Sequence[Picture],
+        *,
+        tiles: Tiles = None,
+        m_per_px: float | None = None,
+        least_score: float | None = None,
+        classes: Sequence[str] | None = None,
+        from_above: bool = False,
+        overlapping: bool = False,
+        early: Early | None = None,
+        is_part: bool = False,
     ) -> Detections | list[Detections]:
         """The objects in a picture, best first; for a sequence of pictures, or an array (N, H, W, C), a list of them.
 
@@ -160,13 +209,20 @@ class Detector:
             raise SettingsError(f"the least score must lie in 0 to 1, not {least_score}")
         sampling = math.nan if m_per_px is None else float(m_per_px)
         if not isinstance(image, Sequence) and getattr(image, "ndim", 0) != 4:
-            return self._seen(image, tiles, sampling, wanted, least_score, from_above, overlapping, is_part, early)
+            return self._seen(
+                image, tiles, sampling, wanted, least_score, from_above, overlapping, is_part, early
+            )
         return [
-            self._seen(each, tiles, sampling, wanted, least_score, from_above, overlapping, is_part) for each in image
+            self._seen(each, tiles, sampling, wanted, least_score, from_above, overlapping, is_part)
+            for each in image
         ]
 
     def thresholds_for(
-        self, picture: Picture, *, from_above: bool = False, m_per_px: float | None = None,
+        self,
+        picture: Picture,
+        *,
+        from_above: bool = False,
+        m_per_px: float | None = None,
     ) -> Mapping[str, float]:
         """From which score on each class is reported in such a picture, by the model that looks at it; of those that
         `detect` looks for in it alone."""
@@ -175,7 +231,11 @@ class Detector:
         least = _thresholds(info, from_above)
         sampling = math.nan if m_per_px is None else m_per_px
         too_small = _too_small(list(least), sampling, thermal=thermal, from_above=from_above)
-        return {name: score for name, score in least.items() if name in self.classes and name not in too_small}
+        return {
+            name: score
+            for name, score in least.items()
+            if name in self.classes and name not in too_small
+        }
 
     def rest(self) -> None:
         """Give back memory that is kept for the next picture: before work that needs it, and after the last picture."""
@@ -191,12 +251,22 @@ class Detector:
         if not classes or (unknown := [name for name in classes if name not in self.classes]):
             named = ", ".join(map(repr, unknown)) if classes else "no class"
             there = ", ".join(self.classes)
-            raise SettingsError(f"the model '{self.info.name}' does not find {named}; it finds {there}")
+            raise SettingsError(
+                f"the model '{self.info.name}' does not find {named}; it finds {there}"
+            )
         return tuple(name for name in self.classes if name in classes)
 
     def _seen(
-        self, picture: Picture, tiles: Tiles, m_per_px: float, wanted: Sequence[str],
-        least_score: float | None, from_above: bool, overlapping: bool, is_part: bool, early: Early | None = None,
+        self,
+        picture: Picture,
+        tiles: Tiles,
+        m_per_px: float,
+        wanted: Sequence[str],
+        least_score: float | None,
+        from_above: bool,
+        overlapping: bool,
+        is_part: bool,
+        early: Early | None = None,
     ) -> Detections:
         thermal = is_thermal(picture)
         session = self._session if self._is_own(thermal=thermal) else self._night_session()
@@ -213,7 +283,9 @@ class Detector:
 
         def reported(looks: Seen, names: Sequence[str]) -> Detections:
             seen = calibrated(looks, session.info)
-            least = _least_scores(session.info, _thresholds(session.info, from_above), names, least_score)
+            least = _least_scores(
+                session.info, _thresholds(session.info, from_above), names, least_score
+            )
             kept = seen.scores >= least[seen.labels]
             labels = seen.labels[kept]
             if session is not self._session:
@@ -221,12 +293,18 @@ class Detector:
             return Detections(seen.boxes_px[kept], seen.scores[kept], labels, self.classes)
 
         def whole(shown: ImageRGB) -> Seen:
-            groups = looks_for(session.info, m_per_px, asked, thermal) if tiles == "auto" else (tuple(asked),)
+            groups = (
+                looks_for(session.info, m_per_px, asked, thermal)
+                if tiles == "auto"
+                else (tuple(asked),)
+            )
             looks: dict[tuple[str, ...], Seen] = {}
             for names in reversed(groups):  # the smaller look first: it is known soon
                 looks[names] = in_sizes(shown, names)
                 is_last = names == groups[0]
-                if early is not None and not (is_last or looks_twice or session.info.second_look.keys() & set(names)):
+                if early is not None and not (
+                    is_last or looks_twice or session.info.second_look.keys() & set(names)
+                ):
                     early(names, reported(looks[names], names))
             return _together([looks[names] for names in groups], groups, session.info.classes)
 
@@ -244,10 +322,19 @@ class Detector:
         def look(shown: ImageRGB, names: Sequence[str], times: float = 1.0) -> _SizedLook:
             size_px = shown.shape[0], shown.shape[1]
             plan = plan_tiles(
-                size_px, session.info, names, tiles=tiles, m_per_px=m_per_px, fixed_px=session.fixed_px,
-                thermal=thermal, times=times,
+                size_px,
+                session.info,
+                names,
+                tiles=tiles,
+                m_per_px=m_per_px,
+                fixed_px=session.fixed_px,
+                thermal=thermal,
+                times=times,
             )
-            tiles_seen = [SeenTile(place, _look(session, shown, place, plan.scale)) for place in plan.places_px]
+            tiles_seen = [
+                SeenTile(place, _look(session, shown, place, plan.scale))
+                for place in plan.places_px
+            ]
             seen = tiles_seen[0].seen if len(tiles_seen) == 1 else merge_tiles(tiles_seen, size_px)
             return _SizedLook(seen, plan.scale, tuple(names))
 
@@ -269,15 +356,21 @@ class Detector:
         with self._seeking:
             if not self._night_was_sought:
                 named = self.info.thermal_by
-                found = thermal_model(self.classes, named) if named or self._any_may_stand_in else None
+                found = (
+                    thermal_model(self.classes, named) if named or self._any_may_stand_in else None
+                )
                 self._at_night = None if found is None else self._opened(found)
                 self._night_was_sought = True
         return self._at_night or self._session
 
-    def _seen_again(self, session: Session, rgb: ImageRGB, seen: Seen, asked: Sequence[str]) -> Seen:
+    def _seen_again(
+        self, session: Session, rgb: ImageRGB, seen: Seen, asked: Sequence[str]
+    ) -> Seen:
         """What was seen, scored again by a second look at the reports of `asked` classes for which a model has one."""
         info = session.info
-        hows = {info.classes.index(name): how for name, how in info.second_look.items() if name in asked}
+        hows = {
+            info.classes.index(name): how for name, how in info.second_look.items() if name in asked
+        }
         for by in dict.fromkeys(how.by for how in hows.values()):
             looking = self._second(session, by)
             mine = {label: how for label, how in hows.items() if how.by == by}
@@ -308,15 +401,21 @@ class Detector:
         return Session(path, self._wanted_provider, self._threads, self._shared)
 
 
-def _together(looks: Sequence[Seen], groups: Sequence[Sequence[str]], classes: Sequence[str]) -> Seen:
+def _together(
+    looks: Sequence[Seen], groups: Sequence[Sequence[str]], classes: Sequence[str]
+) -> Seen:
     """What looks at one picture saw, each of its own group of classes, best first."""
     if len(looks) == 1:
         return looks[0]
-    kept = [np.isin(look.labels, [classes.index(name) for name in names]) for look, names in zip(looks, groups)]
+    kept = [
+        np.isin(look.labels, [classes.index(name) for name in names])
+        for look, names in zip(looks, groups)
+    ]
     scores = np.concatenate([look.scores[mine] for look, mine in zip(looks, kept)])
     order = np.argsort(-scores, kind="stable")
     return Seen(
-        np.concatenate([look.boxes_px[mine] for look, mine in zip(looks, kept)])[order], scores[order],
+        np.concatenate([look.boxes_px[mine] for look, mine in zip(looks, kept)])[order],
+        scores[order],
         np.concatenate([look.labels[mine] for look, mine in zip(looks, kept)])[order],
     )
 
@@ -328,9 +427,14 @@ def _in_sizes(looks: Sequence[_SizedLook], names: Sequence[str], info: ModelInfo
     for name in several:
         own = [each for each in looks if name in each.names]
         groups.append([name])
-        seen.append(agreed_in_sizes(
-            [each.seen for each in own], [each.scale for each in own], info.classes.index(name), info.pyramid[name]
-        ))
+        seen.append(
+            agreed_in_sizes(
+                [each.seen for each in own],
+                [each.scale for each in own],
+                info.classes.index(name),
+                info.pyramid[name],
+            )
+        )
     return _together(seen, groups, info.classes)
 
 
@@ -339,7 +443,13 @@ def _seen_turned(rgb: ImageRGB, whole: Callable[[ImageRGB], Seen]) -> Seen:
     looks, settings = [], LookSettings()
     for quarters in settings.quarters:
         seen = whole(turned(rgb, quarters))
-        looks.append(Seen(turned_back(seen.boxes_px, quarters, (rgb.shape[0], rgb.shape[1])), seen.scores, seen.labels))
+        looks.append(
+            Seen(
+                turned_back(seen.boxes_px, quarters, (rgb.shape[0], rgb.shape[1])),
+                seen.scores,
+                seen.labels,
+            )
+        )
     return agreed(looks, settings)
 
 
@@ -359,7 +469,9 @@ def _places_in(classes: Sequence[str], names: Sequence[str]) -> Labels:
     return np.array([classes.index(name) if name in classes else -1 for name in names], np.int64)
 
 
-def _too_small(names: Sequence[str], m_per_px: float, *, thermal: bool, from_above: bool) -> list[str]:
+def _too_small(
+    names: Sequence[str], m_per_px: float, *, thermal: bool, from_above: bool
+) -> list[str]:
     """Those of the classes that are not looked for in such a picture."""
     return [name for name in names if from_above and not thermal and is_too_small(name, m_per_px)]
 
@@ -369,15 +481,22 @@ def _thresholds(info: ModelInfo, from_above: bool) -> Mapping[str, float]:
 
 
 def _least_scores(
-    info: ModelInfo, thresholds: Mapping[str, float], wanted: Sequence[str], least_score: float | None
+    info: ModelInfo,
+    thresholds: Mapping[str, float],
+    wanted: Sequence[str],
+    least_score: float | None,
 ) -> Floats:
     """(classes,) the score from which on each of the model's classes is reported; infinite where it is not wanted."""
     least = [thresholds[name] if least_score is None else least_score for name in info.classes]
     return np.where([name in wanted for name in info.classes], least, np.inf)
 
 
-def _look(session: Session, rgb: ImageRGB, place_px: tuple[int, int, int, int], scale: float) -> Seen:
+def _look(
+    session: Session, rgb: ImageRGB, place_px: tuple[int, int, int, int], scale: float
+) -> Seen:
     """What the model sees in one tile, in the picture's pixels."""
     left, top, right, bottom = place_px
     seen = session.see(rgb[top:bottom, left:right], scale)
-    return Seen(seen.boxes_px + np.array([left, top, left, top], np.float32), seen.scores, seen.labels)
+    return Seen(
+        seen.boxes_px + np.array([left, top, left, top], np.float32), seen.scores, seen.labels
+    )

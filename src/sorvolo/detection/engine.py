@@ -72,11 +72,16 @@ def open_engine(model: bytes, where: str, provider: Provider, threads: int) -> E
         except RuntimeError as error:
             if provider == "openvino":
                 reason = " ".join(str(error).split())[:200]
-                raise InputError(f"{where}: OpenVINO refuses it ({reason}); choose the provider cpu") from error
+                raise InputError(
+                    f"{where}: OpenVINO refuses it ({reason}); choose the provider cpu"
+                ) from error
             refused = ", since OpenVINO refuses the model"
         else:
             return replace(
-                described, run=run, provider=f"OpenVINO on the CPU, {_count(threads)}", rest=lambda: None
+                described,
+                run=run,
+                provider=f"OpenVINO on the CPU, {_count(threads)}",
+                rest=lambda: None,
             )
     session = _onnx_session(model, where, threads, ["CPUExecutionProvider"])
     return _engine(f"ONNX Runtime on the CPU, {_count(threads)}{refused}", session, where)
@@ -108,7 +113,13 @@ def _engine(provider: str, session: Any, where: str) -> Engine:
     run = _runner(session, output_names(takes_many=takes_many))
     side_px = fixed_px or (info.stride, info.stride)
     return Engine(
-        run, provider, metadata[METADATA_KEY], info, fixed_px, takes_many, lambda: _shrink(session, side_px)
+        run,
+        provider,
+        metadata[METADATA_KEY],
+        info,
+        fixed_px,
+        takes_many,
+        lambda: _shrink(session, side_px),
     )
 
 
@@ -137,7 +148,9 @@ def _onnx_session(
     options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
     # threads that spin while they wait take the processor from who works beside: the mapping, the decoder
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.enable_mem_pattern = False  # a block for all of a picture's layers: two thirds more memory, no quicker
+    options.enable_mem_pattern = (
+        False  # a block for all of a picture's layers: two thirds more memory, no quicker
+    )
     options.log_severity_level = 4
     level = onnxruntime.GraphOptimizationLevel
     options.graph_optimization_level = level.ORT_ENABLE_ALL if optimise else level.ORT_DISABLE_ALL
@@ -174,7 +187,8 @@ def _openvino_runner(model: bytes, threads: int, names: Sequence[str]) -> Run:
 
     core = openvino.Core()
     wishes = {
-        "PERFORMANCE_HINT": "LATENCY", "INFERENCE_NUM_THREADS": threads,
+        "PERFORMANCE_HINT": "LATENCY",
+        "INFERENCE_NUM_THREADS": threads,
         "INFERENCE_PRECISION_HINT": _OPENVINO_PRECISION,
     }
     compiled = core.compile_model(core.read_model(model=model), "CPU", wishes)
@@ -202,7 +216,9 @@ def _input_size(session: Any, where: str, stride: int) -> tuple[int, int] | None
     if not _is_one_picture(shape):
         raise InputError(f"{where} takes {found}; needed is {needed}")
     if PICTURES in outputs and isinstance(shape[0], int):
-        raise InputError(f"{where} gives '{PICTURES}' but takes one picture; leave the number of pictures free")
+        raise InputError(
+            f"{where} gives '{PICTURES}' but takes one picture; leave the number of pictures free"
+        )
     return _fixed_size(shape, stride, f"{where} takes {found}")
 
 
@@ -216,7 +232,9 @@ def _fixed_size(shape: Sequence[Any], stride: int, found: str) -> tuple[int, int
     if not any(fixed):
         return None
     if not all(fixed):
-        raise InputError(f"{found}: height and width must be both free or both fixed; export it again")
+        raise InputError(
+            f"{found}: height and width must be both free or both fixed; export it again"
+        )
     if shape[2] % stride or shape[3] % stride:
         raise InputError(f"{found}, but its stride is {stride}; export it again")
     return int(shape[2]), int(shape[3])

@@ -8,7 +8,13 @@ import numpy as np
 
 from sorvolo.detection.calibration import platt_fit
 from sorvolo.detection.contract import Calibration
-from sorvolo.detection.metrics import ClassMatch, CocoNumbers, Threshold, at_score, reporting_threshold
+from sorvolo.detection.metrics import (
+    ClassMatch,
+    CocoNumbers,
+    Threshold,
+    at_score,
+    reporting_threshold,
+)
 from sorvolo.geometry.arrays import Floats
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
@@ -43,11 +49,20 @@ class Checked:
         `before` are the thresholds of the model that was learnt on from: kept for `too_few` classes.
         """
         unknown = Threshold(_FALLBACK_THRESHOLD, float("nan"), float("nan"), float("nan"))
-        chosen = {name: _chosen(_pooled(self.matches[name])) for name in classes if name in self.matches}
+        chosen = {
+            name: _chosen(_pooled(self.matches[name])) for name in classes if name in self.matches
+        }
         for name in set(self.too_few(classes)) & set(before):
             matches = self.matches.get(name, ())
-            chosen[name] = at_score(_pooled(matches), before[name]) if matches else replace(unknown, score=before[name])
-        return {name: chosen[name] if np.isfinite(chosen.get(name, _NONE).score) else unknown for name in classes}
+            chosen[name] = (
+                at_score(_pooled(matches), before[name])
+                if matches
+                else replace(unknown, score=before[name])
+            )
+        return {
+            name: chosen[name] if np.isfinite(chosen.get(name, _NONE).score) else unknown
+            for name in classes
+        }
 
     def calibration(
         self, classes: Sequence[str], before: Mapping[str, Calibration] = MappingProxyType({})
@@ -70,7 +85,10 @@ class Checked:
 
     def too_few(self, classes: Sequence[str]) -> tuple[str, ...]:
         """The classes with so few held-out labels that a threshold chosen by them is chance."""
-        counts = {name: sum(len(each.true_scores) for each in self.matches.get(name, ())) for name in classes}
+        counts = {
+            name: sum(len(each.true_scores) for each in self.matches.get(name, ()))
+            for name in classes
+        }
         return tuple(name for name in classes if counts[name] < _FEW_LABELS)
 
     def found_sides_px(self, name: str, score: float) -> Floats:
@@ -84,13 +102,21 @@ class Checked:
     def _mean(self, name: str, field: str) -> float:
         rows = [
             (getattr(numbers, field), len(match.true_scores))
-            for numbers, match in zip(self.numbers[name], self.matches[name]) if len(match.true_scores)
+            for numbers, match in zip(self.numbers[name], self.matches[name])
+            if len(match.true_scores)
         ]
-        return float(np.average([row[0] for row in rows], weights=[row[1] for row in rows])) if rows else float("nan")
+        return (
+            float(np.average([row[0] for row in rows], weights=[row[1] for row in rows]))
+            if rows
+            else float("nan")
+        )
 
 
 def best_sizes_px(
-    checked: Checked, thresholds: Mapping[str, float], learnt: Sequence[LabelledSet], classes: Sequence[str],
+    checked: Checked,
+    thresholds: Mapping[str, float],
+    learnt: Sequence[LabelledSet],
+    classes: Sequence[str],
     before: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> dict[str, tuple[float, float]]:
     """Of each class the longer sides between which nine of ten objects lie: of those found where enough were held out,
@@ -100,7 +126,10 @@ def best_sizes_px(
     """
     kept = {name: before[name] for name in checked.too_few(classes) if name in before}
     found = found_sizes_px(checked, thresholds, classes) | kept
-    learnt_px = {name: np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)]) for name in classes}
+    learnt_px = {
+        name: np.concatenate([np.zeros(0), *(_sides_px(each, name) for each in learnt)])
+        for name in classes
+    }
     return {name: found.get(name) or _most_of(learnt_px[name]) for name in classes}
 
 
@@ -141,7 +170,9 @@ def _pooled(matches: Sequence[ClassMatch]) -> ClassMatch:
     scores = np.concatenate([each.scores for each in matches])
     order = np.argsort(-scores, kind="stable")
     return replace(
-        matches[0], scores=scores[order], right=np.concatenate([each.right for each in matches], 1)[:, order],
+        matches[0],
+        scores=scores[order],
+        right=np.concatenate([each.right for each in matches], 1)[:, order],
         ignored=np.concatenate([each.ignored for each in matches], 1)[:, order],
         true_scores=np.concatenate([each.true_scores for each in matches]),
     )

@@ -73,7 +73,8 @@ class GroupTables:
         class's own. All weights one gives COCO's own numbers.
         """
         parts = [
-            self._measure(weights[start:start + _AT_ONCE]) for start in range(0, len(weights), _AT_ONCE)
+            self._measure(weights[start : start + _AT_ONCE])
+            for start in range(0, len(weights), _AT_ONCE)
         ]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
@@ -81,21 +82,27 @@ class GroupTables:
         every: list[Floats] = []
         single: dict[str, Floats] = {}
         for table in self.tables:
-            aps = np.stack([
-                _average_precision(table.labels, groups, before, weights)
-                for groups, before in zip(table.true_groups, table.false_before)
-            ])
+            aps = np.stack(
+                [
+                    _average_precision(table.labels, groups, before, weights)
+                    for groups, before in zip(table.true_groups, table.false_before)
+                ]
+            )
             right, wrong = weights @ table.reported_right, weights @ table.reported_wrong
             precision = np.where(right + wrong > 0, right / np.maximum(right + wrong, 1), 0.0)
             precision[weights @ table.labels == 0] = np.nan
             every.append(np.stack([aps.mean(axis=0), aps[0], aps[5], precision]))
             single |= {f"AP {table.label}": aps.mean(axis=0), f"AP50 {table.label}": aps[0]}
         known = ~np.isnan(every)
-        means = np.where(known, every, 0).sum(axis=0) / np.where(known.any(axis=0), known.sum(axis=0), np.nan)
+        means = np.where(known, every, 0).sum(axis=0) / np.where(
+            known.any(axis=0), known.sum(axis=0), np.nan
+        )
         return dict(zip(("AP", "AP50", "AP75", "thesis_map"), means)) | single
 
 
-def group_tables(matches: Sequence[ClassMatch], groups: Rows, thresholds: Mapping[str, float]) -> GroupTables:
+def group_tables(
+    matches: Sequence[ClassMatch], groups: Rows, thresholds: Mapping[str, float]
+) -> GroupTables:
     """The tables of a set's matches; `groups` (P,) is the index of each picture's group, from 0 without gaps."""
     count = int(groups.max()) + 1 if len(groups) else 0
     tables = []
@@ -110,11 +117,16 @@ def group_tables(matches: Sequence[ClassMatch], groups: Rows, thresholds: Mappin
             np.add.at(steps, (np.cumsum(match.right[k])[wrong], of_found[wrong]), 1)
             before.append(np.cumsum(steps[:-1], axis=0))
         reported = match.scores >= thresholds[match.label]
-        tables.append(_ClassTable(
-            match.label, tuple(right), tuple(before), _counted(of_true, count),
-            _counted(of_found[reported & match.right[0]], count),
-            _counted(of_found[reported & ~match.right[0] & ~match.ignored[0]], count),
-        ))
+        tables.append(
+            _ClassTable(
+                match.label,
+                tuple(right),
+                tuple(before),
+                _counted(of_true, count),
+                _counted(of_found[reported & match.right[0]], count),
+                _counted(of_found[reported & ~match.right[0] & ~match.ignored[0]], count),
+            )
+        )
     return GroupTables(tuple(tables), count)
 
 
@@ -143,7 +155,9 @@ def differences(
     """
     groups = a[0].groups
     exact = [_means(arm) for arm in (a, b)]
-    values = {name: float(exact[1][name][0] - exact[0][name][0]) for name in exact[0] if name in exact[1]}
+    values = {
+        name: float(exact[1][name][0] - exact[0][name][0]) for name in exact[0] if name in exact[1]
+    }
     if groups < 2 and len(a) < 2 and len(b) < 2:
         return {name: Difference(value, np.nan, np.nan, np.nan) for name, value in values.items()}
     weights = draw_groups(groups, draws, seed)
@@ -164,7 +178,10 @@ def _drawn_means(
     measured = [each.measure(weights) for each in arm]
     draws = len(weights)
     chosen = rng.integers(len(arm), size=(len(arm), draws))
-    return {name: np.stack([each[name] for each in measured])[chosen, np.arange(draws)].mean(axis=0) for name in names}
+    return {
+        name: np.stack([each[name] for each in measured])[chosen, np.arange(draws)].mean(axis=0)
+        for name in names
+    }
 
 
 def _average_precision(labels: Floats, groups: Rows, before: Floats, weights: Floats) -> Floats:

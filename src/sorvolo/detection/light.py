@@ -12,9 +12,14 @@ Picture: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) or (H, W, 1) grey, (H, W, 3) RGB, (H, W, 4) RGBA: any picture that a drone's camera makes."""
 
 _LEAST_SPAN = 64  # counts; a thermal frame of one temperature is not stretched until its noise fills the range
-_STRETCH_PERCENT = (0.5, 99.5)  # percentiles that become black and white: single hot pixels take no range; by choice
+_STRETCH_PERCENT = (
+    0.5,
+    99.5,
+)  # percentiles that become black and white: single hot pixels take no range; by choice
 _COLOUR_LEVELS = 10  # grey through a video's coding strays by up to five; daylight pictures of ours reach 17 and more
-_COLOUR_SHARE = 0.01  # of a picture may have colour and the picture still be grey: a logo, a cross-hair
+_COLOUR_SHARE = (
+    0.01  # of a picture may have colour and the picture still be grey: a logo, a cross-hair
+)
 _GLIMPSE_STEP = 4  # px between the pixels that are asked whether there is colour
 
 
@@ -31,7 +36,11 @@ def rgb_from_picture(picture: Picture) -> ImageRGB:
         eight = _stretched(grey) if grey.dtype == np.uint16 else np.asarray(grey, np.uint8)
         return np.broadcast_to(eight[:, :, None], (*eight.shape, 3))
     colour = picture[:, :, :3]
-    return (colour >> 8).astype(np.uint8) if colour.dtype == np.uint16 else np.asarray(colour, np.uint8)
+    return (
+        (colour >> 8).astype(np.uint8)
+        if colour.dtype == np.uint16
+        else np.asarray(colour, np.uint8)
+    )
 
 
 def is_thermal(picture: Picture) -> bool:
@@ -55,7 +64,11 @@ def _check(picture: object) -> None:
     needed = "needed is a NumPy array of uint8 or uint16, (H, W), (H, W, 1), (H, W, 3) RGB or (H, W, 4) RGBA"
     if not isinstance(picture, np.ndarray) or picture.dtype not in (np.uint8, np.uint16):
         raise InputError(f"this is no picture: {found}; {needed}{_type_advice(picture)}")
-    if picture.ndim not in (2, 3) or (picture.ndim == 3 and picture.shape[2] not in (1, 3, 4)) or picture.size == 0:
+    if (
+        picture.ndim not in (2, 3)
+        or (picture.ndim == 3 and picture.shape[2] not in (1, 3, 4))
+        or picture.size == 0
+    ):
         raise InputError(f"this is no picture: {found}; {needed}{_shape_advice(picture.shape)}")
 
 

@@ -121,11 +121,17 @@ def judged_classes(labelled: LabelledSet, classes: Sequence[str]) -> tuple[str, 
 
     Raises InputError when there is none.
     """
-    judged = tuple(name for name in classes if name in labelled.classes and name not in labelled.unlabelled)
+    judged = tuple(
+        name for name in classes if name in labelled.classes and name not in labelled.unlabelled
+    )
     if not judged:
         raise InputError(
             f"{labelled.name}: labels {', '.join(labelled.classes) or 'nothing'}"
-            + (f" (not labelled: {', '.join(sorted(labelled.unlabelled))})" if labelled.unlabelled else "")
+            + (
+                f" (not labelled: {', '.join(sorted(labelled.unlabelled))})"
+                if labelled.unlabelled
+                else ""
+            )
             + f", but the model finds {', '.join(classes)}; map the set's names to the model's with --classes"
         )
     return judged
@@ -140,10 +146,14 @@ def match_pictures(
     of pictures differ.
     """
     if len(found) != len(labelled):
-        raise InputError(f"{labelled.name}: {len(labelled)} pictures, but detections in {len(found)}")
+        raise InputError(
+            f"{labelled.name}: {len(labelled)} pictures, but detections in {len(found)}"
+        )
     truth, truth_rows = _truth(labelled, judged)
     with redirect_stdout(io.StringIO()):  # pycocotools prints as it goes
-        judge = COCOeval(_indexed(truth), _indexed(truth | {"annotations": _candidates(found, judged)}), "bbox")
+        judge = COCOeval(
+            _indexed(truth), _indexed(truth | {"annotations": _candidates(found, judged)}), "bbox"
+        )
         judge.params.maxDets = [1, 10, MOST_BOXES]
         judge.evaluate()
         judge.accumulate()
@@ -151,10 +161,15 @@ def match_pictures(
     pictures = len(labelled)
     areas = len(judge.params.areaRng)
     matches = tuple(
-        _class_match(name, judge.evalImgs[k * areas * pictures:(k * areas + 1) * pictures], judge, truth_rows)
+        _class_match(
+            name,
+            judge.evalImgs[k * areas * pictures : (k * areas + 1) * pictures],
+            judge,
+            truth_rows,
+        )
         for k, name in enumerate(judged)
     )
-    each = {name: _numbers(precision[:, :, k:k + 1]) for k, name in enumerate(judged)}
+    each = {name: _numbers(precision[:, :, k : k + 1]) for k, name in enumerate(judged)}
     return matches, _numbers(precision), each
 
 
@@ -244,7 +259,10 @@ def at_score(match: ClassMatch, score: float) -> Threshold:
 
 
 def recall_by_size(
-    matches: Sequence[ClassMatch], thresholds: Mapping[str, float], scale: Floats, edges: Sequence[float]
+    matches: Sequence[ClassMatch],
+    thresholds: Mapping[str, float],
+    scale: Floats,
+    edges: Sequence[float],
 ) -> dict[str, tuple[SizeRow, ...]]:
     """Each class's recall by the longer side of its labels, in units of `scale` (P,) per pixel of each picture.
 
@@ -252,7 +270,9 @@ def recall_by_size(
     """
     table: dict[str, tuple[SizeRow, ...]] = {}
     for match in matches:
-        sides = (match.true_boxes_px[:, 2:] - match.true_boxes_px[:, :2]).max(axis=1) * scale[match.true_pictures]
+        sides = (match.true_boxes_px[:, 2:] - match.true_boxes_px[:, :2]).max(axis=1) * scale[
+            match.true_pictures
+        ]
         reported = match.true_scores >= thresholds[match.label]
         rows = []
         for low, high in pairwise(edges):
@@ -287,7 +307,9 @@ def confusion(
             missed.setdefault(int(match.true_pictures[g]), []).append((k, g))
     mistakes = []
     for _, k, d in sorted(wrong, key=lambda row: (-row[0], row[1], row[2])):
-        mistake, taken = _wrong_detection(matches, k, d, missed.get(int(matches[k].pictures[d]), []))
+        mistake, taken = _wrong_detection(
+            matches, k, d, missed.get(int(matches[k].pictures[d]), [])
+        )
         if taken is not None:
             missed[mistake.picture].remove(taken)
         table[size if taken is None else taken[0], k] += 1
@@ -295,7 +317,10 @@ def confusion(
     for picture, rows in missed.items():
         for c, g in rows:
             table[c, size] += 1
-            box, score = matches[c].true_boxes_px[g], float(np.nan_to_num(matches[c].true_scores[g]))
+            box, score = (
+                matches[c].true_boxes_px[g],
+                float(np.nan_to_num(matches[c].true_scores[g])),
+            )
             mistakes.append(Mistake("miss", picture, _tuple(box), "", score, matches[c].label))
     return table, tuple(mistakes)
 
@@ -308,15 +333,22 @@ def _wrong_detection(
     match, picture = matches[k], int(matches[k].pictures[d])
     box, score = match.boxes_px[d], float(match.scores[d])
     left = [row for row in missed if row[0] != k]
-    overlaps = iou_matrix(box[None], np.reshape([matches[c].true_boxes_px[g] for c, g in left], (-1, 4)))[0]
+    overlaps = iou_matrix(
+        box[None], np.reshape([matches[c].true_boxes_px[g] for c, g in left], (-1, 4))
+    )[0]
     if len(left) and overlaps.max() >= IOUS[0]:
         c, g = left[int(np.argmax(overlaps))]
-        return Mistake("confusion", picture, _tuple(box), match.label, score, matches[c].label), (c, g)
+        return Mistake("confusion", picture, _tuple(box), match.label, score, matches[c].label), (
+            c,
+            g,
+        )
     near = max((_best_overlap(box, each, picture) for each in matches), default=0.0)
     return Mistake("false alarm", picture, _tuple(box), match.label, score, overlap=near), None
 
 
-def _truth(labelled: LabelledSet, judged: Sequence[str]) -> tuple[dict[str, Any], dict[int, tuple[int, BoxesPx]]]:
+def _truth(
+    labelled: LabelledSet, judged: Sequence[str]
+) -> tuple[dict[str, Any], dict[int, tuple[int, BoxesPx]]]:
     """COCO's records of the labels, and of each label that counts its picture and box by id."""
     annotations: list[dict[str, Any]] = []
     rows: dict[int, tuple[int, BoxesPx]] = {}
@@ -328,33 +360,49 @@ def _truth(labelled: LabelledSet, judged: Sequence[str]) -> tuple[dict[str, Any]
                 annotations.append(_annotation(len(annotations) + 1, index, category[label], box))
         for region in picture.ignored_px:
             annotations += [
-                _annotation(len(annotations) + 1 + k, index, k, region) | {"iscrowd": 1} for k in range(len(judged))
+                _annotation(len(annotations) + 1 + k, index, k, region) | {"iscrowd": 1}
+                for k in range(len(judged))
             ]
     return {
-        "info": {}, "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
-        "categories": [{"id": k, "name": name} for k, name in enumerate(judged)], "annotations": annotations,
+        "info": {},
+        "images": [_image(index, each) for index, each in enumerate(labelled.pictures)],
+        "categories": [{"id": k, "name": name} for k, name in enumerate(judged)],
+        "annotations": annotations,
     }, rows
 
 
 def _candidates(found: Sequence[Detections], judged: Sequence[str]) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for index, detections in enumerate(found):
-        for box, score, name in zip(detections.boxes_px, detections.scores.tolist(), detections.names):
+        for box, score, name in zip(
+            detections.boxes_px, detections.scores.tolist(), detections.names
+        ):
             if name in judged:
-                rows.append(_annotation(len(rows) + 1, index, judged.index(name), box) | {"score": score})
+                rows.append(
+                    _annotation(len(rows) + 1, index, judged.index(name), box) | {"score": score}
+                )
     return rows
 
 
 def _annotation(row_id: int, picture: int, category: int, box: BoxesPx) -> dict[str, Any]:
     left, top, right, bottom = (float(edge) for edge in box)
     return {
-        "id": row_id, "image_id": picture, "category_id": category, "iscrowd": 0,
-        "bbox": [left, top, right - left, bottom - top], "area": (right - left) * (bottom - top),
+        "id": row_id,
+        "image_id": picture,
+        "category_id": category,
+        "iscrowd": 0,
+        "bbox": [left, top, right - left, bottom - top],
+        "area": (right - left) * (bottom - top),
     }
 
 
 def _image(index: int, picture: LabelledPicture) -> dict[str, Any]:
-    return {"id": index, "width": picture.width_px, "height": picture.height_px, "file_name": picture.path}
+    return {
+        "id": index,
+        "width": picture.width_px,
+        "height": picture.height_px,
+        "file_name": picture.path,
+    }
 
 
 def _indexed(dataset: dict[str, Any]) -> COCO:
@@ -366,23 +414,30 @@ def _indexed(dataset: dict[str, Any]) -> COCO:
 
 def _numbers(precision: Floats) -> CocoNumbers:
     """COCO's averages of (IoU, recall, class, area); -1 stands where there is no label."""
+
     def mean(part: Floats) -> float:
         known = part[part > -1]
         return float(known.mean()) if known.size else float("nan")
+
     every = precision[..., 0]
     sizes = (mean(precision[..., area]) for area in (1, 2, 3))
     return CocoNumbers(mean(every), mean(every[0]), mean(every[5]), *sizes)
 
 
 def _class_match(
-    name: str, rows: Sequence[dict[str, Any] | None], judge: COCOeval, truth_rows: Mapping[int, tuple[int, BoxesPx]]
+    name: str,
+    rows: Sequence[dict[str, Any] | None],
+    judge: COCOeval,
+    truth_rows: Mapping[int, tuple[int, BoxesPx]],
 ) -> ClassMatch:
     """The class's pictures of COCO's evaluation (all areas) as columns."""
     seen = [row for row in rows if row is not None]
     true_ids = _counted_labels(seen)
     scores = np.array(list(chain.from_iterable(row["dtScores"] for row in seen)), np.float64)
     ids = chain.from_iterable(row["dtIds"] for row in seen)
-    boxes = np.array([_edges(judge.cocoDt.anns[dt]["bbox"]) for dt in ids], np.float32).reshape(-1, 4)
+    boxes = np.array([_edges(judge.cocoDt.anns[dt]["bbox"]) for dt in ids], np.float32).reshape(
+        -1, 4
+    )
     pictures = np.array([row["image_id"] for row in seen for _ in row["dtIds"]], np.int64)
     matched, ignored = _by_iou(seen, "dtMatches"), _by_iou(seen, "dtIgnore") > 0
     right = (matched > 0) & ~ignored
@@ -391,15 +446,27 @@ def _class_match(
     true_scores[found[found >= 0]] = scores[found >= 0]
     order = np.argsort(-scores, kind="mergesort")
     return ClassMatch(
-        name, scores[order], pictures[order], boxes[order], right[:, order], ignored[:, order], found[order],
+        name,
+        scores[order],
+        pictures[order],
+        boxes[order],
+        right[:, order],
+        ignored[:, order],
+        found[order],
         np.array([truth_rows[gt][0] for gt in true_ids], np.int64),
-        np.array([truth_rows[gt][1] for gt in true_ids], np.float32).reshape(-1, 4), true_scores,
+        np.array([truth_rows[gt][1] for gt in true_ids], np.float32).reshape(-1, 4),
+        true_scores,
     )
 
 
 def _counted_labels(rows: Sequence[dict[str, Any]]) -> list[int]:
     """COCO's ids of the labels that are not to be ignored, one picture after another."""
-    return [gt for row in rows for gt, ignored in zip(row["gtIds"], np.asarray(row["gtIgnore"])) if not ignored]
+    return [
+        gt
+        for row in rows
+        for gt, ignored in zip(row["gtIds"], np.asarray(row["gtIgnore"]))
+        if not ignored
+    ]
 
 
 def _rows_of(ids: Floats, wanted: Sequence[int]) -> Rows:

@@ -51,13 +51,17 @@ def installed_models() -> list[InstalledModel]:
     """All models, the packaged ones first, then the user's by name; a packaged name is never replaced."""
     packaged = _models_in(Path(str(files("sorvolo.detection"))) / "data", is_packaged=True)
     names = {each.name for each in packaged}
-    return packaged + [each for each in _models_in(models_folder(), is_packaged=False) if each.name not in names]
+    return packaged + [
+        each for each in _models_in(models_folder(), is_packaged=False) if each.name not in names
+    ]
 
 
 def hidden_models() -> list[InstalledModel]:
     """The user's models that bear a packaged one's name, which hides them."""
     shown = {each.path for each in installed_models()}
-    return [each for each in _models_in(models_folder(), is_packaged=False) if each.path not in shown]
+    return [
+        each for each in _models_in(models_folder(), is_packaged=False) if each.path not in shown
+    ]
 
 
 def find_model(name_or_path: str | Path) -> Path:
@@ -66,7 +70,12 @@ def find_model(name_or_path: str | Path) -> Path:
     Raises InputError for a name that is not installed, with those that are.
     """
     path = Path(name_or_path).expanduser()
-    if isinstance(name_or_path, Path) or path.suffix.lower() == ".onnx" or os.sep in name_or_path or path.is_file():
+    if (
+        isinstance(name_or_path, Path)
+        or path.suffix.lower() == ".onnx"
+        or os.sep in name_or_path
+        or path.is_file()
+    ):
         return path
     return installed_model(name_or_path).path
 
@@ -118,7 +127,9 @@ def read_card(model: InstalledModel) -> dict[str, Any]:
     try:
         card = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"the model card {path} cannot be read ({error}); write it again or remove it") from error
+        raise InputError(
+            f"the model card {path} cannot be read ({error}); write it again or remove it"
+        ) from error
     if not isinstance(card, dict):
         raise InputError(f"the model card {path} holds no JSON object; write it again or remove it")
     return card
@@ -139,7 +150,10 @@ def file_sha256(path: Path) -> str:
 
 def _searching() -> str:
     """The names of the installed models that search pictures; those of files that cannot be used among them."""
-    return ", ".join(each.name for each in installed_models() if not _is_second_only(each.path)) or "none"
+    return (
+        ", ".join(each.name for each in installed_models() if not _is_second_only(each.path))
+        or "none"
+    )
 
 
 def _is_second_only(path: Path) -> bool:

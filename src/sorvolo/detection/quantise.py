@@ -21,10 +21,21 @@ from sorvolo.geometry.arrays import ImageRGB
 LEAST_PICTURES = 8
 """With fewer pictures the ranges of the numbers are a matter of chance."""
 
-_CARRIERS = frozenset({
-    "Conv", "Relu", "LeakyRelu", "Clip", "Add", "Concat", "MaxPool", "AveragePool", "Resize", "RoiAlign",
-    "ReduceMean",
-})
+_CARRIERS = frozenset(
+    {
+        "Conv",
+        "Relu",
+        "LeakyRelu",
+        "Clip",
+        "Add",
+        "Concat",
+        "MaxPool",
+        "AveragePool",
+        "Resize",
+        "RoiAlign",
+        "ReduceMean",
+    }
+)
 # carry features on, but one interpolates at places that eight bits cannot name, the other means away their rounding
 _FLOAT = frozenset({"RoiAlign", "ReduceMean"})
 _HALF = 10  # ONNX's number for float16, in which a model may store weights
@@ -43,7 +54,11 @@ class Quantised:
 
 
 def quantise(
-    path: Path, pictures: Iterable[ImageRGB], *, float_parts: Sequence[str] = (), weight_bits: Literal[7, 8] = 8
+    path: Path,
+    pictures: Iterable[ImageRGB],
+    *,
+    float_parts: Sequence[str] = (),
+    weight_bits: Literal[7, 8] = 8,
 ) -> Quantised:
     """The model file `path` with its convolutions in int8, by the same contract (its metadata names the precision).
 
@@ -76,9 +91,15 @@ def quantise(
     with tempfile.TemporaryDirectory() as folder, _quiet():
         out = Path(folder) / "int8.onnx"
         quantization.quantize_static(
-            model, out, samples, quant_format=quantization.QuantFormat.QDQ, per_channel=True,
-            activation_type=quantization.QuantType.QUInt8, weight_type=quantization.QuantType.QInt8,
-            reduce_range=weight_bits == 7, nodes_to_quantize=chosen,
+            model,
+            out,
+            samples,
+            quant_format=quantization.QuantFormat.QDQ,
+            per_channel=True,
+            activation_type=quantization.QuantType.QUInt8,
+            weight_type=quantization.QuantType.QInt8,
+            reduce_range=weight_bits == 7,
+            nodes_to_quantize=chosen,
             op_types_to_quantize=sorted(_CARRIERS - _FLOAT),
         )
         quantised = onnx.load_model(out)
@@ -92,17 +113,23 @@ def quantise(
     metadata[METADATA_KEY] = json.dumps(json.loads(metadata[METADATA_KEY]) | {"precision": "int8"})
     onnx.helper.set_model_props(quantised, metadata)
     convolutions = {node.name for node in model.graph.node if node.op_type == "Conv"}
-    return Quantised(quantised.SerializeToString(), len(convolutions & set(chosen)), len(convolutions))
+    return Quantised(
+        quantised.SerializeToString(), len(convolutions & set(chosen)), len(convolutions)
+    )
 
 
 def _chosen(graph: Any, path: Path, float_parts: Sequence[str]) -> list[str]:
     """The nodes to quantise. Raises SettingsError for a part that the graph lacks, InputError where none is left."""
     names = [node.name for node in graph.node]
     if unknown := [part for part in float_parts if not _has_part(names, part)]:
-        raise SettingsError(f"{path} has no part {', '.join(unknown)}; it has {', '.join(_parts_of(names))}")
+        raise SettingsError(
+            f"{path} has no part {', '.join(unknown)}; it has {', '.join(_parts_of(names))}"
+        )
     chosen = [name for name in _quantisable(graph) if not _lies_in_any(name, float_parts)]
     if not chosen:
-        raise InputError(f"{path} has no convolutions that lead to others: eight bits would gain nothing")
+        raise InputError(
+            f"{path} has no convolutions that lead to others: eight bits would gain nothing"
+        )
     return chosen
 
 
@@ -110,7 +137,8 @@ def _parts_of(nodes: Sequence[str]) -> list[str]:
     """The parts of a network, or of each network in a file that holds several, such as "aerial/neck"."""
     networks = sorted({node.split("/")[1] for node in nodes if node.count("/") > 1} - set(_PARTS))
     return [
-        part for part in (*_PARTS, *(f"{network}/{each}" for network in networks for each in _PARTS))
+        part
+        for part in (*_PARTS, *(f"{network}/{each}" for network in networks for each in _PARTS))
         if _has_part(nodes, part)
     ]
 
@@ -137,7 +165,9 @@ def pool_before_rounding(graph: Any) -> None:
     readers = Counter(name for node in graph.node for name in node.input)
     for pool in [node for node in graph.node if node.op_type == "MaxPool"]:
         match _rounding_of(pool.input[0], makers):
-            case back, rounding if _is_float(rounding.input[0], makers) and _are_read_once(readers, back, rounding):
+            case back, rounding if _is_float(rounding.input[0], makers) and _are_read_once(
+                readers, back, rounding
+            ):
                 pool.input[0] = rounding.input[0]
                 graph.node.remove(back)
                 graph.node.remove(rounding)
@@ -230,8 +260,11 @@ def _quantisable(graph: Any) -> list[str]:
     nodes = list(graph.node)
     carried, leads_on = _carried(nodes), _leading_on(nodes)
     return [
-        node.name for node in nodes
-        if node.op_type in _CARRIERS - _FLOAT and node.output[0] in carried and node.output[0] in leads_on
+        node.name
+        for node in nodes
+        if node.op_type in _CARRIERS - _FLOAT
+        and node.output[0] in carried
+        and node.output[0] in leads_on
     ]
 
 

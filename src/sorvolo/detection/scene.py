@@ -20,9 +20,14 @@ Look = Callable[[ImageRGB], Detections]
 class ProbeSettings:
     """When and how the middle of a frame is looked at enlarged."""
 
-    size_px: tuple[int, int] = (480, 640)  # of the middle, height and width: it costs as much as nine times its pixels
+    size_px: tuple[int, int] = (
+        480,
+        640,
+    )  # of the middle, height and width: it costs as much as nine times its pixels
     times: tuple[float, ...] = (1.0, 2.0, 3.0)  # as large as it is
-    first_again: int = 30  # frames until it is done again, then three times as many, and so on: drones climb
+    first_again: int = (
+        30  # frames until it is done again, then three times as many, and so on: drones climb
+    )
     growth: int = 3  # times as many frames until the next
 
 
@@ -32,7 +37,9 @@ class SceneMagnifier:
     Things that are too small in a frame as it is are found in its enlarged middle; their size is the scale.
     """
 
-    def __init__(self, info: ModelInfo, wanted: Sequence[str], settings: ProbeSettings = ProbeSettings()) -> None:
+    def __init__(
+        self, info: ModelInfo, wanted: Sequence[str], settings: ProbeSettings = ProbeSettings()
+    ) -> None:
         self._info, self._wanted, self._settings = info, tuple(wanted), settings
         self._scale = SceneScale()
         self._frames, self._next = 0, 0
@@ -53,15 +60,22 @@ class SceneMagnifier:
         self._scale.see(found, picture.shape[:2])
 
     def _probe(self, picture: ImageRGB, look: Look) -> None:
-        height, width = (min(side, most) for side, most in zip(picture.shape[:2], self._settings.size_px))
+        height, width = (
+            min(side, most) for side, most in zip(picture.shape[:2], self._settings.size_px)
+        )
         top, left = (picture.shape[0] - height) // 2, (picture.shape[1] - width) // 2
         middle = np.ascontiguousarray(picture[top : top + height, left : left + width])
         for times in self._settings.times:
             size = round(width * times), round(height * times)
-            shown = middle if times == 1 else cv2.resize(middle, size, interpolation=cv2.INTER_LINEAR)
+            shown = (
+                middle if times == 1 else cv2.resize(middle, size, interpolation=cv2.INTER_LINEAR)
+            )
             seen = look(np.asarray(shown, np.uint8))
-            boxes_px = seen.boxes_px / np.float32(times) + np.array([left, top, left, top], np.float32)
+            boxes_px = seen.boxes_px / np.float32(times) + np.array(
+                [left, top, left, top], np.float32
+            )
             self._scale.see(
-                Detections(boxes_px, seen.scores, seen.labels, seen.classes), picture.shape[:2],
+                Detections(boxes_px, seen.scores, seen.labels, seen.classes),
+                picture.shape[:2],
                 (left, top, left + width, top + height),
             )

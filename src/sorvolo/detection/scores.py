@@ -5,7 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sorvolo.detection.intervals import DRAWS, Difference, GroupTables, Interval, differences, group_tables, intervals
+from sorvolo.detection.intervals import (
+    DRAWS,
+    Difference,
+    GroupTables,
+    Interval,
+    differences,
+    group_tables,
+    intervals,
+)
 from sorvolo.detection.metrics import (
     SIZES_M,
     SIZES_PX,
@@ -110,8 +118,13 @@ class SetComparison:
 
 
 def score_set(
-    labelled: LabelledSet, found: Sequence[Detections], classes: Sequence[str], thresholds: Mapping[str, float], *,
-    draws: int = DRAWS, seed: int = 0,
+    labelled: LabelledSet,
+    found: Sequence[Detections],
+    classes: Sequence[str],
+    thresholds: Mapping[str, float],
+    *,
+    draws: int = DRAWS,
+    seed: int = 0,
 ) -> SetScores:
     """Measure one Detections a picture against the set's labels; each class is reported from `thresholds` on.
 
@@ -127,19 +140,33 @@ def score_set(
         precision = right / (right + wrong) if right + wrong else float("nan")
         recall = right / (right + missed) if right + missed else float("nan")
         f1 = 2 * right / (2 * right + wrong + missed) if right + wrong + missed else float("nan")
-        scores.append(ClassScores(
-            match.label, len(match.true_scores), by_class[match.label],
-            Threshold(thresholds[match.label], precision, recall, f1), thesis_ap(match, thresholds[match.label]),
-            best_threshold(match), _thinned(np.column_stack(precision_recall(match))),
-            tuple(right_by_score(match)),
-        ))
+        scores.append(
+            ClassScores(
+                match.label,
+                len(match.true_scores),
+                by_class[match.label],
+                Threshold(thresholds[match.label], precision, recall, f1),
+                thesis_ap(match, thresholds[match.label]),
+                best_threshold(match),
+                _thinned(np.column_stack(precision_recall(match))),
+                tuple(right_by_score(match)),
+            )
+        )
     m_per_px = np.array([picture.m_per_px for picture in labelled.pictures])
     return SetScores(
-        labelled.name, len(labelled), tables.groups, sum(len(each.ignored_px) for each in labelled.pictures),
-        tuple(name for name in classes if name not in judged), coco, thesis_map(matches, thresholds),
-        intervals(tables, draws=draws, seed=seed), tuple(scores), table,
+        labelled.name,
+        len(labelled),
+        tables.groups,
+        sum(len(each.ignored_px) for each in labelled.pictures),
+        tuple(name for name in classes if name not in judged),
+        coco,
+        thesis_map(matches, thresholds),
+        intervals(tables, draws=draws, seed=seed),
+        tuple(scores),
+        table,
         recall_by_size(matches, thresholds, np.ones(len(labelled)), SIZES_PX),
-        recall_by_size(matches, thresholds, m_per_px, SIZES_M), mistakes,
+        recall_by_size(matches, thresholds, m_per_px, SIZES_M),
+        mistakes,
         _remarks(scores, tables, len(labelled)),
     )
 
@@ -152,20 +179,27 @@ def compare_arms(
     Raises InputError when they share no class with the set, or two arms are of one name.
     """
     if len({arm.name for arm in arms}) < len(arms):
-        raise InputError(f"arms must have different names, got {', '.join(arm.name for arm in arms)}")
+        raise InputError(
+            f"arms must have different names, got {', '.join(arm.name for arm in arms)}"
+        )
     shared = [name for name in arms[0].classes if all(name in arm.classes for arm in arms)]
     judged = judged_classes(labelled, shared)
     groups = _groups(labelled)
     tables = [_arm_tables(labelled, arm, judged, groups) for arm in arms]
     first = tables[0][0]
     return SetComparison(
-        labelled.name, len(labelled), first.groups, first.label_counts,
+        labelled.name,
+        len(labelled),
+        first.groups,
+        first.label_counts,
         tuple(_arm_scores(arm.name, each) for arm, each in zip(arms, tables)),
         tuple(differences(tables[0], each, draws=draws, seed=seed) for each in tables[1:]),
     )
 
 
-def _arm_tables(labelled: LabelledSet, arm: Arm, judged: Sequence[str], groups: Rows) -> list[GroupTables]:
+def _arm_tables(
+    labelled: LabelledSet, arm: Arm, judged: Sequence[str], groups: Rows
+) -> list[GroupTables]:
     """The tables of each of an arm's seeds."""
     return [
         group_tables(match_pictures(labelled, found, judged)[0], groups, thresholds)
@@ -176,7 +210,10 @@ def _arm_tables(labelled: LabelledSet, arm: Arm, judged: Sequence[str], groups: 
 def _arm_scores(name: str, tables: Sequence[GroupTables]) -> ArmScores:
     measured = [each.measure(np.ones((1, each.groups))) for each in tables]
     values = {key: np.array([each[key][0] for each in measured]) for key in measured[0]}
-    summed = [{key: float(how(value)) for key, value in values.items()} for how in (np.mean, np.min, np.max)]
+    summed = [
+        {key: float(how(value)) for key, value in values.items()}
+        for how in (np.mean, np.min, np.max)
+    ]
     return ArmScores(name, len(tables), *summed)
 
 
@@ -195,11 +232,14 @@ def _thinned(rows: Floats) -> Floats:
 def _remarks(scores: Sequence[ClassScores], tables: GroupTables, pictures: int) -> tuple[str, ...]:
     remarks = [
         f"only {each.labels} labels of {each.label}: read its numbers with their intervals"
-        for each in scores if 0 < each.labels < 100
+        for each in scores
+        if 0 < each.labels < 100
     ]
     remarks += [f"no label of {each.label}: it is not scored" for each in scores if not each.labels]
     if tables.groups == 1 and pictures > 1:
         remarks.append("all pictures are of one video or flight: no interval can be given")
     elif tables.groups < 10:
-        remarks.append(f"only {tables.groups} videos or flights: the intervals themselves are rough")
+        remarks.append(
+            f"only {tables.groups} videos or flights: the intervals themselves are rough"
+        )
     return tuple(remarks)

@@ -27,13 +27,20 @@ Sees = Callable[[ImageRGB], Seen]
 class SheetSettings:
     """How cut-outs are laid side by side on one picture. Weights hold for the values that they were fitted with."""
 
-    cell_px: int = 128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
+    cell_px: int = (
+        128  # a cut-out's side: surroundings count, and a network's last level has 4 cells of it
+    )
     columns: int = 8  # cut-outs in a row of a sheet
     share: float = 0.25  # of the picture's pixels that a position has at most; in a crowd the others keep their score
-    cuts: tuple[int, int] = (8, 96)  # cut-outs of one picture in one position, best first: at least, and at most
+    cuts: tuple[int, int] = (
+        8,
+        96,
+    )  # cut-outs of one picture in one position, best first: at least, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
     surest: float = 0.98  # no first score counts for more, so that the second look can overrule it (decision 0075)
-    least_sure: float = 1e-3  # no score counts for less, nor for more than 1 less this: log-odds stay within 7
+    least_sure: float = (
+        1e-3  # no score counts for less, nor for more than 1 less this: log-odds stay within 7
+    )
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
     filling: int = 114  # beyond the picture's edge, as in training
 
@@ -49,7 +56,10 @@ class _Cut:
 
 
 def looked_again(
-    seen: Seen, picture: ImageRGB, sees: Sees, hows: Mapping[int, SecondLook],
+    seen: Seen,
+    picture: ImageRGB,
+    sees: Sees,
+    hows: Mapping[int, SecondLook],
     settings: SheetSettings = SheetSettings(),
 ) -> Seen:
     """What was `seen` in a picture (H, W, 3), with the scores that a second look leaves, best first.
@@ -57,7 +67,10 @@ def looked_again(
     `hows` names for labels how their reports are looked at again; others keep their score. Reports below `least` are
     not looked at and count as not seen again, so that they stay behind those that were not.
     """
-    scores, again_odds = seen.scores.copy(), np.full(len(seen.scores), log_odds(settings.unseen, settings.least_sure))
+    scores, again_odds = (
+        seen.scores.copy(),
+        np.full(len(seen.scores), log_odds(settings.unseen, settings.least_sure)),
+    )
     looked_at = opinions(seen, picture, sees, hows, settings)
     for row, again in looked_at.items():
         again_odds[row] = log_odds(again, settings.least_sure).mean()
@@ -72,7 +85,10 @@ def looked_again(
 
 
 def opinions(
-    seen: Seen, picture: ImageRGB, sees: Sees, hows: Mapping[int, SecondLook],
+    seen: Seen,
+    picture: ImageRGB,
+    sees: Sees,
+    hows: Mapping[int, SecondLook],
     settings: SheetSettings = SheetSettings(),
 ) -> dict[int, Floats]:
     """The scores (looks in all positions,) of each report, by its row, for those that are looked at again."""
@@ -86,7 +102,11 @@ def opinions(
         return {}
     found: dict[int, list[float]] = {}
     for position in range(max(how.positions for how in hows.values())):
-        shown = [_cut_in_position(each, position) for each in cuts if position < hows[each.label].positions]
+        shown = [
+            _cut_in_position(each, position)
+            for each in cuts
+            if position < hows[each.label].positions
+        ]
         for each, score in zip(shown, _scores(shown, sees, settings).tolist()):
             found.setdefault(each.row, []).append(score)
     return {row: np.array(scores) for row, scores in found.items()}
@@ -102,8 +122,12 @@ def in_position(cell: ImageRGB, position: int) -> ImageRGB:
 def _cut_in_position(cut: _Cut, position: int) -> _Cut:
     quarters, is_mirrored = POSITIONS[position]
     side = cut.picture.shape[0]
-    left, top, right, bottom = turned_back(cut.box_px[None].astype(np.float32), -quarters, (side, side))[0]
-    box_px = np.array([side - right, top, side - left, bottom] if is_mirrored else [left, top, right, bottom])
+    left, top, right, bottom = turned_back(
+        cut.box_px[None].astype(np.float32), -quarters, (side, side)
+    )[0]
+    box_px = np.array(
+        [side - right, top, side - left, bottom] if is_mirrored else [left, top, right, bottom]
+    )
     return _Cut(cut.row, cut.label, in_position(cut.picture, position), box_px)
 
 
@@ -122,7 +146,10 @@ def _cuts(
         how = hows.get(label)
         if how is not None and seen.scores[row] >= how.least:
             sides_px = how.sides_px(float(max(box_px[2:] - box_px[:2])))
-            yield [_Cut(row, label, *cut_out(picture, box_px, side_px, settings)) for side_px in sides_px]
+            yield [
+                _Cut(row, label, *cut_out(picture, box_px, side_px, settings))
+                for side_px in sides_px
+            ]
 
 
 def cut_out(
@@ -141,7 +168,9 @@ def cut_out(
     until = np.maximum(until, into + 1)
     shown = np.full((cell, cell, 3), settings.filling, np.uint8)
     width, height = (until - into).tolist()
-    shown[into[1] : until[1], into[0] : until[0]] = cv2.resize(part, (width, height), interpolation=way)
+    shown[into[1] : until[1], into[0] : until[0]] = cv2.resize(
+        part, (width, height), interpolation=way
+    )
     return shown, (box_px - np.tile(low, 2)) * cell / size
 
 

@@ -50,11 +50,18 @@ class Session:
         that is not installed.
         """
         if provider not in get_args(Provider):
-            raise SettingsError(f"no provider {provider!r}; there are {', '.join(get_args(Provider))}")
+            raise SettingsError(
+                f"no provider {provider!r}; there are {', '.join(get_args(Provider))}"
+            )
         if threads is not None and threads < 1:
             raise SettingsError(f"a model needs at least one thread, not {threads}")
         engine = shared_engine(shared, path) if shared else opened_engine(path, provider, threads)
-        self._run, self.provider, self.info, self.fixed_px = engine.run, engine.provider, engine.info, engine.fixed_px
+        self._run, self.provider, self.info, self.fixed_px = (
+            engine.run,
+            engine.provider,
+            engine.info,
+            engine.fixed_px,
+        )
         self._rest, self._path = engine.rest, path
         self._buffer: Planes = np.zeros((1, 3, 0, 0), np.uint8)
         self._lock = threading.Lock()
@@ -102,7 +109,13 @@ class Session:
         return self._buffer
 
     def _checked(
-        self, boxes: Numbers, scores: Numbers, labels: Numbers, back: Numbers, width: int, height: int
+        self,
+        boxes: Numbers,
+        scores: Numbers,
+        labels: Numbers,
+        back: Numbers,
+        width: int,
+        height: int,
     ) -> Seen:
         count = len(scores)
         if boxes.shape != (count, 4) or labels.shape != (count,):
@@ -144,9 +157,13 @@ def read_model(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
-        raise InputError(f"there is no model file {path}; `sorvolo models list` shows what is installed") from error
+        raise InputError(
+            f"there is no model file {path}; `sorvolo models list` shows what is installed"
+        ) from error
     except OSError as error:
-        raise InputError(f"the model file {path} cannot be read ({error.strerror}); check its permissions") from error
+        raise InputError(
+            f"the model file {path} cannot be read ({error.strerror}); check its permissions"
+        ) from error
 
 
 def opened_engine(path: Path, provider: Provider = "auto", threads: int | None = None) -> Engine:
@@ -164,7 +181,9 @@ def _is_packaged(path: Path) -> bool:
 
 def usable_cores() -> int:
     """How many cores this process may use: its affinity, and its container's quota where one is set."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
     except (OSError, ValueError):
@@ -179,4 +198,6 @@ def _resized(picture: ImageRGB, scale: float) -> ImageRGB:
     if size == (height, width):
         return picture
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(np.ascontiguousarray(picture), size[::-1], interpolation=way), np.uint8)
+    return np.asarray(
+        cv2.resize(np.ascontiguousarray(picture), size[::-1], interpolation=way), np.uint8
+    )

@@ -60,7 +60,9 @@ class _Asker:
             raise self._gone(error) from error
         self._stream = self._socket.makefile("rwb")
 
-    def asked(self, head: dict[str, Any], data: bytes | memoryview = b"") -> tuple[dict[str, Any], bytes]:
+    def asked(
+        self, head: dict[str, Any], data: bytes | memoryview = b""
+    ) -> tuple[dict[str, Any], bytes]:
         """The answer to a message."""
         try:
             write_message(self._stream, head, data)
@@ -73,9 +75,13 @@ class _Asker:
 
     def run(self, planes: Planes) -> tuple[Numbers, ...]:
         """Boxes, scores and labels of one picture."""
-        head, data = self.asked({"shape": list(planes.shape)}, np.ascontiguousarray(planes).data.cast("B"))
+        head, data = self.asked(
+            {"shape": list(planes.shape)}, np.ascontiguousarray(planes).data.cast("B")
+        )
         return outputs_from(head, data, OUTPUTS)
 
     def _gone(self, error: Exception) -> SharedDetectorGone:
         reason = str(error) or type(error).__name__
-        return SharedDetectorGone(f"the detector that this flight shares with others has ended ({reason})")
+        return SharedDetectorGone(
+            f"the detector that this flight shares with others has ended ({reason})"
+        )

@@ -13,9 +13,16 @@ from sorvolo.geometry.box_overlap import areas, cover_matrix, iou_matrix
 SAME_IOU = 0.4
 """Two tiles' boxes of a class are one object if they overlap this much in what both tiles show."""
 
-_COVERED = 0.7  # so much of a cut piece within a box that another tile saw whole: the piece adds nothing
-_TOUCH_SHARE, _TOUCH_PX = 0.2, 2.0  # a box that ends so near its tile's border may go on beyond; boxes are imprecise
-_MORE = 1.1  # times the piece's area: a box of its own size is no whole that it is part of; by choice
+_COVERED = (
+    0.7  # so much of a cut piece within a box that another tile saw whole: the piece adds nothing
+)
+_TOUCH_SHARE, _TOUCH_PX = (
+    0.2,
+    2.0,
+)  # a box that ends so near its tile's border may go on beyond; boxes are imprecise
+_MORE = (
+    1.1  # times the piece's area: a box of its own size is no whole that it is part of; by choice
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +57,11 @@ def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
     views = _views(tiles, size_px)
     objects = _gathered(views, tiles)
     boxes = np.zeros((len(objects), 4), np.float32)
-    scores, labels, is_piece = np.zeros(len(objects)), np.zeros(len(objects), np.int64), np.zeros(len(objects), bool)
+    scores, labels, is_piece = (
+        np.zeros(len(objects)),
+        np.zeros(len(objects), np.int64),
+        np.zeros(len(objects), bool),
+    )
     for row, members in enumerate(objects):
         whole = members[~views.cut[members]]
         if len(whole):
@@ -58,8 +69,14 @@ def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
         else:
             pieces = views.boxes_px[members]
             boxes[row] = [*pieces[:, :2].min(axis=0), *pieces[:, 2:].max(axis=0)]
-        scores[row], labels[row], is_piece[row] = views.scores[members].max(), views.labels[members[0]], not len(whole)
-    kept = _not_covered(boxes, is_piece, [set(views.tiles[members].tolist()) for members in objects])
+        scores[row], labels[row], is_piece[row] = (
+            views.scores[members].max(),
+            views.labels[members[0]],
+            not len(whole),
+        )
+    kept = _not_covered(
+        boxes, is_piece, [set(views.tiles[members].tolist()) for members in objects]
+    )
     order = kept[np.argsort(-scores[kept], kind="stable")]
     return Seen(boxes[order], scores[order], labels[order])
 
@@ -67,7 +84,13 @@ def merge_tiles(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> Seen:
 def _views(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> _Views:
     boxes = np.concatenate([np.zeros((0, 4), np.float32), *(tile.seen.boxes_px for tile in tiles)])
     places = np.concatenate(
-        [np.zeros((0, 4)), *(np.tile(np.array(tile.place_px, float), (len(tile.seen.scores), 1)) for tile in tiles)]
+        [
+            np.zeros((0, 4)),
+            *(
+                np.tile(np.array(tile.place_px, float), (len(tile.seen.scores), 1))
+                for tile in tiles
+            ),
+        ]
     )
     picture = np.array([0, 0, size_px[1], size_px[0]], float)
     room = np.abs(boxes - places)
@@ -87,7 +110,9 @@ def _views(tiles: Sequence[SeenTile], size_px: tuple[int, int]) -> _Views:
 def _gathered(views: _Views, tiles: Sequence[SeenTile]) -> list[Rows]:
     """Indices of the boxes that are one object, most alike first; no two from one tile."""
     pairs = [
-        pair for first, second in combinations(range(len(tiles)), 2) for pair in _alike(views, tiles, first, second)
+        pair
+        for first, second in combinations(range(len(tiles)), 2)
+        for pair in _alike(views, tiles, first, second)
     ]
     groups = [[each] for each in range(len(views.scores))]
     for _, one, other in sorted(pairs, key=lambda pair: -pair[0]):
@@ -104,17 +129,24 @@ def _alike(
 ) -> list[tuple[float, int, int]]:
     """Pairs of boxes, one of each tile, that look the same in the window which both tiles share; how much first."""
     a, b = tiles[first].place_px, tiles[second].place_px
-    window = np.array([max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])], np.float32)
+    window = np.array(
+        [max(a[0], b[0]), max(a[1], b[1]), min(a[2], b[2]), min(a[3], b[3])], np.float32
+    )
     if window[0] >= window[2] or window[1] >= window[3]:
         return []
     ones, others = np.flatnonzero(views.tiles == first), np.flatnonzero(views.tiles == second)
     whole = iou_matrix(views.boxes_px[ones], views.boxes_px[others])
-    through = iou_matrix(_within(views.boxes_px[ones], window), _within(views.boxes_px[others], window))
+    through = iou_matrix(
+        _within(views.boxes_px[ones], window), _within(views.boxes_px[others], window)
+    )
     has_cut = views.cut[ones][:, None] | views.cut[others][None]
     alike = np.where(has_cut, through, whole)
     alike[views.labels[ones][:, None] != views.labels[others][None]] = 0
     rows, columns = np.nonzero(alike >= SAME_IOU)
-    return [(float(alike[row, column]), int(ones[row]), int(others[column])) for row, column in zip(rows, columns)]
+    return [
+        (float(alike[row, column]), int(ones[row]), int(others[column]))
+        for row, column in zip(rows, columns)
+    ]
 
 
 def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> Rows:
@@ -123,7 +155,8 @@ def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> R
     cover = cover_matrix(boxes[pieces], boxes)
     area = areas(boxes)
     gone = [
-        piece for row, piece in enumerate(pieces.tolist())
+        piece
+        for row, piece in enumerate(pieces.tolist())
         if any(
             area[other] > _MORE * area[piece] and not tiles[piece] & tiles[other]
             for other in np.flatnonzero(cover[row] >= _COVERED).tolist()
@@ -134,5 +167,9 @@ def _not_covered(boxes: BoxesPx, is_piece: Mask, tiles: Sequence[set[int]]) -> R
 
 def _within(boxes: BoxesPx, window: Numbers) -> BoxesPx:
     return np.concatenate(
-        [np.clip(boxes[:, :2], window[:2], window[2:]), np.clip(boxes[:, 2:], window[:2], window[2:])], axis=1
+        [
+            np.clip(boxes[:, :2], window[:2], window[2:]),
+            np.clip(boxes[:, 2:], window[:2], window[2:]),
+        ],
+        axis=1,
     )

@@ -28,7 +28,9 @@ COARSEST_M = 1 / required_px_per_m(TASK, BOTTOM_CRITICAL_M)
 """The ground that a pixel may cover for a person from straight above to be recognised (eq. 3.9): 10 cm."""
 
 _THERMAL_PX = 2.0  # times as many pixels as by day must a person have: thermal optics blur, and clothes hide limbs
-_THERMAL_LARGER = 1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
+_THERMAL_LARGER = (
+    1.5  # where the ground's sampling distance is not known: thermal sensors have few pixels
+)
 _MUCH_LONGER = 1.4  # times what the model knows: from there on a class gets a look of its own, which costs half or less
 _LEAST_OVERLAP_PX, _SPARE = 64, 1.15
 _LEAST_SIDE_PX = 64  # of a tile: less is a typing error
@@ -42,7 +44,9 @@ class TilePlan:
     places_px: tuple[tuple[int, int, int, int], ...]
 
 
-def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: bool = False) -> float:
+def scale_for(
+    info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: bool = False
+) -> float:
     """How many times larger the model should see a picture whose pixel covers `m_per_px` of ground.
 
     A person from straight above must be as large as Johnson's criteria ask (`TASK`, the same numbers as `sorvolo
@@ -58,7 +62,9 @@ def scale_for(info: ModelInfo, m_per_px: float, wanted: Sequence[str], thermal: 
     length_m, width_m, height_m = TYPICAL_SIZE_M[name]
     critical_m = BOTTOM_CRITICAL_M if name == "person" else width_m
     most_px = info.best_px[name][1]
-    least = m_per_px * max(required_px_per_m(TASK, critical_m), needed_px_per_m(info, name, length_m))
+    least = m_per_px * max(
+        required_px_per_m(TASK, critical_m), needed_px_per_m(info, name, length_m)
+    )
     if thermal and name == "person":
         least *= _THERMAL_PX
     most = m_per_px * most_px / max(length_m, height_m)
@@ -87,8 +93,10 @@ def looks_for(
         return (tuple(wanted),)
     px_per_m = scale_for(info, m_per_px, wanted, thermal) / m_per_px
     large = tuple(
-        name for name in wanted
-        if name in TYPICAL_SIZE_M and TYPICAL_SIZE_M[name][0] * px_per_m > _MUCH_LONGER * info.best_px[name][1]
+        name
+        for name in wanted
+        if name in TYPICAL_SIZE_M
+        and TYPICAL_SIZE_M[name][0] * px_per_m > _MUCH_LONGER * info.best_px[name][1]
     )
     others = tuple(name for name in wanted if name not in large)
     return (others, large) if others and large else (tuple(wanted),)
@@ -99,7 +107,9 @@ def needed_px_per_m(info: ModelInfo, name: str, length_m: float) -> float:
     return info.best_px[name][0] / length_m
 
 
-def whole_m_per_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, size_px: tuple[int, int]) -> float:
+def whole_m_per_px(
+    info: ModelInfo, wanted: Sequence[str], m_per_px: float, size_px: tuple[int, int]
+) -> float:
     """The sampling distance by which "auto" magnifies a picture of (height, width) `size_px` no further than to one
     tile, `MOST_WHOLE_PX`: of many frames that show the same ground none needs to be searched at any price."""
     scale = scale_for(info, m_per_px, wanted)
@@ -108,8 +118,15 @@ def whole_m_per_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, size
 
 
 def plan_tiles(
-    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], *, tiles: Tiles = "auto",
-    m_per_px: float = math.nan, fixed_px: tuple[int, int] | None = None, thermal: bool = False, times: float = 1.0,
+    size_px: tuple[int, int],
+    info: ModelInfo,
+    wanted: Sequence[str],
+    *,
+    tiles: Tiles = "auto",
+    m_per_px: float = math.nan,
+    fixed_px: tuple[int, int] | None = None,
+    thermal: bool = False,
+    times: float = 1.0,
 ) -> TilePlan:
     """The tiles of a picture of (height, width) `size_px`.
 
@@ -131,18 +148,28 @@ def plan_tiles(
         scale = times * _auto_scale(height * width, info, wanted, m_per_px, thermal)
         return _auto_plan(size_px, info, wanted, m_per_px, scale, fixed_px)
     if type(tiles) is not int or tiles < _LEAST_SIDE_PX:
-        raise SettingsError(f"tiles must be 'auto' or at least {_LEAST_SIDE_PX} px a side, not {tiles!r}")
-    return TilePlan(1.0, _places(size_px, (tiles, tiles), _overlap_px(info, wanted, m_per_px, 1.0), info.stride))
+        raise SettingsError(
+            f"tiles must be 'auto' or at least {_LEAST_SIDE_PX} px a side, not {tiles!r}"
+        )
+    return TilePlan(
+        1.0, _places(size_px, (tiles, tiles), _overlap_px(info, wanted, m_per_px, 1.0), info.stride)
+    )
 
 
-def _auto_scale(area_px: int, info: ModelInfo, wanted: Sequence[str], m_per_px: float, thermal: bool) -> float:
+def _auto_scale(
+    area_px: int, info: ModelInfo, wanted: Sequence[str], m_per_px: float, thermal: bool
+) -> float:
     if not math.isnan(m_per_px):
         return scale_for(info, m_per_px, wanted, thermal)
     return _THERMAL_LARGER if thermal and area_px * _THERMAL_LARGER**2 <= MOST_WHOLE_PX else 1.0
 
 
 def _auto_plan(
-    size_px: tuple[int, int], info: ModelInfo, wanted: Sequence[str], m_per_px: float, scale: float,
+    size_px: tuple[int, int],
+    info: ModelInfo,
+    wanted: Sequence[str],
+    m_per_px: float,
+    scale: float,
     fixed_px: tuple[int, int] | None,
 ) -> TilePlan:
     """One tile where the picture at this scale is small enough for that, else tiles that are."""
@@ -153,7 +180,9 @@ def _auto_plan(
         return TilePlan(scale, _places(size_px, sides, overlap_px, step))
     if height * width * scale**2 <= MOST_WHOLE_PX:
         return TilePlan(scale, ((0, 0, width, height),))
-    return TilePlan(scale, _places(size_px, _cheapest_sides(size_px, overlap_px, step, scale), overlap_px, step))
+    return TilePlan(
+        scale, _places(size_px, _cheapest_sides(size_px, overlap_px, step, scale), overlap_px, step)
+    )
 
 
 def _cheapest_sides(
@@ -186,7 +215,8 @@ def _overlap_px(info: ModelInfo, wanted: Sequence[str], m_per_px: float, scale: 
     """How far tiles overlap, in the picture's pixels: so far that the longest wanted object is whole in one."""
     lengths = [
         _SPARE * math.hypot(*TYPICAL_SIZE_M[name][:2]) / m_per_px
-        for name in wanted if name in TYPICAL_SIZE_M and not math.isnan(m_per_px)
+        for name in wanted
+        if name in TYPICAL_SIZE_M and not math.isnan(m_per_px)
     ]
     if not lengths:
         lengths = [info.best_px[name][1] / scale for name in wanted]

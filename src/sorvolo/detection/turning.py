@@ -19,8 +19,12 @@ class LookSettings:
     """
 
     quarters: tuple[int, ...] = (0, 1)  # quarter turns, one for each look
-    least_down: float = 0.8  # of the optical axis: 37 degrees off straight down or less is from above
-    same_iou: float = 0.5  # boxes of one class that overlap more are one object, as COCO counts them
+    least_down: float = (
+        0.8  # of the optical axis: 37 degrees off straight down or less is from above
+    )
+    same_iou: float = (
+        0.5  # boxes of one class that overlap more are one object, as COCO counts them
+    )
     unseen: float = 0.02  # the score of what a look does not show: models report nothing below it
 
 
@@ -39,7 +43,8 @@ def turned_back(boxes_px: BoxesPx, quarters: int, size_px: tuple[int, int]) -> B
     height, width = size_px
     left, top, right, bottom = boxes_px.T
     columns = {
-        0: (left, top, right, bottom), 1: (width - bottom, left, width - top, right),
+        0: (left, top, right, bottom),
+        1: (width - bottom, left, width - top, right),
         2: (width - right, height - bottom, width - left, height - top),
         3: (top, height - right, bottom, height - left),
     }[quarters % 4]
@@ -64,10 +69,17 @@ def agreed(looks: Sequence[Seen], settings: LookSettings = LookSettings()) -> Se
             members = rows[group]
             best = np.full(len(looks), settings.unseen)
             np.maximum.at(best, of_look[members], scores[members])
-            kept.append((np.average(boxes[members], axis=0, weights=scores[members]), float(best.mean()), label))
+            kept.append(
+                (
+                    np.average(boxes[members], axis=0, weights=scores[members]),
+                    float(best.mean()),
+                    label,
+                )
+            )
     order = sorted(range(len(kept)), key=lambda k: -kept[k][1])
     return Seen(
-        np.array([kept[k][0] for k in order], np.float32).reshape(-1, 4), np.array([kept[k][1] for k in order]),
+        np.array([kept[k][0] for k in order], np.float32).reshape(-1, 4),
+        np.array([kept[k][1] for k in order]),
         np.array([kept[k][2] for k in order], np.int64),
     )
 

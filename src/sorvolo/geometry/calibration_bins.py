@@ -34,9 +34,16 @@ def calibration_bins(
         inside = (chances >= low) & ((chances < high) | ((high == edges[-1]) & (chances <= high)))
         if inside.any():
             bounds = wilson(int(found[inside].sum()), int(inside.sum()))
-            rows.append(CalibrationBin(
-                low, high, int(inside.sum()), float(chances[inside].mean()), float(found[inside].mean()), *bounds
-            ))
+            rows.append(
+                CalibrationBin(
+                    low,
+                    high,
+                    int(inside.sum()),
+                    float(chances[inside].mean()),
+                    float(found[inside].mean()),
+                    *bounds,
+                )
+            )
     return rows
 
 
@@ -46,5 +53,7 @@ def wilson(hits: int, total: int) -> tuple[float, float]:
         return 0.0, 1.0
     share, z2 = hits / total, _Z90**2
     middle = (share + z2 / (2 * total)) / (1 + z2 / total)
-    half = _Z90 / (1 + z2 / total) * float(np.sqrt(share * (1 - share) / total + z2 / (4 * total**2)))
+    half = (
+        _Z90 / (1 + z2 / total) * float(np.sqrt(share * (1 - share) / total + z2 / (4 * total**2)))
+    )
     return max(0.0, middle - half), min(1.0, middle + half)

@@ -28,23 +28,33 @@ class Camera:
     def __post_init__(self) -> None:
         distortion = frozen(np.zeros(5) if self.distortion is None else self.distortion)
         if distortion.shape != (5,):
-            raise GeometryError(f"distortion needs 5 coefficients k1 k2 p1 p2 k3, got {distortion.shape}")
+            raise GeometryError(
+                f"distortion needs 5 coefficients k1 k2 p1 p2 k3, got {distortion.shape}"
+            )
         numbers = np.array([self.fx_px, self.fy_px, self.cx_px, self.cy_px, *distortion])
         if not np.isfinite(numbers).all():
             raise GeometryError("a camera number is not finite")
         if self.width_px < 1 or self.height_px < 1:
-            raise GeometryError(f"image size must be positive, got {self.width_px}x{self.height_px}")
+            raise GeometryError(
+                f"image size must be positive, got {self.width_px}x{self.height_px}"
+            )
         if self.fx_px <= 0 or self.fy_px <= 0:
-            raise GeometryError(f"focal length must be positive, got fx={self.fx_px}, fy={self.fy_px}")
-        if not (-0.5 * self.width_px <= self.cx_px <= 1.5 * self.width_px
-                and -0.5 * self.height_px <= self.cy_px <= 1.5 * self.height_px):
+            raise GeometryError(
+                f"focal length must be positive, got fx={self.fx_px}, fy={self.fy_px}"
+            )
+        if not (
+            -0.5 * self.width_px <= self.cx_px <= 1.5 * self.width_px
+            and -0.5 * self.height_px <= self.cy_px <= 1.5 * self.height_px
+        ):
             raise GeometryError(
                 f"optical centre ({self.cx_px}, {self.cy_px}) lies far outside a {self.width_px}x{self.height_px} image"
             )
         object.__setattr__(self, "distortion", distortion)
 
     @classmethod
-    def from_angle_of_view(cls, width_px: int, height_px: int, horizontal_aov_deg: float) -> "Camera":
+    def from_angle_of_view(
+        cls, width_px: int, height_px: int, horizontal_aov_deg: float
+    ) -> "Camera":
         """A distortion-free camera with square pixels and this horizontal angle of view (inverse of eq. 3.5)."""
         if not 0 < horizontal_aov_deg < 180:
             raise GeometryError(f"angle of view must lie in (0, 180) deg, got {horizontal_aov_deg}")
@@ -87,8 +97,13 @@ class Camera:
         """The camera of the same images resampled to another size (pixel centres stay on pixel centres)."""
         sx, sy = width_px / self.width_px, height_px / self.height_px
         return Camera(
-            width_px, height_px, self.fx_px * sx, self.fy_px * sy,
-            (self.cx_px + 0.5) * sx - 0.5, (self.cy_px + 0.5) * sy - 0.5, self.distortion,
+            width_px,
+            height_px,
+            self.fx_px * sx,
+            self.fy_px * sy,
+            (self.cx_px + 0.5) * sx - 0.5,
+            (self.cy_px + 0.5) * sy - 0.5,
+            self.distortion,
         )
 
     def rays_from_pixels(self, points_px: PointsPx) -> PointsM:
@@ -118,17 +133,22 @@ class Camera:
         """Where distorted image points, shape (N, 2), lie in the image of `undistorted()`."""
         if not self.is_distorted:
             return np.asarray(points_px, dtype=np.float64)
-        return self.rays_from_pixels(points_px)[:, :2] * [self.fx_px, self.fy_px] + [self.cx_px, self.cy_px]
+        return self.rays_from_pixels(points_px)[:, :2] * [self.fx_px, self.fy_px] + [
+            self.cx_px,
+            self.cy_px,
+        ]
 
     def _distort(self, ideal: Floats) -> Floats:
         k1, k2, p1, p2, k3 = self.distortion
         x, y = ideal[:, 0], ideal[:, 1]
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        return np.column_stack([
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ])
+        return np.column_stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ]
+        )
 
     def _distort_with_jacobian(self, ideal: Floats) -> tuple[Floats, Floats]:
         k1, k2, p1, p2, k3 = self.distortion

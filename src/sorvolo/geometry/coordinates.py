@@ -23,7 +23,11 @@ class Coordinates(StrEnum):
     @property
     def heading(self) -> str:
         """What stands over a column of such places."""
-        return {Coordinates.LATLON: "latitude, longitude", Coordinates.UTM: "UTM", Coordinates.MGRS: "MGRS"}[self]
+        return {
+            Coordinates.LATLON: "latitude, longitude",
+            Coordinates.UTM: "UTM",
+            Coordinates.MGRS: "MGRS",
+        }[self]
 
 
 def lonlat_from_text(text: str) -> tuple[float, float]:
@@ -31,13 +35,19 @@ def lonlat_from_text(text: str) -> tuple[float, float]:
     try:
         latitude_deg, longitude_deg = (float(each) for each in text.split(","))
     except ValueError as error:
-        raise GeometryError(f"{text!r} is no place; give LAT,LON in degrees, such as 41.9,12.5") from error
+        raise GeometryError(
+            f"{text!r} is no place; give LAT,LON in degrees, such as 41.9,12.5"
+        ) from error
     if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 360):
-        raise GeometryError(f"{text!r} lies off the Earth; give latitude first, then longitude, in degrees")
+        raise GeometryError(
+            f"{text!r} lies off the Earth; give latitude first, then longitude, in degrees"
+        )
     return longitude_deg, latitude_deg
 
 
-def place_text(latitude_deg: float, longitude_deg: float, system: Coordinates = Coordinates.LATLON) -> str:
+def place_text(
+    latitude_deg: float, longitude_deg: float, system: Coordinates = Coordinates.LATLON
+) -> str:
     """A WGS84 place in words for people: "41.900000, 12.500000", "33T 292645 4641872" or "33T TG 92645 41872".
 
     Latitude and longitude have six decimals, UTM (zone, band, easting, northing) and MGRS whole metres; MGRS metres are

@@ -35,11 +35,14 @@ def ecef_from_wgs84(latitude_deg: Floats, longitude_deg: Floats, height_m: Float
     """(N, 3) Earth-centred metres of WGS84 places."""
     lat, lon = np.radians(latitude_deg), np.radians(longitude_deg)
     prime_vertical_m = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(lat) ** 2)
-    return np.stack([
-        (prime_vertical_m + height_m) * np.cos(lat) * np.cos(lon),
-        (prime_vertical_m + height_m) * np.cos(lat) * np.sin(lon),
-        (prime_vertical_m * (1 - _ECCENTRICITY2) + height_m) * np.sin(lat),
-    ], axis=-1)
+    return np.stack(
+        [
+            (prime_vertical_m + height_m) * np.cos(lat) * np.cos(lon),
+            (prime_vertical_m + height_m) * np.cos(lat) * np.sin(lon),
+            (prime_vertical_m * (1 - _ECCENTRICITY2) + height_m) * np.sin(lat),
+        ],
+        axis=-1,
+    )
 
 
 def wgs84_from_ecef(points_ecef_m: PointsM) -> tuple[Floats, Floats, Floats]:
@@ -50,7 +53,9 @@ def wgs84_from_ecef(points_ecef_m: PointsM) -> tuple[Floats, Floats, Floats]:
     latitude = np.arctan2(z, horizontal_m * (1 - _ECCENTRICITY2))
     for _ in range(6):  # converges to below a micrometre within four steps near the surface
         prime_vertical_m = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
-        latitude = np.arctan2(z + _ECCENTRICITY2 * prime_vertical_m * np.sin(latitude), horizontal_m)
+        latitude = np.arctan2(
+            z + _ECCENTRICITY2 * prime_vertical_m * np.sin(latitude), horizontal_m
+        )
     prime_vertical_m = _SEMI_MAJOR_M / np.sqrt(1 - _ECCENTRICITY2 * np.sin(latitude) ** 2)
     cos_lat, sin_lat = np.cos(latitude), np.sin(latitude)
     height_m = horizontal_m * cos_lat + z * sin_lat - _SEMI_MAJOR_M**2 / prime_vertical_m
@@ -66,20 +71,28 @@ class LocalFrame:
     @cached_property
     def _site_from_ecef(self) -> Floats:
         lat, lon = np.radians(self.origin.latitude_deg), np.radians(self.origin.longitude_deg)
-        return np.array([
-            [-np.sin(lon), np.cos(lon), 0.0],
-            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
-            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
-        ])
+        return np.array(
+            [
+                [-np.sin(lon), np.cos(lon), 0.0],
+                [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+                [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+            ]
+        )
 
     @cached_property
     def _origin_ecef_m(self) -> Floats:
         o = self.origin
-        return ecef_from_wgs84(np.array(o.latitude_deg), np.array(o.longitude_deg), np.array(o.height_m))
+        return ecef_from_wgs84(
+            np.array(o.latitude_deg), np.array(o.longitude_deg), np.array(o.height_m)
+        )
 
-    def site_from_wgs84(self, latitude_deg: Floats, longitude_deg: Floats, height_m: Floats) -> PointsM:
+    def site_from_wgs84(
+        self, latitude_deg: Floats, longitude_deg: Floats, height_m: Floats
+    ) -> PointsM:
         """(N, 3) east, north, up metres of WGS84 places given as (N,) arrays; works across the antimeridian."""
-        ecef = ecef_from_wgs84(np.asarray(latitude_deg), np.asarray(longitude_deg), np.asarray(height_m))
+        ecef = ecef_from_wgs84(
+            np.asarray(latitude_deg), np.asarray(longitude_deg), np.asarray(height_m)
+        )
         return (ecef - self._origin_ecef_m) @ self._site_from_ecef.T
 
     def ground_from_lonlat(self, lonlat_deg: Any) -> PointsM:
@@ -122,9 +135,13 @@ def check_map_crs(crs: str) -> None:
     try:
         parsed = CRS.from_user_input(crs)
     except CRSError as error:
-        raise SettingsError(f"unknown coordinate reference system {crs!r}; try one as EPSG:32633") from error
+        raise SettingsError(
+            f"unknown coordinate reference system {crs!r}; try one as EPSG:32633"
+        ) from error
     if not (parsed.is_projected or parsed.is_geographic):
-        raise SettingsError(f"{crs} ({parsed.name}) is no CRS of a map; choose a projected one as EPSG:32633")
+        raise SettingsError(
+            f"{crs} ({parsed.name}) is no CRS of a map; choose a projected one as EPSG:32633"
+        )
 
 
 @dataclass(frozen=True)
@@ -137,9 +154,13 @@ class Projection:
         try:
             parsed = CRS.from_user_input(self.crs)
         except CRSError as error:
-            raise SettingsError(f"unknown coordinate reference system {self.crs!r}: {error}") from error
+            raise SettingsError(
+                f"unknown coordinate reference system {self.crs!r}: {error}"
+            ) from error
         if not parsed.is_projected:
-            raise SettingsError(f"{self.crs} is not a projected CRS; a map needs one in metres, such as EPSG:32633")
+            raise SettingsError(
+                f"{self.crs} is not a projected CRS; a map needs one in metres, such as EPSG:32633"
+            )
 
     @property
     def _from_wgs84(self) -> Transformer:
@@ -147,7 +168,9 @@ class Projection:
 
     def projected_from_wgs84(self, latitude_deg: Floats, longitude_deg: Floats) -> PointsM:
         """(N, 2) easting, northing."""
-        return np.stack(self._from_wgs84.transform(np.asarray(longitude_deg), np.asarray(latitude_deg)), axis=-1)
+        return np.stack(
+            self._from_wgs84.transform(np.asarray(longitude_deg), np.asarray(latitude_deg)), axis=-1
+        )
 
     def wgs84_from_projected(self, points_m: PointsM) -> tuple[Floats, Floats]:
         """Latitude and longitude (deg), each (N,), of easting, northing, shape (N, 2)."""

@@ -30,7 +30,9 @@ class Grid:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.m_per_px) and self.m_per_px > 0):
-            raise GeometryError(f"the ground sampling distance must be positive, got {self.m_per_px}")
+            raise GeometryError(
+                f"the ground sampling distance must be positive, got {self.m_per_px}"
+            )
         if self.tile_px < 16:
             raise GeometryError(f"a tile needs at least 16 px, got {self.tile_px}")
 
@@ -41,7 +43,9 @@ class Grid:
 
     def projected_from_grid(self, points_px: PointsPx) -> PointsM:
         """(N, 2) easting, northing of grid pixels, shape (N, 2)."""
-        return np.asarray(points_px) * np.array([1.0, -1.0]) * self.m_per_px + np.array(self.origin_m)
+        return np.asarray(points_px) * np.array([1.0, -1.0]) * self.m_per_px + np.array(
+            self.origin_m
+        )
 
     def tile_window(self, tile: TileIndex) -> tuple[int, int, int, int]:
         """x0, y0, x1, y1 of a tile in grid pixels, ends exclusive."""

@@ -24,7 +24,9 @@ def apply_homography(a_from_b: NDArray[np.floating[Any]], points_b: Floats) -> F
     return result
 
 
-def site_from_image_homography(camera: Camera, site_from_camera: Pose, ground_height_m: float = 0.0) -> Matrix3:
+def site_from_image_homography(
+    camera: Camera, site_from_camera: Pose, ground_height_m: float = 0.0
+) -> Matrix3:
     """The homography from undistorted pixels to level ground (east, north in metres) at `ground_height_m`.
 
     Scaled so that the third coordinate is positive for pixels that see the ground in front of the camera.
@@ -33,10 +35,13 @@ def site_from_image_homography(camera: Camera, site_from_camera: Pose, ground_he
     height_m = site_from_camera.translation_m[2] - ground_height_m
     if height_m <= 0:
         raise GeometryError(f"the camera is {height_m:.2f} m above the ground; it must be above it")
-    image_from_site = np.column_stack([
-        site_from_camera.rotation.T[:, :2],
-        site_from_camera.rotation.T @ (np.array([0.0, 0.0, ground_height_m]) - site_from_camera.translation_m),
-    ])
+    image_from_site = np.column_stack(
+        [
+            site_from_camera.rotation.T[:, :2],
+            site_from_camera.rotation.T
+            @ (np.array([0.0, 0.0, ground_height_m]) - site_from_camera.translation_m),
+        ]
+    )
     inverse = np.asarray(np.linalg.inv(camera.matrix @ image_from_site), dtype=np.float64)
     # depth > 0 in front of the camera: the inverse's third row gives 1 / depth
     centre_depth = inverse[2] @ np.array([camera.cx_px, camera.cy_px, 1.0])
@@ -78,7 +83,9 @@ def pose_from_homography(site_from_image: Matrix3, camera: Camera) -> Pose | Non
     columns = columns / scale
     if columns[2, 2] < 0:
         columns = -columns
-    u, _, vt = np.linalg.svd(np.column_stack([columns[:, 0], columns[:, 1], np.cross(columns[:, 0], columns[:, 1])]))
+    u, _, vt = np.linalg.svd(
+        np.column_stack([columns[:, 0], columns[:, 1], np.cross(columns[:, 0], columns[:, 1])])
+    )
     camera_from_site = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
     centre_m = -camera_from_site.T @ columns[:, 2]
     if centre_m[2] <= 0 or camera_from_site[2, 2] > -0.1:

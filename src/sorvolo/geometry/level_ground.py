@@ -7,7 +7,9 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.pose import Pose
 
 
-def ground_from_rays(rays: PointsM, site_from_camera: Pose, ground_height_m: float = 0.0) -> PointsM:
+def ground_from_rays(
+    rays: PointsM, site_from_camera: Pose, ground_height_m: float = 0.0
+) -> PointsM:
     """Where camera rays, shape (N, 3), meet level ground, (N, 3) in the site frame.
 
     A ray at or above the horizon meets nothing and comes back as NaN.

@@ -54,7 +54,9 @@ def required_px_per_m(task: Task, critical_m: float) -> float:
 def focal_px_from_mm(focal_mm: float, pixel_um: float) -> float:
     """The focal length in pixels, f / k."""
     if not (np.isfinite(focal_mm) and focal_mm > 0 and np.isfinite(pixel_um) and pixel_um > 0):
-        raise SettingsError(f"focal length and pixel must be positive, got {focal_mm} mm and {pixel_um} um")
+        raise SettingsError(
+            f"focal length and pixel must be positive, got {focal_mm} mm and {pixel_um} um"
+        )
     return focal_mm / (pixel_um * 1e-3)
 
 
@@ -88,7 +90,9 @@ def scene_length_m(height_m: float, angle_of_view_deg: float) -> float:
 def minimum_frame_rate(speed_m_s: float, scene_m: float, overlap: float) -> float:
     """Frames a second that keep this overlap, in [0, 1), when a frame sees `scene_m` of track (eq. 3.17)."""
     if not 0 <= overlap < 1:
-        raise SettingsError(f"overlap must lie in [0, 1), got {overlap}; 1 would need endlessly many frames")
+        raise SettingsError(
+            f"overlap must lie in [0, 1), got {overlap}; 1 would need endlessly many frames"
+        )
     if not (np.isfinite(speed_m_s) and speed_m_s > 0):
         raise SettingsError(f"the speed must be positive, got {speed_m_s} m/s")
     return speed_m_s / (scene_m * (1 - overlap))
@@ -136,7 +140,9 @@ class FlightPlan:
     def __post_init__(self) -> None:
         passes_m = frozen(self.passes_m)
         if passes_m.ndim != 3 or passes_m.shape[1:] != (2, 2) or len(passes_m) == 0:
-            raise GeometryError(f"a plan needs (P, 2, 2) passes, at least one, got {passes_m.shape}")
+            raise GeometryError(
+                f"a plan needs (P, 2, 2) passes, at least one, got {passes_m.shape}"
+            )
         object.__setattr__(self, "passes_m", passes_m)
 
     @property
@@ -175,7 +181,10 @@ def plan_strips(
     wanted ground for more than two image lengths. Raises SettingsError when thousands of strips are needed.
     """
     width_m, length_m = footprint_size_m(camera, settings.height_m)
-    spacing_m, photo_m = width_m * (1 - settings.side_overlap), length_m * (1 - settings.forward_overlap)
+    spacing_m, photo_m = (
+        width_m * (1 - settings.side_overlap),
+        length_m * (1 - settings.forward_overlap),
+    )
     outlines_m = np.concatenate([rings[0] for rings in polygons_m])
     wished_deg = settings.strip_bearing_deg
     bearing_deg = wished_deg if np.isfinite(wished_deg) else longest_bearing_deg(outlines_m)
@@ -189,10 +198,16 @@ def plan_strips(
     spans = zip(*(band_spans(rings, bands) for rings in turned))
     passes: list[Floats] = []
     for index, (level, parts) in enumerate(zip(levels, spans)):
-        strip = _passes(level, list(chain.from_iterable(parts)), gap_m=2 * length_m, photo_m=photo_m)
+        strip = _passes(
+            level, list(chain.from_iterable(parts)), gap_m=2 * length_m, photo_m=photo_m
+        )
         passes += strip if index % 2 == 0 else [each[::-1] for each in reversed(strip)]
     return FlightPlan(
-        np.array(passes) @ strip_from_site, settings.height_m, settings.speed_m_s, photo_m, spacing_m,
+        np.array(passes) @ strip_from_site,
+        settings.height_m,
+        settings.speed_m_s,
+        photo_m,
+        spacing_m,
         float(bearing_deg % 360),
     )
 

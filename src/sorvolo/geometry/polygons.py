@@ -73,7 +73,9 @@ def band_spans(
     found = []
     for low, high in bands:
         # not clip_by_rect, which fails where a band's edge and a corner differ by rounding alone
-        parts = shapely.get_parts(shapely.intersection(polygon, shapely.box(left - 1.0, low, right + 1.0, high)))
+        parts = shapely.get_parts(
+            shapely.intersection(polygon, shapely.box(left - 1.0, low, right + 1.0, high))
+        )
         is_area = shapely.area(parts) > 0
         spans = [(float(x0), float(x1)) for x0, _, x1, _ in shapely.bounds(parts[is_area])]
         found.append(join_spans(spans, _ROUNDING_M))
@@ -143,7 +145,9 @@ def swollen(polygons: Sequence[Sequence[PointsM]], reach: float) -> list[list[Po
 
     Gaps narrower than `reach` all over are filled.
     """
-    widened = shapely.buffer(shapely.union_all([_polygon(rings) for rings in polygons]), reach, join_style="mitre")
+    widened = shapely.buffer(
+        shapely.union_all([_polygon(rings) for rings in polygons]), reach, join_style="mitre"
+    )
     simple = shapely.simplify(widened, reach / 2)
     # rings that touch themselves at a corner cross by rounding once they are laid on the Earth: opened there
     parted = shapely.buffer(simple, -_PARTED * reach, join_style="mitre")
@@ -155,7 +159,9 @@ def swollen(polygons: Sequence[Sequence[PointsM]], reach: float) -> list[list[Po
 
 
 def _polygon(rings: Sequence[PointsM]) -> Any:
-    return shapely.polygons(shapely.linearrings(rings[0]), [shapely.linearrings(ring) for ring in rings[1:]] or None)
+    return shapely.polygons(
+        shapely.linearrings(rings[0]), [shapely.linearrings(ring) for ring in rings[1:]] or None
+    )
 
 
 def _open(ring: Any) -> PointsM:
@@ -168,5 +174,6 @@ def union_of_boxes(boxes: Floats) -> list[list[PointsM]]:
     parts = shapely.get_parts(shapely.simplify(joined, 0.0))
     return [
         [np.asarray(ring.coords)[:-1] for ring in (part.exterior, *part.interiors)]
-        for part in parts if not part.is_empty
+        for part in parts
+        if not part.is_empty
     ]

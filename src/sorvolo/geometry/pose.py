@@ -26,8 +26,13 @@ class Pose:
     def __post_init__(self) -> None:
         rotation, translation_m = frozen(self.rotation), frozen(self.translation_m)
         if rotation.shape != (3, 3) or translation_m.shape != (3,):
-            raise GeometryError(f"a pose needs (3, 3) and (3,), got {rotation.shape} and {translation_m.shape}")
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+            raise GeometryError(
+                f"a pose needs (3, 3) and (3,), got {rotation.shape} and {translation_m.shape}"
+            )
+        if (
+            not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
+            or np.linalg.det(rotation) < 0
+        ):
             raise GeometryError("rotation is not orthonormal and right-handed")
         if not np.isfinite(translation_m).all():
             raise GeometryError(f"translation is not finite: {translation_m}")
@@ -54,7 +59,9 @@ def rotation_from_vector(rotation_vector_rad: Floats) -> Floats:
     axis = vector[..., None, :] / np.where(small, 1.0, angle)
     x, y, z = axis[..., 0, 0], axis[..., 0, 1], axis[..., 0, 2]
     zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*vector.shape[:-1], 3, 3)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(
+        *vector.shape[:-1], 3, 3
+    )
     turned = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
     return np.where(small, np.eye(3), turned)
 
@@ -79,12 +86,21 @@ def site_from_body_nadir_rotation(yaw_deg: float, pitch_deg: float, roll_deg: fl
 
     The angles are the body's: yaw clockwise from north, pitch nose up, roll right side down (z-y-x).
     """
-    return _ENU_FROM_NED @ _ned_from_angles(yaw_deg, pitch_deg, roll_deg) @ _NADIR_MOUNT @ _GIMBAL_FROM_CAMERA
+    return (
+        _ENU_FROM_NED
+        @ _ned_from_angles(yaw_deg, pitch_deg, roll_deg)
+        @ _NADIR_MOUNT
+        @ _GIMBAL_FROM_CAMERA
+    )
 
 
-def body_nadir_angles_from_rotation(site_from_camera_rotation: Matrix3) -> tuple[float, float, float]:
+def body_nadir_angles_from_rotation(
+    site_from_camera_rotation: Matrix3,
+) -> tuple[float, float, float]:
     """Yaw, pitch, roll in degrees, the inverse of `site_from_body_nadir_rotation`; towards the horizon roll is 0."""
-    ned_from_body = _ENU_FROM_NED.T @ site_from_camera_rotation @ (_NADIR_MOUNT @ _GIMBAL_FROM_CAMERA).T
+    ned_from_body = (
+        _ENU_FROM_NED.T @ site_from_camera_rotation @ (_NADIR_MOUNT @ _GIMBAL_FROM_CAMERA).T
+    )
     return _angles_from_ned(ned_from_body)
 
 
@@ -108,9 +124,13 @@ def _angles_from_ned(rotation: Matrix3) -> tuple[float, float, float]:
 def _ned_from_angles(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix3:
     yaw, pitch, roll = np.radians([yaw_deg, pitch_deg, roll_deg])
     rz = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
-    ry = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    ry = np.array(
+        [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+    )
     rx = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
     return rz @ ry @ rx
 
 
-_NADIR_MOUNT = _ned_from_angles(0.0, -90.0, 0.0)  # a gimbal's axes in those of the body that it hangs below
+_NADIR_MOUNT = _ned_from_angles(
+    0.0, -90.0, 0.0
+)  # a gimbal's axes in those of the body that it hangs below

@@ -25,19 +25,27 @@ def sun_direction(time_ns: int, latitude_deg: float, longitude_deg: float) -> Ve
     sidereal_deg = (280.46062 + 360.98564737 * days + longitude_deg) % 360
     hour_angle = math.radians(sidereal_deg) - ascension
     latitude = math.radians(latitude_deg)
-    return np.array([
-        -math.cos(declination) * math.sin(hour_angle),
-        math.sin(declination) * math.cos(latitude) - math.cos(declination) * math.sin(latitude) * math.cos(hour_angle),
-        math.sin(declination) * math.sin(latitude) + math.cos(declination) * math.cos(latitude) * math.cos(hour_angle),
-    ])
+    return np.array(
+        [
+            -math.cos(declination) * math.sin(hour_angle),
+            math.sin(declination) * math.cos(latitude)
+            - math.cos(declination) * math.sin(latitude) * math.cos(hour_angle),
+            math.sin(declination) * math.sin(latitude)
+            + math.cos(declination) * math.cos(latitude) * math.cos(hour_angle),
+        ]
+    )
 
 
 def direction_from_angles(azimuth_deg: float, elevation_deg: float) -> Vector3:
     """(3,) the unit vector, east, north and up, to an azimuth (clockwise from north) and an elevation."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
-    return np.array([
-        math.sin(azimuth) * math.cos(elevation), math.cos(azimuth) * math.cos(elevation), math.sin(elevation),
-    ])
+    return np.array(
+        [
+            math.sin(azimuth) * math.cos(elevation),
+            math.cos(azimuth) * math.cos(elevation),
+            math.sin(elevation),
+        ]
+    )
 
 
 def slide_of(sun: Vector3 | None) -> Floats | None:

@@ -10,7 +10,9 @@ from sorvolo.geometry.arrays import Floats, PointsM
 _WINDOW_S = 2.0  # shorter steps measure the receiver's noise instead of the speed
 _STEPS_ACROSS = 25  # the steps must be long against the receiver's noise
 _ALONG_DEG = 25.0  # from the strips' bearing: beyond is a turn; by choice
-_LEAST_CONCENTRATION = 0.3  # length of the mean direction, 0 to 1: less is no survey of strips; by choice
+_LEAST_CONCENTRATION = (
+    0.3  # length of the mean direction, 0 to 1: less is no survey of strips; by choice
+)
 
 
 @dataclass(frozen=True)
@@ -82,12 +84,18 @@ def find_strips(points_m: PointsM) -> Strips:
     bearing = 0.5 * np.angle(mean)
     cosines = steps @ np.array([np.sin(bearing), np.cos(bearing)]) / lengths
     ways = np.where(np.abs(cosines) >= np.cos(np.radians(_ALONG_DEG)), np.sign(cosines), 0.0)
-    runs = [list(group) for way, group in groupby(range(len(steps)), key=lambda index: ways[index]) if way]
+    runs = [
+        list(group)
+        for way, group in groupby(range(len(steps)), key=lambda index: ways[index])
+        if way
+    ]
     longest_m = max((lengths[run].sum() for run in runs), default=0.0)
-    passes = [points[run[0]: run[-1] + 2] for run in runs if lengths[run].sum() >= longest_m / 3]
+    passes = [points[run[0] : run[-1] + 2] for run in runs if lengths[run].sum() >= longest_m / 3]
     # the turns between passes have pulled the mean; the passes' own chords have not
     chords = np.array([each[-1] - each[0] for each in passes]).reshape(-1, 2)
-    bearing = 0.5 * np.angle(np.sum((chords[:, 1] + 1j * chords[:, 0]) ** 2)) if len(chords) else bearing
+    bearing = (
+        0.5 * np.angle(np.sum((chords[:, 1] + 1j * chords[:, 0]) ** 2)) if len(chords) else bearing
+    )
     across = np.array([np.cos(bearing), -np.sin(bearing)])
     gaps = np.diff(np.sort([float((each @ across).mean()) for each in passes]))
     # the same line flown twice is one strip

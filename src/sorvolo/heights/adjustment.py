@@ -27,7 +27,9 @@ class AdjustmentSettings:
     focal_sigma: float = 0.02  # relative, of the focal length that the map's flight settled on
     radial_sigma: tuple[float, float] = (0.02, 0.02)  # of third and fifth order
     centre_sigma: float = 0.01  # of the optical centre, in focal lengths
-    attitude_sigma_deg: float = 3.0  # of all the map's attitudes in common: they lean where the ground is not level
+    attitude_sigma_deg: float = (
+        3.0  # of all the map's attitudes in common: they lean where the ground is not level
+    )
     iterations: int = 25  # at most; by choice
     least_sigma_px: float = 0.1  # of a feature's place, however well all fit
 
@@ -67,7 +69,10 @@ class Scene:
         observations = observations & (count[self.point] >= 2)
         used, point = np.unique(self.point[observations], return_inverse=True)
         return replace(
-            self, points_m=self.points_m[used], view=self.view[observations], point=point,
+            self,
+            points_m=self.points_m[used],
+            view=self.view[observations],
+            point=point,
             seen=self.seen[observations],
         )
 
@@ -105,16 +110,22 @@ class _Normal:
 
 def triangulate(scene: Scene) -> PointsM:
     """(P, 3) the points nearest to the rays of their observations; NaN where rays are almost parallel."""
-    rays = np.concatenate([scene.corrected() / np.exp(scene.shared[0]), np.ones((len(scene.seen), 1))], axis=1)
+    rays = np.concatenate(
+        [scene.corrected() / np.exp(scene.shared[0]), np.ones((len(scene.seen), 1))], axis=1
+    )
     rays = np.einsum("mij,mj->mi", scene.rotations[scene.view], rays)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
     count = len(scene.points_m)
     left = _summed(across.reshape(-1, 9), scene.point, count).reshape(-1, 3, 3)
-    right = _summed(np.einsum("mij,mj->mi", across, scene.centres_m[scene.view]), scene.point, count)
+    right = _summed(
+        np.einsum("mij,mj->mi", across, scene.centres_m[scene.view]), scene.point, count
+    )
     # the least eigenvalue is the spread of the rays' directions: 1e-5 is about 0.3 degrees between two
     weak = np.linalg.eigvalsh(left)[:, 0] < 1e-5
-    points = np.asarray(np.linalg.solve(np.where(weak[:, None, None], np.eye(3), left), right[..., None])[..., 0])
+    points = np.asarray(
+        np.linalg.solve(np.where(weak[:, None, None], np.eye(3), left), right[..., None])[..., 0]
+    )
     points[weak] = np.nan
     return points
 
@@ -160,7 +171,11 @@ def matched_deviations(scene: Scene, priors: Priors, settings: AdjustmentSetting
 
     The cameras count as known: what they err, all heights near a point err alike.
     """
-    return np.asarray(np.sqrt(np.linalg.inv(_linearise(scene, priors, settings).points + 1e-9 * np.eye(3))[:, 2, 2]))
+    return np.asarray(
+        np.sqrt(
+            np.linalg.inv(_linearise(scene, priors, settings).points + 1e-9 * np.eye(3))[:, 2, 2]
+        )
+    )
 
 
 def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _Normal:
@@ -172,7 +187,8 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
     cost = settings.robust_sigmas**2 * float(np.log1p(np.where(usable, squared, 1e6)).sum())
     residual = np.where(usable[:, None], residual, 0.0) * root[:, None]
     by_camera, by_shared, by_point = (
-        np.where(usable[:, None, None], each, 0.0) * root[:, None, None] for each in (by_camera, by_shared, by_point)
+        np.where(usable[:, None, None], each, 0.0) * root[:, None, None]
+        for each in (by_camera, by_shared, by_point)
     )
     views, points = len(scene.centres_m), len(scene.points_m)
     size = 6 * views + _SHARED
@@ -183,18 +199,26 @@ def _linearise(scene: Scene, priors: Priors, settings: AdjustmentSettings) -> _N
         at = slice(6 * number, 6 * number + 6)
         system[at, at], system[at, -_SHARED:] = own[number], mixed[number]
         system[-_SHARED:, at] = mixed[number].T
-    system[-_SHARED:, -_SHARED:] = _products(by_shared, by_shared).sum(axis=0).reshape(_SHARED, _SHARED)
+    system[-_SHARED:, -_SHARED:] = (
+        _products(by_shared, by_shared).sum(axis=0).reshape(_SHARED, _SHARED)
+    )
     gradient[:-_SHARED] = -_summed(_pulls(by_camera, residual), scene.view, views).ravel()
     gradient[-_SHARED:] = -_pulls(by_shared, residual).sum(axis=0)
     cost += _add_priors(scene, priors, settings, system, gradient)
-    lens_sigma = np.array([settings.focal_sigma, *settings.radial_sigma, *2 * (settings.centre_sigma,)])
+    lens_sigma = np.array(
+        [settings.focal_sigma, *settings.radial_sigma, *2 * (settings.centre_sigma,)]
+    )
     system[-_SHARED:, -_SHARED:] += np.diag(1 / lens_sigma**2)
     gradient[-_SHARED:] -= scene.shared / lens_sigma**2
     cost += float(((scene.shared / lens_sigma) ** 2).sum())
     blocks = _summed(_products(by_point, by_point), scene.point, points).reshape(-1, 3, 3)
     point_gradient = -_summed(_pulls(by_point, residual), scene.point, points)
-    shared_coupling = _summed(_products(by_shared, by_point), scene.point, points).reshape(-1, _SHARED, 3)
-    coupling = _coupling(_products(by_camera, by_point).reshape(-1, 6, 3), shared_coupling, scene, size)
+    shared_coupling = _summed(_products(by_shared, by_point), scene.point, points).reshape(
+        -1, _SHARED, 3
+    )
+    coupling = _coupling(
+        _products(by_camera, by_point).reshape(-1, 6, 3), shared_coupling, scene, size
+    )
     return _Normal(cost, system, gradient, coupling, blocks, point_gradient)
 
 
@@ -209,11 +233,16 @@ def _derivatives(scene: Scene) -> tuple[Floats, Floats, Floats, Floats]:
     scale, square = np.exp(scene.shared[0]), (scene.seen**2).sum(axis=1, keepdims=True)
     residual = focal * (scale * image - scene.corrected())
     across = turn.transpose(0, 2, 1)
-    by_point = (focal * scale / depth)[..., None] * (across[:, :2] - image[..., None] * across[:, 2:])
+    by_point = (focal * scale / depth)[..., None] * (
+        across[:, :2] - image[..., None] * across[:, 2:]
+    )
     by_turn = np.cross(by_point, offset[:, None, :])
     by_camera = np.concatenate([by_turn, -by_point], axis=2)
     shift = np.broadcast_to(-focal[..., None] * np.eye(2), (len(image), 2, 2))
-    lens = np.stack([focal * scale * image, -focal * scene.seen * square, -focal * scene.seen * square**2], axis=2)
+    lens = np.stack(
+        [focal * scale * image, -focal * scene.seen * square, -focal * scene.seen * square**2],
+        axis=2,
+    )
     by_shared = np.concatenate([lens, shift], axis=2)
     return residual, by_camera, by_shared, by_point
 
@@ -232,8 +261,17 @@ def _add_priors(
     system[place, place] += information
     gradient[place] -= information * miss
     turned = scene.rotations @ priors.rotations.transpose(0, 2, 1)
-    axis = np.stack([turned[:, 2, 1] - turned[:, 1, 2], turned[:, 0, 2] - turned[:, 2, 0],
-                     turned[:, 1, 0] - turned[:, 0, 1]], axis=1) / 2
+    axis = (
+        np.stack(
+            [
+                turned[:, 2, 1] - turned[:, 1, 2],
+                turned[:, 0, 2] - turned[:, 2, 0],
+                turned[:, 1, 0] - turned[:, 0, 1],
+            ],
+            axis=1,
+        )
+        / 2
+    )
     weight = 1 / np.radians(settings.attitude_sigma_deg) ** 2
     system[rows[:, :3], rows[:, :3]] += weight
     gradient[rows[:, :3]] -= weight * axis
@@ -242,13 +280,19 @@ def _add_priors(
 
 def _coupling(by_camera: Floats, by_shared: Floats, scene: Scene, size: int) -> csr_matrix:
     """(6 N + 5, 3 P) how cameras, (M, 6, 3), and shared unknowns, (P, 5, 3), depend on points."""
-    rows = [(6 * scene.view[:, None] + _SIX)[:, :, None], np.full((len(by_shared), 1, 1), size - _SHARED)
-            + np.arange(_SHARED)[:, None]]
-    columns = [3 * scene.point[:, None, None] + np.arange(3), 3 * np.arange(len(by_shared))[:, None, None]
-               + np.arange(3)]
+    rows = [
+        (6 * scene.view[:, None] + _SIX)[:, :, None],
+        np.full((len(by_shared), 1, 1), size - _SHARED) + np.arange(_SHARED)[:, None],
+    ]
+    columns = [
+        3 * scene.point[:, None, None] + np.arange(3),
+        3 * np.arange(len(by_shared))[:, None, None] + np.arange(3),
+    ]
     values = [by_camera, by_shared]
     flat_rows = np.concatenate([np.broadcast_to(r, v.shape).ravel() for r, v in zip(rows, values)])
-    flat_columns = np.concatenate([np.broadcast_to(c, v.shape).ravel() for c, v in zip(columns, values)])
+    flat_columns = np.concatenate(
+        [np.broadcast_to(c, v.shape).ravel() for c, v in zip(columns, values)]
+    )
     flat = np.concatenate([v.ravel() for v in values])
     return csr_matrix((flat, (flat_rows, flat_columns)), shape=(size, 3 * len(by_shared)))
 
@@ -265,7 +309,9 @@ def _step(normal: _Normal, damping: float) -> tuple[Floats, Floats]:
         cameras = cho_solve(cho_factor(system), gradient)
     except LinAlgError:
         cameras = np.linalg.lstsq(system, gradient, rcond=None)[0]
-    points = np.einsum("pij,pj->pi", inverse, normal.point_gradient - (normal.coupling.T @ cameras).reshape(-1, 3))
+    points = np.einsum(
+        "pij,pj->pi", inverse, normal.point_gradient - (normal.coupling.T @ cameras).reshape(-1, 3)
+    )
     return cameras, points
 
 
@@ -274,7 +320,8 @@ def _eliminated(normal: _Normal, inverse: Floats) -> tuple[csr_matrix, csr_matri
     count = len(inverse)
     at = np.arange(3 * count).reshape(-1, 3)
     spread = csr_matrix(
-        (inverse.ravel(), (np.repeat(at, 3, axis=1).ravel(), np.tile(at, (1, 3)).ravel())), shape=(3 * count, 3 * count)
+        (inverse.ravel(), (np.repeat(at, 3, axis=1).ravel(), np.tile(at, (1, 3)).ravel())),
+        shape=(3 * count, 3 * count),
     )
     through = normal.coupling @ spread
     return through @ normal.coupling.T, through
@@ -284,7 +331,10 @@ def _advance(scene: Scene, cameras: Floats, points: Floats) -> Scene:
     steps = cameras[:-_SHARED].reshape(-1, 6)
     u, _, vt = np.linalg.svd(rotation_from_vector(steps[:, :3]) @ scene.rotations)
     return replace(
-        scene, rotations=u @ vt, centres_m=scene.centres_m + steps[:, 3:], points_m=scene.points_m + points,
+        scene,
+        rotations=u @ vt,
+        centres_m=scene.centres_m + steps[:, 3:],
+        points_m=scene.points_m + points,
         shared=scene.shared + cameras[-_SHARED:],
     )
 

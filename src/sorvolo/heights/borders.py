@@ -22,7 +22,10 @@ from sorvolo.heights.views import View, inside, laid_pixels
 
 _CAPACITY = 1000  # of the cut, which counts in whole numbers, for a likeness of 1
 _WAYS = tuple(  # to the eight neighbours, down and right, and what a tie to each weighs
-    (down, right, 1.0 if 0 in (down, right) else 0.7) for down in (-1, 0, 1) for right in (-1, 0, 1) if down or right
+    (down, right, 1.0 if 0 in (down, right) else 0.7)
+    for down in (-1, 0, 1)
+    for right in (-1, 0, 1)
+    if down or right
 )
 
 
@@ -31,19 +34,28 @@ class BorderSettings:
     """How the border of what stands is found."""
 
     step_cells: float = 8.0  # a height so far above one nearby, in cells, stands on the ground
-    reach_cells: int = 9  # nearby: more than half of a patch of 15 cells, and the blur of its contrast
+    reach_cells: int = (
+        9  # nearby: more than half of a patch of 15 cells, and the blur of its contrast
+    )
     window_cells: int = 3  # side of the patches that decide
     views: int = 6  # compared at a place
     pair_share: float = 0.2  # of their pairs, the most alike: the others may be hidden from it
     evidence: float = 2.0  # what a likeness weighs against a border of one cell
     stays: float = 0.05  # likeness in favour of the height that was found
-    edge_levels: float = 8.0  # gray levels between neighbours, at which a border costs 0.6 of its price
+    edge_levels: float = (
+        8.0  # gray levels between neighbours, at which a border costs 0.6 of its price
+    )
     apron_cells: int = 24  # beyond a tile, so that neighbouring tiles agree
 
 
 def beyond_borders(
-    lattice: Lattice, up_m: Floats32, views: Sequence[View], pictures: Callable[[int], ImageGray], tile_cells: int,
-    sweep: SweepSettings, settings: BorderSettings = BorderSettings(),
+    lattice: Lattice,
+    up_m: Floats32,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    tile_cells: int,
+    sweep: SweepSettings,
+    settings: BorderSettings = BorderSettings(),
 ) -> Floats32:
     """(H, W) the ground's height at the cells that patches gave to what stands beside them; NaN at all others.
 
@@ -60,7 +72,9 @@ def beyond_borders(
         standing = _standing(part, lattice.cell_m, settings)
         if standing is None:
             continue
-        moved = ~_kept(lattice.window(left, top, right, below), standing, views, pictures, small, settings)
+        moved = ~_kept(
+            lattice.window(left, top, right, below), standing, views, pictures, small, settings
+        )
         inner = slice(y0 - top, y1 - top), slice(x0 - left, x1 - left)
         found[y0:y1, x0:x1][moved[inner]] = standing.ground_m[inner][moved[inner]]
     return found
@@ -86,7 +100,9 @@ def _standing(up_m: Floats32, cell_m: float, settings: BorderSettings) -> _Stand
     nearby = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))
     calm = cv2.medianBlur(whole, 5)
     near = known & (whole - cv2.erode(calm, nearby) > step_m)
-    below = ~near & (cv2.dilate(calm, nearby) - whole > step_m)  # the ground beside it, and not the middle of a roof
+    below = ~near & (
+        cv2.dilate(calm, nearby) - whole > step_m
+    )  # the ground beside it, and not the middle of a roof
     if not near.any() or not below.any():
         return None
     _, labels = cv2.distanceTransformWithLabels(
@@ -98,15 +114,20 @@ def _standing(up_m: Floats32, cell_m: float, settings: BorderSettings) -> _Stand
 
 
 def _kept(
-    lattice: Lattice, standing: _Standing, views: Sequence[View], pictures: Callable[[int], ImageGray],
-    sweep: SweepSettings, settings: BorderSettings,
+    lattice: Lattice,
+    standing: _Standing,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    sweep: SweepSettings,
+    settings: BorderSettings,
 ) -> Mask:
     """(H, W) which cells keep their height."""
     own_m = standing.up_m
     ground_m = np.where(standing.near, standing.ground_m, own_m)
     chosen = choose_views(lattice, views, float(np.median(own_m)), settings.views)
     own, ground = (
-        _alike(lattice, views, pictures, up_m, chosen, sweep, settings) for up_m in (own_m, ground_m)
+        _alike(lattice, views, pictures, up_m, chosen, sweep, settings)
+        for up_m in (own_m, ground_m)
     )
     if own is None or ground is None:
         return np.ones(own_m.shape, bool)
@@ -116,19 +137,29 @@ def _kept(
 
 
 def _alike(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], up_m: Floats32,
-    chosen: Sequence[int], sweep: SweepSettings, settings: BorderSettings,
+    lattice: Lattice,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    up_m: Floats32,
+    chosen: Sequence[int],
+    sweep: SweepSettings,
+    settings: BorderSettings,
 ) -> Floats32 | None:
     """(H, W) how alike photos are on heights, the mean over their most alike pairs; None without any pair."""
     alike = [each for _, _, each in likeness_on(lattice, views, pictures, up_m, chosen, sweep)]
     if not alike:
         return None
     wanted = int(np.ceil(settings.pair_share * len(alike)))
-    return np.asarray(np.partition(np.stack(alike), -wanted, axis=0)[-wanted:].mean(axis=0), np.float32)
+    return np.asarray(
+        np.partition(np.stack(alike), -wanted, axis=0)[-wanted:].mean(axis=0), np.float32
+    )
 
 
 def _mean_picture(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], up_m: Floats32,
+    lattice: Lattice,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    up_m: Floats32,
     chosen: Sequence[int],
 ) -> Floats32:
     """(H, W) the mean of the photos laid on heights: sharp where those are right, blurred elsewhere."""
@@ -152,13 +183,17 @@ class _Ties:
 
     def add(self, begin: Rows | int, end: Rows | int, price: Floats) -> None:
         """Ties from `begin` to `end`, (N,) or one for all, and what it costs to cut each, (N,)."""
-        self._parts.append((np.broadcast_to(begin, price.shape), np.broadcast_to(end, price.shape), price))
+        self._parts.append(
+            (np.broadcast_to(begin, price.shape), np.broadcast_to(end, price.shape), price)
+        )
 
     def kept(self) -> Rows:
         """The nodes that stay with `keep` when the ties between it and `give` are cut as cheaply as can be."""
         begin, end, price = (np.concatenate(each) for each in zip(*self._parts, strict=True))
         capacity = np.rint(_CAPACITY * price).astype(np.int32)
-        ties = csr_matrix(coo_matrix((capacity, (begin, end)), shape=(self.give + 1, self.give + 1)))
+        ties = csr_matrix(
+            coo_matrix((capacity, (begin, end)), shape=(self.give + 1, self.give + 1))
+        )
         rest = ties - maximum_flow(ties, self.keep, self.give).flow
         rest.data = np.maximum(rest.data, 0)
         rest.eliminate_zeros()

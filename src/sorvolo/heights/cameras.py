@@ -30,7 +30,10 @@ class CameraSettings:
 
     tracks: TrackSettings = field(default_factory=TrackSettings)
     adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
-    rejected_px: tuple[float, ...] = (8.0, 3.0)  # observations farther off are dropped, round by round
+    rejected_px: tuple[float, ...] = (
+        8.0,
+        3.0,
+    )  # observations farther off are dropped, round by round
     least_sigma_m: float = 0.02  # of a fix
 
 
@@ -59,7 +62,9 @@ class Cameras3D:
 
 
 def solve_cameras(
-    views: Sequence[View], gray: Callable[[int], ImageGray], settings: CameraSettings = CameraSettings()
+    views: Sequence[View],
+    gray: Callable[[int], ImageGray],
+    settings: CameraSettings = CameraSettings(),
 ) -> Cameras3D:
     """The cameras of a flight in 3D. Raises InputError where photos share too little for it."""
     tracks = find_tracks(views, gray, settings.tracks)
@@ -71,7 +76,9 @@ def solve_cameras(
         )
     # the attitudes lean alike on a slope: N of them know no more of its tilt than one
     alike_deg = settings.adjustment.attitude_sigma_deg * float(np.sqrt(len(views)))
-    settings = replace(settings, adjustment=replace(settings.adjustment, attitude_sigma_deg=alike_deg))
+    settings = replace(
+        settings, adjustment=replace(settings.adjustment, attitude_sigma_deg=alike_deg)
+    )
     priors = _priors(views, settings)
     scene = _first(views, tracks)
     for limit_px in (*settings.rejected_px, None):
@@ -87,7 +94,11 @@ def _first(views: Sequence[View], tracks: Tracks) -> Scene:
         np.array([each.site_from_camera.rotation for each in views]),
         np.array([each.site_from_camera.translation_m for each in views]),
         np.array([each.camera.fx_px for each in views]),
-        np.full((tracks.count, 3), np.nan), tracks.view, tracks.point, tracks.seen, np.zeros(5),
+        np.full((tracks.count, 3), np.nan),
+        tracks.view,
+        tracks.point,
+        tracks.seen,
+        np.zeros(5),
     )
     scene = replace(scene, points_m=triangulate(scene))
     known = np.asarray(np.isfinite(scene.points_m).all(axis=1))
@@ -144,9 +155,13 @@ def _solved(
 ) -> Cameras3D:
     scale = float(np.exp(scene.shared[0]))
     moved = tuple(
-        replace(view, camera=_found(view.camera, scale, scene.shared[3:]),
-                site_from_camera=Pose(scene.rotations[k], scene.centres_m[k]))
-        for k, view in enumerate(views) if held[k]
+        replace(
+            view,
+            camera=_found(view.camera, scale, scene.shared[3:]),
+            site_from_camera=Pose(scene.rotations[k], scene.centres_m[k]),
+        )
+        for k, view in enumerate(views)
+        if held[k]
     )
     residual = scene.residuals_px()
     with np.errstate(invalid="ignore"):
@@ -154,10 +169,16 @@ def _solved(
     weighed = _as_it_fits(residual, settings.adjustment)
     sigma = SmoothSigma.fitted(scene.points_m[:, :2], height_deviations(scene, priors, weighed))
     return Cameras3D(
-        moved, tuple(view.name for k, view in enumerate(views) if not held[k]), scene.points_m,
-        float(np.sqrt(np.nanmean((residual**2).sum(axis=1)))), scale,
+        moved,
+        tuple(view.name for k, view in enumerate(views) if not held[k]),
+        scene.points_m,
+        float(np.sqrt(np.nanmean((residual**2).sum(axis=1)))),
+        scale,
         (float(scene.shared[1]), float(scene.shared[2])),
-        np.sqrt(np.nanmean(off**2, axis=0)), len(scene.view), sigma, matched_deviations(scene, priors, weighed),
+        np.sqrt(np.nanmean(off**2, axis=0)),
+        len(scene.view),
+        sigma,
+        matched_deviations(scene, priors, weighed),
         np.bincount(scene.point, minlength=len(scene.points_m)),
     )
 
@@ -165,7 +186,8 @@ def _solved(
 def _found(camera: Camera, scale: float, shift: Floats) -> Camera:
     """The camera with the focal length and the optical centre found, for pictures without the left-over distortion."""
     return replace(
-        camera.with_focal_px(camera.fx_px * scale), cx_px=float(camera.cx_px - camera.fx_px * shift[0]),
+        camera.with_focal_px(camera.fx_px * scale),
+        cx_px=float(camera.cx_px - camera.fx_px * shift[0]),
         cy_px=float(camera.cy_px - camera.fy_px * shift[1]),
     )
 

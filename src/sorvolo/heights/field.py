@@ -24,12 +24,17 @@ class HeightField:
 
     def __post_init__(self) -> None:
         if self.up_m.shape != self.lattice.shape or self.sigma_m.shape != self.lattice.shape:
-            raise GeometryError(f"heights {self.up_m.shape} do not fit a lattice of {self.lattice.shape}")
+            raise GeometryError(
+                f"heights {self.up_m.shape} do not fit a lattice of {self.lattice.shape}"
+            )
 
     def at(self, points_m: PointsM) -> tuple[Floats, Floats]:
         """(N,) heights and sigmas at site points, (N, 2), between cells; NaN outside and beside holes."""
         some = 1 << 20  # OpenCV takes no more than 32766 rows at a time
-        bands = [self._bands_at(points_m[first:first + some]) for first in range(0, max(len(points_m), 1), some)]
+        bands = [
+            self._bands_at(points_m[first : first + some])
+            for first in range(0, max(len(points_m), 1), some)
+        ]
         heights, sigmas = (np.concatenate(each) for each in zip(*bands))
         return heights, sigmas
 
@@ -49,14 +54,20 @@ class HeightField:
 
     def _bands_at(self, points_m: PointsM) -> tuple[Floats, Floats]:
         side = 1024
-        padded = np.full((max(1, -(-len(points_m) // side)) * side, 2), 1e9)  # none is a row as well
+        padded = np.full(
+            (max(1, -(-len(points_m) // side)) * side, 2), 1e9
+        )  # none is a row as well
         padded[: len(points_m)] = points_m
         cells = self.lattice.cells_from_site(padded).astype(np.float32).reshape(-1, side, 2)
         heights, sigmas = (
-            cv2.remap(band, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=float("nan")).ravel()
+            cv2.remap(
+                band, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderValue=float("nan")
+            ).ravel()
             for band in (self.up_m, self.sigma_m)
         )
-        return heights[: len(points_m)].astype(np.float64), sigmas[: len(points_m)].astype(np.float64)
+        return heights[: len(points_m)].astype(np.float64), sigmas[: len(points_m)].astype(
+            np.float64
+        )
 
 
 def standing(surface: HeightField, ground: HeightField) -> tuple[Floats32, Matrix3]:
@@ -67,11 +78,15 @@ def standing(surface: HeightField, ground: HeightField) -> tuple[Floats32, Matri
     above_m = surface.up_m - ground.up_m
     with np.errstate(invalid="ignore"):
         stands = above_m > 2 * surface.sigma_m
-    cells_from_site: Matrix3 = np.asarray(np.linalg.inv(surface.lattice.site_from_cells), np.float64)
+    cells_from_site: Matrix3 = np.asarray(
+        np.linalg.inv(surface.lattice.site_from_cells), np.float64
+    )
     return np.where(stands, above_m, 0).astype(np.float32), cells_from_site
 
 
-def above_ground(surface: HeightField, ground: HeightField, points_m: PointsM) -> tuple[Floats, Floats]:
+def above_ground(
+    surface: HeightField, ground: HeightField, points_m: PointsM
+) -> tuple[Floats, Floats]:
     """(N,) how high the surface lies above the bare ground at site points, (N, 2), m, and its sigma; NaN in holes."""
     up_m, sigma_m = surface.at(points_m)
     bare_m, _ = ground.at(points_m)

@@ -19,7 +19,9 @@ class WarningSettings:
     """What of a flight makes its heights weak."""
 
     oblique_deg: float = 25.0  # off the vertical, the median photo
-    one_strip: float = 0.08  # how wide a path is, as a share of its length, below which it is one strip
+    one_strip: float = (
+        0.08  # how wide a path is, as a share of its length, below which it is one strip
+    )
     most_holes: float = 0.1  # share of the ground that two photos see
     bad_fit_px: float = 0.45  # rms, of pictures no larger than `fit_side_px`: level and hilly flights have 0.1 to 0.3
     fit_side_px: int = TrackSettings.side_px  # larger ones are matched at this size
@@ -28,26 +30,44 @@ class WarningSettings:
 def camera_figures(solved: Cameras3D) -> Mapping[str, Any]:
     """The solution of the cameras in 3D, as plain values."""
     return {
-        "views": len(solved.views), "lost": list(solved.lost), "points": len(solved.points_m),
-        "observations": solved.observations, "residual_rms_px": solved.residual_px,
-        "focal_px": solved.views[0].camera.fx_px, "focal_scale": solved.focal_scale, "radial": solved.radial,
-        "fix_rms_m": {axis: float(each) for axis, each in zip(("east", "north", "up"), solved.fix_rms_m)},
+        "views": len(solved.views),
+        "lost": list(solved.lost),
+        "points": len(solved.points_m),
+        "observations": solved.observations,
+        "residual_rms_px": solved.residual_px,
+        "focal_px": solved.views[0].camera.fx_px,
+        "focal_scale": solved.focal_scale,
+        "radial": solved.radial,
+        "fix_rms_m": {
+            axis: float(each) for axis, each in zip(("east", "north", "up"), solved.fix_rms_m)
+        },
         "optical_centre_px": [solved.views[0].camera.cx_px, solved.views[0].camera.cy_px],
         "places": [
-            {"frame": view.name, "east_m": float(e), "north_m": float(n), "up_m": float(u),
-             "rotation": view.site_from_camera.rotation.ravel()}
-            for view in solved.views for e, n, u in [view.site_from_camera.translation_m]
+            {
+                "frame": view.name,
+                "east_m": float(e),
+                "north_m": float(n),
+                "up_m": float(u),
+                "rotation": view.site_from_camera.rotation.ravel(),
+            }
+            for view in solved.views
+            for e, n, u in [view.site_from_camera.translation_m]
         ],
     }
 
 
-def surface_figures(surface: Surface, shows_ground: Mask, judgement: PointJudgement) -> Mapping[str, Any]:
+def surface_figures(
+    surface: Surface, shows_ground: Mask, judgement: PointJudgement
+) -> Mapping[str, Any]:
     """The height model and how its points judge it, as plain values; shares are of the ground that two photos see."""
     known = np.isfinite(surface.up_m)
-    low, middle, high = np.nanpercentile(surface.up_m, [1, 50, 99]) if known.any() else (np.nan,) * 3
+    low, middle, high = (
+        np.nanpercentile(surface.up_m, [1, 50, 99]) if known.any() else (np.nan,) * 3
+    )
     covered = max(int(surface.covered.sum()), 1)
     return {
-        "columns": surface.lattice.width, "rows": surface.lattice.height,
+        "columns": surface.lattice.width,
+        "rows": surface.lattice.height,
         "covered_m2": covered * surface.lattice.cell_m**2,
         "holes_share": 1 - known.sum() / covered,
         "ground_share": float((shows_ground & known).sum() / max(int(known.sum()), 1)),
@@ -55,7 +75,8 @@ def surface_figures(surface: Surface, shows_ground: Mask, judgement: PointJudgem
         "sigma_median_m": float(np.nanmedian(surface.sigma_m)) if known.any() else None,
         "sigma_p95_m": float(np.nanpercentile(surface.sigma_m, 95)) if known.any() else None,
         "own_points": {
-            name: value if np.isfinite(value) else None for name, value in dataclasses.asdict(judgement).items()
+            name: value if np.isfinite(value) else None
+            for name, value in dataclasses.asdict(judgement).items()
         },
     }
 
@@ -75,14 +96,18 @@ def camera_warnings(solved: Cameras3D, settings: WarningSettings = WarningSettin
             "the photos lie along one strip: the tilt of the ground across it is known from the drone's attitude "
             "alone (about 3 degrees); fly at least two strips, or one across, for heights"
         )
-    tilt = np.degrees(np.arccos(np.clip([-view.site_from_camera.rotation[2, 2] for view in solved.views], -1, 1)))
+    tilt = np.degrees(
+        np.arccos(np.clip([-view.site_from_camera.rotation[2, 2] for view in solved.views], -1, 1))
+    )
     if np.median(tilt) > settings.oblique_deg:
         remarks.append(
             f"the photos look {np.median(tilt):.0f} degrees off the vertical: walls and what lies behind things have "
             "heights of their surroundings"
         )
     camera = solved.views[0].camera
-    fit_px = solved.residual_px * min(1.0, settings.fit_side_px / max(camera.width_px, camera.height_px))
+    fit_px = solved.residual_px * min(
+        1.0, settings.fit_side_px / max(camera.width_px, camera.height_px)
+    )
     if fit_px > settings.bad_fit_px:
         remarks.append(
             f"the photos fit each other in space to {solved.residual_px:.2f} px only: a rolling shutter, blur, things "

@@ -25,8 +25,12 @@ class FreeSpaceSettings:
     """When photos see through a height model."""
 
     views: int = 6  # compared with each other at a place
-    agrees: float = 0.3  # likeness of two photos, 0 to 1, by which they agree: by chance it is below 0.15
-    margin_cells: float = 1.5  # what a photo shows, less than that beside a cell's height, is the cell
+    agrees: float = (
+        0.3  # likeness of two photos, 0 to 1, by which they agree: by chance it is below 0.15
+    )
+    margin_cells: float = (
+        1.5  # what a photo shows, less than that beside a cell's height, is the cell
+    )
     share: float = 0.5  # of a piece: seen through so many times, of the times that it is seen
     step_cells: float = 2.0  # a height this much beside its neighbour's, in cells, is another piece
     window_cells: int = 1000  # whose pieces are worked on at a time
@@ -34,8 +38,13 @@ class FreeSpaceSettings:
 
 
 def seen_through(
-    lattice: Lattice, up_m: Floats32, views: Sequence[View], pictures: Callable[[int], ImageGray], tile_cells: int,
-    sweep: SweepSettings, settings: FreeSpaceSettings = FreeSpaceSettings(),
+    lattice: Lattice,
+    up_m: Floats32,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    tile_cells: int,
+    sweep: SweepSettings,
+    settings: FreeSpaceSettings = FreeSpaceSettings(),
 ) -> Mask:
     """(H, W) the cells of a height model, NaN in holes, that as many photos see through as see them, and some pieces.
 
@@ -47,7 +56,9 @@ def seen_through(
         return known
     ground = filled(up_m, known)
     through, shown = np.zeros(up_m.shape, np.uint8), np.zeros(up_m.shape, np.uint8)
-    for number, places in _compared(lattice, ground, known, views, pictures, tile_cells, sweep, settings):
+    for number, places in _compared(
+        lattice, ground, known, views, pictures, tile_cells, sweep, settings
+    ):
         lower, itself = _seen_at(lattice, ground, views[number], places, settings)
         through.ravel()[places.cell[lower]] += 1
         shown.ravel()[places.cell[itself]] += 1
@@ -55,8 +66,13 @@ def seen_through(
     for x0, y0, x1, y1 in lattice.windows(settings.window_cells):
         here = slice(y0, y1), slice(x0, x1)
         rest = np.where(found[here], np.float32(np.nan), up_m[here])
-        for model in (up_m[here], rest):  # a plate beside a wall is apart from it once its own cells are gone
-            found[here] |= known[here] & _mostly(model, through[here], shown[here], lattice.cell_m, settings)
+        for model in (
+            up_m[here],
+            rest,
+        ):  # a plate beside a wall is apart from it once its own cells are gone
+            found[here] |= known[here] & _mostly(
+                model, through[here], shown[here], lattice.cell_m, settings
+            )
     return found
 
 
@@ -69,8 +85,14 @@ class _Places:
 
 
 def _compared(
-    lattice: Lattice, ground: Floats32, known: Mask, views: Sequence[View], pictures: Callable[[int], ImageGray],
-    tile_cells: int, sweep: SweepSettings, settings: FreeSpaceSettings,
+    lattice: Lattice,
+    ground: Floats32,
+    known: Mask,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    tile_cells: int,
+    sweep: SweepSettings,
+    settings: FreeSpaceSettings,
 ) -> Iterator[tuple[int, _Places]]:
     """Of each view, by number, the places at which it can be compared with another one."""
     found: dict[int, list[_Places]] = {}
@@ -86,12 +108,16 @@ def _compared(
             for number in (i, j):
                 best[number] = np.maximum(best[number], alike) if number in best else alike
         for number, alike in best.items():
-            inner = alike[y0 - top:y1 - top, x0 - left:x1 - left]
+            inner = alike[y0 - top : y1 - top, x0 - left : x1 - left]
             rows, columns = np.nonzero((inner > 0) & known[y0:y1, x0:x1])
             cell = ((rows + y0) * lattice.width + columns + x0).astype(np.int32)
-            found.setdefault(number, []).append(_Places(cell, inner[rows, columns].astype(np.float16)))
+            found.setdefault(number, []).append(
+                _Places(cell, inner[rows, columns].astype(np.float16))
+            )
     for number, parts in found.items():
-        places = _Places(*(np.concatenate([getattr(each, name) for each in parts]) for name in ("cell", "alike")))
+        places = _Places(
+            *(np.concatenate([getattr(each, name) for each in parts]) for name in ("cell", "alike"))
+        )
         if len(places.cell):
             yield number, places
 
@@ -103,14 +129,21 @@ def _seen_at(
     rows, columns = np.divmod(places.cell, lattice.width)
     up_m = ground.ravel()[places.cell]
     cells = np.column_stack([columns, rows, np.ones(len(rows))])
-    pixels = view.pixels_from_site(np.column_stack([(cells @ lattice.site_from_cells.T)[:, :2], up_m]))
+    pixels = view.pixels_from_site(
+        np.column_stack([(cells @ lattice.site_from_cells.T)[:, :2], up_m])
+    )
     reach_m = max(float(view.site_from_camera.translation_m[2] - np.median(up_m)), 1e-3)
     per_cell = max(lattice.cell_m * view.camera.fx_px / reach_m, 1.0)
-    width, height = (int(side / per_cell) + 2 for side in (view.camera.width_px, view.camera.height_px))
+    width, height = (
+        int(side / per_cell) + 2 for side in (view.camera.width_px, view.camera.height_px)
+    )
     x, y = np.clip(np.rint(pixels / per_cell).astype(int), 0, [width - 1, height - 1]).T
     at, order = y * width + x, np.argsort(places.alike, kind="stable")
     alike, shows_m = np.zeros(width * height, np.float32), np.zeros(width * height, np.float32)
-    alike[at[order]], shows_m[at[order]] = places.alike[order], up_m[order]  # of several the last is the most alike
+    alike[at[order]], shows_m[at[order]] = (
+        places.alike[order],
+        up_m[order],
+    )  # of several the last is the most alike
     agrees, above_m = alike[at] > settings.agrees, up_m - shows_m[at]
     margin_m = settings.margin_cells * lattice.cell_m
     return agrees & (above_m > margin_m), agrees & (np.abs(above_m) <= margin_m)

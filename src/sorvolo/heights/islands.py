@@ -14,14 +14,18 @@ from sorvolo.geometry.arrays import Floats32, ImageGray, Mask, Rows
 class IslandSettings:
     """What counts as a match by chance (peaks of Hirschmueller 2008)."""
 
-    step_cells: float = 4.0  # a height this much beside its neighbour's, in cells, is another piece of ground
+    step_cells: float = (
+        4.0  # a height this much beside its neighbour's, in cells, is another piece of ground
+    )
     most_cells: int = 340  # of an island: one and a half of the larger patch that is compared
     photos: int = 2  # one pair of photos: nothing confirms what it shows
     window_cells: int = 1000  # worked on at a time ...
     margin_cells: int = 48  # ... with so many around
 
 
-def islands(up_m: Floats32, shown_by: ImageGray, cell_m: float, settings: IslandSettings = IslandSettings()) -> Mask:
+def islands(
+    up_m: Floats32, shown_by: ImageGray, cell_m: float, settings: IslandSettings = IslandSettings()
+) -> Mask:
     """(H, W) the cells of a height model, NaN in holes, that stand alone where `shown_by` (H, W) photos are too few."""
     found = np.zeros(up_m.shape, bool)
     margin = settings.margin_cells
@@ -29,7 +33,7 @@ def islands(up_m: Floats32, shown_by: ImageGray, cell_m: float, settings: Island
         left, top = max(0, x0 - margin), max(0, y0 - margin)
         here = slice(top, y1 + margin), slice(left, x1 + margin)
         alone = _alone(up_m[here], settings.step_cells * cell_m, settings.most_cells)
-        found[y0:y1, x0:x1] = alone[y0 - top:y1 - top, x0 - left:x1 - left]
+        found[y0:y1, x0:x1] = alone[y0 - top : y1 - top, x0 - left : x1 - left]
     return found & (shown_by <= settings.photos)
 
 

@@ -41,7 +41,9 @@ class Lattice:
 
     def __post_init__(self) -> None:
         if min(self.width, self.height) < 1 or not self.cell_m > 0:
-            raise GeometryError(f"a height model needs cells, got {self.width} x {self.height} of {self.cell_m} m")
+            raise GeometryError(
+                f"a height model needs cells, got {self.width} x {self.height} of {self.cell_m} m"
+            )
         if max(self.width, self.height) > MOST_SIDE:
             raise GeometryError(
                 f"a height model of {self.width:,} x {self.height:,} cells: at most {MOST_SIDE:,} a side are possible; "
@@ -54,16 +56,25 @@ class Lattice:
         """The cells of a grid that cover these site points, (N, 2)."""
         middle = points_m.mean(axis=0)
         reach_m = float(np.abs(points_m - middle).max())
-        cells = apply_homography(site_grid.grid_from_site_affine(middle, max(reach_m, 1.0)), points_m)
+        cells = apply_homography(
+            site_grid.grid_from_site_affine(middle, max(reach_m, 1.0)), points_m
+        )
         low, high = np.floor(cells.min(axis=0)).astype(int), np.ceil(cells.max(axis=0)).astype(int)
-        return cls.at(site_grid, (int(low[0]), int(low[1])), int(high[0] - low[0]) + 1, int(high[1] - low[1]) + 1)
+        return cls.at(
+            site_grid,
+            (int(low[0]), int(low[1])),
+            int(high[0] - low[0]) + 1,
+            int(high[1] - low[1]) + 1,
+        )
 
     @classmethod
     def at(cls, site_grid: SiteGrid, first: tuple[int, int], width: int, height: int) -> "Lattice":
         """The cells of a grid from the column and row `first` on."""
         grid = site_grid.grid
         middle_px = np.array([[first[0] + (width - 1) / 2, first[1] + (height - 1) / 2]])
-        middle_m = apply_homography(np.linalg.inv(site_grid.grid_from_site_affine(np.zeros(2), 50.0)), middle_px)[0]
+        middle_m = apply_homography(
+            np.linalg.inv(site_grid.grid_from_site_affine(np.zeros(2), 50.0)), middle_px
+        )[0]
         reach_m = max(width, height) / 2 * grid.m_per_px
         grid_from_site = site_grid.grid_from_site_affine(middle_m, max(reach_m, 1.0))
         shift = np.array([[1.0, 0, first[0]], [0, 1, first[1]], [0, 0, 1]])
@@ -88,16 +99,25 @@ class Lattice:
         """The cells of a window, ends exclusive; it may reach beyond."""
         shift = np.array([[1.0, 0, x0], [0, 1, y0], [0, 0, 1]])
         return replace(
-            self, site_from_cells=self.site_from_cells @ shift, width=x1 - x0, height=y1 - y0,
+            self,
+            site_from_cells=self.site_from_cells @ shift,
+            width=x1 - x0,
+            height=y1 - y0,
             first=(self.first[0] + x0, self.first[1] + y0),
         )
 
     def coarser(self, factor: int) -> "Lattice":
         """Cells `factor` times as large over the same ground."""
-        scale = np.array([[factor, 0, (factor - 1) / 2], [0, factor, (factor - 1) / 2], [0, 0, 1.0]])
+        scale = np.array(
+            [[factor, 0, (factor - 1) / 2], [0, factor, (factor - 1) / 2], [0, 0, 1.0]]
+        )
         return replace(
-            self, site_from_cells=self.site_from_cells @ scale, width=-(-self.width // factor),
-            height=-(-self.height // factor), cell_m=self.cell_m * factor, first=(0, 0),
+            self,
+            site_from_cells=self.site_from_cells @ scale,
+            width=-(-self.width // factor),
+            height=-(-self.height // factor),
+            cell_m=self.cell_m * factor,
+            first=(0, 0),
         )
 
     def windows(self, side: int) -> Iterator[tuple[int, int, int, int]]:
@@ -111,7 +131,9 @@ class Lattice:
     def points_m(self) -> PointsM:
         """(H, W, 2) the cells' middles, site metres."""
         x, y = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return apply_homography(self.site_from_cells, np.column_stack([x.ravel(), y.ravel()])).reshape(*x.shape, 2)
+        return apply_homography(
+            self.site_from_cells, np.column_stack([x.ravel(), y.ravel()])
+        ).reshape(*x.shape, 2)
 
     def cells_from_site(self, points_m: PointsM) -> Floats:
         """(N, 2) column, row of site points, (N, 2)."""

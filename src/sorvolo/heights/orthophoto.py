@@ -27,14 +27,23 @@ from sorvolo.mosaic.blending import (
 class OrthophotoSettings:
     """Which photo shows a piece of ground."""
 
-    hidden_cells: float = 3.0  # a height this much above the line of sight, in cells, hides what is behind
+    hidden_cells: float = (
+        3.0  # a height this much above the line of sight, in cells, hides what is behind
+    )
     hidden_merit: float = 0.02  # of a photo that does not see the ground, against one that does
-    block_tiles: int = 2  # painted together, to a side: what is painted around them is a smaller share
-    strip_blocks: int = 2  # high, painted to and fro: blocks that follow each other show the same few photos
+    block_tiles: int = (
+        2  # painted together, to a side: what is painted around them is a smaller share
+    )
+    strip_blocks: int = (
+        2  # high, painted to and fro: blocks that follow each other show the same few photos
+    )
 
 
 def paint_orthophoto(
-    surface: Surface, site_grid: SiteGrid, views: Sequence[View], pictures: Callable[[int], ImageRGB],
+    surface: Surface,
+    site_grid: SiteGrid,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageRGB],
     settings: OrthophotoSettings = OrthophotoSettings(),
 ) -> Iterator[tuple[TileIndex, ImageRGBA, float]]:
     """The tiles of the true orthophoto, block by block, each with the share that is done; those unseen are left out.
@@ -43,23 +52,32 @@ def paint_orthophoto(
     the ground around.
     """
     ground = filled(surface.up_m, np.isfinite(surface.up_m))
-    painter = _Painter(surface.lattice, ground, choose_photos(surface.lattice, ground, views, settings), site_grid,
-                       views, pictures)
+    painter = _Painter(
+        surface.lattice,
+        ground,
+        choose_photos(surface.lattice, ground, views, settings),
+        site_grid,
+        views,
+        pictures,
+    )
     count, side = settings.block_tiles, site_grid.grid.tile_px
-    blocks = _to_and_fro({(row // count, column // count) for column, row in painter.tiles()}, settings.strip_blocks)
+    blocks = _to_and_fro(
+        {(row // count, column // count) for column, row in painter.tiles()}, settings.strip_blocks
+    )
     for number, (down, across) in enumerate(blocks, start=1):
         first = across * count, down * count
         rgba = painter.block(first, count)
         if rgba is None:
             continue
         for y, x in np.ndindex(count, count):
-            tile = np.ascontiguousarray(rgba[y * side:(y + 1) * side, x * side:(x + 1) * side])
+            tile = np.ascontiguousarray(rgba[y * side : (y + 1) * side, x * side : (x + 1) * side])
             if tile[..., 3].any():
                 yield (first[0] + x, first[1] + y), tile, number / len(blocks)
 
 
 def _to_and_fro(blocks: Collection[tuple[int, int]], rows: int) -> list[tuple[int, int]]:
     """Blocks (row, column) strip by strip of so many rows, every other strip backwards."""
+
     def place(block: tuple[int, int]) -> tuple[int, int, int]:
         strip = block[0] // rows
         return strip, -block[1] if strip % 2 else block[1], block[0]
@@ -67,7 +85,9 @@ def _to_and_fro(blocks: Collection[tuple[int, int]], rows: int) -> list[tuple[in
     return sorted(blocks, key=place)
 
 
-def choose_photos(lattice: Lattice, up_m: Floats32, views: Sequence[View], settings: OrthophotoSettings) -> Winners:
+def choose_photos(
+    lattice: Lattice, up_m: Floats32, views: Sequence[View], settings: OrthophotoSettings
+) -> Winners:
     """(H, W) which view shows each cell of a height model without holes best; -1 where none does."""
     labels = np.full(lattice.shape, -1, np.int16)
     best = np.zeros(lattice.shape, np.float32)
@@ -90,7 +110,9 @@ def visible(lattice: Lattice, up_m: Floats32, view: View, settings: OrthophotoSe
     """(H, W) which cells of a height model without holes nothing of it hides from a view."""
     eye = view.site_from_camera.translation_m
     at = lattice.cells_from_site(eye[None, :2])[0]
-    column, row = np.meshgrid(np.arange(lattice.width, dtype=np.float32), np.arange(lattice.height, dtype=np.float32))
+    column, row = np.meshgrid(
+        np.arange(lattice.width, dtype=np.float32), np.arange(lattice.height, dtype=np.float32)
+    )
     dx, dy = np.float32(at[0]) - column, np.float32(at[1]) - row
     far = np.maximum(np.hypot(dx, dy), 1e-3)
     dx, dy = dx / far, dy / far
@@ -102,7 +124,13 @@ def visible(lattice: Lattice, up_m: Floats32, view: View, settings: OrthophotoSe
     hidden = np.zeros(up_m.shape, bool)
     step = 2.0
     while step < reach:
-        seen = cv2.remap(up_m, column + dx * step, row + dy * step, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        seen = cv2.remap(
+            up_m,
+            column + dx * step,
+            row + dy * step,
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
         hidden |= (seen > up_m + climb * step + margin) & (step < far)
         step = max(step + 1.0, step * 1.06)
     return ~hidden
@@ -112,13 +140,20 @@ class _Painter:
     """What all tiles share: the heights without holes, and which photo shows each cell."""
 
     def __init__(
-        self, lattice: Lattice, ground: Floats32, labels: Winners, site_grid: SiteGrid, views: Sequence[View],
+        self,
+        lattice: Lattice,
+        ground: Floats32,
+        labels: Winners,
+        site_grid: SiteGrid,
+        views: Sequence[View],
         pictures: Callable[[int], ImageRGB],
     ) -> None:
         self._ground, self._labels, self._views = ground, labels, views
         self._pictures, self._grid = pictures, site_grid.grid
         right, bottom = lattice.width - 1, lattice.height - 1
-        corners = lattice.site_from_cells @ np.array([[0, right, right, 0], [0, 0, bottom, bottom], [1, 1, 1, 1]])
+        corners = lattice.site_from_cells @ np.array(
+            [[0, right, right, 0], [0, 0, bottom, bottom], [1, 1, 1, 1]]
+        )
         middle = corners[:2].mean(axis=1)
         reach_m = float(np.abs(corners[:2].T - middle).max())
         site_from_grid = np.linalg.inv(site_grid.grid_from_site_affine(middle, reach_m))
@@ -151,28 +186,56 @@ class _Painter:
         limit = np.array(self._labels.shape[::-1])
         low = np.clip(np.floor(ends[:2].min(axis=1)).astype(int) - 2, 0, limit)
         high = np.clip(np.ceil(ends[:2].max(axis=1)).astype(int) + 3, 0, limit)
-        coarse = self._labels[low[1]:high[1], low[0]:high[0]]
+        coarse = self._labels[low[1] : high[1], low[0] : high[0]]
         there = (_shift(-low[0], -low[1]) @ cells_from_here)[:2]
-        return winners_from_shares((
-            (number, 0, 0, np.asarray(cv2.warpAffine(
-                pixels_of(coarse, number), there, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            ), np.uint8))
-            for number in np.unique(coarse[coarse >= 0]).tolist()
-        ), side, side)
+        return winners_from_shares(
+            (
+                (
+                    number,
+                    0,
+                    0,
+                    np.asarray(
+                        cv2.warpAffine(
+                            pixels_of(coarse, number),
+                            there,
+                            (side, side),
+                            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                        ),
+                        np.uint8,
+                    ),
+                )
+                for number in np.unique(coarse[coarse >= 0]).tolist()
+            ),
+            side,
+            side,
+        )
 
     def _layers(self, labels: Winners, shift: Matrix3, side: int) -> Iterator[Layer]:
-        up_m = np.asarray(cv2.warpAffine(
-            self._ground, (self._cells_from_grid @ shift)[:2], (side, side),
-            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_REPLICATE,
-        ), np.float32)
+        up_m = np.asarray(
+            cv2.warpAffine(
+                self._ground,
+                (self._cells_from_grid @ shift)[:2],
+                (side, side),
+                flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                borderMode=cv2.BORDER_REPLICATE,
+            ),
+            np.float32,
+        )
         for number in np.unique(labels[labels >= 0]).tolist():
             left, top, width, height = cv2.boundingRect(pixels_of(labels, number))
             x0, y0 = (max(0, each - LAYER_APRON_PX) // ALIGN_PX * ALIGN_PX for each in (left, top))
             x1, y1 = (
-                min(side, -(-(each + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX) for each in (left + width, top + height)
+                min(side, -(-(each + LAYER_APRON_PX) // ALIGN_PX) * ALIGN_PX)
+                for each in (left + width, top + height)
             )
-            u, v = laid_pixels(self._views[number], self._site_from_grid @ shift @ _shift(x0, y0), up_m[y0:y1, x0:x1])
-            seen = cv2.remap(self._pictures(number), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+            u, v = laid_pixels(
+                self._views[number],
+                self._site_from_grid @ shift @ _shift(x0, y0),
+                up_m[y0:y1, x0:x1],
+            )
+            seen = cv2.remap(
+                self._pictures(number), u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101
+            )
             yield Layer(number, x0, y0, np.asarray(seen, np.uint8))
 
 
@@ -183,12 +246,21 @@ def _shift(x: float, y: float) -> Matrix3:
 def _window_of(view: View, lattice: Lattice, up_m: Floats32) -> tuple[int, int, int, int]:
     """The cells that a view may see, and the way from them to below the camera: x0, y0, x1, y1, ends exclusive."""
     low_m, high_m = float(up_m.min()), float(up_m.max())
-    corners = np.concatenate([
-        ground_outlines_m([view], each) for each in (low_m, high_m) if each < view.site_from_camera.translation_m[2]
-    ] + [view.site_from_camera.translation_m[None, :2]])
+    corners = np.concatenate(
+        [
+            ground_outlines_m([view], each)
+            for each in (low_m, high_m)
+            if each < view.site_from_camera.translation_m[2]
+        ]
+        + [view.site_from_camera.translation_m[None, :2]]
+    )
     cells = lattice.cells_from_site(corners)
-    x0, y0 = np.clip(np.floor(cells.min(axis=0)).astype(int) - 1, 0, [lattice.width, lattice.height]).tolist()
-    x1, y1 = np.clip(np.ceil(cells.max(axis=0)).astype(int) + 2, 0, [lattice.width, lattice.height]).tolist()
+    x0, y0 = np.clip(
+        np.floor(cells.min(axis=0)).astype(int) - 1, 0, [lattice.width, lattice.height]
+    ).tolist()
+    x1, y1 = np.clip(
+        np.ceil(cells.max(axis=0)).astype(int) + 2, 0, [lattice.width, lattice.height]
+    ).tolist()
     return x0, y0, x1, y1
 
 

@@ -17,7 +17,9 @@ _ROUNDS = 30  # in which the factor settles
 class OwnPointSettings:
     """Which points judge the heights."""
 
-    least_views: int = 3  # see a point: where two see it, a wrong match along the line between them goes unseen
+    least_views: int = (
+        3  # see a point: where two see it, a wrong match along the line between them goes unseen
+    )
     least_points: int = 100  # fewer judge nothing: five of them would be the share beyond two sigma
 
 
@@ -56,7 +58,11 @@ def judged_by_points(
     times = off_m / np.hypot(match_m, sigma_m)
     factor = _factor(off_m, match_m, sigma_m)
     judgement = PointJudgement(
-        len(off_m), float(np.median(off_m)), float((times < 1).mean()), float((times < 2).mean()), factor
+        len(off_m),
+        float(np.median(off_m)),
+        float((times < 1).mean()),
+        float((times < 2).mean()),
+        factor,
     )
     if factor <= 1:
         return surface, judgement
@@ -67,7 +73,7 @@ def judged_by_points(
 
 def _without(sigma: Floats | Floats32, part: Floats) -> Floats:
     """A sigma less an independent part of it; NaN stays."""
-    return np.sqrt(np.maximum(sigma.astype(np.float64)**2 - part**2, 1e-12))
+    return np.sqrt(np.maximum(sigma.astype(np.float64) ** 2 - part**2, 1e-12))
 
 
 def _factor(off_m: Floats, match_m: Floats, point_m: Floats) -> float:

@@ -13,7 +13,9 @@ class SmoothingSettings:
 
     one_level: float = 0.1  # a change of height between neighbours
     more_levels: float = 0.9  # of any larger change: an edge of a roof
-    unseen_sigmas: float = 1.5  # below a cell's mean cost is that of a height at which fewer than two photos see it
+    unseen_sigmas: float = (
+        1.5  # below a cell's mean cost is that of a height at which fewer than two photos see it
+    )
     temperature: float = 0.04  # of a path's total cost, by which a height is e times less likely: fits sigma to errors
 
 

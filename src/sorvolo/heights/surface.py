@@ -26,19 +26,27 @@ class SurfaceSettings:
     """How the height model is made, and how its sigma follows from what the sweep saw."""
 
     sweep: SweepSettings = field(default_factory=SweepSettings)
-    coarse: SweepSettings = field(default_factory=lambda: _NARROW)  # to find what heights a tile has
+    coarse: SweepSettings = field(
+        default_factory=lambda: _NARROW
+    )  # to find what heights a tile has
     coarser: int = 2  # cells of the first sweep, in those of the model
     tile_cells: int = 320  # side of a tile: with its apron it fits the memory of a small computer
-    tile_share: float = 0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
+    tile_share: float = (
+        0.3  # of a photo's ground: a tile is seen whole by the photos that are compared on it
+    )
     apron_cells: int = 10  # beyond a tile, so that neighbouring tiles agree: more than half a patch
     coarse_apron_cells: int = 5  # of the first sweep, whose patches are smaller
-    margin_cells: float = 12.0  # heights searched above and below what the first sweep found, in cells
+    margin_cells: float = (
+        12.0  # heights searched above and below what the first sweep found, in cells
+    )
     unsure_cells: float = 3.0  # how far off heights are that are likely as well, beyond which one pair decides nothing
     islands: IslandSettings = field(default_factory=IslandSettings)
     borders: BorderSettings = field(default_factory=BorderSettings)
     free_space: FreeSpaceSettings = field(default_factory=FreeSpaceSettings)
     match_cells: float = 0.12  # sigma of a match where photos agree perfectly, in cells of parallax
-    relief_share: float = 0.25  # of the heights' spread around a cell: at an edge it is not known which is right
+    relief_share: float = (
+        0.25  # of the heights' spread around a cell: at an edge it is not known which is right
+    )
 
     def sizes_m(self, cell_m: float) -> tuple[float, float]:
         """What a pixel covers of the ground in the pictures that the two sweeps take, for cells of `cell_m`."""
@@ -63,8 +71,12 @@ class Surface:
 
 
 def sweep_surface(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int, float], ImageGray], points_m: PointsM,
-    camera_sigma: SmoothSigma, settings: SurfaceSettings = SurfaceSettings(),
+    lattice: Lattice,
+    views: Sequence[View],
+    pictures: Callable[[int, float], ImageGray],
+    points_m: PointsM,
+    camera_sigma: SmoothSigma,
+    settings: SurfaceSettings = SurfaceSettings(),
 ) -> Iterator[Surface | float]:
     """Yields the share of tiles done, 0 to 1, and in the end the surface.
 
@@ -85,7 +97,14 @@ def sweep_surface(
         window = lattice.window(x0 - apron, y0 - apron, x1 + apron, y1 + apron)
         bounds = _tile_bounds(coarse, settings, (x0, y0, x1, y1), lattice.cell_m)
         if bounds is not None:
-            swept = sweep(window, views, lambda i: pictures(i, lattice.cell_m), bounds, settings.sweep, obstacles)
+            swept = sweep(
+                window,
+                views,
+                lambda i: pictures(i, lattice.cell_m),
+                bounds,
+                settings.sweep,
+                obstacles,
+            )
             found = _calmed(swept)
             unsure = swept.deviation_m > settings.unsure_cells * lattice.cell_m
             found[unsure & (swept.shown_by <= settings.islands.photos)] = np.nan
@@ -97,10 +116,18 @@ def sweep_surface(
         yield (number + 1) / len(tiles)
     up_m[islands(up_m, shown_by, lattice.cell_m, settings.islands)] = np.nan
     ground_m = beyond_borders(
-        lattice, up_m, views, lambda i: pictures(i, lattice.cell_m), side, settings.sweep, settings.borders
+        lattice,
+        up_m,
+        views,
+        lambda i: pictures(i, lattice.cell_m),
+        side,
+        settings.sweep,
+        settings.borders,
     )
     given = np.isfinite(ground_m)
-    sigma_m[given] = np.hypot(sigma_m[given], settings.relief_share * (up_m[given] - ground_m[given]))
+    sigma_m[given] = np.hypot(
+        sigma_m[given], settings.relief_share * (up_m[given] - ground_m[given])
+    )
     up_m[given] = ground_m[given]
     up_m[_seen_through(lattice, up_m, views, pictures, settings)] = np.nan
     sigma_m[np.isnan(up_m)] = np.nan
@@ -108,17 +135,27 @@ def sweep_surface(
 
 
 def _seen_through(
-    lattice: Lattice, up_m: Floats32, views: Sequence[View], pictures: Callable[[int, float], ImageGray],
+    lattice: Lattice,
+    up_m: Floats32,
+    views: Sequence[View],
+    pictures: Callable[[int, float], ImageGray],
     settings: SurfaceSettings,
 ) -> Mask:
     """(H, W) the cells that photos see through, found on cells of the first sweep."""
     times = settings.coarser
     coarse = lattice.coarser(times)
     found = seen_through(
-        coarse, np.ascontiguousarray(up_m[::times, ::times]), views, lambda i: pictures(i, coarse.cell_m),
-        _tile_cells(coarse.cell_m, views, settings), settings.coarse, settings.free_space,
+        coarse,
+        np.ascontiguousarray(up_m[::times, ::times]),
+        views,
+        lambda i: pictures(i, coarse.cell_m),
+        _tile_cells(coarse.cell_m, views, settings),
+        settings.coarse,
+        settings.free_space,
     )
-    return np.repeat(np.repeat(found, times, axis=0), times, axis=1)[:lattice.height, :lattice.width]
+    return np.repeat(np.repeat(found, times, axis=0), times, axis=1)[
+        : lattice.height, : lattice.width
+    ]
 
 
 def _bounds(points_m: PointsM, camera_m: float) -> Bounds:
@@ -130,7 +167,10 @@ def _bounds(points_m: PointsM, camera_m: float) -> Bounds:
 
 
 def _coarse(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int, float], ImageGray], bounds: Bounds,
+    lattice: Lattice,
+    views: Sequence[View],
+    pictures: Callable[[int, float], ImageGray],
+    bounds: Bounds,
     settings: SurfaceSettings,
 ) -> Floats32:
     up_m = np.full(lattice.shape, np.nan, np.float32)
@@ -144,7 +184,9 @@ def _coarse(
 
 def _tile_cells(cell_m: float, views: Sequence[View], settings: SurfaceSettings) -> int:
     ground_m = [
-        view.site_from_camera.translation_m[2] * min(view.camera.width_px, view.camera.height_px) / view.camera.fx_px
+        view.site_from_camera.translation_m[2]
+        * min(view.camera.width_px, view.camera.height_px)
+        / view.camera.fx_px
         for view in views
     ]
     return int(np.clip(settings.tile_share * np.median(ground_m) / cell_m, 32, settings.tile_cells))
@@ -155,7 +197,7 @@ def _tile_bounds(
 ) -> Bounds | None:
     """The heights to search in a tile; None where the coarse model has a hole as large as the tile."""
     x0, y0, x1, y1 = (round(each / settings.coarser) for each in window)
-    around = coarse[max(0, y0 - 6):y1 + 7, max(0, x0 - 6):x1 + 7]
+    around = coarse[max(0, y0 - 6) : y1 + 7, max(0, x0 - 6) : x1 + 7]
     known = around[np.isfinite(around)]
     if not len(known):
         return None
@@ -174,14 +216,20 @@ def _calmed(swept: Swept) -> Floats32:
 
 
 def _sigma_m(
-    swept: Swept, up_m: Floats32, lattice: Lattice, camera_sigma: SmoothSigma, settings: SurfaceSettings
+    swept: Swept,
+    up_m: Floats32,
+    lattice: Lattice,
+    camera_sigma: SmoothSigma,
+    settings: SurfaceSettings,
 ) -> Floats32:
     """(H, W) one sigma of the heights: of the match, of other likely heights, of an edge nearby, of the cameras."""
     likeness = np.sqrt(np.clip(swept.score, 0.01, 1))
     match = settings.match_cells * lattice.cell_m / np.maximum(swept.spread, 0.02) / likeness
     relief = settings.relief_share * _relief(up_m)
     other = np.nan_to_num(swept.deviation_m)
-    sigma = np.sqrt(match**2 + relief**2 + other**2 + camera_sigma.on(lattice) ** 2).astype(np.float32)
+    sigma = np.sqrt(match**2 + relief**2 + other**2 + camera_sigma.on(lattice) ** 2).astype(
+        np.float32
+    )
     sigma[~np.isfinite(up_m)] = np.nan
     return sigma
 

@@ -32,9 +32,14 @@ class SweepSettings:
     """How photos are compared."""
 
     views: int = 4  # laid over each other at a time
-    window_cells: tuple[int, int] = (5, 15)  # sides of the patches that are compared: detail, and what is sure
+    window_cells: tuple[int, int] = (
+        5,
+        15,
+    )  # sides of the patches that are compared: detail, and what is sure
     contrast_px: int = 9  # side of the surroundings that a pixel's gray is measured against
-    pair_share: float = 0.5  # of the pairs of photos that see a cell: the others may be hidden from it
+    pair_share: float = (
+        0.5  # of the pairs of photos that see a cell: the others may be hidden from it
+    )
     noise_levels: float = 3.0  # gray levels; texture below it decides nothing
     level_px: float = 0.8  # parallax between two planes, of the two photos farthest apart
     most_levels: int = 160  # planes of one sweep: bounds time and memory
@@ -66,8 +71,12 @@ class Swept:
 
 
 def sweep(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], bounds: Bounds,
-    settings: SweepSettings, obstacles: Obstacles | None = None,
+    lattice: Lattice,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    bounds: Bounds,
+    settings: SweepSettings,
+    obstacles: Obstacles | None = None,
 ) -> Swept:
     """The heights within bounds of a lattice's cells; a photo from which an obstacle hides a height does not count.
 
@@ -79,7 +88,10 @@ def sweep(
     shape = lattice.shape
     if len(chosen) < 2:
         nothing = np.full(shape, np.nan, np.float32)
-        return Swept(nothing, *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0, np.nan, 0.0)))
+        return Swept(
+            nothing,
+            *(np.full(shape, each, np.float32) for each in (0.0, len(chosen), 0.0, np.nan, 0.0)),
+        )
     spreads = _spreads(lattice, [views[k] for k in chosen], bounds.usual_m)
     finest_m = settings.level_px * lattice.cell_m / max(float(spreads.max()), 0.05)
     level_m = max(finest_m, (high_m - low_m) / (settings.most_levels - 1))
@@ -96,14 +108,22 @@ def sweep(
     total = smoothed(_cost(agreement, settings.smoothing), settings.smoothing)
     up_m, score = _best(total, agreement, levels)
     deviation = _deviation(total, up_m, levels, settings)
-    up_m[~(score >= settings.least_score)] = np.nan  # no two photos see the height that fits, or they do not agree
-    shown_by = np.sum([each.shows(up_m, min(settings.window_cells)) for each in laid], axis=0).astype(np.float32)
+    up_m[~(score >= settings.least_score)] = (
+        np.nan
+    )  # no two photos see the height that fits, or they do not agree
+    shown_by = np.sum(
+        [each.shows(up_m, min(settings.window_cells)) for each in laid], axis=0
+    ).astype(np.float32)
     return Swept(up_m, score, seen_by, _widest(seen, spreads), deviation, shown_by)
 
 
 def likeness_on(
-    lattice: Lattice, views: Sequence[View], pictures: Callable[[int], ImageGray], up_m: Floats32,
-    chosen: Sequence[int], settings: SweepSettings,
+    lattice: Lattice,
+    views: Sequence[View],
+    pictures: Callable[[int], ImageGray],
+    up_m: Floats32,
+    chosen: Sequence[int],
+    settings: SweepSettings,
 ) -> Iterator[tuple[int, int, Floats32]]:
     """Two of the chosen views each, by number, and how alike (0 to 1) they are on heights without holes, (H, W).
 
@@ -124,23 +144,35 @@ def likeness_on(
 
 
 def choose_views(
-    lattice: Lattice, views: Sequence[View], up_m: float, count: int, obstacles: Obstacles | None = None
+    lattice: Lattice,
+    views: Sequence[View],
+    up_m: float,
+    count: int,
+    obstacles: Obstacles | None = None,
 ) -> list[int]:
     """The rows of the views to compare over a lattice: those that see much of it, from angles that differ well.
 
     `obstacles` hide ground from them; without any, the ground is level at a height.
     """
-    ground, covers = _level_shown(lattice, views, up_m) if obstacles is None else obstacles.shown(lattice, views)
+    ground, covers = (
+        _level_shown(lattice, views, up_m) if obstacles is None else obstacles.shown(lattice, views)
+    )
     middle = ground.mean(axis=0)
     rays = np.array([view.site_from_camera.translation_m for view in views]) - middle
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     chosen: list[int] = []
     least = np.ones(len(views))
     seen = np.zeros(len(ground))
-    wanted = np.minimum(covers.sum(axis=0), 2)  # ground that only photos left out see would be a hole
-    while len(chosen) < count or (len(chosen) < count + _MORE and (seen < wanted).mean() >= _LEFT_OUT):
+    wanted = np.minimum(
+        covers.sum(axis=0), 2
+    )  # ground that only photos left out see would be a hole
+    while len(chosen) < count or (
+        len(chosen) < count + _MORE and (seen < wanted).mean() >= _LEFT_OUT
+    ):
         need = 1 / (1.0 + seen) ** 2
-        worth = (covers * need).sum(axis=1) / need.sum() * (np.abs(rays[:, 2]) if not chosen else least)
+        worth = (
+            (covers * need).sum(axis=1) / need.sum() * (np.abs(rays[:, 2]) if not chosen else least)
+        )
         worth[chosen] = 0
         best = int(worth.argmax())
         if worth[best] <= 1e-3:
@@ -170,7 +202,11 @@ def _usefulness(angle: Floats) -> Floats:
 def _spreads(lattice: Lattice, views: Sequence[View], up_m: float) -> Floats:
     """(V, V) how far apart two photos stand, seen from the lattice's middle, over how high they are."""
     middle = lattice.site_from_cells @ [(lattice.width - 1) / 2, (lattice.height - 1) / 2, 1.0]
-    rays = np.array([view.site_from_camera.translation_m for view in views]) - [middle[0], middle[1], up_m]
+    rays = np.array([view.site_from_camera.translation_m for view in views]) - [
+        middle[0],
+        middle[1],
+        up_m,
+    ]
     rays = rays[:, :2] / np.maximum(rays[:, 2:], 0.1)
     return np.asarray(np.linalg.norm(rays[:, None] - rays[None], axis=2))
 
@@ -188,7 +224,12 @@ class _Laid:
     """A photo that is laid on level planes over a lattice: of each pixel how it differs from its surroundings."""
 
     def __init__(
-        self, view: View, picture: ImageGray, lattice: Lattice, bounds: Bounds, others_m: PointsM,
+        self,
+        view: View,
+        picture: ImageGray,
+        lattice: Lattice,
+        bounds: Bounds,
+        others_m: PointsM,
         settings: SweepSettings,
     ) -> None:
         self.shape = lattice.shape
@@ -196,8 +237,12 @@ class _Laid:
         self._clear_m = -np.inf  # nothing from here up is hidden
         camera = view.camera.resized(picture.shape[1], picture.shape[0])
         turn = view.site_from_camera.rotation.T
-        project = camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
-        self._level = project[:, :2] @ lattice.site_from_cells[:2] + np.outer(project[:, 3], [0, 0, 1])
+        project = camera.matrix @ np.column_stack(
+            [turn, -turn @ view.site_from_camera.translation_m]
+        )
+        self._level = project[:, :2] @ lattice.site_from_cells[:2] + np.outer(
+            project[:, 3], [0, 0, 1]
+        )
         self._up = np.outer(project[:, 2], [0, 0, 1])
         right, bottom = lattice.width - 1, lattice.height - 1
         self._corners = np.array([[0, right, 0, right], [0, 0, bottom, bottom], [1.0, 1, 1, 1]])
@@ -207,19 +252,32 @@ class _Laid:
         angles = self._angles(away_m, lattice, bounds.usual_m)
         others = (away_m != 0).any(axis=1)
         channels, which = np.unique(angles[others], return_inverse=True)
-        self._contrast = [_contrast(piece, each * _ANGLE_RAD, settings) for each in channels.tolist()]
-        self._channel = np.zeros(len(others), int)  # of each of the others; nobody asks for the photo's own
+        self._contrast = [
+            _contrast(piece, each * _ANGLE_RAD, settings) for each in channels.tolist()
+        ]
+        self._channel = np.zeros(
+            len(others), int
+        )  # of each of the others; nobody asks for the photo's own
         self._channel[others] = which
-        self._px_per_cell = lattice.cell_m * camera.fx_px / max(
-            float(view.site_from_camera.translation_m[2]) - bounds.usual_m, 1e-3)
+        self._px_per_cell = (
+            lattice.cell_m
+            * camera.fx_px
+            / max(float(view.site_from_camera.translation_m[2]) - bounds.usual_m, 1e-3)
+        )
 
     def at(self, up_m: float) -> list[Floats32]:
         """The photo on the plane at a height, (H, W) float32, for each of the others; 0 outside of it."""
         there = self._from_picture @ self._picture_from_cells(up_m)
         laid = [
-            np.asarray(cv2.warpPerspective(
-                each, there, self.shape[::-1], flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
-            ), np.float32)
+            np.asarray(
+                cv2.warpPerspective(
+                    each,
+                    there,
+                    self.shape[::-1],
+                    flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+                ),
+                np.float32,
+            )
             for each in self._contrast
         ]
         return [laid[each] for each in self._channel.tolist()]
@@ -228,10 +286,16 @@ class _Laid:
         """The photo on heights, (H, W), for each of the others; 0 outside of it."""
         columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
         level, up = self._from_picture @ self._level, self._from_picture @ self._up
-        x, y, z = (each[0] * columns + (each[1] * rows + each[2]) + rise[2] * up_m for each, rise in zip(level, up))
+        x, y, z = (
+            each[0] * columns + (each[1] * rows + each[2]) + rise[2] * up_m
+            for each, rise in zip(level, up)
+        )
         z = np.where(z > 1e-6, z, np.nan)
         u, v = (np.nan_to_num(each / z, nan=-1e6).astype(np.float32) for each in (x, y))
-        laid = [np.asarray(cv2.remap(each, u, v, cv2.INTER_LINEAR), np.float32) for each in self._contrast]
+        laid = [
+            np.asarray(cv2.remap(each, u, v, cv2.INTER_LINEAR), np.float32)
+            for each in self._contrast
+        ]
         return [laid[each] for each in self._channel.tolist()]
 
     def wholes(self, levels_m: Floats, side: int) -> Iterator[Seen]:
@@ -269,17 +333,25 @@ class _Laid:
         inset = 0.5 * (side * self._px_per_cell + self._apron)
         (w, h), planes = self._size, self._level + levels_m[:, None, None] * self._up
         x, y, z = planes[:, 0], planes[:, 1], planes[:, 2]
-        return np.stack([x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y], axis=1)
+        return np.stack(
+            [x - inset * z, (w - 1 - inset) * z - x, y - inset * z, (h - 1 - inset) * z - y], axis=1
+        )
 
     def shows(self, up_m: Floats32, side: int) -> Mask:
         """(H, W) where a patch lies in the photo as a whole at each cell's own height, (H, W); nowhere for NaN."""
         inset = 0.5 * (side * self._px_per_cell + self._apron)
         columns, rows = np.arange(self.shape[1]), np.arange(self.shape[0])[:, None]
-        (w, h), (x, y, z) = self._size, (
-            level[0] * columns + (level[1] * rows + level[2]) + up[2] * up_m for level, up in zip(self._level, self._up)
+        (w, h), (x, y, z) = (
+            self._size,
+            (
+                level[0] * columns + (level[1] * rows + level[2]) + up[2] * up_m
+                for level, up in zip(self._level, self._up)
+            ),
         )
         left, top = x - inset * z, y - inset * z
-        shown: Mask = (left >= 0) & (top >= 0) & (x <= (w - 1 - inset) * z) & (y <= (h - 1 - inset) * z)
+        shown: Mask = (
+            (left >= 0) & (top >= 0) & (x <= (w - 1 - inset) * z) & (y <= (h - 1 - inset) * z)
+        )
         return shown if self._hidden_below_m is None else shown & (up_m >= self._hidden_below_m)
 
     def _picture_from_cells(self, up_m: float) -> Matrix3:
@@ -289,14 +361,16 @@ class _Laid:
         """Keep of the picture what the cells see at all heights."""
         apron = self._apron = settings.contrast_px
         low, high = np.zeros(2, int), np.array(self._size)
-        seen = [self._picture_from_cells(each) @ self._corners for each in (bounds.low_m, bounds.high_m)]
+        seen = [
+            self._picture_from_cells(each) @ self._corners for each in (bounds.low_m, bounds.high_m)
+        ]
         ends = np.concatenate(seen, axis=1)
         if (ends[2] > 1e-6).all():
             places = (ends[:2] / ends[2]).T
             low = np.clip(np.floor(places.min(axis=0)) - apron, 0, high - 1).astype(int)
             high = np.clip(np.ceil(places.max(axis=0)) + apron + 1, low + 1, high).astype(int)
         self._from_picture = np.array([[1.0, 0, -low[0]], [0, 1, -low[1]], [0, 0, 1]])
-        return picture[low[1]:high[1], low[0]:high[0]].astype(np.float32)
+        return picture[low[1] : high[1], low[0] : high[0]].astype(np.float32)
 
     def _angles(self, away_m: PointsM, lattice: Lattice, up_m: float) -> Floats:
         """(N,) in which direction of the picture, in steps, things move with their height against other photos."""
@@ -324,7 +398,11 @@ def _contrast(picture: Floats32, angle_rad: float, settings: SweepSettings) -> F
     x, y = way * np.cos(angle_rad) + side // 2, way * np.sin(angle_rad) + side // 2
     for ax, wx in ((np.floor(x), 1 - x % 1), (np.floor(x) + 1, x % 1)):
         for ay, wy in ((np.floor(y), 1 - y % 1), (np.floor(y) + 1, y % 1)):
-            np.add.at(line, (np.minimum(ay, side - 1).astype(int), np.minimum(ax, side - 1).astype(int)), wx * wy)
+            np.add.at(
+                line,
+                (np.minimum(ay, side - 1).astype(int), np.minimum(ax, side - 1).astype(int)),
+                wx * wy,
+            )
     away = picture - cv2.filter2D(picture, -1, line / line.sum())
     spread = cv2.sqrBoxFilter(away, -1, (side, side))
     return np.asarray(away / np.sqrt(spread + np.float32(settings.noise_levels**2)), np.float32)
@@ -413,10 +491,14 @@ def _better_mean_of_known(scores: list[Floats32], share: float) -> Floats32:
         counted += each >= 0
     wanted = np.ceil(counted * share)
     total = np.zeros_like(counted)
-    for rank, each in enumerate(itertools.islice(_from_the_largest(scores), int(np.ceil(len(scores) * share)))):
+    for rank, each in enumerate(
+        itertools.islice(_from_the_largest(scores), int(np.ceil(len(scores) * share)))
+    ):
         total += each * (rank < wanted)
     with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(counted > 0, total / np.maximum(wanted, 1), np.float32(np.nan)), np.float32)
+        return np.asarray(
+            np.where(counted > 0, total / np.maximum(wanted, 1), np.float32(np.nan)), np.float32
+        )
 
 
 def _from_the_largest(scores: list[Floats32]) -> Iterator[Floats32]:
@@ -464,8 +546,12 @@ def _best(total: Floats32, agreement: Floats32, levels: Floats) -> tuple[Floats3
     return up_m.astype(np.float32), score
 
 
-def _deviation(total: Floats32, up_m: Floats32, levels: Floats, settings: SweepSettings) -> Floats32:
+def _deviation(
+    total: Floats32, up_m: Floats32, levels: Floats, settings: SweepSettings
+) -> Floats32:
     """(H, W) the root mean square distance of the other levels from a height, each by its probability."""
-    chance = np.exp((total.min(axis=1, keepdims=True) - total) / (8 * settings.smoothing.temperature))
+    chance = np.exp(
+        (total.min(axis=1, keepdims=True) - total) / (8 * settings.smoothing.temperature)
+    )
     away = levels[None, :, None].astype(np.float32) - up_m[:, None]
     return np.asarray(np.sqrt((chance * away**2).sum(axis=1) / chance.sum(axis=1)), np.float32)

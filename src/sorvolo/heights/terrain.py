@@ -24,7 +24,9 @@ class TerrainSettings:
     least_height_m: float = 0.3  # above the ground around: lower things are ground
 
 
-def terrain(lattice: Lattice, up_m: Floats32, settings: TerrainSettings = TerrainSettings()) -> tuple[Floats32, Mask]:
+def terrain(
+    lattice: Lattice, up_m: Floats32, settings: TerrainSettings = TerrainSettings()
+) -> tuple[Floats32, Mask]:
     """(H, W) the ground's height, everywhere, and which cells show it; `up_m` (H, W) may have holes (NaN)."""
     factor = max(1, round(settings.cell_m / lattice.cell_m))
     low, known = _lowest(up_m, factor)
@@ -34,7 +36,10 @@ def terrain(lattice: Lattice, up_m: Floats32, settings: TerrainSettings = Terrai
     share, shift = 1 / factor, (1 - factor) / (2 * factor)
     coarse_from_fine = np.array([[share, 0, shift], [0, share, shift]])
     fine = cv2.warpAffine(
-        ground, coarse_from_fine, (width, height), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+        ground,
+        coarse_from_fine,
+        (width, height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
     with np.errstate(invalid="ignore"):
@@ -54,7 +59,9 @@ def filled(up_m: Floats32, known: Mask) -> Floats32:
     result = np.where(weights > 1e-6, values / np.maximum(weights, 1e-6), mean).astype(np.float32)
     for values, weights in reversed(levels):
         wider = cv2.pyrUp(result, dstsize=weights.shape[1::-1])
-        result = np.where(weights > 1e-3, values / np.maximum(weights, 1e-3), wider).astype(np.float32)
+        result = np.where(weights > 1e-3, values / np.maximum(weights, 1e-3), wider).astype(
+            np.float32
+        )
     return result
 
 
@@ -63,7 +70,11 @@ def _lowest(up_m: Floats32, factor: int) -> tuple[Floats32, Mask]:
     height, width = (-(-side // factor) for side in up_m.shape)
     padded = np.full((height * factor, width * factor), np.nan, np.float32)
     padded[: up_m.shape[0], : up_m.shape[1]] = up_m
-    blocks = padded.reshape(height, factor, width, factor).transpose(0, 2, 1, 3).reshape(height, width, -1)
+    blocks = (
+        padded.reshape(height, factor, width, factor)
+        .transpose(0, 2, 1, 3)
+        .reshape(height, width, -1)
+    )
     known = np.isfinite(blocks).sum(axis=2) >= max(1, blocks.shape[2] // 4)
     blocks = np.sort(np.where(np.isfinite(blocks), blocks, np.inf), axis=2)
     low = blocks[..., blocks.shape[2] // 10]
@@ -77,7 +88,9 @@ def _ground_cells(low: Floats32, known: Mask, cell_m: float, settings: TerrainSe
     opened = surface
     radius, before = 1, 0
     while radius * cell_m <= settings.widest_m / 2 + cell_m:
-        opened_now = cv2.morphologyEx(opened, cv2.MORPH_OPEN, _disk(radius), borderType=cv2.BORDER_REPLICATE)
+        opened_now = cv2.morphologyEx(
+            opened, cv2.MORPH_OPEN, _disk(radius), borderType=cv2.BORDER_REPLICATE
+        )
         allowed = settings.least_height_m + settings.slope * (radius - before) * cell_m
         is_ground &= opened - opened_now <= allowed
         opened, before = opened_now, radius

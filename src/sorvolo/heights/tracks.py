@@ -73,7 +73,9 @@ def _features(gray: ImageGray, view: View, settings: TrackSettings) -> _Found:
         size = (round(gray.shape[1] * scale), round(gray.shape[0] * scale))
         gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
     found = sift_features(normalise_contrast(gray), FeatureSettings(sift_count=settings.features))
-    rays = view.camera.resized(gray.shape[1], gray.shape[0]).rays_from_pixels(found.points_px)[:, :2]
+    rays = view.camera.resized(gray.shape[1], gray.shape[0]).rays_from_pixels(found.points_px)[
+        :, :2
+    ]
     return _Found(view, found, gray.shape[1], rays, _on_ground(rays, view))
 
 
@@ -81,10 +83,12 @@ def _pairs(views: Sequence[View], settings: TrackSettings) -> Iterator[tuple[int
     """The pairs of views that overlap, each with its best neighbours."""
     shared = overlaps(list(views))
     shared = np.maximum(shared, shared.T)
-    order = np.argsort(-shared, axis=1, kind="stable")[:, :settings.neighbours]
+    order = np.argsort(-shared, axis=1, kind="stable")[:, : settings.neighbours]
     chosen = {
         (min(i, int(j)), max(i, int(j)))
-        for i in range(len(views)) for j in order[i] if shared[i, j] > settings.least_overlap
+        for i in range(len(views))
+        for j in order[i]
+        if shared[i, j] > settings.least_overlap
     }
     yield from sorted(chosen)
 
@@ -95,8 +99,13 @@ def _shared(left: _Found, right: _Found, settings: TrackSettings) -> Rows:
     They are sought among those that the map puts near each other, else among all: the map may have a view elsewhere.
     """
     every = np.arange(len(left.rays)), np.arange(len(right.rays))
-    near = _near(left.ground_m, right.view, settings.margin), _near(right.ground_m, left.view, settings.margin)
-    threshold = settings.inlier_px * left.view.camera.width_px / left.width_px / left.view.camera.fx_px
+    near = (
+        _near(left.ground_m, right.view, settings.margin),
+        _near(right.ground_m, left.view, settings.margin),
+    )
+    threshold = (
+        settings.inlier_px * left.view.camera.width_px / left.width_px / left.view.camera.fx_px
+    )
     for rows in (near, every):
         matched = _matched(left.features, right.features, rows, settings.ratio)
         good = _agreeing(left.rays[matched[:, 0]], right.rays[matched[:, 1]], threshold)
@@ -121,7 +130,9 @@ def _near(ground_m: PointsM, view: View, margin: float) -> Rows:
         return np.flatnonzero((away < 0.5 + margin).all(axis=1))
 
 
-def _matched(left: Features, right: Features, rows: tuple[Rows, Rows], ratio: float) -> NDArray[np.int64]:
+def _matched(
+    left: Features, right: Features, rows: tuple[Rows, Rows], ratio: float
+) -> NDArray[np.int64]:
     """(N, 2) mutual nearest neighbours, among some rows, of unit descriptors that pass the ratio test."""
     if min(map(len, rows)) < 4:
         return np.zeros((0, 2), np.int64)
@@ -151,15 +162,27 @@ def _joined(
     """Pairs chained into tracks; a chain that meets two features of one picture loses both of them."""
     total = len(rays)
     if not left:
-        return Tracks(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2), int), 0)
+        return Tracks(
+            np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 2), int), 0
+        )
     a, b = np.concatenate(left), np.concatenate(right)
-    _, label = connected_components(coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(total, total)), False)
+    _, label = connected_components(
+        coo_matrix((np.ones(len(a), np.int8), (a, b)), shape=(total, total)), False
+    )
     used = np.unique(np.concatenate([a, b]))
     view, label = np.searchsorted(starts, used, side="right") - 1, label[used]
-    _, at, count = np.unique(label.astype(np.int64) * len(starts) + view, return_inverse=True, return_counts=True)
+    _, at, count = np.unique(
+        label.astype(np.int64) * len(starts) + view, return_inverse=True, return_counts=True
+    )
     single = count[at] == 1
     used, view, label = used[single], view[single], label[single]
     _, point, length = np.unique(label, return_inverse=True, return_counts=True)
     long = length[point] >= 2
     _, point = np.unique(point[long], return_inverse=True)
-    return Tracks(view[long], point, rays[used[long]], np.array(pairs), int(point.max()) + 1 if len(point) else 0)
+    return Tracks(
+        view[long],
+        point,
+        rays[used[long]],
+        np.array(pairs),
+        int(point.max()) + 1 if len(point) else 0,
+    )

@@ -6,7 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.errors import GeometryError
-from sorvolo.geometry.arrays import Floats, Floats32, Mask, Matrix3, PointsM, PointsPx, Vector3, frozen
+from sorvolo.geometry.arrays import (
+    Floats,
+    Floats32,
+    Mask,
+    Matrix3,
+    PointsM,
+    PointsPx,
+    Vector3,
+    frozen,
+)
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose
@@ -28,13 +37,16 @@ class View:
 
     def pixels_from_site(self, points_m: PointsM) -> PointsPx:
         """(N, 2) where site points, (N, 3), are seen; NaN behind the camera."""
-        return self.camera.pixels_from_points((points_m - self.site_from_camera.translation_m) @
-                                              self.site_from_camera.rotation)
+        return self.camera.pixels_from_points(
+            (points_m - self.site_from_camera.translation_m) @ self.site_from_camera.rotation
+        )
 
 
 def outline_m(view: View, up_m: float = 0.0) -> PointsM:
     """(4, 2) the picture's corners on level ground at a height; NaN where a corner looks beyond the horizon."""
-    pose = Pose(view.site_from_camera.rotation, view.site_from_camera.translation_m - [0.0, 0.0, up_m])
+    pose = Pose(
+        view.site_from_camera.rotation, view.site_from_camera.translation_m - [0.0, 0.0, up_m]
+    )
     return footprint(view.camera, pose)
 
 
@@ -44,24 +56,36 @@ def overlaps(views: list[View], samples: int = 12) -> Floats:
     for i, view in enumerate(views):
         grid = np.linspace(0.02, 0.98, samples)
         x, y = np.meshgrid(grid * (view.camera.width_px - 1), grid * (view.camera.height_px - 1))
-        rays = view.camera.rays_from_pixels(np.column_stack([x.ravel(), y.ravel()])) @ view.site_from_camera.rotation.T
+        rays = (
+            view.camera.rays_from_pixels(np.column_stack([x.ravel(), y.ravel()]))
+            @ view.site_from_camera.rotation.T
+        )
         down = rays[:, 2] < -0.05 * np.linalg.norm(rays, axis=1)
         origin = view.site_from_camera.translation_m
         ground = origin + rays[down] * (-origin[2] / rays[down, 2])[:, None]
         for j, other in enumerate(views):
             if j != i and len(ground):
-                shares[i, j] = inside(other.pixels_from_site(ground), other.camera).sum() / samples**2
+                shares[i, j] = (
+                    inside(other.pixels_from_site(ground), other.camera).sum() / samples**2
+                )
     return shares
 
 
 def laid_pixels(view: View, site_from_pixels: Matrix3, up_m: Floats32) -> tuple[Floats32, Floats32]:
     """(H, W) float32 picture x and y of raster pixels on their heights."""
     turn = view.site_from_camera.rotation.T
-    project = view.camera.matrix @ np.column_stack([turn, -turn @ view.site_from_camera.translation_m])
+    project = view.camera.matrix @ np.column_stack(
+        [turn, -turn @ view.site_from_camera.translation_m]
+    )
     level = project[:, :2] @ site_from_pixels[:2] + np.outer(project[:, 3], [0, 0, 1])
-    columns, rows = np.arange(up_m.shape[1], dtype=np.float32), np.arange(up_m.shape[0], dtype=np.float32)
+    columns, rows = (
+        np.arange(up_m.shape[1], dtype=np.float32),
+        np.arange(up_m.shape[0], dtype=np.float32),
+    )
     x, y, z = (
-        np.float32(a) * columns[None, :] + (np.float32(b) * rows[:, None] + np.float32(c)) + np.float32(up) * up_m
+        np.float32(a) * columns[None, :]
+        + (np.float32(b) * rows[:, None] + np.float32(c))
+        + np.float32(up) * up_m
         for (a, b, c), up in zip(level, project[:, 2])
     )
     z = np.where(z > 1e-6, z, np.float32(np.nan))
@@ -72,14 +96,24 @@ def inside(pixels: PointsPx, camera: Camera) -> Mask:
     """(N,) which points, (N, 2), lie in the picture."""
     with np.errstate(invalid="ignore"):
         low = (pixels >= 0).all(axis=-1)
-        return low & (pixels[..., 0] <= camera.width_px - 1) & (pixels[..., 1] <= camera.height_px - 1)
+        return (
+            low & (pixels[..., 0] <= camera.width_px - 1) & (pixels[..., 1] <= camera.height_px - 1)
+        )
 
 
 def pixels_wide(view: View, size_m: float) -> int:
     """How wide the view's picture is when a pixel covers `size_m` of ground at height 0; no wider than it is."""
     share = view.site_from_camera.translation_m[2] / view.camera.fx_px / size_m
     # a few sizes for all photos of a flight: steps of an eighth
-    return int(max(32, min(view.camera.width_px, round(view.camera.width_px * 2 ** (round(8 * np.log2(share)) / 8)))))
+    return int(
+        max(
+            32,
+            min(
+                view.camera.width_px,
+                round(view.camera.width_px * 2 ** (round(8 * np.log2(share)) / 8)),
+            ),
+        )
+    )
 
 
 def ground_outlines_m(views: Sequence[View], up_m: float = 0.0) -> PointsM:
@@ -99,4 +133,6 @@ def ground_outlines_m(views: Sequence[View], up_m: float = 0.0) -> PointsM:
 
 def fix_from_residual(site_from_camera: Pose, residual_m: Sequence[float | None]) -> Vector3:
     """(3,) a GPS fix, NaN where unknown, from the camera's place and camera minus fix."""
-    return site_from_camera.translation_m - np.array([np.nan if each is None else each for each in residual_m])
+    return site_from_camera.translation_m - np.array(
+        [np.nan if each is None else each for each in residual_m]
+    )

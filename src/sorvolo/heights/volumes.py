@@ -62,39 +62,61 @@ class Volume:
         return self.fill_m3 - self.cut_m3
 
 
-def tie(earlier: HeightField, later: HeightField, stable: Mask, settings: VolumeSettings = VolumeSettings()) -> Tie:
+def tie(
+    earlier: HeightField,
+    later: HeightField,
+    stable: Mask,
+    settings: VolumeSettings = VolumeSettings(),
+) -> Tie:
     """How `later` is to be moved onto `earlier`, by the cells of `earlier` that are `stable`, (H, W).
 
     Nuth and Kaab 2011: a shift east or north shows as a difference in height along the slope. Raises InputError where
     the two share too little stable ground.
     """
     shift_m = np.zeros(3)
-    down, east = (np.asarray(np.gradient(earlier.up_m.astype(np.float64), earlier.lattice.cell_m, axis=axis))
-                  for axis in (0, 1))
+    down, east = (
+        np.asarray(np.gradient(earlier.up_m.astype(np.float64), earlier.lattice.cell_m, axis=axis))
+        for axis in (0, 1)
+    )
     north = -down
     spread, sigma, count = np.inf, np.inf, 0
     for _ in range(settings.rounds):
         moved = later.on(earlier.lattice, shift_m[:2])
         off = earlier.up_m - (moved.up_m + shift_m[2])
-        usable = stable & np.isfinite(off) & np.isfinite(east) & np.isfinite(north) & (np.hypot(east, north) < 1.0)
+        usable = (
+            stable
+            & np.isfinite(off)
+            & np.isfinite(east)
+            & np.isfinite(north)
+            & (np.hypot(east, north) < 1.0)
+        )
         if usable.sum() < settings.least_stable:
             raise InputError(
                 f"the two flights share {int(usable.sum())} cells of ground outside the area, "
                 f"{settings.least_stable} are needed to tie them; give a smaller area, or flights that reach beyond it"
             )
         middle = float(np.median(off[usable]))
-        spread = max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(off[usable] - middle))), 1e-4)
+        spread = max(
+            SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(off[usable] - middle))), 1e-4
+        )
         usable &= np.abs(off - middle) < settings.clip_sigmas * spread
         step = _step(off[usable], east[usable], north[usable])
         shift_m += step
-        sigma, count = _offset_sigma(off - step[2], usable, earlier.lattice.cell_m, settings), int(usable.sum())
+        sigma, count = (
+            _offset_sigma(off - step[2], usable, earlier.lattice.cell_m, settings),
+            int(usable.sum()),
+        )
         if np.abs(step).max() < 1e-3:
             break
     return Tie(shift_m, sigma, spread, count)
 
 
 def between(
-    earlier: HeightField, later: HeightField, polygons: Polygons, tied: Tie, settings: VolumeSettings = VolumeSettings()
+    earlier: HeightField,
+    later: HeightField,
+    polygons: Polygons,
+    tied: Tie,
+    settings: VolumeSettings = VolumeSettings(),
 ) -> Volume:
     """Cut and fill within polygons of rings, site metres. Raises InputError where most of them has no heights."""
     moved = later.on(earlier.lattice, tied.shift_m[:2])
@@ -105,7 +127,10 @@ def between(
 
 
 def height_changes(
-    earlier: HeightField, later: HeightField, outlines_m: Sequence[PointsM], changed_m: Sequence[PointsM],
+    earlier: HeightField,
+    later: HeightField,
+    outlines_m: Sequence[PointsM],
+    changed_m: Sequence[PointsM],
     settings: VolumeSettings = VolumeSettings(),
 ) -> list[HeightChange | None]:
     """How much higher the ground within each outline, (N, 2) site metres, lies on the mean than before.
@@ -121,7 +146,11 @@ def height_changes(
 
 
 def _height_change(
-    earlier: HeightField, later: HeightField, polygons: Polygons, tied: Tie, settings: VolumeSettings
+    earlier: HeightField,
+    later: HeightField,
+    polygons: Polygons,
+    tied: Tie,
+    settings: VolumeSettings,
 ) -> HeightChange | None:
     try:
         volume = between(earlier, later, polygons, tied, settings)
@@ -131,12 +160,16 @@ def _height_change(
     return HeightChange(volume.net_m3 / known_m2, volume.sigma_m3 / known_m2)
 
 
-def above_rim(surface: HeightField, polygons: Polygons, settings: VolumeSettings = VolumeSettings()) -> Volume:
+def above_rim(
+    surface: HeightField, polygons: Polygons, settings: VolumeSettings = VolumeSettings()
+) -> Volume:
     """What stands above (fill) and below (cut) the ground that goes on from around polygons of rings, site metres."""
     inside = surface.inside(polygons)
     around = np.isfinite(surface.up_m) & ~inside
     if not around.any():
-        raise InputError("no heights around the area to measure from; give a smaller area, or two flights")
+        raise InputError(
+            "no heights around the area to measure from; give a smaller area, or two flights"
+        )
     base = filled(surface.up_m, around)
     rim = _rim_sigma(surface, inside)
     risen = HeightField(surface.lattice, surface.up_m - base, surface.sigma_m)
@@ -155,14 +188,19 @@ def _added_up(
         advice = "fly it with more overlap"
         if beyond > settings.beyond:
             advice = f"{beyond:.0%} of it is beyond the flight's heights: draw it on flown ground (check its CRS)"
-        raise InputError(f"only {share:.0%} of the area has heights, {settings.least_known:.0%} are needed; {advice}")
+        raise InputError(
+            f"only {share:.0%} of the area has heights, {settings.least_known:.0%} are needed; {advice}"
+        )
     alike = max(1.0, (settings.block_m / cell_m) ** 2)  # cells whose errors are one
-    scatter = float(np.sqrt((sigma[known].astype(np.float64) ** 2).sum() * min(alike, float(known.sum()))))
+    scatter = float(
+        np.sqrt((sigma[known].astype(np.float64) ** 2).sum() * min(alike, float(known.sum())))
+    )
     return Volume(
         cut_m3=float(-np.minimum(rise[known], 0).sum(dtype=np.float64) * cell_m2),
         fill_m3=float(np.maximum(rise[known], 0).sum(dtype=np.float64) * cell_m2),
         sigma_m3=cell_m2 * float(np.hypot(scatter, common_m * known.sum())),
-        area_m2=area_m2, known_share=share,
+        area_m2=area_m2,
+        known_share=share,
     )
 
 

@@ -48,29 +48,43 @@ def equalising_tables(image: Bytes, known: Bytes | None = None, threads: int = 1
     return tables
 
 
-def averaged(image: Bytes, tables: Bytes, width: int, height: int, threads: int = 1) -> tuple[Bytes, Bytes]:
+def averaged(
+    image: Bytes, tables: Bytes, width: int, height: int, threads: int = 1
+) -> tuple[Bytes, Bytes]:
     """An equalised image's window means as planes (3, h, w), and their gray (h, w): see numpy_thesis."""
     _check_image(image)
     _check_tables(tables)
     _check_window(width, height)
-    result: tuple[Bytes, Bytes] = _thesis.averaged(_bytes(image), _bytes(tables), width, height, threads)
+    result: tuple[Bytes, Bytes] = _thesis.averaged(
+        _bytes(image), _bytes(tables), width, height, threads
+    )
     return result
 
 
 def texture_changes(
-    reference: Bytes, query: Bytes, asked: Bytes, width: int, height: int, most: int, threads: int = 1
+    reference: Bytes,
+    query: Bytes,
+    asked: Bytes,
+    width: int,
+    height: int,
+    most: int,
+    threads: int = 1,
 ) -> Bytes:
     """Which of the pixels `asked` (h, w) differ in their patterns, planes being (3, h, w): see numpy_thesis."""
     _check_window(width, height)
     if not reference.shape == query.shape == (3, *asked.shape) or asked.ndim != 2:
-        raise ValueError(f"texture_changes: {reference.shape}, {query.shape} and asked {asked.shape} do not fit")
+        raise ValueError(
+            f"texture_changes: {reference.shape}, {query.shape} and asked {asked.shape} do not fit"
+        )
     mask: Bytes = _thesis.texture_changes(
         _bytes(reference), _bytes(query), _bytes(asked), width, height, most, threads
     )
     return mask
 
 
-def without_isolations(mask: Bytes, width: int, height: int, most_black: int, threads: int = 1) -> Bytes:
+def without_isolations(
+    mask: Bytes, width: int, height: int, most_black: int, threads: int = 1
+) -> Bytes:
     """A mask (h, w) black wherever the window around has more than `most_black` black, else white: see numpy_thesis."""
     _check_mask(mask)
     _check_window(width, height)
@@ -105,7 +119,9 @@ _robust = numpy_robust if _native is None else _native
 
 
 def relight(
-    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.float32],
+    image: NDArray[np.uint8],
+    curves: NDArray[np.int32],
+    gains: NDArray[np.float32],
     out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
     """A picture (h, w, 3) through curves (3, 256) and times lines of gains (H, w, 3) over it: see numpy_robust.
@@ -125,7 +141,11 @@ def relight(
 
 
 def differences(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], known: NDArray[np.bool_] | None, reach: int, weight: int,
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    known: NDArray[np.bool_] | None,
+    reach: int,
+    weight: int,
     out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
     """How far each value of two pictures (h, w, 3) lies outside the other's, planes (6, h, w): see numpy_robust.
@@ -138,17 +158,28 @@ def differences(
     if known is not None and known.shape != (height, width):
         raise ValueError(f"differences: known {known.shape} does not fit pictures {before.shape}")
     if not (0 <= reach <= MOST_REACH_PX and 0 <= weight <= 255):
-        raise ValueError(f"differences: reach {reach} or weight {weight} out of 0 .. {MOST_REACH_PX} and 0 .. 255")
+        raise ValueError(
+            f"differences: reach {reach} or weight {weight} out of 0 .. {MOST_REACH_PX} and 0 .. 255"
+        )
     out = _target(out, (6, height, width))
     marked = None if known is None else np.ascontiguousarray(known, np.bool_).view(np.uint8)
     _robust.differences(
-        np.ascontiguousarray(before, np.uint8), np.ascontiguousarray(after, np.uint8), marked, reach, weight, out
+        np.ascontiguousarray(before, np.uint8),
+        np.ascontiguousarray(after, np.uint8),
+        marked,
+        reach,
+        weight,
+        out,
     )
     return out
 
 
 def tint(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], logs: NDArray[np.uint8], boxes: NDArray[np.int32], margin: int,
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    logs: NDArray[np.uint8],
+    boxes: NDArray[np.int32],
+    margin: int,
     out: NDArray[np.uint8] | None = None,
 ) -> NDArray[np.uint8]:
     """How much redder than blue a picture became, (h, w), in boxes and `margin` around only: see numpy_robust.
@@ -156,62 +187,100 @@ def tint(
     `out` (h, w) is written over there where it is given, and returned; elsewhere it keeps what it held.
     """
     if before.shape != after.shape or before.shape[2:] != (3,) or logs.shape != (256,):
-        raise ValueError(f"tint: pictures {before.shape}, {after.shape} and logs {logs.shape} do not fit")
+        raise ValueError(
+            f"tint: pictures {before.shape}, {after.shape} and logs {logs.shape} do not fit"
+        )
     boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
     out = _target(out, before.shape[:2])
     _robust.tint(
-        np.ascontiguousarray(before, np.uint8), np.ascontiguousarray(after, np.uint8),
-        np.ascontiguousarray(logs, np.uint8), boxes, margin, out,
+        np.ascontiguousarray(before, np.uint8),
+        np.ascontiguousarray(after, np.uint8),
+        np.ascontiguousarray(logs, np.uint8),
+        boxes,
+        margin,
+        out,
     )
     return out
 
 
 def rim_balance(
-    labels: NDArray[np.uint8], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
+    labels: NDArray[np.uint8],
+    boxes: NDArray[np.int32],
+    came: NDArray[np.uint8],
+    went: NDArray[np.uint8],
 ) -> NDArray[np.int64]:
     """By how much `came` exceeds `went` along the rims of regions, (N,): see numpy_robust."""
     boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
     _check_boxes("rim_balance", boxes, labels.shape)
     if not labels.shape == came.shape == went.shape or labels.ndim != 2:
-        raise ValueError(f"rim_balance: labels {labels.shape}, came {came.shape}, went {went.shape} do not fit")
+        raise ValueError(
+            f"rim_balance: labels {labels.shape}, came {came.shape}, went {went.shape} do not fit"
+        )
     _check_labels("rim_balance", labels, len(boxes))
     balance: NDArray[np.int64] = _robust.rim_balance(
-        np.ascontiguousarray(labels, np.uint8), boxes, np.ascontiguousarray(came, np.uint8),
+        np.ascontiguousarray(labels, np.uint8),
+        boxes,
+        np.ascontiguousarray(came, np.uint8),
         np.ascontiguousarray(went, np.uint8),
     )
     return balance
 
 
 def tree_margins(
-    rows: NDArray[np.float64], asked: NDArray[np.int32], thresholds: NDArray[np.float64], leaves: NDArray[np.float64]
+    rows: NDArray[np.float64],
+    asked: NDArray[np.int32],
+    thresholds: NDArray[np.float64],
+    leaves: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """The sums of trees for rows (N, F), (N,): see numpy_robust."""
     trees, depth = asked.shape
-    if thresholds.shape != asked.shape or leaves.shape != (trees, 1 << depth) or trees < 1 or rows.ndim != 2:
+    if (
+        thresholds.shape != asked.shape
+        or leaves.shape != (trees, 1 << depth)
+        or trees < 1
+        or rows.ndim != 2
+    ):
         raise ValueError(
             f"tree_margins: rows {rows.shape}, asked {asked.shape}, thresholds {thresholds.shape} and leaves "
             f"{leaves.shape} do not fit"
         )
     if int(asked.min()) < 0 or int(asked.max()) >= rows.shape[1]:
-        raise ValueError(f"tree_margins: rows have {rows.shape[1]} columns, asked is one of {int(asked.max())}")
+        raise ValueError(
+            f"tree_margins: rows have {rows.shape[1]} columns, asked is one of {int(asked.max())}"
+        )
     margins: NDArray[np.float64] = _robust.tree_margins(
-        np.ascontiguousarray(rows, np.float64), np.ascontiguousarray(asked, np.int32),
-        np.ascontiguousarray(thresholds, np.float64), np.ascontiguousarray(leaves, np.float64),
+        np.ascontiguousarray(rows, np.float64),
+        np.ascontiguousarray(asked, np.int32),
+        np.ascontiguousarray(thresholds, np.float64),
+        np.ascontiguousarray(leaves, np.float64),
     )
     return margins
 
 
 def core_regions(
-    values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
+    values: NDArray[np.uint8],
+    thresholds: NDArray[np.uint8],
+    strong: float,
+    core: float,
+    least_area: int,
+    most: int,
 ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
     """Where values lie over thresholds, both (h, w), each part cut to its core: see numpy_robust."""
     if not 0 <= most <= 255:
-        raise ValueError(f"core_regions: a byte holds the labels of 0 .. 255 regions, not of {most}")
+        raise ValueError(
+            f"core_regions: a byte holds the labels of 0 .. 255 regions, not of {most}"
+        )
     if values.shape != thresholds.shape or values.ndim != 2:
-        raise ValueError(f"core_regions: values {values.shape} and thresholds {thresholds.shape} do not fit")
+        raise ValueError(
+            f"core_regions: values {values.shape} and thresholds {thresholds.shape} do not fit"
+        )
     found: tuple[NDArray[np.uint8], NDArray[np.int32]] = _robust.core_regions(
-        np.ascontiguousarray(values, np.uint8), np.ascontiguousarray(thresholds, np.uint8), strong, core,
-        least_area, most,
+        np.ascontiguousarray(values, np.uint8),
+        np.ascontiguousarray(thresholds, np.uint8),
+        strong,
+        core,
+        least_area,
+        most,
     )
     return found
 
@@ -226,7 +295,10 @@ def held_parts(mask: Bytes, seeds: Bytes) -> Bytes:
 
 
 def measure_regions(
-    labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
+    labels: NDArray[np.uint8],
+    boxes: NDArray[np.int32],
+    channels: Sequence[NDArray[np.uint8]],
+    margin: int,
 ) -> NDArray[np.int64]:
     """Sums over regions and over what is around them, (N, 2, 2 C + 1): see numpy_robust."""
     shapes = {each.shape for each in channels}
@@ -234,8 +306,10 @@ def measure_regions(
         raise ValueError(f"measure_regions: labels {labels.shape} and channels {shapes} do not fit")
     _check_labels("measure_regions", labels, len(boxes))
     sums: NDArray[np.int64] = _robust.measure_regions(
-        np.ascontiguousarray(labels, np.uint8), np.ascontiguousarray(boxes, np.int32).reshape(-1, 4),
-        [np.ascontiguousarray(each, np.uint8) for each in channels], margin,
+        np.ascontiguousarray(labels, np.uint8),
+        np.ascontiguousarray(boxes, np.int32).reshape(-1, 4),
+        [np.ascontiguousarray(each, np.uint8) for each in channels],
+        margin,
     )
     return sums
 
@@ -247,10 +321,15 @@ def match_regions(
     boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
     height, width = query.shape
     if searched.shape != (height + 2 * reach, width + 2 * reach):
-        raise ValueError(f"match_regions: searched {searched.shape}, query {query.shape}, reach {reach} do not fit")
+        raise ValueError(
+            f"match_regions: searched {searched.shape}, query {query.shape}, reach {reach} do not fit"
+        )
     _check_boxes("match_regions", boxes, query.shape)
     found: NDArray[np.float64] = _robust.match_regions(
-        np.ascontiguousarray(query, np.uint8), np.ascontiguousarray(searched, np.uint8), boxes, reach
+        np.ascontiguousarray(query, np.uint8),
+        np.ascontiguousarray(searched, np.uint8),
+        boxes,
+        reach,
     )
     return found
 
@@ -258,7 +337,9 @@ def match_regions(
 _light = numpy_light if _native is None else _native
 
 
-def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float) -> NDArray[np.float64]:
+def slopes(
+    before: NDArray[np.float32], after: NDArray[np.float32], prior: float
+) -> NDArray[np.float64]:
     """By how much one of two (N, C), N > 0, is spread wider than the other, (C,): see numpy_light."""
     if before.shape != after.shape or before.ndim != 2 or len(before) == 0:
         raise ValueError(f"slopes: before {before.shape} and after {after.shape} do not fit")
@@ -271,13 +352,24 @@ def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float
 
 
 def fit_moves(
-    rows_x: NDArray[np.float64], rows_y: NDArray[np.float64], moves: NDArray[np.float64], trust: NDArray[np.float64],
-    ridge: NDArray[np.float64], wide: float, high: float,
+    rows_x: NDArray[np.float64],
+    rows_y: NDArray[np.float64],
+    moves: NDArray[np.float64],
+    trust: NDArray[np.float64],
+    ridge: NDArray[np.float64],
+    wide: float,
+    high: float,
 ) -> tuple[NDArray[np.float64], float]:
     """A robust linear fit (8,) of displacements (N, 2), and its median rest: see numpy_light."""
     count = len(trust)
-    if not rows_x.shape == rows_y.shape == (count, 8) or moves.shape != (count, 2) or ridge.shape != (8,):
-        raise ValueError(f"fit_moves: rows {rows_x.shape}, {rows_y.shape} and moves {moves.shape} do not fit")
+    if (
+        not rows_x.shape == rows_y.shape == (count, 8)
+        or moves.shape != (count, 2)
+        or ridge.shape != (8,)
+    ):
+        raise ValueError(
+            f"fit_moves: rows {rows_x.shape}, {rows_y.shape} and moves {moves.shape} do not fit"
+        )
     if not ((trust >= 0).all() and (trust > 0).any() and (ridge >= 0).all()):
         raise ValueError("fit_moves: trust is 0 or more and somewhere more, a ridge 0 or more")
     if not (np.isfinite(rows_x).all() and np.isfinite(rows_y).all() and np.isfinite(moves).all()):
@@ -285,7 +377,9 @@ def fit_moves(
     x, y, moved, trusted, damping = (
         np.ascontiguousarray(each, np.float64) for each in (rows_x, rows_y, moves, trust, ridge)
     )
-    found: tuple[NDArray[np.float64], float] = _light.fit_moves(x, y, moved, trusted, damping, wide, high)
+    found: tuple[NDArray[np.float64], float] = _light.fit_moves(
+        x, y, moved, trusted, damping, wide, high
+    )
     return found
 
 
@@ -294,9 +388,15 @@ def detail_products(
 ) -> NDArray[np.float32]:
     """What the details of two pictures (h, w) have in common in cells, (3, h / cell, w / cell): see numpy_light."""
     if before.shape != after.shape or before.ndim != 2 or table.shape != (256,):
-        raise ValueError(f"detail_products: pictures {before.shape}, {after.shape}, table {table.shape} do not fit")
-    if not (window % 2 == 1 and 1 <= window <= min(before.shape) and 1 <= cell <= min(before.shape)):
-        raise ValueError(f"detail_products: window {window}, cell {cell} do not fit pictures {before.shape}")
+        raise ValueError(
+            f"detail_products: pictures {before.shape}, {after.shape}, table {table.shape} do not fit"
+        )
+    if not (
+        window % 2 == 1 and 1 <= window <= min(before.shape) and 1 <= cell <= min(before.shape)
+    ):
+        raise ValueError(
+            f"detail_products: window {window}, cell {cell} do not fit pictures {before.shape}"
+        )
     found: NDArray[np.float32] = _light.detail_products(
         _bytes(before), _bytes(after), np.ascontiguousarray(table, np.float32), window, cell
     )
@@ -310,7 +410,9 @@ def flow_on_grid(
     if details.ndim != 2 or flow.shape != (*details.shape, 2):
         raise ValueError(f"flow_on_grid: flow {flow.shape} and details {details.shape} do not fit")
     if not (1 <= rows <= details.shape[0] and 1 <= columns <= details.shape[1]):
-        raise ValueError(f"flow_on_grid: a grid of {rows} x {columns} does not fit details {details.shape}")
+        raise ValueError(
+            f"flow_on_grid: a grid of {rows} x {columns} does not fit details {details.shape}"
+        )
     found: NDArray[np.float32] = _light.flow_on_grid(
         np.ascontiguousarray(flow, np.float32), _bytes(details), rows, columns
     )
@@ -320,14 +422,22 @@ def flow_on_grid(
 def _target(out: NDArray[np.uint8] | None, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     if out is None:
         return np.empty(shape, np.uint8)
-    if out.shape != shape or out.dtype != np.uint8 or not (out.flags.c_contiguous and out.flags.writeable):
-        raise ValueError(f"out: found {out.dtype} of shape {out.shape}; give writeable uint8 in C order, {shape}")
+    if (
+        out.shape != shape
+        or out.dtype != np.uint8
+        or not (out.flags.c_contiguous and out.flags.writeable)
+    ):
+        raise ValueError(
+            f"out: found {out.dtype} of shape {out.shape}; give writeable uint8 in C order, {shape}"
+        )
     return out
 
 
 def _check_labels(kernel: str, labels: NDArray[np.uint8], count: int) -> None:
     if labels.dtype != np.uint8 or count > 255:
-        raise ValueError(f"{kernel}: labels are bytes of at most 255 regions, got {labels.dtype} and {count} regions")
+        raise ValueError(
+            f"{kernel}: labels are bytes of at most 255 regions, got {labels.dtype} and {count} regions"
+        )
 
 
 def _check_boxes(name: str, boxes: NDArray[np.int32], shape: tuple[int, ...]) -> None:
@@ -364,4 +474,6 @@ def _check_tables(tables: Bytes) -> None:
 
 def _check_window(width: int, height: int) -> None:
     if not (1 <= width <= LARGEST_WINDOW_PX and 1 <= height <= LARGEST_WINDOW_PX):
-        raise ValueError(f"a window is 1 to {LARGEST_WINDOW_PX} px wide and high, got {width} x {height}")
+        raise ValueError(
+            f"a window is 1 to {LARGEST_WINDOW_PX} px wide and high, got {width} x {height}"
+        )

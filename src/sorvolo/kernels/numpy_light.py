@@ -7,7 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float) -> NDArray[np.float64]:
+def slopes(
+    before: NDArray[np.float32], after: NDArray[np.float32], prior: float
+) -> NDArray[np.float64]:
     """(C,) by how much `after` (N, C) is spread wider than `before` (N, C), both about 0, re-weighted three times.
 
     What lies one and a half median rests off the slope weighs half. `prior` is added to both sums of squares.
@@ -22,14 +24,21 @@ def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float
                 scale = max(1.5 * float(np.median(np.abs(rest))), 0.01)
             off = rest / np.float32(scale)
             weights = (np.float32(1) / (np.float32(1) + off * off)).astype(np.float64)
-            one, other = ((weights * each * each).sum() + prior for each in (a.astype(float), b.astype(float)))
+            one, other = (
+                (weights * each * each).sum() + prior for each in (a.astype(float), b.astype(float))
+            )
             found[channel] = np.sqrt(other / one)
     return found
 
 
 def fit_moves(
-    rows_x: NDArray[np.float64], rows_y: NDArray[np.float64], moves: NDArray[np.float64], trust: NDArray[np.float64],
-    ridge: NDArray[np.float64], wide: float, high: float,
+    rows_x: NDArray[np.float64],
+    rows_y: NDArray[np.float64],
+    moves: NDArray[np.float64],
+    trust: NDArray[np.float64],
+    ridge: NDArray[np.float64],
+    wide: float,
+    high: float,
 ) -> tuple[NDArray[np.float64], float]:
     """The solution (8,) by which `rows_x` and `rows_y` (N, 8) make `moves` (N, 2), fitted four times; the median rest.
 
@@ -39,25 +48,39 @@ def fit_moves(
     weights, solution, median = trust.copy(), np.zeros(8), 0.0
     for _ in range(4):
         normal = (rows_x * weights[:, None]).T @ rows_x + (rows_y * weights[:, None]).T @ rows_y
-        right = (rows_x * weights[:, None]).T @ moves[:, 0] + (rows_y * weights[:, None]).T @ moves[:, 1]
+        right = (rows_x * weights[:, None]).T @ moves[:, 0] + (rows_y * weights[:, None]).T @ moves[
+            :, 1
+        ]
         solution = np.linalg.solve(normal + weights.sum() * np.diag(ridge), right)
-        rest = np.hypot((moves[:, 0] - rows_x @ solution) * wide, (moves[:, 1] - rows_y @ solution) * high)
+        rest = np.hypot(
+            (moves[:, 0] - rows_x @ solution) * wide, (moves[:, 1] - rows_y @ solution) * high
+        )
         median = float(np.median(rest[trust > 0]))
         weights = trust / (1 + (rest / max(1.5 * median, 0.05)) ** 2)
     return solution, median
 
 
 def detail_products(
-    before: NDArray[np.uint8], after: NDArray[np.uint8], table: NDArray[np.float32], window: int, cell: int
+    before: NDArray[np.uint8],
+    after: NDArray[np.uint8],
+    table: NDArray[np.float32],
+    window: int,
+    cell: int,
 ) -> NDArray[np.float32]:
     """(3, h / cell, w / cell) means over cells of the details' products: before by after, before and after squared.
 
     Details are the values (h, w) in `table` (256,) less the mean of `window` pixels each way, the rim mirrored.
     """
     high, wide = before.shape[0] // cell, before.shape[1] // cell
-    one, other = (_details(table[each], window)[: high * cell, : wide * cell] for each in (before, after))
+    one, other = (
+        _details(table[each], window)[: high * cell, : wide * cell] for each in (before, after)
+    )
     products = np.stack([one * other, one * one, other * other])
-    return products.reshape(3, high, cell, wide, cell).mean(axis=(2, 4), dtype=np.float64).astype(np.float32)
+    return (
+        products.reshape(3, high, cell, wide, cell)
+        .mean(axis=(2, 4), dtype=np.float64)
+        .astype(np.float32)
+    )
 
 
 def _details(values: NDArray[np.float32], window: int) -> NDArray[np.float32]:

@@ -8,8 +8,14 @@ from scipy import ndimage
 
 
 def relight(
-    image: NDArray[np.uint8], curves: NDArray[np.int32], gains: NDArray[np.float32], left: int, top: int, wide: int,
-    high: int, out: NDArray[np.uint8],
+    image: NDArray[np.uint8],
+    curves: NDArray[np.int32],
+    gains: NDArray[np.float32],
+    left: int,
+    top: int,
+    wide: int,
+    high: int,
+    out: NDArray[np.uint8],
 ) -> None:
     """Fills a part of `out` with `image` (h, w, 3) through `curves` (3, 256) and times `gains` (H, w, 3), 4096 one.
 
@@ -29,7 +35,11 @@ def relight(
 
 
 def differences(
-    reference: NDArray[np.uint8], query: NDArray[np.uint8], known: NDArray[np.uint8] | None, reach: int, weight: int,
+    reference: NDArray[np.uint8],
+    query: NDArray[np.uint8],
+    known: NDArray[np.uint8] | None,
+    reach: int,
+    weight: int,
     out: NDArray[np.uint8],
 ) -> None:
     """Fills `out` (6, h, w) from two BGR pictures (h, w, 3), blurred by 3 x 3 and taken apart into light and colour.
@@ -41,12 +51,20 @@ def differences(
     """
     before, after = _light_and_colour(reference), _light_and_colour(query)
     (came, came_colour), (went, went_colour) = (
-        _outside(values, others, reach, weight) for values, others in ((after, before), (before, after))
+        _outside(values, others, reach, weight)
+        for values, others in ((after, before), (before, after))
     )
     difference = np.maximum(came, went)
     if known is not None:
         difference[known == 0] = 0
-    out[:] = difference, np.maximum(came_colour, went_colour), came, went, before[..., 0], after[..., 0]
+    out[:] = (
+        difference,
+        np.maximum(came_colour, went_colour),
+        came,
+        went,
+        before[..., 0],
+        after[..., 0],
+    )
 
 
 def _light_and_colour(image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -55,7 +73,9 @@ def _light_and_colour(image: NDArray[np.uint8]) -> NDArray[np.int64]:
     half = 1 << 13
     luma = (blue * 1868 + green * 9617 + red * 4899 + half) >> 14
     colours = ((red - luma) * 11682, (blue - luma) * 9241)
-    return np.stack([luma, *(np.clip((each + (128 << 14) + half) >> 14, 0, 255) for each in colours)], axis=-1)
+    return np.stack(
+        [luma, *(np.clip((each + (128 << 14) + half) >> 14, 0, 255) for each in colours)], axis=-1
+    )
 
 
 def _blurred(image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -70,7 +90,9 @@ def _outside(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     window, axes = (2 * reach + 1, 2 * reach + 1), (0, 1)
     rim = ((reach, reach), (reach, reach), (0, 0))
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(others, rim, mode="edge"), window, axes)
+    around = np.lib.stride_tricks.sliding_window_view(
+        np.pad(others, rim, mode="edge"), window, axes
+    )
     most, least = around.max(axis=(-2, -1)), around.min(axis=(-2, -1))
     luma, red, blue = np.moveaxis(np.maximum(np.maximum(values - most, least - values), 0), 2, 0)
     colour = np.minimum(red + blue, 255)
@@ -78,8 +100,12 @@ def _outside(
 
 
 def tint(
-    reference: NDArray[np.uint8], query: NDArray[np.uint8], logs: NDArray[np.uint8], boxes: NDArray[np.int32],
-    margin: int, out: NDArray[np.uint8],
+    reference: NDArray[np.uint8],
+    query: NDArray[np.uint8],
+    logs: NDArray[np.uint8],
+    boxes: NDArray[np.int32],
+    margin: int,
+    out: NDArray[np.uint8],
 ) -> None:
     """Fills `out` (h, w) in `boxes` (N, 4) grown by `margin`: how much redder against blue `query` is, 128 where alike.
 
@@ -88,22 +114,35 @@ def tint(
     before, after = (logs[image].astype(np.float64) for image in (reference, query))
     steps = np.rint(64 + (after - before) / 4)[..., 2] + np.rint(64 - (after - before) / 4)[..., 0]
     for x, y, wide, high in boxes.tolist():
-        window = slice(max(y - margin, 0), y + high + margin), slice(max(x - margin, 0), x + wide + margin)
+        window = (
+            slice(max(y - margin, 0), y + high + margin),
+            slice(max(x - margin, 0), x + wide + margin),
+        )
         out[window] = np.minimum(steps[window], 255)
 
 
 def rim_balance(
-    labels: NDArray[np.uint8], boxes: NDArray[np.int32], came: NDArray[np.uint8], went: NDArray[np.uint8]
+    labels: NDArray[np.uint8],
+    boxes: NDArray[np.int32],
+    came: NDArray[np.uint8],
+    went: NDArray[np.uint8],
 ) -> NDArray[np.int64]:
     """(N,) sums of `came` - `went` over the pixels of regions 1 .. N of `labels` (h, w) with a 0 within 2 px around."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(labels, 2, mode="edge"), (5, 5))
     rim = (labels > 0) & (around == 0).any(axis=(-2, -1))
     balance = came.astype(np.int64) - went
-    return np.array([balance[rim & (labels == region + 1)].sum() for region in range(len(boxes))], np.int64)
+    return np.array(
+        [balance[rim & (labels == region + 1)].sum() for region in range(len(boxes))], np.int64
+    )
 
 
 def core_regions(
-    values: NDArray[np.uint8], thresholds: NDArray[np.uint8], strong: float, core: float, least_area: int, most: int
+    values: NDArray[np.uint8],
+    thresholds: NDArray[np.uint8],
+    strong: float,
+    core: float,
+    least_area: int,
+    most: int,
 ) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
     """Where `values` (h, w) lie over `thresholds` (h, w): labels (h, w), 0 none, and boxes (N, 4) x, y, w, h.
 
@@ -137,7 +176,10 @@ def _parts(mask: NDArray[np.bool_]) -> list[tuple[NDArray[np.int64], NDArray[np.
         part = [(int(y), int(x))]
         for row, column in part:
             rows, columns = slice(max(row - 1, 0), row + 2), slice(max(column - 1, 0), column + 2)
-            near = [(rows.start + dy, columns.start + dx) for dy, dx in np.argwhere(left[rows, columns]).tolist()]
+            near = [
+                (rows.start + dy, columns.start + dx)
+                for dy, dx in np.argwhere(left[rows, columns]).tolist()
+            ]
             left[rows, columns] = False
             part += near
         found = np.array(sorted(part), np.int64)
@@ -152,7 +194,10 @@ def held_parts(mask: NDArray[np.uint8], seeds: NDArray[np.uint8]) -> NDArray[np.
 
 
 def measure_regions(
-    labels: NDArray[np.uint8], boxes: NDArray[np.int32], channels: Sequence[NDArray[np.uint8]], margin: int
+    labels: NDArray[np.uint8],
+    boxes: NDArray[np.int32],
+    channels: Sequence[NDArray[np.uint8]],
+    margin: int,
 ) -> NDArray[np.int64]:
     """(N, 2, 2 C + 1) count, C sums and C sums of squares of `channels` (h, w), for each region 1 .. N of `labels`.
 
@@ -166,7 +211,9 @@ def measure_regions(
         window = rows, slice(max(x - margin, 0), min(x + wide + margin, width))
         for part, label in enumerate((region + 1, 0)):
             values = stack[window][labels[window] == label].astype(np.int64)
-            sums[region, part] = np.concatenate([[len(values)], values.sum(axis=0), (values * values).sum(axis=0)])
+            sums[region, part] = np.concatenate(
+                [[len(values)], values.sum(axis=0), (values * values).sum(axis=0)]
+            )
     return sums
 
 
@@ -209,7 +256,10 @@ def _correlation(q: NDArray[np.int64], t: NDArray[np.int64]) -> float:
 
 
 def tree_margins(
-    rows: NDArray[np.float64], asked: NDArray[np.int32], thresholds: NDArray[np.float64], leaves: NDArray[np.float64]
+    rows: NDArray[np.float64],
+    asked: NDArray[np.int32],
+    thresholds: NDArray[np.float64],
+    leaves: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """(N,) sums over oblivious trees of the leaf that each of `rows` (N, F) comes to, in the order of the trees.
 

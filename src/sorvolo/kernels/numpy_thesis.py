@@ -31,12 +31,16 @@ def equalising_tables(image: Bytes, known: Bytes | None, threads: int) -> Bytes:
     return tables
 
 
-def averaged(image: Bytes, tables: Bytes, width: int, height: int, threads: int) -> tuple[Bytes, Bytes]:
+def averaged(
+    image: Bytes, tables: Bytes, width: int, height: int, threads: int
+) -> tuple[Bytes, Bytes]:
     """An image (h, w, 3) through its tables and averaged over a window: planes (3, h, w) and their gray (h, w)."""
     del threads
     equalised = looked_up(image, tables).transpose(2, 0, 1)
     area = width * height
-    planes = np.stack([(_window_sums(plane, width, height) + area // 2) // area for plane in equalised])
+    planes = np.stack(
+        [(_window_sums(plane, width, height) + area // 2) // area for plane in equalised]
+    )
     return planes.astype(np.uint8), gray_of(planes.transpose(1, 2, 0))
 
 
@@ -63,7 +67,9 @@ def texture_changes(
     return changes
 
 
-def without_isolations(mask: Bytes, width: int, height: int, most_black: int, threads: int) -> Bytes:
+def without_isolations(
+    mask: Bytes, width: int, height: int, most_black: int, threads: int
+) -> Bytes:
     """Equation 3.21: 0 where the window around a pixel has more than `most_black` black ones, else 255."""
     del threads
     black = _window_sums((mask == 0).astype(np.uint8), width, height)
@@ -114,4 +120,9 @@ def _window_sums(plane: Bytes, width: int, height: int) -> NDArray[np.int64]:
     """The sum over the window around each pixel of a plane (h, w)."""
     around = np.pad(_mirrored(plane, width, height), ((1, 0), (1, 0)))
     sums = around.cumsum(axis=0, dtype=np.int64).cumsum(axis=1)
-    return sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+    return (
+        sums[height:, width:]
+        - sums[:-height, width:]
+        - sums[height:, :-width]
+        + sums[:-height, :-width]
+    )

@@ -5,7 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.capture.calibration import camera_xml
-from sorvolo.capture.checkerboard import Board, BoardView, Calibration, NoBoard, calibrate, find_board
+from sorvolo.capture.checkerboard import (
+    Board,
+    BoardView,
+    Calibration,
+    NoBoard,
+    calibrate,
+    find_board,
+)
 from sorvolo.capture.source import Source, open_sources
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.store.atomic import atomic_write_bytes
@@ -28,7 +35,9 @@ def parse_board(text: str, square_mm: float) -> Board:
     """The board of "9x6", counted in inner corners. Raises SettingsError for anything else."""
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdecimal() and rows.isdecimal()):
-        raise SettingsError(f"--board {text!r}: give the inner corners a row and a column, such as 9x6")
+        raise SettingsError(
+            f"--board {text!r}: give the inner corners a row and a column, such as 9x6"
+        )
     return Board(int(columns), int(rows), square_mm)
 
 

@@ -35,12 +35,21 @@ def copy_by_hash(address: str, to: Path, sha256: str, *, offline: str) -> None:
             while chunk := stream.read(_CHUNK_BYTES):
                 size += len(chunk)
                 if size > _MOST_BYTES:
-                    raise InputError(f"{address} is larger than {_MOST_BYTES >> 30} GB, so not what was asked for")
+                    raise InputError(
+                        f"{address} is larger than {_MOST_BYTES >> 30} GB, so not what was asked for"
+                    )
                 digest.update(chunk)
                 file.write(chunk)
-    except (urllib.error.URLError, TimeoutError, ConnectionError, http.client.HTTPException) as error:
+    except (
+        urllib.error.URLError,
+        TimeoutError,
+        ConnectionError,
+        http.client.HTTPException,
+    ) as error:
         reason = getattr(error, "reason", None) or error
-        raise InputError(f"{address} cannot be fetched ({reason}). Without a network, {offline}") from error
+        raise InputError(
+            f"{address} cannot be fetched ({reason}). Without a network, {offline}"
+        ) from error
     found = digest.hexdigest()
     if found != sha256:
         raise InputError(
@@ -59,11 +68,13 @@ def _opened(address: str) -> IO[bytes]:
 class WebRedirects(urllib.request.HTTPRedirectHandler):
     """Follows a redirect to the web alone, and from https to https alone."""
 
-    def redirect_request(  # noqa: D102
+    def redirect_request(
         self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> urllib.request.Request | None:
         asked = urllib.parse.urlsplit(req.full_url).scheme
         scheme = urllib.parse.urlsplit(newurl).scheme
         if scheme not in ("http", "https") or (asked == "https" and scheme != "https"):
-            raise urllib.error.URLError(f"it redirects from {asked} to {scheme}, which is not followed")
+            raise urllib.error.URLError(
+                f"it redirects from {asked} to {scheme}, which is not followed"
+            )
         return super().redirect_request(req, fp, code, msg, headers, newurl)

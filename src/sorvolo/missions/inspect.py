@@ -24,14 +24,23 @@ from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.flight import CameraModel, Notice
 
 _ZONE_NS = 900 * SECOND_NS  # time zones differ by quarters of an hour
-_BLURRED = 1.5  # registration.features.sharpness at 960 px falls below this when blurred by two pixels
+_BLURRED = (
+    1.5  # registration.features.sharpness at 960 px falls below this when blurred by two pixels
+)
 _BARE_LEVELS = 1.5  # grey levels of `sharpness_and_texture`'s second figure
 _STILL_SHARE = 0.7  # of the first picture that all others show: the drone hovers, all flight long
 _STILL_M = 3.0  # flown in all, no more than a hovering drone's fixes wander
 
-_INFORMATION = frozenset({
-    "repeated_fix", "ignored_file", "resized_photo", "rotated_photo", "duplicate_photo", "time_zone_unknown",
-})
+_INFORMATION = frozenset(
+    {
+        "repeated_fix",
+        "ignored_file",
+        "resized_photo",
+        "rotated_photo",
+        "duplicate_photo",
+        "time_zone_unknown",
+    }
+)
 _ADVICE = {
     "truncated": "copy the video again; what is there is mapped",
     "decode_error": "copy the video again from the drone's card",
@@ -97,7 +106,9 @@ class Inspection:
 
 
 def inspect_input(
-    inputs: Sequence[Path | str], telemetry: Path | str | None = None, camera: Path | str | None = None
+    inputs: Sequence[Path | str],
+    telemetry: Path | str | None = None,
+    camera: Path | str | None = None,
 ) -> list[Inspection]:
     """Look at each flight among the inputs: all metadata, and a handful of frames; of a live one the next seconds.
 
@@ -112,7 +123,8 @@ def _inspect(source: Source) -> Inspection:
     telemetry = telemetry_facts(source, frames)
     flight = flight_facts(while_filming(source, frames), source.camera.camera, frames)
     findings = [
-        *_frame_findings(frames), *_camera_findings(source.camera, flight),
+        *_frame_findings(frames),
+        *_camera_findings(source.camera, flight),
         *_telemetry_findings(source, frames, telemetry),
         *_movement_findings(source.kind, frames, telemetry, flight),
         *_flight_findings(source.kind, frames, telemetry, flight),
@@ -121,12 +133,20 @@ def _inspect(source: Source) -> Inspection:
     order = [Level.PROBLEM, Level.WARNING, Level.INFO]
     model = source.camera
     return Inspection(
-        source.name, source.kind, source.inputs, frames,
+        source.name,
+        source.kind,
+        source.inputs,
+        frames,
         CameraFacts(
-            model.origin, model.camera.fx_px, model.focal_sigma, model.camera.angle_of_view_deg,
+            model.origin,
+            model.camera.fx_px,
+            model.focal_sigma,
+            model.camera.angle_of_view_deg,
             model.camera.is_distorted,
         ),
-        telemetry, flight, tuple(sorted(findings, key=lambda finding: order.index(finding.level))),
+        telemetry,
+        flight,
+        tuple(sorted(findings, key=lambda finding: order.index(finding.level))),
     )
 
 
@@ -136,51 +156,73 @@ def _frame_findings(frames: FrameFacts) -> list[Finding]:
         text = f"only {frames.count} frames"
         found.append(Finding(Level.WARNING, text, "a map needs several overlapping ones"))
     if frames.sharpness < _BLURRED:
-        found.append(Finding(
-            Level.WARNING, f"the pictures are blurred (sharpness {frames.sharpness:.1f}, good from 2)",
-            "fly slower, use a shorter exposure, check the focus",
-        ))
+        found.append(
+            Finding(
+                Level.WARNING,
+                f"the pictures are blurred (sharpness {frames.sharpness:.1f}, good from 2)",
+                "fly slower, use a shorter exposure, check the focus",
+            )
+        )
     if frames.texture_levels < _BARE_LEVELS:
-        found.append(Finding(
-            Level.WARNING, f"the pictures show hardly any texture ({frames.texture_levels:.1f} gray levels), "
-            "as water, snow, fog or a covered lens do", "frames without texture are placed by GPS alone",
-        ))
+        found.append(
+            Finding(
+                Level.WARNING,
+                f"the pictures show hardly any texture ({frames.texture_levels:.1f} gray levels), "
+                "as water, snow, fog or a covered lens do",
+                "frames without texture are placed by GPS alone",
+            )
+        )
     return found
 
 
 def _camera_findings(model: CameraModel, flight: FlightFacts) -> list[Finding]:
     found = []
     if model.focal_sigma >= 0.1:
-        found.append(Finding(
-            Level.WARNING, f"the focal length is uncertain by {100 * model.focal_sigma:.0f} %",
-            "give --camera FILE or a preset's name, or calibrate once with `sorvolo calibrate`",
-        ))
+        found.append(
+            Finding(
+                Level.WARNING,
+                f"the focal length is uncertain by {100 * model.focal_sigma:.0f} %",
+                "give --camera FILE or a preset's name, or calibrate once with `sorvolo calibrate`",
+            )
+        )
     pitch_deg = flight.camera_pitch_deg
     if pitch_deg > -45:
-        found.append(Finding(
-            Level.PROBLEM, f"the camera looks at the horizon (gimbal pitch {pitch_deg:.0f} deg)",
-            "fly with the gimbal straight down (-90 deg); such frames cannot be mapped",
-        ))
+        found.append(
+            Finding(
+                Level.PROBLEM,
+                f"the camera looks at the horizon (gimbal pitch {pitch_deg:.0f} deg)",
+                "fly with the gimbal straight down (-90 deg); such frames cannot be mapped",
+            )
+        )
     elif pitch_deg > -75:
-        found.append(Finding(
-            Level.WARNING, f"the camera looks ahead (gimbal pitch {pitch_deg:.0f} deg)",
-            "fly with the gimbal straight down (-90 deg) for an even map",
-        ))
+        found.append(
+            Finding(
+                Level.WARNING,
+                f"the camera looks ahead (gimbal pitch {pitch_deg:.0f} deg)",
+                "fly with the gimbal straight down (-90 deg) for an even map",
+            )
+        )
     return found
 
 
 def _telemetry_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -> list[Finding]:
     if not facts.positions:
-        return [Finding(
-            Level.WARNING, "no positions: the map will have no scale and no place on Earth",
-            "give the flight's log with --telemetry, or put it beside the video under the same name",
-        )]
+        return [
+            Finding(
+                Level.WARNING,
+                "no positions: the map will have no scale and no place on Earth",
+                "give the flight's log with --telemetry, or put it beside the video under the same name",
+            )
+        ]
     if math.isnan(facts.covered_s) or not frames.duration_s > 0:
         if source.kind == "video":
-            return [Finding(
-                Level.WARNING, f"how video and telemetry fit in time is {facts.tie}",
-                "give --offset if you know it; else it is estimated from the motion",
-            )]
+            return [
+                Finding(
+                    Level.WARNING,
+                    f"how video and telemetry fit in time is {facts.tie}",
+                    "give --offset if you know it; else it is estimated from the motion",
+                )
+            ]
         return []
     return _cover_findings(source, frames, facts)
 
@@ -190,17 +232,23 @@ def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -
     share = facts.covered_s / frames.duration_s
     beyond_s = float(source.telemetry.video_time_ns.max(initial=0)) / SECOND_NS - frames.duration_s
     if source.kind == "video" and beyond_s > max(5.0, 0.2 * frames.duration_s):
-        return [Finding(
-            Level.WARNING, f"the telemetry continues for {beyond_s:.0f} s after the video's end",
-            "check that it belongs to this video, and that the video is whole",
-        )]
+        return [
+            Finding(
+                Level.WARNING,
+                f"the telemetry continues for {beyond_s:.0f} s after the video's end",
+                "check that it belongs to this video, and that the video is whole",
+            )
+        ]
     if share > 0.98 or facts.format == "exif":
         return []
     if share > 0:
-        return [Finding(
-            Level.WARNING, f"the telemetry covers {100 * share:.0f} % of the frames' time",
-            "frames outside it are placed by their overlap alone",
-        )]
+        return [
+            Finding(
+                Level.WARNING,
+                f"the telemetry covers {100 * share:.0f} % of the frames' time",
+                "frames outside it are placed by their overlap alone",
+            )
+        ]
     apart_ns = facts.start_ns - source.start_ns
     zone_ns = round(apart_ns / _ZONE_NS) * _ZONE_NS
     if abs(zone_ns) <= 14 * 3600 * SECOND_NS and common_ns(
@@ -208,15 +256,20 @@ def _cover_findings(source: Source, frames: FrameFacts, facts: TelemetryFacts) -
     ):
         hours = abs(zone_ns) / (3600 * SECOND_NS)
         way = "behind" if zone_ns > 0 else "ahead of"
-        return [Finding(
-            Level.PROBLEM, f"the frames' clock is about {hours:g} h {way} the telemetry's: a time zone?",
-            "give the difference with --offset",
-        )]
-    return [Finding(
-        Level.PROBLEM,
-        f"the telemetry is of another time: it begins {apart_ns / SECOND_NS:+.0f} s from the frames",
-        "give the telemetry of this flight, or --offset if a clock was wrong",
-    )]
+        return [
+            Finding(
+                Level.PROBLEM,
+                f"the frames' clock is about {hours:g} h {way} the telemetry's: a time zone?",
+                "give the difference with --offset",
+            )
+        ]
+    return [
+        Finding(
+            Level.PROBLEM,
+            f"the telemetry is of another time: it begins {apart_ns / SECOND_NS:+.0f} s from the frames",
+            "give the telemetry of this flight, or --offset if a clock was wrong",
+        )
+    ]
 
 
 def _movement_findings(
@@ -228,15 +281,21 @@ def _movement_findings(
         "such a video"
     )
     if telemetry.positions > 1 and flight.distance_m < _STILL_M and frames.count > 1:
-        return [Finding(
-            Level.PROBLEM, f"the drone hovers: {flight.distance_m:.1f} m flown in {frames.duration_s:.0f} s", advice
-        )]
+        return [
+            Finding(
+                Level.PROBLEM,
+                f"the drone hovers: {flight.distance_m:.1f} m flown in {frames.duration_s:.0f} s",
+                advice,
+            )
+        ]
     if kind == "video" and not telemetry.positions and frames.shared_view > _STILL_SHARE:
-        return [Finding(
-            Level.PROBLEM,
-            f"the drone hovers: all pictures show {100 * frames.shared_view:.0f} % or more of what the first one shows",
-            advice,
-        )]
+        return [
+            Finding(
+                Level.PROBLEM,
+                f"the drone hovers: all pictures show {100 * frames.shared_view:.0f} % or more of what the first one shows",
+                advice,
+            )
+        ]
     return []
 
 
@@ -247,21 +306,30 @@ def _flight_findings(
         return []
     found = []
     if flight.height_m <= 0.5:
-        found.append(Finding(
-            Level.PROBLEM, f"the height is {flight.height_m:.1f} m {flight.height_reference}",
-            "the drone's height was not set; the map's scale then comes from positions alone",
-        ))
+        found.append(
+            Finding(
+                Level.PROBLEM,
+                f"the height is {flight.height_m:.1f} m {flight.height_reference}",
+                "the drone's height was not set; the map's scale then comes from positions alone",
+            )
+        )
     elif math.isnan(flight.height_m):
-        found.append(Finding(
-            Level.WARNING, f"height above ground {flight.height_reference}",
-            "ground resolution and overlap are unknown before mapping",
-        ))
+        found.append(
+            Finding(
+                Level.WARNING,
+                f"height above ground {flight.height_reference}",
+                "ground resolution and overlap are unknown before mapping",
+            )
+        )
     usual_m = flight.height_m if flight.height_m > 0 else 60.0
     if flight.height_spread_m > max(10.0, 0.4 * usual_m):
-        found.append(Finding(
-            Level.WARNING, f"the height changes by {flight.height_spread_m:.0f} m during the flight",
-            "if the drone kept its height, its altitude is wrong and is given little weight",
-        ))
+        found.append(
+            Finding(
+                Level.WARNING,
+                f"the height changes by {flight.height_spread_m:.0f} m during the flight",
+                "if the drone kept its height, its altitude is wrong and is given little weight",
+            )
+        )
     return found + _overlap_findings(kind, frames, flight)
 
 
@@ -269,20 +337,29 @@ def _overlap_findings(kind: str, frames: FrameFacts, flight: FlightFacts) -> lis
     found = []
     if flight.forward_overlap < 0.6:
         level = Level.PROBLEM if flight.forward_overlap < 0.3 else Level.WARNING
-        found.append(Finding(
-            level, f"consecutive photos overlap by {100 * flight.forward_overlap:.0f} % only",
-            "fly slower or higher, or take photos more often: 70 % is good",
-        ))
+        found.append(
+            Finding(
+                level,
+                f"consecutive photos overlap by {100 * flight.forward_overlap:.0f} % only",
+                "fly slower or higher, or take photos more often: 70 % is good",
+            )
+        )
     if kind == "video" and frames.rate_hz * flight.frame_interval_s < 1:
-        found.append(Finding(
-            Level.PROBLEM, f"{frames.rate_hz:.1f} frames a second are too few for 70 % overlap at this speed",
-            f"at least {1 / flight.frame_interval_s:.1f} are needed: fly slower or higher",
-        ))
+        found.append(
+            Finding(
+                Level.PROBLEM,
+                f"{frames.rate_hz:.1f} frames a second are too few for 70 % overlap at this speed",
+                f"at least {1 / flight.frame_interval_s:.1f} are needed: fly slower or higher",
+            )
+        )
     if flight.side_overlap < 0.3:
-        found.append(Finding(
-            Level.WARNING, f"neighbouring strips overlap by {100 * flight.side_overlap:.0f} % only",
-            "fly the strips closer: 60 % is good",
-        ))
+        found.append(
+            Finding(
+                Level.WARNING,
+                f"neighbouring strips overlap by {100 * flight.side_overlap:.0f} % only",
+                "fly the strips closer: 60 % is good",
+            )
+        )
     return found
 
 

@@ -43,23 +43,35 @@ def fetch_model(source: str, sha256: str, *, name: str = "") -> InstalledModel:
     address = _address_of(source)
     own = name or re.sub(r"(?i)\.onnx$", "", re.split(r"[/\\]", address.split("?")[0])[-1])
     if not _NAME.fullmatch(own):
-        raise SettingsError(f"{own!r} cannot be a model's name: use letters, digits, '.', '_' and '-' with --name")
+        raise SettingsError(
+            f"{own!r} cannot be a model's name: use letters, digits, '.', '_' and '-' with --name"
+        )
     if any(each.name == own and each.is_packaged for each in installed_models()):
-        raise SettingsError(f"{own!r} is a packaged model's name; give the new one another with --name")
+        raise SettingsError(
+            f"{own!r} is a packaged model's name; give the new one another with --name"
+        )
     folder = models_folder()
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{own}.onnx"
     with atomic_path(path) as temporary:
         copy_by_hash(
-            address, temporary, wanted,
+            address,
+            temporary,
+            wanted,
             offline="bring the file on a disk and give its path: sorvolo models fetch FILE --sha256 HASH",
         )
         try:
             read_info(temporary)
         except InputError as error:
-            raise InputError(f"nothing was installed: {str(error).replace(str(temporary), address)}") from error
-        card = {HASH_KEY: wanted, "source": address, "fetched": datetime.now(UTC).isoformat(timespec="seconds")}
+            raise InputError(
+                f"nothing was installed: {str(error).replace(str(temporary), address)}"
+            ) from error
+        card = {
+            HASH_KEY: wanted,
+            "source": address,
+            "fetched": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
         atomic_write_bytes(path.with_suffix(".json"), json.dumps(card, indent=1).encode())
     return installed_model(own)
 
@@ -68,12 +80,19 @@ def parse_sha256(text: str) -> str:
     """A SHA-256 as a person gives it, in small letters. Raises SettingsError where it cannot be one."""
     wanted = text.strip().lower()
     if not _SHA256.fullmatch(wanted):
-        raise SettingsError(f"--sha256 {text!r}: a SHA-256 has 64 hexadecimal digits; ask whoever gives the model")
+        raise SettingsError(
+            f"--sha256 {text!r}: a SHA-256 has 64 hexadecimal digits; ask whoever gives the model"
+        )
     return wanted
 
 
 def quantise_model(
-    model: Path, pictures: Path, out: Path, *, most: int, float_parts: Sequence[str] = (),
+    model: Path,
+    pictures: Path,
+    out: Path,
+    *,
+    most: int,
+    float_parts: Sequence[str] = (),
     weight_bits: Literal[7, 8] = 8,
 ) -> Quantised:
     """Write `model` in eight bits to `out`, its ranges from at most `most` pictures of a folder, evenly chosen.
@@ -84,10 +103,14 @@ def quantise_model(
     if out.suffix.lower() != ".onnx":
         raise SettingsError(f"--out {out}: a model's file ends in .onnx")
     if not pictures.is_dir():
-        raise InputError(f"{pictures} is no folder of pictures; give one with what the model will have to see")
+        raise InputError(
+            f"{pictures} is no folder of pictures; give one with what the model will have to see"
+        )
     paths = sorted(path for path in pictures.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
     if not paths:
-        raise InputError(f"there are no pictures in {pictures}; needed are {', '.join(sorted(PHOTO_SUFFIXES))}")
+        raise InputError(
+            f"there are no pictures in {pictures}; needed are {', '.join(sorted(PHOTO_SUFFIXES))}"
+        )
     count = min(most, len(paths))
     chosen = [paths[index * len(paths) // count] for index in range(count)]
     result = quantise(model, _pictures(chosen), float_parts=float_parts, weight_bits=weight_bits)

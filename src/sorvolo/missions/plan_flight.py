@@ -121,9 +121,13 @@ def camera_to_plan_with(
     Without `size_px` a preset plans with its full photo, anything else with `DEFAULT_SIZE_PX`.
     """
     preset = next(iter(find_presets(option)), None) if option else None
-    width_px, height_px = size_px or ((preset.width_px, preset.height_px) if preset else DEFAULT_SIZE_PX)
+    width_px, height_px = size_px or (
+        (preset.width_px, preset.height_px) if preset else DEFAULT_SIZE_PX
+    )
     if option and not (math.isnan(focal_mm) and math.isnan(pixel_um)):
-        raise SettingsError("--camera and --focal-mm/--pixel-um both describe the camera; give one of them")
+        raise SettingsError(
+            "--camera and --focal-mm/--pixel-um both describe the camera; give one of them"
+        )
     if option:
         return camera_from_option(option, width_px, height_px)
     if math.isnan(focal_mm) or math.isnan(pixel_um):
@@ -132,7 +136,9 @@ def camera_to_plan_with(
             "--focal-mm and --pixel-um"
         )
     focal_px = focal_px_from_mm(focal_mm, pixel_um)
-    camera = Camera(width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2)
+    camera = Camera(
+        width_px, height_px, focal_px, focal_px, (width_px - 1) / 2, (height_px - 1) / 2
+    )
     return CameraModel(camera, f"{focal_mm:g} mm lens, {pixel_um:g} um pixels", 0.01)
 
 
@@ -142,9 +148,16 @@ def answer_questions(model: CameraModel, settings: PlanSettings) -> FlightAnswer
     required = {task.value: required_px_per_m(task, settings.critical_m) for task in Task}
     focal_px = min(camera.fx_px, camera.fy_px)
     heights_m = {task: maximum_height_m(focal_px, each) for task, each in required.items()}
-    bounds_m: dict[str, float] = {Bound.TASK: heights_m[settings.task], **_detector_bound(focal_px, settings)}
+    bounds_m: dict[str, float] = {
+        Bound.TASK: heights_m[settings.task],
+        **_detector_bound(focal_px, settings),
+    }
     bounds_m[Bound.CEILING] = settings.max_height_m
-    bound = Bound(min(bounds_m, key=lambda each: bounds_m[each])) if math.isnan(settings.height_m) else Bound.ASKED
+    bound = (
+        Bound(min(bounds_m, key=lambda each: bounds_m[each]))
+        if math.isnan(settings.height_m)
+        else Bound.ASKED
+    )
     height_m = settings.height_m if bound is Bound.ASKED else bounds_m[bound]
     strips = _strips(settings, height_m)
     width_m, _ = footprint_size_m(camera, height_m)
@@ -159,8 +172,12 @@ def answer_questions(model: CameraModel, settings: PlanSettings) -> FlightAnswer
         height_m=height_m,
         ground_sampling_m=1 / px_per_m(height_m, focal_px),
         footprint_m=(width_m, length_m),
-        fulfilled_tasks=tuple(task for task, highest_m in heights_m.items() if height_m <= highest_m),
-        minimum_frame_rate_hz=minimum_frame_rate(strips.speed_m_s, length_m, strips.forward_overlap),
+        fulfilled_tasks=tuple(
+            task for task, highest_m in heights_m.items() if height_m <= highest_m
+        ),
+        minimum_frame_rate_hz=minimum_frame_rate(
+            strips.speed_m_s, length_m, strips.forward_overlap
+        ),
         photo_spacing_m=length_m * (1 - strips.forward_overlap),
         strip_spacing_m=width_m * (1 - strips.side_overlap),
     )
@@ -178,15 +195,24 @@ def write_plan(path: Path, plan: FlightPlan, area: Area, *, dji_drone: str = "fl
 
 
 def fly_again(
-    area: Area, camera: Camera, height_m: float, files: Sequence[Path], *, dji_drone: str = "fly",
+    area: Area,
+    camera: Camera,
+    height_m: float,
+    files: Sequence[Path],
+    *,
+    dji_drone: str = "fly",
     settings: ReflySettings = ReflySettings(),
 ) -> FlightPlan:
     """Slow passes over what a flight with this camera did not see, written to the files; as high as it was flown."""
     wishes = PlanSettings(
-        height_m=min(height_m, LEGAL_CEILING_M), model="none", speed_m_s=settings.speed_m_s,
+        height_m=min(height_m, LEGAL_CEILING_M),
+        model="none",
+        speed_m_s=settings.speed_m_s,
         forward_overlap=settings.forward_overlap,
     )
-    plan = plan_over(area, answer_questions(CameraModel(camera, "the mapped flight's", 0.01), wishes), wishes)
+    plan = plan_over(
+        area, answer_questions(CameraModel(camera, "the mapped flight's", 0.01), wishes), wishes
+    )
     for path in files:
         write_plan(path, plan, area, dji_drone=dji_drone)
     return plan
@@ -213,7 +239,9 @@ def _detector_bound(focal_px: float, settings: PlanSettings) -> dict[str, float]
     info = read_info(find_model(settings.model))
     demand_searching(info)
     if "person" not in info.best_px:
-        raise InputError(f"the model {settings.model} does not look for people; give another --model, or none")
+        raise InputError(
+            f"the model {settings.model} does not look for people; give another --model, or none"
+        )
     needed = needed_px_per_m(info, "person", settings.person_m)
     return {Bound.DETECTOR: maximum_height_m(focal_px, needed)}
 

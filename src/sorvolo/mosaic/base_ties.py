@@ -41,7 +41,9 @@ class FoundFrame:
     residual_m: float
 
     @classmethod
-    def of(cls, keyframe_id: int, camera: Camera, site_from_image: Matrix3, residual_px: float) -> "FoundFrame":
+    def of(
+        cls, keyframe_id: int, camera: Camera, site_from_image: Matrix3, residual_px: float
+    ) -> "FoundFrame":
         """The frame with its misfit given in pixels of `camera`, by how large the one in its middle is."""
         pixel = np.array([[camera.cx_px, camera.cy_px], [camera.cx_px + 1, camera.cy_px]])
         m_per_px = float(np.linalg.norm(np.diff(apply_homography(site_from_image, pixel), axis=0)))
@@ -61,7 +63,9 @@ class BaseReport:
     moved_m: float
 
 
-def sought_keyframes(mapper: PlanarMapper, settings: BaseTieSettings = BaseTieSettings()) -> list[int]:
+def sought_keyframes(
+    mapper: PlanarMapper, settings: BaseTieSettings = BaseTieSettings()
+) -> list[int]:
     """The keyframes to look for: all, or some evenly spread."""
     placed = mapper.placed()
     return placed[:: -(-len(placed) // settings.most_frames)]
@@ -75,7 +79,12 @@ def prior_on_map(mapper: PlanarMapper, keyframe_id: int, sigma_m: float) -> Came
 
 
 def tie_to_base(
-    mapper: PlanarMapper, frames: Sequence[FoundFrame], full: Camera, m_per_px: float, *, is_datum: bool,
+    mapper: PlanarMapper,
+    frames: Sequence[FoundFrame],
+    full: Camera,
+    m_per_px: float,
+    *,
+    is_datum: bool,
     settings: BaseTieSettings = BaseTieSettings(),
 ) -> tuple[int, float]:
     """Tie the map to the base map; how many frames were left out as laid on other ground, and the median misfit, m."""
@@ -84,9 +93,14 @@ def tie_to_base(
     for _ in range(settings.rounds):
         parts = [_ties(mapper, each, full, m_per_px, settings) for each in kept]
         mapper.tie_to_ground(_joined(parts), is_datum=is_datum)
-        misfit = np.array([
-            np.median(np.linalg.norm(mapper.ground_places_m(each) - each.place_m[:, :2], axis=1)) for each in parts
-        ])
+        misfit = np.array(
+            [
+                np.median(
+                    np.linalg.norm(mapper.ground_places_m(each) - each.place_m[:, :2], axis=1)
+                )
+                for each in parts
+            ]
+        )
         good = misfit <= max(settings.wild * float(np.median(misfit)), 3 * m_per_px)
         if good.all():
             break
@@ -95,11 +109,17 @@ def tie_to_base(
 
 
 def _ties(
-    mapper: PlanarMapper, frame: FoundFrame, full: Camera, m_per_px: float, settings: BaseTieSettings
+    mapper: PlanarMapper,
+    frame: FoundFrame,
+    full: Camera,
+    m_per_px: float,
+    settings: BaseTieSettings,
 ) -> GroundTies:
     camera = frame.camera
-    x, y = (np.linspace(0.12, 0.88, count) * size
-            for count, size in zip(settings.points, (camera.width_px, camera.height_px), strict=True))
+    x, y = (
+        np.linspace(0.12, 0.88, count) * size
+        for count, size in zip(settings.points, (camera.width_px, camera.height_px), strict=True)
+    )
     pixels = np.column_stack([each.ravel() for each in np.meshgrid(x, y)])
     ground_m = apply_homography(frame.site_from_image, pixels)
     seen = np.isfinite(ground_m).all(axis=1)
@@ -109,7 +129,9 @@ def _ties(
     return GroundTies(
         np.full(count, frame.keyframe_id),
         (pixels[seen] - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px],
-        np.column_stack([ground_m[seen], np.zeros(count)]), np.full(count, scale), np.full(count, sigma_m),
+        np.column_stack([ground_m[seen], np.zeros(count)]),
+        np.full(count, scale),
+        np.full(count, sigma_m),
         common_m=m_per_px,
     )
 
@@ -120,13 +142,20 @@ def _joined(parts: Sequence[GroundTies]) -> GroundTies:
         for name in ("keyframe_ids", "ideal", "place_m", "sigma_px", "sigma_m")
     }
     return GroundTies(
-        columns["keyframe_ids"].astype(int), columns["ideal"], columns["place_m"], columns["sigma_px"],
-        columns["sigma_m"], common_m=max(each.common_m for each in parts),
+        columns["keyframe_ids"].astype(int),
+        columns["ideal"],
+        columns["place_m"],
+        columns["sigma_px"],
+        columns["sigma_m"],
+        common_m=max(each.common_m for each in parts),
     )
 
 
 def find_flight(
-    mapper: PlanarMapper, overview: Overview, ground: Overview, full: Camera,
+    mapper: PlanarMapper,
+    overview: Overview,
+    ground: Overview,
+    full: Camera,
     settings: BaseTieSettings = BaseTieSettings(),
 ) -> bool:
     """Bring a flight of unknown place, scale and north to where its overview lies on the base map's; whether it is."""
@@ -141,10 +170,16 @@ def find_flight(
     # the point straight below a camera, in its picture
     ideal = np.array([_nadir(mapper.pose(each).rotation) for each in ids])
     below_m = apply_homography(site_from_local, local_m)
-    mapper.tie_to_ground(GroundTies(
-        np.array(ids), ideal, np.column_stack([below_m, np.zeros(len(ids))]), np.full(len(ids), 3.0),
-        np.full(len(ids), 3 * ground.unit_per_px),
-    ), is_datum=True)
+    mapper.tie_to_ground(
+        GroundTies(
+            np.array(ids),
+            ideal,
+            np.column_stack([below_m, np.zeros(len(ids))]),
+            np.full(len(ids), 3.0),
+            np.full(len(ids), 3 * ground.unit_per_px),
+        ),
+        is_datum=True,
+    )
     return True
 
 
@@ -153,12 +188,18 @@ def _nadir(rotation: Matrix3) -> Floats:
     return np.asarray(down[:2] / max(float(down[2]), 0.1))
 
 
-def base_grid(frame: LocalFrame, crs: str, base_m_per_px: float, native_m_per_px: float, width_px: int) -> SiteGrid:
+def base_grid(
+    frame: LocalFrame, crs: str, base_m_per_px: float, native_m_per_px: float, width_px: int
+) -> SiteGrid:
     """The grid in which a flight is laid over its base map: no finer than either needs it."""
-    return SiteGrid.at(frame.origin, max(base_m_per_px, native_m_per_px * max(1.0, width_px / 900)), crs)
+    return SiteGrid.at(
+        frame.origin, max(base_m_per_px, native_m_per_px * max(1.0, width_px / 900)), crs
+    )
 
 
-def overview_grid(frame: LocalFrame, crs: str, base_m_per_px: float, extent_m: float, side_px: int) -> SiteGrid:
+def overview_grid(
+    frame: LocalFrame, crs: str, base_m_per_px: float, extent_m: float, side_px: int
+) -> SiteGrid:
     """The grid in which the whole of a base map is `side_px` at most."""
     return SiteGrid.at(frame.origin, max(base_m_per_px, extent_m / side_px), crs)
 
@@ -169,7 +210,9 @@ def as_overview(rgba: ImageRGBA, first_m: PointsM, site_grid: SiteGrid) -> Overv
     grid_from_image[:2, 2] = np.rint(site_grid.grid.grid_from_projected(first_m[None])[0])
     site_from_grid = np.linalg.inv(site_grid.grid_from_site_affine(np.zeros(2), 50.0))
     return Overview(
-        gray_from_rgb(np.ascontiguousarray(rgba[..., :3])), rgba[..., 3] == 255, site_from_grid @ grid_from_image
+        gray_from_rgb(np.ascontiguousarray(rgba[..., :3])),
+        rgba[..., 3] == 255,
+        site_from_grid @ grid_from_image,
     )
 
 

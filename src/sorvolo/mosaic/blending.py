@@ -103,7 +103,9 @@ def fill_invalid(image: ImageRGB, valid: Mask) -> ImageRGB:
     filled = colours / np.maximum(weights, 1e-6)[..., None]
     for colours, weights in reversed(levels):
         wider = cv2.pyrUp(filled, dstsize=weights.shape[1::-1])
-        filled = np.where(weights[..., None] > 1e-3, colours / np.maximum(weights, 1e-3)[..., None], wider)
+        filled = np.where(
+            weights[..., None] > 1e-3, colours / np.maximum(weights, 1e-3)[..., None], wider
+        )
     result = np.clip(filled, 0, 255).astype(np.uint8)
     result[valid] = image[valid]
     return result
@@ -121,9 +123,12 @@ def coarse_fill(image: ImageRGB, valid: Mask) -> ImageRGB:
     seen = cv2.copyMakeBorder(cv2.copyTo(image, known), 0, below, 0, beside, cv2.BORDER_CONSTANT)
     share = cv2.copyMakeBorder(known, 0, below, 0, beside, cv2.BORDER_CONSTANT)
     colours, weights = (
-        cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.float32) for each in (seen, share)
+        cv2.resize(each, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+        for each in (seen, share)
     )
-    small = np.clip(colours * 255 / np.maximum(weights, 1)[..., None] + 0.5, 0, 255).astype(np.uint8)
+    small = np.clip(colours * 255 / np.maximum(weights, 1)[..., None] + 0.5, 0, 255).astype(
+        np.uint8
+    )
     return fill_invalid(small, weights > 64)
 
 
@@ -145,9 +150,13 @@ class _Bands:
             coarser = _coarser(gaussian) if k < BANDS - 1 else None
             if k < _HARD_BANDS:
                 winner = np.ascontiguousarray(mask[:: 1 << k, :: 1 << k])
-                self._fine[k][here] = cv2.copyTo(_laplacian(gaussian, coarser, cv2.CV_16S), winner, self._fine[k][here])
+                self._fine[k][here] = cv2.copyTo(
+                    _laplacian(gaussian, coarser, cv2.CV_16S), winner, self._fine[k][here]
+                )
             else:
-                self._sums[k - _HARD_BANDS][here] += _laplacian(gaussian, coarser, cv2.CV_32F) * share[..., None]
+                self._sums[k - _HARD_BANDS][here] += (
+                    _laplacian(gaussian, coarser, cv2.CV_32F) * share[..., None]
+                )
                 self._weights[k - _HARD_BANDS][here] += share
             if coarser is not None:
                 gaussian, share = coarser, _coarser(share)
@@ -160,7 +169,9 @@ class _Bands:
             soft = cv2.pyrUp(soft, dstsize=band.shape[1::-1]) + band
         picture = cv2.pyrUp(soft.round().astype(np.int16), dstsize=self._fine[-1].shape[1::-1])
         for k in range(_HARD_BANDS - 1, 0, -1):
-            picture = cv2.pyrUp(cv2.add(picture, self._fine[k]), dstsize=self._fine[k - 1].shape[1::-1])
+            picture = cv2.pyrUp(
+                cv2.add(picture, self._fine[k]), dstsize=self._fine[k - 1].shape[1::-1]
+            )
         return cv2.add(picture, self._fine[0], dtype=cv2.CV_8U)  # type: ignore[return-value]
 
 

@@ -18,7 +18,9 @@ from scipy.sparse.linalg import splu
 from sorvolo.geometry.arrays import Floats, Rows
 
 SIDE = 6  # unknowns of a camera
-_AT_ONCE = 20  # cameras that go out together whatever they are tied to: so few are not worth an order
+_AT_ONCE = (
+    20  # cameras that go out together whatever they are tied to: so few are not worth an order
+)
 _FILLED = 0.1  # of a piece's numbers may be zeros that a smaller piece would not hold
 
 
@@ -41,7 +43,9 @@ class Elimination:
         at = np.empty(count, int)
         for number, front in enumerate(self._fronts):
             at[front.out] = number
-        first = np.minimum(at[one], at[other])  # that front takes a tie in, in which the first of its cameras goes out
+        first = np.minimum(
+            at[one], at[other]
+        )  # that front takes a tie in, in which the first of its cameras goes out
         order = np.argsort(first, kind="stable")
         self._ties = np.split(order, np.searchsorted(first[order], np.arange(1, len(self._fronts))))
 
@@ -99,9 +103,15 @@ class BlockFactors:
             found[out] = dtrsm(1.0, corner.T, found[out], trans_a=1)
             if len(front.rest):
                 found[_unknowns(front.rest)] -= below @ found[out]
-        for front, (corner, below) in zip(reversed(self._fronts), reversed(self._pieces), strict=True):
+        for front, (corner, below) in zip(
+            reversed(self._fronts), reversed(self._pieces), strict=True
+        ):
             out = _unknowns(front.out)
-            known = found[out] - below.T @ found[_unknowns(front.rest)] if len(front.rest) else found[out]
+            known = (
+                found[out] - below.T @ found[_unknowns(front.rest)]
+                if len(front.rest)
+                else found[out]
+            )
             found[out] = dtrsm(1.0, corner.T, known)
         return found.reshape(right.shape)
 
@@ -113,7 +123,9 @@ def _fronts(count: int, one: Rows, other: Rows) -> list[_Front]:
     when = _order(count, one, other)
     tied = _tied_then(when, one, other)
     camera = np.argsort(when)
-    merged: list[list[int]] = []  # for each camera the ones that go out with it, itself last, in the order of `when`
+    merged: list[
+        list[int]
+    ] = []  # for each camera the ones that go out with it, itself last, in the order of `when`
     zeros = [0] * count
     before: list[list[int]] = [[] for _ in range(count)]  # whose first remaining tie is to this one
     joined = np.full(count, -1)
@@ -131,11 +143,16 @@ def _fronts(count: int, one: Rows, other: Rows) -> list[_Front]:
     for position, end in enumerate(ends):
         number[merged[end]] = position
     return [
-        _Front(camera[merged[end]], camera[tied[end]], number[tied[end][0]] if len(tied[end]) else -1) for end in ends
+        _Front(
+            camera[merged[end]], camera[tied[end]], number[tied[end][0]] if len(tied[end]) else -1
+        )
+        for end in ends
     ]
 
 
-def _waiting_little(ends: Sequence[int], merged: Sequence[Sequence[int]], tied: Sequence[Rows]) -> list[int]:
+def _waiting_little(
+    ends: Sequence[int], merged: Sequence[Sequence[int]], tied: Sequence[Rows]
+) -> list[int]:
     """The fronts, each by its last camera, in the order in which what waits to be taken in by a later one needs the
     least memory (Liu 1986): of those that one takes in the first are those that need the most for themselves."""
     front_of = {at: end for end in ends for at in merged[end]}
@@ -160,7 +177,9 @@ def _order(count: int, one: Rows, other: Rows) -> Rows:
     ties = coo_matrix((np.full(len(one), -1.0), (one, other)), shape=(count, count))
     ties = ties + ties.T
     degree = np.asarray(ties.sum(axis=0)).ravel()
-    regular = csc_matrix(ties - coo_matrix((degree - 1, (np.arange(count), np.arange(count))), shape=(count, count)))
+    regular = csc_matrix(
+        ties - coo_matrix((degree - 1, (np.arange(count), np.arange(count))), shape=(count, count))
+    )
     return splu(
         regular, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
     ).perm_c.astype(int)
@@ -171,7 +190,10 @@ def _tied_then(when: Rows, one: Rows, other: Rows) -> list[Rows]:
     it was tied to from the first, and what those had left that went out before and reached it first."""
     first, last = np.minimum(when[one], when[other]), np.maximum(when[one], when[other])
     order = np.argsort(first, kind="stable")
-    parts = [[each] for each in np.split(last[order], np.searchsorted(first[order], np.arange(1, len(when))))]
+    parts = [
+        [each]
+        for each in np.split(last[order], np.searchsorted(first[order], np.arange(1, len(when))))
+    ]
     tied = []
     for at, some in enumerate(parts):
         here = np.unique(np.concatenate(some))

@@ -18,8 +18,14 @@ from sorvolo.mosaic.block_cholesky import Elimination
 from sorvolo.mosaic.normal_equations import NormalEquations
 
 SHARED = (
-    "log_focal", "radial", "altitude_offset_m", "east_offset_m", "north_offset_m",
-    "boresight_x_rad", "boresight_y_rad", "boresight_z_rad",
+    "log_focal",
+    "radial",
+    "altitude_offset_m",
+    "east_offset_m",
+    "north_offset_m",
+    "boresight_x_rad",
+    "boresight_y_rad",
+    "boresight_z_rad",
 )
 """Unknowns that all keyframes of a flight share: focal length (log of its scale), the first radial distortion that
 the calibration left over, the constant offsets of the altitude's zero and of GPS against the map, and the constant
@@ -40,7 +46,9 @@ class Nodes:
     prior_sigma_m: Floats  # (N, 3)
     prior_rotations: Floats  # (N, 3, 3)
     prior_sigma_rad: Floats  # (N, 3) about the camera's own axes
-    own: NDArray[np.bool_]  # (N,) bool: of the flight being mapped; the others are the known map and never move
+    own: NDArray[
+        np.bool_
+    ]  # (N,) bool: of the flight being mapped; the others are the known map and never move
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +109,9 @@ class Ground:
         return replace(picked, node=np.searchsorted(nodes, picked.node))
 
 
-NO_GROUND = Ground(np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0))
+NO_GROUND = Ground(
+    np.zeros(0, int), np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0), np.zeros(0), np.zeros(0)
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +149,10 @@ def linearise(nodes: Nodes, pairs: Pairs, shared: Floats) -> Linearised:
     log_focal, radial = shared[0], shared[1]
     old_own, new_own = nodes.own[pairs.old], nodes.own[pairs.new]
     rotation_old, rotation_new = nodes.rotations[pairs.old], nodes.rotations[pairs.new]
-    centre_old, centre_new = nodes.centres_m[pairs.old][:, None], nodes.centres_m[pairs.new][:, None]
+    centre_old, centre_new = (
+        nodes.centres_m[pairs.old][:, None],
+        nodes.centres_m[pairs.new][:, None],
+    )
     focal_old = np.where(old_own, np.exp(-log_focal), 1.0)[:, None, None]
     focal_new = np.where(new_own, np.exp(log_focal), 1.0)[:, None, None]
     r2_old = (pairs.old_ideal**2).sum(-1, keepdims=True) * old_own[:, None, None]
@@ -223,8 +236,14 @@ class Solution:
 
 
 def solve(
-    nodes: Nodes, pairs: Linked, shared: Floats, shared_sigma: Floats, free: NDArray[np.bool_], iterations: int,
-    robust_sigmas: float = 3.0, ground: Ground = NO_GROUND,
+    nodes: Nodes,
+    pairs: Linked,
+    shared: Floats,
+    shared_sigma: Floats,
+    free: NDArray[np.bool_],
+    iterations: int,
+    robust_sigmas: float = 3.0,
+    ground: Ground = NO_GROUND,
 ) -> Solution:
     """Levenberg-Marquardt with a Cauchy loss over the free nodes, (N,) bool, and the shared unknowns.
 
@@ -265,7 +284,12 @@ class _Problem:
 
     @classmethod
     def of(
-        cls, pairs: Linked, ground: Ground, shared_sigma: Floats, free: NDArray[np.bool_], robust_sigmas: float
+        cls,
+        pairs: Linked,
+        ground: Ground,
+        shared_sigma: Floats,
+        free: NDArray[np.bool_],
+        robust_sigmas: float,
     ) -> "_Problem":
         """With the nodes that are `free`, (N,) bool."""
         position = np.full(len(free), -1)
@@ -273,7 +297,11 @@ class _Problem:
         one, other = position[pairs.old], position[pairs.new]
         both = (one >= 0) & (other >= 0)
         return cls(
-            pairs, ground, shared_sigma, robust_sigmas, position,
+            pairs,
+            ground,
+            shared_sigma,
+            robust_sigmas,
+            position,
             Elimination(int(free.sum()), one[both], other[both]),
         )
 
@@ -310,7 +338,7 @@ def _common_motions(offsets_m: Floats) -> Floats:
     motions[:, 3:, 3] = offsets_m
     basis = np.zeros((6 * count + len(SHARED), 4 + len(SHARED)))
     basis[: 6 * count, :4] = motions.reshape(-1, 4)
-    basis[6 * count:, 4:] = np.eye(len(SHARED))
+    basis[6 * count :, 4:] = np.eye(len(SHARED))
     return basis
 
 
@@ -319,7 +347,9 @@ def _move_as_one(nodes: Nodes, middle_m: Floats, step: Floats) -> Nodes:
     shift_m = np.array([step[0], step[1], 0.0])
     rotations, centres_m = nodes.rotations.copy(), nodes.centres_m.copy()
     rotations[nodes.own] = turn @ rotations[nodes.own]
-    centres_m[nodes.own] = middle_m + shift_m + np.exp(step[3]) * (centres_m[nodes.own] - middle_m) @ turn.T
+    centres_m[nodes.own] = (
+        middle_m + shift_m + np.exp(step[3]) * (centres_m[nodes.own] - middle_m) @ turn.T
+    )
     return replace(nodes, rotations=rotations, centres_m=centres_m)
 
 
@@ -335,7 +365,12 @@ def _normal_equations(problem: _Problem, nodes: Nodes, shared: Floats) -> Normal
 
 
 def _add_links(
-    into: NormalEquations, nodes: Nodes, pairs: Linked, shared: Floats, position: Rows, robust: float
+    into: NormalEquations,
+    nodes: Nodes,
+    pairs: Linked,
+    shared: Floats,
+    position: Rows,
+    robust: float,
 ) -> None:
     for some in pairs.batches():
         line = linearise(nodes, some, shared)
@@ -347,19 +382,28 @@ def _add_links(
         root = np.sqrt(weight / (1 + squared))[..., None]
         residual = (residual * root).reshape(len(some.old), -1)
         jacobian = np.concatenate([line.by_old, line.by_new, line.by_shared], axis=-1)
-        jacobian = (white @ jacobian * root[..., None]).reshape(len(some.old), residual.shape[1], -1)
+        jacobian = (white @ jacobian * root[..., None]).reshape(
+            len(some.old), residual.shape[1], -1
+        )
         into.add(jacobian, residual, (position[some.old], position[some.new]))
 
 
 def _add_ground(
-    into: NormalEquations, nodes: Nodes, ground: Ground, shared: Floats, position: Rows, robust: float
+    into: NormalEquations,
+    nodes: Nodes,
+    ground: Ground,
+    shared: Floats,
+    position: Rows,
+    robust: float,
 ) -> None:
     rows = linearise_ground(nodes, ground, shared)
     residual = rows.residual_px / rows.sigma_px[:, None]
     squared = (residual**2).sum(-1) / robust**2
     into.cost += float((rows.seen * np.log1p(squared)).sum()) * robust**2
     root = np.sqrt(rows.seen / (1 + squared))[:, None]
-    jacobian = np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
+    jacobian = (
+        np.concatenate([rows.by_camera, rows.by_shared], axis=-1) / rows.sigma_px[:, None, None]
+    )
     into.add(jacobian * root[..., None], residual * root, (position[ground.node],))
 
 
@@ -371,7 +415,9 @@ def _add_shared_priors(into: NormalEquations, shared: Floats, shared_sigma: Floa
     into.cost += float(np.where(held, 0.0, prior * shared**2).sum())
 
 
-def _add_telemetry(into: NormalEquations, nodes: Nodes, shared: Floats, position: Rows, robust: float) -> None:
+def _add_telemetry(
+    into: NormalEquations, nodes: Nodes, shared: Floats, position: Rows, robust: float
+) -> None:
     index = np.flatnonzero(position >= 0)  # in the order of their positions
     blocks, coupling = np.zeros((len(index), 6, 6)), np.zeros((len(index), 6, len(SHARED)))
     own, shared_pull = np.zeros((len(SHARED), len(SHARED))), np.zeros(len(SHARED))
@@ -379,7 +425,10 @@ def _add_telemetry(into: NormalEquations, nodes: Nodes, shared: Floats, position
     root = 1 / nodes.prior_sigma_m[index]
     miss = nodes.centres_m[index] + shared[[3, 4, 2]] - nodes.prior_centres_m[index]
     white = miss * root
-    squared = np.column_stack([(white[:, :2] ** 2).sum(1), (white[:, :2] ** 2).sum(1), white[:, 2] ** 2]) / robust**2
+    squared = (
+        np.column_stack([(white[:, :2] ** 2).sum(1), (white[:, :2] ** 2).sum(1), white[:, 2] ** 2])
+        / robust**2
+    )
     into.cost += float((np.log1p(squared[:, 1]) + np.log1p(squared[:, 2])).sum()) * robust**2
     information = root**2 / (1 + squared)
     blocks[:, [3, 4, 5], [3, 4, 5]] = information
@@ -415,9 +464,11 @@ def _advance(nodes: Nodes, shared: Floats, step: Floats, position: Rows) -> tupl
     rotations[index] = u @ vt  # rounding would add up over thousands of steps
     shift = steps[:, 3:].copy()
     limit = 0.5 * np.abs(centres[index, 2])
-    shift[:, 2] = np.clip(shift[:, 2], -limit, limit)  # a camera may not dive through the ground in one step
+    shift[:, 2] = np.clip(
+        shift[:, 2], -limit, limit
+    )  # a camera may not dive through the ground in one step
     centres[index] += shift
-    return replace(nodes, rotations=rotations, centres_m=centres), shared + step[6 * len(index):]
+    return replace(nodes, rotations=rotations, centres_m=centres), shared + step[6 * len(index) :]
 
 
 def _times_cross(rows: Floats, vector: Floats) -> Floats:
@@ -427,10 +478,17 @@ def _times_cross(rows: Floats, vector: Floats) -> Floats:
 
 def rotation_vector(rotation: Floats) -> Floats:
     """(N, 3) rotation vectors of matrices, (N, 3, 3); good up to half a turn."""
-    axis = np.stack([
-        rotation[:, 2, 1] - rotation[:, 1, 2], rotation[:, 0, 2] - rotation[:, 2, 0],
-        rotation[:, 1, 0] - rotation[:, 0, 1],
-    ], axis=-1) / 2
+    axis = (
+        np.stack(
+            [
+                rotation[:, 2, 1] - rotation[:, 1, 2],
+                rotation[:, 0, 2] - rotation[:, 2, 0],
+                rotation[:, 1, 0] - rotation[:, 0, 1],
+            ],
+            axis=-1,
+        )
+        / 2
+    )
     sine = np.linalg.norm(axis, axis=1)
     cosine = (np.trace(rotation, axis1=1, axis2=2) - 1) / 2
     angle = np.arctan2(sine, cosine)

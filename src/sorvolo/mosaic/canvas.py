@@ -49,7 +49,9 @@ class CanvasSettings:
 
     def __post_init__(self) -> None:
         if self.moved_px < 0 or self.gain_step < 0 or self.window_px < 64:
-            raise SettingsError("canvas: moved_px and gain_step must not be negative, window_px at least 64")
+            raise SettingsError(
+                "canvas: moved_px and gain_step must not be negative, window_px at least 64"
+            )
 
 
 class _Chunk:
@@ -90,19 +92,25 @@ class Canvas:
         self._within = within
         self._fillings: dict[int, ImageRGB] = {}
         self._warping = ThreadPoolExecutor(1, thread_name_prefix="warping")
-        self._bounded: set[TileIndex] = set()  # chunks where painted frames win what the map showed, no more
+        self._bounded: set[TileIndex] = (
+            set()
+        )  # chunks where painted frames win what the map showed, no more
         for frame in painted:
             self._add(frame)
             self._painted_before.add(frame.id)
 
-    def paint(self, frames: Iterable[CanvasFrame], forget: Iterable[int] = ()) -> frozenset[TileIndex]:
+    def paint(
+        self, frames: Iterable[CanvasFrame], forget: Iterable[int] = ()
+    ) -> frozenset[TileIndex]:
         """Put new or moved frames in place, drop those to forget, and return the tiles whose picture changed.
 
         Known frames that moved by no more than `moved_px` at every corner, with the same gains, are left as
         they are. A tile that nothing covers any more is deleted.
         """
         changed = {frame.id: frame for frame in frames if self._differs(frame)}
-        gone = {each for each in forget if each in self._frames} | (changed.keys() & self._frames.keys())
+        gone = {each for each in forget if each in self._frames} | (
+            changed.keys() & self._frames.keys()
+        )
         touched = self._chunks_before_and_after(changed, gone)
         if self._known is not None:
             for key in touched:
@@ -135,15 +143,21 @@ class Canvas:
         if (known.width_px, known.height_px) != (frame.width_px, frame.height_px):
             return True
         moved_px = np.abs(frame.outline_px - known.outline_px).max()
-        brighter = np.abs(np.log(np.maximum(frame.gains, 1e-6) / np.maximum(known.gains, 1e-6))).max()
+        brighter = np.abs(
+            np.log(np.maximum(frame.gains, 1e-6) / np.maximum(known.gains, 1e-6))
+        ).max()
         shaded = np.abs(frame.vignette - known.vignette).max()
-        return bool(moved_px > self._settings.moved_px or max(brighter, shaded) > self._settings.gain_step)
+        return bool(
+            moved_px > self._settings.moved_px or max(brighter, shaded) > self._settings.gain_step
+        )
 
     @staticmethod
     def _chunks_of(frame: CanvasFrame) -> frozenset[TileIndex]:
         return Grid((0.0, 0.0), 1.0, CELL_PX * _CHUNK_CELLS).tiles_touched(frame.outline_px)
 
-    def _chunks_before_and_after(self, changed: Mapping[int, CanvasFrame], gone: set[int]) -> set[TileIndex]:
+    def _chunks_before_and_after(
+        self, changed: Mapping[int, CanvasFrame], gone: set[int]
+    ) -> set[TileIndex]:
         """The chunks under changed and gone frames, where they lie now and where they will lie."""
         touched: set[TileIndex] = set()
         for each in [*gone, *changed]:
@@ -160,7 +174,9 @@ class Canvas:
     def _enter(self, frame: CanvasFrame, key: TileIndex) -> None:
         chunk = self._chunks.setdefault(key, _Chunk())
         chunk.frames.add(frame.id)
-        merit = cell_merits(frame, key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS, _CHUNK_CELLS, _CHUNK_CELLS)
+        merit = cell_merits(
+            frame, key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS, _CHUNK_CELLS, _CHUNK_CELLS
+        )
         wins = (merit > chunk.merit) | ((merit == chunk.merit) & (frame.id < chunk.winner))
         wins &= np.isfinite(merit)
         if self._known is not None and key in self._bounded and frame.id in self._painted_before:
@@ -183,7 +199,9 @@ class Canvas:
         if not ids:
             return
         column, row = key[0] * _CHUNK_CELLS, key[1] * _CHUNK_CELLS
-        theirs = np.isin(self._winners(column - 1, row - 1, _CHUNK_CELLS + 2, _CHUNK_CELLS + 2), list(ids))
+        theirs = np.isin(
+            self._winners(column - 1, row - 1, _CHUNK_CELLS + 2, _CHUNK_CELLS + 2), list(ids)
+        )
         if theirs.any():
             cells = cv2.dilate(theirs.astype(np.uint8), np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0
             ground = np.repeat(np.repeat(cells, CELL_PX, axis=0), CELL_PX, axis=1)
@@ -229,7 +247,7 @@ class Canvas:
         cells = np.zeros((high - low)[::-1], np.uint8)
         for (column, row), mask in dirty.items():
             x, y = column * _CHUNK_CELLS - low[0], row * _CHUNK_CELLS - low[1]
-            cells[y:y + _CHUNK_CELLS, x:x + _CHUNK_CELLS] = mask
+            cells[y : y + _CHUNK_CELLS, x : x + _CHUNK_CELLS] = mask
         cells = cv2.dilate(cells, np.ones((2 * _REACH_CELLS + 1,) * 2, np.uint8))
         if self._within is not None:
             cells = cv2.bitwise_and(cells, self._cells_within(self._within, low, cells.shape))
@@ -253,7 +271,12 @@ class Canvas:
         result = np.zeros(shape, np.uint8)
         side = self._grid.tile_px // CELL_PX
         for column, row in tiles:
-            _paste(result, np.ones((side, side), np.uint8), column * side - int(low[0]), row * side - int(low[1]))
+            _paste(
+                result,
+                np.ones((side, side), np.uint8),
+                column * side - int(low[0]),
+                row * side - int(low[1]),
+            )
         return result
 
     def _cuts(self, first: int, count: int) -> NDArray[np.int64]:
@@ -266,7 +289,9 @@ class Canvas:
             return np.array([first, first + count])
         whole_px = most_px // tile_px * tile_px if tile_px % ALIGN_PX == 0 else 0
         step = (whole_px or most_px) // CELL_PX
-        return np.array([first, *range((first // step + 1) * step, first + count, step), first + count])
+        return np.array(
+            [first, *range((first // step + 1) * step, first + count, step), first + count]
+        )
 
     def _render(self, x0: int, y0: int, x1: int, y1: int) -> ImageRGBA:
         """The picture of an aligned window of grid pixels, ends exclusive."""
@@ -286,10 +311,12 @@ class Canvas:
         def share_of(each: int) -> tuple[int, int, NDArray[np.uint8]]:
             left, top, share = _share(winners == each, self._frames[each], x, y, pad)
             if shown is not None and each in self._painted_before:
-                share = share * shown[top:top + share.shape[0], left:left + share.shape[1]]
+                share = share * shown[top : top + share.shape[0], left : left + share.shape[1]]
             return left, top, share
 
-        labels = winners_from_shares(((number, *share_of(each)) for number, each in enumerate(ids)), height, width)
+        labels = winners_from_shares(
+            ((number, *share_of(each)) for number, each in enumerate(ids)), height, width
+        )
         picture = blend(labels, self._one_ahead(self._layers(ids, labels, x, y)))
         if self._known is not None and apron > WINDOW_APRON_PX:
             lasting = self._known.lasting(x, y, x + width, y + height) & (labels >= 0)
@@ -339,7 +366,9 @@ class Canvas:
         """(height, width) winners of a block of cells."""
         result = np.full((height, width), _NOBODY, np.int64)
         for chunk_row in range(row // _CHUNK_CELLS, (row + height - 1) // _CHUNK_CELLS + 1):
-            for chunk_column in range(column // _CHUNK_CELLS, (column + width - 1) // _CHUNK_CELLS + 1):
+            for chunk_column in range(
+                column // _CHUNK_CELLS, (column + width - 1) // _CHUNK_CELLS + 1
+            ):
                 chunk = self._chunks.get((chunk_column, chunk_row))
                 if chunk is None:
                     continue
@@ -372,7 +401,9 @@ class Canvas:
     def _store_in(self, index: TileIndex, x: int, y: int, rgba: ImageRGBA) -> bool:
         """Put what of a rendered window falls into a tile there, but for lasting ground; whether that changed it."""
         side = self._grid.tile_px
-        lasting = None if self._known is None else self._known.lasting(*self._grid.tile_window(index))
+        lasting = (
+            None if self._known is None else self._known.lasting(*self._grid.tile_window(index))
+        )
         known = self._tiles.get(index)
         tile = np.zeros((side, side, 4), np.uint8) if known is None else known.copy()
         _paste(tile, rgba, x - index[0] * side, y - index[1] * side)
@@ -391,8 +422,12 @@ class Canvas:
 
 def _neighbours_first(across: int, down: int) -> list[tuple[int, int]]:
     """Columns and rows so that those near each other follow each other (Z-order): they show the same few frames."""
+
     def along_z(place: tuple[int, int]) -> int:
-        return sum((place[0] >> bit & 1) << 2 * bit | (place[1] >> bit & 1) << 2 * bit + 1 for bit in range(24))
+        return sum(
+            (place[0] >> bit & 1) << 2 * bit | (place[1] >> bit & 1) << 2 * bit + 1
+            for bit in range(24)
+        )
 
     return sorted(((column, row) for row in range(down) for column in range(across)), key=along_z)
 
@@ -410,12 +445,14 @@ def _share(
     c0, c1 = max(0, left - 2), min(wins.shape[1], left + columns + 2)
     r0, r1 = max(0, top - 2), min(wins.shape[0], top + rows + 2)
     cells = cv2.GaussianBlur(wins[r0:r1, c0:c1].astype(np.uint8) * 255, (3, 3), 0)
-    share = np.asarray(cv2.resize(cells, None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_LINEAR), np.uint8)
+    share = np.asarray(
+        cv2.resize(cells, None, fx=CELL_PX, fy=CELL_PX, interpolation=cv2.INTER_LINEAR), np.uint8
+    )
     # the padding cells were needed for smoothing only
     x0, y0 = (c0 - pad) * CELL_PX, (r0 - pad) * CELL_PX
     cut_x, cut_y = max(0, -x0), max(0, -y0)
     x0, y0 = x0 + cut_x, y0 + cut_y
-    share = share[cut_y:cut_y + height - y0, cut_x:cut_x + width - x0]
+    share = share[cut_y : cut_y + height - y0, cut_x : cut_x + width - x0]
     window = x + x0, y + y0, x + x0 + share.shape[1], y + y0 + share.shape[0]
     return x0, y0, share & coverage(frame, window)
 
@@ -433,4 +470,4 @@ def _paste(target: NDArray[np.generic], patch: NDArray[np.generic], x: int, y: i
     x0, y0 = max(0, x), max(0, y)
     x1, y1 = min(target.shape[1], x + patch.shape[1]), min(target.shape[0], y + patch.shape[0])
     if x0 < x1 and y0 < y1:
-        target[y0:y1, x0:x1] = patch[y0 - y:y1 - y, x0 - x:x1 - x]
+        target[y0:y1, x0:x1] = patch[y0 - y : y1 - y, x0 - x : x1 - x]

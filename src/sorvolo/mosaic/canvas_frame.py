@@ -43,19 +43,31 @@ class CanvasFrame:
         if self.id < 0:
             raise GeometryError(f"frame ids count up from 0, got {self.id}")
         if self.valid is not None and self.valid.shape != (self.height_px, self.width_px):
-            raise GeometryError(f"frame {self.id}: valid mask {self.valid.shape} is not of the image's size")
-        if not np.isfinite(self.outline_px).all() or abs(np.linalg.det(self.grid_from_image)) < 1e-12:
-            raise GeometryError(f"frame {self.id}: a corner of the image lies at or beyond the horizon")
+            raise GeometryError(
+                f"frame {self.id}: valid mask {self.valid.shape} is not of the image's size"
+            )
+        if (
+            not np.isfinite(self.outline_px).all()
+            or abs(np.linalg.det(self.grid_from_image)) < 1e-12
+        ):
+            raise GeometryError(
+                f"frame {self.id}: a corner of the image lies at or beyond the horizon"
+            )
 
     @property
     def outline_px(self) -> PointsPx:
         """(4, 2) the image's outer corners on the grid: top-left, top-right, bottom-right, bottom-left."""
         w, h = self.width_px - 0.5, self.height_px - 0.5
-        return apply_homography(self.grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]]))
+        return apply_homography(
+            self.grid_from_image, np.array([[-0.5, -0.5], [w, -0.5], [w, h], [-0.5, h]])
+        )
 
 
 def warp(
-    image: ImageRGB, frame: CanvasFrame, window: tuple[int, int, int, int], beyond: ImageRGB | None = None
+    image: ImageRGB,
+    frame: CanvasFrame,
+    window: tuple[int, int, int, int],
+    beyond: ImageRGB | None = None,
 ) -> ImageRGB:
     """A frame's image, its exposure corrected, in a window of grid pixels (x0, y0, x1, y1, ends exclusive).
 
@@ -81,17 +93,27 @@ def warp(
     for _ in range(halvings):
         source = cv2.pyrDown(source)  # type: ignore[assignment]
     x0, y0, x1, y1 = part
-    place = x0 >> halvings, y0 >> halvings, -(-frame.width_px >> halvings), -(-frame.height_px >> halvings)
+    place = (
+        x0 >> halvings,
+        y0 >> halvings,
+        -(-frame.width_px >> halvings),
+        -(-frame.height_px >> halvings),
+    )
     # four channels and a constant border are OpenCV's fast path: three times faster than RGB and reflection
     rgba = cv2.cvtColor(corrected(source, frame.gains, frame.vignette, place), cv2.COLOR_RGB2RGBA)
     left, top = pad * (x0 == 0), pad * (y0 == 0)
     right, bottom = pad * (x1 == frame.width_px), pad * (y1 == frame.height_px)
     window_from_source = (
-        _shift(-window[0], -window[1]) @ frame.grid_from_image @ _shift(x0, y0) @ np.diag([2.0**halvings] * 2 + [1.0])
+        _shift(-window[0], -window[1])
+        @ frame.grid_from_image
+        @ _shift(x0, y0)
+        @ np.diag([2.0**halvings] * 2 + [1.0])
     )
     framed = cv2.copyMakeBorder(rgba, top, bottom, left, right, cv2.BORDER_REFLECT)
     size = window[2] - window[0], window[3] - window[1]
-    warped = cv2.warpPerspective(framed, window_from_source @ _shift(-left, -top), size, flags=cv2.INTER_LINEAR)
+    warped = cv2.warpPerspective(
+        framed, window_from_source @ _shift(-left, -top), size, flags=cv2.INTER_LINEAR
+    )
     return cv2.cvtColor(warped, cv2.COLOR_RGBA2RGB)  # type: ignore[return-value]
 
 
@@ -226,7 +248,9 @@ def _stretch(frame: CanvasFrame) -> tuple[float, float]:
     """
     u, v = (frame.width_px - 1) / 2, (frame.height_px - 1) / 2
     x, y, z = frame.grid_from_image @ np.array([u, v, 1.0])
-    linear = frame.grid_from_image[:2, :2] / z - np.outer([x, y], frame.grid_from_image[2, :2]) / z**2
+    linear = (
+        frame.grid_from_image[:2, :2] / z - np.outer([x, y], frame.grid_from_image[2, :2]) / z**2
+    )
     large, small = np.linalg.svd(linear, compute_uv=False)
     return float(small), float(large)
 

@@ -22,7 +22,9 @@ def coarse_grid(site_grid: SiteGrid, step: int) -> SiteGrid:
     grid = site_grid.grid
     beside_m = (step - 1) / 2 * grid.m_per_px  # the centre of the first pixel lies so far into it
     origin_m = grid.origin_m[0] + beside_m, grid.origin_m[1] - beside_m
-    return SiteGrid(site_grid.frame, Grid(origin_m, grid.m_per_px * step, grid.tile_px // step, grid.crs))
+    return SiteGrid(
+        site_grid.frame, Grid(origin_m, grid.m_per_px * step, grid.tile_px // step, grid.crs)
+    )
 
 
 class CoarseTiles(MutableMapping[TileIndex, ImageRGBA]):
@@ -33,7 +35,11 @@ class CoarseTiles(MutableMapping[TileIndex, ImageRGBA]):
     """
 
     def __init__(
-        self, tiles: MutableMapping[TileIndex, ImageRGBA], grid: Grid, step: int, most_bytes: int = 16 << 20
+        self,
+        tiles: MutableMapping[TileIndex, ImageRGBA],
+        grid: Grid,
+        step: int,
+        most_bytes: int = 16 << 20,
     ) -> None:
         self._tiles, self._grid, self._step = tiles, grid, step
         self._known = KnownGround(grid, tiles)
@@ -44,7 +50,9 @@ class CoarseTiles(MutableMapping[TileIndex, ImageRGBA]):
     def __getitem__(self, index: TileIndex) -> ImageRGBA:
         if index not in self._near:
             self._opaque(index)
-            self._keep(index, np.ascontiguousarray(self._tiles[index][:: self._step, :: self._step]))
+            self._keep(
+                index, np.ascontiguousarray(self._tiles[index][:: self._step, :: self._step])
+            )
         self._near.move_to_end(index)
         return self._near[index]
 

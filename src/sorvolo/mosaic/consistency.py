@@ -25,7 +25,9 @@ class ConsistencySettings:
     most_off_m: float = 5.0  # median, if it is also a quarter of how far the flight reaches
     off_share: float = 0.25
     least_alike: float = 0.6  # rms misfit over the fixes' spread: more, and the path is another one
-    most_uneven: float = 0.35  # of the height above ground: heights of frames that scatter so against telemetry's
+    most_uneven: float = (
+        0.35  # of the height above ground: heights of frames that scatter so against telemetry's
+    )
     least_uneven_m: float = 8.0
     heights_differ: float = 0.15  # of the stated height: more is reported ...
     heights_differ_m: float = 4.0  # ... if it is so many metres as well
@@ -68,37 +70,50 @@ NOTHING_KNOWN = Consistency((), (), (), ())
 
 
 def consistency(
-    placed: Sequence[PlacedFrame], pieces: Sequence[Sequence[int]], figures: FlightFigures, stated: Stated,
-    graph: GraphReport | None = None, settings: ConsistencySettings = ConsistencySettings(),
+    placed: Sequence[PlacedFrame],
+    pieces: Sequence[Sequence[int]],
+    figures: FlightFigures,
+    stated: Stated,
+    graph: GraphReport | None = None,
+    settings: ConsistencySettings = ConsistencySettings(),
 ) -> Consistency:
     """Hold a map against itself and against telemetry. `pieces` are the frames, by index, that links tie together."""
     by_index = {each.index: each for each in placed if each.status is not Status.REJECTED}
-    groups = sorted(([by_index[k] for k in ids if k in by_index] for ids in pieces), key=lambda group: -len(group))
+    groups = sorted(
+        ([by_index[k] for k in ids if k in by_index] for ids in pieces),
+        key=lambda group: -len(group),
+    )
     found = [_piece(group, stated) for group in groups]
     known = tuple(each for each in found if each is not None)
     frames = list(by_index.values())
     faults = [
-        *_scale_faults(known, settings), *_gps_faults(frames, figures, stated, settings),
+        *_scale_faults(known, settings),
+        *_gps_faults(frames, figures, stated, settings),
         *_height_faults(frames, figures, settings),
     ]
     steps = [
-        *_steps(groups[: len(known)], figures), *(_gps_doubts(figures, settings) if not faults else []),
+        *_steps(groups[: len(known)], figures),
+        *(_gps_doubts(figures, settings) if not faults else []),
         *_relief_doubts(figures, graph),
     ]
-    return Consistency(known, tuple(faults), tuple(steps), tuple(_height_remarks(figures, stated, settings)))
+    return Consistency(
+        known, tuple(faults), tuple(steps), tuple(_height_remarks(figures, stated, settings))
+    )
 
 
 def _steps(groups: Sequence[Sequence[PlacedFrame]], figures: FlightFigures) -> list[str]:
     """Pieces that lie beside each other, tied by telemetry alone: two areas far apart are none."""
     centres = [np.array([each.outline_m.mean(axis=0) for each in group]) for group in groups]
     beside = [
-        k for k in range(1, len(groups))
+        k
+        for k in range(1, len(groups))
         if any(_apart_m(centres[k], other) < 0.6 * figures.diagonal_m for other in centres[:k])
     ]
     if not beside:
         return []
     listed = "; ".join(
-        f"{counted(len(groups[k]), 'frame')} from {groups[k][0].name} to {groups[k][-1].name}" for k in [0, *beside][:4]
+        f"{counted(len(groups[k]), 'frame')} from {groups[k][0].name} to {groups[k][-1].name}"
+        for k in [0, *beside][:4]
     )
     return [
         f"the map is in {len(beside) + 1} pieces that no picture ties together ({listed}): expect steps of some metres "
@@ -128,7 +143,11 @@ def _piece(frames: Sequence[PlacedFrame], stated: Stated) -> Piece | None:
     if len(frames) < 2:
         return None
     centres_m, fixes_m = _centres_and_fixes(frames)
-    heights = [each.site_from_camera.translation_m[2] for each in frames if each.site_from_camera is not None]
+    heights = [
+        each.site_from_camera.translation_m[2]
+        for each in frames
+        if each.site_from_camera is not None
+    ]
     scale = sigma = float("nan")
     spread_m = float(np.linalg.norm(fixes_m.std(axis=0))) if len(fixes_m) else 0.0
     if len(fixes_m) >= ConsistencySettings.least_frames and spread_m > 2 * stated.position_sigma_m:
@@ -144,7 +163,8 @@ def _piece(frames: Sequence[PlacedFrame], stated: Stated) -> Piece | None:
 def _centres_and_fixes(frames: Sequence[PlacedFrame]) -> tuple[PointsM, PointsM]:
     """(N, 2) each: camera places and the fixes they are held against, of frames that have both."""
     rows = [
-        (each.site_from_camera.translation_m[:2], each.gps_residual_m[:2]) for each in frames
+        (each.site_from_camera.translation_m[:2], each.gps_residual_m[:2])
+        for each in frames
         if each.site_from_camera is not None and np.isfinite(each.gps_residual_m[:2]).all()
     ]
     centres_m, off_m = (np.array([row[k] for row in rows]).reshape(-1, 2) for k in (0, 1))
@@ -155,7 +175,9 @@ def _scale_faults(pieces: Sequence[Piece], settings: ConsistencySettings) -> lis
     known = [each for each in pieces if np.isfinite(each.scale)]
     faults = []
     for piece in known[:1]:
-        if abs(np.log(piece.scale)) > max(settings.most_scale, settings.scale_sigmas * piece.scale_sigma):
+        if abs(np.log(piece.scale)) > max(
+            settings.most_scale, settings.scale_sigmas * piece.scale_sigma
+        ):
             faults.append(
                 f"the map is {piece.scale:.2f} times as large as its GPS track (frames {piece.first} to {piece.last})"
             )
@@ -171,7 +193,10 @@ def _scale_faults(pieces: Sequence[Piece], settings: ConsistencySettings) -> lis
 
 
 def _gps_faults(
-    frames: Sequence[PlacedFrame], figures: FlightFigures, stated: Stated, settings: ConsistencySettings
+    frames: Sequence[PlacedFrame],
+    figures: FlightFigures,
+    stated: Stated,
+    settings: ConsistencySettings,
 ) -> list[str]:
     rms_m = figures.gps_rms_m
     if rms_m is None or len(frames) <= 3:
@@ -189,7 +214,9 @@ def _gps_faults(
 
 def _gps_doubts(figures: FlightFigures, settings: ConsistencySettings) -> list[str]:
     median_m = figures.gps_median_m
-    if median_m is None or median_m <= max(settings.off_share * figures.reach_m, settings.most_off_m):
+    if median_m is None or median_m <= max(
+        settings.off_share * figures.reach_m, settings.most_off_m
+    ):
         return []
     return [
         f"the pictures' own path and the telemetry disagree by {median_m:.0f} m (median): is this the telemetry of "
@@ -210,16 +237,23 @@ def _is_alike(frames: Sequence[PlacedFrame], settings: ConsistencySettings) -> b
 def _height_faults(
     frames: Sequence[PlacedFrame], figures: FlightFigures, settings: ConsistencySettings
 ) -> list[str]:
-    rows = np.array([
-        (each.site_from_camera.translation_m[2], each.gps_residual_m[2]) for each in frames
-        if each.site_from_camera is not None and np.isfinite(each.gps_residual_m[2])
-    ]).reshape(-1, 2)
+    rows = np.array(
+        [
+            (each.site_from_camera.translation_m[2], each.gps_residual_m[2])
+            for each in frames
+            if each.site_from_camera is not None and np.isfinite(each.gps_residual_m[2])
+        ]
+    ).reshape(-1, 2)
     if len(rows) < settings.least_frames or figures.height_m is None:
         return []
     up_m, off_m = rows.T
     uneven_m = _uneven_m(off_m)
-    telemetry_drifts = _uneven_m(up_m) < _uneven_m(up_m - off_m)  # a barometer or a poor receiver, not the map
-    if telemetry_drifts or uneven_m <= max(settings.most_uneven * figures.height_m, settings.least_uneven_m):
+    telemetry_drifts = _uneven_m(up_m) < _uneven_m(
+        up_m - off_m
+    )  # a barometer or a poor receiver, not the map
+    if telemetry_drifts or uneven_m <= max(
+        settings.most_uneven * figures.height_m, settings.least_uneven_m
+    ):
         return []
     return [
         f"the pictures put frames {uneven_m:.0f} m higher or lower than telemetry, at {figures.height_m:.0f} m above "
@@ -232,11 +266,15 @@ def _uneven_m(values_m: Floats) -> float:
     return float(np.percentile(np.abs(values_m - np.median(values_m)), 75))
 
 
-def _height_remarks(figures: FlightFigures, stated: Stated, settings: ConsistencySettings) -> list[str]:
+def _height_remarks(
+    figures: FlightFigures, stated: Stated, settings: ConsistencySettings
+) -> list[str]:
     found_m, stated_m = figures.height_m, stated.height_m
     if found_m is None or not np.isfinite(stated_m):
         return []
-    if abs(found_m - stated_m) <= max(settings.heights_differ * abs(stated_m), settings.heights_differ_m):
+    if abs(found_m - stated_m) <= max(
+        settings.heights_differ * abs(stated_m), settings.heights_differ_m
+    ):
         return []
     return [
         f"{stated.source} give {stated_m:.0f} m above the ground, the pictures and GPS {found_m:.0f} m: the ground "

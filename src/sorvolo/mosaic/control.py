@@ -13,7 +13,13 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.units import FOOT_M
 from sorvolo.mosaic.ground_ties import GroundTies, similarity_of_most
 from sorvolo.mosaic.planar import PlanarMapper
-from sorvolo.survey.control import ControlMark, ControlReport, ControlResidual, ControlRole, GroundControl
+from sorvolo.survey.control import (
+    ControlMark,
+    ControlReport,
+    ControlResidual,
+    ControlRole,
+    GroundControl,
+)
 
 LEAST_CONTROL = 3  # points: two fix a similarity, the third shows whether they are right
 
@@ -24,21 +30,32 @@ class ControlSettings:
 
     sigma_m: float = 0.05  # of the survey, horizontal
     mark_px: float = 1.0  # with which a person marks, px of the frame
-    checks: tuple[str, ...] = ()  # labels held back; one that ends in * stands for all that begin so
+    checks: tuple[
+        str, ...
+    ] = ()  # labels held back; one that ends in * stands for all that begin so
     excluded_sigmas: float = 5.0  # beyond which a point may be wrong ...
     excluded_times: float = 4.0  # ... if it also misses so many times as much as the others
-    most_misfit: float = 0.12  # of the points' spread: more, and the points are not those in the pictures
+    most_misfit: float = (
+        0.12  # of the points' spread: more, and the points are not those in the pictures
+    )
     least_spread_m: float = 0.1  # rms: closer together they give no scale and no north
     most_off_gps_m: float = 60.0  # no receiver errs so far: the points' CRS is another
     most_scale: float = 1.3  # between GPS and the points
-    on_line: float = 0.1  # spread across over spread along, or over that of a picture's ground: less is one line
-    clearly_better: float = 0.5  # times the rms miss, by choice: heights in feet that fit so much better are in feet
-    in_corner: float = 0.3  # their spread over that of the flight's cameras, below which they hold a corner of it
+    on_line: float = (
+        0.1  # spread across over spread along, or over that of a picture's ground: less is one line
+    )
+    clearly_better: float = (
+        0.5  # times the rms miss, by choice: heights in feet that fit so much better are in feet
+    )
+    in_corner: float = (
+        0.3  # their spread over that of the flight's cameras, below which they hold a corner of it
+    )
 
     def holds_back(self, label: str) -> bool:
         """Whether this point measures the map in place of tying it."""
         return any(
-            label.startswith(each[:-1]) if each.endswith("*") else label == each for each in self.checks
+            label.startswith(each[:-1]) if each.endswith("*") else label == each
+            for each in self.checks
         )
 
 
@@ -59,7 +76,9 @@ class _Seen:
         off_m = places_m - self.ties.place_m[:, :2]
         mean = np.array([off_m[self.point == k].mean(axis=0) for k in range(len(self.labels))])
         scatter = np.sqrt(((off_m - mean[self.point]) ** 2).sum(axis=1))
-        return mean, np.array([np.sqrt((scatter[self.point == k] ** 2).mean()) for k in range(len(self.labels))])
+        return mean, np.array(
+            [np.sqrt((scatter[self.point == k] ** 2).mean()) for k in range(len(self.labels))]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +94,9 @@ class ControlProblem:
     other_readings: Callable[[], Iterable[tuple[str, GroundControl]]] = field(default=lambda: ())
 
 
-def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: ControlSettings) -> ControlReport:
+def tie_control(
+    mapper: PlanarMapper, problem: ControlProblem, settings: ControlSettings
+) -> ControlReport:
     """Tie the map to its control points, points that contradict the others excluded one by one.
 
     Raises InputError where too few are seen, and where they do not fit the pictures at all.
@@ -98,9 +119,13 @@ def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: Control
             break
         used.remove(wrong)
         excluded.add(wrong)
-    rows = {label: (misses[k], scatter[k], int((seen.point == k).sum())) for k, label in enumerate(seen.labels)}
+    rows = {
+        label: (misses[k], scatter[k], int((seen.point == k).sum()))
+        for k, label in enumerate(seen.labels)
+    }
     residuals = tuple(
-        _residual(problem.control, number, rows, used, excluded) for number in range(len(problem.control.points))
+        _residual(problem.control, number, rows, used, excluded)
+        for number in range(len(problem.control.points))
     )
     remarks = (
         *_misfit_remarks(mapper, problem, seen, used, expected_m, settings),
@@ -108,11 +133,17 @@ def tie_control(mapper: PlanarMapper, problem: ControlProblem, settings: Control
     )
     missed_m = _rms_m(misses[np.array([label not in excluded for label in seen.labels], bool)])
     mapper.note_ground_miss(float(np.sqrt(max(0.0, missed_m**2 - expected_m**2) / 2)))
-    return ControlReport(problem.control.name, problem.control.crs, settings.sigma_m, residuals, remarks)
+    return ControlReport(
+        problem.control.name, problem.control.crs, settings.sigma_m, residuals, remarks
+    )
 
 
 def _misfit_remarks(
-    mapper: PlanarMapper, problem: ControlProblem, seen: _Seen, used: set[str], expected_m: float,
+    mapper: PlanarMapper,
+    problem: ControlProblem,
+    seen: _Seen,
+    used: set[str],
+    expected_m: float,
     settings: ControlSettings,
 ) -> tuple[str, ...]:
     """In words, that the points miss the tied map by more than they err: its ground is not level, or their heights are
@@ -148,7 +179,9 @@ def _layout_remarks(
 ) -> tuple[str, ...]:
     cameras_m = np.array([mapper.pose(each).translation_m for each in mapper.placed()])
     picture_m = float(np.median(cameras_m[:, 2])) * problem.camera.width_px / problem.camera.fx_px
-    return layout_remarks(np.unique(ties.place_m[:, :2], axis=0), cameras_m[:, :2], picture_m, settings)
+    return layout_remarks(
+        np.unique(ties.place_m[:, :2], axis=0), cameras_m[:, :2], picture_m, settings
+    )
 
 
 def layout_remarks(
@@ -174,20 +207,27 @@ def layout_remarks(
 
 def _spreads_m(places_m: PointsM) -> tuple[float, float]:
     """The standard deviations of places, (N, 2), along the line that fits them best, and across it."""
-    along, across = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)[:2] / np.sqrt(len(places_m))
+    along, across = np.linalg.svd(places_m - places_m.mean(axis=0), compute_uv=False)[:2] / np.sqrt(
+        len(places_m)
+    )
     return float(along), float(across)
 
 
 def _residual(
-    control: GroundControl, number: int, rows: Mapping[str, tuple[Floats, float, int]], used: set[str],
+    control: GroundControl,
+    number: int,
+    rows: Mapping[str, tuple[Floats, float, int]],
+    used: set[str],
     excluded: set[str],
 ) -> ControlResidual:
     point = control.points[number]
     if point.label not in rows:
         return ControlResidual(point, ControlRole.UNSEEN, 0, np.nan, np.nan, np.nan)
     miss, scatter, marks = rows[point.label]
-    role = ControlRole.CONTROL if point.label in used else (
-        ControlRole.EXCLUDED if point.label in excluded else ControlRole.CHECK
+    role = (
+        ControlRole.CONTROL
+        if point.label in used
+        else (ControlRole.EXCLUDED if point.label in excluded else ControlRole.CHECK)
     )
     return ControlResidual(point, role, marks, float(miss[0]), float(miss[1]), float(scatter))
 
@@ -199,13 +239,17 @@ def _seen(
     marked = {each.label for each in marks}
     labels = tuple(each.label for each in control.points if each.label in marked)
     frame = LocalFrame(control.middle) if problem.is_datum else problem.frame
-    place_of = dict(zip((each.label for each in control.points), _places_m(control, frame), strict=True))
+    place_of = dict(
+        zip((each.label for each in control.points), _places_m(control, frame), strict=True)
+    )
     keyframes, pixels, point = _columns(marks, problem.keyframe_of, labels)
     count = np.bincount(point, minlength=len(labels))[point]
     scale = [mapper.registration_scale(each, problem.camera) for each in keyframes.tolist()]
     ties = GroundTies(
-        keyframes, problem.camera.rays_from_pixels(pixels)[:, :2],
-        np.array([place_of[each.label] for each in marks]).reshape(-1, 3), settings.mark_px * np.array(scale),
+        keyframes,
+        problem.camera.rays_from_pixels(pixels)[:, :2],
+        np.array([place_of[each.label] for each in marks]).reshape(-1, 3),
+        settings.mark_px * np.array(scale),
         settings.sigma_m * np.sqrt(count),  # marks of one point share its error
     )
     return _Seen(labels, point, ties)
@@ -232,17 +276,25 @@ def _places_m(control: GroundControl, frame: LocalFrame) -> PointsM:
     return np.column_stack([frame.site_from_wgs84(latitude, longitude, level)[:, :2], up_m])
 
 
-def _expected_m(mapper: PlanarMapper, seen: _Seen, problem: ControlProblem, settings: ControlSettings) -> float:
+def _expected_m(
+    mapper: PlanarMapper, seen: _Seen, problem: ControlProblem, settings: ControlSettings
+) -> float:
     """How far a point that is right may miss, one sigma: its survey's error and that of its marks."""
     heights_m = [mapper.pose(each).translation_m[2] for each in seen.ties.keyframe_ids.tolist()]
-    return float(np.hypot(settings.sigma_m, settings.mark_px * np.median(heights_m) / problem.camera.fx_px))
+    return float(
+        np.hypot(settings.sigma_m, settings.mark_px * np.median(heights_m) / problem.camera.fx_px)
+    )
 
 
 def _wrong_point(
     seen: _Seen, misses: PointsM, used: set[str], expected_m: float, settings: ControlSettings
 ) -> str | None:
     """The used point that misses most, where it misses more than surveying, marking and the others allow."""
-    miss_m = {label: float(np.linalg.norm(misses[k])) for k, label in enumerate(seen.labels) if label in used}
+    miss_m = {
+        label: float(np.linalg.norm(misses[k]))
+        for k, label in enumerate(seen.labels)
+        if label in used
+    }
     worst = max(miss_m, key=lambda label: miss_m[label])
     usual_m = float(np.median([value for label, value in miss_m.items() if label != worst]))
     limit_m = max(settings.excluded_sigmas * expected_m, settings.excluded_times * usual_m)
@@ -250,7 +302,11 @@ def _wrong_point(
 
 
 def _check_fit(
-    mapper: PlanarMapper, problem: ControlProblem, seen: _Seen, used: set[str], settings: ControlSettings
+    mapper: PlanarMapper,
+    problem: ControlProblem,
+    seen: _Seen,
+    used: set[str],
+    settings: ControlSettings,
 ) -> None:
     """Raise InputError where the points as they are read cannot be those in the pictures."""
     found = _disagreement(mapper, seen, used, problem, settings)
@@ -258,15 +314,23 @@ def _check_fit(
         return
     for words, control in problem.other_readings():
         other = _seen(mapper, problem, control, settings)
-        if len(used & set(other.labels)) == len(used) and not _disagreement(mapper, other, used, problem, settings):
-            raise InputError(f"{problem.control.name}: {found}; they fit if {words}: correct the file")
+        if len(used & set(other.labels)) == len(used) and not _disagreement(
+            mapper, other, used, problem, settings
+        ):
+            raise InputError(
+                f"{problem.control.name}: {found}; they fit if {words}: correct the file"
+            )
     raise InputError(
         f"{problem.control.name}: {found}; check the CRS in its first line, the order of x and y, and the marks"
     )
 
 
 def _disagreement(
-    mapper: PlanarMapper, seen: _Seen, used: set[str], problem: ControlProblem, settings: ControlSettings
+    mapper: PlanarMapper,
+    seen: _Seen,
+    used: set[str],
+    problem: ControlProblem,
+    settings: ControlSettings,
 ) -> str:
     """In words, how the points cannot be those in the pictures; "" where they can."""
     ties = seen.of(used)
@@ -288,7 +352,9 @@ def _disagreement(
     return "" if problem.is_datum else _against_gps(a, b, change, spread_m, settings)
 
 
-def _against_gps(a: PointsM, b: PointsM, change: Matrix3, spread_m: float, settings: ControlSettings) -> str:
+def _against_gps(
+    a: PointsM, b: PointsM, change: Matrix3, spread_m: float, settings: ControlSettings
+) -> str:
     """How surveyed places `a` cannot be those that a map by GPS has at `b`, (P, 2) each; "" where they can."""
     off_m = float(np.median(np.linalg.norm(a - b, axis=1)))
     scale = float(np.hypot(change[0, 0], change[1, 0]))

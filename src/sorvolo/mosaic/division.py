@@ -53,7 +53,10 @@ def _halved(ids: Rows, centres_m: Floats, count: int) -> list[Rows]:
     axis = int(np.argmax(high - low))
     ordered = ids[np.argsort(centres_m[ids, axis], kind="stable")]
     at = round(len(ids) * (count // 2) / count)
-    return [*_halved(ordered[:at], centres_m, count // 2), *_halved(ordered[at:], centres_m, count - count // 2)]
+    return [
+        *_halved(ordered[:at], centres_m, count // 2),
+        *_halved(ordered[at:], centres_m, count - count // 2),
+    ]
 
 
 def _margin(home: Rows, centres_m: Floats, reach_m: float) -> frozenset[int]:
@@ -64,4 +67,6 @@ def _margin(home: Rows, centres_m: Floats, reach_m: float) -> frozenset[int]:
     if not np.isfinite(reach_m):
         return frozenset(others.tolist())
     near = cKDTree(centres_m[home]).query_ball_point(centres_m[others], reach_m)
-    return frozenset(int(other) for other, found in zip(others, near) if found and home[max(found)] > other)
+    return frozenset(
+        int(other) for other, found in zip(others, near) if found and home[max(found)] > other
+    )

@@ -15,7 +15,16 @@ from scipy.sparse import csc_array, diags_array
 from scipy.sparse.linalg import splu
 
 from sorvolo.errors import GeometryError, SettingsError
-from sorvolo.geometry.arrays import Floats, Floats16, Floats32, ImageRGB, Mask, PointsPx, Rows, frozen
+from sorvolo.geometry.arrays import (
+    Floats,
+    Floats16,
+    Floats32,
+    ImageRGB,
+    Mask,
+    PointsPx,
+    Rows,
+    frozen,
+)
 
 _SHRINK = 4  # times smaller pictures: colours are means of so many pixels a side
 _ITERATIONS = 8  # rounds of the robust solve; by choice
@@ -28,7 +37,9 @@ _SIGMA_FROM_MEDIAN = 1.126  # of the root mean square of three normal numbers
 class ExposureSettings:
     """How far gains may go; sigmas are of the logarithm (0.1 is about 10 %)."""
 
-    gain_sigma: float = 0.15  # prior about gain 1: keeps the whole map from drifting along a chain of links
+    gain_sigma: float = (
+        0.15  # prior about gain 1: keeps the whole map from drifting along a chain of links
+    )
     vignette_sigma: float = 0.3  # prior about no vignette: where radii do not differ it stays at 0
     colour_sigma: float = 0.03  # least spread of a point's colour: noise, texture and misplacement
     points_per_link: int = 48  # colours of the ground that both pictures show
@@ -69,7 +80,9 @@ class ColourPairs:
         if len(self) <= most:
             return self
         pick = np.linspace(0, len(self) - 1, most).astype(int)
-        return ColourPairs(self.colours_a[pick], self.colours_b[pick], self.radius2_a[pick], self.radius2_b[pick])
+        return ColourPairs(
+            self.colours_a[pick], self.colours_b[pick], self.radius2_a[pick], self.radius2_b[pick]
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +106,9 @@ class Exposure:
 
     def updated(self, newer: "Exposure") -> "Exposure":
         """With all that the newer one knows, and what only this one does."""
-        return Exposure({**self.gains, **newer.gains}, {**self.vignettes, **newer.vignettes}, newer.spread)
+        return Exposure(
+            {**self.gains, **newer.gains}, {**self.vignettes, **newer.vignettes}, newer.spread
+        )
 
 
 def tie_colours(
@@ -108,8 +123,10 @@ def tie_colours(
     both = np.hstack([colours_a, colours_b])
     keep = (both.min(axis=1) > 6) & (both.max(axis=1) < 247)
     return ColourPairs(
-        colours_a[keep], colours_b[keep],
-        _radius2(points_a_px, image_a)[keep], _radius2(points_b_px, image_b)[keep],
+        colours_a[keep],
+        colours_b[keep],
+        _radius2(points_a_px, image_a)[keep],
+        _radius2(points_b_px, image_b)[keep],
     )
 
 
@@ -131,7 +148,7 @@ def solve_exposure(
     solution, spread = _robust_solution(_equations(pairs, unknowns, settings), unknowns, settings)
     limit = np.log(settings.largest_gain)
     gains = {e: np.exp(np.clip(solution[i], -limit, limit)) for e, i in unknowns.column.items()}
-    vignettes = {c: solution[i:i + 2, 0].copy() for c, i in unknowns.lens.items()}
+    vignettes = {c: solution[i : i + 2, 0].copy() for c, i in unknowns.lens.items()}
     return Exposure(gains, vignettes, spread)
 
 
@@ -154,15 +171,20 @@ def corrected(
     y = (2 * np.arange(y0, y0 + height) - (whole_height - 1)) ** 2 / diagonal2
     x, y = x.astype(np.float32), y.astype(np.float32)
     result = np.empty((height, width, 3), np.uint8)
-    rows = max(1, _FIELD_PX // width)  # at a time: the field of a whole picture is five times as large as the picture
+    rows = max(
+        1, _FIELD_PX // width
+    )  # at a time: the field of a whole picture is five times as large as the picture
     for first in range(0, height, rows):
         some = slice(first, first + rows)
         radius2 = y[some, None] + x
         field = cv2.exp(-(np.float32(vignette[0]) + np.float32(vignette[1]) * radius2) * radius2)
-        cv2.merge([
-            cv2.multiply(channel, field, scale=float(gain), dtype=cv2.CV_8U)
-            for channel, gain in zip(cv2.split(image[some]), gains)
-        ], result[some])
+        cv2.merge(
+            [
+                cv2.multiply(channel, field, scale=float(gain), dtype=cv2.CV_8U)
+                for channel, gain in zip(cv2.split(image[some]), gains)
+            ],
+            result[some],
+        )
     return result
 
 
@@ -201,7 +223,9 @@ class _Equations:
 def _unknowns(ids: Sequence[int], camera_of: Mapping[int, int]) -> _Unknowns:
     cameras = sorted({camera_of[each] for each in ids})
     lens = {camera: len(ids) + 2 * i for i, camera in enumerate(cameras)}
-    return _Unknowns({each: i for i, each in enumerate(ids)}, lens, {each: lens[camera_of[each]] for each in ids})
+    return _Unknowns(
+        {each: i for i, each in enumerate(ids)}, lens, {each: lens[camera_of[each]] for each in ids}
+    )
 
 
 def _equations(
@@ -217,8 +241,12 @@ def _equations(
     for row, (link, count) in enumerate(zip(links, counts.tolist(), strict=True)):
         chosen = pairs[link].thinned(settings.points_per_link)
         radius2_a[row, :count], radius2_b[row, :count] = chosen.radius2_a, chosen.radius2_b
-        colours_a, colours_b = (each.astype(np.float32) for each in (chosen.colours_a, chosen.colours_b))
-        difference[row, :count] = np.log(np.maximum(colours_a, 1.0)) - np.log(np.maximum(colours_b, 1.0))
+        colours_a, colours_b = (
+            each.astype(np.float32) for each in (chosen.colours_a, chosen.colours_b)
+        )
+        difference[row, :count] = np.log(np.maximum(colours_a, 1.0)) - np.log(
+            np.maximum(colours_b, 1.0)
+        )
     columns = np.array([_columns_of(each, unknowns) for each in links])
     return _Equations(columns, radius2_a, radius2_b, difference, exists)
 
@@ -235,13 +263,20 @@ def _robust_solution(
 ) -> tuple[Floats, float]:
     """(U, 3) unknowns per channel, logarithms of gains first, and the robust spread of what is left."""
     frames = len(unknowns.column)
-    prior = np.repeat([settings.gain_sigma**-2, settings.vignette_sigma**-2], [frames, 2 * len(unknowns.lens)])
+    prior = np.repeat(
+        [settings.gain_sigma**-2, settings.vignette_sigma**-2], [frames, 2 * len(unknowns.lens)]
+    )
     solution, typical = np.zeros((len(prior), 3)), 0.0
     for _ in range(_ITERATIONS):
-        length = np.concatenate([
-            np.linalg.norm(equations.difference[some] + factors @ solution[equations.columns[some]], axis=-1)
-            for some, factors in equations.batches()
-        ]) / np.sqrt(3)
+        length = np.concatenate(
+            [
+                np.linalg.norm(
+                    equations.difference[some] + factors @ solution[equations.columns[some]],
+                    axis=-1,
+                )
+                for some, factors in equations.batches()
+            ]
+        ) / np.sqrt(3)
         typical = float(np.median(length[equations.exists]))
         spread = max(settings.colour_sigma, _SIGMA_FROM_MEDIAN * typical)
         weight = equations.exists / (1 + (length / spread) ** 2) / spread**2
@@ -261,7 +296,9 @@ def _solve(equations: _Equations, weight: Floats, prior: Floats, frames: int) ->
         blocks[some] = weighted @ factors
         np.add.at(right, columns[some], -(weighted @ equations.difference[some]))
     rows, others = np.broadcast_arrays(columns[:, :, None], columns[:, None, :])
-    normal = csc_array((blocks.ravel(), (rows.ravel(), others.ravel())), shape=(count, count)) + diags_array(prior)
+    normal = csc_array(
+        (blocks.ravel(), (rows.ravel(), others.ravel())), shape=(count, count)
+    ) + diags_array(prior)
     # gains per channel eliminated for the vignette of their mean, then put back with that vignette
     normal = normal.tocsc()
     mean = _solved(normal, right.mean(axis=1))
@@ -273,7 +310,9 @@ def _solve(equations: _Equations, weight: Floats, prior: Floats, frames: int) ->
 
 def _solved(normal: csc_array, right: Floats) -> Floats:
     """The solution of symmetric, positive definite equations."""
-    factors = splu(normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0)
+    factors = splu(
+        normal, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+    )
     return np.asarray(factors.solve(right))
 
 
@@ -284,17 +323,20 @@ def _sample(image: ImageRGB, points_px: PointsPx) -> Floats:
     # remap takes at most 32767 points in a row
     columns = 1024
     padded = np.zeros((-(-len(at) // columns) * columns, 2), np.float32)
-    padded[:len(at)] = at
+    padded[: len(at)] = at
     grid = padded.reshape(-1, columns, 2)
     if not len(at):
         return np.zeros((0, 3))
     colours = cv2.remap(  # type: ignore[call-overload]
         smooth, grid, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    return np.asarray(colours.reshape(-1, 3)[:len(at)], np.float64)
+    return np.asarray(colours.reshape(-1, 3)[: len(at)], np.float64)
 
 
 def _radius2(points_px: PointsPx, image: ImageRGB) -> Floats:
     height, width = image.shape[:2]
-    centred = np.asarray(points_px, dtype=np.float64).reshape(-1, 2) - [(width - 1) / 2, (height - 1) / 2]
+    centred = np.asarray(points_px, dtype=np.float64).reshape(-1, 2) - [
+        (width - 1) / 2,
+        (height - 1) / 2,
+    ]
     return (centred**2).sum(axis=1) * 4 / (width**2 + height**2)

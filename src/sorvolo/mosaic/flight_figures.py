@@ -43,23 +43,38 @@ def flight_figures(placed: Sequence[PlacedFrame], focal_px: float) -> FlightFigu
     heights_m = [float(each.translation_m[2]) for each in poses]
     residuals = [each.residual_px for each in seen]
     return FlightFigures(
-        median_of_known(residuals), percentile_of_known(residuals, 95),
-        median_of_known(horizontal_m), rms_of_known(horizontal_m), median_of_known(np.abs(gps[:, 2])),
-        median_of_known([each.sigma_m for each in seen]), median_of_known(heights_m),
-        float(np.median(heights_m) / focal_px) if heights_m else None, _reach_m(seen),
-        _diagonal_m(seen), _tilt_deg(poses),
+        median_of_known(residuals),
+        percentile_of_known(residuals, 95),
+        median_of_known(horizontal_m),
+        rms_of_known(horizontal_m),
+        median_of_known(np.abs(gps[:, 2])),
+        median_of_known([each.sigma_m for each in seen]),
+        median_of_known(heights_m),
+        float(np.median(heights_m) / focal_px) if heights_m else None,
+        _reach_m(seen),
+        _diagonal_m(seen),
+        _tilt_deg(poses),
     )
 
 
 def track_row(each: PlacedFrame) -> dict[str, Any]:
     """One frame for the report's plots, in site metres."""
     centre = each.outline_m.mean(axis=0)
-    camera_m = each.site_from_camera.translation_m if each.site_from_camera is not None else np.append(centre, np.nan)
+    camera_m = (
+        each.site_from_camera.translation_m
+        if each.site_from_camera is not None
+        else np.append(centre, np.nan)
+    )
     return {
-        "frame": each.name, "status": each.status.value,
-        "east_m": float(camera_m[0]), "north_m": float(camera_m[1]), "up_m": float(camera_m[2]),
-        "residual_px": each.residual_px, "sigma_m": each.sigma_m,
-        "gps_east_m": float(each.gps_residual_m[0]), "gps_north_m": float(each.gps_residual_m[1]),
+        "frame": each.name,
+        "status": each.status.value,
+        "east_m": float(camera_m[0]),
+        "north_m": float(camera_m[1]),
+        "up_m": float(camera_m[2]),
+        "residual_px": each.residual_px,
+        "sigma_m": each.sigma_m,
+        "gps_east_m": float(each.gps_residual_m[0]),
+        "gps_north_m": float(each.gps_residual_m[1]),
         "gps_up_m": float(each.gps_residual_m[2]),
     }
 
@@ -67,10 +82,15 @@ def track_row(each: PlacedFrame) -> dict[str, Any]:
 def stated_height_m(placed: Sequence[PlacedFrame], altitude_offset_m: float) -> float:
     """The median height above ground that telemetry states for the placed frames, whose residuals count from it less
     the offset that the flight showed; NaN without any."""
-    stated = median_of_known([
-        float(each.site_from_camera.translation_m[2] + altitude_offset_m - each.gps_residual_m[2]) for each in placed
-        if each.site_from_camera is not None
-    ])
+    stated = median_of_known(
+        [
+            float(
+                each.site_from_camera.translation_m[2] + altitude_offset_m - each.gps_residual_m[2]
+            )
+            for each in placed
+            if each.site_from_camera is not None
+        ]
+    )
     return float("nan") if stated is None else stated
 
 
@@ -84,7 +104,9 @@ def _reach_m(seen: Sequence[PlacedFrame]) -> float:
 def _diagonal_m(seen: Sequence[PlacedFrame]) -> float:
     if not seen:
         return 0.0
-    return float(np.median([np.linalg.norm(each.outline_m[2] - each.outline_m[0]) for each in seen]))
+    return float(
+        np.median([np.linalg.norm(each.outline_m[2] - each.outline_m[0]) for each in seen])
+    )
 
 
 def _tilt_deg(poses: Sequence[Pose]) -> float:
@@ -100,4 +122,9 @@ def delay_figures(delays_s: Sequence[float]) -> dict[str, float | int] | None:
     if not delays_s:
         return None
     median, p95 = np.percentile(delays_s, [50, 95])
-    return {"frames": len(delays_s), "median": float(median), "p95": float(p95), "largest": max(delays_s)}
+    return {
+        "frames": len(delays_s),
+        "median": float(median),
+        "p95": float(p95),
+        "largest": max(delays_s),
+    }

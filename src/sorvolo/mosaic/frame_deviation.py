@@ -64,10 +64,15 @@ class MapDeviation:
         corners = apply_homography(grid_from_site, np.asarray(outline_m, np.float64))
         low, high = np.floor(corners.min(axis=0)), np.ceil(corners.max(axis=0)) + 1
         window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
-        ends = np.array([[0, 0], [width_px - 1, 0], [width_px - 1, height_px - 1], [0, height_px - 1]], np.float32)
+        ends = np.array(
+            [[0, 0], [width_px - 1, 0], [width_px - 1, height_px - 1], [0, height_px - 1]],
+            np.float32,
+        )
         frame_from_window = cv2.getPerspectiveTransform((corners - low).astype(np.float32), ends)
         found = cv2.warpPerspective(
-            self._crop(window, self._site_grid.grid.tile_px), frame_from_window, (width_px, height_px)
+            self._crop(window, self._site_grid.grid.tile_px),
+            frame_from_window,
+            (width_px, height_px),
         )
         found[found[..., 3] == 0] = _UNSEEN
         return np.ascontiguousarray(found[..., :3])
@@ -78,7 +83,10 @@ class MapDeviation:
         x, y, z = site_from_image @ np.array([width / 2, height / 2, 1.0])
         grid_from_site = self._site_grid.grid_from_site_affine(np.array([x / z, y / z]), 100.0)
         frame = CanvasFrame(0, 0, width, height, grid_from_site @ site_from_image)
-        low, high = np.floor(frame.outline_px.min(axis=0)), np.ceil(frame.outline_px.max(axis=0)) + 1
+        low, high = (
+            np.floor(frame.outline_px.min(axis=0)),
+            np.ceil(frame.outline_px.max(axis=0)) + 1,
+        )
         window = int(low[0]), int(low[1]), int(high[0]), int(high[1])
         mosaic = self._crop(window, self._site_grid.grid.tile_px)
         mask = (coverage(frame, window) > 0) & (mosaic[..., 3] > 0)
@@ -95,8 +103,9 @@ class MapDeviation:
                 left, top = max(x0, column * side), max(y0, row * side)
                 right, bottom = min(x1, (column + 1) * side), min(y1, (row + 1) * side)
                 tile = self._tile((column, row))
-                result[top - y0:bottom - y0, left - x0:right - x0] = tile[
-                    top - row * side:bottom - row * side, left - column * side:right - column * side
+                result[top - y0 : bottom - y0, left - x0 : right - x0] = tile[
+                    top - row * side : bottom - row * side,
+                    left - column * side : right - column * side,
                 ]
         return result
 
@@ -112,7 +121,11 @@ class MapDeviation:
 
 def frames_to_compare(count: int, most: int) -> list[int]:
     """At most this many of a flight's frames, by number, evenly chosen."""
-    return list(range(count)) if count <= most else np.linspace(0, count - 1, most).astype(int).tolist()
+    return (
+        list(range(count))
+        if count <= most
+        else np.linspace(0, count - 1, most).astype(int).tolist()
+    )
 
 
 def summed_up(deviations: Sequence[Deviation]) -> DeviationSummary:
@@ -123,6 +136,9 @@ def summed_up(deviations: Sequence[Deviation]) -> DeviationSummary:
         return DeviationSummary(nan, nan, nan, np.zeros(DEVIATION_BINS), 0)
     shares = np.array([each.share for each in found])
     return DeviationSummary(
-        float(shares.mean()), float(np.median(shares)), float(shares.max()),
-        np.mean([each.histogram for each in found], axis=0), len(found),
+        float(shares.mean()),
+        float(np.median(shares)),
+        float(shares.max()),
+        np.mean([each.histogram for each in found], axis=0),
+        len(found),
     )

@@ -16,7 +16,9 @@ class AlignmentSettings:
 
     rounds: int = 3  # trimmed: a few wild fixes must not turn the map
     wild: float = 3.0  # times the median miss: such a fix is left out
-    most_uncertain: float = 0.15  # relative, of scale and turn by these fixes: beyond, they leave them open
+    most_uncertain: float = (
+        0.15  # relative, of scale and turn by these fixes: beyond, they leave them open
+    )
     least_sigmas: float = 3.0  # of scale or turn, or ...
     least_scale: float = 0.02  # ... relative, ...
     least_turn_rad: float = 0.03  # 1.7 degrees
@@ -24,7 +26,10 @@ class AlignmentSettings:
 
 
 def change_to_fixes(
-    places_m: PointsM, fixes_m: PointsM, sigma_m: Floats, settings: AlignmentSettings = AlignmentSettings()
+    places_m: PointsM,
+    fixes_m: PointsM,
+    sigma_m: Floats,
+    settings: AlignmentSettings = AlignmentSettings(),
 ) -> Matrix3 | None:
     """The similarity (3, 3) of the ground that brings cameras, (N, 2), to their fixes, (N, 2), of sigmas (N,).
 
@@ -33,7 +38,11 @@ def change_to_fixes(
     for _ in range(settings.rounds):
         spread_m = float(np.sqrt(((fixes_m - fixes_m.mean(0)) ** 2).sum(1).mean()))
         uncertainty = float(np.median(sigma_m)) / (np.sqrt(len(fixes_m)) * max(spread_m, 1e-9))
-        if len(fixes_m) < 3 or uncertainty > settings.most_uncertain or np.ptp(places_m, axis=0).max() <= 0:
+        if (
+            len(fixes_m) < 3
+            or uncertainty > settings.most_uncertain
+            or np.ptp(places_m, axis=0).max() <= 0
+        ):
             return None
         change = fit_similarity(fixes_m, places_m)
         miss_m = np.linalg.norm(places_m @ change[:2, :2].T + change[:2, 2] - fixes_m, axis=1)
@@ -65,11 +74,17 @@ def change_to_ground(
 def move_all(rows: NodeRows, change: Matrix3) -> None:
     """Shift, turn and scale all cameras by a similarity of the ground."""
     scale, turn = _scale_and_turn(change)
-    matrix = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]])
+    matrix = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]]
+    )
     centres_m = rows.centres_m
     rows.rotations[:] = matrix @ rows.rotations
-    centres_m[:] = np.column_stack([centres_m[:, :2] @ change[:2, :2].T + change[:2, 2], centres_m[:, 2] * scale])
+    centres_m[:] = np.column_stack(
+        [centres_m[:, :2] @ change[:2, :2].T + change[:2, 2], centres_m[:, 2] * scale]
+    )
 
 
 def _scale_and_turn(change: Matrix3) -> tuple[float, float]:
-    return float(np.hypot(change[0, 0], change[1, 0])), float(np.arctan2(change[1, 0], change[0, 0]))
+    return float(np.hypot(change[0, 0], change[1, 0])), float(
+        np.arctan2(change[1, 0], change[0, 0])
+    )

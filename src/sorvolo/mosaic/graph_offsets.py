@@ -14,14 +14,24 @@ _GROUPS = ((2,), (5, 6), (7,))  # of SHARED: altitude's zero, tilt, heading; jud
 def shared_sigma(settings: PoseGraphSettings, as_reported: NDArray[np.bool_]) -> Floats:
     """(8,) prior sigma of each shared unknown; those taken as reported, (8,) bool, are held close to zero."""
     tilt, heading = np.radians([settings.tilt_offset_sigma_deg, settings.heading_offset_sigma_deg])
-    sigma = np.array([
-        settings.focal_sigma, settings.radial_sigma, settings.altitude_offset_sigma_m,
-        settings.gps_offset_sigma_m, settings.gps_offset_sigma_m, tilt, tilt, heading,
-    ])
+    sigma = np.array(
+        [
+            settings.focal_sigma,
+            settings.radial_sigma,
+            settings.altitude_offset_sigma_m,
+            settings.gps_offset_sigma_m,
+            settings.gps_offset_sigma_m,
+            tilt,
+            tilt,
+            heading,
+        ]
+    )
     return np.where(as_reported, np.minimum(sigma, _held_sigma(settings.offsets)), sigma)
 
 
-def unconfirmed(shared: Floats, sigma: Floats, factors: Factors, settings: OffsetSettings) -> list[int]:
+def unconfirmed(
+    shared: Floats, sigma: Floats, factors: Factors, settings: OffsetSettings
+) -> list[int]:
     """The offsets, as indices of SHARED, that a flight does not show: telemetry is taken as it reports them.
 
     An offset that all frames share (altitude's zero, gimbal, compass) and that the rest of the flight sees at less than
@@ -44,13 +54,22 @@ def unconfirmed(shared: Floats, sigma: Floats, factors: Factors, settings: Offse
 def shared_variances(factors: Factors) -> Floats:
     """(8,) of the shared unknowns, the last of the normal equations."""
     units = np.zeros((factors.size, len(SHARED)))
-    units[-len(SHARED):] = np.eye(len(SHARED))
-    return np.diag(factors.solve(units)[-len(SHARED):])
+    units[-len(SHARED) :] = np.eye(len(SHARED))
+    return np.diag(factors.solve(units)[-len(SHARED) :])
 
 
 def _held_sigma(settings: OffsetSettings) -> Floats:
     """(8,) prior sigma of an offset that is taken as telemetry reports it."""
     tilt_rad = settings.tilt_rad
-    return np.array([
-        np.inf, np.inf, settings.altitude_m, np.inf, np.inf, tilt_rad, tilt_rad, settings.heading_rad
-    ])
+    return np.array(
+        [
+            np.inf,
+            np.inf,
+            settings.altitude_m,
+            np.inf,
+            np.inf,
+            tilt_rad,
+            tilt_rad,
+            settings.heading_rad,
+        ]
+    )

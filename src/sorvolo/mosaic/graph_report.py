@@ -22,10 +22,17 @@ class GraphReport:
     links_dropped: int
     relief_m: float
     rms_px: float
-    angles_contradicted: int = 0  # frames whose stated angles the pictures rule out: these angles are not used
-    turned_deg: tuple[float, float] = (0.0, 0.0)  # tilt and heading that all stated angles are off by
+    angles_contradicted: int = (
+        0  # frames whose stated angles the pictures rule out: these angles are not used
+    )
+    turned_deg: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # tilt and heading that all stated angles are off by
     is_uneven: bool = False  # pictures fit each other as over ground that is not level
-    lean_m: float = 0.0  # median of `leans_m`, and how far stated angles leave the ground open themselves
+    lean_m: float = (
+        0.0  # median of `leans_m`, and how far stated angles leave the ground open themselves
+    )
     lean_stated_m: float = 0.0
 
 
@@ -35,11 +42,15 @@ def leans_m(rotations: Floats, stated: Floats, heights_m: Floats) -> Floats:
     Over a slope a camera that looks straight down takes the same pictures, but for their fixes, as one that leans over
     level ground. Pictures over ground that is not level cannot show which it is: this is what the map errs by then.
     """
-    here, there = (each[:, :2, 2] / -np.minimum(each[:, 2:, 2], -0.1) for each in (rotations, stated))
+    here, there = (
+        each[:, :2, 2] / -np.minimum(each[:, 2:, 2], -0.1) for each in (rotations, stated)
+    )
     return np.asarray(heights_m * np.linalg.norm(here - there, axis=1) / np.sqrt(2))
 
 
-def ground_sigmas_m(rotations: Floats, heights_m: Floats, starts: Rows, factors: Factors) -> list[float]:
+def ground_sigmas_m(
+    rotations: Floats, heights_m: Floats, starts: Rows, factors: Factors
+) -> list[float]:
     """One sigma of the ground points at some cameras' image centres, per axis; their unknowns begin at `starts` (M,) of
     `factors`.
 
@@ -48,7 +59,10 @@ def ground_sigmas_m(rotations: Floats, heights_m: Floats, starts: Rows, factors:
     found: list[float] = []
     for first in range(0, len(starts), _AT_ONCE):
         some = slice(first, first + _AT_ONCE)
-        blocks = [_ground_centre_jacobian(*each) for each in zip(rotations[some], heights_m[some], strict=True)]
+        blocks = [
+            _ground_centre_jacobian(*each)
+            for each in zip(rotations[some], heights_m[some], strict=True)
+        ]
         unknowns = starts[some, None] + np.arange(6)
         right = np.zeros((factors.size, len(blocks), 2))
         for k, block in enumerate(blocks):

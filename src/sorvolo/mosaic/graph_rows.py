@@ -14,7 +14,9 @@ from sorvolo.mosaic.shelf import Shelf, ShelvedRows
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
 
-_UNKNOWN_SIGMA_M = 1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
+_UNKNOWN_SIGMA_M = (
+    1e6  # stands in for an infinite sigma; its weight is nothing, its arithmetic finite
+)
 _FIRST_ROOM = 16  # rows; then they double
 
 
@@ -32,12 +34,14 @@ class _Columns:
 
     def column(self, name: str) -> NDArray[Any]:
         """(N, ...) a view, good until the next `append` or `keep`."""
-        return self._columns[name][:self._count]
+        return self._columns[name][: self._count]
 
     def append(self, **row: Any) -> None:
         """One value for each column."""
         if self._count == len(next(iter(self._columns.values()))):
-            self._columns = {name: _with_twice_the_room(each) for name, each in self._columns.items()}
+            self._columns = {
+                name: _with_twice_the_room(each) for name, each in self._columns.items()
+            }
         for name, value in row.items():
             self._columns[name][self._count] = value
         self._count += 1
@@ -46,7 +50,7 @@ class _Columns:
         """Drop the rows where `chosen` (N,) is False."""
         count = int(np.sum(chosen))
         for each in self._columns.values():
-            each[:count] = each[:self._count][chosen]
+            each[:count] = each[: self._count][chosen]
         self._count = count
 
 
@@ -55,8 +59,13 @@ class NodeRows:
 
     def __init__(self) -> None:
         self._rows = _Columns(
-            rotations=(float, (3, 3)), centres_m=(float, (3,)), prior_centres_m=(float, (3,)),
-            prior_sigma_m=(float, (3,)), prior_rotations=(float, (3, 3)), prior_sigma_rad=(float, (3,)), own=(bool, ()),
+            rotations=(float, (3, 3)),
+            centres_m=(float, (3,)),
+            prior_centres_m=(float, (3,)),
+            prior_sigma_m=(float, (3,)),
+            prior_rotations=(float, (3, 3)),
+            prior_sigma_rad=(float, (3,)),
+            own=(bool, ()),
         )
 
     def __len__(self) -> int:
@@ -105,17 +114,25 @@ class NodeRows:
     def set_prior(self, at: int, prior: CameraPrior) -> None:
         """Replace the telemetry of a keyframe."""
         self.prior_centres_m[at], self.stated_sigma_m[at] = prior.position_m, prior.position_sigma_m
-        self.prior_rotations[at], self.stated_sigma_rad[at] = prior.rotation, np.radians(prior.attitude_sigma_deg)
+        self.prior_rotations[at], self.stated_sigma_rad[at] = (
+            prior.rotation,
+            np.radians(prior.attitude_sigma_deg),
+        )
 
-    def nodes(self, place: Floats, attitude: Floats, contradicted: Rows, at: Rows | slice = slice(None)) -> Nodes:
+    def nodes(
+        self, place: Floats, attitude: Floats, contradicted: Rows, at: Rows | slice = slice(None)
+    ) -> Nodes:
         """For the solver: stated sigmas times `place` and `attitude`, (3,) each, no angles where contradicted; all
         nodes, or those `at` some rows."""
         sigma_m, sigma_rad = self.stated_sigma_m[at] * place, self.stated_sigma_rad[at] * attitude
         sigma_rad[np.isin(np.arange(len(self))[at], contradicted)] = np.inf
         return Nodes(
-            self.rotations[at], self.centres_m[at], self.prior_centres_m[at],
+            self.rotations[at],
+            self.centres_m[at],
+            self.prior_centres_m[at],
             np.where(np.isfinite(sigma_m), np.maximum(sigma_m, 1e-3), _UNKNOWN_SIGMA_M),
-            self.prior_rotations[at], np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
+            self.prior_rotations[at],
+            np.where(np.isfinite(sigma_rad), np.maximum(sigma_rad, 1e-4), _UNKNOWN_SIGMA_M),
             self.own[at],
         )
 
@@ -123,11 +140,18 @@ class NodeRows:
 class LinkRows:
     """The links and their matched points; the points of older ones lie on the `shelf`, if there is one."""
 
-    def __init__(self, pairs_per_link: int, independent_pairs: float, shelf: Shelf | None = None) -> None:
+    def __init__(
+        self, pairs_per_link: int, independent_pairs: float, shelf: Shelf | None = None
+    ) -> None:
         self._most, self._independent = pairs_per_link, independent_pairs
         self._rows = _Columns(
-            old=(int, ()), new=(int, ()), pairs=(int, ()), points=(int, ()), focal_px=(float, ()),
-            sigma_px=(float, ()), relief_m=(float, ()),
+            old=(int, ()),
+            new=(int, ()),
+            pairs=(int, ()),
+            points=(int, ()),
+            focal_px=(float, ()),
+            sigma_px=(float, ()),
+            relief_m=(float, ()),
         )
         self._points = ShelvedRows("points", (2, pairs_per_link, 2), float, shelf)
 
@@ -154,17 +178,24 @@ class LinkRows:
         """(L,) across the parallax."""
         return self._rows.column("sigma_px")
 
-    def append(self, each: Link, old: tuple[int, Camera], new: tuple[int, Camera], sigma_px: float) -> None:
+    def append(
+        self, each: Link, old: tuple[int, Camera], new: tuple[int, Camera], sigma_px: float
+    ) -> None:
         """A link more, between two nodes and their registration cameras; its relief is that of the others."""
         pick = np.arange(len(each.new_px))
         if len(pick) > self._most:
             pick = np.linspace(0, len(pick) - 1, self._most).round().astype(int)
         points = np.zeros((2, self._most, 2))
-        points[0, :len(pick)] = _ideal(old[1], each.old_px[pick])
-        points[1, :len(pick)] = _ideal(new[1], each.new_px[pick])
+        points[0, : len(pick)] = _ideal(old[1], each.old_px[pick])
+        points[1, : len(pick)] = _ideal(new[1], each.new_px[pick])
         self._rows.append(
-            old=old[0], new=new[0], pairs=len(pick), points=len(self._points), focal_px=new[1].fx_px,
-            sigma_px=sigma_px, relief_m=float(np.median(self.relief_m)) if len(self) else 0.1,
+            old=old[0],
+            new=new[0],
+            pairs=len(pick),
+            points=len(self._points),
+            focal_px=new[1].fx_px,
+            sigma_px=sigma_px,
+            relief_m=float(np.median(self.relief_m)) if len(self) else 0.1,
         )
         self._points.append(points)
 
@@ -192,7 +223,7 @@ class LinkRows:
 def _with_twice_the_room(column: NDArray[Any]) -> NDArray[Any]:
     """The column with as many rows again, which take memory only once they are written."""
     wider = np.empty((2 * len(column), *column.shape[1:]), column.dtype)
-    wider[:len(column)] = column
+    wider[: len(column)] = column
     return wider
 
 

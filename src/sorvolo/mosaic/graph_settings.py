@@ -25,7 +25,9 @@ class OffsetSettings:
     tilt_rad: float = 0.002
     heading_rad: float = 0.003
     least_sigmas: float = 2.0  # of its own, without the prior: less is noise
-    widest_sigma: float = 100.0  # of the prior, m or rad: a wider one is no belief that a flight could confirm
+    widest_sigma: float = (
+        100.0  # of the prior, m or rad: a wider one is no belief that a flight could confirm
+    )
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,12 @@ class PoseGraphSettings:
     """What the graph may move and when it solves."""
 
     pairs_per_link: int = 40  # matches that stand for a link, spread over it
-    independent_pairs: float = 20.0  # matches of one link share lens and relief errors: they count as so many
-    sigma_px: float = 0.3  # floor of a match's noise; calibration and rolling shutter never are better
+    independent_pairs: float = (
+        20.0  # matches of one link share lens and relief errors: they count as so many
+    )
+    sigma_px: float = (
+        0.3  # floor of a match's noise; calibration and rolling shutter never are better
+    )
     window: int = 6  # recent keyframes freed by each local solve
     region: int = 120  # keyframes; a larger flight is solved around its newest ones only, until it ends or is strained
     uneven: float = 0.002  # relief left between linked pictures over the height: level ground 0.0003, hills 0.004
@@ -42,14 +48,22 @@ class PoseGraphSettings:
     focal_sigma: float = 0.0  # relative; 0 holds the focal length
     radial_sigma: float = 0.0  # prior of the left-over radial distortion; 0 holds it
     altitude_offset_sigma_m: float = 1.0  # how well the altitude's zero is known to be the ground
-    gps_offset_sigma_m: float = 0.0  # > 0 when a known map fixes the datum instead of this flight's GPS
-    tilt_offset_sigma_deg: float = 0.0  # of gimbal or mount against the vertical, the same all flight
+    gps_offset_sigma_m: float = (
+        0.0  # > 0 when a known map fixes the datum instead of this flight's GPS
+    )
+    tilt_offset_sigma_deg: float = (
+        0.0  # of gimbal or mount against the vertical, the same all flight
+    )
     heading_offset_sigma_deg: float = 0.0  # of the compass, the same all flight
     offsets: OffsetSettings = OffsetSettings()
 
     @classmethod
     def of_flight(
-        cls, focal_sigma: float, altitude_offset_sigma_m: float | None, *, joins_map: bool,
+        cls,
+        focal_sigma: float,
+        altitude_offset_sigma_m: float | None,
+        *,
+        joins_map: bool,
         priors: FlightPriors = FlightPriors(),
     ) -> "PoseGraphSettings":
         """What is free on a flight whose focal length is known to `focal_sigma` (relative) and the zero of whose
@@ -58,7 +72,9 @@ class PoseGraphSettings:
         """
         calibrated = focal_sigma <= priors.calibrated
         has_telemetry = altitude_offset_sigma_m is not None
-        height_known = altitude_offset_sigma_m is not None and bool(np.isfinite(altitude_offset_sigma_m))
+        height_known = altitude_offset_sigma_m is not None and bool(
+            np.isfinite(altitude_offset_sigma_m)
+        )
         return cls(
             focal_sigma=0.0 if calibrated or not height_known else focal_sigma,
             radial_sigma=0.0 if calibrated else priors.radial,

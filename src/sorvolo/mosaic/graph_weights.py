@@ -37,7 +37,10 @@ class LinkNoise:
 def link_noise(nodes: Nodes, pairs: Linked, shared: Floats) -> LinkNoise:
     """The noise of at least one link, by the cameras as they stand."""
     found = [_noise(nodes, some, shared) for some in pairs.batches()]
-    return LinkNoise(np.concatenate([each.across_px for each in found]), np.concatenate([e.relief_m for e in found]))
+    return LinkNoise(
+        np.concatenate([each.across_px for each in found]),
+        np.concatenate([e.relief_m for e in found]),
+    )
 
 
 def miss_px(nodes: Nodes, pairs: Linked, shared: Floats) -> Iterator[tuple[Rows, Rows, Floats]]:
@@ -60,10 +63,16 @@ def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:
     error_rad = rotation_vector(rows.prior_rotations.transpose(0, 2, 1) @ rows.rotations)
     size = np.linalg.norm(error_rad, axis=1)
     angled = np.isfinite(stated_rad[:, 2])
-    contradicted = np.flatnonzero(tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15))))
+    contradicted = np.flatnonzero(
+        tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15)))
+    )
     used = tied & angled
     used[contradicted] = False
-    return Trust(_place_factors(stated_m, tied, miss_m), _attitude_factors(stated_rad, used, error_rad), contradicted)
+    return Trust(
+        _place_factors(stated_m, tied, miss_m),
+        _attitude_factors(stated_rad, used, error_rad),
+        contradicted,
+    )
 
 
 def _place_factors(stated_m: Floats, tied: Mask, miss_m: Floats) -> Floats:
@@ -93,10 +102,18 @@ def _noise(nodes: Nodes, pairs: Pairs, shared: Floats) -> LinkNoise:
     length = np.linalg.norm(line.parallax, axis=-1)
     along = line.parallax / np.maximum(length, 1e-9)[..., None]
     miss_along = np.abs((line.residual_px * along).sum(-1))
-    miss_across = np.abs(line.residual_px[..., 0] * along[..., 1] - line.residual_px[..., 1] * along[..., 0])
+    miss_across = np.abs(
+        line.residual_px[..., 0] * along[..., 1] - line.residual_px[..., 1] * along[..., 0]
+    )
     unused = pairs.weight <= 0
     with np.errstate(all="ignore"):
-        across = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(np.where(unused, np.nan, miss_across), axis=1)
-        sigma_along = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(np.where(unused, np.nan, miss_along), axis=1)
+        across = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(
+            np.where(unused, np.nan, miss_across), axis=1
+        )
+        sigma_along = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(
+            np.where(unused, np.nan, miss_along), axis=1
+        )
         reach = np.nanmedian(np.where(unused, np.nan, length), axis=1)
-    return LinkNoise(across, np.sqrt(np.maximum(sigma_along**2 - across**2, 0)) / np.maximum(reach, 1e-6))
+    return LinkNoise(
+        across, np.sqrt(np.maximum(sigma_along**2 - across**2, 0)) / np.maximum(reach, 1e-6)
+    )

@@ -7,7 +7,9 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, Matrix3, PointsM, Rows
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 
-_MOST_GUESSES = 600  # pairs of points that may give the similarity: 600 find it among two thirds of wild ones
+_MOST_GUESSES = (
+    600  # pairs of points that may give the similarity: 600 find it among two thirds of wild ones
+)
 _MILD = 2.5  # robust sigmas
 
 
@@ -29,8 +31,12 @@ class GroundTies:
     def of(self, chosen: Rows) -> "GroundTies":
         """Some of them, by index or mask (M,)."""
         return GroundTies(
-            self.keyframe_ids[chosen], self.ideal[chosen], self.place_m[chosen], self.sigma_px[chosen],
-            self.sigma_m[chosen], self.common_m,
+            self.keyframe_ids[chosen],
+            self.ideal[chosen],
+            self.place_m[chosen],
+            self.sigma_px[chosen],
+            self.sigma_m[chosen],
+            self.common_m,
         )
 
     def __len__(self) -> int:
@@ -48,7 +54,9 @@ def similarity_of_most(points_a: PointsM, points_b: PointsM) -> Matrix3 | None:
         return fit_similarity(points_a, points_b)
     a, b = points_a @ np.array([1, 1j]), points_b @ np.array([1, 1j])
     first, second = _guesses(len(a))
-    apart = np.abs(b[first] - b[second]) > 0.2 * np.median(np.abs(b - np.median(b.real) - 1j * np.median(b.imag)))
+    apart = np.abs(b[first] - b[second]) > 0.2 * np.median(
+        np.abs(b - np.median(b.real) - 1j * np.median(b.imag))
+    )
     first, second = first[apart], second[apart]
     if not len(first):
         return fit_similarity(points_a, points_b)

@@ -73,7 +73,10 @@ class Keyframes:
             rest = self._rest[keyframe_id]
             with np.load(io.BytesIO(self._shelf.get(keyframe_id)), allow_pickle=False) as kept:
                 features = Features(rest.kind, kept["points_px"], kept["descriptors"])
-                found = Keyframe(keyframe_id, rest.camera, kept["gray"], features, rest.prior), kept["thumbnail"]
+                found = (
+                    Keyframe(keyframe_id, rest.camera, kept["gray"], features, rest.prior),
+                    kept["thumbnail"],
+                )
             self._take(*found)
         self._near.move_to_end(keyframe_id)
         return found
@@ -95,13 +98,21 @@ class Keyframes:
 
 def _size(keyframe: Keyframe, thumbnail: ImageRGB) -> int:
     features = keyframe.features
-    return keyframe.gray.nbytes + features.points_px.nbytes + features.descriptors.nbytes + thumbnail.nbytes
+    return (
+        keyframe.gray.nbytes
+        + features.points_px.nbytes
+        + features.descriptors.nbytes
+        + thumbnail.nbytes
+    )
 
 
 def _bytes(keyframe: Keyframe, thumbnail: ImageRGB) -> bytes:
     data = io.BytesIO()
     np.savez(
-        data, gray=keyframe.gray, points_px=keyframe.features.points_px, descriptors=keyframe.features.descriptors,
+        data,
+        gray=keyframe.gray,
+        points_px=keyframe.features.points_px,
+        descriptors=keyframe.features.descriptors,
         thumbnail=thumbnail,
     )
     return data.getvalue()

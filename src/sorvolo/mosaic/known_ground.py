@@ -100,15 +100,25 @@ def settled(picture: ImageRGB, stored: ImageRGB, lasting: Mask) -> ImageRGB:
     inwards_px = cv2.distanceTransform(lasting.view(np.uint8), cv2.DIST_L2, 3)
     outwards_px = cv2.distanceTransform((~lasting).view(np.uint8), cv2.DIST_L2, 3)
     rim = np.exp(inwards_px / -_RIM_PX) * lasting
-    step = np.clip(cv2.subtract(stored, picture, dtype=cv2.CV_16S), -_LARGEST_STEP, _LARGEST_STEP) * rim[..., None]
+    step = (
+        np.clip(cv2.subtract(stored, picture, dtype=cv2.CV_16S), -_LARGEST_STEP, _LARGEST_STEP)
+        * rim[..., None]
+    )
     side = 2 * (_REACH_PX // _SHRINK) + 1
     steps, shares = (
-        cv2.GaussianBlur(cv2.resize(each, small, interpolation=cv2.INTER_AREA), (side, side), _REACH_PX / 3 / _SHRINK)
+        cv2.GaussianBlur(
+            cv2.resize(each, small, interpolation=cv2.INTER_AREA),
+            (side, side),
+            _REACH_PX / 3 / _SHRINK,
+        )
         for each in (step.astype(np.float32), rim.astype(np.float32))
     )
     at_rim = steps / np.maximum(shares, 1e-6)[..., None]
     kept = np.clip(1 - outwards_px / _REACH_PX, 0, 1) ** 2
-    fitted = picture + cv2.resize(at_rim, (width, height), interpolation=cv2.INTER_LINEAR) * kept[..., None]
+    fitted = (
+        picture
+        + cv2.resize(at_rim, (width, height), interpolation=cv2.INTER_LINEAR) * kept[..., None]
+    )
     result = np.clip(fitted + 0.5, 0, 255).astype(np.uint8)
     result[lasting] = picture[lasting]
     return result

@@ -32,7 +32,9 @@ class LinkedColours(Mapping[tuple[int, int], ColourPairs]):
         """Take the pairs of a link in, in place of earlier ones of it."""
         kept = pairs.thinned(self._most)
         row = np.zeros((self._most, 8), np.float16)
-        row[:len(kept)] = np.column_stack([kept.colours_a, kept.colours_b, kept.radius2_a, kept.radius2_b])
+        row[: len(kept)] = np.column_stack(
+            [kept.colours_a, kept.colours_b, kept.radius2_a, kept.radius2_b]
+        )
         self._places[link] = len(self._rows), len(kept)
         self._rows.append(row)
 

@@ -82,9 +82,18 @@ def spread_of(distances_m: Floats, gsd_m: float) -> Spread:
     if not len(distances_m):
         nan = float("nan")
         return Spread(nan, nan, nan, nan, nan, nan, 0)
-    rms, p95, most = np.sqrt((distances_m**2).mean()), np.percentile(distances_m, 95), distances_m.max()
+    rms, p95, most = (
+        np.sqrt((distances_m**2).mean()),
+        np.percentile(distances_m, 95),
+        distances_m.max(),
+    )
     return Spread(
-        float(rms), float(p95), float(most), float(rms / gsd_m), float(p95 / gsd_m), float(most / gsd_m),
+        float(rms),
+        float(p95),
+        float(most),
+        float(rms / gsd_m),
+        float(p95 / gsd_m),
+        float(most / gsd_m),
         len(distances_m),
     )
 
@@ -101,9 +110,14 @@ def corner_errors(
     `true_cameras_m` and `fixes_m`, (M, 2) each, give the floor; the fixes may be of more frames than were
     placed, because the floor is a property of the flight. Raises GeometryError when shapes differ.
     """
-    estimated, true = np.asarray(estimated_m, dtype=np.float64), np.asarray(true_m, dtype=np.float64)
+    estimated, true = (
+        np.asarray(estimated_m, dtype=np.float64),
+        np.asarray(true_m, dtype=np.float64),
+    )
     if estimated.shape != true.shape or estimated.shape[1:] != (4, 2):
-        raise GeometryError(f"outlines must be (N, 4, 2) both, got {estimated.shape} and {true.shape}")
+        raise GeometryError(
+            f"outlines must be (N, 4, 2) both, got {estimated.shape} and {true.shape}"
+        )
     estimated, true = estimated.reshape(-1, 2), true.reshape(-1, 2)
     none = spread_of(np.zeros(0), gsd_m)
     if not len(true):
@@ -119,7 +133,9 @@ def corner_errors(
     return CornerErrors(absolute, shape, floor, over_floor)
 
 
-def position_errors(estimated_m: PointsM, reference_m: PointsM, gsd_m: float) -> tuple[Spread, Spread]:
+def position_errors(
+    estimated_m: PointsM, reference_m: PointsM, gsd_m: float
+) -> tuple[Spread, Spread]:
     """Camera positions, (N, 2) or (N, 3) m, against a reference: as they lie, and after the best similarity.
 
     The similarity acts on east and north only and needs three cameras; heights stay as they are. Raises
@@ -133,7 +149,9 @@ def position_errors(estimated_m: PointsM, reference_m: PointsM, gsd_m: float) ->
     if len(reference) < 3:
         return absolute, spread_of(np.zeros(0), gsd_m)
     moved = estimated.copy()
-    moved[:, :2] = apply_homography(fit_similarity(reference[:, :2], estimated[:, :2]), estimated[:, :2])
+    moved[:, :2] = apply_homography(
+        fit_similarity(reference[:, :2], estimated[:, :2]), estimated[:, :2]
+    )
     return absolute, spread_of(np.linalg.norm(moved - reference, axis=1), gsd_m)
 
 

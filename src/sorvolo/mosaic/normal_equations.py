@@ -42,7 +42,7 @@ class NormalEquations:
             one, other = cameras
             both = (one >= 0) & (other >= 0)
             end = self._ties + int(both.sum())
-            self._between[self._ties:end] = information[both, :SIDE, SIDE:2 * SIDE]
+            self._between[self._ties : end] = information[both, :SIDE, SIDE : 2 * SIDE]
             self._ties = end
         self._shared[:few, :few] += information[:, rest, rest].sum(axis=0)
         self._shared_pull[:few] += pull[:, rest].sum(axis=0)
@@ -73,8 +73,8 @@ class NormalEquations:
 
     def times(self, vectors: Floats) -> Floats:
         """The information matrix times (6 n + shared, k) vectors."""
-        own = vectors[:-len(self._shared)].reshape(*self._pull.shape, -1)
-        shared = vectors[-len(self._shared):]
+        own = vectors[: -len(self._shared)].reshape(*self._pull.shape, -1)
+        shared = vectors[-len(self._shared) :]
         found = self._cameras @ own + self._with_shared @ shared
         one, other = self._elimination.one, self._elimination.other
         np.add.at(found, one, self._between @ own[other])
@@ -85,7 +85,9 @@ class NormalEquations:
     def factorised(self, damping: float = 0.0) -> "Factors":
         """The equations, ready to be solved; each unknown held by `damping` times its own information, and a little."""
         if not damping:
-            return Factors(self._elimination, self._cameras, self._between, self._with_shared, self._shared)
+            return Factors(
+                self._elimination, self._cameras, self._between, self._with_shared, self._shared
+            )
         cameras, shared = self._cameras.copy(), self._shared.copy()
         for blocks in (cameras, shared):
             own = np.arange(blocks.shape[-1])
@@ -97,7 +99,12 @@ class Factors:
     """Normal equations in factors: those of the cameras, and what the shared unknowns have to do with them."""
 
     def __init__(
-        self, elimination: Elimination, cameras: Floats, between: Floats, with_shared: Floats, shared: Floats
+        self,
+        elimination: Elimination,
+        cameras: Floats,
+        between: Floats,
+        with_shared: Floats,
+        shared: Floats,
     ) -> None:
         self.size = cameras.shape[0] * SIDE + len(shared)
         self._cameras = elimination.factorised(cameras, between)

@@ -34,8 +34,10 @@ def outline_distortion(outlines_m: Sequence[Floats]) -> OutlineDistortion:
     pairs = np.stack([lengths[:, :2], lengths[:, 2:]])
     areas = np.abs([signed_area(each) for each in corners])
     return OutlineDistortion(
-        float((pairs.max(axis=0) / pairs.min(axis=0)).max()), float(areas.max() / areas.min()),
-        _bend(corners.mean(axis=1), float(np.sqrt(areas[0]))), len(known),
+        float((pairs.max(axis=0) / pairs.min(axis=0)).max()),
+        float(areas.max() / areas.min()),
+        _bend(corners.mean(axis=1), float(np.sqrt(areas[0]))),
+        len(known),
     )
 
 

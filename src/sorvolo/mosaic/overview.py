@@ -28,7 +28,9 @@ class Overview:
 def lay_out(frames: Sequence[tuple[ImageRGB, Matrix3]], side_px: int) -> Overview | None:
     """Frames (small pictures with their site_from_image) over each other, the later on top, within `side_px`; None
     where none lies on the ground."""
-    outlines = [apply_homography(site_from_image, _corners(image)) for image, site_from_image in frames]
+    outlines = [
+        apply_homography(site_from_image, _corners(image)) for image, site_from_image in frames
+    ]
     flat = [each for each in outlines if np.isfinite(each).all()]
     if not flat:
         return None
@@ -42,8 +44,13 @@ def lay_out(frames: Sequence[tuple[ImageRGB, Matrix3]], side_px: int) -> Overvie
         if not np.isfinite(outline).all():
             continue
         matrix = np.linalg.inv(site_from_image) @ site_from_frame
-        seen = cv2.warpPerspective(np.full(image.shape[:2], 255, np.uint8), matrix, (width, height)) == 255
-        laid = cv2.warpPerspective(gray_from_rgb(image), matrix, (width, height), flags=cv2.INTER_AREA)
+        seen = (
+            cv2.warpPerspective(np.full(image.shape[:2], 255, np.uint8), matrix, (width, height))
+            == 255
+        )
+        laid = cv2.warpPerspective(
+            gray_from_rgb(image), matrix, (width, height), flags=cv2.INTER_AREA
+        )
         gray[seen], known[seen] = laid[seen], True
     return Overview(gray, known, site_from_image)
 

@@ -26,9 +26,11 @@ def true_names(
     for name in frames.keys() - named.keys():
         alike = {
             true: sum(
-                row.name in rows and abs(row.time_ns - rows[row.name].time_ns) < _SAME_FLIGHT_NS for row in frames[name]
+                row.name in rows and abs(row.time_ns - rows[row.name].time_ns) < _SAME_FLIGHT_NS
+                for row in frames[name]
             )
-            for true, rows in true_frames.items() if true not in named.values()
+            for true, rows in true_frames.items()
+            if true not in named.values()
         }
         best = max(alike, key=alike.__getitem__, default="")
         if best and alike[best]:
@@ -51,21 +53,28 @@ class PairedFlights:
     def placed(self, names: Sequence[str]) -> list[tuple[str, FrameRow]]:
         """The frames of these flights that lie somewhere, with their flights."""
         return [
-            (name, row) for name in names for row in self.mine.get(name, ())
+            (name, row)
+            for name in names
+            for row in self.mine.get(name, ())
             if row.status not in _NOT_PLACED and row.has_outline
         ]
 
     def clock(self, name: str) -> tuple[int, int]:
         """When the flight ended by its own clock, and how far that is behind the truth's: logs may have no date."""
         true = self.true[self.names[name]]
-        behind_ns = [true[row.name].time_ns - row.time_ns for row in self.mine[name] if row.name in true]
-        return max((row.time_ns for row in self.mine[name]), default=0), int(np.median(behind_ns)) if behind_ns else 0
+        behind_ns = [
+            true[row.name].time_ns - row.time_ns for row in self.mine[name] if row.name in true
+        ]
+        return max((row.time_ns for row in self.mine[name]), default=0), int(
+            np.median(behind_ns)
+        ) if behind_ns else 0
 
     def map_from_truth(self, names: Sequence[str]) -> tuple[Matrix3, float]:
         """The similarity that takes true places to where these flights lie; the rms of what it moves, NaN if none."""
         pairs = [
             (row.outline_m, self.true[self.names[name]][row.name].outline_m)
-            for name, row in self.placed(names) if name in self.names and row.name in self.true[self.names[name]]
+            for name, row in self.placed(names)
+            if name in self.names and row.name in self.true[self.names[name]]
         ]
         pairs = [pair for pair in pairs if np.isfinite(pair).all()]
         if not pairs:

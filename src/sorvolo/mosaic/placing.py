@@ -17,8 +17,14 @@ _KNOWN_ATTITUDE_DEG = 4.0  # one sigma of a gimbal's tilt
 
 
 def canvas_frame(
-    keyframe_id: int, rank: int, stored: Camera, site_from_image: Matrix3, site_grid: SiteGrid, gains: Floats,
-    vignette: Floats, valid: Mask | None,
+    keyframe_id: int,
+    rank: int,
+    stored: Camera,
+    site_from_image: Matrix3,
+    site_grid: SiteGrid,
+    gains: Floats,
+    vignette: Floats,
+    valid: Mask | None,
 ) -> CanvasFrame | None:
     """A stored picture laid on the grid; None when part of it lies at or beyond the horizon."""
     centre = site_from_image @ np.array([stored.cx_px, stored.cy_px, 1.0])
@@ -27,7 +33,13 @@ def canvas_frame(
     grid_from_site = site_grid.grid_from_site_affine(centre[:2] / centre[2], min(reach_m, 1000.0))
     try:
         return CanvasFrame(
-            keyframe_id, rank, stored.width_px, stored.height_px, grid_from_site @ site_from_image, gains, vignette,
+            keyframe_id,
+            rank,
+            stored.width_px,
+            stored.height_px,
+            grid_from_site @ site_from_image,
+            gains,
+            vignette,
             valid,
         )
     except GeometryError:

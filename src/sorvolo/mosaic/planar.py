@@ -103,7 +103,11 @@ class _Tie:
     @property
     def refusal_reason(self) -> str:
         """Why the picture that refused first did."""
-        return next(iter(self.refusals.values())).reason if self.refusals else "nothing of the map lies under it"
+        return (
+            next(iter(self.refusals.values())).reason
+            if self.refusals
+            else "nothing of the map lies under it"
+        )
 
 
 class PlanarMapper:
@@ -113,8 +117,12 @@ class PlanarMapper:
     """
 
     def __init__(
-        self, graph: PoseGraphSettings, settings: PlanarSettings = PlanarSettings(),
-        known: Sequence[KnownKeyframe] = (), shelf: Shelf | None = None, keyframe_bytes: int = 1 << 28,
+        self,
+        graph: PoseGraphSettings,
+        settings: PlanarSettings = PlanarSettings(),
+        known: Sequence[KnownKeyframe] = (),
+        shelf: Shelf | None = None,
+        keyframe_bytes: int = 1 << 28,
     ) -> None:
         self._settings = settings
         self._graph = PoseGraph(graph, shelf)
@@ -123,7 +131,9 @@ class PlanarMapper:
         self._keyframes = Keyframes(shelf, keyframe_bytes)
         self._own: list[int] = []
         self._known = {each.id: each for each in known}
-        self._known_centres_m = np.array([each.site_from_camera.translation_m for each in known]).reshape(-1, 3)
+        self._known_centres_m = np.array(
+            [each.site_from_camera.translation_m for each in known]
+        ).reshape(-1, 3)
         self._colours = LinkedColours(settings.exposure.points_per_link, shelf)
         self._failures: dict[int, str] = {}
         self._met: list[int] = []  # of the known map, in the order in which they were loaded
@@ -137,18 +147,23 @@ class PlanarMapper:
         self._keyframes.release()
         release_network()
 
-    def register(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Registered:
+    def register(
+        self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior
+    ) -> Registered:
         """Tie an undistorted picture to the map as it is; `place` is what adds it."""
         keyframe = self._keyframe(keyframe_id, camera, image, prior)
         before = len(self._met)
         links, guess, reason = self._tie(keyframe)
-        return Registered(keyframe, _thumbnail(image), tuple(links), guess, reason, tuple(self._met[before:]))
+        return Registered(
+            keyframe, _thumbnail(image), tuple(links), guess, reason, tuple(self._met[before:])
+        )
 
     def can_place(self, new: Registered) -> bool:
         """Whether all that a registered picture was tied to is there: else it is of another flight."""
         others = {each.old_id for each in new.links}
         return (
-            new.keyframe.id not in self._graph and self._known.keys() >= set(new.met)
+            new.keyframe.id not in self._graph
+            and self._known.keys() >= set(new.met)
             and all(each in self._graph or each in new.met for each in others)
         )
 
@@ -191,7 +206,9 @@ class PlanarMapper:
 
     def retime(self, priors: Mapping[int, CameraPrior]) -> frozenset[int]:
         """Take the telemetry of another clock offset; the keyframes that moved."""
-        return self._graph.retime({each: prior for each, prior in priors.items() if each in self._graph})
+        return self._graph.retime(
+            {each: prior for each, prior in priors.items() if each in self._graph}
+        )
 
     def tie_to_ground(self, ties: GroundTies, *, is_datum: bool) -> frozenset[int]:
         """See `PoseGraph.tie_to_ground`; the keyframes that moved."""
@@ -220,7 +237,9 @@ class PlanarMapper:
 
     def m_per_px(self, full: Camera) -> float:
         """What a pixel of the flight's pictures, of `full`'s size, usually covers on the ground."""
-        return float(np.median(self._graph.centres_m(self._own)[:, 2]) / self._graph.refined(full).fx_px)
+        return float(
+            np.median(self._graph.centres_m(self._own)[:, 2]) / self._graph.refined(full).fx_px
+        )
 
     def median_move_m(self, before_m: PointsM) -> float:
         """How far cameras are from where `path_m` had them, median; NaN without any."""
@@ -275,7 +294,8 @@ class PlanarMapper:
         """Median transfer residual of each keyframe, px of the full frame's size."""
         return {
             each: value * full.width_px / self._keyframes.camera(each).width_px
-            for each, value in self._graph.residuals_px().items() if each in self._keyframes
+            for each, value in self._graph.residuals_px().items()
+            if each in self._keyframes
         }
 
     def sigmas_m(self) -> dict[int, float]:
@@ -285,10 +305,16 @@ class PlanarMapper:
         level what its slopes may move the map by is added, and by what known ground was seen to miss it.
         """
         tied_to = [self._known[each].sigma_m for each in self._known if each in self._graph]
-        common_m = float(np.nanmedian(tied_to)) if np.isfinite(tied_to).any() else self._graph.common_sigma_m()
+        common_m = (
+            float(np.nanmedian(tied_to))
+            if np.isfinite(tied_to).any()
+            else self._graph.common_sigma_m()
+        )
         leans_m = self._graph.leans_m()
         return {
-            each: float(np.sqrt(sigma_m**2 + common_m**2 + leans_m[each]**2 + self._ground_miss_m**2))
+            each: float(
+                np.sqrt(sigma_m**2 + common_m**2 + leans_m[each] ** 2 + self._ground_miss_m**2)
+            )
             for each, sigma_m in self._graph.sigmas_m().items()
         }
 
@@ -315,7 +341,9 @@ class PlanarMapper:
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _keyframe(self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior) -> Keyframe:
+    def _keyframe(
+        self, keyframe_id: int, camera: Camera, image: ImageRGB, prior: CameraPrior
+    ) -> Keyframe:
         scale = min(1.0, self._settings.registration_side_px / max(image.shape[:2]))
         gray = gray_from_rgb(image)
         if scale < 1.0:
@@ -323,7 +351,9 @@ class PlanarMapper:
             gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
             camera = camera.resized(*size)
         gray = normalise_contrast(gray)
-        return Keyframe(keyframe_id, camera, gray, orb_features(gray, self._settings.links.features), prior)
+        return Keyframe(
+            keyframe_id, camera, gray, orb_features(gray, self._settings.links.features), prior
+        )
 
     def _tie(self, new: Keyframe) -> tuple[list[Link], Pose | None, str]:
         """The links of a new keyframe, where it stands by them or by telemetry, and what failed.
@@ -334,7 +364,9 @@ class PlanarMapper:
         previous = self._own[::-1][: self._settings.previous]
         tie = _Tie(new, self._guess_by_telemetry(new))
         if previous:
-            self._ask(tie, previous[0], self._loose_prediction(new, previous[0], tie.guess), Effort.CHEAP)
+            self._ask(
+                tie, previous[0], self._loose_prediction(new, previous[0], tie.guess), Effort.CHEAP
+            )
         self._ask_under(tie, previous)
         if len(tie.links) < self._settings.wanted_links:
             self._ask_dearly(tie)
@@ -345,12 +377,20 @@ class PlanarMapper:
             tie.guess = Pose(new.prior.rotation, new.prior.position_m)
         reason = tie.refusal_reason
         if not tie.links and self._own and not new.prior.knows_place:
-            return [], None, f"no picture of the map fits it ({reason}) and telemetry reports no position"
+            return (
+                [],
+                None,
+                f"no picture of the map fits it ({reason}) and telemetry reports no position",
+            )
         return tie.links, tie.guess, reason
 
-    def _ask(self, tie: _Tie, other: int, prediction: LinkPrediction | None, effort: Effort) -> None:
+    def _ask(
+        self, tie: _Tie, other: int, prediction: LinkPrediction | None, effort: Effort
+    ) -> None:
         """Try to link one picture; the first link places the new keyframe."""
-        found = link(tie.new, self._picture(other), prediction, self._settings.links, self._cache, effort)
+        found = link(
+            tie.new, self._picture(other), prediction, self._settings.links, self._cache, effort
+        )
         if isinstance(found, NoLink):
             tie.refusals[other] = _Refusal(found.reason, prediction)
             return
@@ -366,7 +406,12 @@ class PlanarMapper:
         asked = {each.old_id for each in tie.links}
         asked |= {other for other, no in tie.refusals.items() if not tie.links or no.was_tight}
         for each in self._under(tie.new, tie.guess, asked, previous, bool(tie.links)):
-            self._ask(tie, each, self._prediction(tie.new, each, tie.guess, tight=bool(tie.links)), Effort.CHEAP)
+            self._ask(
+                tie,
+                each,
+                self._prediction(tie.new, each, tie.guess, tight=bool(tie.links)),
+                Effort.CHEAP,
+            )
 
     def _ask_dearly(self, tie: _Tie) -> None:
         for other, refusal in list(tie.refusals.items()):
@@ -380,7 +425,11 @@ class PlanarMapper:
     def _ask_everywhere(self, tie: _Tie) -> None:
         """Ask the last pictures and some of all the flight until one links: nobody knows where the new one is."""
         for each in [*self._own[::-1][1:10], *self._own[:: max(1, len(self._own) // 20)]]:
-            if each not in tie.refusals and len(tie.refusals) < self._settings.recovery and not tie.links:
+            if (
+                each not in tie.refusals
+                and len(tie.refusals) < self._settings.recovery
+                and not tie.links
+            ):
                 self._ask(tie, each, None, Effort.ALL)
 
     def _guess_by_telemetry(self, new: Keyframe) -> Pose | None:
@@ -396,13 +445,17 @@ class PlanarMapper:
                 rotation = recent.rotation
         return Pose(rotation, np.array([*prior.position_m[:2], max(up_m, 0.5)]))
 
-    def _loose_prediction(self, new: Keyframe, old: int, guess: Pose | None) -> LinkPrediction | None:
+    def _loose_prediction(
+        self, new: Keyframe, old: int, guess: Pose | None
+    ) -> LinkPrediction | None:
         """Where telemetry alone puts the previous keyframe; None when it knows too little to be a help."""
         if guess is None or not np.isfinite(new.prior.attitude_sigma_deg[2]):
             return None
         return self._prediction(new, old, guess, tight=False)
 
-    def _prediction(self, new: Keyframe, old: int, guess: Pose, *, tight: bool) -> LinkPrediction | None:
+    def _prediction(
+        self, new: Keyframe, old: int, guess: Pose, *, tight: bool
+    ) -> LinkPrediction | None:
         """Where the old keyframe falls in the new one, off by the errors of telemetry, or of the graph if `tight`."""
         try:
             site_from_new = site_from_image_homography(new.camera, guess)
@@ -415,12 +468,16 @@ class PlanarMapper:
         else:
             tilt = np.radians(np.nan_to_num(new.prior.attitude_sigma_deg[:2].max(), posinf=15.0))
             place = new.prior.position_sigma_m[:2].max() / max(guess.translation_m[2], 0.5)
-            search = float(np.clip(2.5 * new.camera.fx_px * (tilt + place), 0.08 * side, 0.5 * side))
+            search = float(
+                np.clip(2.5 * new.camera.fx_px * (tilt + place), 0.08 * side, 0.5 * side)
+            )
         return LinkPrediction(new_from_old, search, is_tight=tight)
 
     def _by_link(self, new: Keyframe, each: Link) -> Pose | None:
         old = self._graph.camera(each.old_id)
-        return pose_from_link(each, self._graph.refined(new.camera), old, self._graph.pose(each.old_id))
+        return pose_from_link(
+            each, self._graph.refined(new.camera), old, self._graph.pose(each.old_id)
+        )
 
     def _under(
         self, new: Keyframe, guess: Pose, tried: set[int], previous: Sequence[int], linked: bool
@@ -429,7 +486,11 @@ class PlanarMapper:
         ids = [*self._own, *self._known]
         overlap = self._overlaps(new, guess)
         count = len(self._own)  # the keyframes before are the last of the flight's own
-        chosen = [each for k, each in enumerate(previous, 1) if each not in tried and overlap[count - k] > 0.1]
+        chosen = [
+            each
+            for k, each in enumerate(previous, 1)
+            if each not in tried and overlap[count - k] > 0.1
+        ]
         under = np.flatnonzero(overlap > self._settings.least_overlap)
         limit = len(chosen) + self._settings.spatial + (0 if linked else 3)
         near = {*tried, *previous}
@@ -448,17 +509,24 @@ class PlanarMapper:
         All are taken for as large as the new view; 0 where the guess does not see the ground.
         """
         centres = np.concatenate([self._graph.centres_m(self._own), self._known_centres_m])
-        axes = np.concatenate([
-            self._graph.axes(self._own),
-            np.array([each.site_from_camera.rotation[:, 2] for each in self._known.values()]).reshape(-1, 3),
-        ])
+        axes = np.concatenate(
+            [
+                self._graph.axes(self._own),
+                np.array(
+                    [each.site_from_camera.rotation[:, 2] for each in self._known.values()]
+                ).reshape(-1, 3),
+            ]
+        )
         centres = centres - axes * (centres[:, 2] / np.minimum(axes[:, 2], -0.1))[:, None]
         try:
             image_from_site = np.linalg.inv(site_from_image_homography(new.camera, guess))
         except GeometryError:
             return np.zeros(len(centres))
         seen = apply_homography(image_from_site, centres[:, :2])
-        offset = np.abs(seen - [new.camera.cx_px, new.camera.cy_px]) / [new.camera.width_px, new.camera.height_px]
+        offset = np.abs(seen - [new.camera.cx_px, new.camera.cy_px]) / [
+            new.camera.width_px,
+            new.camera.height_px,
+        ]
         with np.errstate(invalid="ignore"):
             return np.nan_to_num(np.clip(1 - offset, 0, 1).prod(axis=1))
 
@@ -473,20 +541,30 @@ class PlanarMapper:
         if other not in self._keyframes:
             known = self._known[other]
             unknown = CameraPrior(
-                known.site_from_camera.translation_m, np.full(3, np.inf), known.site_from_camera.rotation,
+                known.site_from_camera.translation_m,
+                np.full(3, np.inf),
+                known.site_from_camera.rotation,
                 np.full(3, np.inf),
             )
             image = known.image()
-            self._keyframes.add(self._keyframe(other, known.camera, image, unknown), _thumbnail(image))
+            self._keyframes.add(
+                self._keyframe(other, known.camera, image, unknown), _thumbnail(image)
+            )
             self._graph.add_known(other, self._keyframes.camera(other), known.site_from_camera)
             self._met.append(other)
         return self._keyframes.keyframe(other)
 
     def _tie_colours(self, each: Link) -> None:
-        small_new, small_old = self._keyframes.thumbnail(each.new_id), self._keyframes.thumbnail(each.old_id)
+        small_new, small_old = (
+            self._keyframes.thumbnail(each.new_id),
+            self._keyframes.thumbnail(each.old_id),
+        )
         new, old = self._keyframes.camera(each.new_id), self._keyframes.camera(each.old_id)
         pairs = tie_colours(
-            small_new, _scaled(each.new_px, new, small_new), small_old, _scaled(each.old_px, old, small_old)
+            small_new,
+            _scaled(each.new_px, new, small_new),
+            small_old,
+            _scaled(each.old_px, old, small_old),
         )
         self._colours.keep((each.new_id, each.old_id), pairs)
 

@@ -13,7 +13,15 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import pose_from_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, site_from_gimbal_rotation
-from sorvolo.mosaic.bundle import NO_GROUND, SHARED, Ground, Nodes, Solution, linearise_ground, solve
+from sorvolo.mosaic.bundle import (
+    NO_GROUND,
+    SHARED,
+    Ground,
+    Nodes,
+    Solution,
+    linearise_ground,
+    solve,
+)
 from sorvolo.mosaic.graph_alignment import change_to_fixes, change_to_ground, move_all
 from sorvolo.mosaic.graph_offsets import shared_sigma, shared_variances, unconfirmed
 from sorvolo.mosaic.graph_report import GraphReport, ground_sigmas_m, leans_m
@@ -41,7 +49,9 @@ class PoseGraph:
     """
 
     def __init__(
-        self, settings: PoseGraphSettings = PoseGraphSettings(), shelf: Shelf | None = None  # noqa: B008 (frozen)
+        self,
+        settings: PoseGraphSettings = PoseGraphSettings(),
+        shelf: Shelf | None = None,
     ) -> None:
         self._settings = settings
         self._ids: dict[int, int] = {}
@@ -123,19 +133,27 @@ class PoseGraph:
     def add_known(self, keyframe_id: int, camera: Camera, site_from_camera: Pose) -> None:
         """A keyframe of the known map: it ties others down and never moves."""
         prior = CameraPrior(
-            site_from_camera.translation_m, np.full(3, np.inf), site_from_camera.rotation, np.full(3, np.inf)
+            site_from_camera.translation_m,
+            np.full(3, np.inf),
+            site_from_camera.rotation,
+            np.full(3, np.inf),
         )
         self._append(keyframe_id, _Node(camera, False, np.zeros((4, 2))), prior, site_from_camera)
 
     def add(
-        self, keyframe_id: int, camera: Camera, prior: CameraPrior, links: Sequence[Link], guess: Pose
+        self,
+        keyframe_id: int,
+        camera: Camera,
+        prior: CameraPrior,
+        links: Sequence[Link],
+        guess: Pose,
     ) -> frozenset[int]:
         """Tie a new keyframe to the graph by its links (`new_id` is this one), starting from `guess`."""
         self._append(keyframe_id, _Node(camera, True, np.full((4, 2), np.inf)), prior, guess)
         for each in links:
             self._append_link(each)
         free = np.zeros(len(self._nodes), bool)
-        free[-self._settings.window:] = True
+        free[-self._settings.window :] = True
         free[[self._ids[each.old_id] for each in links]] = True
         free &= self._own()
         self._solve_around(free, iterations=2)
@@ -170,7 +188,12 @@ class PoseGraph:
         node = np.array([self._ids[each] for each in ties.keyframe_ids], int)
         focal_px = np.array([self._nodes[at].camera.fx_px for at in node])
         self._ground = Ground(
-            node, ties.ideal, ties.place_m, focal_px, np.maximum(ties.sigma_px, self._settings.sigma_px), ties.sigma_m
+            node,
+            ties.ideal,
+            ties.place_m,
+            focal_px,
+            np.maximum(ties.sigma_px, self._settings.sigma_px),
+            ties.sigma_m,
         )
         self._ground_common_m = ties.common_m
         self._align()
@@ -181,7 +204,11 @@ class PoseGraph:
     def ground_places_m(self, ties: GroundTies) -> PointsM:
         """(M, 2) where the map has the tied points: their rays cut at the height of their known places."""
         node = np.array([self._ids[each] for each in ties.keyframe_ids], int)
-        ideal = ties.ideal * (1 + self.radial * (ties.ideal**2).sum(1, keepdims=True)) / self.focal_scale
+        ideal = (
+            ties.ideal
+            * (1 + self.radial * (ties.ideal**2).sum(1, keepdims=True))
+            / self.focal_scale
+        )
         rays = np.column_stack([ideal, np.ones(len(ideal))])
         turned = np.einsum("mij,mj->mi", self._rows.rotations[node], rays)
         centres_m = self._rows.centres_m[node]
@@ -205,13 +232,26 @@ class PoseGraph:
             sigma = float(np.sqrt(max(0.0, shared_variances(factors)[0])))
         rms = np.array([value for value in self.residuals_px().values() if np.isfinite(value)])
         leans = list(self.leans_m().values())
-        tilts_rad, heights_m = self._rows.stated_sigma_rad[self._own(), 0], self._rows.centres_m[self._own(), 2]
+        tilts_rad, heights_m = (
+            self._rows.stated_sigma_rad[self._own(), 0],
+            self._rows.centres_m[self._own(), 2],
+        )
         return GraphReport(
-            float(np.exp(self._shared[0])), sigma, float(self._shared[1]), float(self._shared[2]), len(self._links),
-            self._dropped, self._relief_m(),
-            float(np.sqrt(np.mean(rms**2))) if len(rms) else float("nan"), len(self._trust.contradicted),
-            (float(np.degrees(np.linalg.norm(self._shared[5:7]))), float(np.degrees(self._shared[7]))),
-            self._is_uneven(), float(np.median(leans)) if leans else 0.0,
+            float(np.exp(self._shared[0])),
+            sigma,
+            float(self._shared[1]),
+            float(self._shared[2]),
+            len(self._links),
+            self._dropped,
+            self._relief_m(),
+            float(np.sqrt(np.mean(rms**2))) if len(rms) else float("nan"),
+            len(self._trust.contradicted),
+            (
+                float(np.degrees(np.linalg.norm(self._shared[5:7]))),
+                float(np.degrees(self._shared[7])),
+            ),
+            self._is_uneven(),
+            float(np.median(leans)) if leans else 0.0,
             float(np.median(tilts_rad * heights_m)) if leans else 0.0,
         )
 
@@ -246,13 +286,21 @@ class PoseGraph:
         solution = self._solve(own, shared=True, iterations=0)
         sigmas = dict.fromkeys((self._names[at] for at in np.flatnonzero(own)), float("nan"))
         index = np.flatnonzero(own & self._held())
-        sample = index if len(index) <= 250 else index[np.linspace(0, len(index) - 1, 250).round().astype(int)]
+        sample = (
+            index
+            if len(index) <= 250
+            else index[np.linspace(0, len(index) - 1, 250).round().astype(int)]
+        )
         found = ground_sigmas_m(
-            self._rows.rotations[sample], self._rows.centres_m[sample, 2], 6 * solution.position[sample],
+            self._rows.rotations[sample],
+            self._rows.centres_m[sample, 2],
+            6 * solution.position[sample],
             solution.equations.factorised(),
         )
         every = np.interp(index, sample, found) if len(sample) else np.zeros(0)
-        return sigmas | {self._names[at]: float(value) for at, value in zip(index, every, strict=True)}
+        return sigmas | {
+            self._names[at]: float(value) for at, value in zip(index, every, strict=True)
+        }
 
     def common_sigma_m(self) -> float:
         """What all fixes of the flight err in common, per axis, m; 0 without fixes.
@@ -262,7 +310,9 @@ class PoseGraph:
         it is that of the mean of all places.
         """
         if len(self._ground.node):
-            return float(np.hypot(self._ground_common_m, 1 / np.sqrt((self._ground.sigma_m**-2.0).sum())))
+            return float(
+                np.hypot(self._ground_common_m, 1 / np.sqrt((self._ground.sigma_m**-2.0).sum()))
+            )
         stated_m = self._rows.stated_sigma_m[self._own(), 0]
         stated_m = stated_m[np.isfinite(stated_m)]
         fixes = self._own().any() and len(stated_m) >= 2
@@ -278,11 +328,15 @@ class PoseGraph:
     def _piece_labels(self) -> Rows:
         """(N,) which piece each node belongs to; see `pieces`."""
         size = len(self._nodes)
-        ties = coo_matrix((np.ones(len(self._links)), (self._links.old, self._links.new)), shape=(size, size))
+        ties = coo_matrix(
+            (np.ones(len(self._links)), (self._links.old, self._links.new)), shape=(size, size)
+        )
         known = np.flatnonzero(~self._own())
         if len(known):
             ones = np.ones(len(known))
-            ties = ties + coo_matrix((ones, (known, np.full(len(known), known[0]))), shape=(size, size))
+            ties = ties + coo_matrix(
+                (ones, (known, np.full(len(known), known[0]))), shape=(size, size)
+            )
         return np.asarray(connected_components(ties, directed=False)[1], int)
 
     def _held(self) -> NDArray[np.bool_]:
@@ -302,7 +356,9 @@ class PoseGraph:
     def _append_link(self, each: Link) -> None:
         old, new = self._ids[each.old_id], self._ids[each.new_id]
         self._links.append(
-            each, (old, self._nodes[old].camera), (new, self._nodes[new].camera),
+            each,
+            (old, self._nodes[old].camera),
+            (new, self._nodes[new].camera),
             max(self._settings.sigma_px, each.sigma_px),
         )
 
@@ -315,7 +371,9 @@ class PoseGraph:
 
     def _state(self, at: Rows | slice = slice(None)) -> Nodes:
         """All nodes, or some of them."""
-        return self._rows.nodes(self._trust.place, self._trust.attitude, self._trust.contradicted, at)
+        return self._rows.nodes(
+            self._trust.place, self._trust.attitude, self._trust.contradicted, at
+        )
 
     def _gps_miss_m(self) -> Floats:
         return self._rows.centres_m + self._shared[[3, 4, 2]] - self._rows.prior_centres_m
@@ -326,15 +384,26 @@ class PoseGraph:
 
     def _is_uneven(self) -> bool:
         own = self._own()
-        return bool(own.any()) and self._relief_m() > self._settings.uneven * np.median(self._rows.centres_m[own, 2])
+        return bool(own.any()) and self._relief_m() > self._settings.uneven * np.median(
+            self._rows.centres_m[own, 2]
+        )
 
     def _solve(self, free: NDArray[np.bool_], *, shared: bool, iterations: int) -> Solution:
         sigma = shared_sigma(self._settings, self._as_reported) if shared else np.zeros(len(SHARED))
         solution = solve(
-            self._state(), self._links, self._shared, sigma, free, iterations, ground=self._weighed_ground()
+            self._state(),
+            self._links,
+            self._shared,
+            sigma,
+            free,
+            iterations,
+            ground=self._weighed_ground(),
         )
         if iterations:
-            self._rows.rotations[:], self._rows.centres_m[:] = solution.nodes.rotations, solution.nodes.centres_m
+            self._rows.rotations[:], self._rows.centres_m[:] = (
+                solution.nodes.rotations,
+                solution.nodes.centres_m,
+            )
             self._shared = solution.shared
         return solution
 
@@ -346,12 +415,22 @@ class PoseGraph:
         chosen = self._links_of(free)
         pairs = self._links.of(chosen)
         near = np.unique(np.concatenate([np.flatnonzero(free), pairs.old, pairs.new]))
-        few = replace(pairs, old=np.searchsorted(near, pairs.old), new=np.searchsorted(near, pairs.new))
+        few = replace(
+            pairs, old=np.searchsorted(near, pairs.old), new=np.searchsorted(near, pairs.new)
+        )
         solution = solve(
-            self._state(near), few, self._shared, np.zeros(len(SHARED)), free[near], iterations,
+            self._state(near),
+            few,
+            self._shared,
+            np.zeros(len(SHARED)),
+            free[near],
+            iterations,
             ground=self._weighed_ground().among(near),
         )
-        self._rows.rotations[near], self._rows.centres_m[near] = solution.nodes.rotations, solution.nodes.centres_m
+        self._rows.rotations[near], self._rows.centres_m[near] = (
+            solution.nodes.rotations,
+            solution.nodes.centres_m,
+        )
         return chosen
 
     def _settle_region(self) -> frozenset[int]:
@@ -424,7 +503,13 @@ class PoseGraph:
 
     def _change_to_ground(self) -> Matrix3 | None:
         names = np.array(self._names)[self._ground.node]
-        ties = GroundTies(names, self._ground.ideal, self._ground.place_m, self._ground.sigma_px, self._ground.sigma_m)
+        ties = GroundTies(
+            names,
+            self._ground.ideal,
+            self._ground.place_m,
+            self._ground.sigma_px,
+            self._ground.sigma_m,
+        )
         places_m = self.ground_places_m(ties)
         known = np.isfinite(places_m).all(axis=1)
         return change_to_ground(places_m[known], ties.place_m[known, :2])
@@ -437,7 +522,8 @@ class PoseGraph:
             sigma_deg = np.array([*np.degrees(self._rows.stated_sigma_rad[at, :2]), np.inf])
             down = site_from_gimbal_rotation(yaw_deg, -90.0, 0.0)
             self._rows.set_prior(
-                at, CameraPrior(self._rows.centres_m[at].copy(), np.full(3, np.inf), down, sigma_deg)
+                at,
+                CameraPrior(self._rows.centres_m[at].copy(), np.full(3, np.inf), down, sigma_deg),
             )
 
     def _weigh_links(self) -> None:
@@ -455,7 +541,9 @@ class PoseGraph:
     def _weigh(self, links: Rows, noise: LinkNoise, chosen: NDArray[np.bool_]) -> None:
         """Give `links` the noise of those that are `chosen`, their relief half their own and half that of most."""
         overall = float(np.median(noise.relief_m))
-        self._links.relief_m[links] = np.clip(np.sqrt(0.5 * (noise.relief_m[chosen] ** 2 + overall**2)), 0.0, 5.0)
+        self._links.relief_m[links] = np.clip(
+            np.sqrt(0.5 * (noise.relief_m[chosen] ** 2 + overall**2)), 0.0, 5.0
+        )
         self._links.sigma_px[links] = np.clip(noise.across_px[chosen], self._settings.sigma_px, 5.0)
 
     def _weigh_telemetry(self) -> None:
@@ -468,15 +556,20 @@ class PoseGraph:
         for at in candidates:
             node = self._nodes[at]
             camera = self.refined(node.camera)
-            outline = footprint(camera, Pose(self._rows.rotations[at].copy(), self._rows.centres_m[at].copy()))
+            outline = footprint(
+                camera, Pose(self._rows.rotations[at].copy(), self._rows.centres_m[at].copy())
+            )
             m_per_px = max(self._rows.centres_m[at, 2], 1e-6) / camera.fx_px
             if not np.nanmax(np.abs(outline - node.reported_m), initial=0.0) <= 0.5 * m_per_px:
                 node.reported_m = outline
                 moved.add(self._names[at])
         return frozenset(moved)
 
+
 def pose_from_link(each: Link, new: Camera, old: Camera, site_from_old: Pose) -> Pose | None:
     """The new keyframe's pose as one link gives it."""
-    site_from_new = site_from_image_homography(old, site_from_old) @ np.linalg.inv(each.new_from_old)
+    site_from_new = site_from_image_homography(old, site_from_old) @ np.linalg.inv(
+        each.new_from_old
+    )
     centre = site_from_new @ np.array([new.cx_px, new.cy_px, 1.0])
     return pose_from_homography(site_from_new * np.sign(centre[2]), new)

@@ -51,8 +51,12 @@ def match_reference(mine: MapPicture, other: MapPicture) -> ReferenceMatch | Non
     back = np.asarray(cv2.warpAffine(own, moved, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
     still = mask & (cv2.warpAffine(mask.astype(np.uint8), moved, size, flags=cv2.INTER_NEAREST) > 0)
     return ReferenceMatch(
-        correlation(gray, own, mask), correlation(gray, back, still), shift,
-        shift.x_px * mine.m_per_px, -shift.y_px * mine.m_per_px, mine.m_per_px,
+        correlation(gray, own, mask),
+        correlation(gray, back, still),
+        shift,
+        shift.x_px * mine.m_per_px,
+        -shift.y_px * mine.m_per_px,
+        mine.m_per_px,
         float(mask.sum()) * mine.m_per_px**2,
     )
 

@@ -43,10 +43,16 @@ class RoiStitchingSettings:
 
     side_px: int = 1024  # longest side of a picture: the thesis stitches at half HD (section 4.1.2)
     akaze_threshold: float = 8e-5  # OpenCV's 1e-3 finds next to nothing on low-contrast ground
-    max_features: int = 6000  # the strongest, in frame and region each: matching costs their product
-    matching: Literal["cross-check", "ratio"] = "cross-check"  # both read "only identical patterns match"
+    max_features: int = (
+        6000  # the strongest, in frame and region each: matching costs their product
+    )
+    matching: Literal["cross-check", "ratio"] = (
+        "cross-check"  # both read "only identical patterns match"
+    )
     ratio: float = 0.8  # Lowe's (2004)
-    transform: Literal["similarity", "homography"] = "similarity"  # homography: the thesis's Figure 3.12a
+    transform: Literal["similarity", "homography"] = (
+        "similarity"  # homography: the thesis's Figure 3.12a
+    )
     ransac_px: float = 3.0  # OpenCV's own for homographies
     min_inliers: int = 12
     roi_frames: float = 3.0  # side of the region, in frames ("three times the size of a frame")
@@ -60,14 +66,20 @@ class RoiStitchingSettings:
             ("max_features", self.max_features >= 1, "at least 1"),
             ("matching", self.matching in ("cross-check", "ratio"), "cross-check or ratio"),
             ("ratio", 0 < self.ratio <= 1, "more than 0, at most 1"),
-            ("transform", self.transform in ("similarity", "homography"), "similarity or homography"),
+            (
+                "transform",
+                self.transform in ("similarity", "homography"),
+                "similarity or homography",
+            ),
             ("ransac_px", self.ransac_px > 0, "a positive number"),
             ("min_inliers", self.min_inliers >= 4, "at least 4"),
             ("roi_frames", self.roi_frames >= 1, "at least 1"),
             ("bands", 1 <= self.bands <= 10, "1 to 10"),
         ):
             if not fits:
-                raise SettingsError(f"method thesis: {name} is {getattr(self, name)!r}; give {needed}")
+                raise SettingsError(
+                    f"method thesis: {name} is {getattr(self, name)!r}; give {needed}"
+                )
 
 
 NAMES: dict[str, tuple[str, Callable[[str], object]]] = {
@@ -84,7 +96,9 @@ NAMES: dict[str, tuple[str, Callable[[str], object]]] = {
 """The settings as a person writes them: NAME=VALUE (docs/thesis.md)."""
 
 
-def stitching_settings(written: Sequence[str], *, transform: str = "similarity") -> RoiStitchingSettings:
+def stitching_settings(
+    written: Sequence[str], *, transform: str = "similarity"
+) -> RoiStitchingSettings:
     """The settings, less those written otherwise, such as "features=3000". Raises SettingsError in words."""
     chosen: dict[str, Any] = named_values(written, NAMES, "method thesis of sorvolo map")
     return RoiStitchingSettings(transform=transform, **chosen)  # type: ignore[arg-type]  # checked there
@@ -152,7 +166,7 @@ class RoiStitcher:
         """The picture, cut to what is painted (0 x 0 before the first frame), and where it lies."""
         x, y, width, height = cv2.boundingRect(np.ascontiguousarray(self._picture[..., 3]))
         offset = self._offset[0] + x, self._offset[1] + y
-        return self._picture[y:y + height, x:x + width].copy(), offset
+        return self._picture[y : y + height, x : x + width].copy(), offset
 
     def _register(self, frame_id: int, image: ImageRGB, last: Stitched) -> Stitched | NotStitched:
         height, width = image.shape[:2]
@@ -166,25 +180,35 @@ class RoiStitcher:
             )
         pairs = self._match(in_mosaic[1], in_frame[1])
         if len(pairs) < self._settings.min_inliers:
-            return NotStitched(frame_id, f"only {len(pairs)} matches with the mosaic around the last frame")
+            return NotStitched(
+                frame_id, f"only {len(pairs)} matches with the mosaic around the last frame"
+            )
         mosaic_px, frame_px = in_mosaic[0][pairs[:, 0]] + origin, in_frame[0][pairs[:, 1]]
         mosaic_from_image, inliers = self._fit(mosaic_px, frame_px)
         if mosaic_from_image is None or inliers.sum() < self._settings.min_inliers:
             return NotStitched(frame_id, f"only {int(inliers.sum())} of {len(pairs)} matches agree")
         miss = apply_homography(mosaic_from_image, frame_px[inliers]) - mosaic_px[inliers]
         return Stitched(
-            frame_id, mosaic_from_image, _barycentre(mosaic_from_image, width, height),
-            len(pairs), int(inliers.sum()), float(np.sqrt((miss**2).sum(axis=1).mean())),
+            frame_id,
+            mosaic_from_image,
+            _barycentre(mosaic_from_image, width, height),
+            len(pairs),
+            int(inliers.sum()),
+            float(np.sqrt((miss**2).sum(axis=1).mean())),
         )
 
-    def _roi(self, centre_px: Floats, width: int, height: int) -> tuple[ImageGray, NDArray[np.uint8], Floats]:
+    def _roi(
+        self, centre_px: Floats, width: int, height: int
+    ) -> tuple[ImageGray, NDArray[np.uint8], Floats]:
         """The mosaic around a point as gray, where it is painted, and its origin in mosaic coordinates."""
         half = self._settings.roi_frames * np.array([width, height]) / 2
         limit = np.array(self._picture.shape[1::-1])
         x0, y0 = np.clip(np.floor(centre_px - half) - self._offset, 0, limit).astype(int)
         x1, y1 = np.clip(np.ceil(centre_px + half) - self._offset, 0, limit).astype(int)
         part = self._picture[y0:y1, x0:x1]
-        painted = cv2.copyMakeBorder(np.ascontiguousarray(part[..., 3]), 1, 1, 1, 1, cv2.BORDER_CONSTANT)
+        painted = cv2.copyMakeBorder(
+            np.ascontiguousarray(part[..., 3]), 1, 1, 1, 1, cv2.BORDER_CONSTANT
+        )
         # a feature on the mosaic's own border describes where it ends, not the ground
         mask = cv2.erode(painted, np.ones((11, 11), np.uint8))[1:-1, 1:-1]
         gray = gray_from_rgb(np.ascontiguousarray(part[..., :3]))
@@ -211,17 +235,28 @@ class RoiStitcher:
             found = list(best.values())
         return np.array([(m.trainIdx, m.queryIdx) for m in found], dtype=np.int64).reshape(-1, 2)
 
-    def _fit(self, mosaic_px: PointsPx, frame_px: PointsPx) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
+    def _fit(
+        self, mosaic_px: PointsPx, frame_px: PointsPx
+    ) -> tuple[Matrix3 | None, NDArray[np.bool_]]:
         # both estimators seed their own generator, so the same points give the same answer
         if self._settings.transform == "similarity":
             affine, inliers = cv2.estimateAffinePartial2D(
-                frame_px, mosaic_px, method=cv2.RANSAC, ransacReprojThreshold=self._settings.ransac_px,
-                maxIters=5000, confidence=0.999,
+                frame_px,
+                mosaic_px,
+                method=cv2.RANSAC,
+                ransacReprojThreshold=self._settings.ransac_px,
+                maxIters=5000,
+                confidence=0.999,
             )
             matrix = None if affine is None else np.vstack([affine, [0.0, 0.0, 1.0]])
         else:
             matrix, inliers = cv2.findHomography(
-                frame_px, mosaic_px, cv2.RANSAC, self._settings.ransac_px, maxIters=5000, confidence=0.999
+                frame_px,
+                mosaic_px,
+                cv2.RANSAC,
+                self._settings.ransac_px,
+                maxIters=5000,
+                confidence=0.999,
             )
         if matrix is None or inliers is None:
             return None, np.zeros(len(frame_px), dtype=bool)
@@ -261,15 +296,23 @@ class RoiStitcher:
         wider = np.zeros((height, width, 4), np.uint8)
         if self._picture.size:
             x, y = (np.array(self._offset) - low).tolist()
-            wider[y:y + self._picture.shape[0], x:x + self._picture.shape[1]] = self._picture
+            wider[y : y + self._picture.shape[0], x : x + self._picture.shape[1]] = self._picture
         self._picture, self._offset = wider, (int(low[0]), int(low[1]))
 
     def _blend(self, image: ImageRGB, mosaic_from_image: Matrix3, outline: PointsPx) -> None:
         """Put the frame on top, its gain matched to what it overlaps, its border blended in several bands."""
         apron = 1 << (self._settings.bands + 1)
         limit = np.array(self._picture.shape[1::-1])
-        x0, y0 = np.clip(np.floor(outline.min(axis=0)) - apron - self._offset, 0, limit).astype(int).tolist()
-        x1, y1 = np.clip(np.ceil(outline.max(axis=0)) + apron - self._offset, 0, limit).astype(int).tolist()
+        x0, y0 = (
+            np.clip(np.floor(outline.min(axis=0)) - apron - self._offset, 0, limit)
+            .astype(int)
+            .tolist()
+        )
+        x1, y1 = (
+            np.clip(np.ceil(outline.max(axis=0)) + apron - self._offset, 0, limit)
+            .astype(int)
+            .tolist()
+        )
         part = self._picture[y0:y1, x0:x1]
         size = (x1 - x0, y1 - y0)
         move = np.array([[1.0, 0, -x0 - self._offset[0]], [0, 1, -y0 - self._offset[1]], [0, 0, 1]])
@@ -278,7 +321,9 @@ class RoiStitcher:
             image, part_from_image, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
         )
         full = np.full(image.shape[:2], 255, np.uint8)
-        mask = np.asarray(cv2.warpPerspective(full, part_from_image, size, flags=cv2.INTER_NEAREST), np.uint8)
+        mask = np.asarray(
+            cv2.warpPerspective(full, part_from_image, size, flags=cv2.INTER_NEAREST), np.uint8
+        )
         painted = np.ascontiguousarray(part[..., 3])
         known = np.ascontiguousarray(part[..., :3])
         shared = (mask > 0) & (painted > 0)
@@ -291,7 +336,9 @@ class RoiStitcher:
             blender = cv2.detail_MultiBandBlender(0, self._settings.bands)  # type: ignore[attr-defined]
             blender.prepare((0, 0, *size))
             beneath = fill_invalid(known, painted > 0)
-            blender.feed(beneath.astype(np.int16), cv2.bitwise_and(painted, cv2.bitwise_not(mask)), (0, 0))
+            blender.feed(
+                beneath.astype(np.int16), cv2.bitwise_and(painted, cv2.bitwise_not(mask)), (0, 0)
+            )
             blender.feed(warped.astype(np.int16), mask, (0, 0))
             blended, both = blender.blend(None, None)
             picture = np.clip(blended, 0, 255).astype(np.uint8)
@@ -299,7 +346,9 @@ class RoiStitcher:
         part[..., 3] |= mask
 
 
-def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM, *, robust: bool = False) -> Matrix3:
+def georeference(
+    barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM, *, robust: bool = False
+) -> Matrix3:
     """site_from_mosaic (3, 3): the least-squares similarity of anchored barycentres, (N, 2) px, onto fixes,
     (N, 2) m.
 
@@ -310,7 +359,9 @@ def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM, *, robu
     barycentres = np.asarray(barycentres_mosaic_px, dtype=np.float64)
     fixes_m = np.asarray(fixes_site_m, dtype=np.float64)
     if barycentres.shape != fixes_m.shape or barycentres.shape[1:] != (2,):
-        raise GeometryError(f"barycentres {barycentres.shape} and fixes {fixes_m.shape} must both be (N, 2)")
+        raise GeometryError(
+            f"barycentres {barycentres.shape} and fixes {fixes_m.shape} must both be (N, 2)"
+        )
     upright = barycentres * [1.0, -1.0]
     keep = np.ones(len(upright), dtype=bool)
     site_from_upright = fit_similarity(fixes_m, upright)
@@ -322,7 +373,9 @@ def georeference(barycentres_mosaic_px: PointsPx, fixes_site_m: PointsM, *, robu
 
 
 def _corners(width: int, height: int) -> PointsPx:
-    return np.array([[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]])
+    return np.array(
+        [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]]
+    )
 
 
 def _barycentre(mosaic_from_image: Matrix3, width: int, height: int) -> Floats:

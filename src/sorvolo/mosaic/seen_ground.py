@@ -18,7 +18,12 @@ class SeenSettings:
 
     cells_across: int = 24  # of a picture's shorter side on the ground
     most_cells: int = 1500  # along a side of the whole flight: then they are larger
-    steps: tuple[int, ...] = (1, 2, 3, 5)  # numbers of pictures that are distinguished: heights need 3, better 5
+    steps: tuple[int, ...] = (
+        1,
+        2,
+        3,
+        5,
+    )  # numbers of pictures that are distinguished: heights need 3, better 5
     bridged: float = 1.0  # of a picture's shorter side: gaps between strips up to this wide are amid what was seen
     least_hole: float = 0.05  # of a picture's area: notches at its corners are smaller
 
@@ -32,7 +37,8 @@ class PictureOnGround:
 
 
 def seen_ground(
-    pictures: Sequence[PictureOnGround], area_m: Sequence[Sequence[PointsM]] = (),
+    pictures: Sequence[PictureOnGround],
+    area_m: Sequence[Sequence[PointsM]] = (),
     settings: SeenSettings = SeenSettings(),
 ) -> list[SeenGround]:
     """The ground in parts by the number of pictures that show it, then the holes, each in its own part.
@@ -59,15 +65,21 @@ def seen_ground(
 def coverage_figures(ground: Sequence[SeenGround]) -> dict[str, float | int | None]:
     """The figures of a report: areas seen, seen in one picture only, of the holes, and their number; the resolution
     that half of the ground has or a finer one."""
-    seen, holes = [each for each in ground if each.views], [each for each in ground if not each.views]
+    seen, holes = (
+        [each for each in ground if each.views],
+        [each for each in ground if not each.views],
+    )
     total_m2, coarser_m2, middle = sum(each.area_m2 for each in seen), 0.0, None
     for each in sorted(seen, key=lambda part: part.m_per_px):
         coarser_m2 += each.area_m2
         if middle is None and 2 * coarser_m2 >= total_m2:
             middle = each.m_per_px
     return {
-        "seen_m2": total_m2, "one_view_m2": sum(each.area_m2 for each in seen if each.views == 1),
-        "holes": len(holes), "holes_m2": sum(each.area_m2 for each in holes), "m_per_px": middle,
+        "seen_m2": total_m2,
+        "one_view_m2": sum(each.area_m2 for each in seen if each.views == 1),
+        "holes": len(holes),
+        "holes_m2": sum(each.area_m2 for each in holes),
+        "m_per_px": middle,
     }
 
 
@@ -75,16 +87,31 @@ class _Raster:
     """Cells over a flight, row 0 in the north; one picture's side is kept free around it."""
 
     def __init__(
-        self, pictures: Sequence[PictureOnGround], area_m: Sequence[Sequence[PointsM]], settings: SeenSettings
+        self,
+        pictures: Sequence[PictureOnGround],
+        area_m: Sequence[Sequence[PointsM]],
+        settings: SeenSettings,
     ) -> None:
-        sides_m = np.array([np.linalg.norm(np.diff(each.outline_m[[0, 1, 2]], axis=0), axis=1) for each in pictures])
+        sides_m = np.array(
+            [
+                np.linalg.norm(np.diff(each.outline_m[[0, 1, 2]], axis=0), axis=1)
+                for each in pictures
+            ]
+        )
         self._side_m = float(np.median(sides_m.min(axis=1)))
         self.picture_m2 = float(np.median(sides_m.prod(axis=1)))
-        outlines = [*(each.outline_m for each in pictures), *(ring for rings in area_m for ring in rings)]
+        outlines = [
+            *(each.outline_m for each in pictures),
+            *(ring for rings in area_m for ring in rings),
+        ]
         corners = np.concatenate(outlines)
         self._reach_m = settings.bridged * self._side_m / 2
         low, high = corners.min(axis=0) - 2 * self._reach_m, corners.max(axis=0) + 2 * self._reach_m
-        self.cell_m = max(self._side_m / settings.cells_across, float((high - low).max()) / settings.most_cells, 1e-3)
+        self.cell_m = max(
+            self._side_m / settings.cells_across,
+            float((high - low).max()) / settings.most_cells,
+            1e-3,
+        )
         self._west_m, self._north_m = float(low[0]), float(high[1])
         self._shape = tuple(np.ceil((high - low) / self.cell_m).astype(int)[::-1])
 
@@ -94,10 +121,12 @@ class _Raster:
         for each in pictures:
             middle_m = each.outline_m.mean(axis=0)
             # OpenCV fills what an outline only touches as well: half a cell on each side
-            cells = self._cells(middle_m + (each.outline_m - middle_m) * (1 - self.cell_m / self._side_m))
+            cells = self._cells(
+                middle_m + (each.outline_m - middle_m) * (1 - self.cell_m / self._side_m)
+            )
             low = np.clip(cells.min(axis=0), 0, None)
             high = cells.max(axis=0) + 1
-            part = np.s_[low[1]:high[1], low[0]:high[0]]
+            part = np.s_[low[1] : high[1], low[0] : high[0]]
             under = np.zeros(views[part].shape, np.uint8)
             cv2.fillConvexPoly(under, (cells - low).astype(np.int32), 1)
             views[part] += under
@@ -108,12 +137,18 @@ class _Raster:
         """The cells in these polygons."""
         found = np.zeros(self._shape, np.uint8)
         for rings in area_m:
-            own, corners = np.zeros(self._shape, np.uint8), [self._cells(ring).astype(np.int32) for ring in rings]
+            own, corners = (
+                np.zeros(self._shape, np.uint8),
+                [self._cells(ring).astype(np.int32) for ring in rings],
+            )
             cv2.fillPoly(own, corners, 1)
             edge = np.zeros(self._shape, np.uint8)
             cv2.polylines(edge, corners, True, 1)
             rows, columns = np.nonzero(edge)  # of those some have their centre outside
-            centres_m = np.column_stack([columns + 0.5, -rows - 0.5]) * self.cell_m + [self._west_m, self._north_m]
+            centres_m = np.column_stack([columns + 0.5, -rows - 0.5]) * self.cell_m + [
+                self._west_m,
+                self._north_m,
+            ]
             own[rows, columns] = points_inside(rings, centres_m)
             found |= own
         return found > 0
@@ -129,15 +164,24 @@ class _Raster:
 
     def part(self, cells: Mask, views: int, m_per_px: float) -> SeenGround:
         """These cells as polygons."""
-        boxes = np.array([
-            (self._west_m + x0 * self.cell_m, self._north_m - (y + 1) * self.cell_m,
-             self._west_m + x1 * self.cell_m, self._north_m - y * self.cell_m) for y, x0, x1 in _runs(cells)
-        ])
+        boxes = np.array(
+            [
+                (
+                    self._west_m + x0 * self.cell_m,
+                    self._north_m - (y + 1) * self.cell_m,
+                    self._west_m + x1 * self.cell_m,
+                    self._north_m - y * self.cell_m,
+                )
+                for y, x0, x1 in _runs(cells)
+            ]
+        )
         polygons = tuple(tuple(rings) for rings in union_of_boxes(boxes))
         return SeenGround(polygons, float(cells.sum()) * self.cell_m**2, views, m_per_px)
 
     def _cells(self, points_m: PointsM) -> NDArray[np.intp]:
-        return np.floor((points_m - [self._west_m, self._north_m]) * [1, -1] / self.cell_m).astype(int)
+        return np.floor((points_m - [self._west_m, self._north_m]) * [1, -1] / self.cell_m).astype(
+            int
+        )
 
 
 def _runs(cells: Mask) -> Iterator[tuple[int, int, int]]:

@@ -23,16 +23,24 @@ class SelectionSettings:
     """When a frame is worth a place in the map."""
 
     overlap: float = 0.7  # s of eq. 3.17: share of a frame that its successor shows again
-    least_overlap: float = 0.5  # a blurred frame is skipped only while its successors still overlap this much
+    least_overlap: float = (
+        0.5  # a blurred frame is skipped only while its successors still overlap this much
+    )
     blurred: float = 0.6  # of the usual sharpness: wait for a better one
     useless: float = 0.35  # of the usual sharpness: reject
-    bare_levels: float = 0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
+    bare_levels: float = (
+        0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
+    )
     usual: int = 25  # frames that show how sharp the flight's usually are
-    sparse_share: float = 2 / 3  # of the way between keyframes that decoded frames may lie apart (decision 0033)
+    sparse_share: float = (
+        2 / 3
+    )  # of the way between keyframes that decoded frames may lie apart (decision 0033)
 
     def __post_init__(self) -> None:
         if not 0 < self.least_overlap <= self.overlap < 1:
-            raise SettingsError(f"overlap must lie between {self.least_overlap} and 1, got {self.overlap}")
+            raise SettingsError(
+                f"overlap must lie between {self.least_overlap} and 1, got {self.overlap}"
+            )
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,9 @@ class CandidateSettings:
     """Which frames are looked at where telemetry does not show how fast the flight is."""
 
     step_s: float = 0.2  # five a second: the pictures decide
-    live_speed_m_s: float = 5.0  # at least, of a live flight that has just begun: a drone's usual speed over a survey
+    live_speed_m_s: float = (
+        5.0  # at least, of a live flight that has just begun: a drone's usual speed over a survey
+    )
 
 
 @dataclass(frozen=True)
@@ -89,7 +99,12 @@ def untimed_plan(
 
 
 def live_plan(
-    camera: Camera, height_m: float, speed_m_s: float, overlap: float, *, by_pictures: bool,
+    camera: Camera,
+    height_m: float,
+    speed_m_s: float,
+    overlap: float,
+    *,
+    by_pictures: bool,
     settings: CandidateSettings = CandidateSettings(),
 ) -> FramePlan:
     """The plan of a video that has just begun and does not show yet how fast it will be."""
@@ -99,7 +114,13 @@ def live_plan(
 
 
 def video_plan(
-    camera: Camera, height_m: float, speed_m_s: float, overlap: float, duration_s: float, frame_rate_hz: float, *,
+    camera: Camera,
+    height_m: float,
+    speed_m_s: float,
+    overlap: float,
+    duration_s: float,
+    frame_rate_hz: float,
+    *,
     by_pictures: bool,
 ) -> FramePlan:
     """The plan of a recorded video. `by_pictures`: three times as many frames are asked as eq. 3.17 needs, and the
@@ -107,7 +128,9 @@ def video_plan(
     keyframe_s = interval_s(camera, height_m, speed_m_s, overlap)
     share = 3 if by_pictures else 1
     step_s = float(np.clip(keyframe_s / share, 1 / max(frame_rate_hz, 1.0), 2.0 / share))
-    return FramePlan(step_s, 0.5 * keyframe_s if by_pictures else 0.0, max(2, round(duration_s / keyframe_s)))
+    return FramePlan(
+        step_s, 0.5 * keyframe_s if by_pictures else 0.0, max(2, round(duration_s / keyframe_s))
+    )
 
 
 def every(step_s: float) -> Callable[[int, int], bool]:
@@ -129,8 +152,12 @@ def evenly(count: int, most: int) -> list[int]:
 
 
 def select_keyframes(
-    frames: Iterable[PosedFrame | LostFrame], settings: SelectionSettings, *, keep_all: bool,
-    inside: Callable[[PosedFrame], bool], memory: SelectionMemory = SelectionMemory(),
+    frames: Iterable[PosedFrame | LostFrame],
+    settings: SelectionSettings,
+    *,
+    keep_all: bool,
+    inside: Callable[[PosedFrame], bool],
+    memory: SelectionMemory = SelectionMemory(),
     small: "SmallCopies | None" = None,
 ) -> Iterator[Selected | LostFrame]:
     """The frames that the map needs, in order; lost ones pass through.
@@ -152,7 +179,9 @@ def select_keyframes(
         typical = float(np.median(memory.usual)) if memory.usual else clarity
         texture = normalise_contrast(gray)
         overlap = 0.0 if memory.last is None or keep_all else _overlap(memory.last, texture)
-        memory = SelectionMemory(memory.last, (*memory.usual, clarity)[-settings.usual:], memory.count + 1)
+        memory = SelectionMemory(
+            memory.last, (*memory.usual, clarity)[-settings.usual :], memory.count + 1
+        )
         reason = _reason_if_selected(overlap, clarity, typical, memory.count, settings)
         if reason is None:
             continue
@@ -209,7 +238,11 @@ class StretchSelection:
     def take(self, outline_m: PointsM | None) -> bool:
         """Whether to take the frame of this outline, (4, 2) site metres; None where its place is not known."""
         last_m = None if self._keep_all else self._last_m
-        if outline_m is not None and last_m is not None and _covered(last_m, outline_m) > self._overlap:
+        if (
+            outline_m is not None
+            and last_m is not None
+            and _covered(last_m, outline_m) > self._overlap
+        ):
             return False
         self._last_m = outline_m
         return True

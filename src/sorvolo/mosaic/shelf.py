@@ -26,7 +26,9 @@ class Shelf(Protocol):
 class ShelvedRows:
     """Arrays of one `shape`, appended one after the other and never changed; without a shelf all stay in memory."""
 
-    def __init__(self, name: str, shape: tuple[int, ...], dtype: DTypeLike, shelf: Shelf | None) -> None:
+    def __init__(
+        self, name: str, shape: tuple[int, ...], dtype: DTypeLike, shelf: Shelf | None
+    ) -> None:
         self._name, self._shape, self._dtype, self._shelf = name, shape, np.dtype(dtype), shelf
         self._count = 0
         self._newest = self._empty()
@@ -67,7 +69,9 @@ class ShelvedRows:
         found = self._full.get(number)
         if found is None:
             assert self._shelf is not None
-            found = np.frombuffer(self._shelf.get((self._name, number)), self._dtype).reshape(_AT_ONCE, *self._shape)
+            found = np.frombuffer(self._shelf.get((self._name, number)), self._dtype).reshape(
+                _AT_ONCE, *self._shape
+            )
         self._near(number, found)
         return found
 

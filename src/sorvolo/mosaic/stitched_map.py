@@ -30,7 +30,10 @@ def mosaic_m_per_px(site_from_mosaic: Matrix3) -> float:
 
 
 def paint_mosaic(
-    rgba: ImageRGBA, corner_px: tuple[int, int], site_from_mosaic: Matrix3, site_grid: SiteGrid,
+    rgba: ImageRGBA,
+    corner_px: tuple[int, int],
+    site_from_mosaic: Matrix3,
+    site_grid: SiteGrid,
     tiles: MutableMapping[TileIndex, ImageRGBA],
 ) -> None:
     """Cut the mosaic, whose first pixel is `corner_px` in mosaic coordinates, into tiles; known ground stays."""
@@ -39,14 +42,20 @@ def paint_mosaic(
     corner = np.array([[1.0, 0.0, x], [0.0, 1.0, y], [0.0, 0.0, 1.0]])
     site_from_rgba = site_from_mosaic @ corner
     middle_m = apply_homography(site_from_rgba, np.array([[width / 2, height / 2]]))[0]
-    reach_m = float(np.linalg.norm(apply_homography(site_from_rgba, np.zeros((1, 2)))[0] - middle_m))
+    reach_m = float(
+        np.linalg.norm(apply_homography(site_from_rgba, np.zeros((1, 2)))[0] - middle_m)
+    )
     grid_from_rgba = site_grid.grid_from_site_affine(middle_m, reach_m) @ site_from_rgba
-    outline = apply_homography(grid_from_rgba, np.array([[0, 0], [width, 0], [width, height], [0, height]], float))
+    outline = apply_homography(
+        grid_from_rgba, np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+    )
     side = site_grid.grid.tile_px
     for tile in sorted(site_grid.grid.tiles_touched(outline)):
         x0, y0, _, _ = site_grid.grid.tile_window(tile)
         shift = np.array([[1.0, 0.0, -x0], [0.0, 1.0, -y0], [0.0, 0.0, 1.0]])
-        painted: ImageRGBA = cv2.warpPerspective(rgba, shift @ grid_from_rgba, (side, side), flags=cv2.INTER_LINEAR)  # type: ignore[assignment]
+        painted: ImageRGBA = cv2.warpPerspective(
+            rgba, shift @ grid_from_rgba, (side, side), flags=cv2.INTER_LINEAR
+        )  # type: ignore[assignment]
         seen = painted[..., 3] == 255
         known = tiles.get(tile)
         result = np.zeros((side, side, 4), np.uint8) if known is None else known.copy()
@@ -64,9 +73,13 @@ class StitchedPlaces:
     `has_fixes` the first frame's place is the site's own origin, which no frame departs from.
     """
 
-    def __init__(self, full: Camera, small: Camera, site_from_mosaic: Matrix3, *, has_fixes: bool = True) -> None:
+    def __init__(
+        self, full: Camera, small: Camera, site_from_mosaic: Matrix3, *, has_fixes: bool = True
+    ) -> None:
         self._camera, self._site_from_mosaic, self._has_fixes = full, site_from_mosaic, has_fixes
-        self._corners: PointsPx = full.undistort_points(full.corners_px) if full.is_distorted else full.corners_px
+        self._corners: PointsPx = (
+            full.undistort_points(full.corners_px) if full.is_distorted else full.corners_px
+        )
         scale = np.diag([small.width_px / full.width_px, small.height_px / full.height_px, 1.0])
         scale[:2, 2] = 0.5 * np.diag(scale)[:2] - 0.5  # pixel centres stay on pixel centres
         self._small_from_full: Matrix3 = scale
@@ -74,23 +87,43 @@ class StitchedPlaces:
         self._last: Matrix3 | None = None
 
     def place(
-        self, posed: PosedFrame, stitched: Stitched | None, time_ns: int, status: Status, reason: str
+        self,
+        posed: PosedFrame,
+        stitched: Stitched | None,
+        time_ns: int,
+        status: Status,
+        reason: str,
     ) -> PlacedFrame:
         """The frame's record; the first frame of a flight is always stitched."""
         if stitched is not None:
             self._last = self._site_from_mosaic @ stitched.mosaic_from_image
         assert self._last is not None
-        site_from_image = self._last if stitched is not None else self._moved(self._last, posed.prior.position_m[:2])
+        site_from_image = (
+            self._last
+            if stitched is not None
+            else self._moved(self._last, posed.prior.position_m[:2])
+        )
         outline_m = apply_homography(site_from_image @ self._small_from_full, self._corners)
         centre_m = apply_homography(site_from_image, self._barycentre[None])[0]
         gps = np.full(3, np.nan)
         if self._has_fixes and posed.prior.knows_place:
             gps[:2] = centre_m - posed.prior.position_m[:2]
-        sigma_m = float(np.hypot(*posed.prior.position_sigma_m[:2])) if stitched is None else float("nan")
+        sigma_m = (
+            float(np.hypot(*posed.prior.position_sigma_m[:2])) if stitched is None else float("nan")
+        )
         return PlacedFrame(
-            posed.frame.name, posed.frame.index, time_ns, status, reason, self._camera, None,
-            site_from_image @ self._small_from_full, outline_m,
-            stitched.residual_px if stitched else float("nan"), sigma_m, gps_residual_m=gps,
+            posed.frame.name,
+            posed.frame.index,
+            time_ns,
+            status,
+            reason,
+            self._camera,
+            None,
+            site_from_image @ self._small_from_full,
+            outline_m,
+            stitched.residual_px if stitched else float("nan"),
+            sigma_m,
+            gps_residual_m=gps,
         )
 
     def _moved(self, site_from_image: Matrix3, place_m: PointsM) -> Matrix3:

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from sorvolo.geometry.arrays import Floats
-from sorvolo.mosaic.map_quality import CornerErrors, Spread, corner_errors, position_errors, spread_of
+from sorvolo.mosaic.map_quality import (
+    CornerErrors,
+    Spread,
+    corner_errors,
+    position_errors,
+    spread_of,
+)
 from sorvolo.survey.frame_rows import FrameRow
 from sorvolo.survey.mosaic import Status
 
@@ -30,16 +36,27 @@ class PositionErrors:
     missing: int
 
 
-def truth_errors(name: str, pairs: Sequence[tuple[FrameRow, FrameRow]], m_per_px: float) -> TruthErrors:
+def truth_errors(
+    name: str, pairs: Sequence[tuple[FrameRow, FrameRow]], m_per_px: float
+) -> TruthErrors:
     """The errors of a flight's frames, each given beside the true one."""
-    corners = corner_errors(*_outlines_m(pairs, Status.VISION), m_per_px, *_true_cameras_and_fixes_m(pairs))
-    by_gps_m = [np.linalg.norm(mine - true, axis=1) for mine, true in zip(*_outlines_m(pairs, Status.GPS_ONLY))]
+    corners = corner_errors(
+        *_outlines_m(pairs, Status.VISION), m_per_px, *_true_cameras_and_fixes_m(pairs)
+    )
+    by_gps_m = [
+        np.linalg.norm(mine - true, axis=1)
+        for mine, true in zip(*_outlines_m(pairs, Status.GPS_ONLY))
+    ]
     cameras_m = [
-        float(np.linalg.norm(mine.camera_m - true.camera_m)) for mine, true in pairs
+        float(np.linalg.norm(mine.camera_m - true.camera_m))
+        for mine, true in pairs
         if mine.has_camera and true.has_camera
     ]
     return TruthErrors(
-        name, corners, spread_of(np.array(by_gps_m), m_per_px), spread_of(np.array(cameras_m), m_per_px)
+        name,
+        corners,
+        spread_of(np.array(by_gps_m), m_per_px),
+        spread_of(np.array(cameras_m), m_per_px),
     )
 
 
@@ -57,9 +74,15 @@ def table_errors(
     return PositionErrors(*position_errors(mine, reference, m_per_px), missing)
 
 
-def _outlines_m(pairs: Sequence[tuple[FrameRow, FrameRow]], status: Status) -> tuple[Floats, Floats]:
+def _outlines_m(
+    pairs: Sequence[tuple[FrameRow, FrameRow]], status: Status
+) -> tuple[Floats, Floats]:
     """(N, 4, 2) the estimated and the true outlines of the frames with this status that have both."""
-    both = [pair for pair in pairs if pair[0].status == status and pair[0].has_outline and pair[1].has_outline]
+    both = [
+        pair
+        for pair in pairs
+        if pair[0].status == status and pair[0].has_outline and pair[1].has_outline
+    ]
     mine = np.array([each.outline_m for each, _ in both]).reshape(-1, 4, 2)
     return mine, np.array([each.outline_m for _, each in both]).reshape(-1, 4, 2)
 

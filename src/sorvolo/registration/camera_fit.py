@@ -39,7 +39,13 @@ class CameraFit:
 
 
 def fit_camera(
-    image_px: PointsPx, ground_m: PointsM, camera: Camera, prior: PosePrior, *, start_px: float, band_px: float
+    image_px: PointsPx,
+    ground_m: PointsM,
+    camera: Camera,
+    prior: PosePrior,
+    *,
+    start_px: float,
+    band_px: float,
 ) -> CameraFit | None:
     """The pose that explains the most pairs, (N, 2) each, as near to the prior as they allow; None where none does.
 
@@ -69,7 +75,9 @@ def fit_camera(
     return _as_fit(rotation, place, image_px, ground_m, camera, band_px)
 
 
-def similar(new_px: PointsPx, old_px: PointsPx, threshold_px: float, most_scale: float) -> tuple[Matrix3, Mask] | None:
+def similar(
+    new_px: PointsPx, old_px: PointsPx, threshold_px: float, most_scale: float
+) -> tuple[Matrix3, Mask] | None:
     """new_from_old as a similarity that the most pairs, (N, 2) each, agree on, and which; None where none is likely."""
     if len(new_px) < 4:
         return None
@@ -92,11 +100,18 @@ def _misses(
         site_from_image = site_from_image_homography(camera, Pose(rotation, place_m))
     except GeometryError:
         return None
-    return np.nan_to_num(apply_homography(np.linalg.inv(site_from_image), ground_m) - image_px, nan=_FAR_PX)
+    return np.nan_to_num(
+        apply_homography(np.linalg.inv(site_from_image), ground_m) - image_px, nan=_FAR_PX
+    )
 
 
 def _derivatives(
-    rotation: Matrix3, place_m: Vector3, miss: Floats, image_px: PointsPx, ground_m: PointsM, camera: Camera
+    rotation: Matrix3,
+    place_m: Vector3,
+    miss: Floats,
+    image_px: PointsPx,
+    ground_m: PointsM,
+    camera: Camera,
 ) -> Floats:
     """(N, 2, 6) of the misses by a turn about the camera's axes, radians, and a move in the site, metres."""
     result = np.zeros((*miss.shape, 6))
@@ -116,7 +131,12 @@ def _from_prior(rotation: Matrix3, place_m: Vector3, prior: PosePrior) -> Floats
 
 
 def _as_fit(
-    rotation: Matrix3, place_m: Vector3, image_px: PointsPx, ground_m: PointsM, camera: Camera, band_px: float
+    rotation: Matrix3,
+    place_m: Vector3,
+    image_px: PointsPx,
+    ground_m: PointsM,
+    camera: Camera,
+    band_px: float,
 ) -> CameraFit | None:
     miss = _misses(rotation, place_m, image_px, ground_m, camera)
     if miss is None:
@@ -126,4 +146,6 @@ def _as_fit(
     if not agree.any():
         return None
     pose = Pose(rotation, place_m)
-    return CameraFit(pose, site_from_image_homography(camera, pose), agree, float(np.median(far[agree])))
+    return CameraFit(
+        pose, site_from_image_homography(camera, pose), agree, float(np.median(far[agree]))
+    )

@@ -18,7 +18,9 @@ _TEXTURE_SIDE_PX = 960  # longer side at which sharpness is measured, whatever t
 class FeatureSettings:
     """How many points are looked for, and on what."""
 
-    detection_side_px: int = 640  # longest side for ORB: pairs are refined at full size, so coarse is enough
+    detection_side_px: int = (
+        640  # longest side for ORB: pairs are refined at full size, so coarse is enough
+    )
     orb_count: int = 700  # points of a picture, the strongest
     sift_count: int = 2500  # points where ORB fails: SIFT is slower and surer
     corner_count: int = 150  # points that a link is refined on
@@ -48,7 +50,12 @@ def normalise_contrast(gray: ImageGray) -> ImageGray:
 def orb_features(gray: ImageGray, settings: FeatureSettings) -> Features:
     """ORB (Rublee 2011) of a contrast-normalised image."""
     orb = cv2.ORB.create(
-        nfeatures=settings.orb_count, scaleFactor=1.35, nlevels=4, edgeThreshold=17, patchSize=31, fastThreshold=35
+        nfeatures=settings.orb_count,
+        scaleFactor=1.35,
+        nlevels=4,
+        edgeThreshold=17,
+        patchSize=31,
+        fastThreshold=35,
     )
     small, scale = _detection_image(gray, settings)
     keypoints, descriptors = orb.detectAndCompute(small, None)
@@ -59,12 +66,19 @@ def sift_features(gray: ImageGray, settings: FeatureSettings) -> Features:
     """SIFT (Lowe 2004), as RootSIFT (Arandjelovic 2012), of a contrast-normalised image: slow, for weak links."""
     # without the precise upscaling every point lies 0.25 px too far right and down: it shows between turned pictures
     sift = cv2.SIFT.create(
-        nfeatures=settings.sift_count, nOctaveLayers=3, contrastThreshold=0.015, edgeThreshold=10, sigma=1.6,
-        descriptorType=cv2.CV_32F, enable_precise_upscale=True,
+        nfeatures=settings.sift_count,
+        nOctaveLayers=3,
+        contrastThreshold=0.015,
+        edgeThreshold=10,
+        sigma=1.6,
+        descriptorType=cv2.CV_32F,
+        enable_precise_upscale=True,
     )
     keypoints, descriptors = sift.detectAndCompute(gray, None)
     if descriptors is not None and len(descriptors):
-        descriptors = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6))
+        descriptors = np.sqrt(
+            descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)
+        )
     return _features("sift", keypoints, descriptors, 1.0)
 
 
@@ -92,9 +106,15 @@ def corners(gray: ImageGray, settings: FeatureSettings) -> PointsPx:
     for y0, y1 in pairwise(ys):
         for x0, x1 in pairwise(xs):
             cell = response[y0:y1, x0:x1].ravel()
-            best = np.argpartition(-cell, per_cell)[:per_cell] if cell.size > per_cell else np.arange(cell.size)
+            best = (
+                np.argpartition(-cell, per_cell)[:per_cell]
+                if cell.size > per_cell
+                else np.arange(cell.size)
+            )
             best = best[cell[best] > 0]
-            found.append(np.column_stack([best % max(1, x1 - x0) + x0, best // max(1, x1 - x0) + y0]))
+            found.append(
+                np.column_stack([best % max(1, x1 - x0) + x0, best // max(1, x1 - x0) + y0])
+            )
     return (np.concatenate(found) + 0.5) / scale - 0.5
 
 
@@ -117,12 +137,16 @@ def sharpness(gray: ImageGray) -> float:
     return fine / (coarse + 0.05)
 
 
-def _features(kind: str, keypoints: Sequence[cv2.KeyPoint], descriptors: MatLike | None, scale: float) -> Features:
+def _features(
+    kind: str, keypoints: Sequence[cv2.KeyPoint], descriptors: MatLike | None, scale: float
+) -> Features:
     if descriptors is None or len(keypoints) == 0:
         return Features(kind, np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
     points = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float64)
     as_bytes = kind == "orb"
-    packed: Descriptors = np.asarray(descriptors, np.uint8) if as_bytes else np.asarray(descriptors, np.float32)
+    packed: Descriptors = (
+        np.asarray(descriptors, np.uint8) if as_bytes else np.asarray(descriptors, np.float32)
+    )
     return Features(kind, (points + 0.5) / scale - 0.5, packed)
 
 

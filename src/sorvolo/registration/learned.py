@@ -32,9 +32,13 @@ def learned_features(gray: ImageGray, most: int = 2048) -> Features:
     padded = cv2.copyMakeBorder(
         gray, 0, -height % _WHOLE_PX, 0, -width % _WHOLE_PX, cv2.BORDER_REFLECT_101
     ).astype(np.float32)
-    descriptors, likely, reliability = _network().run(None, {"gray": padded[None, None] / np.float32(255)})
+    descriptors, likely, reliability = _network().run(
+        None, {"gray": padded[None, None] / np.float32(255)}
+    )
     likely = likely[0, 0, :height, :width]
-    peaks = (likely > _LEAST_POINT) & (likely == cv2.dilate(likely, np.ones((_APART_PX, _APART_PX), np.uint8)))
+    peaks = (likely > _LEAST_POINT) & (
+        likely == cv2.dilate(likely, np.ones((_APART_PX, _APART_PX), np.uint8))
+    )
     ys, xs = np.nonzero(peaks)
     points = np.column_stack([xs, ys]).astype(np.float64)
     sure = likely[ys, xs] * _sampled(reliability[0], points)[:, 0]
@@ -57,7 +61,9 @@ def match_learned(
         return np.zeros((0, 2), np.int64)
     expected = None
     if new_from_old is not None:
-        expected = np.nan_to_num(apply_homography(new_from_old, old.points_px), nan=1e9).astype(np.float32)
+        expected = np.nan_to_num(apply_homography(new_from_old, old.points_px), nan=1e9).astype(
+            np.float32
+        )
     here = new.points_px.astype(np.float32)
     ours, theirs = (np.asarray(each.descriptors, np.float32) for each in (new, old))
     nearest, likest = np.zeros(len(new), np.int64), np.zeros(len(new), np.float32)
@@ -71,7 +77,9 @@ def match_learned(
         nearest[part], likest[part] = likeness.argmax(axis=1), likeness.max(axis=1)
         np.maximum(likest_back, likeness.max(axis=0), out=likest_back)
     rows = np.flatnonzero((likest == likest_back[nearest]) & (likest > _LEAST_LIKENESS))
-    _, first = np.unique(nearest[rows], return_index=True)  # of new ones that are as like, the first
+    _, first = np.unique(
+        nearest[rows], return_index=True
+    )  # of new ones that are as like, the first
     rows = rows[np.sort(first)]
     return np.column_stack([rows, nearest[rows]]).astype(np.int64)
 
@@ -85,8 +93,10 @@ def _sampled(planes: Floats32, points_px: PointsPx) -> Floats32:
     share = (at - low).astype(np.float32)
     x, y = share[:, 0], share[:, 1]
     return (
-        planes[:, low[:, 1], low[:, 0]] * ((1 - x) * (1 - y)) + planes[:, low[:, 1], high[:, 0]] * (x * (1 - y))
-        + planes[:, high[:, 1], low[:, 0]] * ((1 - x) * y) + planes[:, high[:, 1], high[:, 0]] * (x * y)
+        planes[:, low[:, 1], low[:, 0]] * ((1 - x) * (1 - y))
+        + planes[:, low[:, 1], high[:, 0]] * (x * (1 - y))
+        + planes[:, high[:, 1], low[:, 0]] * ((1 - x) * y)
+        + planes[:, high[:, 1], high[:, 0]] * (x * y)
     ).T
 
 

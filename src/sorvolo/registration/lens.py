@@ -11,7 +11,9 @@ _VISIBLE_PX = 0.5  # at a corner: what moves no pixel by more is left as it is
 _RADII = 4096  # of the table of distortion, from the middle to the corner
 
 
-_AVERAGED = 2.0  # times as large at most: a mean of 2 x 2 pixels is enough for what is left out between
+_AVERAGED = (
+    2.0  # times as large at most: a mean of 2 x 2 pixels is enough for what is left out between
+)
 
 
 class Undistorter:
@@ -31,7 +33,9 @@ class Undistorter:
             x, y = cv2.initUndistortRectifyMap(
                 taken.matrix, taken.distortion, None, camera.matrix, self._size, cv2.CV_32FC1
             )
-            self._maps = cv2.convertMaps(x + 0.5, y + 0.5, cv2.CV_16SC2)  # the mean lies half a pixel before its last
+            self._maps = cv2.convertMaps(
+                x + 0.5, y + 0.5, cv2.CV_16SC2
+            )  # the mean lies half a pixel before its last
         elif camera.is_distorted:
             self._maps = cv2.initUndistortRectifyMap(
                 camera.matrix, camera.distortion, None, camera.matrix, self._size, cv2.CV_16SC2
@@ -40,11 +44,19 @@ class Undistorter:
     @classmethod
     def left_over(cls, camera: Camera, radial: float) -> "Undistorter | None":
         """For the distortion k that a flight found (ideal = seen (1 + k r^2)); None where it moves no pixel visibly."""
-        corners = np.array([[x, y] for x in (0, camera.width_px - 1) for y in (0, camera.height_px - 1)])
-        if np.abs(_seen_pixels(corners, camera, radial) - corners).max() < _VISIBLE_PX:  # it moves them most
+        corners = np.array(
+            [[x, y] for x in (0, camera.width_px - 1) for y in (0, camera.height_px - 1)]
+        )
+        if (
+            np.abs(_seen_pixels(corners, camera, radial) - corners).max() < _VISIBLE_PX
+        ):  # it moves them most
             return None
-        x = (np.arange(camera.width_px, dtype=np.float32) - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
-        y = (np.arange(camera.height_px, dtype=np.float32) - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
+        x = (np.arange(camera.width_px, dtype=np.float32) - np.float32(camera.cx_px)) / np.float32(
+            camera.fx_px
+        )
+        y = (np.arange(camera.height_px, dtype=np.float32) - np.float32(camera.cy_px)) / np.float32(
+            camera.fy_px
+        )
         made = cls(camera.undistorted())
         made._maps = _maps_of_left_over(x, y, camera, radial)
         return made
@@ -79,7 +91,9 @@ def refined_camera(camera: Camera, focal_scale: float, radial: float, fifth: flo
     result = camera.with_focal_px(camera.fx_px * focal_scale)
     if radial == fifth == 0.0 and (focal_scale == 1.0 or not camera.is_distorted):
         return result
-    x, y = np.meshgrid(np.linspace(-0.5, camera.width_px - 0.5, 25), np.linspace(-0.5, camera.height_px - 0.5, 25))
+    x, y = np.meshgrid(
+        np.linspace(-0.5, camera.width_px - 0.5, 25), np.linspace(-0.5, camera.height_px - 0.5, 25)
+    )
     pixels = np.column_stack([x.ravel(), y.ravel()])
     seen = camera.rays_from_pixels(pixels)[:, :2]
     square = (seen**2).sum(axis=1, keepdims=True)
@@ -93,17 +107,27 @@ def refined_camera(camera: Camera, focal_scale: float, radial: float, fifth: flo
         np.concatenate([columns_u, columns_v]), (distorted - ray).T.ravel(), rcond=None
     )
     return Camera(
-        result.width_px, result.height_px, result.fx_px, result.fy_px, result.cx_px, result.cy_px, coefficients
+        result.width_px,
+        result.height_px,
+        result.fx_px,
+        result.fy_px,
+        result.cx_px,
+        result.cy_px,
+        coefficients,
     )
 
 
-def _maps_of_left_over(x: Floats32, y: Floats32, camera: Camera, radial: float) -> tuple[MatLike, MatLike]:
+def _maps_of_left_over(
+    x: Floats32, y: Floats32, camera: Camera, radial: float
+) -> tuple[MatLike, MatLike]:
     """Where each pixel of the perfect picture, in focal lengths x (W,) and y (H,), lies in the one taken.
 
     How much nearer to the middle depends on the radius alone, so it is found for some radii, to a millionth of a pixel.
     """
     radii = np.linspace(0, np.hypot(np.abs(x).max(), np.abs(y).max()), _RADII)
-    nearer = _seen_from_ideal(np.column_stack([radii, np.zeros(_RADII)]), radial)[:, 0] / np.maximum(radii, 1e-12)
+    nearer = _seen_from_ideal(np.column_stack([radii, np.zeros(_RADII)]), radial)[
+        :, 0
+    ] / np.maximum(radii, 1e-12)
     nearer[0] = 1.0
     factor = np.interp(np.hypot(x, y[:, None]), radii, nearer).astype(np.float32)
     across = factor * x * np.float32(camera.fx_px) + np.float32(camera.cx_px)

@@ -32,7 +32,9 @@ class LinkSettings:
     max_pairs: int = 40  # pairs kept per link, spread over the overlap
     min_correlation: float = 0.35  # of the overlaid images: the last check against a false fit
     least_learned: float = 0.35  # share of learned pairs that agree, for them to link by themselves
-    most_shared: float = 0.4  # of a picture: what is known to share less is searched with SIFT there alone
+    most_shared: float = (
+        0.4  # of a picture: what is known to share less is searched with SIFT there alone
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,11 @@ class Effort(StrEnum):
 
 
 def link(
-    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache,
+    new: Keyframe,
+    old: Keyframe,
+    prediction: LinkPrediction | None,
+    settings: LinkSettings,
+    cache: LinkCache,
     effort: Effort = Effort.ALL,
 ) -> Link | NoLink:
     """How `new` fits `old`.
@@ -123,7 +129,11 @@ class _Fit:
 
 
 def _candidates(
-    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache,
+    new: Keyframe,
+    old: Keyframe,
+    prediction: LinkPrediction | None,
+    settings: LinkSettings,
+    cache: LinkCache,
     effort: Effort,
 ) -> Iterator[_Fit]:
     if effort is not Effort.DEAR:
@@ -137,7 +147,11 @@ def _candidates(
 
 
 def _dear_candidates(
-    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+    new: Keyframe,
+    old: Keyframe,
+    prediction: LinkPrediction | None,
+    settings: LinkSettings,
+    cache: LinkCache,
 ) -> Iterator[_Fit]:
     """SIFT where a shared part is known, SIFT of all (the prediction may have been wrong), what a prediction allows."""
     shared = _shared_sift(new, old, prediction, settings, cache)
@@ -169,19 +183,31 @@ def _fit(
 
 
 def _fit_learned(
-    new: Keyframe, old: Keyframe, prediction: LinkPrediction, settings: LinkSettings, cache: LinkCache
+    new: Keyframe,
+    old: Keyframe,
+    prediction: LinkPrediction,
+    settings: LinkSettings,
+    cache: LinkCache,
 ) -> _Fit | None:
     """By learned features of the old picture laid as predicted: they bear faint ground and noise, but no turn."""
     size = (new.gray.shape[1], new.gray.shape[0])
-    laid = np.asarray(cv2.warpPerspective(old.gray, prediction.new_from_old, size, borderValue=128), np.uint8)
-    seen = cv2.warpPerspective(np.full(old.gray.shape, 255, np.uint8), prediction.new_from_old, size) > 0
+    laid = np.asarray(
+        cv2.warpPerspective(old.gray, prediction.new_from_old, size, borderValue=128), np.uint8
+    )
+    seen = (
+        cv2.warpPerspective(np.full(old.gray.shape, 255, np.uint8), prediction.new_from_old, size)
+        > 0
+    )
     ours, theirs = cache.learned(new), known_only(learned_features(laid), np.asarray(seen))
-    found = _agreed(ours, theirs, match_learned(ours, theirs, np.eye(3), prediction.search_px), settings)
+    found = _agreed(
+        ours, theirs, match_learned(ours, theirs, np.eye(3), prediction.search_px), settings
+    )
     if found is None:
         return None
     fit, share = found
     return _Fit(
-        fit.new_from_old @ prediction.new_from_old, fit.new_px,
+        fit.new_from_old @ prediction.new_from_old,
+        fit.new_px,
         apply_homography(np.linalg.inv(prediction.new_from_old), fit.old_px),
         is_sub_pixel=bool(share > settings.least_learned and _are_spread(fit.new_px, size)),
     )
@@ -207,10 +233,18 @@ def _are_spread(points_px: PointsPx, size: tuple[int, int]) -> bool:
 
 
 def _shared_sift(
-    new: Keyframe, old: Keyframe, prediction: LinkPrediction | None, settings: LinkSettings, cache: LinkCache
+    new: Keyframe,
+    old: Keyframe,
+    prediction: LinkPrediction | None,
+    settings: LinkSettings,
+    cache: LinkCache,
 ) -> tuple[Features, Features] | None:
     """SIFT features of what two pictures share, where that is little and known: the rest is most of the cost."""
-    if prediction is None or not prediction.is_tight or (cache.has_sift(new) and cache.has_sift(old)):
+    if (
+        prediction is None
+        or not prediction.is_tight
+        or (cache.has_sift(new) and cache.has_sift(old))
+    ):
         return None
     in_new = _shared_box(new.gray, old.gray, prediction.new_from_old, prediction.search_px)
     old_from_new: Matrix3 = np.linalg.inv(prediction.new_from_old).astype(np.float64)
@@ -220,11 +254,15 @@ def _shared_sift(
     return _sift_in(new, in_new, settings), _sift_in(old, in_old, settings)
 
 
-def _shared_box(image: ImageGray, other: ImageGray, image_from_other: Matrix3, margin_px: float) -> tuple[slice, slice]:
+def _shared_box(
+    image: ImageGray, other: ImageGray, image_from_other: Matrix3, margin_px: float
+) -> tuple[slice, slice]:
     """Rows and columns of `image` in which the other one lies, and as much around it."""
     height, width = other.shape
     corners_px = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
-    seen = np.nan_to_num(apply_homography(image_from_other, corners_px), nan=0.0, posinf=0.0, neginf=0.0)
+    seen = np.nan_to_num(
+        apply_homography(image_from_other, corners_px), nan=0.0, posinf=0.0, neginf=0.0
+    )
     size = np.array(image.shape[::-1])
     low = np.clip(np.floor(seen.min(axis=0) - margin_px), 0, size).astype(int)
     high = np.clip(np.ceil(seen.max(axis=0) + margin_px), 0, size).astype(int)
@@ -241,7 +279,9 @@ def _sift_in(keyframe: Keyframe, box: tuple[slice, slice], settings: LinkSetting
     if min(part.shape) < 2 * settings.refine_window_px:
         return Features("sift", np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     found = sift_features(np.ascontiguousarray(part), settings.features)
-    return Features(found.kind, found.points_px + np.array([box[1].start, box[0].start]), found.descriptors)
+    return Features(
+        found.kind, found.points_px + np.array([box[1].start, box[0].start]), found.descriptors
+    )
 
 
 def _as_link(new: Keyframe, old: Keyframe, found: _Fit, settings: LinkSettings) -> Link:
@@ -249,10 +289,14 @@ def _as_link(new: Keyframe, old: Keyframe, found: _Fit, settings: LinkSettings) 
     miss = np.linalg.norm(apply_homography(found.new_from_old, found.old_px) - found.new_px, axis=1)
     chosen = _spread(found.new_px, miss, np.isfinite(miss), settings.max_pairs)
     sigma_px = max(0.3, float(np.median(miss) / 1.1774))
-    return Link(new.id, old.id, found.new_px[chosen], found.old_px[chosen], found.new_from_old, sigma_px)
+    return Link(
+        new.id, old.id, found.new_px[chosen], found.old_px[chosen], found.new_from_old, sigma_px
+    )
 
 
-def _correlate(new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: float) -> Matrix3 | None:
+def _correlate(
+    new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: float
+) -> Matrix3 | None:
     """Shift the predicted overlay to the peak of the normalised cross-correlation, at half size."""
     half = np.diag([0.5, 0.5, 1.0])
     size = (new.shape[1] // 2, new.shape[0] // 2)
@@ -270,11 +314,11 @@ def _correlate(new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: fl
     if y1 - y0 < 48 or x1 - x0 < 48 or seen[y0:y1, x0:x1].mean() < 0.8:
         return None
     template = _band_pass(warped)[y0:y1, x0:x1]
-    window = small[y0 - reach:y1 + reach, x0 - reach:x1 + reach]
+    window = small[y0 - reach : y1 + reach, x0 - reach : x1 + reach]
     score = cv2.matchTemplate(window, template, cv2.TM_CCOEFF_NORMED)
     _, peak, _, (px, py) = cv2.minMaxLoc(score)
     blanked = score.copy()
-    blanked[max(0, py - 4):py + 5, max(0, px - 4):px + 5] = -1
+    blanked[max(0, py - 4) : py + 5, max(0, px - 4) : px + 5] = -1
     if peak < 0.12 or peak < 1.3 * blanked.max():
         return None
     shift = np.eye(3)
@@ -284,7 +328,9 @@ def _correlate(new: ImageGray, old: ImageGray, predicted: Matrix3, search_px: fl
 
 def _band_pass(gray: MatLike) -> Floats32:
     image = gray.astype(np.float32)
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0), np.float32)
+    return np.asarray(
+        cv2.GaussianBlur(image, (0, 0), 1.0) - cv2.GaussianBlur(image, (0, 0), 8.0), np.float32
+    )
 
 
 def refine(
@@ -303,18 +349,31 @@ def refine(
     overlaid = old.gray.shape == new.gray.shape and np.array_equal(new_from_old, np.eye(3))
     warped = old.gray
     if not overlaid:
-        warped = np.asarray(cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR), np.uint8)
+        warped = np.asarray(
+            cv2.warpPerspective(old.gray, new_from_old, size, flags=cv2.INTER_LINEAR), np.uint8
+        )
     start = points.astype(np.float32).reshape(-1, 1, 2)
     window = (settings.refine_window_px, settings.refine_window_px)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
     ahead, found, _ = cv2.calcOpticalFlowPyrLK(
-        new.gray, warped, start, start.copy(), winSize=window, maxLevel=1, criteria=stop,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-7,
+        new.gray,
+        warped,
+        start,
+        start.copy(),
+        winSize=window,
+        maxLevel=1,
+        criteria=stop,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-7,
     )
-    good = (found.ravel() > 0) & (np.linalg.norm((ahead - start)[:, 0], axis=1) < settings.refine_reach_px)
+    good = (found.ravel() > 0) & (
+        np.linalg.norm((ahead - start)[:, 0], axis=1) < settings.refine_reach_px
+    )
     if good.sum() < settings.min_inliers:
         return f"only {int(good.sum())} points could be followed from one image to the other"
-    good[good] = _correlation(new.gray, warped, start[good, 0], ahead[good, 0]) > settings.min_correlation
+    good[good] = (
+        _correlation(new.gray, warped, start[good, 0], ahead[good, 0]) > settings.min_correlation
+    )
     if good.sum() < settings.min_inliers:
         return f"the overlaid images agree at only {int(good.sum())} points"
     new_px = points[good]
@@ -333,7 +392,9 @@ def refine(
     return Link(new.id, old.id, new_px[chosen], old_px[chosen], homography, max(sigma_px, 0.05))
 
 
-def _correlation(new: ImageGray, warped: ImageGray, at_new: Floats32, at_warped: Floats32) -> Floats32:
+def _correlation(
+    new: ImageGray, warped: ImageGray, at_new: Floats32, at_warped: Floats32
+) -> Floats32:
     """(N,) normalised cross-correlation of 15 px patches around paired points."""
     offsets = np.arange(-7, 8, dtype=np.float32)
     dy, dx = np.meshgrid(offsets, offsets, indexing="ij")
@@ -355,11 +416,15 @@ def _spread(points: PointsPx, miss: Floats, usable: Mask, count: int) -> NDArray
     if len(indices) <= count:
         return indices
     low, high = points[indices].min(axis=0), points[indices].max(axis=0)
-    cell = np.minimum((points[indices] - low) / (high - low + 1e-9) * 6, 5).astype(int) @ np.array([1, 6])
+    cell = np.minimum((points[indices] - low) / (high - low + 1e-9) * 6, 5).astype(int) @ np.array(
+        [1, 6]
+    )
     order = np.lexsort((miss[indices], cell))
     rank = np.zeros(len(indices), int)
     starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
-    rank[order] = np.arange(len(indices)) - np.repeat(starts, np.diff(np.append(starts, len(indices))))
+    rank[order] = np.arange(len(indices)) - np.repeat(
+        starts, np.diff(np.append(starts, len(indices)))
+    )
     return np.sort(indices[np.lexsort((cell, rank))[:count]])
 
 

@@ -12,7 +12,11 @@ _EMPTY = np.zeros((0, 2), np.int64)
 
 
 def match(
-    new: Features, old: Features, new_from_old: Matrix3 | None, search_px: float, ratio: float = 0.85
+    new: Features,
+    old: Features,
+    new_from_old: Matrix3 | None,
+    search_px: float,
+    ratio: float = 0.85,
 ) -> NDArray[np.int64]:
     """(N, 2) index pairs (new, old), nearest neighbours that pass Lowe's ratio test and are mutual.
 
@@ -24,7 +28,9 @@ def match(
     keep_new, keep_old = np.arange(len(new)), np.arange(len(old))
     if new_from_old is not None:
         keep_old = _inside(apply_homography(new_from_old, old.points_px), new, search_px)
-        keep_new = _inside(apply_homography(np.linalg.inv(new_from_old), new.points_px), old, search_px)
+        keep_new = _inside(
+            apply_homography(np.linalg.inv(new_from_old), new.points_px), old, search_px
+        )
         if len(keep_new) < 4 or len(keep_old) < 4:
             return _EMPTY
     norm = cv2.NORM_HAMMING if new.descriptors.dtype == np.uint8 else cv2.NORM_L2
@@ -32,14 +38,21 @@ def match(
     distance, nearest = cv2.batchDistance(
         new.descriptors[keep_new], old.descriptors[keep_old], -1, normType=norm, K=count
     )
-    accepted = np.flatnonzero(distance[:, 0] < ratio * distance[:, -1]) if count == 2 else np.zeros(0, np.int64)
+    accepted = (
+        np.flatnonzero(distance[:, 0] < ratio * distance[:, -1])
+        if count == 2
+        else np.zeros(0, np.int64)
+    )
     # mutual: of several new points with the same old one, the nearest stays
     accepted = accepted[np.lexsort((distance[accepted, 0], nearest[accepted, 0]))]
     first = np.diff(nearest[accepted, 0], prepend=-1) != 0
     indices = np.column_stack([accepted[first], nearest[accepted[first], 0]]).astype(np.int64)
     indices = np.column_stack([keep_new[indices[:, 0]], keep_old[indices[:, 1]]])
     if new_from_old is not None:
-        miss = apply_homography(new_from_old, old.points_px[indices[:, 1]]) - new.points_px[indices[:, 0]]
+        miss = (
+            apply_homography(new_from_old, old.points_px[indices[:, 1]])
+            - new.points_px[indices[:, 0]]
+        )
         indices = indices[np.linalg.norm(miss, axis=1) < search_px]
     return indices
 

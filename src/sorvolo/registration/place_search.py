@@ -8,7 +8,13 @@ import numpy as np
 
 from sorvolo.geometry.arrays import ImageGray, Mask, Matrix3, PointsPx
 from sorvolo.registration.camera_fit import similar
-from sorvolo.registration.features import FeatureSettings, filled, known_only, normalise_contrast, sift_features
+from sorvolo.registration.features import (
+    FeatureSettings,
+    filled,
+    known_only,
+    normalise_contrast,
+    sift_features,
+)
 from sorvolo.registration.learned import learned_features, match_learned
 from sorvolo.registration.matching import match
 
@@ -28,7 +34,9 @@ class PlaceSettings:
 
 
 def find_place(
-    picture: tuple[ImageGray, Mask], ground: tuple[ImageGray, Mask], scales: Sequence[float] = (),
+    picture: tuple[ImageGray, Mask],
+    ground: tuple[ImageGray, Mask],
+    scales: Sequence[float] = (),
     settings: PlaceSettings = PlaceSettings(),
 ) -> Matrix3 | None:
     """ground_from_picture (3, 3), a similarity; None where none is sure. Each is a gray image and where it is known.
@@ -44,11 +52,15 @@ def find_place(
     # a larger picture would lie beside the ground with more of itself than may disagree
     most_px = min(settings.most_side_px, max(ground[0].shape) / settings.least_share**0.5)
     for turned_from_picture, size in _turns(picture[0].shape, scales, most_px, settings):
-        gray = cv2.warpPerspective(filled(*picture), turned_from_picture, size, flags=cv2.INTER_AREA)
+        gray = cv2.warpPerspective(
+            filled(*picture), turned_from_picture, size, flags=cv2.INTER_AREA
+        )
         known = cv2.warpPerspective(picture[1].astype(np.uint8), turned_from_picture, size) > 0
         new = known_only(learned_features(gray, 3000), known)  # type: ignore[arg-type]
         pairs = match_learned(new, old)
-        agreed = _agreed(new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings, settings.step**2)
+        agreed = _agreed(
+            new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings, settings.step**2
+        )
         if agreed is not None and (best is None or agreed[1] > best[0]):
             best = agreed[1], agreed[0] @ turned_from_picture
     return None if best is None else best[1]
@@ -59,12 +71,15 @@ def _by_sift(
 ) -> Matrix3 | None:
     wanted = FeatureSettings(sift_count=4000, detection_side_px=4000)
     new, old = (
-        known_only(sift_features(normalise_contrast(filled(*each)), wanted), each[1]) for each in (picture, ground)
+        known_only(sift_features(normalise_contrast(filled(*each)), wanted), each[1])
+        for each in (picture, ground)
     )
     if min(len(new), len(old)) < settings.least_pairs:
         return None
     pairs = match(new, old, None, 0.0)
-    agreed = _agreed(new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings, settings.most_scale)
+    agreed = _agreed(
+        new.points_px[pairs[:, 0]], old.points_px[pairs[:, 1]], settings, settings.most_scale
+    )
     return None if agreed is None else agreed[0]
 
 
@@ -78,7 +93,10 @@ def _agreed(
     count = int(found[1].sum())
     # pairs that all lie in one spot agree on anything
     spread_px = np.ptp(new_px[found[1]], axis=0).min() if count else 0.0
-    if count < max(settings.least_pairs, settings.least_share * len(new_px)) or spread_px < 4 * settings.band_px:
+    if (
+        count < max(settings.least_pairs, settings.least_share * len(new_px))
+        or spread_px < 4 * settings.band_px
+    ):
         return None
     return found[0], count
 

@@ -47,4 +47,9 @@ def is_believable(a_from_b: Matrix3, points_b: PointsPx) -> bool:
     image_of_centre = (a_from_b[:2, :2] @ centre + a_from_b[:2, 2]) / depth_centre
     jacobian = (a_from_b[:2, :2] - np.outer(image_of_centre, a_from_b[2, :2])) / depth_centre
     stretch = np.linalg.svd(jacobian, compute_uv=False)
-    return bool(np.linalg.det(jacobian) > 0 and stretch[0] < 4 and stretch[1] > 0.25 and stretch[0] < 2 * stretch[1])
+    return bool(
+        np.linalg.det(jacobian) > 0
+        and stretch[0] < 4
+        and stretch[1] > 0.25
+        and stretch[0] < 2 * stretch[1]
+    )

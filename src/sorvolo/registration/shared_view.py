@@ -46,7 +46,9 @@ def second_from_first(first: SmallView, second: SmallView) -> Matrix3 | None:
     fit = fit_homography(new_px, old_px, _THRESHOLD_PX)
     if fit is None or fit[1].sum() < _LEAST_INLIERS:
         return None
-    return np.asarray(np.linalg.inv(second.small_from_picture) @ fit[0] @ first.small_from_picture, np.float64)
+    return np.asarray(
+        np.linalg.inv(second.small_from_picture) @ fit[0] @ first.small_from_picture, np.float64
+    )
 
 
 def shared_view(first: ImageRGB, second: ImageRGB) -> float:
@@ -55,7 +57,9 @@ def shared_view(first: ImageRGB, second: ImageRGB) -> float:
     if found is None:
         return 0.0
     height, width = first.shape[:2]
-    middles = (np.arange(_POINTS) + 0.5) / _POINTS  # of cells: points on the rim itself fall out by a hair
+    middles = (
+        np.arange(_POINTS) + 0.5
+    ) / _POINTS  # of cells: points on the rim itself fall out by a hair
     columns, rows = np.meshgrid(width * middles - 0.5, height * middles - 0.5)
     there = apply_homography(found, np.column_stack([columns.ravel(), rows.ravel()]))
     height, width = second.shape[:2]

@@ -68,13 +68,18 @@ class Cells:
 
     def rows_at(self, places_m: PointsM) -> NDArray[np.intp]:
         """(N,) the numbers of the cells in which places (N, 2) lie, site metres; -1 beyond all cells."""
-        column, row = (np.floor(self.site_grid.grid_from_site(places_m) + 0.5).astype(int) - (self.left, self.top)).T
+        column, row = (
+            np.floor(self.site_grid.grid_from_site(places_m) + 0.5).astype(int)
+            - (self.left, self.top)
+        ).T
         inside = (column >= 0) & (row >= 0) & (column < self.columns) & (row < self.rows)
         return np.where(inside, row * self.columns + column, -1)
 
     def outer_corner_m(self) -> tuple[float, float]:
         """Easting and northing of the grid's north-west corner, in the grid's own projection."""
-        corner = self.site_grid.grid.projected_from_grid(np.array([[self.left - 0.5, self.top - 0.5]]))[0]
+        corner = self.site_grid.grid.projected_from_grid(
+            np.array([[self.left - 0.5, self.top - 0.5]])
+        )[0]
         return float(corner[0]), float(corner[1])
 
 
@@ -87,7 +92,9 @@ def cell_side_m(outlines_m: Sequence[PointsM], settings: CellSettings = CellSett
     return float(next(step * power for step in (1, 2, 5, 10) if step * power >= least_m - 1e-9))
 
 
-def cells_of(outlines_m: Sequence[PointsM], site: Site, area_m: Sequence[Sequence[PointsM]] | None) -> Cells:
+def cells_of(
+    outlines_m: Sequence[PointsM], site: Site, area_m: Sequence[Sequence[PointsM]] | None
+) -> Cells:
     """`cells_over` of a site, of a side that bounds their number."""
     side_m = cell_side_m(_rings_to_cover(outlines_m, area_m))
     return cells_over(outlines_m, SiteGrid.at(site.origin, side_m, site.crs), area_m)
@@ -107,26 +114,38 @@ def cells_over(
     columns, rows = right - left, bottom - top
     centres_m = _centres_m(site_grid, left, top, columns, rows)
     if area_m is None:
-        wanted = _with_enclosed(_inside_any([[each] for each in outlines_m], centres_m).reshape(rows, columns)).ravel()
+        wanted = _with_enclosed(
+            _inside_any([[each] for each in outlines_m], centres_m).reshape(rows, columns)
+        ).ravel()
     else:
         wanted = _inside_any(area_m, centres_m)
         if not wanted.any():  # narrower than a cell
             for rings in area_m:
                 for ring_m in rings:
-                    x, y = np.floor(_along(site_grid.grid_from_site(np.asarray(ring_m))) + 0.5).astype(int).T
+                    x, y = (
+                        np.floor(_along(site_grid.grid_from_site(np.asarray(ring_m))) + 0.5)
+                        .astype(int)
+                        .T
+                    )
                     wanted[(y - top) * columns + x - left] = True
     return Cells(site_grid, left, top, columns, rows, wanted)
 
 
-def _rings_to_cover(outlines_m: Sequence[PointsM], area_m: Sequence[Sequence[PointsM]] | None) -> list[PointsM]:
+def _rings_to_cover(
+    outlines_m: Sequence[PointsM], area_m: Sequence[Sequence[PointsM]] | None
+) -> list[PointsM]:
     """What cells have to cover: frames' outlines and the area's rings, or these alone where both are far apart."""
     own = [np.asarray(each) for each in outlines_m]
     wanted = [np.asarray(ring) for rings in area_m or () for ring in rings]
     if area_m is None:
         return own
     shown, asked = np.concatenate(own), np.concatenate(wanted)
-    apart_m = np.maximum(shown.min(axis=0) - asked.max(axis=0), asked.min(axis=0) - shown.max(axis=0))
-    return wanted if (apart_m > np.ptp(asked, axis=0) + np.ptp(shown, axis=0)).any() else own + wanted
+    apart_m = np.maximum(
+        shown.min(axis=0) - asked.max(axis=0), asked.min(axis=0) - shown.max(axis=0)
+    )
+    return (
+        wanted if (apart_m > np.ptp(asked, axis=0) + np.ptp(shown, axis=0)).any() else own + wanted
+    )
 
 
 def _along(ring_px: PointsPx) -> PointsPx:
@@ -139,7 +158,9 @@ def _along(ring_px: PointsPx) -> PointsPx:
 def _centres_m(site_grid: SiteGrid, left: int, top: int, columns: int, rows: int) -> PointsM:
     x, y = np.meshgrid(np.arange(left, left + columns), np.arange(top, top + rows))
     site_from_grid = np.linalg.inv(site_grid.grid_from_site_affine(np.zeros(2), 50.0))
-    return apply_homography(site_from_grid, np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+    return apply_homography(
+        site_from_grid, np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)
+    )
 
 
 def _inside_any(polygons: Sequence[Sequence[PointsM]], points: PointsM) -> Mask:

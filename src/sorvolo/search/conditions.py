@@ -92,8 +92,10 @@ class Conditions:
         """Of M of the places, by their numbers (M,); below 0: of one that no frame shows."""
         known = rows >= 0
         return Conditions(
-            np.where(known, self.views[rows], 0), np.where(known[:, None], self.columns[rows], np.nan),
-            np.where(known, self.crowns[rows], 0), known & self.roofs[rows],
+            np.where(known, self.views[rows], 0),
+            np.where(known[:, None], self.columns[rows], np.nan),
+            np.where(known, self.crowns[rows], 0),
+            known & self.roofs[rows],
         )
 
     def m_per_px(self) -> Floats:
@@ -102,7 +104,11 @@ class Conditions:
 
 
 def look_at(
-    image: ImageRGB, camera: Camera, site_from_camera: Pose, blur_px: float, sun: Vector3 | None = None,
+    image: ImageRGB,
+    camera: Camera,
+    site_from_camera: Pose,
+    blur_px: float,
+    sun: Vector3 | None = None,
     settings: LookSettings = LookSettings(),
 ) -> FrameLook:
     """The small maps of a frame (H, W, 3); `sun` (3,) is the direction to the sun in the site, None: not known."""
@@ -114,11 +120,19 @@ def look_at(
     lightness = small.mean(axis=2)
     around = max(3, 2 * round(settings.window * settings.look_m / small_m / 2) + 1)
     mean = cv2.blur(lightness, (around, around))
-    texture = np.sqrt(np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0)) / np.maximum(mean, 8)
+    texture = np.sqrt(
+        np.maximum(cv2.blur(lightness**2, (around, around)) - mean**2, 0)
+    ) / np.maximum(mean, 8)
     crowns = crowns_in(image, small, m_per_px, small_m, _sunward(site_from_camera, sun))
     return FrameLook(
-        camera, site_from_camera, blur_px, camera.width_px / size[0], lightness.astype(np.float16),
-        texture.astype(np.float16), plants_in(small, small_m), crowns,
+        camera,
+        site_from_camera,
+        blur_px,
+        camera.width_px / size[0],
+        lightness.astype(np.float16),
+        texture.astype(np.float16),
+        plants_in(small, small_m),
+        crowns,
     )
 
 
@@ -132,7 +146,9 @@ def _sunward(site_from_camera: Pose, sun: Vector3 | None) -> Floats | None:
 
 
 def gather(
-    looks: Iterable[FrameLook], places_m: PointsM | Sequence[Floats], reach_m: float,
+    looks: Iterable[FrameLook],
+    places_m: PointsM | Sequence[Floats],
+    reach_m: float,
     above: AboveGround | None = None,
 ) -> Conditions:
     """The conditions of places (N, 2); a frame counts that shows what reaches `reach_m` about a place whole.
@@ -169,9 +185,15 @@ class Gathering:
         rows, columns = look.lightness.shape
         x, y = (pixels[shown] / look.scale).astype(int).clip(0, [columns - 1, rows - 1]).T
         near_m = m_per_px[shown]
-        self._sums[at] += np.column_stack([
-            np.log(near_m), np.log(look.blur_px * near_m), look.texture[y, x], look.lightness[y, x], slant[shown],
-        ])
+        self._sums[at] += np.column_stack(
+            [
+                np.log(near_m),
+                np.log(look.blur_px * near_m),
+                look.texture[y, x],
+                look.lightness[y, x],
+                slant[shown],
+            ]
+        )
         self._crowns[at] += look.crowns[y, x]
         self._plants[at] += look.plants[y, x]
         self._views[at] += 1
@@ -180,17 +202,29 @@ class Gathering:
         """What the looks so far show."""
         views = self._views.copy()
         with np.errstate(invalid="ignore", divide="ignore"):
-            means, share, green = self._sums / views[:, None], self._crowns / views, self._plants / views
+            means, share, green = (
+                self._sums / views[:, None],
+                self._crowns / views,
+                self._plants / views,
+            )
             log_views = np.where(views > 0, np.log(views), np.nan)
         roofs = np.zeros(len(views), bool)
         if self._above is not None and len(views):
             raised = _raised(*self._above(self._places_m)) & (views > 0)
             roofs = raised & (green <= _CROWN_SHARE)
             share = np.where(roofs, 0.0, np.where(raised, 1.0, share))
-        columns = np.column_stack([
-            means[:, 0], log_views, np.where(views > 0, views == 1, np.nan), means[:, 1], means[:, 2], means[:, 3],
-            means[:, 4], share,
-        ])
+        columns = np.column_stack(
+            [
+                means[:, 0],
+                log_views,
+                np.where(views > 0, views == 1, np.nan),
+                means[:, 1],
+                means[:, 2],
+                means[:, 3],
+                means[:, 4],
+                share,
+            ]
+        )
         return Conditions(views, columns, np.nan_to_num(share), roofs)
 
 
@@ -213,7 +247,9 @@ def _about(look: FrameLook, places_m: PointsM) -> Mask:
     return np.asarray(((places_m >= low - spare) & (places_m <= high + spare)).all(axis=1), bool)
 
 
-def _projected(look: FrameLook, places_m: PointsM, reach_m: float) -> tuple[Mask, Floats, Floats, Floats]:
+def _projected(
+    look: FrameLook, places_m: PointsM, reach_m: float
+) -> tuple[Mask, Floats, Floats, Floats]:
     """Which places (N, 2) a frame shows whole; their pixels (N, 2), metres a pixel (N,), tangents of the slant (N,)."""
     camera, pose = look.camera, look.site_from_camera
     points = np.column_stack([places_m, np.zeros(len(places_m))])
@@ -222,11 +258,17 @@ def _projected(look: FrameLook, places_m: PointsM, reach_m: float) -> tuple[Mask
     plain = camera.undistorted().pixels_from_points(local)
     distance_m = np.linalg.norm(points - pose.translation_m, axis=1)
     m_per_px = distance_m / camera.fx_px
-    slant = np.hypot(*(points[:, :2] - pose.translation_m[:2]).T) / max(float(pose.translation_m[2]), 1e-3)
+    slant = np.hypot(*(points[:, :2] - pose.translation_m[:2]).T) / max(
+        float(pose.translation_m[2]), 1e-3
+    )
     size = np.array([camera.width_px, camera.height_px])
     margin = (reach_m / m_per_px + 2.0)[:, None]
     with np.errstate(invalid="ignore"):
         # far outside, a lens's polynomial folds back into the picture: there the plain camera decides
         near = ((plain > -0.3 * size) & (plain < 1.3 * size)).all(axis=1)
-        shown = near & ((pixels >= margin) & (pixels <= size - 1 - margin)).all(axis=1) & (slant < _FARTHEST)
+        shown = (
+            near
+            & ((pixels >= margin) & (pixels <= size - 1 - margin)).all(axis=1)
+            & (slant < _FARTHEST)
+        )
     return np.asarray(shown & (local[:, 2] > 0), bool), pixels, m_per_px, slant

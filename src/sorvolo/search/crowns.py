@@ -23,8 +23,14 @@ class CrownLengths:
     leaf_m: float = 0.1  # along a pixel on which leaves show ...
     leaves_m: float = 0.5  # ... and over which their roughness is taken
     around_m: float = 1.25  # over which a wood's roughness is taken
-    even_m: float = 0.75  # over which lightness is taken for shadows: grass in one has lighter spots
-    shadows_m: tuple[float, ...] = (1.0, 2.0, 4.0)  # the widths of shadows that are followed to what throws them
+    even_m: float = (
+        0.75  # over which lightness is taken for shadows: grass in one has lighter spots
+    )
+    shadows_m: tuple[float, ...] = (
+        1.0,
+        2.0,
+        4.0,
+    )  # the widths of shadows that are followed to what throws them
     crown_m: float = 1.5  # the narrowest crown, and over which it must be so
     wood_m: float = 8.0  # the narrowest wood: shadows of single trees are narrower
     gap_m: float = 6.0  # a gap among crowns that is no wider is forest: smooth or dark crowns, and their shade ...
@@ -40,7 +46,9 @@ class CrownSettings:
     leaves: float = 0.14  # rms of lightness within `leaves_m` over its mean, or the frame's where lighter: lit crowns
     rough: float = 0.2  # rms of lightness over its mean within `around_m`: woods, shadows too
     dark: float = 0.6  # of the frame's lightness: shadows
-    thrown: float = 2.5  # of a shadow's width: how far from within it, towards the sun, what throws it reaches
+    thrown: float = (
+        2.5  # of a shadow's width: how far from within it, towards the sun, what throws it reaches
+    )
     least_grey: float = 8.0  # grey levels: below, a mean is noise; by choice
     lengths: CrownLengths = field(default_factory=CrownLengths)
 
@@ -49,11 +57,17 @@ def plants_in(small: _Grey, m_per_px: float, settings: CrownSettings = CrownSett
     """(H, W) where a small colour picture (H, W, 3) shows plants."""
     green = (2 * small[..., 1] - small[..., 0] - small[..., 2]) / np.maximum(small.sum(axis=2), 1)
     wide = _odd_px(settings.lengths.crown_m, m_per_px)
-    return np.asarray(cv2.blur((green > settings.green).astype(np.float32), (wide, wide)) > settings.plants, bool)
+    return np.asarray(
+        cv2.blur((green > settings.green).astype(np.float32), (wide, wide)) > settings.plants, bool
+    )
 
 
 def crowns_in(
-    image: ImageRGB, small: _Grey, image_m_per_px: float, m_per_px: float, sunward: Floats | None,
+    image: ImageRGB,
+    small: _Grey,
+    image_m_per_px: float,
+    m_per_px: float,
+    sunward: Floats | None,
     settings: CrownSettings = CrownSettings(),
 ) -> Mask:
     """(H, W) where crowns show in a frame; `small` (H, W, 3) is its small picture, whose pixel covers `m_per_px`.
@@ -86,11 +100,15 @@ def _leaf_roughness(
     """The roughness of leaves, laid on a small picture of (H, W)."""
     scale = max(1.0, lengths.leaf_m / m_per_px)
     size = max(8, round(image.shape[1] / scale)), max(8, round(image.shape[0] / scale))
-    fine = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32).mean(axis=2)
+    fine = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.float32).mean(
+        axis=2
+    )
     around = _odd_px(lengths.leaves_m, max(m_per_px, lengths.leaf_m))
     # over the frame's lightness where it is darker there: shadows are rough over their own mean by their rims alone
     rough = _rms(fine, around) / np.maximum(cv2.blur(fine, (around, around)), usual)
-    return np.asarray(cv2.resize(rough, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(
+        cv2.resize(rough, (shape[1], shape[0]), interpolation=cv2.INTER_AREA), np.float32
+    )
 
 
 def _towards_sun(dark: Mask, sunward: Floats, m_per_px: float, settings: CrownSettings) -> Mask:
@@ -109,7 +127,9 @@ def _wood(rough: Mask, lengths: CrownLengths, m_per_px: float) -> Mask:
     """The wide parts of rough plants, with the narrow gaps in them."""
     spare = round(lengths.wood_m / m_per_px)
     # beyond the picture the forest may go on: what lies at its edge is judged by what the picture shows
-    wide = cv2.copyMakeBorder(rough.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT)
+    wide = cv2.copyMakeBorder(
+        rough.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT
+    )
     closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, _disc(lengths.stand_m, m_per_px))
     return _opened(closed > 0, lengths.wood_m, m_per_px)[spare:-spare, spare:-spare]
 
@@ -117,14 +137,18 @@ def _wood(rough: Mask, lengths: CrownLengths, m_per_px: float) -> Mask:
 def _closed(crowns: Mask, lengths: CrownLengths, m_per_px: float) -> Mask:
     """The crowns (H, W) with the narrow gaps between them, where they are those of a stand of trees."""
     spare = max(3, round(lengths.gap_m / m_per_px))
-    wide = cv2.copyMakeBorder(crowns.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT)
+    wide = cv2.copyMakeBorder(
+        crowns.astype(np.uint8), spare, spare, spare, spare, cv2.BORDER_REFLECT
+    )
     stand = _opened(wide > 0, lengths.stand_m, m_per_px).astype(np.uint8)
     closed = cv2.morphologyEx(stand, cv2.MORPH_CLOSE, _disc(lengths.gap_m, m_per_px))
     return np.asarray(crowns | (closed[spare:-spare, spare:-spare] > 0), bool)
 
 
 def _opened(mask: Mask, width_m: float, m_per_px: float) -> Mask:
-    return np.asarray(cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(width_m, m_per_px)) > 0, bool)
+    return np.asarray(
+        cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(width_m, m_per_px)) > 0, bool
+    )
 
 
 def _disc(width_m: float, m_per_px: float) -> NDArray[np.uint8]:

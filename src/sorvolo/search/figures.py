@@ -57,13 +57,19 @@ def together(flights: Sequence[Chances]) -> Chances:
     """
     seen = np.any([np.isfinite(each.mean) for each in flights], axis=0)
     mean, low, high = (
-        np.where(seen, 1 - np.prod([1 - np.nan_to_num(getattr(each, name)) for each in flights], axis=0), np.nan)
+        np.where(
+            seen,
+            1 - np.prod([1 - np.nan_to_num(getattr(each, name)) for each in flights], axis=0),
+            np.nan,
+        )
         for name in ("mean", "low", "high")
     )
     return Chances(mean, low, high)
 
 
-def figures(flights: Sequence[Chances], wanted: Mask, cell_m: float, path_m: float) -> SearchFigures:
+def figures(
+    flights: Sequence[Chances], wanted: Mask, cell_m: float, path_m: float
+) -> SearchFigures:
     """The figures of the wanted cells, (N,), of one or more flights; `path_m` is how far their cameras flew in all."""
     cell_m2 = cell_m**2
     inside = np.asarray(wanted, bool)
@@ -75,14 +81,25 @@ def figures(flights: Sequence[Chances], wanted: Mask, cell_m: float, path_m: flo
     is_seen = any(np.isfinite(each.mean).any() for each in flights)
     width_m = anywhere_m2 / path_m if path_m > 0 and is_seen else float("nan")
     coverage = swept_m2 / area_m2 if area_m2 else 0.0
-    pod, pod_low, pod_high = (float(each.mean()) if len(each) else 0.0 for each in (mean, low, high))
+    pod, pod_low, pod_high = (
+        float(each.mean()) if len(each) else 0.0 for each in (mean, low, high)
+    )
     return SearchFigures(
-        area_m2, float(np.isfinite(total.mean[inside]).sum()) * cell_m2, pod, pod_low, pod_high, swept_m2,
-        width_m, coverage, float(1 - np.exp(-coverage)),
+        area_m2,
+        float(np.isfinite(total.mean[inside]).sum()) * cell_m2,
+        pod,
+        pod_low,
+        pod_high,
+        swept_m2,
+        width_m,
+        coverage,
+        float(1 - np.exp(-coverage)),
     )
 
 
-def segment(name: str, poa: float, chances: Chances, inside: Mask, cell_m: float, area_m2: float) -> Segment:
+def segment(
+    name: str, poa: float, chances: Chances, inside: Mask, cell_m: float, area_m2: float
+) -> Segment:
     """A segment's figures. `inside` (N,) are its cells; ground of it beyond all cells, of `area_m2`, was not seen."""
     sum_of_chances = float(np.nansum(chances.mean[inside])) * cell_m**2
     pod = min(1.0, sum_of_chances / area_m2) if area_m2 else 0.0
@@ -92,4 +109,8 @@ def segment(name: str, poa: float, chances: Chances, inside: Mask, cell_m: float
 
 def path_length_m(places_m: Sequence[Floats]) -> float:
     """The length over ground of a way over places, (2,) or (3,) each, in order."""
-    return float(np.hypot(*np.diff(np.array(places_m)[:, :2], axis=0).T).sum()) if len(places_m) > 1 else 0.0
+    return (
+        float(np.hypot(*np.diff(np.array(places_m)[:, :2], axis=0).T).sum())
+        if len(places_m) > 1
+        else 0.0
+    )

@@ -48,21 +48,40 @@ class Reason(StrEnum):
     @property
     def can_be_flown_again(self) -> bool:
         """Whether another flight may see what this one did not."""
-        return self not in (Reason.NONE, Reason.TREES, Reason.ROOF, Reason.DETECTOR, Reason.UNMEASURED)
+        return self not in (
+            Reason.NONE,
+            Reason.TREES,
+            Reason.ROOF,
+            Reason.DETECTOR,
+            Reason.UNMEASURED,
+        )
 
 
 REASONS = tuple(Reason)
 """The reasons by the numbers that `hole_reasons` gives."""
 
 _BY_CONDITION = {
-    "resolution": Reason.COARSE, "views": Reason.FEW_VIEWS, "single view": Reason.FEW_VIEWS, "blur": Reason.BLUR,
-    "texture": Reason.TEXTURE, "light": Reason.DARK, "slant": Reason.SLANT, "trees": Reason.TREES,
+    "resolution": Reason.COARSE,
+    "views": Reason.FEW_VIEWS,
+    "single view": Reason.FEW_VIEWS,
+    "blur": Reason.BLUR,
+    "texture": Reason.TEXTURE,
+    "light": Reason.DARK,
+    "slant": Reason.SLANT,
+    "trees": Reason.TREES,
 }
 
 
 def hole_reasons(
-    cells: Cells, seen: Conditions, chances: Chances, recall: Recall | None, *, enough: float, needed_m_per_px: float,
-    length_m: float, settings: HoleSettings = HoleSettings(),
+    cells: Cells,
+    seen: Conditions,
+    chances: Chances,
+    recall: Recall | None,
+    *,
+    enough: float,
+    needed_m_per_px: float,
+    length_m: float,
+    settings: HoleSettings = HoleSettings(),
 ) -> Holes:
     """(N,) the number in REASONS of why each wanted cell has less than `enough` of a chance; 0 where it has it.
 
@@ -76,9 +95,12 @@ def hole_reasons(
     light = seen.columns[:, CONDITIONS.index("light")]
     with np.errstate(invalid="ignore"):
         rules: list[tuple[Reason, Mask]] = [
-            (Reason.NOT_SEEN, ~seen.seen), (Reason.ROOF, seen.roofs), (Reason.TREES, seen.under_trees),
+            (Reason.NOT_SEEN, ~seen.seen),
+            (Reason.ROOF, seen.roofs),
+            (Reason.TREES, seen.under_trees),
             (Reason.COARSE, seen.m_per_px() > needed_m_per_px),
-            (Reason.BLUR, blur_m > settings.blurred_share * length_m), (Reason.DARK, light < settings.dark),
+            (Reason.BLUR, blur_m > settings.blurred_share * length_m),
+            (Reason.DARK, light < settings.dark),
         ]
     worst = _worst_condition(seen.columns, recall, settings.least_pull)
     for reason, holds in (*rules, *worst):
@@ -96,13 +118,18 @@ def _worst_condition(
     pulls = np.nan_to_num(recall.pulls(columns))
     is_lowest = pulls.argmin(axis=1)
     is_strong = pulls.min(axis=1) < -least_pull
-    found = [(_BY_CONDITION[name], is_strong & (is_lowest == k)) for k, name in enumerate(CONDITIONS)]
+    found = [
+        (_BY_CONDITION[name], is_strong & (is_lowest == k)) for k, name in enumerate(CONDITIONS)
+    ]
     return [*found, (Reason.DETECTOR, everything)]
 
 
 def reasons_together(
-    reasons: Sequence[Holes], flights: Sequence[Chances], total: Chances,
-    cells: Cells, enough: float,
+    reasons: Sequence[Holes],
+    flights: Sequence[Chances],
+    total: Chances,
+    cells: Cells,
+    enough: float,
 ) -> Holes:
     """(N,) the reasons of several flights: of each cell, the reason of the flight that had the best chance there."""
     chances = np.array([np.nan_to_num(each.mean, nan=-1.0) for each in flights])
@@ -111,12 +138,16 @@ def reasons_together(
     return np.where(poor, best, 0).astype(np.uint8)
 
 
-def hole_areas_m2(
-    numbers: Holes, cell_m: float
-) -> dict[str, float]:
+def hole_areas_m2(numbers: Holes, cell_m: float) -> dict[str, float]:
     """The area of the holes of each reason, the largest first."""
-    areas = {reason.value: float((numbers == k).sum()) * cell_m**2 for k, reason in enumerate(REASONS) if k}
-    return dict(sorted(((name, area) for name, area in areas.items() if area), key=lambda item: -item[1]))
+    areas = {
+        reason.value: float((numbers == k).sum()) * cell_m**2
+        for k, reason in enumerate(REASONS)
+        if k
+    }
+    return dict(
+        sorted(((name, area) for name, area in areas.items() if area), key=lambda item: -item[1])
+    )
 
 
 def flyable(numbers: Holes) -> Holes:
@@ -136,5 +167,7 @@ def without_seen(numbers: Holes, cells: Cells, outlines_m: Sequence[PointsM]) ->
 def pod_classes(chances: Chances, wanted: Mask) -> Holes:
     """(N,) 1 for the lowest of POD_EDGES' classes, 2 for the next ...; 0 for what is not wanted or was not seen."""
     known = wanted & np.isfinite(chances.mean)
-    numbers = np.clip(np.digitize(np.nan_to_num(chances.mean), POD_EDGES[1:-1]) + 1, 1, len(POD_EDGES) - 1)
+    numbers = np.clip(
+        np.digitize(np.nan_to_num(chances.mean), POD_EDGES[1:-1]) + 1, 1, len(POD_EDGES) - 1
+    )
     return np.where(known, numbers, 0).astype(np.uint8)

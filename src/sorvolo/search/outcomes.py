@@ -33,7 +33,9 @@ def found_rows(places_m: Sequence[Floats], seen: Conditions, hits: Sequence[bool
     """The outcomes of plants that at least one frame shows whole."""
     keep = seen.seen
     return Outcomes(
-        np.reshape(places_m, (-1, 2))[keep], seen.columns[keep], np.array(hits, bool).reshape(-1)[keep],
+        np.reshape(places_m, (-1, 2))[keep],
+        seen.columns[keep],
+        np.array(hits, bool).reshape(-1)[keep],
         seen.views[keep],
     )
 

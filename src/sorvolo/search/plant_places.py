@@ -36,8 +36,16 @@ class PlantPlace:
 
 
 def plant_places(
-    cells: Cells, seen: Conditions, labels: Sequence[str], plants: int, *, keep_off_m: Sequence[Floats], free_m: float,
-    rng: np.random.Generator, usable: Mask, settings: PlaceSettings = PlaceSettings(),
+    cells: Cells,
+    seen: Conditions,
+    labels: Sequence[str],
+    plants: int,
+    *,
+    keep_off_m: Sequence[Floats],
+    free_m: float,
+    rng: np.random.Generator,
+    usable: Mask,
+    settings: PlaceSettings = PlaceSettings(),
 ) -> list[list[PlantPlace]]:
     """Rounds of places: this many of each class in all, those of a round so far apart that all stand at once.
 
@@ -53,7 +61,9 @@ def plant_places(
         placed: list[PlantPlace] = []
         for label in sorted(left, key=lambda name: -_room_m(name)):
             for _ in range(left[label]):
-                place_m = _free_place(cells, chances, label, placed, taken_m, free_m, rng, settings.tries)
+                place_m = _free_place(
+                    cells, chances, label, placed, taken_m, free_m, rng, settings.tries
+                )
                 if place_m is None:
                     break
                 placed.append(PlantPlace(label, place_m))
@@ -82,7 +92,13 @@ class PlantField:
     """
 
     def __init__(
-        self, labels: Sequence[str], outline_m: PointsM, *, keep_off_m: Sequence[Floats], free_m: float, seed: int,
+        self,
+        labels: Sequence[str],
+        outline_m: PointsM,
+        *,
+        keep_off_m: Sequence[Floats],
+        free_m: float,
+        seed: int,
         settings: FieldSettings = FieldSettings(),
     ) -> None:
         self._seed, self._settings = seed, settings
@@ -90,7 +106,9 @@ class PlantField:
         self._side_m = _side_m(outline_m, settings)
         self._wide = tuple(each for each in labels if _room_m(each) > self._side_m)
         self._others = tuple(each for each in labels if each not in self._wide)
-        self._numbers: dict[tuple[int, int], int | None] = {}  # by square; None: nothing stands there
+        self._numbers: dict[
+            tuple[int, int], int | None
+        ] = {}  # by square; None: nothing stands there
         self.places: list[PlantPlace] = []
         """All that any frame came near, in the order of their numbers."""
 
@@ -103,7 +121,9 @@ class PlantField:
         low = np.floor((np.min(outline_m, axis=0) - reach_m) / self._side_m).astype(int)
         high = np.floor((np.max(outline_m, axis=0) + reach_m) / self._side_m).astype(int)
         numbers = [
-            self._number(column, row) for row in range(low[1], high[1] + 1) for column in range(low[0], high[0] + 1)
+            self._number(column, row)
+            for row in range(low[1], high[1] + 1)
+            for column in range(low[0], high[0] + 1)
         ]
         return [each for each in numbers if each is not None]
 
@@ -121,7 +141,9 @@ class PlantField:
         if not labels:
             return None
         rng = np.random.default_rng([self._seed, 43, column & 0xFFFFFFFF, row & 0xFFFFFFFF])
-        place_m = (np.array([column, row]) + 0.5 + self._settings.free * rng.uniform(-0.5, 0.5, 2)) * self._side_m
+        place_m = (
+            np.array([column, row]) + 0.5 + self._settings.free * rng.uniform(-0.5, 0.5, 2)
+        ) * self._side_m
         label = labels[int(rng.integers(len(labels)))]
         least_m = max(self._free_m, _room_m(label) / 2 + 1.0)
         if len(self._keep_off_m) and np.hypot(*(self._keep_off_m - place_m).T).min() < least_m:
@@ -152,15 +174,24 @@ def _chances(seen: Conditions, usable: Mask) -> Floats:
 
 
 def _free_place(
-    cells: Cells, chances: Floats, label: str, placed: Sequence[PlantPlace], keep_off_m: PointsM, free_m: float,
-    rng: np.random.Generator, tries: int,
+    cells: Cells,
+    chances: Floats,
+    label: str,
+    placed: Sequence[PlantPlace],
+    keep_off_m: PointsM,
+    free_m: float,
+    rng: np.random.Generator,
+    tries: int,
 ) -> Floats | None:
     for index in rng.choice(len(chances), tries, p=chances / chances.sum()):
         place_m = cells.centres_m[index] + rng.uniform(-0.5, 0.5, 2) * cells.cell_m
-        if len(keep_off_m) and np.hypot(*(keep_off_m - place_m).T).min() < max(free_m, _room_m(label) / 2 + 1.0):
+        if len(keep_off_m) and np.hypot(*(keep_off_m - place_m).T).min() < max(
+            free_m, _room_m(label) / 2 + 1.0
+        ):
             continue
         if all(
-            np.hypot(*(each.place_m - place_m)) > (_room_m(each.label) + _room_m(label)) / 2 for each in placed
+            np.hypot(*(each.place_m - place_m)) > (_room_m(each.label) + _room_m(label)) / 2
+            for each in placed
         ):
             return np.asarray(place_m, np.float64)
     return None

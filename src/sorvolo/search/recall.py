@@ -20,7 +20,9 @@ class RecallSettings:
 
     slope_sigma: float = 0.5  # of a weight, for one standard deviation of its condition
     chance_sigma: float = 2.5  # of the log odds
-    farthest: float = 2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
+    farthest: float = (
+        2.5  # standard deviations: beyond what plants covered, nothing is extrapolated
+    )
     least_spread: float = 0.05  # of a condition: what hardly varies explains nothing
     draws: int = 400  # of the weights, for the interval
     steps: int = 40  # of Newton's method, at most
@@ -47,7 +49,9 @@ class Recall:
         rows = self._rows(columns)
         known = np.isfinite(rows).all(axis=1)
         rng = np.random.default_rng(1)
-        drawn = rng.multivariate_normal(self.weights, self.covariance, self.settings.draws, method="cholesky")
+        drawn = rng.multivariate_normal(
+            self.weights, self.covariance, self.settings.draws, method="cholesky"
+        )
         mean, low, high = (np.full(len(rows), np.nan) for _ in range(3))
         for part in np.array_split(np.flatnonzero(known), max(1, int(known.sum()) // 5000)):
             chances = _logistic(rows[part] @ drawn.T)
@@ -79,7 +83,9 @@ class Chances:
 
     def at(self, rows: NDArray[np.intp]) -> "Chances":
         """Of M of them, by their numbers (M,); below 0: unknown."""
-        return Chances(*(np.where(rows >= 0, each[rows], np.nan) for each in (self.mean, self.low, self.high)))
+        return Chances(
+            *(np.where(rows >= 0, each[rows], np.nan) for each in (self.mean, self.low, self.high))
+        )
 
 
 def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSettings()) -> Recall:
@@ -88,7 +94,9 @@ def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSe
     spread = np.maximum(columns.std(axis=0), settings.least_spread)
     scaled = np.clip((columns - middle) / spread, -settings.farthest, settings.farthest)
     rows = np.column_stack([np.ones(len(scaled)), scaled])
-    prior = np.diag([1 / settings.chance_sigma**2] + [1 / settings.slope_sigma**2] * columns.shape[1])
+    prior = np.diag(
+        [1 / settings.chance_sigma**2] + [1 / settings.slope_sigma**2] * columns.shape[1]
+    )
     right = found.astype(np.float64)
     weights = np.zeros(rows.shape[1])
     for _ in range(settings.steps):
@@ -100,14 +108,21 @@ def fit_recall(columns: Floats, found: Mask, settings: RecallSettings = RecallSe
             break
     chances = _logistic(rows @ weights)
     curvature = (rows * (chances * (1 - chances))[:, None]).T @ rows + prior
-    return Recall(middle, spread, weights, np.linalg.inv(curvature), len(found), int(found.sum()), settings)
+    return Recall(
+        middle, spread, weights, np.linalg.inv(curvature), len(found), int(found.sum()), settings
+    )
 
 
 def map_chances(recall: Recall | None, columns: Floats, hidden: Mask) -> Chances:
     """The chances of cells under conditions (N, K): 0 where crowns hide the ground, unknown without a regression."""
     unknown = np.full(len(columns), np.nan)
     open_ground = Chances(unknown, unknown, unknown) if recall is None else recall.of(columns)
-    return Chances(*(np.where(hidden, 0.0, each) for each in (open_ground.mean, open_ground.low, open_ground.high)))
+    return Chances(
+        *(
+            np.where(hidden, 0.0, each)
+            for each in (open_ground.mean, open_ground.low, open_ground.high)
+        )
+    )
 
 
 def held_out_chances(columns: Floats, found: Mask, parts: int = 5) -> Floats:

@@ -11,14 +11,31 @@ from sorvolo.simulation.view import Patch, cut_out, opaque
 
 _BOTH_SIDES = np.zeros(3)
 _UP = np.array([0.0, 0.0, 1.0])
-_PAINTS = np.array([
-    [222, 224, 226], [196, 200, 204], [60, 62, 66], [28, 30, 34], [150, 26, 28], [28, 62, 128], [70, 92, 78],
-    [190, 158, 60],
-], np.float64)
-_CLOTHES = np.array([
-    [200, 40, 44], [30, 60, 140], [232, 232, 226], [40, 40, 44], [226, 170, 40], [50, 120, 70],
-    [120, 70, 130],
-], np.float64)
+_PAINTS = np.array(
+    [
+        [222, 224, 226],
+        [196, 200, 204],
+        [60, 62, 66],
+        [28, 30, 34],
+        [150, 26, 28],
+        [28, 62, 128],
+        [70, 92, 78],
+        [190, 158, 60],
+    ],
+    np.float64,
+)
+_CLOTHES = np.array(
+    [
+        [200, 40, 44],
+        [30, 60, 140],
+        [232, 232, 226],
+        [40, 40, 44],
+        [226, 170, 40],
+        [50, 120, 70],
+        [120, 70, 130],
+    ],
+    np.float64,
+)
 
 
 def build_body(thing: Thing, light: Light, m_per_px: float) -> Body:
@@ -27,7 +44,11 @@ def build_body(thing: Thing, light: Light, m_per_px: float) -> Body:
     rng = np.random.default_rng([thing.seed, 7])
     to_object = Light(thing.turn.T @ light.sun, light.ambient)
     builders = {
-        Label.PERSON: _person, Label.CAR: _car, Label.SMALL: _small, Label.TREE: _tree, Label.HOUSE: _house,
+        Label.PERSON: _person,
+        Label.CAR: _car,
+        Label.SMALL: _small,
+        Label.TREE: _tree,
+        Label.HOUSE: _house,
     }
     return Body(tuple(builders[thing.label](thing, to_object, texel_m, rng)))
 
@@ -36,8 +57,13 @@ def _texels(length_m: float, texel_m: float) -> int:
     return int(np.clip(round(length_m / texel_m), 1, 2048))
 
 
-def _plain(size_m: tuple[float, float], texel_m: tuple[float, float], colour: Floats, grain: float,
-           rng: np.random.Generator) -> Floats:
+def _plain(
+    size_m: tuple[float, float],
+    texel_m: tuple[float, float],
+    colour: Floats,
+    grain: float,
+    rng: np.random.Generator,
+) -> Floats:
     """(height, width, 3) a coloured surface with a little grain, as float."""
     shape = (_texels(size_m[1], texel_m[1]), _texels(size_m[0], texel_m[0]))
     field = fractal(rng, shape, max(texel_m), (0.04, 0.15, 0.6), (0.6, 0.8, 1.0))
@@ -49,10 +75,14 @@ def _as_texture(rgb: Floats, shade: float) -> ImageRGBA:
 
 
 def _quad(a: Floats, b: Floats, c: Floats, d: Floats, texture: ImageRGBA, normal: Floats) -> Patch:
-    return Patch.spanned(np.array([a, b, c, d], np.float64), texture, np.asarray(normal, np.float64))
+    return Patch.spanned(
+        np.array([a, b, c, d], np.float64), texture, np.asarray(normal, np.float64)
+    )
 
 
-def _level(centre_m: tuple[float, float, float], size_m: tuple[float, float], texture: ImageRGBA) -> Patch:
+def _level(
+    centre_m: tuple[float, float, float], size_m: tuple[float, float], texture: ImageRGBA
+) -> Patch:
     """A level leaf, its texture's top to the left (+y) and its right forward (+x)."""
     x, y, z = centre_m
     a, b = size_m[0] / 2, size_m[1] / 2
@@ -87,11 +117,20 @@ def _rectangle(length_m: float, width_m: float, z_m: float, x_m: float = 0.0) ->
     return np.array([[x_m - a, -b, z_m], [x_m + a, -b, z_m], [x_m + a, b, z_m], [x_m - a, b, z_m]])
 
 
-def _box_walls(length_m: float, width_m: float, height_m: float, texel_m: float, colour: Floats, grain: float,
-               rng: np.random.Generator) -> list[Floats]:
+def _box_walls(
+    length_m: float,
+    width_m: float,
+    height_m: float,
+    texel_m: float,
+    colour: Floats,
+    grain: float,
+    rng: np.random.Generator,
+) -> list[Floats]:
     # walls are seen from above, foreshortened: fewer texels upwards keep them from flickering
     texels = (texel_m, 2.5 * texel_m)
-    return [_plain((side, height_m), texels, colour, grain, rng) for side in (length_m, width_m) * 2]
+    return [
+        _plain((side, height_m), texels, colour, grain, rng) for side in (length_m, width_m) * 2
+    ]
 
 
 def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
@@ -99,7 +138,10 @@ def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator
         return build_person(thing, light, texel_m, rng)
     is_lying = thing.kind == LYING
     height = thing.size_m[0 if is_lying else 2]
-    shirt, trousers = _CLOTHES[rng.integers(len(_CLOTHES))], rng.uniform(25, 90) * np.array([0.9, 0.95, 1.15])
+    shirt, trousers = (
+        _CLOTHES[rng.integers(len(_CLOTHES))],
+        rng.uniform(25, 90) * np.array([0.9, 0.95, 1.15]),
+    )
     skin, hair = (
         np.array([205.0, 160, 130]) * rng.uniform(0.55, 1.05),
         np.array([60.0, 44, 32]) * rng.uniform(0.4, 2.2),
@@ -108,7 +150,9 @@ def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator
     rows = max(6, _texels(height, texel_m if is_lying else 2.0 * texel_m))
     columns = max(4, _texels(0.5, texel_m))
     z = (1 - (np.arange(rows) + 0.5) / rows)[:, None]
-    x = np.abs((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :] * 0.25  # metres from the middle
+    x = (
+        np.abs((np.arange(columns) + 0.5) / columns * 2 - 1)[None, :] * 0.25
+    )  # metres from the middle
     half = np.select([z > 0.95, z > 0.87, z > 0.83, z > 0.5], [0.07, 0.10, 0.06, 0.22], 0.15)
     silhouette = np.clip((half - x) / (0.5 / columns) + 0.5, 0, 1).astype(np.float32)
     colour = np.where((z > 0.87)[..., None], skin, np.where((z > 0.48)[..., None], shirt, trousers))
@@ -117,7 +161,10 @@ def _person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator
         bright = np.clip(colour * light.shade(_UP), 0, 255)
         flat = cut_out(np.broadcast_to(bright, (rows, columns, 3)).astype(np.uint8), silhouette)
         rotated = np.ascontiguousarray(np.rot90(flat, -1))
-        return [_level((0.0, 0, share * thing.size_m[2]), (height, 0.5), rotated) for share in (0.3, 1.0)]
+        return [
+            _level((0.0, 0, share * thing.size_m[2]), (height, 0.5), rotated)
+            for share in (0.3, 1.0)
+        ]
     arms = _disc((0.26, 0.52), texel_m, shirt, light.shade(_UP))
     head = _disc((0.2, 0.17), texel_m, hair, light.shade(_UP))
     feet = _disc((0.3, 0.3), texel_m, trousers, 0.8)
@@ -139,27 +186,41 @@ def _car(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -
         rows, columns = wall.shape[:2]
         for at in (0.2, 0.79):  # wheels
             half = int(0.34 / length * columns)
-            wall[rows // 3:, max(0, int(at * columns) - half):int(at * columns) + half] = 26
+            wall[rows // 3 :, max(0, int(at * columns) - half) : int(at * columns) + half] = 26
     parts: list[Part] = []
     parts += _prism(
-        _rectangle(length, width, 0.18), _rectangle(length * 0.98, width * 0.96, waist), walls, light
+        _rectangle(length, width, 0.18),
+        _rectangle(length * 0.98, width * 0.96, waist),
+        walls,
+        light,
     )
     deck = _plain((length * 0.98, width * 0.96), (texel_m, texel_m), paint, 0.015, rng)
     rows, columns = deck.shape[:2]
     hood = int(0.3 * columns) if thing.kind != "van" else int(0.15 * columns)
     cv2.rectangle(
-        deck, (columns - hood, rows // 7), (columns - 2, rows - rows // 7), tuple(paint * 0.9), 1, cv2.LINE_AA
+        deck,
+        (columns - hood, rows // 7),
+        (columns - 2, rows - rows // 7),
+        tuple(paint * 0.9),
+        1,
+        cv2.LINE_AA,
     )
     deck[: rows // 6, -max(1, columns // 30) :] = deck[-(rows // 6) :, -max(1, columns // 30) :] = (
         235,
         232,
         215,
     )
-    deck[: rows // 6, : max(1, columns // 40)] = deck[-(rows // 6):, : max(1, columns // 40)] = (170, 30, 26)
+    deck[: rows // 6, : max(1, columns // 40)] = deck[-(rows // 6) :, : max(1, columns // 40)] = (
+        170,
+        30,
+        26,
+    )
     texture = _as_texture(deck, light.shade(_UP))
     a = _rectangle(length * 0.98, width * 0.96, waist)
     parts.append(_quad(a[3], a[2], a[1], a[0], texture, _UP))
-    back, front = {"hatchback": (-0.49, 0.2), "saloon": (-0.36, 0.2), "van": (-0.49, 0.36)}[thing.kind]
+    back, front = {"hatchback": (-0.49, 0.2), "saloon": (-0.36, 0.2), "van": (-0.49, 0.36)}[
+        thing.kind
+    ]
     rake = {"hatchback": (0.04, 0.14), "saloon": (0.12, 0.15), "van": (0.01, 0.1)}[thing.kind]
     cabin, roof = (front - back) * length, (front - back - sum(rake)) * length
     base = _rectangle(cabin, width * 0.9, waist, (front + back) / 2 * length)
@@ -192,7 +253,11 @@ def _small(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator)
                 (length, width),
                 _disc((length, width), texel_m, colour, light.shade(_UP)),
             ),
-            _level((0, 0, height), (0.12, 0.12), _disc((0.12, 0.12), texel_m, np.array([90.0, 88, 84]), 1.0)),
+            _level(
+                (0, 0, height),
+                (0.12, 0.12),
+                _disc((0.12, 0.12), texel_m, np.array([90.0, 88, 84]), 1.0),
+            ),
         ]
     colours = {
         "box": (178, 138, 92),
@@ -208,10 +273,14 @@ def _small(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator)
     rows, columns = lid.shape[:2]
     if "box" in thing.kind:
         tape = max(1, round(rows * 0.12))
-        lid[(rows - tape) // 2:(rows + tape) // 2 + 1] = (206, 184, 142)
+        lid[(rows - tape) // 2 : (rows + tape) // 2 + 1] = (206, 184, 142)
     elif "suitcase" in thing.kind:
-        lid[::max(2, rows // 5)] *= 0.7
-        lid[rows // 2 - rows // 8: rows // 2 + rows // 8 + 1, -max(1, columns // 8):] = (30, 30, 32)
+        lid[:: max(2, rows // 5)] *= 0.7
+        lid[rows // 2 - rows // 8 : rows // 2 + rows // 8 + 1, -max(1, columns // 8) :] = (
+            30,
+            30,
+            32,
+        )
     top = _rectangle(length * taper, width * taper, height)
     parts: list[Part] = []
     parts += _prism(_rectangle(length, width, 0.0), top, walls, light)
@@ -230,7 +299,9 @@ def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) 
     parts: list[Part] = []
     if not is_bush:
         bark = np.full(
-            (_texels(low, 2 * texel_m) + 1, max(2, _texels(0.3, texel_m)), 3), (84, 66, 50), np.uint8
+            (_texels(low, 2 * texel_m) + 1, max(2, _texels(0.3, texel_m)), 3),
+            (84, 66, 50),
+            np.uint8,
         )
         parts.append(Standing(0.0, (0.3, low * 1.3), opaque(bark)))
     side = max(6, _texels(width, texel_m))
@@ -247,10 +318,16 @@ def _tree(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) 
         alpha *= np.clip(1.35 + 0.55 * leaves - 0.5 * share, 0.25, 1)
         lit = 0.5 + 0.5 * share + 0.16 * (x * sun[0] + y * sun[1]) + 0.27 * leaves + 0.1 * lobes
         rgb = np.clip(green * np.clip(lit, 0.25, 1.7)[..., None], 0, 255)
-        sway = np.array(thing.sway_m) * (0.3 + share) if not is_bush else np.array(thing.sway_m) * share
+        sway = (
+            np.array(thing.sway_m) * (0.3 + share)
+            if not is_bush
+            else np.array(thing.sway_m) * share
+        )
         sway = thing.turn[:2, :2].T @ sway
         z = low + (height - low) * share
-        parts.append(_level((sway[0], sway[1], z), (width, width), cut_out(rgb.astype(np.uint8), alpha)))
+        parts.append(
+            _level((sway[0], sway[1], z), (width, width), cut_out(rgb.astype(np.uint8), alpha))
+        )
     return parts
 
 
@@ -280,17 +357,29 @@ def _house(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator)
         texture = cut_out(
             np.clip(gable * light.shade(normal), 0, 255).astype(np.uint8), slope.astype(np.float32)
         )
-        parts.append(_quad(
-            np.array([x, left, height]), np.array([x, -left, height]), np.array([x, -left, eaves]),
-            np.array([x, left, eaves]), texture, normal,
-        ))
-    out, drop = 0.35, 0.35 * 0.56  # the roof hangs over the walls, downhill at the pitch of 0.28 / 0.5
+        parts.append(
+            _quad(
+                np.array([x, left, height]),
+                np.array([x, -left, height]),
+                np.array([x, -left, eaves]),
+                np.array([x, left, eaves]),
+                texture,
+                normal,
+            )
+        )
+    out, drop = (
+        0.35,
+        0.35 * 0.56,
+    )  # the roof hangs over the walls, downhill at the pitch of 0.28 / 0.5
     for sign in (1.0, -1.0):
         normal = np.array([0.0, sign * 0.56, 1.0]) / np.hypot(1, 0.56)
         tiles = _roof_tiles((length + 2 * out, (width / 2 + out) * 1.146), texel_m, rng)
         end, edge = length / 2 + out, sign * (width / 2 + out)
         ridge = [np.array([-sign * end, 0.0, height]), np.array([sign * end, 0.0, height])]
-        foot = [np.array([sign * end, edge, eaves - drop]), np.array([-sign * end, edge, eaves - drop])]
+        foot = [
+            np.array([sign * end, edge, eaves - drop]),
+            np.array([-sign * end, edge, eaves - drop]),
+        ]
         # seen from above and downhill, the ridge is the texture's top
         corners = (ridge[1], ridge[0], foot[1], foot[0])
         parts.append(_quad(*corners, _as_texture(tiles, light.shade(normal)), normal))
@@ -308,16 +397,27 @@ def _roof_tiles(size_m: tuple[float, float], texel_m: float, rng: np.random.Gene
     courses = ((down % 0.36) < 0.07).reshape(rows, fine).mean(axis=1)
     tiles *= (0.84 + 0.26 * across)[None, :, None] * (1 - 0.35 * courses)[:, None, None]
     patches = cv2.resize(
-        rng.standard_normal((int(size_m[1] / 0.36) + 1, int(size_m[0] / 0.24) + 1)), (columns, rows),
+        rng.standard_normal((int(size_m[1] / 0.36) + 1, int(size_m[0] / 0.24) + 1)),
+        (columns, rows),
         interpolation=cv2.INTER_AREA if texel_m > 0.24 else cv2.INTER_NEAREST,
     )
     return tiles * (1 + 0.07 * patches[..., None])
 
 
-def _flat_roof(length: float, width: float, height: float, light: Light, texel_m: float,
-               rng: np.random.Generator) -> list[Part]:
+def _flat_roof(
+    length: float,
+    width: float,
+    height: float,
+    light: Light,
+    texel_m: float,
+    rng: np.random.Generator,
+) -> list[Part]:
     felt = _plain(
-        (length, width), (texel_m, texel_m), np.array([142.0, 140, 136]) * rng.uniform(0.7, 1.2), 0.09, rng
+        (length, width),
+        (texel_m, texel_m),
+        np.array([142.0, 140, 136]) * rng.uniform(0.7, 1.2),
+        0.09,
+        rng,
     )
     rows = felt.shape[0]
     rim = max(1, round(0.25 / texel_m))
@@ -342,12 +442,19 @@ def _flat_roof(length: float, width: float, height: float, light: Light, texel_m
         shift = np.array([x, y, 0.0])
         metal = np.array([190.0, 192, 194])
         walls = _box_walls(a, b, c, texel_m, metal * 0.85, 0.04, rng)
-        parts += _prism(_rectangle(a, b, height) + shift, _rectangle(a, b, height + c) + shift, walls, light)
+        parts += _prism(
+            _rectangle(a, b, height) + shift, _rectangle(a, b, height + c) + shift, walls, light
+        )
         lid = _plain((a, b), (texel_m, texel_m), metal, 0.03, rng)
         top = _rectangle(a, b, height + c) + shift
         fan = min(lid.shape[:2])
         cv2.circle(
-            lid, (lid.shape[1] // 2, lid.shape[0] // 2), max(1, fan // 3), (70, 72, 74), -1, cv2.LINE_AA
+            lid,
+            (lid.shape[1] // 2, lid.shape[0] // 2),
+            max(1, fan // 3),
+            (70, 72, 74),
+            -1,
+            cv2.LINE_AA,
         )
         parts.append(_quad(top[3], top[2], top[1], top[0], _as_texture(lid, light.shade(_UP)), _UP))
     return parts

@@ -112,7 +112,9 @@ class SimulatedFlight:
 
     def frame(self, index: int) -> Frame:
         """One frame; the same one whenever and in whatever order it is asked for."""
-        image = render(self.day, self.view(index), self.true_poses[index], float(self.from_middle_s[index]))
+        image = render(
+            self.day, self.view(index), self.true_poses[index], float(self.from_middle_s[index])
+        )
         image = self._as_recorded(image, index)
         return Frame(index, self.frame_name(index), int(self.frame_times_ns[index]), image)
 
@@ -135,7 +137,9 @@ class SimulatedFlight:
             return next(iter(self.observations.values()), None)
         if format_name not in self.observations:
             recorded = ", ".join(self.observations) or "none"
-            raise SettingsError(f"{self.name} recorded no {format_name} telemetry; it recorded {recorded}")
+            raise SettingsError(
+                f"{self.name} recorded no {format_name} telemetry; it recorded {recorded}"
+            )
         return self.observations[format_name]
 
     @cached_property
@@ -149,7 +153,8 @@ class SimulatedFlight:
         )
         bodies = {
             thing.id: (
-                self.day.bodies[thing.id] if today.get(thing.id) is thing
+                self.day.bodies[thing.id]
+                if today.get(thing.id) is thing
                 else build_body(thing, self.day.light, m_per_px)
             )
             for thing in first
@@ -164,7 +169,11 @@ class SimulatedFlight:
         balance = np.exp(
             [float(imaging.white_balance[0](time_s)), 0.0, float(imaging.white_balance[1](time_s))]
         )
-        shade = imaging.vignette if self.day.cloud_shade == 0 else imaging.vignette * self._cloud_light(index)
+        shade = (
+            imaging.vignette
+            if self.day.cloud_shade == 0
+            else imaging.vignette * self._cloud_light(index)
+        )
         gains = cv2.merge([shade * np.float32(gain) for gain in brightness * balance])
         exposed = cv2.multiply(image, gains, dtype=cv2.CV_32F)
         if settings.noise == 0:
@@ -173,7 +182,7 @@ class SimulatedFlight:
         height, width = image.shape[:2]
         y = rng.integers(0, imaging.noise.shape[0] - height + 1)
         x = rng.integers(0, imaging.noise.shape[1] - width + 1)
-        noisy = cv2.add(exposed, imaging.noise[y:y + height, x:x + width], dtype=cv2.CV_8U)
+        noisy = cv2.add(exposed, imaging.noise[y : y + height, x : x + width], dtype=cv2.CV_8U)
         return np.asarray(noisy, np.uint8)
 
     def _blurred(self, image: ImageRGB, index: int) -> ImageRGB:
@@ -183,10 +192,14 @@ class SimulatedFlight:
             return image
         time_s, camera = float(self.frame_times_s[index]), self.camera
         middle = np.array([[camera.cx_px, camera.cy_px]])
-        ground = apply_homography(site_from_image_homography(camera, self.true_poses[index]), middle)
+        ground = apply_homography(
+            site_from_image_homography(camera, self.true_poses[index]), middle
+        )
         point = np.column_stack([ground, [0.0]])
         begun, ended = (self.path.pose(time_s + side * exposure_s / 2) for side in (-1, 1))
-        start, end = (camera.pixels_from_points(each.inverse().apply(point))[0] for each in (begun, ended))
+        start, end = (
+            camera.pixels_from_points(each.inverse().apply(point))[0] for each in (begun, ended)
+        )
         moved = end - start
         if np.hypot(*moved) < 0.3:
             return image
@@ -196,13 +209,19 @@ class SimulatedFlight:
         """(height, width) how much light clouds leave on the ground at each pixel."""
         camera, pose = self.camera, self.true_poses[index]
         rays = np.ascontiguousarray(self.imaging.rays[::_CLOUD_STEP_PX, ::_CLOUD_STEP_PX])
-        rays = np.dstack([rays, np.ones(rays.shape[:2], np.float32)]) @ pose.rotation.T.astype(np.float32)
+        rays = np.dstack([rays, np.ones(rays.shape[:2], np.float32)]) @ pose.rotation.T.astype(
+            np.float32
+        )
         ground = pose.translation_m[:2] - rays[..., :2] / rays[..., 2:] * pose.translation_m[2]
         drift = np.array([2.2, 1.1]) * float(self.from_middle_s[index])
-        cells = ((ground - drift) / _CLOUD_CELL_M + np.array(self.imaging.clouds.shape) / 2).astype(np.float32)
+        cells = ((ground - drift) / _CLOUD_CELL_M + np.array(self.imaging.clouds.shape) / 2).astype(
+            np.float32
+        )
         thickness = remapped(self.imaging.clouds, cells, cv2.BORDER_WRAP)
         light = 1 - np.float32(self.day.cloud_shade) * np.clip(1.1 * thickness - 0.1, 0, 1)
-        grown = cv2.resize(light, (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR)
+        grown = cv2.resize(
+            light, (camera.width_px, camera.height_px), interpolation=cv2.INTER_LINEAR
+        )
         return np.asarray(grown, np.float32)
 
 
@@ -214,7 +233,8 @@ def simulate_flights(
     Raises SettingsError when the ground is an orthophoto that is missing or too small.
     """
     plans = [
-        path_of_flight(settings.path, settings.later, number) for number in range(1, settings.flights + 1)
+        path_of_flight(settings.path, settings.later, number)
+        for number in range(1, settings.flights + 1)
     ]
     world = build_world(settings, [planned_waypoints(plan) for plan in plans], orthophoto)
     for number, plan in enumerate(plans, start=1):
@@ -223,10 +243,14 @@ def simulate_flights(
         path = fly(plan, settings.motion, rng)
         day = build_day(world, settings, number, plan.height_m / own.imaging.camera.fx_px)
         imaging = _set_up(own, path, rng)
-        yield SimulatedFlight(own, number, world, day, path, imaging, _observe_all(own, path, number))
+        yield SimulatedFlight(
+            own, number, world, day, path, imaging, _observe_all(own, path, number)
+        )
 
 
-def simulate_flight(settings: SimulationSettings, orthophoto: PaintedGround | None = None) -> SimulatedFlight:
+def simulate_flight(
+    settings: SimulationSettings, orthophoto: PaintedGround | None = None
+) -> SimulatedFlight:
     """The first flight alone, for tests and benchmarks."""
     return next(simulate_flights(replace(settings, flights=1), orthophoto))
 
@@ -241,24 +265,34 @@ def has_changed(before: Thing, now: Thing | None) -> bool:
 def _frame_times_s(settings: SimulationSettings, path: FlownPath) -> Floats:
     if settings.output.photos:
         camera = settings.imaging.camera
-        step_m = (1 - settings.output.photo_overlap) * camera.height_px / camera.fy_px * path.height_m
+        step_m = (
+            (1 - settings.output.photo_overlap) * camera.height_px / camera.fy_px * path.height_m
+        )
         step_s = step_m / settings.path.speed_m_s
     else:
         step_s = 1 / settings.imaging.fps
     return np.arange(int(np.floor(path.duration_s / step_s + 1e-9)) + 1, dtype=np.float64) * step_s
 
 
-def _observe_all(settings: SimulationSettings, path: FlownPath, number: int) -> dict[str, Observation]:
+def _observe_all(
+    settings: SimulationSettings, path: FlownPath, number: int
+) -> dict[str, Observation]:
     site = LocalFrame(settings.scene.origin)
     started_ns = start_ns(settings, number)
     observations: dict[str, Observation] = {}
     if settings.output.photos and settings.output.telemetry != "none":
         rng = np.random.default_rng([settings.seed, 8, number, 99])
         times_s = _frame_times_s(settings, path)
-        observations["photos"] = observe(path, site, started_ns, settings.sensor, "photos", rng, times_s)
+        observations["photos"] = observe(
+            path, site, started_ns, settings.sensor, "photos", rng, times_s
+        )
     for format_name in settings.output.formats:
-        rng = np.random.default_rng([settings.seed, 8, number, TELEMETRY_FORMATS.index(format_name)])
-        observations[format_name] = observe(path, site, started_ns, settings.sensor, format_name, rng)
+        rng = np.random.default_rng(
+            [settings.seed, 8, number, TELEMETRY_FORMATS.index(format_name)]
+        )
+        observations[format_name] = observe(
+            path, site, started_ns, settings.sensor, format_name, rng
+        )
     return observations
 
 
@@ -268,7 +302,9 @@ def _set_up(settings: SimulationSettings, path: FlownPath, rng: np.random.Genera
     rays = ray_grid(camera)
     vignette = 1 / (1 + 0.22 * (rays**2).sum(axis=2))
     spare = 96  # each frame takes another window of one large noise picture
-    noise = rng.standard_normal((camera.height_px + spare, camera.width_px + spare, 3), dtype=np.float32)
+    noise = rng.standard_normal(
+        (camera.height_px + spare, camera.width_px + spare, 3), dtype=np.float32
+    )
     exposure = smooth_series(rng, *span, 6.0, imaging.exposure_drift)
     balance = (
         smooth_series(rng, *span, 12.0, imaging.white_balance_drift),
@@ -276,7 +312,12 @@ def _set_up(settings: SimulationSettings, path: FlownPath, rng: np.random.Genera
     )
     clouds = layer(rng, (256, 256), 4.0) + 0.35 * layer(rng, (256, 256), 1.6)
     return _Imaging(
-        rays, vignette.astype(np.float32), noise * np.float32(imaging.noise), exposure, balance, clouds
+        rays,
+        vignette.astype(np.float32),
+        noise * np.float32(imaging.noise),
+        exposure,
+        balance,
+        clouds,
     )
 
 

@@ -58,13 +58,17 @@ def frame_light(image: ImageRGB) -> FrameLight:
     blur_px2, noise = _blur_px2(grey), _noise(grey)
     if is_thermal:
         gain, level = _warmth(sample[:, 0])
-        return FrameLight(np.full(3, gain), np.full(3, level), blur_px2, noise, 0.0, is_thermal=True)
+        return FrameLight(
+            np.full(3, gain), np.full(3, level), blur_px2, noise, 0.0, is_thermal=True
+        )
     lightness = sample.mean(axis=1)
     low, middle, high = (float(each) for each in np.percentile(lightness, (1, 50, 98)))
     haze = 0.3 * max(0.0, low - 60.0)  # bare sand has no dark pixels either: rather too little
     # the usual brightness of ground and of bright things: snow does not make a coat white, nor a wood make it black;
     # one gain for all channels, since grass is green in white light
-    gain = float(np.clip(np.sqrt(max(middle - haze, 1) / 95 * max(high - haze, 1) / 200), 0.08, 1.4))
+    gain = float(
+        np.clip(np.sqrt(max(middle - haze, 1) / 95 * max(high - haze, 1) / 200), 0.08, 1.4)
+    )
     dark = float(np.percentile(lightness, 2) / max(float(np.median(lightness)), 1.0))
     shadow = float(np.clip((0.75 - dark) / 0.4, 0, 1))
     return FrameLight(np.full(3, gain), np.full(3, haze), blur_px2, noise, shadow, is_thermal=False)
@@ -85,7 +89,9 @@ def _noise(grey: _Grey) -> float:
     rows, columns = (side // _BLOCK_PX * _BLOCK_PX for side in grey.shape)
     if not rows or not columns:
         return 0.0
-    blocks = left[:rows, :columns].reshape(rows // _BLOCK_PX, _BLOCK_PX, columns // _BLOCK_PX, _BLOCK_PX)
+    blocks = left[:rows, :columns].reshape(
+        rows // _BLOCK_PX, _BLOCK_PX, columns // _BLOCK_PX, _BLOCK_PX
+    )
     rms = np.sqrt((blocks**2).mean(axis=(1, 3)))
     # the mean of three channels has less noise than each of them, by the root of three
     return float(min(np.percentile(rms, 2) / 6 * np.sqrt(3), _MOST_NOISE))
@@ -93,11 +99,15 @@ def _noise(grey: _Grey) -> float:
 
 def _blur_px2(grey: _Grey) -> Floats:
     """The covariance of a picture's blur, px2: a second blur takes less from soft edges (Zhuo and Sim 2011)."""
-    soft = np.asarray(cv2.GaussianBlur(np.asarray(grey, np.float32), (0, 0), _REBLUR_PX), np.float32)
+    soft = np.asarray(
+        cv2.GaussianBlur(np.asarray(grey, np.float32), (0, 0), _REBLUR_PX), np.float32
+    )
     x, y = _gradients(np.asarray(grey, np.float32))
     again = np.hypot(*_gradients(soft))
     strength = np.hypot(x, y)
-    is_ridge = strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8)) - 1e-3  # an edge's own line, not its slopes
+    is_ridge = (
+        strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8)) - 1e-3
+    )  # an edge's own line, not its slopes
     angle = np.arctan2(y, x) % np.pi
     ratio = np.maximum(strength / np.maximum(again, 1e-6), 1.0001)
     sigmas = np.clip(_OF_SHARPEST * _REBLUR_PX / np.sqrt(ratio**2 - 1), 0.0, _MOST_BLUR_PX)
@@ -107,7 +117,11 @@ def _blur_px2(grey: _Grey) -> Floats:
         middle = sector * np.pi / _SECTORS
         inside = np.abs((angle - middle + np.pi / 2) % np.pi - np.pi / 2) < np.pi / _SECTORS / 2
         # edges along a motion keep their strength, those across it lose it: each direction has its own strongest
-        is_edge = inside & (strength > max(float(np.quantile(strength[inside], 1 - _EDGES)), _WEAKEST)) & is_ridge
+        is_edge = (
+            inside
+            & (strength > max(float(np.quantile(strength[inside], 1 - _EDGES)), _WEAKEST))
+            & is_ridge
+        )
         own = sigmas[is_edge]
         if len(own) >= 12:
             rows.append([np.cos(middle) ** 2, np.sin(2 * middle), np.sin(middle) ** 2])
@@ -117,7 +131,9 @@ def _blur_px2(grey: _Grey) -> Floats:
         return max(sigma, _LEAST_BLUR_PX) ** 2 * np.eye(2)
     xx, xy, yy = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
     values, vectors = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
-    return np.asarray((vectors * np.clip(values, _LEAST_BLUR_PX**2, _MOST_BLUR_PX**2)) @ vectors.T, np.float64)
+    return np.asarray(
+        (vectors * np.clip(values, _LEAST_BLUR_PX**2, _MOST_BLUR_PX**2)) @ vectors.T, np.float64
+    )
 
 
 def _gradients(picture: _Grey) -> tuple[_Grey, _Grey]:

@@ -71,7 +71,9 @@ class GroundRaster:
         return replace(
             self,
             rgb=np.asarray(cv2.resize(self.rgb, size, interpolation=cv2.INTER_AREA), np.uint8),
-            vegetation=np.asarray(cv2.resize(self.vegetation, size, interpolation=cv2.INTER_AREA), np.uint8),
+            vegetation=np.asarray(
+                cv2.resize(self.vegetation, size, interpolation=cv2.INTER_AREA), np.uint8
+            ),
             m_per_px=(self.m_per_px[0] * width / new_width, self.m_per_px[1] * height / new_height),
         )
 
@@ -88,7 +90,9 @@ class Canvas:
         self.grain = np.zeros(self.coarse_shape, np.float32)
         self.vegetation = np.zeros(self.coarse_shape, np.uint8)
         self.rgb: ImageRGB = np.zeros((1, 1, 3), np.uint8)
-        rows, columns = np.mgrid[0:self.coarse_shape[0], 0:self.coarse_shape[1]].astype(np.float32)
+        rows, columns = np.mgrid[0 : self.coarse_shape[0], 0 : self.coarse_shape[1]].astype(
+            np.float32
+        )
         step = np.float32(m_per_px * _COARSE)
         self.east = area.west_m + (columns + 0.5) * step
         self.north = area.north_m - (rows + 0.5) * step
@@ -97,14 +101,27 @@ class Canvas:
     def over(cls, area: Area, m_per_px: float, rng: np.random.Generator) -> "Canvas":
         """An empty canvas over this area."""
         width_m, height_m = area.size_m
-        return cls(area, m_per_px, (int(np.ceil(width_m / m_per_px)), int(np.ceil(height_m / m_per_px))), rng)
+        return cls(
+            area,
+            m_per_px,
+            (int(np.ceil(width_m / m_per_px)), int(np.ceil(height_m / m_per_px))),
+            rng,
+        )
 
     def field(self, *scales_m: float) -> FieldF32:
         """Unit noise on the coarse raster, equal parts of these scales."""
-        return fractal(self.rng, self.coarse_shape, self.m_per_px * _COARSE, scales_m, [1.0] * len(scales_m))
+        return fractal(
+            self.rng, self.coarse_shape, self.m_per_px * _COARSE, scales_m, [1.0] * len(scales_m)
+        )
 
-    def lay(self, cover: FieldF32, colour: tuple[float, float, float], grain: float, mottle: FieldF32,
-            is_plant: bool = False) -> None:
+    def lay(
+        self,
+        cover: FieldF32,
+        colour: tuple[float, float, float],
+        grain: float,
+        mottle: FieldF32,
+        is_plant: bool = False,
+    ) -> None:
         """Cover the ground, where `cover` is 1, with a material of this colour, coarse mottle and fine grain."""
         share = np.clip(cover, 0, 1).astype(np.float32)
         material = np.array(colour, np.float32) * (1 + mottle[..., None])
@@ -113,8 +130,11 @@ class Canvas:
         plant = 255.0 if is_plant else 0.0
         self.vegetation = (self.vegetation + (plant - self.vegetation) * share).astype(np.uint8)
 
-    def develop(self, fine_scales_m: tuple[float, ...] = (0.0, 0.03, 0.07, 0.16),
-                weights: tuple[float, ...] = (0.4, 0.8, 1.0, 0.9)) -> None:
+    def develop(
+        self,
+        fine_scales_m: tuple[float, ...] = (0.0, 0.03, 0.07, 0.16),
+        weights: tuple[float, ...] = (0.4, 0.8, 1.0, 0.9),
+    ) -> None:
         """Bring the mix to the full raster and add its grain."""
         width, height = self.size_px
         scales = [max(scale, self.m_per_px) for scale in fine_scales_m]
@@ -122,11 +142,17 @@ class Canvas:
         tint = layer(self.rng, (height, width), max(0.09 / self.m_per_px, 1.5))
         self.rgb = np.empty((height, width, 3), np.uint8)
         band = 512  # rows at a time: the whole in float would fill the memory
-        wide = cv2.resize(self.colour, (width, self.coarse_shape[0]), interpolation=cv2.INTER_LINEAR)
-        wide_grain = cv2.resize(self.grain, (width, self.coarse_shape[0]), interpolation=cv2.INTER_LINEAR)
+        wide = cv2.resize(
+            self.colour, (width, self.coarse_shape[0]), interpolation=cv2.INTER_LINEAR
+        )
+        wide_grain = cv2.resize(
+            self.grain, (width, self.coarse_shape[0]), interpolation=cv2.INTER_LINEAR
+        )
         for top in range(0, height, band):
             rows = np.arange(top, min(top + band, height), dtype=np.float32)
-            source = np.clip((rows + 0.5) * self.coarse_shape[0] / height - 0.5, 0, self.coarse_shape[0] - 1)
+            source = np.clip(
+                (rows + 0.5) * self.coarse_shape[0] / height - 0.5, 0, self.coarse_shape[0] - 1
+            )
             first = source.astype(int)
             second = np.minimum(first + 1, self.coarse_shape[0] - 1)
             share = (source - first)[:, None].astype(np.float32)
@@ -142,25 +168,44 @@ class Canvas:
 
     def px(self, points_m: Floats) -> Floats:
         """(N, 2) full-raster pixels of east, north."""
-        return (np.asarray(points_m) - [self.area.west_m, self.area.north_m]) * [1, -1] / self.m_per_px - 0.5
+        return (np.asarray(points_m) - [self.area.west_m, self.area.north_m]) * [
+            1,
+            -1,
+        ] / self.m_per_px - 0.5
 
     def polygon(self, points_m: Floats, colour: Floats) -> None:
         """Fill a polygon of site metres with one colour, its edge smooth."""
-        cv2.fillPoly(self.rgb, [_shifted(self.px(points_m))], [float(c) for c in colour], cv2.LINE_AA, 4)
+        cv2.fillPoly(
+            self.rgb, [_shifted(self.px(points_m))], [float(c) for c in colour], cv2.LINE_AA, 4
+        )
 
     def stroke(self, points_m: Floats, width_m: float, colour: Floats) -> None:
         """Draw a line of site metres."""
         width = max(1, round(width_m / self.m_per_px))
         cv2.polylines(
-            self.rgb, [_shifted(self.px(points_m))], False, [float(c) for c in colour], width, cv2.LINE_AA, 4
+            self.rgb,
+            [_shifted(self.px(points_m))],
+            False,
+            [float(c) for c in colour],
+            width,
+            cv2.LINE_AA,
+            4,
         )
 
-    def stones(self, per_m2: float, sizes_m: tuple[float, float], colour: tuple[float, float, float],
-               cover: FieldF32 | None = None) -> None:
+    def stones(
+        self,
+        per_m2: float,
+        sizes_m: tuple[float, float],
+        colour: tuple[float, float, float],
+        cover: FieldF32 | None = None,
+    ) -> None:
         """Scatter stones, each with a lit face and a dark foot, more where `cover` is high."""
         width_m, height_m = self.area.size_m
         count = int(min(per_m2 * width_m * height_m, 60000))
-        x, y = self.rng.uniform(0, self.size_px[0], count), self.rng.uniform(0, self.size_px[1], count)
+        x, y = (
+            self.rng.uniform(0, self.size_px[0], count),
+            self.rng.uniform(0, self.size_px[1], count),
+        )
         radii = (
             sizes_m[0]
             * (sizes_m[1] / sizes_m[0]) ** (self.rng.uniform(0, 1, count) ** 2.2)
@@ -216,7 +261,9 @@ def distance_to_curve(
     at = np.arange(len(knots)) * scale_m + low - 2 * scale_m
     fine = np.linspace(low, high, 512)
     # smooth enough through a few averages of the piecewise line
-    curve = np.convolve(np.interp(fine, at, knots), np.hanning(41) / np.hanning(41).sum(), mode="same")
+    curve = np.convolve(
+        np.interp(fine, at, knots), np.hanning(41) / np.hanning(41).sum(), mode="same"
+    )
     bend = np.interp(along.ravel(), fine, curve).reshape(along.shape) * wander_m
     return (across - np.float32(offset_m) - bend).astype(np.float32)
 
@@ -240,11 +287,15 @@ def scatter(
         if len(chosen) >= per_m2 * width_m * height_m:
             break
     points = np.array(chosen).reshape(-1, 2)
-    places = np.column_stack([canvas.area.west_m + points[:, 0], canvas.area.north_m - points[:, 1]])
+    places = np.column_stack(
+        [canvas.area.west_m + points[:, 0], canvas.area.north_m - points[:, 1]]
+    )
     return np.column_stack([places, rng.uniform(0, 360, len(places))])
 
 
-def rectangle_cover(canvas: Canvas, west: float, south: float, east: float, north: float) -> FieldF32:
+def rectangle_cover(
+    canvas: Canvas, west: float, south: float, east: float, north: float
+) -> FieldF32:
     """1 inside an upright rectangle of site metres, 0 outside."""
     inside = np.minimum(
         np.minimum(canvas.east - west, east - canvas.east),

@@ -33,11 +33,14 @@ def layer(rng: np.random.Generator, shape: tuple[int, int], scale_px: float) -> 
     top, left = int(scale_px), int(scale_px)
     if grown.shape[0] < top + height or grown.shape[1] < left + width:
         grown = cv2.resize(grown, (left + width, top + height), interpolation=cv2.INTER_LINEAR)
-    return np.ascontiguousarray(grown[top:top + height, left:left + width]) * np.float32(1.25)
+    return np.ascontiguousarray(grown[top : top + height, left : left + width]) * np.float32(1.25)
 
 
 def fractal(
-    rng: np.random.Generator, shape: tuple[int, int], m_per_px: float, scales_m: Sequence[float],
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    m_per_px: float,
+    scales_m: Sequence[float],
     weights: Sequence[float],
 ) -> FieldF32:
     """A sum of `layer`s of these scales in metres, (height, width), brought to unit spread.
@@ -48,7 +51,9 @@ def fractal(
     for scale_m, weight in zip(scales_m, weights):
         scale_px = scale_m / m_per_px
         total += np.float32(weight * min(1.0, scale_px)) * layer(rng, shape, scale_px)
-    spread = float(np.sqrt(sum((w * min(1.0, s / m_per_px)) ** 2 for s, w in zip(scales_m, weights))))
+    spread = float(
+        np.sqrt(sum((w * min(1.0, s / m_per_px)) ** 2 for s, w in zip(scales_m, weights)))
+    )
     return total / np.float32(max(spread, 1e-9))
 
 

@@ -38,15 +38,23 @@ LYING = "lying person"
 """The kind of a person who lies on the ground: whom search teams look for."""
 
 POSES = {
-    "standing": (0.25, 0.4, 1.0), "walking": (0.5, 0.4, 1.0), "waving": (0.3, 0.5, 1.25),
-    "crouching": (0.55, 0.4, 0.6), "sitting": (0.7, 0.5, 0.55), "lying": (1.1, 0.7, 0.16),
+    "standing": (0.25, 0.4, 1.0),
+    "walking": (0.5, 0.4, 1.0),
+    "waving": (0.3, 0.5, 1.25),
+    "crouching": (0.55, 0.4, 0.6),
+    "sitting": (0.7, 0.5, 0.55),
+    "lying": (1.1, 0.7, 0.16),
 }
 """The kinds of people who are drawn limb by limb, each dressed in an own way: about how long, wide and high they are,
 as shares of their stature."""
 
 _SMALL_SIZES_M = {  # length, width, height
-    "box": (0.45, 0.35, 0.32), "big box": (0.95, 0.75, 0.7), "suitcase": (0.72, 0.48, 0.28),
-    "metal suitcase": (0.55, 0.4, 0.2), "bag": (0.6, 0.36, 0.3), "tyre": (0.66, 0.66, 0.2),
+    "box": (0.45, 0.35, 0.32),
+    "big box": (0.95, 0.75, 0.7),
+    "suitcase": (0.72, 0.48, 0.28),
+    "metal suitcase": (0.55, 0.4, 0.2),
+    "bag": (0.6, 0.36, 0.3),
+    "tyre": (0.66, 0.66, 0.2),
     "gas bottle": (0.32, 0.32, 0.62),
 }
 _CAR_SIZES_M = {"hatchback": (4.0, 1.75, 1.48), "saloon": (4.6, 1.82, 1.45), "van": (5.2, 2.0, 2.3)}
@@ -92,19 +100,28 @@ class Thing:
 
     def place_m(self, from_middle_s: float) -> Vector3:
         """Where it stands this long after the middle of the flight, (3,) in the site frame."""
-        return np.array([
-            self.east_m + self.velocity_m_s[0] * from_middle_s,
-            self.north_m + self.velocity_m_s[1] * from_middle_s, self.up_m + self.climb_m_s * from_middle_s,
-        ])
+        return np.array(
+            [
+                self.east_m + self.velocity_m_s[0] * from_middle_s,
+                self.north_m + self.velocity_m_s[1] * from_middle_s,
+                self.up_m + self.climb_m_s * from_middle_s,
+            ]
+        )
 
     def footprint_m(self, from_middle_s: float = 0.0) -> PointsM:
         """(N, 2) the outline of its base on the ground, counter-clockwise."""
         length, width, _ = self.size_m
         if self.label in (Label.PERSON, Label.TREE) or self.kind in ("tyre", "gas bottle"):
             angle = np.linspace(0, 2 * np.pi, 16, endpoint=False)
-            base = np.column_stack([np.cos(angle) * length / 2, np.sin(angle) * width / 2, np.zeros(16)])
+            base = np.column_stack(
+                [np.cos(angle) * length / 2, np.sin(angle) * width / 2, np.zeros(16)]
+            )
         else:
-            base = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [length / 2, width / 2, 0]
+            base = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [
+                length / 2,
+                width / 2,
+                0,
+            ]
         return (base @ self.turn.T + self.place_m(from_middle_s))[:, :2]
 
 
@@ -120,7 +137,11 @@ class Standing:
         """The patch as seen from `eye_m`, (4,) homogeneous."""
         away = eye_m[:2] - eye_m[3] * place_m[:2]
         length = float(np.hypot(away[0], away[1]))
-        side = np.array([-away[1], away[0], 0.0]) / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+        side = (
+            np.array([-away[1], away[0], 0.0]) / length
+            if length > 1e-6
+            else np.array([1.0, 0.0, 0.0])
+        )
         half = side * self.size_m[0] / 2
         foot = place_m + _UP * self.foot_m
         top = foot + _UP * self.size_m[1]
@@ -144,7 +165,10 @@ class Limb:
         along = (end - start) - sight * float((end - start) @ sight)
         length = float(np.linalg.norm(along))
         if length < 1e-6:  # seen along its axis: a disc
-            along, length = np.cross(sight, _UP if abs(sight[2]) < 0.9 else np.array([1.0, 0.0, 0.0])), 0.0
+            along, length = (
+                np.cross(sight, _UP if abs(sight[2]) < 0.9 else np.array([1.0, 0.0, 0.0])),
+                0.0,
+            )
         along = along / np.linalg.norm(along)
         half = np.cross(along, sight) * self.width_m / 2
         middle, reach = (start + end) / 2, along * (length + self.width_m) / 2

@@ -40,15 +40,20 @@ class FlownPath:
     def position_m(self, time_s: Floats) -> PointsM:
         """(N, 3) the camera in the site frame at these times, (N,)."""
         plan = np.asarray(self.plan(time_s))
-        return np.column_stack([
-            plan[:, 0] + self.east(time_s), plan[:, 1] + self.north(time_s), self.height_m + self.up(time_s)
-        ])
+        return np.column_stack(
+            [
+                plan[:, 0] + self.east(time_s),
+                plan[:, 1] + self.north(time_s),
+                self.height_m + self.up(time_s),
+            ]
+        )
 
     def velocity_m_s(self, time_s: Floats) -> PointsM:
         """(N, 3) the camera's velocity in the site frame."""
         half_s = 0.05
         return (
-            self.position_m(np.asarray(time_s) + half_s) - self.position_m(np.asarray(time_s) - half_s)
+            self.position_m(np.asarray(time_s) + half_s)
+            - self.position_m(np.asarray(time_s) - half_s)
         ) / (2 * half_s)
 
     def pose(self, time_s: float) -> Pose:
@@ -107,11 +112,17 @@ def fly(path: PathSettings, motion: MotionSettings, rng: np.random.Generator) ->
     heading = CubicSpline(times_s, gaussian_filter1d(heading_deg, smooth, mode="nearest"))
     span = (-LEAD_S, duration_s + LEAD_S)
     return FlownPath(
-        duration_s, plan, heading, path.height_m, motion.camera_pitch_deg,
+        duration_s,
+        plan,
+        heading,
+        path.height_m,
+        motion.camera_pitch_deg,
         east=smooth_series(rng, *span, 10.0, motion.drift_rms_m),
         north=smooth_series(rng, *span, 10.0, motion.drift_rms_m),
         up=smooth_series(rng, *span, 8.0, motion.height_rms_m),
-        roll=smooth_series(rng, *span, 1.2, motion.tilt_rms_deg if roll_rms_deg is None else roll_rms_deg),
+        roll=smooth_series(
+            rng, *span, 1.2, motion.tilt_rms_deg if roll_rms_deg is None else roll_rms_deg
+        ),
         pitch=smooth_series(rng, *span, 1.2, motion.tilt_rms_deg),
         yaw=smooth_series(rng, *span, 4.0, motion.yaw_rms_deg),
         bank=_bank(times_s, heading, path.speed_m_s, motion),
@@ -147,7 +158,9 @@ def _passed_s(
     return passed_s - passed_s[first]
 
 
-def _bank(times_s: Floats, heading: CubicSpline, speed_m_s: float, motion: MotionSettings) -> CubicSpline:
+def _bank(
+    times_s: Floats, heading: CubicSpline, speed_m_s: float, motion: MotionSettings
+) -> CubicSpline:
     """Degrees of roll, right side down, of a coordinated turn: tan(bank) = speed x turn rate / g."""
     if not motion.is_fixed_wing:
         return CubicSpline(times_s[[0, -1]], np.zeros(2))
@@ -161,7 +174,8 @@ def path_of_flight(path: PathSettings, later: LaterSettings, flight: int) -> Pat
     if flight == 1:
         return path
     return replace(
-        path, height_m=path.height_m * later.revisit.height_factor,
+        path,
+        height_m=path.height_m * later.revisit.height_factor,
         heading_deg=(path.heading_deg + later.revisit.heading_change_deg) % 360.0,
     )
 

@@ -34,13 +34,17 @@ class _Clothes:
     skirt_m: float  # how wide the legs' upper halves are dressed, 0 for trousers
 
 
-def build_person(thing: Thing, light: Light, texel_m: float, rng: np.random.Generator) -> list[Part]:
+def build_person(
+    thing: Thing, light: Light, texel_m: float, rng: np.random.Generator
+) -> list[Part]:
     """The limbs of a person of one of the POSES, lowest first, the light from above painted in.
 
     `thing.size_m` gives the stature: its height divided by the pose's share of it, or its length for one who lies.
     """
     lying = thing.kind == "lying"
-    stature_m = thing.size_m[0] / POSES[thing.kind][0] if lying else thing.size_m[2] / POSES[thing.kind][2]
+    stature_m = (
+        thing.size_m[0] / POSES[thing.kind][0] if lying else thing.size_m[2] / POSES[thing.kind][2]
+    )
     worn = _dressed(rng)
     limbs = _skeleton(thing.kind, worn, rng)
     ends = np.array([limb[0] for limb in limbs]) * stature_m / 1.75
@@ -62,11 +66,15 @@ def build_person(thing: Thing, light: Light, texel_m: float, rng: np.random.Gene
     return parts
 
 
-def _skeleton(pose: str, worn: _Clothes, rng: np.random.Generator) -> list[tuple[Floats, float, Floats]]:
+def _skeleton(
+    pose: str, worn: _Clothes, rng: np.random.Generator
+) -> list[tuple[Floats, float, Floats]]:
     """Ends (2, 3) in metres, width in metres and colour (3,) of each part, the hips at the origin."""
-    lean_deg = {"crouching": rng.uniform(10, 50), "sitting": rng.uniform(-20, 35), "walking": rng.uniform(0, 10)}.get(
-        pose, rng.normal(0, 4)
-    )
+    lean_deg = {
+        "crouching": rng.uniform(10, 50),
+        "sitting": rng.uniform(-20, 35),
+        "walking": rng.uniform(0, 10),
+    }.get(pose, rng.normal(0, 4))
     upper = _about_y(lean_deg)
     stride_deg = float(rng.uniform(12, 32)) if pose == "walking" else 0.0
     limbs: list[tuple[Floats, float, Floats]] = []
@@ -77,12 +85,19 @@ def _skeleton(pose: str, worn: _Clothes, rng: np.random.Generator) -> list[tuple
     chest, neck = upper @ np.array([0.0, 0.0, 0.48]), upper @ np.array([0.0, 0.0, 0.58])
     shoulders = np.array([upper @ np.array([0.0, y, 0.5]) for y in (-0.14, 0.14)])
     limbs += [
-        (np.array([[0.0, 0.0, 0.0], chest * 0.85]), 0.31 * float(rng.uniform(0.9, 1.3)), worn.shirt),
+        (
+            np.array([[0.0, 0.0, 0.0], chest * 0.85]),
+            0.31 * float(rng.uniform(0.9, 1.3)),
+            worn.shirt,
+        ),
         (shoulders, 0.2, worn.shirt),
     ]
     nod = upper @ _about_y(float(rng.normal(8, 12)))
     head = np.array([neck, neck + nod @ np.array([0.02, 0.0, 0.13])])
-    limbs += [(head, 0.15, worn.skin), (head + nod @ np.array([-0.02, 0.0, 0.035]), 0.17, worn.hair)]
+    limbs += [
+        (head, 0.15, worn.skin),
+        (head + nod @ np.array([-0.02, 0.0, 0.035]), 0.17, worn.hair),
+    ]
     if worn.hat is not None:
         brim = np.array([head[1] + nod @ np.array([x, 0.0, 0.06]) for x in (-0.03, 0.04)])
         limbs.append((brim, 0.22, worn.hat))
@@ -95,12 +110,17 @@ def _skeleton(pose: str, worn: _Clothes, rng: np.random.Generator) -> list[tuple
 def _leg(
     pose: str, side: float, forward_deg: float, worn: _Clothes, rng: np.random.Generator
 ) -> list[tuple[Floats, float, Floats]]:
-    splay_deg = side * float(rng.uniform(0, 28) if pose in ("sitting", "crouching", "lying") else rng.uniform(0, 7))
+    splay_deg = side * float(
+        rng.uniform(0, 28) if pose in ("sitting", "crouching", "lying") else rng.uniform(0, 7)
+    )
     thigh_deg, knee_deg = {
         "walking": (forward_deg, rng.uniform(5, 40) if forward_deg < 0 else rng.uniform(0, 12)),
         "crouching": (rng.uniform(75, 115), rng.uniform(110, 145)),
         "sitting": (rng.uniform(75, 120), rng.uniform(0, 110)),
-        "lying": (rng.choice((0.0, 1.0)) * rng.uniform(0, 50), rng.choice((0.0, 1.0)) * rng.uniform(0, 80)),
+        "lying": (
+            rng.choice((0.0, 1.0)) * rng.uniform(0, 50),
+            rng.choice((0.0, 1.0)) * rng.uniform(0, 80),
+        ),
     }.get(pose, (rng.normal(0, 5), rng.uniform(0, 8)))
     hip = np.array([0.0, 0.09 * side, 0.0])
     knee = hip + 0.44 * _swung(float(thigh_deg), splay_deg)
@@ -108,13 +128,19 @@ def _leg(
     toes = ankle + np.array([0.17, 0.03 * side, -0.02])
     thigh = max(0.165, worn.skirt_m)
     return [
-        (np.array([ankle, toes]), 0.095, worn.shoe), (np.array([knee, ankle]), 0.115, worn.shin),
+        (np.array([ankle, toes]), 0.095, worn.shoe),
+        (np.array([knee, ankle]), 0.115, worn.shin),
         (np.array([hip, knee]), thigh, worn.thigh),
     ]
 
 
 def _arm(
-    pose: str, side: float, forward_deg: float, upper: Matrix3, worn: _Clothes, rng: np.random.Generator
+    pose: str,
+    side: float,
+    forward_deg: float,
+    upper: Matrix3,
+    worn: _Clothes,
+    rng: np.random.Generator,
 ) -> list[tuple[Floats, float, Floats]]:
     out_deg, bend_deg = side * float(rng.uniform(2, 22)), float(rng.uniform(0, 70))
     swing_deg = forward_deg + float(rng.normal(0, 10))
@@ -131,7 +157,8 @@ def _arm(
     joints = np.array([shoulder, elbow, hand]) @ upper.T
     wrist = joints[1] + 0.8 * (joints[2] - joints[1])
     return [
-        (np.array([wrist, joints[2]]), 0.08, worn.skin), (np.array([joints[1], wrist]), 0.09, worn.forearm),
+        (np.array([wrist, joints[2]]), 0.08, worn.skin),
+        (np.array([joints[1], wrist]), 0.09, worn.forearm),
         (joints[:2], 0.115, worn.sleeve),
     ]
 
@@ -163,8 +190,16 @@ def _dressed(rng: np.random.Generator) -> _Clothes:
     if rng.uniform() < 0.07:  # a dress or a long coat
         thigh = shirt
     return _Clothes(
-        shirt, sleeve, forearm, thigh, shin, np.array([1.0, 1, 1]) * rng.choice((30.0, 60.0, 200.0)), hair, skin,
-        _cloth(rng) if rng.uniform() < 0.25 else None, _cloth(rng) if rng.uniform() < 0.2 else None,
+        shirt,
+        sleeve,
+        forearm,
+        thigh,
+        shin,
+        np.array([1.0, 1, 1]) * rng.choice((30.0, 60.0, 200.0)),
+        hair,
+        skin,
+        _cloth(rng) if rng.uniform() < 0.25 else None,
+        _cloth(rng) if rng.uniform() < 0.2 else None,
         float(rng.uniform(0.22, 0.34)) if rng.uniform() < 0.08 else 0.0,
     )
 
@@ -175,8 +210,10 @@ def _cloth(rng: np.random.Generator) -> Floats:
     if kind < 0.5:
         grey = rng.choice((rng.uniform(18, 70), rng.uniform(70, 170), rng.uniform(190, 240)))
         return np.clip(grey + rng.normal(0, 5, 3), 5, 250)
-    saturation, value = (rng.uniform(0.12, 0.5), rng.uniform(0.2, 0.85)) if kind < 0.8 else (
-        rng.uniform(0.6, 1.0), rng.uniform(0.4, 0.95)
+    saturation, value = (
+        (rng.uniform(0.12, 0.5), rng.uniform(0.2, 0.85))
+        if kind < 0.8
+        else (rng.uniform(0.6, 1.0), rng.uniform(0.4, 0.95))
     )
     hsv = np.array([[[rng.uniform(0, 360), saturation, value]]], np.float32)
     return 255.0 * cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0].astype(np.float64)
@@ -192,16 +229,24 @@ def _legwear(rng: np.random.Generator) -> Floats:
     return _cloth(rng)
 
 
-def _sleeve(ends_m: Floats, width_m: float, colour: Floats, texel_m: float, rng: np.random.Generator) -> ImageRGBA:
+def _sleeve(
+    ends_m: Floats, width_m: float, colour: Floats, texel_m: float, rng: np.random.Generator
+) -> ImageRGBA:
     """A limb's texture, darker to its sides, with round ends and a little grain; faint if below a texel."""
     length_m = float(np.linalg.norm(ends_m[1] - ends_m[0])) + width_m
     drawn_m = max(width_m, 1.2 * texel_m)
     rows, columns = (int(np.clip(round(2 * size / texel_m), 5, 96)) for size in (length_m, drawn_m))
     y, x = np.mgrid[0:rows, 0:columns]
     x, y = np.abs((x + 0.5) / columns * 2 - 1), np.abs((y + 0.5) / rows * 2 - 1)
-    round_share = min(1.0, drawn_m / max(length_m, drawn_m))  # of the half length that the round end takes
+    round_share = min(
+        1.0, drawn_m / max(length_m, drawn_m)
+    )  # of the half length that the round end takes
     y = np.clip((y - (1 - round_share)) / round_share, 0, 1)
     radius = np.hypot(x, y)
     alpha = np.clip((1 - radius) * columns / 2 + 0.5, 0, 1) * min(1.0, width_m / drawn_m)
-    lit = colour * (1.06 - 0.24 * (x**2)[..., None]) * (1 + 0.05 * rng.standard_normal((rows, columns, 1)))
+    lit = (
+        colour
+        * (1.06 - 0.24 * (x**2)[..., None])
+        * (1 + 0.05 * rng.standard_normal((rows, columns, 1)))
+    )
     return cut_out(np.clip(lit, 0, 255).astype(np.uint8), alpha.astype(np.float32))

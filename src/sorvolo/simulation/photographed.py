@@ -15,7 +15,9 @@ def photographed(image: ImageRGB, gains: Floats, rng: np.random.Generator) -> Im
     """
     height, width = image.shape[:2]
     light = image.astype(np.float32) * gains.astype(np.float32)
-    light *= 1 + 0.12 * np.clip(layer(rng, (height, width), 0.4 * width), -2, 2)[..., None]  # clouds' shadows
+    light *= (
+        1 + 0.12 * np.clip(layer(rng, (height, width), 0.4 * width), -2, 2)[..., None]
+    )  # clouds' shadows
     if rng.uniform() < 0.2:
         air = rng.uniform(170, 230) * np.array([0.96, 1.0, 1.05]) * gains
         haze = np.float32(rng.uniform(0.05, 0.4))
@@ -40,9 +42,9 @@ def recompressed(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
     return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])  # type: ignore[index]
 
 
-def _blurred(image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], rng: np.random.Generator) -> np.ndarray[
-    tuple[int, ...], np.dtype[np.float32]
-]:
+def _blurred(
+    image: np.ndarray[tuple[int, ...], np.dtype[np.float32]], rng: np.random.Generator
+) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
     """Out of focus a little, and in a third of the pictures moved during the exposure."""
     sigma_px = rng.uniform(0.0, 1.1)
     if sigma_px > 0.3:

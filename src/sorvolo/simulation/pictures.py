@@ -58,10 +58,14 @@ class PictureSettings:
                 f"unknown ground {self.ground!r}; choose {', '.join(GroundKind)}, or an orthophoto's file"
             )
         for name, value, low, high in (
-            ("pictures", self.pictures, 1, 10**6), ("seed", self.seed, 0, 2**62),
-            ("thermal_share", self.thermal_share, 0, 1), ("empty_share", self.empty_share, 0, 1),
-            ("m_per_px", self.m_per_px[0], 0.004, self.m_per_px[1]), ("m_per_px", self.m_per_px[1], 0.004, 0.5),
-            ("height_m", self.height_m[0], 4, self.height_m[1]), ("height_m", self.height_m[1], 4, 500),
+            ("pictures", self.pictures, 1, 10**6),
+            ("seed", self.seed, 0, 2**62),
+            ("thermal_share", self.thermal_share, 0, 1),
+            ("empty_share", self.empty_share, 0, 1),
+            ("m_per_px", self.m_per_px[0], 0.004, self.m_per_px[1]),
+            ("m_per_px", self.m_per_px[1], 0.004, 0.5),
+            ("height_m", self.height_m[0], 4, self.height_m[1]),
+            ("height_m", self.height_m[1], 4, 500),
             ("tilt_deg", self.tilt_deg, 0, 45),
         ):
             if not low <= value <= high:
@@ -93,7 +97,9 @@ def simulate_picture(
     Raises SettingsError when the ground is an orthophoto that is missing or too small for any of the heights.
     """
     if (settings.ground == "orthophoto") != (orthophoto is not None):
-        raise SettingsError("an orthophoto was asked for but none given, or given but not asked for")
+        raise SettingsError(
+            "an orthophoto was asked for but none given, or given but not asked for"
+        )
     rng = np.random.default_rng([settings.seed, 20, index])
     is_thermal = bool(rng.uniform() < settings.thermal_share)
     largest_m = None if orthophoto is None else min(orthophoto.raster.area.size_m)
@@ -131,13 +137,21 @@ def _new_shot(
 ) -> tuple[Camera, Pose]:
     """A camera without distortion somewhere above the site's origin; `largest_m` bounds the ground that it needs."""
     for _ in range(2000):
-        width_px, height_px = _THERMAL_SIZE_PX if is_thermal else _SIZES_PX[rng.integers(len(_SIZES_PX))]
+        width_px, height_px = (
+            _THERMAL_SIZE_PX if is_thermal else _SIZES_PX[rng.integers(len(_SIZES_PX))]
+        )
         camera = Camera.from_angle_of_view(width_px, height_px, float(rng.uniform(30, 84)))
         m_per_px = float(np.exp(rng.uniform(*np.log(settings.m_per_px))))
-        pitch_deg = float(abs(rng.normal(0, 5)) if rng.uniform() < 0.55 else rng.uniform(0.2, 1.0) * settings.tilt_deg)
+        pitch_deg = float(
+            abs(rng.normal(0, 5))
+            if rng.uniform() < 0.55
+            else rng.uniform(0.2, 1.0) * settings.tilt_deg
+        )
         pitch_deg = min(pitch_deg, settings.tilt_deg)
         height_m = m_per_px * camera.fx_px * float(np.cos(np.radians(pitch_deg)))
-        rotation = site_from_body_nadir_rotation(float(rng.uniform(0, 360)), pitch_deg, float(rng.normal(0, 2)))
+        rotation = site_from_body_nadir_rotation(
+            float(rng.uniform(0, 360)), pitch_deg, float(rng.normal(0, 2))
+        )
         pose = Pose(rotation, np.array([0.0, 0.0, height_m]))
         down = -(camera.rays_from_pixels(camera.corners_px) @ rotation.T)[:, 2]
         lengths = np.linalg.norm(camera.rays_from_pixels(camera.corners_px), axis=1)
@@ -147,7 +161,11 @@ def _new_shot(
             continue
         if largest_m is None or max(_needed_area(camera, pose).size_m) < largest_m:
             return camera, pose
-    bound = "" if largest_m is None else f", nor any that sees no more than {largest_m:.0f} m of the orthophoto"
+    bound = (
+        ""
+        if largest_m is None
+        else f", nor any that sees no more than {largest_m:.0f} m of the orthophoto"
+    )
     raise SettingsError(
         f"no camera sees the ground at {settings.m_per_px[0]:g} to {settings.m_per_px[1]:g} m per pixel from"
         f" {settings.height_m[0]:g} to {settings.height_m[1]:g} m{bound}; widen one of them"
@@ -172,19 +190,28 @@ def _cut(orthophoto: PaintedGround, area: Area, rng: np.random.Generator) -> Pai
     left = int(rng.integers(max(1, raster.rgb.shape[1] - columns)))
     top = int(rng.integers(max(1, raster.rgb.shape[0] - rows)))
     window = slice(top, top + rows), slice(left, left + columns)
-    piece = GroundRaster(raster.rgb[window], raster.vegetation[window], area.west_m, area.north_m, raster.m_per_px)
+    piece = GroundRaster(
+        raster.rgb[window], raster.vegetation[window], area.west_m, area.north_m, raster.m_per_px
+    )
     return PaintedGround(piece, orthophoto.layout)
 
 
-def _new_day(ground: GroundRaster, things: tuple[Thing, ...], m_per_px: float, rng: np.random.Generator) -> Day:
+def _new_day(
+    ground: GroundRaster, things: tuple[Thing, ...], m_per_px: float, rng: np.random.Generator
+) -> Day:
     """The site under a light of its own: mostly day, sometimes dusk, street lamps or snow."""
     sky = rng.uniform()
     weather = WeatherSettings(
-        has_clouds=False, wind_m=0.0,
-        brightness=float(rng.uniform(0.05, 0.12) if sky < 0.05 else rng.uniform(0.2, 0.6) if sky < 0.15 else 1.0),
+        has_clouds=False,
+        wind_m=0.0,
+        brightness=float(
+            rng.uniform(0.05, 0.12) if sky < 0.05 else rng.uniform(0.2, 0.6) if sky < 0.15 else 1.0
+        ),
         snow=float(rng.uniform(0.3, 1.0)) if rng.uniform() < 0.05 else 0.0,
     )
-    settings = SimulationSettings(seed=int(rng.integers(2**31)), later=LaterSettings(weather=weather))
+    settings = SimulationSettings(
+        seed=int(rng.integers(2**31)), later=LaterSettings(weather=weather)
+    )
     return build_day(World(ground, (things, things)), settings, 2, m_per_px)
 
 
@@ -196,7 +223,8 @@ def _targets(
     counts = {
         label: int(min(rng.poisson(rng.choice(means)), ground_m2 / room_m2))
         for label, means, room_m2 in (
-            (Label.PERSON, (0.5, 3.0, 9.0), 10.0), (Label.CAR, (0.2, 2.0, 8.0), 45.0),
+            (Label.PERSON, (0.5, 3.0, 9.0), 10.0),
+            (Label.CAR, (0.2, 2.0, 8.0), 45.0),
             (Label.SMALL, (0.5, 2.0, 6.0), 6.0),
         )
     }
@@ -206,7 +234,14 @@ def _targets(
             kind = _person(rng) if label is Label.PERSON else new_kind(label, rng)
             size_m = new_size(label, kind, rng)
             new = Thing(
-                len(others) + len(placed) + 1, label, kind, 0.0, 0.0, 0.0, size_m, int(rng.integers(2**31))
+                len(others) + len(placed) + 1,
+                label,
+                kind,
+                0.0,
+                0.0,
+                0.0,
+                size_m,
+                int(rng.integers(2**31)),
             )
             for _ in range(20):
                 east, north, yaw_deg = _place(label, placed, layout, camera, pose, rng)
@@ -225,7 +260,12 @@ def _person(rng: np.random.Generator) -> str:
 
 
 def _place(
-    label: Label, placed: list[Thing], layout: Layout, camera: Camera, pose: Pose, rng: np.random.Generator
+    label: Label,
+    placed: list[Thing],
+    layout: Layout,
+    camera: Camera,
+    pose: Pose,
+    rng: np.random.Generator,
 ) -> tuple[float, float, float]:
     """East, north and yaw of a likely place: anywhere in the picture, on a parking lot, or beside another thing."""
     if label is Label.CAR and len(layout.parkings) and rng.uniform() < 0.6:
@@ -235,7 +275,11 @@ def _place(
         near = placed[int(rng.integers(len(placed)))]
         if label is Label.CAR and near.label is Label.CAR:  # parked side by side
             side_m = near.turn[:2, 1] * float(rng.choice((-1, 1)) * rng.uniform(3.2, 4.0))
-            return near.east_m + side_m[0], near.north_m + side_m[1], near.yaw_deg + float(rng.normal(0, 2))
+            return (
+                near.east_m + side_m[0],
+                near.north_m + side_m[1],
+                near.yaw_deg + float(rng.normal(0, 2)),
+            )
         angle, reach_m = rng.uniform(0, 2 * np.pi), near.reach_m + rng.uniform(0.8, 3.0)
         east, north = near.east_m + reach_m * np.cos(angle), near.north_m + reach_m * np.sin(angle)
         return float(east), float(north), float(rng.uniform(0, 360))

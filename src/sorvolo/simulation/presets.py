@@ -136,7 +136,11 @@ def _from_row(name: str, row: _Row) -> SimulationSettings:
         # the phantom's stated accuracy: 1.5 m level, 0.5 m in height (section 2.2)
         sensor=SensorSettings(noise_m=(0.3, 0.3, 0.2), wander_m=1.0),
         later=LaterSettings(
-            people=row.objects[0], cars=row.objects[1], small_objects=row.objects[2], removed=0, moved=0
+            people=row.objects[0],
+            cars=row.objects[1],
+            small_objects=row.objects[2],
+            removed=0,
+            moved=0,
         ),
         output=OutputSettings(telemetry=row.telemetry),
     )
@@ -154,7 +158,8 @@ def _demo() -> SimulationSettings:
 
 def _survey(ground: str, name: str) -> SimulationSettings:
     return SimulationSettings(
-        preset=name, flights=1,
+        preset=name,
+        flights=1,
         scene=SceneSettings(ground),
         # 40 m and 62 degrees give 0.05 m a pixel; five strips at 70 % overlap along, 60 % across
         path=PathSettings(height_m=40, speed_m_s=8, length_m=104, strips=5, strip_spacing_m=19),
@@ -166,13 +171,22 @@ def _survey(ground: str, name: str) -> SimulationSettings:
 def _fixed_wing() -> SimulationSettings:
     """A survey by a small flying wing: 60 % overlap, gusts that roll it by 15 degrees, wind across, poor light."""
     return SimulationSettings(
-        preset="fixed-wing", flights=1,
+        preset="fixed-wing",
+        flights=1,
         scene=SceneSettings("countryside"),
         # 65 m and 72 degrees give 0.06 m a pixel; strips at 60 % overlap both ways
-        path=PathSettings(height_m=65, speed_m_s=13, length_m=260, strips=4, strip_spacing_m=38, heading_deg=60),
+        path=PathSettings(
+            height_m=65, speed_m_s=13, length_m=260, strips=4, strip_spacing_m=38, heading_deg=60
+        ),
         motion=MotionSettings(
-            tilt_rms_deg=3.0, yaw_rms_deg=3.0, height_rms_m=3.0, drift_rms_m=2.0, roll_rms_deg=6.0, is_fixed_wing=True,
-            wind_m_s=5.0, wind_from_deg=300.0,
+            tilt_rms_deg=3.0,
+            yaw_rms_deg=3.0,
+            height_rms_m=3.0,
+            drift_rms_m=2.0,
+            roll_rms_deg=6.0,
+            is_fixed_wing=True,
+            wind_m_s=5.0,
+            wind_from_deg=300.0,
         ),
         imaging=ImagingSettings(1600, 1200, 72.0, fps=5, exposure_s=1 / 400),
         sensor=SensorSettings(noise_m=(1.0, 1.0, 1.5), wander_m=1.0, attitude_noise_deg=2.0),
@@ -180,7 +194,9 @@ def _fixed_wing() -> SimulationSettings:
     )
 
 
-def _compare(name: str, ground: str = "countryside", later: LaterSettings | None = None) -> SimulationSettings:
+def _compare(
+    name: str, ground: str = "countryside", later: LaterSettings | None = None
+) -> SimulationSettings:
     """Two short video flights over the same path: things added, taken away, moved and moving, in other weather."""
     return SimulationSettings(
         preset=name,
@@ -210,7 +226,9 @@ def _compare_photos(name: str, ground: str = "countryside") -> SimulationSetting
 
 def _compare_none(name: str) -> SimulationSettings:
     """The flights of `compare` with nothing changed but light, clouds and wind: whatever is found is false."""
-    settings = _compare(name, later=LaterSettings(people=0, cars=0, small_objects=0, removed=0, moved=0))
+    settings = _compare(
+        name, later=LaterSettings(people=0, cars=0, small_objects=0, removed=0, moved=0)
+    )
     return replace(settings, scene=replace(settings.scene, moving_share=0.0))
 
 
@@ -220,7 +238,9 @@ def _compare_unlike(
     """The flights of `compare`, shorter, the second one in a way that makes comparing hard or impossible."""
     settings = _compare(name, later=replace(_COMPARE_LATER, weather=weather, revisit=revisit))
     return replace(
-        settings, path=replace(settings.path, length_m=25), imaging=replace(settings.imaging, fps=10),
+        settings,
+        path=replace(settings.path, length_m=25),
+        imaging=replace(settings.imaging, fps=10),
         output=replace(settings.output, truth_step=2),
     )
 
@@ -237,13 +257,25 @@ _GENERAL: Mapping[str, Callable[[], SimulationSettings]] = {
     "compare-dirt": lambda: _compare("compare-dirt", "dirt"),
     "compare-photos": lambda: _compare_photos("compare-photos"),
     "compare-none": lambda: _compare_none("compare-none"),
-    "compare-higher": lambda: _compare_unlike("compare-higher", revisit=RevisitSettings(height_factor=1.5)),
-    "compare-across": lambda: _compare_unlike("compare-across", revisit=RevisitSettings(heading_change_deg=90)),
-    "compare-back": lambda: _compare_unlike("compare-back", revisit=RevisitSettings(heading_change_deg=180)),
+    "compare-higher": lambda: _compare_unlike(
+        "compare-higher", revisit=RevisitSettings(height_factor=1.5)
+    ),
+    "compare-across": lambda: _compare_unlike(
+        "compare-across", revisit=RevisitSettings(heading_change_deg=90)
+    ),
+    "compare-back": lambda: _compare_unlike(
+        "compare-back", revisit=RevisitSettings(heading_change_deg=180)
+    ),
     "compare-camera": lambda: _compare_unlike(
         "compare-camera",
-        revisit=RevisitSettings(imaging=ImagingSettings(1920, 1080, 74.0, (-0.02, 0.01, 0.0, 0.0, 0.0), fps=10)),
+        revisit=RevisitSettings(
+            imaging=ImagingSettings(1920, 1080, 74.0, (-0.02, 0.01, 0.0, 0.0, 0.0), fps=10)
+        ),
     ),
-    "compare-night": lambda: _compare_unlike("compare-night", WeatherSettings(has_clouds=False, brightness=0.06)),
-    "compare-snow": lambda: _compare_unlike("compare-snow", WeatherSettings(has_clouds=False, snow=1.0)),
+    "compare-night": lambda: _compare_unlike(
+        "compare-night", WeatherSettings(has_clouds=False, brightness=0.06)
+    ),
+    "compare-snow": lambda: _compare_unlike(
+        "compare-snow", WeatherSettings(has_clouds=False, snow=1.0)
+    ),
 }

@@ -10,7 +10,10 @@ from sorvolo.simulation.ground_painting import Area
 from sorvolo.simulation.view import View
 
 _WAVES = 5  # that are summed to hills
-_SHORTEST, _LONGEST = 2.5, 5.0  # lengths of the waves, in heights of the flight: hills that a survey flies over
+_SHORTEST, _LONGEST = (
+    2.5,
+    5.0,
+)  # lengths of the waves, in heights of the flight: hills that a survey flies over
 _COARSE_PX = 4  # the hills are smooth: rays are followed on a coarse grid of the picture
 _MOST_STEPS = 200  # of following a ray down
 _NEAR_M = 1e-4  # to the ground: the ray has arrived
@@ -29,7 +32,9 @@ class Relief:
     middle_m: float = 0.0
 
     @classmethod
-    def hills(cls, relief_m: float, flight_m: float, area: Area, rng: np.random.Generator) -> "Relief":
+    def hills(
+        cls, relief_m: float, flight_m: float, area: Area, rng: np.random.Generator
+    ) -> "Relief":
         """Hills of `relief_m` from the lowest to the highest ground of an area, half of it above height 0."""
         if not relief_m:
             return LEVEL
@@ -38,10 +43,15 @@ class Relief:
         heading = rng.uniform(0, np.pi, count)
         turns = 2 * np.pi / lengths[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
         raw = cls(turns, rng.uniform(0, 2 * np.pi, count), rng.uniform(0.5, 1.0, count))
-        east, north = np.linspace(area.west_m, area.east_m, 64), np.linspace(area.south_m, area.north_m, 64)
+        east, north = (
+            np.linspace(area.west_m, area.east_m, 64),
+            np.linspace(area.south_m, area.north_m, 64),
+        )
         up = raw.up_m(np.dstack(np.meshgrid(east, north)))
         scale = relief_m / np.ptp(up)
-        return cls(turns, raw.phases, scale * raw.heights_m, -scale * float(up.min() + up.max()) / 2)
+        return cls(
+            turns, raw.phases, scale * raw.heights_m, -scale * float(up.min() + up.max()) / 2
+        )
 
     @property
     def is_level(self) -> bool:
@@ -85,9 +95,13 @@ class Relief:
     def seen(self, view: View) -> Floats32:
         """(height, width, 2) east and north of the ground at each pixel of a camera's view, far off at the horizon."""
         height, width = view.camera.height_px, view.camera.width_px
-        columns, rows = (np.append(np.arange(0, side - 1, _COARSE_PX), side - 1) for side in (width, height))
+        columns, rows = (
+            np.append(np.arange(0, side - 1, _COARSE_PX), side - 1) for side in (width, height)
+        )
         rays = view.rays_in((0, 0, width, height))[np.ix_(rows, columns)]
-        rays = np.dstack([rays, np.ones(rays.shape[:2])]) @ np.linalg.inv(view.ray_from_site[:, :3]).T
+        rays = (
+            np.dstack([rays, np.ones(rays.shape[:2])]) @ np.linalg.inv(view.ray_from_site[:, :3]).T
+        )
         met_m = np.nan_to_num(self.met(view.eye_m[:3], rays)[..., :2], nan=1e6).astype(np.float32)
         x, y = (
             np.interp(np.arange(side), at, np.arange(len(at))).astype(np.float32)

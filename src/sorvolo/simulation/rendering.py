@@ -20,7 +20,11 @@ Labels = NDArray[np.int32]
 
 def render(day: Day, view: View, site_from_camera: Pose, from_middle_s: float) -> ImageRGB:
     """The picture before the camera's own faults, this long after the middle of the flight."""
-    image = render_ground(day.ground, view) if day.relief.is_level else render_hills(day.ground, day.relief, view)
+    image = (
+        render_ground(day.ground, view)
+        if day.relief.is_level
+        else render_hills(day.ground, day.relief, view)
+    )
     seen = _in_sight(day.things, view, site_from_camera, from_middle_s)
     patches = [
         day.shadows[thing.id].moved(np.eye(3), thing.place_m(from_middle_s))
@@ -49,7 +53,9 @@ def render_ground(ground: GroundRaster, view: View) -> ImageRGB:
     x0, y0 = np.clip(np.floor(reach.min(axis=0)) - 2, 0, [columns - 2, rows - 2]).astype(int)
     x1, y1 = np.clip(np.ceil(reach.max(axis=0)) + 3, [x0 + 2, y0 + 2], [columns, rows]).astype(int)
     shift = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
-    where = cv2.perspectiveTransform(np.ascontiguousarray(rays).reshape(-1, 1, 2), shift @ raster_from_ray)
+    where = cv2.perspectiveTransform(
+        np.ascontiguousarray(rays).reshape(-1, 1, 2), shift @ raster_from_ray
+    )
     return remapped(ground.rgb[y0:y1, x0:x1], where.reshape(height, width, 2), cv2.BORDER_REPLICATE)
 
 
@@ -62,7 +68,11 @@ def render_hills(ground: GroundRaster, relief: Relief, view: View) -> ImageRGB:
     # only this window is handed on: remap takes no picture of more than 32767 pixels a side
     low = np.clip(np.floor(where.min(axis=(0, 1))) - 2, 0, [columns - 2, rows - 2]).astype(int)
     high = np.clip(np.ceil(where.max(axis=(0, 1))) + 3, low + 2, [columns, rows]).astype(int)
-    return remapped(ground.rgb[low[1]:high[1], low[0]:high[0]], where - low.astype(np.float32), cv2.BORDER_REPLICATE)
+    return remapped(
+        ground.rgb[low[1] : high[1], low[0] : high[0]],
+        where - low.astype(np.float32),
+        cv2.BORDER_REPLICATE,
+    )
 
 
 def render_labels(
@@ -115,9 +125,13 @@ def _in_sight(
     near = ((middles_px > -reach_px) & (middles_px < size + reach_px)).all(axis=1)
     nearest = [
         (_distance_to_outline(thing.footprint_m(from_middle_s), eye_m[:2]), thing)
-        for thing, keep in zip(things, near) if keep
+        for thing, keep in zip(things, near)
+        if keep
     ]
-    return [thing for _, thing in sorted(nearest, key=lambda pair: (-pair[0], pair[1].size_m[2], pair[1].id))]
+    return [
+        thing
+        for _, thing in sorted(nearest, key=lambda pair: (-pair[0], pair[1].size_m[2], pair[1].id))
+    ]
 
 
 def _distance_to_outline(outline_m: Floats, point_m: Floats) -> float:

@@ -76,7 +76,9 @@ class MotionSettings:
     drift_rms_m: float = 0.4  # east and north each, wind over ten seconds
     camera_pitch_deg: float = -90.0  # -90 looks straight down
     roll_rms_deg: float | None = None  # of roll alone; None: as tilt_rms_deg
-    is_fixed_wing: bool = False  # banks into turns, and keeps its speed through the air instead of over the ground
+    is_fixed_wing: bool = (
+        False  # banks into turns, and keeps its speed through the air instead of over the ground
+    )
     wind_m_s: float = 0.0  # of a fixed wing: it is carried along and turns its nose into the wind
     wind_from_deg: float = 0.0  # clockwise from north
 
@@ -84,7 +86,9 @@ class MotionSettings:
         _demand("roll_rms_deg", self.roll_rms_deg or 0.0, 0, 15)
         _demand("wind_m_s", self.wind_m_s, 0, 20)
         if self.wind_m_s and not self.is_fixed_wing:
-            raise SettingsError("wind_m_s carries fixed wings only; a rotor drone's drift is drift_rms_m")
+            raise SettingsError(
+                "wind_m_s carries fixed wings only; a rotor drone's drift is drift_rms_m"
+            )
         _demand("tilt_rms_deg", self.tilt_rms_deg, 0, 15)
         _demand("height_rms_m", self.height_rms_m, 0, 50)
         _demand("drift_rms_m", self.drift_rms_m, 0, 50)
@@ -115,7 +119,9 @@ class ImagingSettings:
         _demand("width_px", self.width_px, 64, 8192)
         _demand("height_px", self.height_px, 64, 8192)
         if self.width_px % 2 or self.height_px % 2:
-            raise SettingsError(f"H.264 needs an even picture size, got {self.width_px}x{self.height_px}")
+            raise SettingsError(
+                f"H.264 needs an even picture size, got {self.width_px}x{self.height_px}"
+            )
         _demand("angle_of_view_deg", self.angle_of_view_deg, 10, 120)
         _demand("fps", self.fps, 0.2, 120)
         _demand("exposure_s", self.exposure_s, 0, 0.1)
@@ -127,8 +133,13 @@ class ImagingSettings:
         ideal = Camera.from_angle_of_view(self.width_px, self.height_px, self.angle_of_view_deg)
         shift = self.width_px / 960
         return Camera(
-            self.width_px, self.height_px, ideal.fx_px, ideal.fy_px, ideal.cx_px + 3.0 * shift,
-            ideal.cy_px - 2.0 * shift, np.array(self.distortion),
+            self.width_px,
+            self.height_px,
+            ideal.fx_px,
+            ideal.fy_px,
+            ideal.cx_px + 3.0 * shift,
+            ideal.cy_px - 2.0 * shift,
+            np.array(self.distortion),
         )
 
 
@@ -152,7 +163,9 @@ class SensorSettings:
             _demand("rate_hz", self.rate_hz, 0.1, 200)
         _demand("noise_m", min(self.noise_m), 0, 1000)
         _demand("clock_offset_s", self.clock_offset_s, -3, 3)
-        _demand("faults", min(self.gaps, self.jumps, self.zero_fixes, self.bad_checksums), 0, 100000)
+        _demand(
+            "faults", min(self.gaps, self.jumps, self.zero_fixes, self.bad_checksums), 0, 100000
+        )
 
 
 @dataclass(frozen=True)
@@ -198,7 +211,10 @@ class LaterSettings:
 
     def __post_init__(self) -> None:
         _demand(
-            "changes", min(self.people, self.cars, self.small_objects, self.removed, self.moved), 0, 10000
+            "changes",
+            min(self.people, self.cars, self.small_objects, self.removed, self.moved),
+            0,
+            10000,
         )
 
 

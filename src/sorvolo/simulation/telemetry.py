@@ -46,14 +46,22 @@ class Observation:
         sound = self.is_sound
         if not sound.any():
             return np.full(len(time_s), np.nan), np.full(len(time_s), np.nan)
-        latitude, longitude = self.telemetry["latitude_deg"][sound], self.telemetry["longitude_deg"][sound]
+        latitude, longitude = (
+            self.telemetry["latitude_deg"][sound],
+            self.telemetry["longitude_deg"][sound],
+        )
         true_s = self.true_s[sound]
         return np.interp(time_s, true_s, latitude), np.interp(time_s, true_s, longitude)
 
 
 def observe(
-    path: FlownPath, site: LocalFrame, started_ns: int, settings: SensorSettings, format_name: str,
-    rng: np.random.Generator, at_s: Floats | None = None,
+    path: FlownPath,
+    site: LocalFrame,
+    started_ns: int,
+    settings: SensorSettings,
+    format_name: str,
+    rng: np.random.Generator,
+    at_s: Floats | None = None,
 ) -> Observation:
     """Sample the flown path as an instrument of this format does.
 
@@ -64,7 +72,9 @@ def observe(
         rate_hz = settings.rate_hz or _RATES_HZ[format_name]
         # a table or subtitle track begins with its video; a receiver's log runs on both sides of it
         spare_s = 0.0 if format_name in ("csv", "srt") else 1.0
-        ticks = np.arange(np.ceil(-spare_s * rate_hz), np.floor((path.duration_s + spare_s) * rate_hz) + 1)
+        ticks = np.arange(
+            np.ceil(-spare_s * rate_hz), np.floor((path.duration_s + spare_s) * rate_hz) + 1
+        )
         true_s = ticks / rate_hz - settings.clock_offset_s
         true_s = true_s[_outside_gaps(true_s, settings.gaps, path.duration_s, rng)]
     else:
@@ -81,9 +91,11 @@ def observe(
     faulty = rng.permutation(count)[: settings.jumps + settings.zero_fixes]
     is_sound[faulty] = False
     jumps = faulty[: settings.jumps]
-    fixes_m[jumps, :2] += rng.choice([-1.0, 1.0], (len(jumps), 2)) * rng.uniform(150, 900, (len(jumps), 2))
+    fixes_m[jumps, :2] += rng.choice([-1.0, 1.0], (len(jumps), 2)) * rng.uniform(
+        150, 900, (len(jumps), 2)
+    )
     latitude_deg, longitude_deg, ellipsoidal_m = site.wgs84_from_site(fixes_m)
-    zeros = faulty[settings.jumps:]
+    zeros = faulty[settings.jumps :]
     latitude_deg[zeros], longitude_deg[zeros] = 0.0, 0.0
     columns = {
         "latitude_deg": latitude_deg,
@@ -97,11 +109,15 @@ def observe(
     }
     recorded_s = true_s + settings.clock_offset_s
     telemetry = Telemetry(
-        format_name, started_ns + _ns(recorded_s), {name: columns[name] for name in _COLUMNS[format_name]},
+        format_name,
+        started_ns + _ns(recorded_s),
+        {name: columns[name] for name in _COLUMNS[format_name]},
         _ns(recorded_s) if format_name == "srt" else np.full(count, -1),
     )
     corrupt = frozenset(int(i) for i in rng.permutation(count)[: settings.bad_checksums])
-    return Observation(telemetry, true_s, is_sound, corrupt if format_name == "nmea" else frozenset())
+    return Observation(
+        telemetry, true_s, is_sound, corrupt if format_name == "nmea" else frozenset()
+    )
 
 
 def _ns(time_s: Floats) -> TimesNs:
@@ -122,16 +138,22 @@ def _attitudes(
 ) -> dict[str, Floats]:
     """The camera's angles as a gimbal reports them, and a body that leans into its speed."""
     turns = rotation_from_vector(np.radians(rng.standard_normal((len(time_s), 3)) * noise_deg))
-    camera = np.array([
-        gimbal_angles_from_rotation(path.pose(float(t)).rotation @ turn) for t, turn in zip(time_s, turns)
-    ]).reshape(-1, 3)
+    camera = np.array(
+        [
+            gimbal_angles_from_rotation(path.pose(float(t)).rotation @ turn)
+            for t, turn in zip(time_s, turns)
+        ]
+    ).reshape(-1, 3)
     speed_m_s = np.hypot(*path.velocity_m_s(time_s)[:, :2].T)
     lean_deg = -np.degrees(np.arctan(0.012 * speed_m_s))
     jitter = rng.standard_normal((len(time_s), 3)) * max(noise_deg, 0.1)
     return {
-        "camera_yaw_deg": camera[:, 0], "camera_pitch_deg": camera[:, 1], "camera_roll_deg": camera[:, 2],
+        "camera_yaw_deg": camera[:, 0],
+        "camera_pitch_deg": camera[:, 1],
+        "camera_roll_deg": camera[:, 2],
         "body_yaw_deg": (path.heading_deg(time_s) + jitter[:, 0]) % 360.0,
-        "body_pitch_deg": lean_deg + jitter[:, 1], "body_roll_deg": jitter[:, 2],
+        "body_pitch_deg": lean_deg + jitter[:, 1],
+        "body_roll_deg": jitter[:, 2],
     }
 
 

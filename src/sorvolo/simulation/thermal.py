@@ -19,7 +19,10 @@ GROUND_LEVEL = 90.0
 _UP_SIDES = np.zeros(3)
 # how much warmer than the ground, in grey levels of the span that `GROUND_LEVEL` leaves; people always stand out
 _WARMTH = {
-    Label.PERSON: (35.0, 140.0), Label.CAR: (-45.0, 55.0), Label.SMALL: (-35.0, 40.0), Label.TREE: (-15.0, 25.0),
+    Label.PERSON: (35.0, 140.0),
+    Label.CAR: (-45.0, 55.0),
+    Label.SMALL: (-35.0, 40.0),
+    Label.TREE: (-15.0, 25.0),
     Label.HOUSE: (-30.0, 45.0),
 }
 _LEAST_CONTRAST = 12.0  # of targets: what is as warm as the ground cannot be seen, nor be asked for
@@ -45,12 +48,16 @@ def heat_picture(image: ImageRGB, rng: np.random.Generator) -> ImageRGB:
     """The rendered warmth as a thermal camera shows it: soft, noisy, striped, stretched to its own range."""
     warmth = image[..., 0].astype(np.float32)
     warmth = np.asarray(cv2.GaussianBlur(warmth, (0, 0), rng.uniform(0.5, 1.3)), np.float32)
-    warmth = warmth + np.float32(rng.uniform(0.5, 3.0)) * rng.standard_normal(warmth.shape, dtype=np.float32)
+    warmth = warmth + np.float32(rng.uniform(0.5, 3.0)) * rng.standard_normal(
+        warmth.shape, dtype=np.float32
+    )
     stripes = rng.standard_normal(warmth.shape[1], dtype=np.float32)
     warmth += np.float32(rng.uniform(0, 1.5)) * stripes
     low, high = np.percentile(warmth, (0.5, 99.8))
     room = max(float(high - low), 40.0)
-    shown = np.clip((warmth - low + rng.uniform(0, 0.3) * room) / (room * rng.uniform(1.0, 1.5)), 0, 1)
+    shown = np.clip(
+        (warmth - low + rng.uniform(0, 0.3) * room) / (room * rng.uniform(1.0, 1.5)), 0, 1
+    )
     if rng.uniform() < 0.35:  # black hot
         shown = 1 - shown
     return recompressed(np.dstack([np.round(255 * shown).astype(np.uint8)] * 3), rng)
@@ -65,14 +72,19 @@ def warm_body(thing: Thing, body: Body, rng: np.random.Generator) -> Body:
     detail = float(rng.uniform(0.3, 0.8) if thing.label is Label.TREE else rng.uniform(0.05, 0.25))
     mean = _mean_grey([part.texture for part in body.parts])
     parts: list[Part] = [
-        replace(part, texture=_warmed(part.texture, GROUND_LEVEL + warmth, detail, mean)) for part in body.parts
+        replace(part, texture=_warmed(part.texture, GROUND_LEVEL + warmth, detail, mean))
+        for part in body.parts
     ]
     if thing.label is Label.PERSON and len(parts) > 2:  # feet and clothes are cooler than the head
         for index, share in ((0, 0.6), (-1, 1.2)):
-            texture = _warmed(body.parts[index].texture, GROUND_LEVEL + share * warmth, detail, mean)
+            texture = _warmed(
+                body.parts[index].texture, GROUND_LEVEL + share * warmth, detail, mean
+            )
             parts[index] = replace(parts[index], texture=texture)
     if thing.label is Label.CAR and rng.uniform() < 0.65:
-        parts.insert(5, _engine(thing, GROUND_LEVEL + float(rng.uniform(30, 140))))  # above the bonnet, below the cabin
+        parts.insert(
+            5, _engine(thing, GROUND_LEVEL + float(rng.uniform(30, 140)))
+        )  # above the bonnet, below the cabin
     return Body(tuple(parts))
 
 
@@ -84,13 +96,17 @@ def _engine(thing: Thing, warmth: float) -> Patch:
     texture = cut_out(np.full((16, 16, 3), np.clip(warmth, 0, 255), np.uint8), alpha)
     z = 0.6 * height
     back, front, side = 0.16 * length, 0.48 * length, 0.42 * width
-    corners: Floats = np.array([[back, side, z], [front, side, z], [front, -side, z], [back, -side, z]])
+    corners: Floats = np.array(
+        [[back, side, z], [front, side, z], [front, -side, z], [back, -side, z]]
+    )
     return Patch.spanned(corners, texture, _UP_SIDES)
 
 
 def _mean_grey(textures: list[ImageRGBA]) -> float:
     weight = sum(float(texture[..., 3].sum(dtype=np.int64)) for texture in textures) / 255
-    return sum(float(texture[..., :3].sum(dtype=np.int64)) for texture in textures) / (3 * max(weight, 1.0))
+    return sum(float(texture[..., :3].sum(dtype=np.int64)) for texture in textures) / (
+        3 * max(weight, 1.0)
+    )
 
 
 def _warmed(texture: ImageRGBA, warmth: float, detail: float, mean: float) -> ImageRGBA:

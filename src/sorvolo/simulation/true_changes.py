@@ -51,7 +51,10 @@ def true_events(flight: SimulatedFlight) -> list[TruthEvent]:
     if flight.number == 1:
         return []
     came, left = _came_and_left(flight)
-    events = [_arrival(flight, thing, None if thing.is_moving else _take_near(thing, left)) for thing in came]
+    events = [
+        _arrival(flight, thing, None if thing.is_moving else _take_near(thing, left))
+        for thing in came
+    ]
     movers = [thing for thing in flight.day.things if thing.is_moving]
     return events + [_departure(flight, thing, movers) for thing in left]
 
@@ -62,14 +65,20 @@ def _came_and_left(flight: SimulatedFlight) -> tuple[list[Thing], list[Thing]]:
     today = {thing.id: thing for thing in flight.day.things}
     known = {thing.id: thing for thing in first}
     left = [thing for thing in first if has_changed(thing, today.get(thing.id))]
-    came = [thing for thing in flight.day.things if thing.id not in known or has_changed(known[thing.id], thing)]
+    came = [
+        thing
+        for thing in flight.day.things
+        if thing.id not in known or has_changed(known[thing.id], thing)
+    ]
     return came, left
 
 
 def _arrival(flight: SimulatedFlight, thing: Thing, old: Thing | None) -> TruthEvent:
     """Something that came, in place of an old one or not, or that moves."""
     views = _clear_views(flight, thing, flight.day.things, flight.day.bodies)
-    places = np.array([thing.place_m(float(flight.from_middle_s[index]))[:2] for index in views]).reshape(-1, 2)
+    places = np.array(
+        [thing.place_m(float(flight.from_middle_s[index]))[:2] for index in views]
+    ).reshape(-1, 2)
     if thing.is_moving:
         middle_s = float(flight.from_middle_s[views[len(views) // 2]]) if views else 0.0
         return TruthEvent("moving", None, thing, thing.footprint_m(middle_s), views, places)
@@ -83,7 +92,8 @@ def _departure(flight: SimulatedFlight, thing: Thing, movers: Sequence[Thing]) -
     """Something that is gone."""
     first, bodies = flight.before
     views = tuple(
-        index for index in _clear_views(flight, thing, first, bodies)
+        index
+        for index in _clear_views(flight, thing, first, bodies)
         if not _is_trodden(thing, movers, float(flight.from_middle_s[index]))
     )
     places = np.tile(thing.place_m(0.0)[:2], (len(views), 1))
@@ -92,7 +102,9 @@ def _departure(flight: SimulatedFlight, thing: Thing, movers: Sequence[Thing]) -
 
 def event_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
     """`true_events` as GeoJSON features, numbered from 1."""
-    return [_feature(number, event, flight) for number, event in enumerate(true_events(flight), start=1)]
+    return [
+        _feature(number, event, flight) for number, event in enumerate(true_events(flight), start=1)
+    ]
 
 
 def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> dict[str, Any]:
@@ -104,12 +116,19 @@ def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> dict[st
         "type": "Feature",
         "geometry": polygon_geometry(event.footprint_m, flight.site),
         "properties": {
-            "number": number, "flight": flight.name, "since": "flight1", "kind": event.kind,
+            "number": number,
+            "flight": flight.name,
+            "since": "flight1",
+            "kind": event.kind,
             "class_before": "" if event.before is None else str(event.before.label),
             "class_after": "" if event.after is None else str(event.after.label),
-            "objects": sorted({each.id for each in (event.before, event.after) if each is not None}),
-            "east_m": round(float(middle[0]), 4), "north_m": round(float(middle[1]), 4),
-            "length_m": round(thing.size_m[0], 4), "width_m": round(thing.size_m[1], 4),
+            "objects": sorted(
+                {each.id for each in (event.before, event.after) if each is not None}
+            ),
+            "east_m": round(float(middle[0]), 4),
+            "north_m": round(float(middle[1]), 4),
+            "length_m": round(thing.size_m[0], 4),
+            "width_m": round(thing.size_m[1], 4),
             "height_m": round(thing.size_m[2], 4),
             "velocity_m_s": [round(speed, 4) for speed in thing.velocity_m_s],
             "clear_views": [iso_time(int(times_ns[index])) for index in event.clear_views],
@@ -121,9 +140,12 @@ def _feature(number: int, event: TruthEvent, flight: SimulatedFlight) -> dict[st
 def _degrees(points_m: PointsM, site: LocalFrame) -> list[list[float]]:
     if not len(points_m):
         return []
-    latitude, longitude, _ = site.wgs84_from_site(np.column_stack([points_m, np.zeros(len(points_m))]))
+    latitude, longitude, _ = site.wgs84_from_site(
+        np.column_stack([points_m, np.zeros(len(points_m))])
+    )
     return [
-        [round(float(x), DEGREE_DECIMALS), round(float(y), DEGREE_DECIMALS)] for x, y in zip(longitude, latitude)
+        [round(float(x), DEGREE_DECIMALS), round(float(y), DEGREE_DECIMALS)]
+        for x, y in zip(longitude, latitude)
     ]
 
 
@@ -138,7 +160,9 @@ def _clear_views(
     for index in range(0, len(flight), step):
         from_middle_s = float(flight.from_middle_s[index])
         base = thing.footprint_m(from_middle_s)
-        box = np.concatenate([np.column_stack([base, np.full(len(base), z)]) for z in (0.0, thing.size_m[2])])
+        box = np.concatenate(
+            [np.column_stack([base, np.full(len(base), z)]) for z in (0.0, thing.size_m[2])]
+        )
         pixels = flight.view(index).project(box)
         with np.errstate(invalid="ignore"):
             is_whole = bool(((pixels >= 0) & (pixels <= size_px - 1)).all())
@@ -148,14 +172,20 @@ def _clear_views(
 
 
 def _visible_share(
-    flight: SimulatedFlight, thing: Thing, things: Sequence[Thing], bodies: dict[int, Body], index: int
+    flight: SimulatedFlight,
+    thing: Thing,
+    things: Sequence[Thing],
+    bodies: dict[int, Body],
+    index: int,
 ) -> float:
     from_middle_s = float(flight.from_middle_s[index])
     place = thing.place_m(from_middle_s)
     # nothing hides what lies farther from its foot than its own height, in a picture that looks down steeply
     near = [
-        other for other in things
-        if other is thing or np.hypot(*(other.place_m(from_middle_s) - place)[:2])
+        other
+        for other in things
+        if other is thing
+        or np.hypot(*(other.place_m(from_middle_s) - place)[:2])
         < thing.reach_m + other.reach_m + other.size_m[2]
     ]
     labels, totals = render_labels(
@@ -167,7 +197,9 @@ def _visible_share(
 
 def _take_near(thing: Thing, left: list[Thing]) -> Thing | None:
     """Take out of `left` what stood where the thing stands now, the nearest first."""
-    near = [(_gap_m(thing.footprint_m(), old.footprint_m()), number) for number, old in enumerate(left)]
+    near = [
+        (_gap_m(thing.footprint_m(), old.footprint_m()), number) for number, old in enumerate(left)
+    ]
     gap_m, number = min(near, default=(np.inf, -1))
     return left.pop(number) if gap_m < JOINED_GAP_M else None
 
@@ -175,7 +207,8 @@ def _take_near(thing: Thing, left: list[Thing]) -> Thing | None:
 def _is_trodden(thing: Thing, movers: Sequence[Thing], from_middle_s: float) -> bool:
     place = thing.place_m(0.0)
     return any(
-        np.hypot(*(mover.place_m(from_middle_s) - place)[:2]) < thing.reach_m + mover.reach_m + JOINED_GAP_M
+        np.hypot(*(mover.place_m(from_middle_s) - place)[:2])
+        < thing.reach_m + mover.reach_m + JOINED_GAP_M
         for mover in movers
     )
 

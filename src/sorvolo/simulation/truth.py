@@ -57,9 +57,13 @@ def frame_features(flight: SimulatedFlight) -> list[dict[str, Any]]:
             "fix_latitude_deg": _degrees_or_null(fixes[index, 0]),
         }
         outline = _outline_m(flight, pose)
-        features.append({
-            "type": "Feature", "geometry": polygon_geometry(outline, flight.site), "properties": properties,
-        })
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": polygon_geometry(outline, flight.site),
+                "properties": properties,
+            }
+        )
     return features
 
 
@@ -80,17 +84,25 @@ def object_features(world: World, site: LocalFrame) -> list[dict[str, Any]]:
             place = (thing.id, thing.east_m, thing.north_m, thing.yaw_deg, thing.velocity_m_s)
             first_seen.setdefault(place, (thing, []))[1].append(number)
     for thing, flights in first_seen.values():
-        features.append({
-            "type": "Feature",
-            "geometry": polygon_geometry(thing.footprint_m(), site),
-            "properties": {
-                "id": thing.id, "class": str(thing.label), "subtype": thing.kind,
-                "height_m": round(thing.size_m[2], 4), "length_m": round(thing.size_m[0], 4),
-                "width_m": round(thing.size_m[1], 4), "east_m": round(thing.east_m, 4),
-                "north_m": round(thing.north_m, 4), "flights": flights,
-                "moving": thing.is_moving, "velocity_m_s": [round(speed, 4) for speed in thing.velocity_m_s],
-            },
-        })
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": polygon_geometry(thing.footprint_m(), site),
+                "properties": {
+                    "id": thing.id,
+                    "class": str(thing.label),
+                    "subtype": thing.kind,
+                    "height_m": round(thing.size_m[2], 4),
+                    "length_m": round(thing.size_m[0], 4),
+                    "width_m": round(thing.size_m[1], 4),
+                    "east_m": round(thing.east_m, 4),
+                    "north_m": round(thing.north_m, 4),
+                    "flights": flights,
+                    "moving": thing.is_moving,
+                    "velocity_m_s": [round(speed, 4) for speed in thing.velocity_m_s],
+                },
+            }
+        )
     return features
 
 
@@ -114,18 +126,28 @@ def coco_boxes(flight: SimulatedFlight, frames: Iterable[int]) -> dict[str, Any]
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     for index in frames:
-        images.append({
-            "id": index, "file_name": _picture_name(flight, index), "width": flight.camera.width_px,
-            "height": flight.camera.height_px, "frame": index,
-        })
+        images.append(
+            {
+                "id": index,
+                "file_name": _picture_name(flight, index),
+                "width": flight.camera.width_px,
+                "height": flight.camera.height_px,
+                "frame": index,
+            }
+        )
         labels, totals = render_labels(
-            flight.day.things, flight.day.bodies, flight.view(index), flight.true_poses[index],
+            flight.day.things,
+            flight.day.bodies,
+            flight.view(index),
+            flight.true_poses[index],
             float(flight.from_middle_s[index]),
         )
         annotations += box_rows(flight.day.things, labels, totals, index, len(annotations) + 1)
     return {
-        "info": {"description": f"simulated {flight.name}"}, "categories": coco_categories(),
-        "images": images, "annotations": annotations,
+        "info": {"description": f"simulated {flight.name}"},
+        "categories": coco_categories(),
+        "images": images,
+        "annotations": annotations,
     }
 
 
@@ -148,12 +170,18 @@ def box_rows(
         if len(y) < _FEWEST_PX:
             continue
         left, top = int(x.min()), int(y.min())
-        rows.append({
-            "id": first_id + len(rows), "image_id": image_id, "category_id": CATEGORIES.index(thing.label) + 1,
-            "bbox": [left, top, int(x.max()) - left + 1, int(y.max()) - top + 1],
-            "area": len(y), "iscrowd": 0, "object_id": thing.id,
-            "visibility": round(len(y) / totals[thing.id], 4),
-        })
+        rows.append(
+            {
+                "id": first_id + len(rows),
+                "image_id": image_id,
+                "category_id": CATEGORIES.index(thing.label) + 1,
+                "bbox": [left, top, int(x.max()) - left + 1, int(y.max()) - top + 1],
+                "area": len(y),
+                "iscrowd": 0,
+                "object_id": thing.id,
+                "visibility": round(len(y) / totals[thing.id], 4),
+            }
+        )
     return rows
 
 
@@ -168,7 +196,8 @@ def change_mask(flight: SimulatedFlight, index: int) -> ImageGray:
     before = {thing.id: thing for thing in first}
     left = [thing.id for thing in first if has_changed(thing, today.get(thing.id))]
     came = [
-        thing.id for thing in flight.day.things
+        thing.id
+        for thing in flight.day.things
         if thing.id not in before or has_changed(before[thing.id], thing)
     ]
     view, pose = flight.view(index), flight.true_poses[index]
@@ -185,18 +214,26 @@ def map_tiles(ground: GroundRaster, site_grid: SiteGrid) -> dict[TileIndex, Imag
     centre = np.array([(area.west_m + area.east_m) / 2, (area.south_m + area.north_m) / 2])
     grid_from_site = site_grid.grid_from_site_affine(centre, max(area.size_m) / 2)
     grid_from_raster = grid_from_site @ np.linalg.inv(ground.raster_from_site_matrix)
-    corners = np.array([
-        [area.west_m, area.south_m], [area.east_m, area.south_m], [area.east_m, area.north_m],
-        [area.west_m, area.north_m],
-    ])
+    corners = np.array(
+        [
+            [area.west_m, area.south_m],
+            [area.east_m, area.south_m],
+            [area.east_m, area.north_m],
+            [area.west_m, area.north_m],
+        ]
+    )
     rgba = np.dstack([ground.rgb, np.full(ground.rgb.shape[:2], 255, np.uint8)])
     tiles: dict[TileIndex, ImageRGBA] = {}
     for tile in sorted(site_grid.grid.tiles_touched(site_grid.grid_from_site(corners))):
         x0, y0, x1, y1 = site_grid.grid.tile_window(tile)
         shift = np.array([[1.0, 0, -x0], [0, 1, -y0], [0, 0, 1]])
         picture = cv2.warpAffine(
-            rgba, (shift @ grid_from_raster)[:2], (x1 - x0, y1 - y0), flags=cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT, borderValue=(0, 0, 0, 0),
+            rgba,
+            (shift @ grid_from_raster)[:2],
+            (x1 - x0, y1 - y0),
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=(0, 0, 0, 0),
         )
         if picture[..., 3].any():
             picture[picture[..., 3] < 255] = 0
@@ -206,12 +243,18 @@ def map_tiles(ground: GroundRaster, site_grid: SiteGrid) -> dict[TileIndex, Imag
 
 def iso_time(time_ns: int) -> str:
     """UTC with microseconds and a Z."""
-    moment = datetime.fromtimestamp(time_ns // 10**9, UTC).replace(microsecond=time_ns % 10**9 // 1000)
+    moment = datetime.fromtimestamp(time_ns // 10**9, UTC).replace(
+        microsecond=time_ns % 10**9 // 1000
+    )
     return moment.isoformat(timespec="microseconds").replace("+00:00", "Z")
 
 
 def _picture_name(flight: SimulatedFlight, index: int) -> str:
-    return flight.frame_name(index) if flight.settings.output.photos else f"{flight.name}_{index:06d}.png"
+    return (
+        flight.frame_name(index)
+        if flight.settings.output.photos
+        else f"{flight.name}_{index:06d}.png"
+    )
 
 
 def _degrees_or_null(value: float) -> float | None:
@@ -247,8 +290,13 @@ def surface_heights(
                 continue  # a wall has no ground of its own
             for (x0, y0, x1, y1), rgba in sample_patches(view, [patch]):
                 rays = view.rays_in((x0, y0, x1, y1))
-                east, north = rays[..., 0] - view.ray_from_site[0, 3], view.ray_from_site[1, 3] - rays[..., 1]
-                slope = (normal[0] * (east - corners[0, 0]) + normal[1] * (north - corners[0, 1])) / normal[2]
+                east, north = (
+                    rays[..., 0] - view.ray_from_site[0, 3],
+                    view.ray_from_site[1, 3] - rays[..., 1],
+                )
+                slope = (
+                    normal[0] * (east - corners[0, 0]) + normal[1] * (north - corners[0, 1])
+                ) / normal[2]
                 up = np.clip(corners[0, 2] - slope, corners[:, 2].min(), corners[:, 2].max())
                 here = heights[y0:y1, x0:x1]
                 np.maximum(here, up, out=here, where=rgba[..., 3] > 127, casting="same_kind")

@@ -66,8 +66,12 @@ class View:
         if self.rays is not None:
             return self.rays[y0:y1, x0:x1]
         camera = self.camera
-        x = (np.arange(x0, x1, dtype=np.float32) - np.float32(camera.cx_px)) / np.float32(camera.fx_px)
-        y = (np.arange(y0, y1, dtype=np.float32) - np.float32(camera.cy_px)) / np.float32(camera.fy_px)
+        x = (np.arange(x0, x1, dtype=np.float32) - np.float32(camera.cx_px)) / np.float32(
+            camera.fx_px
+        )
+        y = (np.arange(y0, y1, dtype=np.float32) - np.float32(camera.cy_px)) / np.float32(
+            camera.fy_px
+        )
         return np.dstack(np.meshgrid(x, y))
 
     def faces(self, corner_m: Vector3, normal_m: Vector3) -> bool:
@@ -95,11 +99,13 @@ def map_view(
     shadow.
     """
     slide = np.zeros(2) if sun is None else sun[:2] / sun[2]
-    matrix = np.array([
-        [1.0, 0.0, -slide[0], -west_m],
-        [0.0, -1.0, slide[1], north_m],
-        [0.0, 0.0, 0.0, 1.0],
-    ])
+    matrix = np.array(
+        [
+            [1.0, 0.0, -slide[0], -west_m],
+            [0.0, -1.0, slide[1], north_m],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
     fx, fy = 1 / m_per_px[0], 1 / m_per_px[1]
     camera = Camera(size_px[0], size_px[1], fx, fy, -0.5, -0.5)
     direction = np.array([0.0, 0.0, 1.0]) if sun is None else sun
@@ -129,11 +135,15 @@ class Patch:
         if np.allclose(corners_m[2] - corners_m[0], u + v, atol=1e-9):
             matrix = np.array([[width, 0.0, -0.5], [0.0, height, -0.5], [0.0, 0.0, 1.0]])
         else:
-            far = np.linalg.lstsq(np.column_stack([u, v]), corners_m[2] - corners_m[0], rcond=None)[0]
+            far = np.linalg.lstsq(np.column_stack([u, v]), corners_m[2] - corners_m[0], rcond=None)[
+                0
+            ]
             right, bottom = width - 0.5, height - 0.5
             matrix = cv2.getPerspectiveTransform(
                 np.array([[0, 0], [1, 0], far, [0, 1]], np.float32),
-                np.array([[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]], np.float32),
+                np.array(
+                    [[-0.5, -0.5], [right, -0.5], [right, bottom], [-0.5, bottom]], np.float32
+                ),
             )
         return cls(corners_m, texture, normal, np.asarray(matrix, np.float64))
 
@@ -145,17 +155,23 @@ class Patch:
 def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Window, ImageRGBA]]:
     """The patches in sight as this view sees them, in order: a window of the image and its RGBA there."""
     facing = [
-        patch for patch in patches if not patch.normal.any() or view.faces(patch.corners_m[0], patch.normal)
+        patch
+        for patch in patches
+        if not patch.normal.any() or view.faces(patch.corners_m[0], patch.normal)
     ]
     if not facing:
         return
     # one projection for all corners: a picture has hundreds of patches, many of them out of sight
-    corners_px = view.project(np.concatenate([patch.corners_m for patch in facing])).reshape(-1, 4, 2)
+    corners_px = view.project(np.concatenate([patch.corners_m for patch in facing])).reshape(
+        -1, 4, 2
+    )
     low, high = corners_px.min(axis=1), corners_px.max(axis=1)
     slack = 2 + 0.02 * (high - low)  # distortion bows edges outwards
     size = np.array([view.camera.width_px, view.camera.height_px])
     with np.errstate(invalid="ignore"):
-        is_seen = ((high + slack > 0) & (low - slack < size)).all(axis=1)  # a corner behind the camera is NaN
+        is_seen = ((high + slack > 0) & (low - slack < size)).all(
+            axis=1
+        )  # a corner behind the camera is NaN
     starts = np.maximum(np.floor(low[is_seen] - slack[is_seen]), 0).astype(int)
     ends = np.minimum(np.ceil(high[is_seen] + slack[is_seen]).astype(int) + 1, size)
     for index, (x0, y0), (x1, y1) in zip(np.flatnonzero(is_seen), starts.tolist(), ends.tolist()):
@@ -167,7 +183,9 @@ def sample_patches(view: View, patches: Sequence[Patch]) -> Iterator[tuple[Windo
 def _sample(view: View, patch: Patch, window: Window) -> ImageRGBA | None:
     """The patch within a window; None when it is seen edge-on."""
     corners = patch.corners_m
-    ray_from_plane = view.ray_from_plane(corners[0], corners[1] - corners[0], corners[3] - corners[0])
+    ray_from_plane = view.ray_from_plane(
+        corners[0], corners[1] - corners[0], corners[3] - corners[0]
+    )
     if abs(np.linalg.det(ray_from_plane / np.abs(ray_from_plane).max())) < 1e-9:
         return None
     texture_from_ray = patch.texture_from_plane @ np.linalg.inv(ray_from_plane)

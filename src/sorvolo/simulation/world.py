@@ -70,7 +70,11 @@ def _reach_m(settings: SimulationSettings, flight: int) -> float:
     """How far from the point below it the camera of a flight may see the ground."""
     camera = settings.imaging.camera
     height_factor = 1.0 if flight == 1 else settings.later.revisit.height_factor
-    height_m = settings.path.height_m * height_factor + 4 * settings.motion.height_rms_m + settings.scene.relief_m
+    height_m = (
+        settings.path.height_m * height_factor
+        + 4 * settings.motion.height_rms_m
+        + settings.scene.relief_m
+    )
     across = 0.5 * camera.width_px / camera.fx_px, 0.5 * camera.height_px / camera.fy_px
     # barrel distortion shows more than the pinhole's angle: its rays are the truth
     corner = np.abs(camera.rays_from_pixels(camera.corners_px)[:, :2]).max(axis=0)
@@ -98,19 +102,31 @@ def build_world(
     else:
         width_m, height_m = area.size_m
         m_per_px = max(
-            min(0.025, 0.72 * settings.m_per_px), float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX))
+            min(0.025, 0.72 * settings.m_per_px),
+            float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)),
         )
         painted = paint_ground(GroundKind(settings.scene.ground), area, m_per_px, rng)
     relief = Relief.hills(
-        settings.scene.relief_m, settings.path.height_m, area, np.random.default_rng([settings.seed, 10])
+        settings.scene.relief_m,
+        settings.path.height_m,
+        area,
+        np.random.default_rng([settings.seed, 10]),
     )
     first = _furnish(
-        settings.scene, painted.layout, plans_m[0], settings, np.random.default_rng([settings.seed, 2])
+        settings.scene,
+        painted.layout,
+        plans_m[0],
+        settings,
+        np.random.default_rng([settings.seed, 2]),
     )
     days = [first]
     for flight in range(2, settings.flights + 1):
         days.append(_next_day(days[0], painted.layout, plans_m[0], settings, flight))
-    return World(painted.raster, tuple(tuple(_on_hills(thing, relief) for thing in day) for day in days), relief)
+    return World(
+        painted.raster,
+        tuple(tuple(_on_hills(thing, relief) for thing in day) for day in days),
+        relief,
+    )
 
 
 def _on_hills(thing: Thing, relief: Relief) -> Thing:
@@ -137,7 +153,9 @@ def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px:
     standing = [thing for thing in things if not thing.is_moving]
     ground = _with_shadows(ground, standing, bodies, light)
     shadows = {
-        thing.id: own_shadow(thing, bodies[thing.id], light, m_per_px) for thing in things if thing.is_moving
+        thing.id: own_shadow(thing, bodies[thing.id], light, m_per_px)
+        for thing in things
+        if thing.is_moving
     }
     cloud_shade = 0.38 if weather.has_clouds else 0.0
     return Day(ground, things, bodies, shadows, light, gains, cloud_shade, world.relief)
@@ -151,11 +169,15 @@ def _gains(weather: WeatherSettings, rng: np.random.Generator) -> Floats:
     return np.asarray(gains * weather.brightness)
 
 
-def _swayed(things: tuple[Thing, ...], wind_m: float, rng: np.random.Generator) -> tuple[Thing, ...]:
+def _swayed(
+    things: tuple[Thing, ...], wind_m: float, rng: np.random.Generator
+) -> tuple[Thing, ...]:
     """The things, trees moved by the wind."""
     return tuple(
         replace(thing, sway_m=(rng.normal(0, 2.0 * wind_m), rng.normal(0, 2.0 * wind_m)))
-        if thing.label is Label.TREE else thing for thing in things
+        if thing.label is Label.TREE
+        else thing
+        for thing in things
     )
 
 
@@ -164,12 +186,18 @@ def scenery(ground: str, layout: Layout, rng: np.random.Generator) -> tuple[Thin
     roof = "flat roof" if ground == GroundKind.URBAN else "gable roof"
     things: list[Thing] = []
     for kind, label, places in (
-        (roof, Label.HOUSE, layout.houses), ("tree", Label.TREE, layout.trees), ("bush", Label.TREE, layout.bushes),
+        (roof, Label.HOUSE, layout.houses),
+        ("tree", Label.TREE, layout.trees),
+        ("bush", Label.TREE, layout.bushes),
     ):
         for east, north, yaw in places:
             size = new_size(label, kind, rng)
             seed = int(rng.integers(2**31))
-            things.append(Thing(len(things) + 1, label, kind, float(east), float(north), float(yaw), size, seed))
+            things.append(
+                Thing(
+                    len(things) + 1, label, kind, float(east), float(north), float(yaw), size, seed
+                )
+            )
     return tuple(things)
 
 
@@ -177,71 +205,116 @@ def is_free(thing: Thing, others: Sequence[Thing]) -> bool:
     """Whether a thing can stand where it is beside the others, a little air between them."""
     return all(
         np.hypot(thing.east_m - other.east_m, thing.north_m - other.north_m)
-        > thing.reach_m * 0.8 + other.reach_m * (0.9 if other.label is not Label.HOUSE else 1.05) + 0.6
+        > thing.reach_m * 0.8
+        + other.reach_m * (0.9 if other.label is not Label.HOUSE else 1.05)
+        + 0.6
         for other in others
     )
 
 
-def _furnish(scene: SceneSettings, layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
-             rng: np.random.Generator) -> tuple[Thing, ...]:
+def _furnish(
+    scene: SceneSettings,
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    rng: np.random.Generator,
+) -> tuple[Thing, ...]:
     """The things of the first flight: scenery first, then targets."""
     things = list(scenery(scene.ground, layout, rng)) if scene.has_scenery else []
-    wanted = [Label.PERSON] * scene.people + [Label.CAR] * scene.cars + [Label.SMALL] * scene.small_objects
+    wanted = (
+        [Label.PERSON] * scene.people
+        + [Label.CAR] * scene.cars
+        + [Label.SMALL] * scene.small_objects
+    )
     for label in wanted:
         things.append(_place(label, len(things) + 1, things, layout, waypoints_m, settings, rng))
     return tuple(things)
 
 
-def _next_day(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
-              flight: int) -> tuple[Thing, ...]:
+def _next_day(
+    first: tuple[Thing, ...],
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    flight: int,
+) -> tuple[Thing, ...]:
     """The things of a later flight: some targets of the first are gone, some moved, some are new, some move."""
     rng = np.random.default_rng([settings.seed, 4, flight])
     today = _left_and_moved(first, layout, waypoints_m, settings, rng)
     next_id = 1000 * flight
     later = settings.later
-    came = [Label.PERSON] * later.people + [Label.CAR] * later.cars + [Label.SMALL] * later.small_objects
+    came = (
+        [Label.PERSON] * later.people
+        + [Label.CAR] * later.cars
+        + [Label.SMALL] * later.small_objects
+    )
     for i, label in enumerate(came):
         today.append(_place(label, next_id + i, today, layout, waypoints_m, settings, rng))
     return tuple(
         _set_off(thing, today, rng)
-        if thing.label in (Label.PERSON, Label.CAR) and rng.uniform() < settings.scene.moving_share else thing
+        if thing.label in (Label.PERSON, Label.CAR) and rng.uniform() < settings.scene.moving_share
+        else thing
         for thing in today
     )
 
 
-def _left_and_moved(first: tuple[Thing, ...], layout: Layout, waypoints_m: Floats, settings: SimulationSettings,
-                    rng: np.random.Generator) -> list[Thing]:
+def _left_and_moved(
+    first: tuple[Thing, ...],
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    rng: np.random.Generator,
+) -> list[Thing]:
     """The first flight's things, some of its targets taken away, some moved."""
     targets = [thing for thing in first if thing.label.is_target]
     order = [targets[i].id for i in rng.permutation(len(targets))]
-    removed = set(order[:settings.later.removed])
+    removed = set(order[: settings.later.removed])
     shifted = set(order[settings.later.removed : settings.later.removed + settings.later.moved])
     today = [thing for thing in first if thing.id not in removed]
     for i, thing in enumerate(today):
         if thing.id in shifted:
             others = [other for other in today if other.id != thing.id]
             place = _place(thing.label, thing.id, others, layout, waypoints_m, settings, rng)
-            today[i] = replace(thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg)
+            today[i] = replace(
+                thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg
+            )
     return today
 
 
-def _place(label: Label, thing_id: int, others: list[Thing], layout: Layout, waypoints_m: Floats,
-           settings: SimulationSettings, rng: np.random.Generator) -> Thing:
+def _place(
+    label: Label,
+    thing_id: int,
+    others: list[Thing],
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    rng: np.random.Generator,
+) -> Thing:
     """A new target near the flown path, free of what stands there already."""
-    kind = SMALL_KINDS[int(rng.integers(len(SMALL_KINDS)))] if label is Label.SMALL else new_kind(label, rng)
+    kind = (
+        SMALL_KINDS[int(rng.integers(len(SMALL_KINDS)))]
+        if label is Label.SMALL
+        else new_kind(label, rng)
+    )
     size = new_size(label, kind, rng)
     thing = Thing(thing_id, label, kind, 0.0, 0.0, 0.0, size, int(rng.integers(2**31)))
     half_strip_m = 0.4 * settings.imaging.height_px * settings.m_per_px
-    near_path = layout.parkings[[
-        _distance_to_path(place[:2], waypoints_m) < half_strip_m for place in layout.parkings
-    ]] if len(layout.parkings) else layout.parkings
+    near_path = (
+        layout.parkings[
+            [_distance_to_path(place[:2], waypoints_m) < half_strip_m for place in layout.parkings]
+        ]
+        if len(layout.parkings)
+        else layout.parkings
+    )
     for attempt in range(400):
         if label is Label.CAR and len(near_path) and attempt < 100:
             east, north, yaw = near_path[int(rng.integers(len(near_path)))]
             yaw = yaw + 180 * rng.integers(2) + rng.normal(0, 1.5)
         else:
             leg = int(rng.integers(len(waypoints_m) - 1))
-            along = waypoints_m[leg] + rng.uniform(0.03, 0.97) * (waypoints_m[leg + 1] - waypoints_m[leg])
+            along = waypoints_m[leg] + rng.uniform(0.03, 0.97) * (
+                waypoints_m[leg + 1] - waypoints_m[leg]
+            )
             east, north = along + rng.uniform(-half_strip_m, half_strip_m, 2)
             yaw = rng.uniform(0, 360)
         thing = replace(thing, east_m=float(east), north_m=float(north), yaw_deg=float(yaw))
@@ -286,7 +359,9 @@ def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> Gro
     rows, columns = shape
     # a kerb beside grass does not bend with it
     plants = cv2.erode(
-        ground.vegetation, np.ones((3, 3), np.uint8), iterations=max(1, round(0.06 / ground.m_per_px[0]))
+        ground.vegetation,
+        np.ones((3, 3), np.uint8),
+        iterations=max(1, round(0.06 / ground.m_per_px[0])),
     )
     weight = cv2.GaussianBlur(plants, (0, 0), 1.5).astype(np.float32) / 255
     moved = np.empty_like(ground.rgb)
@@ -314,7 +389,11 @@ def _snowed_in(ground: GroundRaster, share: float, rng: np.random.Generator) -> 
     """The ground with snow on about this share of it, almost without texture; what stands on it stays bare."""
     shape = ground.rgb.shape[:2]
     drifts = fractal(rng, shape, ground.m_per_px[0], (0.5, 2.0, 6.0), (0.4, 0.8, 1.0))
-    depth = np.clip(0.5 + 2.0 * (drifts - np.float32(np.quantile(drifts, 1 - share))), 0, 1) if share < 1 else 1.0
+    depth = (
+        np.clip(0.5 + 2.0 * (drifts - np.float32(np.quantile(drifts, 1 - share))), 0, 1)
+        if share < 1
+        else 1.0
+    )
     white = 226 + 5 * fractal(rng, shape, ground.m_per_px[0], (0.05, 0.3, 1.5), (0.6, 0.8, 1.0))
     cover = np.broadcast_to(np.float32(depth), shape)[..., None]
     rgb = ground.rgb * (1 - cover) + white[..., None] * cover
@@ -328,11 +407,15 @@ def _with_shadows(
     depth = np.zeros((height, width), np.uint8)
     sun_view = map_view(ground.west_m, ground.north_m, ground.m_per_px, (width, height), light.sun)
     for thing in things:
-        foot = np.append(thing.place_m(0.0)[:2], 0.0)  # the ground around is as high as it: its shadow begins there
+        foot = np.append(
+            thing.place_m(0.0)[:2], 0.0
+        )  # the ground around is as high as it: its shadow begins there
         _cast(bodies[thing.id].placed(thing.turn, foot, sun_view.eye_m), sun_view, depth)
     if not depth.any():
         return ground
-    depth[:] = cv2.GaussianBlur(depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0]))  # the sun is no point
+    depth[:] = cv2.GaussianBlur(
+        depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0])
+    )  # the sun is no point
     rgb = ground.rgb.copy()
     for top in range(0, height, 512):
         part = slice(top, top + 512)
@@ -345,7 +428,9 @@ def own_shadow(thing: Thing, body: Body, light: Light, m_per_px: float) -> Patch
     """The shadow of something that moves, as a dark patch on the ground around its place."""
     reach_m = thing.reach_m + thing.size_m[2] * float(np.hypot(*light.sun[:2]) / light.sun[2]) + 0.3
     side = max(8, int(np.ceil(2 * reach_m / m_per_px)))
-    sun_view = map_view(-reach_m, reach_m, (2 * reach_m / side, 2 * reach_m / side), (side, side), light.sun)
+    sun_view = map_view(
+        -reach_m, reach_m, (2 * reach_m / side, 2 * reach_m / side), (side, side), light.sun
+    )
     depth: ImageGray = np.zeros((side, side), np.uint8)
     _cast(body.placed(thing.turn, np.zeros(3), sun_view.eye_m), sun_view, depth)
     depth[:] = cv2.GaussianBlur(depth, (0, 0), 0.7)
@@ -376,8 +461,12 @@ def _cast(patches: list[Patch], sun_view: View, depth: ImageGray) -> None:
 
 
 def _demand_cover(given: Area, needed: Area) -> None:
-    if (given.west_m > needed.west_m or given.south_m > needed.south_m
-            or given.east_m < needed.east_m or given.north_m < needed.north_m):
+    if (
+        given.west_m > needed.west_m
+        or given.south_m > needed.south_m
+        or given.east_m < needed.east_m
+        or given.north_m < needed.north_m
+    ):
         have, need = given.size_m, needed.size_m
         raise SettingsError(
             f"the orthophoto covers {have[0]:.0f} x {have[1]:.0f} m, but the flight sees up to"

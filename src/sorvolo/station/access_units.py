@@ -50,7 +50,9 @@ def begins_decoding(codec: str, data: bytes) -> bool:
 def parameter_sets(codec: str, data: bytes) -> bytes:
     """The parameter sets in it, each behind a start code; empty where there are none."""
     return b"".join(
-        b"\x00\x00\x00\x01" + unit for unit in nal_units(data) if nal_type(codec, unit) in _SETS[codec]
+        b"\x00\x00\x00\x01" + unit
+        for unit in nal_units(data)
+        if nal_type(codec, unit) in _SETS[codec]
     )
 
 

@@ -100,9 +100,22 @@ class Station:
         ingest = Ingest(settings.root / STREAMS_FOLDER, limits, announcing(events))
         inputs = Inputs(settings, uploads, ingest.newest)
         return cls(
-            settings, state, shelf, tiles, events, SiteCollections(shelf, findings), reviews, ingest, uploads, inputs,
-            Runs(settings, state, shelf, events, inputs, ingest.show), MapWatch(shelf, tiles, reviews, events),
-            FlightVideos(inputs), PlaceIndex(shelf), findings, lock,
+            settings,
+            state,
+            shelf,
+            tiles,
+            events,
+            SiteCollections(shelf, findings),
+            reviews,
+            ingest,
+            uploads,
+            inputs,
+            Runs(settings, state, shelf, events, inputs, ingest.show),
+            MapWatch(shelf, tiles, reviews, events),
+            FlightVideos(inputs),
+            PlaceIndex(shelf),
+            findings,
+            lock,
         )
 
     def close(self) -> None:
@@ -116,7 +129,9 @@ class Station:
         self.lock.close()
 
 
-def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardSettings()) -> FastAPI:  # noqa: B008
+def station_app(
+    settings: StationSettings, receivers: OutwardSettings = OutwardSettings()
+) -> FastAPI:
     """The application that serves the sites below the settings' root, and passes events on to the receivers.
 
     Raises StoreError as `Station.open`, InputError as `Outward`.
@@ -126,9 +141,15 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     door = CameraDoor(door_path(settings), station.ingest)
     drawings = Drawings(settings, station.shelf, station.events)
     deletion = SiteDeletion(
-        station.shelf, station.runs, station.reviews, drawings, settings.state_folder / DELETED_FOLDER
+        station.shelf,
+        station.runs,
+        station.reviews,
+        drawings,
+        settings.state_folder / DELETED_FOLDER,
     )
-    metrics = StationMetrics(settings, station.ingest, station.events, station.runs.counts, outward.figures)
+    metrics = StationMetrics(
+        settings, station.ingest, station.events, station.runs.counts, outward.figures
+    )
 
     @asynccontextmanager
     async def while_it_runs(_: FastAPI) -> AsyncIterator[None]:
@@ -144,7 +165,11 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
         station.close()
 
     app = FastAPI(
-        title="Sorvolo station", version=__version__, lifespan=while_it_runs, docs_url=None, redoc_url=None,
+        title="Sorvolo station",
+        version=__version__,
+        lifespan=while_it_runs,
+        docs_url=None,
+        redoc_url=None,
         responses=PROBLEM_ANSWERS,
         description="Maps from small drones while they fly, what changed, what was found.",
     )
@@ -152,21 +177,33 @@ def station_app(settings: StationSettings, receivers: OutwardSettings = OutwardS
     answer_problems(app)
     answer_raster_errors(app)
     for router in (
-        _about_routes(station), _site_routes(station), event_routes(station.events),
-        feature_routes(station.collections, station.reviews), review_routes(station.reviews, station.shelf),
-        crop_routes(station.shelf, station.findings), stream_routes(station.ingest, station.runs),
-        metrics_routes(metrics), upload_routes(station.uploads, station.runs),
+        _about_routes(station),
+        _site_routes(station),
+        event_routes(station.events),
+        feature_routes(station.collections, station.reviews),
+        review_routes(station.reviews, station.shelf),
+        crop_routes(station.shelf, station.findings),
+        stream_routes(station.ingest, station.runs),
+        metrics_routes(metrics),
+        upload_routes(station.uploads, station.runs),
         run_routes(station.runs, station.inputs, station.ingest),
-        place_routes(station.shelf, station.collections, station.reviews, station.videos, station.place_index),
+        place_routes(
+            station.shelf, station.collections, station.reviews, station.videos, station.place_index
+        ),
         video_routes(station.shelf, station.collections, station.videos),
-        drawing_routes(drawings), site_deletion_routes(deletion),
+        drawing_routes(drawings),
+        site_deletion_routes(deletion),
         export_routes(station.shelf, station.collections),
-        wmts_routes(station.shelf), stac_routes(station.shelf), *cog_routes(station.shelf),
+        wmts_routes(station.shelf),
+        stac_routes(station.shelf),
+        *cog_routes(station.shelf),
     ):
         app.include_router(router)
     _serve_page(app)
     app.add_middleware(Doorkeeper, settings=settings, state=station.state, upload_path=_UPLOADS)
-    app.add_middleware(Observer, count=metrics.count)  # outermost: what the doorkeeper refuses counts, too
+    app.add_middleware(
+        Observer, count=metrics.count
+    )  # outermost: what the doorkeeper refuses counts, too
     return app
 
 
@@ -179,10 +216,14 @@ def _about_routes(station: Station) -> APIRouter:
         free, memory = shutil.disk_usage(station.settings.root).free, memory_bytes()
         holder = holder_in(request)
         return {
-            "version": __version__, "role": holder.role.word, "name": holder.name,
-            "sites": len(station.shelf.folders()), "disk_free_gb": round(free / 1e9, 2),
+            "version": __version__,
+            "role": holder.role.word,
+            "name": holder.name,
+            "sites": len(station.shelf.folders()),
+            "disk_free_gb": round(free / 1e9, 2),
             "memory_mb": None if memory is None else round(memory / 1e6, 1),
-            "disk_floor_gb": station.settings.free_floor_gb, "units_default": "metric",
+            "disk_floor_gb": station.settings.free_floor_gb,
+            "units_default": "metric",
             "last_event": station.events.last,
             "base_map_url": None if station.settings.base_map is None else _BASE_MAP,
         }
@@ -192,17 +233,37 @@ def _about_routes(station: Station) -> APIRouter:
         """The base map as PMTiles, read in ranges; 404 where the station was given none."""
         path = station.settings.base_map
         if path is None or not path.is_file():
-            raise Problem(404, "this station has no base map; start it with --base-map FILE.pmtiles")
-        return FileResponse(path, media_type="application/octet-stream", headers={"cache-control": "private, no-cache"})
+            raise Problem(
+                404, "this station has no base map; start it with --base-map FILE.pmtiles"
+            )
+        return FileResponse(
+            path,
+            media_type="application/octet-stream",
+            headers={"cache-control": "private, no-cache"},
+        )
 
     @router.post("/api/session")
-    async def log_in(request: Request, token: Annotated[str, Body(embed=True, max_length=200)]) -> JSONResponse:
+    async def log_in(
+        request: Request, token: Annotated[str, Body(embed=True, max_length=200)]
+    ) -> JSONResponse:
         """Exchange a token for a cookie that scripts cannot read."""
-        holder = await _doorkeeper(request).look_at(token, request.client.host if request.client else "")
+        holder = await _doorkeeper(request).look_at(
+            token, request.client.host if request.client else ""
+        )
         if holder is None:
-            raise Problem(401, "this token is not known here, or has expired; ask who runs the station for another")
+            raise Problem(
+                401,
+                "this token is not known here, or has expired; ask who runs the station for another",
+            )
         answer = JSONResponse({"name": holder.name, "role": holder.role.word})
-        answer.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=station.settings.is_secure, path="/")
+        answer.set_cookie(
+            COOKIE,
+            token,
+            httponly=True,
+            samesite="strict",
+            secure=station.settings.is_secure,
+            path="/",
+        )
         return answer
 
     @router.delete("/api/session", status_code=204)
@@ -216,7 +277,9 @@ def _about_routes(station: Station) -> APIRouter:
 
 
 def _site_routes(station: Station) -> APIRouter:
-    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(
+        prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.VIEW))]
+    )
 
     @router.get("")
     def sites() -> list[dict[str, Any]]:
@@ -227,15 +290,27 @@ def _site_routes(station: Station) -> APIRouter:
     def one_site(request: Request, site: str) -> dict[str, Any]:
         """A site with its versions and flights, and the revision of its live map."""
         detail = site_detail(site, station.shelf.open(site))
-        revision = station.tiles.live(site).revision if detail["versions"] or detail["bounds_wgs84"] else None
+        revision = (
+            station.tiles.live(site).revision
+            if detail["versions"] or detail["bounds_wgs84"]
+            else None
+        )
         return {**detail, "live_revision": revision, "links": landing_links(request, site)}
 
-    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.webp", response_class=Response, responses=_picture("webp"))
+    @router.get(
+        "/{site}/tiles/{version}/{z}/{x}/{y}.webp",
+        response_class=Response,
+        responses=_picture("webp"),
+    )
     def tile_webp(site: str, version: str, z: int, x: int, y: int) -> Response:
         """A Web Mercator tile, 256 px; `version` is a number, `live-REVISION` or `live`. 204 where the map is not."""
         return _tile(station, site, version, (z, x, y), ".webp")
 
-    @router.get("/{site}/tiles/{version}/{z}/{x}/{y}.png", response_class=Response, responses=_picture("png"))
+    @router.get(
+        "/{site}/tiles/{version}/{z}/{x}/{y}.png",
+        response_class=Response,
+        responses=_picture("png"),
+    )
     def tile_png(site: str, version: str, z: int, x: int, y: int) -> Response:
         """The same as PNG, for programs that read no WebP."""
         return _tile(station, site, version, (z, x, y), ".png")
@@ -246,13 +321,18 @@ def _site_routes(station: Station) -> APIRouter:
 def _picture(kind: str) -> dict[int | str, dict[str, Any]]:
     """How a tile's answers are described."""
     return {
-        200: {"description": "The tile", "content": {f"image/{kind}": {}}}, 204: {"description": "Nothing of the map"},
+        200: {"description": "The tile", "content": {f"image/{kind}": {}}},
+        204: {"description": "Nothing of the map"},
     }
 
 
-def _tile(station: Station, site: str, version: str, place: tuple[int, int, int], ending: str) -> Response:
+def _tile(
+    station: Station, site: str, version: str, place: tuple[int, int, int], ending: str
+) -> Response:
     answer = station.tiles.tile(site, version, *place, ending)
-    headers = {"cache-control": _FOR_EVER.replace("public", "private") if answer.is_final else "no-cache"}
+    headers = {
+        "cache-control": _FOR_EVER.replace("public", "private") if answer.is_final else "no-cache"
+    }
     if not answer.data:
         return Response(status_code=204, headers=headers)
     return Response(answer.data, media_type=f"image/{ending[1:]}", headers=headers)
@@ -265,7 +345,9 @@ def _serve_page(app: FastAPI) -> None:
     def page() -> Response:
         path = PAGE_FOLDER / "index.html"
         if not path.is_file():
-            raise Problem(404, "this installation has no page; the API is described by /openapi.json")
+            raise Problem(
+                404, "this installation has no page; the API is described by /openapi.json"
+            )
         return FileResponse(path, headers={"cache-control": "no-cache"})
 
     app.mount("/page", _PageFiles(directory=PAGE_FOLDER), name="page")

@@ -64,7 +64,11 @@ def camera_opened(order: Order, folder: Path, until: threading.Event) -> Iterato
     camera = _Camera(order, folder)
     try:
         path = camera.flight(Path(order.streams) / order.stream, until)
-        own = replace(order, stream="") if path is None else replace(order, source=f"follow:{path}", telemetry="")
+        own = (
+            replace(order, stream="")
+            if path is None
+            else replace(order, source=f"follow:{path}", telemetry="")
+        )
         yield OpenedCamera(own, lambda: camera.left)
     except KeyboardInterrupt:
         camera.end(_LEAVE_S)
@@ -77,10 +81,14 @@ class _Camera:
     """The process that reads a camera, seen from the mission. `end` ends it; it ends by itself with the mission."""
 
     def __init__(self, order: Order, folder: Path) -> None:
-        job = CameraJob(order.source, order.telemetry, order.stream, order.door, str(folder.resolve() / "spool"))
+        job = CameraJob(
+            order.source, order.telemetry, order.stream, order.door, str(folder.resolve() / "spool")
+        )
         self._spool = Path(job.spool)
         self._process = subprocess.Popen(
-            python_command("sorvolo.station.camera"), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            python_command("sorvolo.station.camera"),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             cwd=Path(order.door).parent,
         )
         assert self._process.stdin is not None
@@ -110,7 +118,9 @@ class _Camera:
                 self._path = found.resolve()
                 return self._path
             if flight and time.monotonic() - since_s > _STATION_AWAY_S:
-                raise InputError(f"the station took no picture of the camera: {why or 'it is away'}")
+                raise InputError(
+                    f"the station took no picture of the camera: {why or 'it is away'}"
+                )
         raise KeyboardInterrupt
 
     def end(self, within_s: float) -> None:
@@ -179,7 +189,9 @@ def _send(job: CameraJob, stop: threading.Event) -> int:
         _state({"unsendable": without_secret(str(error), job.source)})
         return 0
     # every picture is sent, also after the station was away: the mission's own map is made of them
-    settings = StreamSettings(latency_s=float("inf"), spool_bytes=_SPOOL_BYTES, door=Path(job.door).name)
+    settings = StreamSettings(
+        latency_s=float("inf"), spool_bytes=_SPOOL_BYTES, door=Path(job.door).name
+    )
     waiting = Spool(Path(job.spool), _SPOOL_BYTES)
     client = StreamClient(footage, waiting, f"ws://localhost/{job.stream}", "", settings, stop)
     _state({"flight": waiting.flight})

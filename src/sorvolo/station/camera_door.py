@@ -35,10 +35,18 @@ class CameraDoor:
         try:
             listening = _listening(self._path)
         except OSError as error:
-            _LOG.warning("no socket can be made in %s (%s): cameras' video is not shown", self._path.parent, error)
+            _LOG.warning(
+                "no socket can be made in %s (%s): cameras' video is not shown",
+                self._path.parent,
+                error,
+            )
             return
         self._server = await unix_serve(
-            self._take, sock=listening, compression=None, max_size=_MOST_MESSAGE_BYTES, close_timeout=2.0,
+            self._take,
+            sock=listening,
+            compression=None,
+            max_size=_MOST_MESSAGE_BYTES,
+            close_timeout=2.0,
         )
 
     async def close(self) -> None:
@@ -49,7 +57,9 @@ class CameraDoor:
             self._path.unlink(missing_ok=True)
 
     async def _take(self, connection: ServerConnection) -> None:
-        stream = connection.request.path.rpartition("/")[2] if connection.request is not None else ""
+        stream = (
+            connection.request.path.rpartition("/")[2] if connection.request is not None else ""
+        )
         await self._ingest.serve(stream, SocketLink(connection))
 
 

@@ -11,13 +11,29 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
-_MEMORY_BYTES = 3 << 30  # a picture of 200 megapixels takes 0.6 GB decoded, copies and libraries the rest
+_MEMORY_BYTES = (
+    3 << 30
+)  # a picture of 200 megapixels takes 0.6 GB decoded, copies and libraries the rest
 _CPU_S = 600  # of processor time; by choice
 _MOST_PIXELS = 200_000_000  # of one picture: a 100-megapixel camera twice over
 _MOST_FILES = 20_000  # photos of a day's flights; by choice
 _MOST_RATIO = 200  # unpacked over packed: photos hardly shrink
 _PHOTOS = (".jpg", ".jpeg", ".tif", ".tiff", ".dng", ".heic", ".png")
-_TEXTS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".json", ".xml", ".mrk", ".obs", ".nav", ".bin", ".rtk")
+_TEXTS = (
+    ".srt",
+    ".csv",
+    ".gpx",
+    ".txt",
+    ".nmea",
+    ".log",
+    ".json",
+    ".xml",
+    ".mrk",
+    ".obs",
+    ".nav",
+    ".bin",
+    ".rtk",
+)
 _PICTURE_FORMATS = ("JPEG", "TIFF", "PNG")
 _CONTAINERS = {".mp4": "mov", ".mov": "mov", ".m4v": "mov", ".mkv": "matroska", ".ts": "mpegts"}
 _SIGNATURES = {".heic": ((4, b"ftyp"),), ".dng": ((0, b"II*\0"), (0, b"MM\0*"))}
@@ -62,23 +78,40 @@ def _video(part: Path, container: str) -> dict[str, Any]:
                 raise Refusal("no picture in it can be decoded; was it cut off?")
             width_px, height_px = stream.codec_context.width, stream.codec_context.height
             if not 0 < width_px * height_px <= _MOST_PIXELS:
-                raise Refusal(f"its pictures have {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken")
+                raise Refusal(
+                    f"its pictures have {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken"
+                )
             next(video.decode(stream))
-            seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else None
+            seconds = (
+                float(stream.duration * stream.time_base)
+                if stream.duration and stream.time_base
+                else None
+            )
             whole_bytes = max((each.pos + each.size for each in stream.index_entries), default=0)
-            return {"kind": "video", "width_px": width_px, "height_px": height_px, "seconds": seconds,
-                    "codec": stream.codec_context.name,
-                    "missing_bytes": max(0, whole_bytes - part.stat().st_size)}  # a flight that was cut is still one
+            return {
+                "kind": "video",
+                "width_px": width_px,
+                "height_px": height_px,
+                "seconds": seconds,
+                "codec": stream.codec_context.name,
+                "missing_bytes": max(0, whole_bytes - part.stat().st_size),
+            }  # a flight that was cut is still one
     except StopIteration:
         raise Refusal("no picture in it can be decoded; was it cut off?") from None
     except (av.FFmpegError, OSError) as error:
-        raise Refusal(f"it cannot be read as a video ({error.strerror}); was the file cut off?") from error
+        raise Refusal(
+            f"it cannot be read as a video ({error.strerror}); was the file cut off?"
+        ) from error
 
 
 def _has_signature(head: bytes, container: str) -> bool:
     if container == "mov":
         return head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
-    return head[:4] == b"\x1aE\xdf\xa3" if container == "matroska" else head[:1] == b"G" or head[4:5] == b"G"
+    return (
+        head[:4] == b"\x1aE\xdf\xa3"
+        if container == "matroska"
+        else head[:1] == b"G" or head[4:5] == b"G"
+    )
 
 
 def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> dict[str, Any]:
@@ -98,7 +131,9 @@ def _photos(part: Path, target: Path, most_bytes: int, keep_free_bytes: int) -> 
     except (zipfile.BadZipFile, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
         raise Refusal(f"it cannot be unpacked ({error}); was the file cut off?") from error
     except OSError as error:
-        raise Refusal(f"it cannot be unpacked here ({error.strerror}); check the station's disk") from error
+        raise Refusal(
+            f"it cannot be unpacked here ({error.strerror}); check the station's disk"
+        ) from error
     photos = sum(Path(name).suffix.lower() in _PHOTOS for name in taken)
     if not photos:
         raise Refusal("there is no photo in it")
@@ -120,7 +155,9 @@ def _entries(archive: zipfile.ZipFile, most_bytes: int) -> Iterator[zipfile.ZipI
     if len(entries) > _MOST_FILES:
         raise Refusal(f"{len(entries)} files are in it, at most {_MOST_FILES} are taken")
     if sum(each.file_size for each in entries) > most_bytes:
-        raise Refusal(f"unpacked it would have more than the {most_bytes / 1e9:.0f} GB that are taken")
+        raise Refusal(
+            f"unpacked it would have more than the {most_bytes / 1e9:.0f} GB that are taken"
+        )
     for each in entries:
         path = PurePosixPath(each.filename.replace("\\", "/"))
         _demand_harmless(each, path)
@@ -171,17 +208,33 @@ def _check_picture(path: Path) -> None:
 
     with path.open("rb") as file:
         head = file.read(12)
-    if path.suffix.lower() in _SIGNATURES:  # their decoders are the mission's; their size is bounded there
-        if not any(head[at:at + len(sign)] == sign for at, sign in _SIGNATURES[path.suffix.lower()]):
-            raise Refusal(f"{path.name} is no {path.suffix[1:].upper()} picture, whatever its name is")
+    if (
+        path.suffix.lower() in _SIGNATURES
+    ):  # their decoders are the mission's; their size is bounded there
+        if not any(
+            head[at : at + len(sign)] == sign for at, sign in _SIGNATURES[path.suffix.lower()]
+        ):
+            raise Refusal(
+                f"{path.name} is no {path.suffix[1:].upper()} picture, whatever its name is"
+            )
         return
     try:
         with Image.open(path, formats=_PICTURE_FORMATS) as picture:
             width_px, height_px = picture.size
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise Refusal(f"{path.name} is no picture that can be read, whatever its name is") from error
+    except (
+        UnidentifiedImageError,
+        OSError,
+        ValueError,
+        SyntaxError,
+        Image.DecompressionBombError,
+    ) as error:
+        raise Refusal(
+            f"{path.name} is no picture that can be read, whatever its name is"
+        ) from error
     if not 0 < width_px * height_px <= _MOST_PIXELS:
-        raise Refusal(f"{path.name} has {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken")
+        raise Refusal(
+            f"{path.name} has {width_px} x {height_px} pixels, at most {_MOST_PIXELS:,} are taken"
+        )
 
 
 def main(part: str, target: str, most_bytes: str, keep_free_bytes: str) -> None:

@@ -26,7 +26,9 @@ _TURN_S = 0.02  # how long the sender rests where there is nothing to send
 _CONNECT_S = 10.0  # over a weak link; by choice
 _ANSWER_S = 10.0  # to a greeting or a flight's end; by choice
 _MOST_SENT_BYTES = 4_000_000  # on the way and not acknowledged
-_MOST_WAY_S = 2.0  # age of what is on the way; more waits in the spool, from where it can be left out
+_MOST_WAY_S = (
+    2.0  # age of what is on the way; more waits in the spool, from where it can be left out
+)
 _CATCH_UP = 0.5  # seconds of an outage that are made up for in a second
 _DELAYS_KEPT = 100_000  # acknowledgements: an hour of video at 25 pictures a second
 _SAME_FLIGHT_NS = 600_000_000_000  # a client that was away for longer comes with another flight
@@ -45,7 +47,9 @@ class StreamSettings:
     ping_s: float = 5.0  # a link that answers no ping for so long is opened anew
     give_up_s: float = float("inf")  # without a link, once everything was taken
     authority: Path | None = None  # of the station's certificate, PEM
-    door: str = ""  # the socket of a station on this machine, which is called instead of the address
+    door: str = (
+        ""  # the socket of a station on this machine, which is called instead of the address
+    )
 
     def __post_init__(self) -> None:
         if not (self.speed == 0 or 0.01 <= self.speed <= 1000):
@@ -85,9 +89,13 @@ def stream_url(station: str, stream: str) -> str:
         parts = urlsplit(station)
         host, _ = parts.hostname, parts.port
     except ValueError as error:
-        raise SettingsError(f"--to {station}: {error}; give for instance http://192.168.1.5:8750") from error
+        raise SettingsError(
+            f"--to {station}: {error}; give for instance http://192.168.1.5:8750"
+        ) from error
     if parts.scheme not in schemes or not host or parts.username or parts.query:
-        raise SettingsError(f"--to {station} is no station's address; give for instance http://192.168.1.5:8750")
+        raise SettingsError(
+            f"--to {station} is no station's address; give for instance http://192.168.1.5:8750"
+        )
     path = f"{parts.path.rstrip('/')}/api/ingest/{stream}"
     return urlunsplit((schemes[parts.scheme], parts.netloc, path, "", ""))
 
@@ -105,14 +113,22 @@ class StreamClient:
     """Sends one flight. `run` returns when all of it is with the station, or what is left is kept in the spool."""
 
     def __init__(
-        self, footage: Footage, spool: Spool, url: str, token: str, settings: StreamSettings, stop: threading.Event
+        self,
+        footage: Footage,
+        spool: Spool,
+        url: str,
+        token: str,
+        settings: StreamSettings,
+        stop: threading.Event,
     ) -> None:
         self._footage, self._spool, self._url, self._token = footage, spool, url, token
         self._settings, self._stop = settings, stop
         self._is_taken = threading.Event()  # all pieces were taken
         self._failure: BaseException | None = None
         self._allowance = _Allowance(settings.latency_s)
-        if (oldest_ns := spool.oldest_ns) is not None:  # what an earlier run left is late, and sent all the same
+        if (
+            oldest_ns := spool.oldest_ns
+        ) is not None:  # what an earlier run left is late, and sent all the same
             self._allowance.add((time.time_ns() - oldest_ns) / 1e9)
         self._way = _Way()
         self._was_linked = False
@@ -164,7 +180,11 @@ class StreamClient:
             if not pace.wait(piece.dts_us, self._stop) or not self._wait_for_room():
                 return
             spool.append(
-                piece.kind, piece.pts_us, piece.payload, is_key=piece.is_key, dts_us=piece.dts_us,
+                piece.kind,
+                piece.pts_us,
+                piece.payload,
+                is_key=piece.is_key,
+                dts_us=piece.dts_us,
                 taken_ns=time.time_ns(),
             )
 
@@ -192,7 +212,9 @@ class StreamClient:
                         await self._greet(link)
                         backoff.reset()
                         if lost_s is not None:
-                            self._came_back(time.monotonic() - lost_s, is_first=not self._was_linked)
+                            self._came_back(
+                                time.monotonic() - lost_s, is_first=not self._was_linked
+                            )
                             lost_s = None
                         await self._talk(link)
                         return
@@ -213,8 +235,12 @@ class StreamClient:
         """A new connection to the station, to be entered."""
         ping_s, headers = self._settings.ping_s, self._headers()
         ways: dict[str, Any] = {
-            "compression": None, "open_timeout": _CONNECT_S, "ping_interval": ping_s, "ping_timeout": ping_s,
-            "close_timeout": 2.0, "max_size": 1_000_000,
+            "compression": None,
+            "open_timeout": _CONNECT_S,
+            "ping_interval": ping_s,
+            "ping_timeout": ping_s,
+            "close_timeout": 2.0,
+            "max_size": 1_000_000,
         }
         if self._settings.door:
             return unix_connect(self._settings.door, self._url, **ways)
@@ -241,7 +267,9 @@ class StreamClient:
                 f"{self._url}: the station's certificate is not trusted ({error.verify_message}); give its authority "
                 "as --ca"
             ) from error
-        self.report.words = (close.reason if close is not None else "") or str(error) or type(error).__name__
+        self.report.words = (
+            (close.reason if close is not None else "") or str(error) or type(error).__name__
+        )
 
     def _judge_status(self, status: int) -> None:
         """Raises InputError for an answer that stays the same."""
@@ -251,7 +279,9 @@ class StreamClient:
                 "sorvolo token, and give it as --token or SORVOLO_TOKEN"
             )
         if status in (404, 405, 421):
-            raise InputError(f"{self._url}: no station takes streams there (HTTP {status}); check --to")
+            raise InputError(
+                f"{self._url}: no station takes streams there (HTTP {status}); check --to"
+            )
 
     def _came_back(self, outage_s: float, *, is_first: bool) -> None:
         """Whatever was taken without a link is sent, late as it is."""
@@ -264,7 +294,12 @@ class StreamClient:
     async def _greet(self, link: ClientConnection) -> None:
         form = self._footage.format
         hello = Hello(
-            self._spool.flight, form.codec, form.width, form.height, form.fps, self._footage.name,
+            self._spool.flight,
+            form.codec,
+            form.width,
+            form.height,
+            form.fps,
+            self._footage.name,
             f"sorvolo {__version__}",
         )
         text = hello.to_json()
@@ -296,7 +331,9 @@ class StreamClient:
         spool, allowed_s = self._spool, self._allowance.now_s()
         if allowed_s != float("inf"):
             spool.drop_late(time.time_ns() - round(allowed_s * 1e9))
-        if self._way.bytes > _MOST_SENT_BYTES or self._way.age_s() > min(_MOST_WAY_S, allowed_s / 2):
+        if self._way.bytes > _MOST_SENT_BYTES or self._way.age_s() > min(
+            _MOST_WAY_S, allowed_s / 2
+        ):
             return False  # more would only wait in the network's own buffers
         message = spool.next()
         if message is None:
@@ -334,7 +371,9 @@ class StreamClient:
         try:
             return ssl.create_default_context(cafile=None if authority is None else str(authority))
         except (OSError, ssl.SSLError) as error:
-            raise SettingsError(f"--ca {authority}: no usable certificate ({error}); give a PEM file") from error
+            raise SettingsError(
+                f"--ca {authority}: no usable certificate ({error}); give a PEM file"
+            ) from error
 
     async def _show(self, show: Callable[[StreamReport], None]) -> None:
         while True:

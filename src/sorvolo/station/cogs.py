@@ -29,12 +29,20 @@ from sorvolo.station.tokens import Role
 from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
 
-_OF_FLIGHT = {"orthophoto": "True orthophoto", "heights": "Surface heights, m", "terrain": "Bare ground, m"}
-_MATRIX_SETS = TileMatrixSets({
-    name: all_tile_matrix_sets.get(name) for name in ("WebMercatorQuad", "WGS1984Quad")
-})
+_OF_FLIGHT = {
+    "orthophoto": "True orthophoto",
+    "heights": "Surface heights, m",
+    "terrain": "Bare ground, m",
+}
+_MATRIX_SETS = TileMatrixSets(
+    {name: all_tile_matrix_sets.get(name) for name in ("WebMercatorQuad", "WGS1984Quad")}
+)
 _PREFIX = "/api/sites/{site}/cogs/{cog}"
-_GDAL = {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_CACHEMAX": 64, "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none"}
+_GDAL = {
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_CACHEMAX": 64,
+    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": "none",
+}
 
 
 @dataclass(frozen=True)
@@ -103,7 +111,9 @@ def tilejson_address(site: str, cog: Cog) -> str:
 
 def cog_routes(shelf: SiteShelf) -> list[APIRouter]:
     """The list of a site's rasters, and titiler's routes below each."""
-    listing = APIRouter(prefix="/api/sites/{site}/cogs", tags=["rasters"], dependencies=[Depends(needs(Role.VIEW))])
+    listing = APIRouter(
+        prefix="/api/sites/{site}/cogs", tags=["rasters"], dependencies=[Depends(needs(Role.VIEW))]
+    )
 
     @listing.get("")
     def rasters(site: str) -> list[dict[str, str]]:
@@ -114,10 +124,17 @@ def cog_routes(shelf: SiteShelf) -> list[APIRouter]:
         ]
 
     factory = TileFactory(
-        reader=TiffReader, path_dependency=_path_of(shelf), router_prefix=_PREFIX, layer_dependency=BidxParams,
+        reader=TiffReader,
+        path_dependency=_path_of(shelf),
+        router_prefix=_PREFIX,
+        layer_dependency=BidxParams,
         process_dependency=Algorithms({"hillshade": HillShade, "slope": Slope}).dependency,
-        supported_tms=_MATRIX_SETS, render_func=_rendered, environment_dependency=lambda: dict(_GDAL),
-        router=APIRouter(tags=["rasters"], dependencies=[Depends(needs(Role.VIEW)), Depends(_within_bounds)]),
+        supported_tms=_MATRIX_SETS,
+        render_func=_rendered,
+        environment_dependency=lambda: dict(_GDAL),
+        router=APIRouter(
+            tags=["rasters"], dependencies=[Depends(needs(Role.VIEW)), Depends(_within_bounds)]
+        ),
     )
     below = APIRouter()
     below.include_router(factory.router, prefix=_PREFIX)
@@ -129,10 +146,14 @@ def answer_raster_errors(app: FastAPI) -> None:
 
     @app.exception_handler(TileOutsideBounds)
     async def _outside(_: Request, __: TileOutsideBounds) -> JSONResponse:
-        return problem_answer(404, "this tile shows nothing of the raster; its TileJSON states its bounds")
+        return problem_answer(
+            404, "this tile shows nothing of the raster; its TileJSON states its bounds"
+        )
 
     async def _unreadable(_: Request, error: Exception) -> JSONResponse:
-        return problem_answer(400, f"this cannot be drawn ({str(error)[:200]}); /openapi.json describes what can")
+        return problem_answer(
+            400, f"this cannot be drawn ({str(error)[:200]}); /openapi.json describes what can"
+        )
 
     app.add_exception_handler(RioTilerError, _unreadable)
     app.add_exception_handler(RasterioError, _unreadable)
@@ -152,7 +173,10 @@ def _path_of(shelf: SiteShelf) -> Callable[[str, str], str]:
         archive = shelf.open(site)
         found = cogs_of(archive).get(cog)
         if found is None:
-            raise Problem(404, f"the site has no raster {cog[:80]!r}; /api/sites/{site}/cogs lists those there are")
+            raise Problem(
+                404,
+                f"the site has no raster {cog[:80]!r}; /api/sites/{site}/cogs lists those there are",
+            )
         with open_below(archive.folder, found.file):  # refuses links on the way
             return str(archive.folder / found.file)
 

@@ -100,7 +100,9 @@ class SiteCollections:
     def __init__(self, shelf: SiteShelf, findings: Findings) -> None:
         self._shelf, self._findings = shelf, findings
         self._kept: dict[tuple[str, str], _Kept] = {}
-        self._flights: dict[tuple[str, str, str], tuple[int, FlightFrames]] = {}  # frames with their file's time
+        self._flights: dict[
+            tuple[str, str, str], tuple[int, FlightFrames]
+        ] = {}  # frames with their file's time
         self._lock = threading.Lock()
 
     def frames_of(self, site_id: str, flights: Sequence[str]) -> list[FlightFrames]:
@@ -109,8 +111,12 @@ class SiteCollections:
         site, created_utc = archive.site(), archive.created_utc
         return [self._frames_of(site_id, created_utc, archive, site, each) for each in flights]
 
-    def _frames_of(self, site_id: str, created_utc: str, archive: Archive, site: Site, flight: str) -> FlightFrames:
-        mark = _modified(archive, f"flights/{flight}/{features_name('frames', is_local=site.is_local)}")
+    def _frames_of(
+        self, site_id: str, created_utc: str, archive: Archive, site: Site, flight: str
+    ) -> FlightFrames:
+        mark = _modified(
+            archive, f"flights/{flight}/{features_name('frames', is_local=site.is_local)}"
+        )
         key = (site_id, created_utc, flight)
         with self._lock:
             known = self._flights.pop(key, None)
@@ -133,7 +139,11 @@ class SiteCollections:
         if name not in _MAKERS:
             raise Problem(404, f"no collection {name[:40]!r}; there are {', '.join(TITLES)}")
         archive = self._shelf.open(site_id)
-        mark = (archive.change_mark(), _modified(archive, _POD_FILE), _modified(archive, LIVE_COVERAGE))
+        mark = (
+            archive.change_mark(),
+            _modified(archive, _POD_FILE),
+            _modified(archive, LIVE_COVERAGE),
+        )
         with self._lock:
             known = self._kept.get((site_id, name))
         if known is not None and known.mark == mark:
@@ -167,9 +177,14 @@ def _frames_of(archive: Archive, site: Site, flight: str) -> list[Feature]:
         geometry = _lonlat(each.get("geometry"), site)
         if site.is_local:
             values |= _camera_on_earth(values, site)
-        features.append({
-            "type": "Feature", "id": f"{flight}:{values.get('frame')}", "geometry": geometry, "properties": values,
-        })
+        features.append(
+            {
+                "type": "Feature",
+                "id": f"{flight}:{values.get('frame')}",
+                "geometry": geometry,
+                "properties": values,
+            }
+        )
     return features
 
 
@@ -177,7 +192,9 @@ def _track(archive: Archive) -> list[Feature]:
     lines: dict[str, list[tuple[str, list[float]]]] = {}
     for each in _frames(archive):
         values = each["properties"]
-        place = [values.get(f"camera_{name}") for name in ("longitude_deg", "latitude_deg", "height_m")]
+        place = [
+            values.get(f"camera_{name}") for name in ("longitude_deg", "latitude_deg", "height_m")
+        ]
         if None not in place[:2]:
             known = [each for each in place if each is not None]
             lines.setdefault(values["flight"], []).append((values["time"], known))
@@ -187,16 +204,22 @@ def _track(archive: Archive) -> list[Feature]:
         if len(places) < 2:
             continue
         values = {
-            "flight": flight, "datetime": places[0][0], "end_datetime": places[-1][0],
+            "flight": flight,
+            "datetime": places[0][0],
+            "end_datetime": places[-1][0],
             "times": [time for time, _ in places],
         }
         geometry = {"type": "LineString", "coordinates": [place for _, place in places]}
-        features.append({"type": "Feature", "id": flight, "geometry": geometry, "properties": values})
+        features.append(
+            {"type": "Feature", "id": flight, "geometry": geometry, "properties": values}
+        )
     return features
 
 
 def _objects(archive: Archive) -> list[Feature]:
-    made = objects_geojson(archive.newest_objects(), on_earth(archive.site()), crops_from_site=True)["features"]
+    made = objects_geojson(
+        archive.newest_objects(), on_earth(archive.site()), crops_from_site=True
+    )["features"]
     return [_with(each, "object", each["properties"]["class"]) for each in made]
 
 
@@ -204,23 +227,38 @@ def _changes(archive: Archive) -> list[Feature]:
     stored = archive.changes()
     versions = {each.flight_id: each for each in archive.versions() if each.complete}
     features = []
-    for change, each in zip(stored, changes_geojson(stored, on_earth(archive.site()))["features"], strict=True):
+    for change, each in zip(
+        stored, changes_geojson(stored, on_earth(archive.site()))["features"], strict=True
+    ):
         label = change.class_after or change.class_before or change.kind.value
         version = versions.get(change.flight_id)
         more = {
-            "flight": change.flight_id, "class": label, "version": version and version.id,
+            "flight": change.flight_id,
+            "class": label,
+            "version": version and version.id,
             "from_version": version and version.parent_id,
         }
         features.append(_with(each, "change", label, more))
     return features
 
 
-def _with(feature: Feature, kind: str, label: str, more: Mapping[str, Any] | None = None) -> Feature:
+def _with(
+    feature: Feature, kind: str, label: str, more: Mapping[str, Any] | None = None
+) -> Feature:
     values = {
-        **feature["properties"], **(more or {}), "class": label, "datetime": feature["properties"]["first_seen"],
-        "end_datetime": feature["properties"]["last_seen"], "review_kind": kind,
+        **feature["properties"],
+        **(more or {}),
+        "class": label,
+        "datetime": feature["properties"]["first_seen"],
+        "end_datetime": feature["properties"]["last_seen"],
+        "review_kind": kind,
     }
-    return {"type": "Feature", "id": values["id"], "geometry": feature["geometry"], "properties": values}
+    return {
+        "type": "Feature",
+        "id": values["id"],
+        "geometry": feature["geometry"],
+        "properties": values,
+    }
 
 
 def _coverage(archive: Archive) -> list[Feature]:
@@ -229,23 +267,44 @@ def _coverage(archive: Archive) -> list[Feature]:
         for number, each in enumerate(_features_of(archive, f"flights/{flight}", COVERAGE)):
             values = {**(each.get("properties") or {}), "flight": flight}
             geometry = _lonlat(each.get("geometry"), archive.site())
-            features.append({"type": "Feature", "id": f"{flight}:{number}", "geometry": geometry, "properties": values})
-    for number, each in enumerate(_features_of(archive, "", _LIVE_COVERAGE, local=False)):  # of the flight in the air
+            features.append(
+                {
+                    "type": "Feature",
+                    "id": f"{flight}:{number}",
+                    "geometry": geometry,
+                    "properties": values,
+                }
+            )
+    for number, each in enumerate(
+        _features_of(archive, "", _LIVE_COVERAGE, local=False)
+    ):  # of the flight in the air
         values = {**(each.get("properties") or {}), "flight": None}
         geometry = _lonlat(each.get("geometry"), archive.site())
-        features.append({"type": "Feature", "id": f"live:{number}", "geometry": geometry, "properties": values})
+        features.append(
+            {"type": "Feature", "id": f"live:{number}", "geometry": geometry, "properties": values}
+        )
     return features
 
 
 def _pod(archive: Archive) -> list[Feature]:
     return [
-        {"type": "Feature", "id": str(number), "geometry": each.get("geometry"), "properties": each.get("properties")}
+        {
+            "type": "Feature",
+            "id": str(number),
+            "geometry": each.get("geometry"),
+            "properties": each.get("properties"),
+        }
         for number, each in enumerate(_features_of(archive, SEARCH_FOLDER, "pod", local=False))
     ]
 
 
 _MAKERS: Mapping[str, Callable[[Archive], list[Feature]]] = {
-    "frames": _frames, "objects": _objects, "changes": _changes, "coverage": _coverage, "pod": _pod, "track": _track,
+    "frames": _frames,
+    "objects": _objects,
+    "changes": _changes,
+    "coverage": _coverage,
+    "pod": _pod,
+    "track": _track,
 }
 
 
@@ -257,7 +316,9 @@ def _complete(archive: Archive) -> list[FlightEntry]:
     return [each for each in archive.flights() if each.status == "complete"]
 
 
-def _features_of(archive: Archive, folder: str, name: str, *, local: bool | None = None) -> list[Feature]:
+def _features_of(
+    archive: Archive, folder: str, name: str, *, local: bool | None = None
+) -> list[Feature]:
     """The features of a GeoJSON file of the site; none where there is no such file or somebody broke it."""
     is_local = archive.site().is_local if local is None else local
     try:
@@ -265,7 +326,9 @@ def _features_of(archive: Archive, folder: str, name: str, *, local: bool | None
         features = json.loads(read_below(archive.folder, file, _MOST_BYTES)).get("features")
     except (OSError, ValueError, RecursionError, AttributeError):
         return []
-    return [each for each in features if isinstance(each, dict)] if isinstance(features, list) else []
+    return (
+        [each for each in features if isinstance(each, dict)] if isinstance(features, list) else []
+    )
 
 
 def _lonlat(geometry: Any, site: Site) -> Any:
@@ -275,7 +338,9 @@ def _lonlat(geometry: Any, site: Site) -> Any:
 
     def turned(coordinates: Any) -> Any:
         if coordinates and isinstance(coordinates[0], int | float):
-            longitudes, latitudes = longitude_latitude(np.array([coordinates[:2]], np.float64), site)
+            longitudes, latitudes = longitude_latitude(
+                np.array([coordinates[:2]], np.float64), site
+            )
             return [float(longitudes[0]), float(latitudes[0])]
         return [turned(each) for each in coordinates]
 
@@ -287,7 +352,10 @@ def _camera_on_earth(values: Mapping[str, Any], site: Site) -> dict[str, Any]:
     if east is None or north is None:
         return {}
     longitudes, latitudes = longitude_latitude(np.array([[east, north]], np.float64), site)
-    return {"camera_longitude_deg": float(longitudes[0]), "camera_latitude_deg": float(latitudes[0])}
+    return {
+        "camera_longitude_deg": float(longitudes[0]),
+        "camera_latitude_deg": float(latitudes[0]),
+    }
 
 
 def _content(archive: Archive) -> object:
@@ -298,7 +366,11 @@ def _content(archive: Archive) -> object:
     return (
         archive.created_utc,
         [(each.id, each.finished_utc) for each in _complete(archive)],
-        [_modified(archive, f"flights/{flight}/{name}") for flight in _flights(archive) for name in names],
+        [
+            _modified(archive, f"flights/{flight}/{name}")
+            for flight in _flights(archive)
+            for name in names
+        ],
         [each.id for each in archive.versions() if each.complete],
         [(each.change_id, each.verdict, each.at_utc, each.note) for each in archive.reviews()],
         _modified(archive, _POD_FILE),

@@ -10,7 +10,14 @@ from sorvolo.geometry.units import M_PER_DEG_LATITUDE
 from sorvolo.missions.watch.cot_sender import CotSender
 from sorvolo.station.relays import NotTaken, features_of
 from sorvolo.station.state import utc_now
-from sorvolo.store.exports.cursor_on_target import COT_TYPES, DroneView, cot_drone, cot_removal, cot_spot, cot_type
+from sorvolo.store.exports.cursor_on_target import (
+    COT_TYPES,
+    DroneView,
+    cot_drone,
+    cot_removal,
+    cot_spot,
+    cot_type,
+)
 
 WANTED = frozenset({"object.found", "change.announced", "change.withdrawn", "frame.placed"})
 """The events that a TAK server gets."""
@@ -53,7 +60,9 @@ class CotRelay:
         elif event["type"] == "change.withdrawn":
             uid = f"sorvolo.{site}.{data.get('id')}"
             if uid in self._sent_types:
-                self._sender.send(cot_removal(uid, type_=self._sent_types.pop(uid), now_ns=time.time_ns()))
+                self._sender.send(
+                    cot_removal(uid, type_=self._sent_types.pop(uid), now_ns=time.time_ns())
+                )
         else:
             for feature in features_of(event):
                 self._spot(site, event, feature)
@@ -65,43 +74,70 @@ class CotRelay:
             raise NotTaken("it has no place on Earth")
         thing = properties.get("id", event["seq"])
         if event["type"] == "change.announced":
-            name, uid, type_ = str(properties.get("kind", "change")), f"sorvolo.{site}.{thing}", _CHANGE_TYPE
+            name, uid, type_ = (
+                str(properties.get("kind", "change")),
+                f"sorvolo.{site}.{thing}",
+                _CHANGE_TYPE,
+            )
         else:
             name = str(properties.get("class", "object"))
             uid, type_ = f"sorvolo.{site}.{event.get('run')}.{thing}", cot_type(name)
         self._sent_types[uid] = type_
-        self._sender.send(cot_spot(
-            *place, uid=uid, kind=type_, callsign=f"{name} {thing}",
-            words=_remarks(name, properties.get("score"), event),
-            error_m=float(properties.get("sigma_m") or nan), now_ns=time.time_ns(), stale_s=_SPOT_STALE_S,
-        ))
+        self._sender.send(
+            cot_spot(
+                *place,
+                uid=uid,
+                kind=type_,
+                callsign=f"{name} {thing}",
+                words=_remarks(name, properties.get("score"), event),
+                error_m=float(properties.get("sigma_m") or nan),
+                now_ns=time.time_ns(),
+                stale_s=_SPOT_STALE_S,
+            )
+        )
 
     def _place(self, run: str, event: Mapping[str, Any], data: Mapping[str, Any]) -> None:
         """A mission placed a frame: the drone is where its camera was, unless it sends that itself."""
-        if time.monotonic() - self._placed_s.get(run, -1e9) < _DRONE_EVERY_S or not _is_new(event) or self._drones():
+        if (
+            time.monotonic() - self._placed_s.get(run, -1e9) < _DRONE_EVERY_S
+            or not _is_new(event)
+            or self._drones()
+        ):
             return
         self._placed_s[run] = time.monotonic()
         view = view_of_frame(data)
         if view is not None:
-            self._sender.send(cot_drone(
-                view, uid=f"sorvolo.drone.{run}", callsign=f"drone {event.get('site') or run}", now_ns=time.time_ns(),
-                stale_s=_DRONE_STALE_S,
-            ))
+            self._sender.send(
+                cot_drone(
+                    view,
+                    uid=f"sorvolo.drone.{run}",
+                    callsign=f"drone {event.get('site') or run}",
+                    now_ns=time.time_ns(),
+                    stale_s=_DRONE_STALE_S,
+                )
+            )
 
     def _run(self) -> None:
         while not self._stop.wait(_DRONE_EVERY_S):
             for stream, view in self._drones().items():
                 event = cot_drone(
-                    view, uid=f"sorvolo.drone.{stream}", callsign=stream, now_ns=time.time_ns(), stale_s=_DRONE_STALE_S
+                    view,
+                    uid=f"sorvolo.drone.{stream}",
+                    callsign=stream,
+                    now_ns=time.time_ns(),
+                    stale_s=_DRONE_STALE_S,
                 )
                 try:
                     self._drone_sender.send(event)
-                except OSError:  # the next position is sent in a second; `send` reports a receiver that is away
+                except (
+                    OSError
+                ):  # the next position is sent in a second; `send` reports a receiver that is away
                     break
 
 
 def view_of_sample(columns: Mapping[str, float], stated: Mapping[str, float]) -> DroneView | None:
     """A drone's place and view by its own telemetry; None without a place."""
+
     def known(*names: str) -> float:
         return next((columns[name] for name in names if isfinite(columns.get(name, nan))), nan)
 
@@ -109,10 +145,17 @@ def view_of_sample(columns: Mapping[str, float], stated: Mapping[str, float]) ->
         return None
     elevation_deg = known("camera_pitch_deg")
     return DroneView(
-        known("latitude_deg"), known("longitude_deg"), known("ellipsoidal_height_m"), known("course_deg"),
-        known("speed_m_s"), known("camera_yaw_deg", "body_yaw_deg"), elevation_deg,
-        stated.get("sensor_horizontal_fov_deg", nan), stated.get("sensor_vertical_fov_deg", nan),
-        _range_m(known("height_above_takeoff_m"), elevation_deg), known("horizontal_sigma_m"),
+        known("latitude_deg"),
+        known("longitude_deg"),
+        known("ellipsoidal_height_m"),
+        known("course_deg"),
+        known("speed_m_s"),
+        known("camera_yaw_deg", "body_yaw_deg"),
+        elevation_deg,
+        stated.get("sensor_horizontal_fov_deg", nan),
+        stated.get("sensor_vertical_fov_deg", nan),
+        _range_m(known("height_above_takeoff_m"), elevation_deg),
+        known("horizontal_sigma_m"),
     )
 
 
@@ -126,13 +169,20 @@ def view_of_frame(data: Mapping[str, Any]) -> DroneView | None:
         longitude, latitude = (float(each) for each in data["position"])
         height_m, heading_deg = float(data["height_m"]), float(data["heading_deg"])
         east_m = M_PER_DEG_LATITUDE * cos(radians(latitude))
-        corners = [((x - longitude) * east_m, (y - latitude) * M_PER_DEG_LATITUDE) for x, y in data["footprint"][:4]]
+        corners = [
+            ((x - longitude) * east_m, (y - latitude) * M_PER_DEG_LATITUDE)
+            for x, y in data["footprint"][:4]
+        ]
         top_left, top_right, low_right, low_left = corners
     except (KeyError, TypeError, ValueError):
         return None
     middle = _mean(*corners)
     return DroneView(
-        latitude, longitude, course_deg=nan, azimuth_deg=heading_deg, elevation_deg=float(data.get("pitch_deg", -90.0)),
+        latitude,
+        longitude,
+        course_deg=nan,
+        azimuth_deg=heading_deg,
+        elevation_deg=float(data.get("pitch_deg", -90.0)),
         across_deg=_angle_deg(_mean(top_left, low_left), _mean(top_right, low_right), height_m),
         down_deg=_angle_deg(_mean(top_left, top_right), _mean(low_left, low_right), height_m),
         range_m=hypot(*middle, height_m),
@@ -145,7 +195,9 @@ def _remarks(name: str, score: Any, event: Mapping[str, Any]) -> str:
 
 
 def _mean(*points: tuple[float, float]) -> tuple[float, float]:
-    return sum(each[0] for each in points) / len(points), sum(each[1] for each in points) / len(points)
+    return sum(each[0] for each in points) / len(points), sum(each[1] for each in points) / len(
+        points
+    )
 
 
 def _angle_deg(one: tuple[float, float], other: tuple[float, float], height_m: float) -> float:
@@ -158,13 +210,20 @@ def _angle_deg(one: tuple[float, float], other: tuple[float, float], height_m: f
 def _range_m(height_m: float, elevation_deg: float) -> float:
     """To level ground along the camera's axis; NaN where it looks at the sky or the height is unknown."""
     down = -sin(radians(elevation_deg))
-    return height_m / down if isfinite(height_m) and isfinite(elevation_deg) and down > 0.05 else nan
+    return (
+        height_m / down if isfinite(height_m) and isfinite(elevation_deg) and down > 0.05 else nan
+    )
 
 
 def _middle(geometry: Mapping[str, Any]) -> tuple[float, float] | None:
     """A point's place, or the mean of an outline's corners, longitude and latitude."""
     found = geometry.get("coordinates")
-    while isinstance(found, list) and found and isinstance(found[0], list) and isinstance(found[0][0], list):
+    while (
+        isinstance(found, list)
+        and found
+        and isinstance(found[0], list)
+        and isinstance(found[0][0], list)
+    ):
         found = found[0]
     if not isinstance(found, list) or not found:
         return None

@@ -34,7 +34,9 @@ class JpegResponse(Response):
 def crop_routes(shelf: SiteShelf, findings: Findings) -> APIRouter:
     """Pictures by the id of what they show; never by a path."""
     cutting = CapacityLimiter(_AT_ONCE)
-    router = APIRouter(prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(
+        prefix="/api/sites/{site}/crops", tags=["crops"], dependencies=[Depends(needs(Role.VIEW))]
+    )
 
     @router.get("/change/{change_id}/{n}.jpg", response_class=JpegResponse)
     def of_change(site: str, change_id: str, n: int) -> Response:
@@ -42,7 +44,9 @@ def crop_routes(shelf: SiteShelf, findings: Findings) -> APIRouter:
         archive = shelf.open(site)
         found = next((each for each in archive.changes() if each.id == change_id), None)
         if found is None or n not in (0, 1):
-            raise Problem(404, "no such picture: 0 is before and 1 after, of a change that the site has")
+            raise Problem(
+                404, "no such picture: 0 is before and 1 after, of a change that the site has"
+            )
         file = f"flights/{found.flight_id}/changes/{crop_names(found.id)[n]}"
         rgba = rgba_from_png(_read(archive, file), file)
         return _jpeg(np.where(rgba[..., 3:] > 0, rgba[..., :3], 127).astype(np.uint8))
@@ -62,7 +66,9 @@ def crop_routes(shelf: SiteShelf, findings: Findings) -> APIRouter:
         """What a watch found, as its best frame shows it."""
         if n != 0:
             raise Problem(404, "no such picture: 0 is the best one")
-        return JpegResponse(findings.crop(site, finding_id), headers={"cache-control": "private, no-cache"})
+        return JpegResponse(
+            findings.crop(site, finding_id), headers={"cache-control": "private, no-cache"}
+        )
 
     @router.get("/frame/{flight}/{index}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse)
     async def of_frame(site: str, flight: str, index: int, east_mm: int, north_mm: int) -> Response:
@@ -92,15 +98,19 @@ def cut(archive: Archive, frame: StoredKeyframe, place_m: PointsM) -> ImageRGB:
     Raises StoreError where its picture is gone.
     """
     m_per_px = CROP_M / CROP_PX
-    site_from_crop = np.array([
-        [m_per_px, 0, place_m[0] - m_per_px * (CROP_PX - 1) / 2],
-        [0, -m_per_px, place_m[1] + m_per_px * (CROP_PX - 1) / 2],
-        [0, 0, 1],
-    ])
+    site_from_crop = np.array(
+        [
+            [m_per_px, 0, place_m[0] - m_per_px * (CROP_PX - 1) / 2],
+            [0, -m_per_px, place_m[1] + m_per_px * (CROP_PX - 1) / 2],
+            [0, 0, 1],
+        ]
+    )
     image = archive.image(frame)
     image_from_crop = np.linalg.inv(frame.site_from_image) @ site_from_crop
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    cropped = cv2.warpPerspective(image, image_from_crop, (CROP_PX, CROP_PX), flags=flags, borderValue=(127,) * 3)
+    cropped = cv2.warpPerspective(
+        image, image_from_crop, (CROP_PX, CROP_PX), flags=flags, borderValue=(127,) * 3
+    )
     return np.asarray(cropped, np.uint8)
 
 

@@ -45,7 +45,9 @@ def main() -> None:
     corners = (np.array(order["corners"]) * [width, height] - 0.5).astype(np.float32)
     square = (np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * side - 0.5).astype(np.float32)
     crop_from_image = cv2.getPerspectiveTransform(corners, square)
-    crop = cv2.warpPerspective(image, crop_from_image, (side, side), flags=cv2.INTER_LINEAR, borderValue=(127,) * 3)
+    crop = cv2.warpPerspective(
+        image, crop_from_image, (side, side), flags=cv2.INTER_LINEAR, borderValue=(127,) * 3
+    )
     sys.stdout.buffer.write(jpeg_from_image(np.asarray(crop, np.uint8)))
 
 

@@ -11,7 +11,11 @@ _RESERVE_BYTES = 8_000_000  # some hundred runs' last states, with SQLite's jour
 def shortage(folder: Path, floor_gb: float) -> str:
     """How little of the folder's disk is free where that is less than the floor; "" where there is room."""
     free_gb = shutil.disk_usage(folder).free / 1e9
-    return "" if free_gb >= floor_gb else f"{free_gb:.2f} GB are free, and {floor_gb:.2f} GB must stay so"
+    return (
+        ""
+        if free_gb >= floor_gb
+        else f"{free_gb:.2f} GB are free, and {floor_gb:.2f} GB must stay so"
+    )
 
 
 class Reserve:

@@ -35,7 +35,8 @@ class _Point(BaseModel):
 class _Polygon(BaseModel):
     type: Literal["Polygon"]
     coordinates: Annotated[
-        list[Annotated[list[Place], Field(min_length=4, max_length=_MOST_CORNERS)]], Field(min_length=1, max_length=1)
+        list[Annotated[list[Place], Field(min_length=4, max_length=_MOST_CORNERS)]],
+        Field(min_length=1, max_length=1),
     ]
 
 
@@ -73,7 +74,11 @@ class Drawings:
     def get(self, site_id: str) -> dict[str, Any]:
         """The drawings of a site with their revision. Raises Problem (404)."""
         kept = self._kept(site_id, self._shelf.open(site_id).created_utc)
-        return {"type": "FeatureCollection", "revision": kept.get("revision", 0), "features": kept.get("features", [])}
+        return {
+            "type": "FeatureCollection",
+            "revision": kept.get("revision", 0),
+            "features": kept.get("features", []),
+        }
 
     def put(self, site_id: str, wish: DrawingsWish) -> dict[str, Any]:
         """Keep a site's drawings. Raises Problem (404; 409 where somebody drew meanwhile), StoreError."""
@@ -81,7 +86,11 @@ class Drawings:
             made_utc = self._shelf.open(site_id).created_utc
             now = self._kept(site_id, made_utc).get("revision", 0)
             if wish.revision != now:
-                raise Problem(409, "somebody drew meanwhile; load the drawings again and add yours", revision=now)
+                raise Problem(
+                    409,
+                    "somebody drew meanwhile; load the drawings again and add yours",
+                    revision=now,
+                )
             kept = {"revision": now + 1, "features": [each.model_dump() for each in wish.features]}
             path = self._path(site_id)
             with writing(path):
@@ -107,7 +116,9 @@ class Drawings:
         except (FileNotFoundError, ValueError):
             return {}
         of_utc = kept.get("made_utc")
-        is_ours = at_utc >= made_utc if of_utc is None else of_utc in ("", made_utc)  # "": before its first map
+        is_ours = (
+            at_utc >= made_utc if of_utc is None else of_utc in ("", made_utc)
+        )  # "": before its first map
         return kept if is_ours else {}
 
     def _path(self, site_id: str) -> Path:

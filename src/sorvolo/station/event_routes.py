@@ -18,7 +18,8 @@ def event_routes(events: EventLog) -> APIRouter:
 
     @router.get("/api/events", response_class=StreamingResponse)
     async def sse(
-        after: int | None = Query(None, ge=0, le=2**62), last_event_id: str | None = Header(None, max_length=40),
+        after: int | None = Query(None, ge=0, le=2**62),
+        last_event_id: str | None = Header(None, max_length=40),
     ) -> StreamingResponse:
         """Events after a number (Last-Event-ID goes before it; without either: from now on), each once and in order."""
         known = int(last_event_id) if last_event_id and last_event_id.isdecimal() else after

@@ -35,7 +35,9 @@ class EventLog:
         self._state, self._most_kept = state, most_kept
         self._lock = threading.Lock()
         rows = state.rows("SELECT * FROM events ORDER BY seq DESC LIMIT ?", (_IN_MEMORY,))
-        self._recent: deque[dict[str, Any]] = deque((_event(row) for row in reversed(rows)), maxlen=_IN_MEMORY)
+        self._recent: deque[dict[str, Any]] = deque(
+            (_event(row) for row in reversed(rows)), maxlen=_IN_MEMORY
+        )
         last = state.rows("SELECT seq FROM sqlite_sequence WHERE name = 'events'")
         self._last = int(last[0]["seq"]) if last else 0
         self._waiting: set[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = set()
@@ -63,13 +65,21 @@ class EventLog:
                         "INSERT INTO events (at, type, site, run, data) VALUES (?, ?, ?, ?, ?)",
                         (at, each.type, each.site, each.run, compact_json(each.data)),
                     )
-                    made.append({
-                        "seq": cursor.lastrowid, "at": at, "type": each.type, "site": each.site, "run": each.run,
-                        "data": dict(each.data),
-                    })
+                    made.append(
+                        {
+                            "seq": cursor.lastrowid,
+                            "at": at,
+                            "type": each.type,
+                            "site": each.site,
+                            "run": each.run,
+                            "data": dict(each.data),
+                        }
+                    )
                 yield connection
                 if made and made[-1]["seq"] % 1000 < len(made):
-                    connection.execute("DELETE FROM events WHERE seq <= ?", (made[-1]["seq"] - self._most_kept,))
+                    connection.execute(
+                        "DELETE FROM events WHERE seq <= ?", (made[-1]["seq"] - self._most_kept,)
+                    )
             self._recent.extend(made)
             self._last = made[-1]["seq"] if made else self._last
             waiting = list(self._waiting)
@@ -86,19 +96,29 @@ class EventLog:
         if seq >= last:
             return []
         if recent and recent[0]["seq"] <= seq + 1:
-            return recent[seq + 1 - recent[0]["seq"]:][:_AT_ONCE]
-        rows = self._state.rows("SELECT * FROM events WHERE seq > ? ORDER BY seq LIMIT ?", (seq, _AT_ONCE))
+            return recent[seq + 1 - recent[0]["seq"] :][:_AT_ONCE]
+        rows = self._state.rows(
+            "SELECT * FROM events WHERE seq > ? ORDER BY seq LIMIT ?", (seq, _AT_ONCE)
+        )
         found = [_event(row) for row in rows]
         if found and found[0]["seq"] > seq + 1:
             gap = {"from": seq + 1, "to": found[0]["seq"] - 1}
-            lost = {"seq": gap["to"], "at": found[0]["at"], "type": LOST, "site": None, "run": None, "data": gap}
+            lost = {
+                "seq": gap["to"],
+                "at": found[0]["at"],
+                "type": LOST,
+                "site": None,
+                "run": None,
+                "data": gap,
+            }
             found = [lost, *found]
         return found
 
     def newest(self, kind: str, site: str) -> dict[str, Any] | None:
         """The last event of a kind about a site; None where there was none, or none is kept."""
         rows = self._state.rows(
-            "SELECT * FROM events WHERE type = ? AND site = ? ORDER BY seq DESC LIMIT 1", (kind, site)
+            "SELECT * FROM events WHERE type = ? AND site = ? ORDER BY seq DESC LIMIT 1",
+            (kind, site),
         )
         return _event(rows[0]) if rows else None
 
@@ -107,10 +127,21 @@ class EventLog:
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()
         self._waiting.add((loop, arrived))
         try:
-            if seq > self._last:  # the numbers of a station whose memory was moved away: no event would come for long
+            if (
+                seq > self._last
+            ):  # the numbers of a station whose memory was moved away: no event would come for long
                 seq = self._last
                 gap = {"from": 1, "to": seq}
-                yield [{"seq": seq, "at": utc_now(), "type": LOST, "site": None, "run": None, "data": gap}]
+                yield [
+                    {
+                        "seq": seq,
+                        "at": utc_now(),
+                        "type": LOST,
+                        "site": None,
+                        "run": None,
+                        "data": gap,
+                    }
+                ]
             while True:
                 arrived.clear()
                 events = await asyncio.to_thread(self.after, seq) if seq < self._last else []
@@ -127,4 +158,7 @@ class EventLog:
 
 
 def _event(row: sqlite3.Row) -> dict[str, Any]:
-    return {**{name: row[name] for name in ("seq", "at", "type", "site", "run")}, "data": json.loads(row["data"])}
+    return {
+        **{name: row[name] for name in ("seq", "at", "type", "site", "run")},
+        "data": json.loads(row["data"]),
+    }

@@ -25,19 +25,28 @@ from sorvolo.store.nofollow import open_below
 from sorvolo.store.site.archive import Archive
 
 _OF_SITE: Mapping[str, str] = {
-    "mosaic.tif": "Map, Cloud Optimized GeoTIFF", "mosaic.kmz": "Map for Google Earth",
+    "mosaic.tif": "Map, Cloud Optimized GeoTIFF",
+    "mosaic.kmz": "Map for Google Earth",
     "preview.png": "Map, small picture",
-    "objects.geojson": "Objects, GeoJSON", "objects.kml": "Objects, KML", "objects.gpx": "Objects, GPX",
+    "objects.geojson": "Objects, GeoJSON",
+    "objects.kml": "Objects, KML",
+    "objects.gpx": "Objects, GPX",
     "search/search.html": "Search: probability of detection, one file",
     "search/pod.tif": "Probability of detection, GeoTIFF",
     "search/pod.geojson": "Probability of detection, GeoJSON",
     "search/plants.geojson": "Search: what was planted and what of it found, GeoJSON",
 }
 _OF_FLIGHT: Mapping[str, str] = {
-    "report.html": "report, one file", "report.json": "report, JSON", "changes.html": "changes, one file",
-    "changes.geojson": "changes, GeoJSON", "changes.kml": "changes, KML", "changes.gpx": "changes, GPX",
-    "coverage.geojson": "ground compared, GeoJSON", "frames.geojson": "frames, GeoJSON",
-    "orthophoto.tif": "true orthophoto, GeoTIFF", "heights.tif": "surface heights, GeoTIFF",
+    "report.html": "report, one file",
+    "report.json": "report, JSON",
+    "changes.html": "changes, one file",
+    "changes.geojson": "changes, GeoJSON",
+    "changes.kml": "changes, KML",
+    "changes.gpx": "changes, GPX",
+    "coverage.geojson": "ground compared, GeoJSON",
+    "frames.geojson": "frames, GeoJSON",
+    "orthophoto.tif": "true orthophoto, GeoTIFF",
+    "heights.tif": "surface heights, GeoTIFF",
     "terrain.tif": "bare ground, GeoTIFF",
 }
 _GEOPACKAGE = "site.gpkg"
@@ -56,15 +65,23 @@ class ExportFile:
 
 def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
     """What can be taken away, each by its id; a profile of heights."""
-    router = APIRouter(prefix="/api/sites/{site}", tags=["exports"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(
+        prefix="/api/sites/{site}", tags=["exports"], dependencies=[Depends(needs(Role.VIEW))]
+    )
 
     @router.get("/exports")
     def listed(site: str) -> list[dict[str, Any]]:
         """The files of a site that are there."""
         archive = shelf.open(site)
-        rows = [_row(site, each, size) for each in export_files(archive) if (size := _size(archive, each)) is not None]
+        rows = [
+            _row(site, each, size)
+            for each in export_files(archive)
+            if (size := _size(archive, each)) is not None
+        ]
         if archive.has_site:
-            package = ExportFile(_GEOPACKAGE, "", "Objects, changes, frames and coverage, GeoPackage")
+            package = ExportFile(
+                _GEOPACKAGE, "", "Objects, changes, frames and coverage, GeoPackage"
+            )
             rows.insert(min(2, len(rows)), _row(site, package, None))
         return rows
 
@@ -80,12 +97,17 @@ def export_routes(shelf: SiteShelf, collections: SiteCollections) -> APIRouter:
         except FileNotFoundError:
             file = None
         if found is None or file is None:
-            raise Problem(404, f"no file {export_id[:80]!r} of this site; its list of exports names those there are")
+            raise Problem(
+                404,
+                f"no file {export_id[:80]!r} of this site; its list of exports names those there are",
+            )
         return _download(file, f"{_plain_name(site)}-{found.id}")
 
     @router.get("/profile")
     def profile(
-        site: str, line: str = Query(max_length=4000), step_m: float = Query(0, ge=0, le=1000),
+        site: str,
+        line: str = Query(max_length=4000),
+        step_m: float = Query(0, ge=0, le=1000),
     ) -> dict[str, Any]:
         """Heights along a line, `LON,LAT;LON,LAT;...`; 404 where the site has no heights."""
         return _profile(shelf.open(site).folder, line, step_m)
@@ -98,7 +120,9 @@ def export_files(archive: Archive) -> list[ExportFile]:
     files = [ExportFile(path.rpartition("/")[2], path, title) for path, title in _OF_SITE.items()]
     for flight in reversed(archive.flights()) if archive.has_site else ():
         files += [
-            ExportFile(f"{flight.id}-{name}", f"flights/{flight.id}/{name}", f"{flight.id}: {title}")
+            ExportFile(
+                f"{flight.id}-{name}", f"flights/{flight.id}/{name}", f"{flight.id}: {title}"
+            )
             for name, title in _OF_FLIGHT.items()
         ]
     return files
@@ -114,7 +138,13 @@ def _size(archive: Archive, file: ExportFile) -> int | None:
 
 def _row(site: str, file: ExportFile, size: int | None) -> dict[str, Any]:
     url = f"/api/sites/{quote(site, safe='')}/exports/{quote(file.id, safe='')}"
-    return {"id": file.id, "title": file.title, "bytes": size, "url": url, "name": f"{_plain_name(site)}-{file.id}"}
+    return {
+        "id": file.id,
+        "title": file.title,
+        "bytes": size,
+        "url": url,
+        "name": f"{_plain_name(site)}-{file.id}",
+    }
 
 
 def _plain_name(site: str) -> str:
@@ -124,7 +154,8 @@ def _plain_name(site: str) -> str:
 def _download(file: BinaryIO, name: str) -> StreamingResponse:
     headers = {
         "content-disposition": f"attachment; filename*=UTF-8''{quote(name)}",
-        "content-length": str(os.fstat(file.fileno()).st_size), "cache-control": "no-cache",
+        "content-length": str(os.fstat(file.fileno()).st_size),
+        "cache-control": "no-cache",
     }
     return StreamingResponse(_pieces(file), media_type="application/octet-stream", headers=headers)
 
@@ -141,8 +172,12 @@ def _geopackage(site: str, archive: Archive, collections: SiteCollections) -> St
     layers = {name: collections.get(site, name).features for name in TITLES}
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as folder:
         path = Path(folder) / _GEOPACKAGE
-        write_geopackage(path, layers, {name: qml_of(style) for name, style in LAYER_STYLES.items()})
-        return _download(path.open("rb"), f"{_plain_name(site)}.gpkg")  # open: it outlives its folder
+        write_geopackage(
+            path, layers, {name: qml_of(style) for name, style in LAYER_STYLES.items()}
+        )
+        return _download(
+            path.open("rb"), f"{_plain_name(site)}.gpkg"
+        )  # open: it outlives its folder
 
 
 def _profile(folder: Path, line: str, step_m: float) -> dict[str, Any]:
@@ -164,7 +199,10 @@ def _places(line: str) -> list[str]:
     """The places of `LON,LAT;LON,LAT;...` as `LAT,LON` each. Raises Problem (400)."""
     places = [each.split(",") for each in line.split(";") if each]
     if not 2 <= len(places) <= _MOST_PROFILE_PLACES or any(len(each) != 2 for each in places):
-        raise Problem(400, f"line={line[:80]}: 2 to {_MOST_PROFILE_PLACES} places LON,LAT;LON,LAT;... were needed")
+        raise Problem(
+            400,
+            f"line={line[:80]}: 2 to {_MOST_PROFILE_PLACES} places LON,LAT;LON,LAT;... were needed",
+        )
     return [f"{lat},{lon}" for lon, lat in places]
 
 

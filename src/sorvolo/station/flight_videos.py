@@ -50,7 +50,9 @@ class FlightVideos:
         known, found = {each.id for each in archive.flights()}, {}
         for flight in known.intersection(flights):
             names = archive.report(flight).get("inputs")
-            named = paths.get(str(names[0]), []) if isinstance(names, list) and len(names) == 1 else []
+            named = (
+                paths.get(str(names[0]), []) if isinstance(names, list) and len(names) == 1 else []
+            )
             if len(named) == 1:
                 found[flight] = named[0]
         return found
@@ -58,28 +60,41 @@ class FlightVideos:
 
 def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightVideos) -> APIRouter:
     """A flight's video, and pictures of a place cut from it."""
-    router = APIRouter(prefix="/api/sites/{site}", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(
+        prefix="/api/sites/{site}", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))]
+    )
     cutting = CapacityLimiter(_AT_ONCE)
     cache = BytesCache[tuple[Any, ...], bytes](_CACHE_BYTES, len)
 
     @router.get("/flights/{flight}/video", response_class=FileResponse)
     def video(site: str, flight: str) -> Response:
         """The video that the flight was made of, as it is; ranges are answered, so that a browser can jump."""
-        return FileResponse(_demanded(shelf.open(site), flight, videos), headers={"cache-control": "private"})
+        return FileResponse(
+            _demanded(shelf.open(site), flight, videos), headers={"cache-control": "private"}
+        )
 
-    @router.get("/crops/video/{flight}/{frame}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse)
+    @router.get(
+        "/crops/video/{flight}/{frame}/{east_mm}/{north_mm}.jpg", response_class=JpegResponse
+    )
     async def crop(site: str, flight: str, frame: int, east_mm: int, north_mm: int) -> Response:
         """The ground around a place (site millimetres), north up, from a frame of the flight's video."""
 
         def made() -> Response:
             archive = shelf.open(site)
             path = _demanded(archive, flight, videos)
-            feature = next((
-                each for each in collections.get(site, "frames").features if each["id"] == f"{flight}:{frame}"
-            ), None)
+            feature = next(
+                (
+                    each
+                    for each in collections.get(site, "frames").features
+                    if each["id"] == f"{flight}:{frame}"
+                ),
+                None,
+            )
             if feature is None:
                 raise Problem(404, f"{flight[:80]!r} has no frame {frame}")
-            ring = archive.site().frame.ground_from_lonlat(feature["geometry"]["coordinates"][0][:4])
+            ring = archive.site().frame.ground_from_lonlat(
+                feature["geometry"]["coordinates"][0][:4]
+            )
             place_m = np.array([east_mm, north_mm]) / 1000
             key = (str(path), path.stat().st_mtime_ns, frame, east_mm, north_mm)
             data = cache.get(key, lambda: _cut(path, frame, _crop_corners(ring, place_m)))
@@ -93,7 +108,10 @@ def video_routes(shelf: SiteShelf, collections: SiteCollections, videos: FlightV
 def _demanded(archive: Archive, flight: str, videos: FlightVideos) -> Path:
     path = videos.find(archive, flight)
     if path is None:
-        raise Problem(404, f"the video of {flight[:80]!r} is no longer below the station's folder, or there was none")
+        raise Problem(
+            404,
+            f"the video of {flight[:80]!r} is no longer below the station's folder, or there was none",
+        )
     return path
 
 
@@ -103,9 +121,14 @@ def _crop_corners(ring_m: Any, place_m: Any) -> Sequence[Sequence[float]]:
     `ring_m` (4, 2) are the picture's own corners on the ground.
     """
     unit = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
-    picture_from_site = cv2.getPerspectiveTransform((np.asarray(ring_m) - place_m).astype(np.float32), unit)
+    picture_from_site = cv2.getPerspectiveTransform(
+        (np.asarray(ring_m) - place_m).astype(np.float32), unit
+    )
     half = CROP_M / 2
-    corners = np.array([[-half, half, 1], [half, half, 1], [half, -half, 1], [-half, -half, 1]]) @ picture_from_site.T
+    corners = (
+        np.array([[-half, half, 1], [half, half, 1], [half, -half, 1], [-half, -half, 1]])
+        @ picture_from_site.T
+    )
     shares: list[list[float]] = (corners[:, :2] / corners[:, 2:]).tolist()
     return shares
 
@@ -116,8 +139,11 @@ def _cut(path: Path, frame: int, corners: Sequence[Sequence[float]]) -> bytes:
     with _CUTTING:
         try:
             done = subprocess.run(
-                python_command("sorvolo.station.cut_video"), input=order.encode(), capture_output=True,
-                timeout=_WITHIN_S, check=False,
+                python_command("sorvolo.station.cut_video"),
+                input=order.encode(),
+                capture_output=True,
+                timeout=_WITHIN_S,
+                check=False,
             )
         except subprocess.TimeoutExpired as error:
             raise Problem(404, "this frame took too long to decode") from error

@@ -36,8 +36,11 @@ class Folder:
         """The folders in it that anybody may fill; links are not followed."""
         kept = (STATE_FOLDER, STREAMS_FOLDER) if self.depth == 0 else ()
         return [
-            Folder(Path(each.path), self.depth + 1) for each in self.entries
-            if each.is_dir(follow_symlinks=False) and not each.name.startswith(".") and each.name not in kept
+            Folder(Path(each.path), self.depth + 1)
+            for each in self.entries
+            if each.is_dir(follow_symlinks=False)
+            and not each.name.startswith(".")
+            and each.name not in kept
         ]
 
 

@@ -12,7 +12,12 @@ from typing import Any, Protocol
 
 import av
 
-from sorvolo.capture.live.addresses import FollowedPath, StreamAddress, is_live_address, live_address
+from sorvolo.capture.live.addresses import (
+    FollowedPath,
+    StreamAddress,
+    is_live_address,
+    live_address,
+)
 from sorvolo.capture.live.klv import LocalSet, local_sets
 from sorvolo.capture.live.klv_telemetry import columns_of, klv_streams
 from sorvolo.capture.live.links import LINK_FORMS, NmeaLink, is_link
@@ -96,9 +101,13 @@ def open_footage(
     if is_live_address(text):
         address = live_address(text)
         if isinstance(address, FollowedPath):
-            raise InputError(f"{text}: stream takes the camera's address, or a recording; map and watch follow files")
+            raise InputError(
+                f"{text}: stream takes the camera's address, or a recording; map and watch follow files"
+            )
         if telemetry is not None and not is_link(telemetry):
-            raise InputError(f"--telemetry {telemetry}: a live source's comes from a receiver; give {LINK_FORMS}")
+            raise InputError(
+                f"--telemetry {telemetry}: a live source's comes from a receiver; give {LINK_FORMS}"
+            )
         return LiveFootage(address, telemetry, live, stop)
     sources = open_sources([text], telemetry, camera)
     if len(sources) != 1 or sources[0].kind != "video":
@@ -178,9 +187,17 @@ class Recording:
         if not len(telemetry):
             start_ns = source.start_ns or time.time_ns()
             times_us = range(0, round(duration_s * 1e6) + 1, _TIME_EVERY_US)
-            return [_piece(first_us + each, Sample(start_ns + each * 1000, {}, lens)) for each in times_us]
+            return [
+                _piece(first_us + each, Sample(start_ns + each * 1000, {}, lens))
+                for each in times_us
+            ]
         clock = tie_clocks(
-            telemetry, kind="video", start_ns=source.start_ns, duration_s=duration_s, offset_given=False, strict=False
+            telemetry,
+            kind="video",
+            start_ns=source.start_ns,
+            duration_s=duration_s,
+            offset_given=False,
+            strict=False,
         )
         found = []
         for row, second in enumerate(clock.sample_s):
@@ -188,7 +205,12 @@ class Recording:
                 columns = {name: float(column[row]) for name, column in telemetry.columns.items()}
                 stated = lens | _ground(source.ground_elevation_m, columns)
                 time_ns = clock.first_frame_utc_ns + round(float(second) * 1e9)
-                found.append(_piece(max(0, first_us + round(float(second) * 1e6)), Sample(time_ns, columns, stated)))
+                found.append(
+                    _piece(
+                        max(0, first_us + round(float(second) * 1e6)),
+                        Sample(time_ns, columns, stated),
+                    )
+                )
         return found
 
 
@@ -197,7 +219,13 @@ class LiveFootage:
 
     is_live = True
 
-    def __init__(self, address: StreamAddress, link: str | None, settings: LiveSettings, stop: threading.Event) -> None:
+    def __init__(
+        self,
+        address: StreamAddress,
+        link: str | None,
+        settings: LiveSettings,
+        stop: threading.Event,
+    ) -> None:
         self._address, self._settings, self._stop = address, settings, stop
         self.name = safe_name(address.shown.partition("://")[2] or address.shown)
         self.outages = Outages(address.shown)
@@ -207,8 +235,12 @@ class LiveFootage:
         self._clock = ArrivalClock()
         self._why = ""  # the last connection broke
         self._fixes: deque[tuple[int, Epoch]] = deque(maxlen=1000)
-        self._link = None if link is None else NmeaLink(
-            link, settings, lambda arrived_ns, epoch: self._fixes.append((arrived_ns, epoch))
+        self._link = (
+            None
+            if link is None
+            else NmeaLink(
+                link, settings, lambda arrived_ns, epoch: self._fixes.append((arrived_ns, epoch))
+            )
         )
         self._container: Any = self._first()
         self.format = _format_of(self._container.streams.video[0], address.shown)
@@ -243,7 +275,9 @@ class LiveFootage:
         found = [each.text for each in self.outages.notices()]
         found += [each.text for each in self._link.notices()] if self._link is not None else []
         if self._timeline.restarts:
-            found.append(f"the camera's clock began anew, and was joined: {self._timeline.restarts}")
+            found.append(
+                f"the camera's clock began anew, and was joined: {self._timeline.restarts}"
+            )
         return [*found, *self._units.notices()]
 
     def _connected(self, container: Any) -> Iterator[Piece]:
@@ -277,7 +311,9 @@ class LiveFootage:
 
     def _open(self, left_s: float) -> Any:
         container = av.open(
-            self._address.url, format=self._address.container, options=dict(self._address.options),
+            self._address.url,
+            format=self._address.container,
+            options=dict(self._address.options),
             timeout=(min(self._address.opens_s, left_s), self._settings.silent_s),
         )
         if not container.streams.video:
@@ -289,7 +325,9 @@ class LiveFootage:
         video = container.streams.video[0]
         found = _format_of(video, self._address.shown)
         if found.codec != self.format.codec:
-            raise InputError(f"{self._address.shown}: the camera sent {self.format.codec} and now {found.codec}")
+            raise InputError(
+                f"{self._address.shown}: the camera sent {self.format.codec} and now {found.codec}"
+            )
         due_us, shift_us = -1, 0
         has_metadata = False
         for item in self._units.of(container, video, klv_streams(container)):
@@ -303,12 +341,18 @@ class LiveFootage:
             yield from self._fixed(placed.pts_us)
             if not has_metadata and placed.dts_us >= due_us:
                 due_us = placed.dts_us + _TIME_EVERY_US
-                yield _piece(placed.pts_us, Sample(self._clock.utc_ns(placed.pts_us, time.time_ns())))
+                yield _piece(
+                    placed.pts_us, Sample(self._clock.utc_ns(placed.pts_us, time.time_ns()))
+                )
             yield placed
 
     def _stated(self, data: "_Data", shift_us: int) -> list[Piece]:
         pts_us = self._timeline.last_us if data.pts_us is None else data.pts_us + shift_us
-        return [_piece(pts_us, _sample_of(each)) for each in local_sets(data.payload, self._counts) if each.time_ns]
+        return [
+            _piece(pts_us, _sample_of(each))
+            for each in local_sets(data.payload, self._counts)
+            if each.time_ns
+        ]
 
     def _fixed(self, pts_us: int) -> Iterator[Piece]:
         """The receiver's moments that came since the last picture."""
@@ -362,7 +406,11 @@ class ArrivalClock:
         begins anew where a picture is late by more than a connection holds back.
         """
         zero_ns = now_ns - pts_us * 1000
-        grown_ns = zero_ns if self._zero_ns is None else self._zero_ns + round(_DRIFT * max(0, now_ns - self._at_ns))
+        grown_ns = (
+            zero_ns
+            if self._zero_ns is None
+            else self._zero_ns + round(_DRIFT * max(0, now_ns - self._at_ns))
+        )
         self._zero_ns = zero_ns if zero_ns - grown_ns > _LATE_NS else min(zero_ns, grown_ns)
         self._at_ns = now_ns
         return self._zero_ns + pts_us * 1000
@@ -392,7 +440,10 @@ class _Units:
         sets = b""
         for packet in container.demux([video, *metadata]):
             if packet.stream.type != "video":
-                yield _Data(_us(packet.pts if packet.pts is not None else packet.dts, packet.time_base), bytes(packet))
+                yield _Data(
+                    _us(packet.pts if packet.pts is not None else packet.dts, packet.time_base),
+                    bytes(packet),
+                )
                 continue
             if not packet.size:
                 continue
@@ -413,13 +464,19 @@ class _Units:
         if not has_picture(codec, data):
             self._damaged += 1
             return None
-        return Piece(Kind.VIDEO, pts_us, data, bool(unit.is_keyframe), pts_us if dts_us is None else dts_us)
+        return Piece(
+            Kind.VIDEO, pts_us, data, bool(unit.is_keyframe), pts_us if dts_us is None else dts_us
+        )
 
     def notices(self) -> list[str]:
         """What was left out."""
         return [
             *([f"packets without a picture, not sent: {self._damaged}"] if self._damaged else []),
-            *([f"pictures without a time stamp, not sent: {self._timeless}"] if self._timeless else []),
+            *(
+                [f"pictures without a time stamp, not sent: {self._timeless}"]
+                if self._timeless
+                else []
+            ),
         ]
 
 
@@ -452,10 +509,19 @@ def _piece(pts_us: int, sample: Sample) -> Piece:
 
 def _sample_of(stated: LocalSet) -> Sample:
     kept = (
-        "sensor_horizontal_fov_deg", "sensor_vertical_fov_deg", "frame_center_elevation_m",
-        "frame_center_ellipsoid_height_m", "frame_center_latitude_deg", "frame_center_longitude_deg", "slant_range_m",
+        "sensor_horizontal_fov_deg",
+        "sensor_vertical_fov_deg",
+        "frame_center_elevation_m",
+        "frame_center_ellipsoid_height_m",
+        "frame_center_latitude_deg",
+        "frame_center_longitude_deg",
+        "slant_range_m",
     )
-    return Sample(stated.time_ns, columns_of(stated), {name: stated[name] for name in kept if isfinite(stated[name])})
+    return Sample(
+        stated.time_ns,
+        columns_of(stated),
+        {name: stated[name] for name in kept if isfinite(stated[name])},
+    )
 
 
 def _lens_of(model: CameraModel) -> dict[str, float]:
@@ -473,7 +539,11 @@ def _ground(elevation_m: float, columns: dict[str, float]) -> dict[str, float]:
     if not isfinite(elevation_m):
         return {}
     is_orthometric = isfinite(columns.get("orthometric_height_m", float("nan")))
-    return {"frame_center_elevation_m" if is_orthometric else "frame_center_ellipsoid_height_m": elevation_m}
+    return {
+        "frame_center_elevation_m"
+        if is_orthometric
+        else "frame_center_ellipsoid_height_m": elevation_m
+    }
 
 
 def _us(stamp: int | None, time_base: Any) -> int | None:

@@ -23,10 +23,18 @@ def cut_off(order: Order, *, was_stopped: bool) -> str:
         return ""
     short = shortage(path.parent, order.floor_gb)
     full = f"the station's disk is full ({short}): it took no more pictures" if short else ""
-    away = "" if was_stopped else f"nothing came for {order.away_s:.0f} s, and the flight's end was never stated"
+    away = (
+        ""
+        if was_stopped
+        else f"nothing came for {order.away_s:.0f} s, and the flight's end was never stated"
+    )
     return "; ".join(filter(None, (full, away)))
 
 
 def unsent(pictures: int) -> str:
     """What it means that a camera's last pictures are not on the station's disk; "" where all are."""
-    return f"{counted(pictures, 'picture')} of the camera did not get to the station's disk" if pictures else ""
+    return (
+        f"{counted(pictures, 'picture')} of the camera did not get to the station's disk"
+        if pictures
+        else ""
+    )

@@ -34,7 +34,10 @@ from sorvolo.store.atomic import atomic_write_bytes
 REFUSED_CODE, BUSY_CODE = 4400, 4503
 """WebSocket close codes: trying again is no use; try again later."""
 
-_SHOWN_AS = {BOXES: "boxes", MOTION: "motion"}  # the messages of a mission's lines, beside the video
+_SHOWN_AS = {
+    BOXES: "boxes",
+    MOTION: "motion",
+}  # the messages of a mission's lines, beside the video
 _LIVE_NS = 60_000_000_000  # telemetry that is so old was recorded
 _MOST_REASON_BYTES = 120  # a close frame holds 123
 
@@ -86,13 +89,18 @@ class Ingest:
     """All streams of a station, each a folder below `folder`. Used from one event loop."""
 
     def __init__(
-        self, folder: Path, limits: IngestLimits = IngestLimits(), announce: Announce = lambda *_: None,
+        self,
+        folder: Path,
+        limits: IngestLimits = IngestLimits(),
+        announce: Announce = lambda *_: None,
     ) -> None:
         self._folder, self._limits, self._announce = folder, limits, announce
         self._flights: dict[str, Flight] = {}
         self._links: dict[str, Link] = {}
         self._hubs: dict[str, VideoHub] = {}
-        self._loop: asyncio.AbstractEventLoop | None = None  # in which drones and viewers are served
+        self._loop: asyncio.AbstractEventLoop | None = (
+            None  # in which drones and viewers are served
+        )
 
     async def serve(self, stream: str, link: Link) -> None:
         """Take one connection until it ends; why it was refused is sent to the drone."""
@@ -114,7 +122,11 @@ class Ingest:
         impossible id."""
         check_stream(stream)
         if stream not in self._hubs:
-            for name in [name for name, hub in self._hubs.items() if not hub.viewers and name not in self._links]:
+            for name in [
+                name
+                for name, hub in self._hubs.items()
+                if not hub.viewers and name not in self._links
+            ]:
                 del self._hubs[name]  # asked for once, perhaps by a name that never was
             self._hubs[stream] = VideoHub()
         return self._hubs[stream]
@@ -126,7 +138,11 @@ class Ingest:
 
     def streams(self) -> list[dict[str, Any]]:
         """The state of every stream that was ever taken, by name."""
-        names = {each.name for each in self._folder.iterdir() if each.is_dir()} if self._folder.is_dir() else set()
+        names = (
+            {each.name for each in self._folder.iterdir() if each.is_dir()}
+            if self._folder.is_dir()
+            else set()
+        )
         return [self.state(name) for name in sorted(names) if is_stream(name)]
 
     def state(self, stream: str) -> dict[str, Any]:
@@ -134,14 +150,20 @@ class Ingest:
         check_stream(stream)
         flight, files = self._flights.get(stream), self._files(stream)
         found = {
-            "stream": stream, "is_connected": stream in self._links, "flight_count": len(files),
-            "flights": [_kept(each) for each in files[-self._limits.flights_shown:]],
+            "stream": stream,
+            "is_connected": stream in self._links,
+            "flight_count": len(files),
+            "flights": [_kept(each) for each in files[-self._limits.flights_shown :]],
         }
         return found | (flight.figures() if flight is not None else {})
 
     def samples(self) -> dict[str, Sample]:
         """The newest telemetry of each drone that sends now, by stream. Safe to use from other threads."""
-        found = {stream: self._flights[stream].last_sample for stream in list(self._links) if stream in self._flights}
+        found = {
+            stream: self._flights[stream].last_sample
+            for stream in list(self._links)
+            if stream in self._flights
+        }
         return {stream: sample for stream, sample in found.items() if sample is not None}
 
     def newest(self, stream: str) -> Path | None:
@@ -161,7 +183,9 @@ class Ingest:
         check_stream(stream)
         files = [each for each in self._files(stream) if flight in (None, each.stem)]
         if not files:
-            raise Problem(404, f"no such recording of the stream {stream}; /api/streams lists those there are")
+            raise Problem(
+                404, f"no such recording of the stream {stream}; /api/streams lists those there are"
+            )
         now = self._flights.get(stream)
         if stream in self._links and (now is None or now.path in files):
             raise Problem(423, f"the stream {stream} is being sent; wait until its flight is over")
@@ -180,9 +204,19 @@ class Ingest:
         """
         stream = str(found.get("stream") or "")
         flight, hub, loop = self._flights.get(stream), self._hubs.get(stream), self._loop
-        if flight is None or hub is None or loop is None or flight.zero_us is None or not hub.viewers:
+        if (
+            flight is None
+            or hub is None
+            or loop is None
+            or flight.zero_us is None
+            or not hub.viewers
+        ):
             return
-        words = {**found, "type": _SHOWN_AS[kind], "pts_us": _utc_us(found["time"]) - flight.zero_us}
+        words = {
+            **found,
+            "type": _SHOWN_AS[kind],
+            "pts_us": _utc_us(found["time"]) - flight.zero_us,
+        }
         if kind == MOTION:
             words["from_us"] = _utc_us(found["from_time"]) - flight.zero_us
         try:
@@ -204,7 +238,9 @@ class Ingest:
         flight = self._flights.get(stream)
         try:
             if flight is not None:
-                await asyncio.to_thread(flight.close)  # first: a link that comes meanwhile must not use this file
+                await asyncio.to_thread(
+                    flight.close
+                )  # first: a link that comes meanwhile must not use this file
         finally:
             if self._links.get(stream) is link:
                 del self._links[stream]
@@ -242,12 +278,17 @@ class Ingest:
         older = self._links.get(stream)
         if older is None:
             if len(self._links) >= self._limits.streams:
-                raise Refusal(f"{len(self._links)} streams are being sent, and no more are taken", is_final=False)
+                raise Refusal(
+                    f"{len(self._links)} streams are being sent, and no more are taken",
+                    is_final=False,
+                )
             self._links[stream] = link  # so that two that come at once are not both let in
             return
         before = self._flights.get(stream)
         if before is not None and before.hello.flight != hello.flight:
-            raise Refusal(f"another drone sends as {stream}; give --stream another name", is_final=False)
+            raise Refusal(
+                f"another drone sends as {stream}; give --stream another name", is_final=False
+            )
         self._links[stream] = link
         await _close(older, BUSY_CODE, "the drone opened a newer link")
         if before is not None:
@@ -273,7 +314,11 @@ class Ingest:
                     return
                 if flight.take(message) and message.kind is Kind.VIDEO:
                     hub.show(message)
-                elif flight.last_sample is not None and hub.epoch_us is None and _is_now(flight.last_sample):
+                elif (
+                    flight.last_sample is not None
+                    and hub.epoch_us is None
+                    and _is_now(flight.last_sample)
+                ):
                     hub.epoch_us = flight.zero_us
         finally:
             syncing.cancel()
@@ -282,9 +327,13 @@ class Ingest:
         try:
             data = await asyncio.wait_for(link.receive(), self._limits.silent_s)
         except TimeoutError:
-            raise Refusal(f"nothing came for {self._limits.silent_s:.0f} s", is_final=False) from None
+            raise Refusal(
+                f"nothing came for {self._limits.silent_s:.0f} s", is_final=False
+            ) from None
         if len(data) > self._limits.message_bytes:
-            raise Refusal(f"a message of {len(data):,} bytes; {self._limits.message_bytes:,} at most are taken")
+            raise Refusal(
+                f"a message of {len(data):,} bytes; {self._limits.message_bytes:,} at most are taken"
+            )
         return message_from_bytes(data)
 
     def _check_space(self) -> None:
@@ -367,9 +416,17 @@ class Flight:
         span_s = self._taken_s[-1] - self._taken_s[0] if len(self._taken_s) > 1 else 0.0
         hello = self.hello
         return {
-            "flight": self.path.stem, "name": hello.name, "codec": hello.codec, "width": hello.width,
-            "height": hello.height, "fps": hello.fps, "frames": self.frames, "samples": self.samples,
-            "repeated": self.repeated, "last_seq": self._file.last_seq, "last_pts_us": self._file.last_pts_us,
+            "flight": self.path.stem,
+            "name": hello.name,
+            "codec": hello.codec,
+            "width": hello.width,
+            "height": hello.height,
+            "fps": hello.fps,
+            "frames": self.frames,
+            "samples": self.samples,
+            "repeated": self.repeated,
+            "last_seq": self._file.last_seq,
+            "last_pts_us": self._file.last_pts_us,
             "frames_per_s": round((len(self._taken_s) - 1) / span_s, 2) if span_s else None,
             "telemetry": None if self.last_sample is None else dict(self.last_sample.columns),
         }
@@ -404,10 +461,14 @@ def open_flight(folder: Path, hello: Hello) -> Flight:
             return Flight(path, hello)
         before = hello_from_json(found.with_suffix(".json").read_bytes())
         if before.codec != hello.codec:
-            raise InputError(f"this flight is {before.codec}, and now {hello.codec} comes; begin a new flight")
+            raise InputError(
+                f"this flight is {before.codec}, and now {hello.codec} comes; begin a new flight"
+            )
         return Flight(found, hello)
     except OSError as error:
-        raise StoreError(f"cannot use {folder} ({error.strerror or error}); check the disk") from error
+        raise StoreError(
+            f"cannot use {folder} ({error.strerror or error}); check the disk"
+        ) from error
 
 
 def _utc_us(text: Any) -> int:

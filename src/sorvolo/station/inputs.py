@@ -38,7 +38,10 @@ class Inputs:
     """What can be flown through a mission. Threads may share it."""
 
     def __init__(
-        self, settings: StationSettings, uploads: Uploads, newest_of_stream: Callable[[str], Path | None]
+        self,
+        settings: StationSettings,
+        uploads: Uploads,
+        newest_of_stream: Callable[[str], Path | None],
     ) -> None:
         self._settings, self._uploads, self._newest_of_stream = settings, uploads, newest_of_stream
         self._lock = threading.Lock()
@@ -67,15 +70,21 @@ class Inputs:
         if wish.input is not None:
             found = next((each for each in self.all() if each.id == wish.input), None)
             if found is None:
-                raise Problem(404, f"no input {wish.input[:64]!r}; /api/inputs lists those there are")
+                raise Problem(
+                    404, f"no input {wish.input[:64]!r}; /api/inputs lists those there are"
+                )
             return str(found.path)
         if wish.stream is not None:
             check_stream(wish.stream)
             newest = self._newest_of_stream(wish.stream)
             if newest is None:
-                raise Problem(404, f"no drone sent a stream {wish.stream[:80]!r} yet; /api/streams lists them")
+                raise Problem(
+                    404, f"no drone sent a stream {wish.stream[:80]!r} yet; /api/streams lists them"
+                )
             path = newest.resolve()
-            return str(path) if path.with_name(path.name + ENDED_SUFFIX).exists() else f"follow:{path}"
+            return (
+                str(path) if path.with_name(path.name + ENDED_SUFFIX).exists() else f"follow:{path}"
+            )
         return checked_stream(wish.stream_url or "", self._settings.stream_ranges)
 
     def shown(self, wish: InputWish | None) -> dict[str, Any] | None:
@@ -86,7 +95,9 @@ class Inputs:
         if wish.stream_url is not None:
             plain["stream_url"] = without_password(wish.stream_url)
         if wish.input is not None:
-            plain["name"] = next((each.name for each in self.all() if each.id == wish.input), wish.input)
+            plain["name"] = next(
+                (each.name for each in self.all() if each.id == wish.input), wish.input
+            )
         if wish.upload is not None:
             plain["name"] = self._uploads.name_of(wish.upload)
         return plain
@@ -94,7 +105,12 @@ class Inputs:
 
 def input_row(found: FoundInput) -> dict[str, Any]:
     """An input as it is listed."""
-    return {"id": found.id, "name": found.name, "kind": found.kind, "megabytes": round(found.megabytes, 1)}
+    return {
+        "id": found.id,
+        "name": found.name,
+        "kind": found.kind,
+        "megabytes": round(found.megabytes, 1),
+    }
 
 
 def _inputs_below(root: Path) -> list[FoundInput]:
@@ -115,13 +131,21 @@ def _inputs_in(folder: Folder, root: Path) -> list[FoundInput]:
     sizes = [each.stat().st_size for each in files if each.name.lower().endswith(_PHOTO_ENDINGS)]
     if len(sizes) >= 2 and folder.path != root:
         name = _name(folder.path, root)
-        found.append(FoundInput(_id_of(folder.path, root), name, "photos", folder.path, sum(sizes) / 1e6))
+        found.append(
+            FoundInput(_id_of(folder.path, root), name, "photos", folder.path, sum(sizes) / 1e6)
+        )
     return found
 
 
 def _input_of(path: Path, root: Path, size: int) -> FoundInput | None:
     ending = path.suffix.lower()
-    kind = "video" if ending in VIDEO_ENDINGS else "telemetry or camera" if ending in _SIDE_ENDINGS else ""
+    kind = (
+        "video"
+        if ending in VIDEO_ENDINGS
+        else "telemetry or camera"
+        if ending in _SIDE_ENDINGS
+        else ""
+    )
     if not kind or path.name.startswith("."):
         return None
     return FoundInput(_id_of(path, root), _name(path, root), kind, path, size / 1e6)

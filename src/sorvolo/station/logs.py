@@ -13,7 +13,12 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from sorvolo.station.tokens import Holder
 
 _LOG = logging.getLogger("sorvolo.station.requests")
-_KEPT = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "taskName", "color_message"}
+_KEPT = frozenset(vars(logging.makeLogRecord({}))) | {
+    "message",
+    "asctime",
+    "taskName",
+    "color_message",
+}
 
 _METHODS = frozenset({"GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE", "WS"})
 
@@ -26,10 +31,22 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The line."""
-        at = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-        line: dict[str, Any] = {"time": at, "level": record.levelname.lower(), "logger": record.name,
-                                "message": record.getMessage()}
-        line |= {name: value for name, value in vars(record).items() if name not in _KEPT and name not in line}
+        at = (
+            datetime.fromtimestamp(record.created, UTC)
+            .isoformat(timespec="milliseconds")
+            .replace("+00:00", "Z")
+        )
+        line: dict[str, Any] = {
+            "time": at,
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        line |= {
+            name: value
+            for name, value in vars(record).items()
+            if name not in _KEPT and name not in line
+        }
         if record.exc_info:
             line["traceback"] = self.formatException(record.exc_info)
         return json.dumps(line, ensure_ascii=False, default=str)
@@ -78,7 +95,9 @@ class Observer:
         finally:
             seconds = time.monotonic() - began_s
             method = scope.get("method", "WS")
-            method = method if method in _METHODS else "other"  # a client may invent as many as it likes
+            method = (
+                method if method in _METHODS else "other"
+            )  # a client may invent as many as it likes
             self._count(_pattern(scope, status), method, status, seconds)
             _log(scope, method, status, seconds)
 
@@ -87,10 +106,18 @@ def _log(scope: Scope, method: str, status: int, seconds: float) -> None:
     client = scope.get("client")
     holder = scope.get("state", {}).get("holder")
     _LOG.log(
-        logging.WARNING if status >= 500 else logging.INFO, "%s %s %d", method, scope["path"], status,
+        logging.WARNING if status >= 500 else logging.INFO,
+        "%s %s %d",
+        method,
+        scope["path"],
+        status,
         extra={
-            "method": method, "path": scope["path"], "status": status, "ms": round(1000 * seconds, 1),
-            "client": client[0] if client else None, "who": holder.name if isinstance(holder, Holder) else None,
+            "method": method,
+            "path": scope["path"],
+            "status": status,
+            "ms": round(1000 * seconds, 1),
+            "client": client[0] if client else None,
+            "who": holder.name if isinstance(holder, Holder) else None,
         },
     )
 

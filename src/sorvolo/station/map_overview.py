@@ -36,13 +36,20 @@ class MapOverview:
                 if max(source.overviews(1), default=1) < 2 ** (level - 1):  # it would be read whole
                     return None
                 return self._read(source, level, index, left, top)
-        except (RasterioError, SorvoloError, OSError):  # damaged or taken away: the tiles themselves have it all
+        except (
+            RasterioError,
+            SorvoloError,
+            OSError,
+        ):  # damaged or taken away: the tiles themselves have it all
             return None
 
     def _corner(self, source: DatasetReader) -> tuple[int | None, int | None]:
         """Grid pixel of the file's first pixel; None where the file lies on another grid."""
         transform, grid = source.transform, self._grid
-        if source.crs != crs_of_epsg(grid.crs) or abs(transform.a - grid.m_per_px) > 1e-6 * grid.m_per_px:
+        if (
+            source.crs != crs_of_epsg(grid.crs)
+            or abs(transform.a - grid.m_per_px) > 1e-6 * grid.m_per_px
+        ):
             return None, None
         left = (transform.c - grid.origin_m[0]) / grid.m_per_px + 0.5
         top = (grid.origin_m[1] - transform.f) / grid.m_per_px + 0.5
@@ -50,7 +57,9 @@ class MapOverview:
             return None, None
         return round(left), round(top)
 
-    def _read(self, source: DatasetReader, level: int, index: TileIndex, left: int, top: int) -> ImageRGBA:
+    def _read(
+        self, source: DatasetReader, level: int, index: TileIndex, left: int, top: int
+    ) -> ImageRGBA:
         size = self._grid.tile_px
         side = size << level
         x0, y0 = index[0] * side, index[1] * side
@@ -64,7 +73,7 @@ class MapOverview:
             colours = source.read((1, 2, 3), out_shape=(3, height, width), **how)
             alpha = source.dataset_mask(out_shape=(height, width), **how)
             column, row = (low_x - x0) >> level, (low_y - y0) >> level
-            result[row:row + height, column:column + width] = np.dstack([*colours, alpha])
+            result[row : row + height, column : column + width] = np.dstack([*colours, alpha])
         result.setflags(write=False)
         return result
 

@@ -30,18 +30,26 @@ class _Seen:
 class MapWatch:
     """What the maps looked like last. Only `look` changes it; a thread calls it."""
 
-    def __init__(self, shelf: SiteShelf, tiles: WebTiles, reviews: Reviews, events: EventLog) -> None:
+    def __init__(
+        self, shelf: SiteShelf, tiles: WebTiles, reviews: Reviews, events: EventLog
+    ) -> None:
         self._shelf, self._tiles, self._reviews, self._events = shelf, tiles, reviews, events
-        self._listed: set[str] = set()  # also those that could not be opened: their end is announced as well
+        self._listed: set[str] = (
+            set()
+        )  # also those that could not be opened: their end is announced as well
         self._seen: dict[str, _Seen] = {}
-        self._covered: dict[str, int] = {}  # when the coverage of the flight in the air was written, by site
+        self._covered: dict[
+            str, int
+        ] = {}  # when the coverage of the flight in the air was written, by site
         self._settled_s = 0.0
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="maps", daemon=True)
 
     def start(self) -> None:
         """Follow the maps from now on; the sites of this moment are known when this returns."""
-        self._listed |= self._shelf.folders().keys()  # one deleted before the first look has to be announced as well
+        self._listed |= (
+            self._shelf.folders().keys()
+        )  # one deleted before the first look has to be announced as well
         self._thread.start()
 
     def close(self) -> None:
@@ -104,7 +112,9 @@ class MapWatch:
             self._events.append(NewEvent("coverage.changed", {}, site_id))
         self._covered[site_id] = written_ns
 
-    def _announce(self, site_id: str, archive: Archive, state: Pyramid | None, before: Pyramid | None) -> None:
+    def _announce(
+        self, site_id: str, archive: Archive, state: Pyramid | None, before: Pyramid | None
+    ) -> None:
         """The tiles that changed; all of them where nobody knows what was before."""
         if state is None or not state.keys[0]:
             return

@@ -22,7 +22,9 @@ CODECS = ("h264", "hevc")
 _STREAM = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _HEAD = struct.Struct(">cBQqq")
 _MOST_TELEMETRY_BYTES = 16_384  # a sample has hundreds; by choice
-_MOST_HELLO_BYTES = 65_536  # a greeting holds a camera and a decoder's head, some kilobytes; by choice
+_MOST_HELLO_BYTES = (
+    65_536  # a greeting holds a camera and a decoder's head, some kilobytes; by choice
+)
 _STATED = frozenset(item.name for item in ITEMS.values())
 
 
@@ -67,7 +69,10 @@ class Message:
     def to_bytes(self) -> bytes:
         """The message as one binary WebSocket message: 26 bytes of head, then the payload."""
         dts_us = self.pts_us if self.dts_us is None else self.dts_us
-        return _HEAD.pack(self.kind.encode(), int(self.is_key), self.seq, self.pts_us, dts_us) + self.payload
+        return (
+            _HEAD.pack(self.kind.encode(), int(self.is_key), self.seq, self.pts_us, dts_us)
+            + self.payload
+        )
 
 
 def message_from_bytes(data: bytes) -> Message:
@@ -78,8 +83,10 @@ def message_from_bytes(data: bytes) -> Message:
     try:
         kind = Kind(letter.decode("latin-1"))
     except ValueError:
-        raise InputError(f"a message of the unknown kind {letter!r}; known are H, V, T and E") from None
-    return Message(kind, seq, pts_us, data[_HEAD.size:], bool(flags & 1), dts_us)
+        raise InputError(
+            f"a message of the unknown kind {letter!r}; known are H, V, T and E"
+        ) from None
+    return Message(kind, seq, pts_us, data[_HEAD.size :], bool(flags & 1), dts_us)
 
 
 @dataclass(frozen=True)
@@ -111,8 +118,12 @@ class Hello:
                 f"the pictures are {self.codec[:32]!r}; a stream carries {' or '.join(CODECS)}, so set the camera to "
                 "one of them, or convert the recording: ffmpeg -i INPUT -c:v libx264 OUTPUT.mp4"
             )
-        if not (16 <= self.width <= 16_384 and 16 <= self.height <= 16_384 and 0 <= self.fps <= 1000):
-            raise InputError(f"pictures of {self.width} x {self.height} at {self.fps:g} a second are none")
+        if not (
+            16 <= self.width <= 16_384 and 16 <= self.height <= 16_384 and 0 <= self.fps <= 1000
+        ):
+            raise InputError(
+                f"pictures of {self.width} x {self.height} at {self.fps:g} a second are none"
+            )
 
     def to_json(self) -> str:
         """The payload of a hello message."""
@@ -124,12 +135,19 @@ def hello_from_json(text: str | bytes) -> Hello:
     found = _json_object(text, _MOST_HELLO_BYTES, "a hello")
     try:
         return Hello(
-            str(found["flight"]), str(found["codec"]), int(found["width"]), int(found["height"]),
-            float(found.get("fps") or 0.0), str(found.get("name", ""))[:200], str(found.get("sent_by", ""))[:200],
+            str(found["flight"]),
+            str(found["codec"]),
+            int(found["width"]),
+            int(found["height"]),
+            float(found.get("fps") or 0.0),
+            str(found.get("name", ""))[:200],
+            str(found.get("sent_by", ""))[:200],
             int(found.get("protocol", 0)),
         )
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"a hello without a usable {error}; flight, codec, width and height were needed") from error
+        raise InputError(
+            f"a hello without a usable {error}; flight, codec, width and height were needed"
+        ) from error
 
 
 @dataclass(frozen=True)
@@ -145,11 +163,14 @@ class Sample:
 
     def to_json(self) -> str:
         """The payload of a telemetry message; numbers that are not known are left out."""
-        return json.dumps({
-            "time_ns": self.time_ns,
-            "columns": {name: value for name, value in self.columns.items() if isfinite(value)},
-            "stated": {name: value for name, value in self.stated.items() if isfinite(value)},
-        }, separators=(",", ":"))
+        return json.dumps(
+            {
+                "time_ns": self.time_ns,
+                "columns": {name: value for name, value in self.columns.items() if isfinite(value)},
+                "stated": {name: value for name, value in self.stated.items() if isfinite(value)},
+            },
+            separators=(",", ":"),
+        )
 
 
 def sample_from_json(text: str | bytes) -> Sample:
@@ -160,7 +181,9 @@ def sample_from_json(text: str | bytes) -> Sample:
         columns = _numbers(found.get("columns") or {}, TELEMETRY_COLUMNS)
         stated = _numbers(found.get("stated") or {}, _STATED)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
-        raise InputError(f"telemetry without a usable {error}; time_ns and columns were needed") from error
+        raise InputError(
+            f"telemetry without a usable {error}; time_ns and columns were needed"
+        ) from error
     if not 0 <= time_ns < 2**63:
         raise InputError(f"telemetry of the time {time_ns} ns; 0 to 2^63 was needed")
     return Sample(time_ns, columns, stated)

@@ -50,7 +50,9 @@ def mqtt_place(url: str, password: str = "") -> MqttPlace:
         raise SettingsError(f"--mqtt {parts.scheme}://{host or ''} is no broker; {_WANTED}")
     prefix, user = parts.path.strip("/") or "sorvolo", unquote(parts.username or "")
     _check_password(parts.password, password, user)
-    return MqttPlace(host, port or _PORTS[parts.scheme], prefix, user, password, parts.scheme == "mqtts")
+    return MqttPlace(
+        host, port or _PORTS[parts.scheme], prefix, user, password, parts.scheme == "mqtts"
+    )
 
 
 def _check_password(in_address: str | None, password: str, user: str) -> None:
@@ -82,7 +84,9 @@ class MqttSender:
             self._client.username_pw_set(place.user, place.password)
         if place.is_secure:
             try:
-                context = ssl.create_default_context(cafile=None if authority is None else str(authority))
+                context = ssl.create_default_context(
+                    cafile=None if authority is None else str(authority)
+                )
             except (OSError, ssl.SSLError) as error:
                 words = f"--mqtt-ca {authority}: no usable certificate ({error}); give a PEM file"
                 raise SettingsError(words) from error
@@ -92,7 +96,9 @@ class MqttSender:
     def send(self, event: Mapping[str, Any]) -> None:
         """Publish one event. Raises OSError where the broker does not acknowledge it."""
         self._demand_connection()
-        topic = f"{self._place.prefix}/{_level(event.get('site') or 'station')}/{_level(event['type'])}"
+        topic = (
+            f"{self._place.prefix}/{_level(event.get('site') or 'station')}/{_level(event['type'])}"
+        )
         sent = self._client.publish(topic, json.dumps(event, separators=(",", ":")), qos=1)
         try:
             sent.wait_for_publish(_PUBLISH_S)
@@ -104,7 +110,9 @@ class MqttSender:
     def close(self) -> None:
         """End the connection."""
         if self._connected.is_set():
-            self._client.publish(f"{self._place.prefix}/status", "offline", qos=1, retain=True).wait_for_publish(1.0)
+            self._client.publish(
+                f"{self._place.prefix}/status", "offline", qos=1, retain=True
+            ).wait_for_publish(1.0)
         self._client.disconnect()
         self._client.loop_stop()
 

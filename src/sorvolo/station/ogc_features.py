@@ -15,7 +15,8 @@ from sorvolo.station.security import needs
 from sorvolo.station.tokens import Role
 
 _CONFORMS = [
-    f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}" for name in ("core", "oas30", "geojson")
+    f"http://www.opengis.net/spec/ogcapi-features-1/1.0/conf/{name}"
+    for name in ("core", "oas30", "geojson")
 ]
 _GEOJSON = "application/geo+json"
 _MOST = 10_000  # features in one answer; by choice
@@ -43,7 +44,9 @@ def landing_links(request: Request, site: str) -> list[dict[str, str]]:
 
 def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
     """Conformance, collections and items of each site."""
-    router = APIRouter(prefix="/api/sites/{site}", tags=["features"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(
+        prefix="/api/sites/{site}", tags=["features"], dependencies=[Depends(needs(Role.VIEW))]
+    )
 
     @router.get("/conformance")
     def conformance(site: str) -> dict[str, Any]:
@@ -67,17 +70,27 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
 
     @router.get("/collections/{name}/items", response_class=GeoJsonResponse)
     def items(
-        request: Request, site: str, name: str, bbox: str = Query("", max_length=200),
-        datetime: str = Query("", max_length=100), limit: int = Limit, offset: int = Offset,
-        labels: str = Query("", alias="class", max_length=400), min_score: float | None = Query(None, ge=0, le=1),
-        flight: str = Query("", max_length=400), review: str = Query("", max_length=40),
-        from_version: int | None = Query(None, ge=0, le=2**62), to_version: int | None = Query(None, ge=0, le=2**62),
+        request: Request,
+        site: str,
+        name: str,
+        bbox: str = Query("", max_length=200),
+        datetime: str = Query("", max_length=100),
+        limit: int = Limit,
+        offset: int = Offset,
+        labels: str = Query("", alias="class", max_length=400),
+        min_score: float | None = Query(None, ge=0, le=1),
+        flight: str = Query("", max_length=400),
+        review: str = Query("", max_length=40),
+        from_version: int | None = Query(None, ge=0, le=2**62),
+        to_version: int | None = Query(None, ge=0, le=2**62),
     ) -> JSONResponse:
         """Features: within a box, at a time, of classes, with a score at least, of flights, by verdict; in pages."""
         collection = collections.get(site, name)
         wanted = _places(collection, bbox)
         features = _reviewed([collection.features[each] for each in wanted], name, site, reviews)
-        kept = _filtered(features, _interval(datetime), _words(labels), min_score, _words(flight), _words(review))
+        kept = _filtered(
+            features, _interval(datetime), _words(labels), min_score, _words(flight), _words(review)
+        )
         if name == "changes":
             kept = [each for each in kept if _between(each["properties"], from_version, to_version)]
         return GeoJsonResponse(_page(request, kept, limit, offset))
@@ -85,7 +98,9 @@ def feature_routes(collections: SiteCollections, reviews: Reviews) -> APIRouter:
     @router.get("/collections/{name}/items/{feature_id}", response_class=GeoJsonResponse)
     def one_item(site: str, name: str, feature_id: str) -> JSONResponse:
         """One feature."""
-        found = [each for each in collections.get(site, name).features if str(each["id"]) == feature_id]
+        found = [
+            each for each in collections.get(site, name).features if str(each["id"]) == feature_id
+        ]
         if not found:
             raise Problem(404, f"{name} has no feature {feature_id[:80]!r}")
         return GeoJsonResponse(_reviewed(found, name, site, reviews)[0])
@@ -104,9 +119,17 @@ def _about(name: str, collection: Collection, base: str) -> dict[str, Any]:
         edges = [each.bounds for each in collection.shapes]
         columns = list(zip(*edges))
         bbox = [min(columns[0]), min(columns[1]), max(columns[2]), max(columns[3])]
-        extent = {"extent": {"spatial": {"bbox": [bbox], "crs": "http://www.opengis.net/def/crs/OGC/1.3/CRS84"}}}
+        extent = {
+            "extent": {
+                "spatial": {"bbox": [bbox], "crs": "http://www.opengis.net/def/crs/OGC/1.3/CRS84"}
+            }
+        }
     return {
-        "id": name, "title": TITLES[name], "itemType": "feature", "count": len(collection.features), **extent,
+        "id": name,
+        "title": TITLES[name],
+        "itemType": "feature",
+        "count": len(collection.features),
+        **extent,
         "crs": ["http://www.opengis.net/def/crs/OGC/1.3/CRS84"],
         "links": [
             _link(f"{base}/collections/{name}", "self", "application/json", TITLES[name]),
@@ -120,15 +143,26 @@ def _link(href: str, rel: str, kind: str, title: str) -> dict[str, str]:
 
 
 def _page(request: Request, features: Sequence[Feature], limit: int, offset: int) -> dict[str, Any]:
-    shown = features[offset:offset + limit]
+    shown = features[offset : offset + limit]
     path = f"{str(request.base_url).rstrip('/')}{quote(request.url.path, safe='/:')}"
-    links = [_link(f"{path}?{request.url.query}" if request.url.query else path, "self", _GEOJSON, "This page")]
+    links = [
+        _link(
+            f"{path}?{request.url.query}" if request.url.query else path,
+            "self",
+            _GEOJSON,
+            "This page",
+        )
+    ]
     if offset + limit < len(features):
         query = urlencode({**dict(request.query_params), "limit": limit, "offset": offset + limit})
         links.append(_link(f"{path}?{query}", "next", _GEOJSON, "Next page"))
     return {
-        "type": "FeatureCollection", "timeStamp": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-        "numberMatched": len(features), "numberReturned": len(shown), "links": links, "features": shown,
+        "type": "FeatureCollection",
+        "timeStamp": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "numberMatched": len(features),
+        "numberReturned": len(shown),
+        "links": links,
+        "features": shown,
     }
 
 
@@ -146,7 +180,10 @@ def _places(collection: Collection, bbox: str) -> list[int]:
         raise Problem(400, f"bbox={bbox[:80]}: west,south,east,north in degrees was needed")
     if edges[0] > edges[2]:  # across the antimeridian
         west, south, east, north = edges
-        found = {*collection.within([west, south, 180.0, north]), *collection.within([-180.0, south, east, north])}
+        found = {
+            *collection.within([west, south, 180.0, north]),
+            *collection.within([-180.0, south, east, north]),
+        }
         return sorted(found)
     return collection.within(edges)
 
@@ -157,7 +194,9 @@ def _interval(text: str) -> tuple[datetime | None, datetime | None]:
         return None, None
     parts = text.split("/")
     if len(parts) > 2:
-        raise Problem(400, f"datetime={text[:80]}: a moment or START/END was needed, .. for an open end")
+        raise Problem(
+            400, f"datetime={text[:80]}: a moment or START/END was needed, .. for an open end"
+        )
     ends = [None if each in ("", "..") else _moment(each) for each in parts]
     return (ends[0], ends[0]) if len(ends) == 1 else (ends[0], ends[1])
 
@@ -166,7 +205,9 @@ def _moment(text: str) -> datetime:
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
     except ValueError as error:
-        raise Problem(400, f"datetime: {text[:60]!r} is no time such as 2026-05-31T12:00:00Z") from error
+        raise Problem(
+            400, f"datetime: {text[:60]!r} is no time such as 2026-05-31T12:00:00Z"
+        ) from error
     return moment if moment.tzinfo else moment.replace(tzinfo=UTC)
 
 
@@ -184,8 +225,12 @@ def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Review
     for each in features:
         review = current.get(str(each["id"]))
         values = {
-            **each["properties"], "review": review and review.verdict, "revision": review.revision if review else 0,
-            "note": review and review.note, "reviewer": review and review.who, "reviewed_at": review and review.at,
+            **each["properties"],
+            "review": review and review.verdict,
+            "revision": review.revision if review else 0,
+            "note": review and review.note,
+            "reviewer": review and review.who,
+            "reviewed_at": review and review.at,
             "crops": _crops(site, kind, each),
         }
         result.append({**each, "properties": values})
@@ -193,7 +238,9 @@ def _reviewed(features: Sequence[Feature], name: str, site: str, reviews: Review
 
 
 def _crops(site: str, kind: str, feature: Feature) -> list[str]:
-    has_none = kind == "finding" and not feature["properties"].get("crop")  # not every watch keeps pictures
+    has_none = kind == "finding" and not feature["properties"].get(
+        "crop"
+    )  # not every watch keeps pictures
     return [] if has_none else crop_addresses(site, kind, str(feature["id"]))
 
 
@@ -204,12 +251,21 @@ def crop_addresses(site: str, kind: str, feature_id: str) -> list[str]:
 
 
 def _filtered(
-    features: Sequence[Feature], interval: tuple[datetime | None, datetime | None], labels: frozenset[str],
-    min_score: float | None, flights: frozenset[str], verdicts: frozenset[str],
+    features: Sequence[Feature],
+    interval: tuple[datetime | None, datetime | None],
+    labels: frozenset[str],
+    min_score: float | None,
+    flights: frozenset[str],
+    verdicts: frozenset[str],
 ) -> list[Feature]:
     def is_wanted(values: Mapping[str, Any]) -> bool:
         return (
-            (not labels or not labels.isdisjoint({values.get("class"), values.get("kind"), values.get("status")}))
+            (
+                not labels
+                or not labels.isdisjoint(
+                    {values.get("class"), values.get("kind"), values.get("status")}
+                )
+            )
             and (min_score is None or (values.get("score") or 0.0) >= min_score)
             and (not flights or values.get("flight") in flights)
             and (not verdicts or (values.get("review") or "none") in verdicts)

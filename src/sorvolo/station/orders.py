@@ -12,7 +12,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from sorvolo.capture.live.addresses import shown_address
 from sorvolo.store.atomic import atomic_write_bytes
 
-ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = "order.json", "journal.jsonl", "log.txt", "running.lock"
+ORDER_FILE, JOURNAL_FILE, LOG_FILE, LOCK_FILE = (
+    "order.json",
+    "journal.jsonl",
+    "log.txt",
+    "running.lock",
+)
 """The files of a run's folder: what it is to do, what it did line by line, what it printed, who is at it."""
 
 BOXES, MOTION = "frame.boxes", "frame.motion"
@@ -54,7 +59,9 @@ class InputWish(BaseModel):
     def _one_of_them(self) -> "InputWish":
         given = [name for name, value in self if value is not None]
         if len(given) != 1:
-            raise ValueError(f"one of upload, input, stream_url and stream was needed, got {len(given)}")
+            raise ValueError(
+                f"one of upload, input, stream_url and stream was needed, got {len(given)}"
+            )
         return self
 
 
@@ -66,8 +73,12 @@ class MissionOptions(BaseModel):
     camera: Annotated[str | None, Field(max_length=80, pattern=_CAMERA)] = None
     camera_file: InputWish | None = None
     telemetry: InputWish | None = None
-    model: Annotated[str | None, Field(max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = None
-    classes: Annotated[list[Annotated[str, Field(min_length=1, max_length=60)]], Field(max_length=40)] = []
+    model: Annotated[str | None, Field(max_length=80, pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$")] = (
+        None
+    )
+    classes: Annotated[
+        list[Annotated[str, Field(min_length=1, max_length=60)]], Field(max_length=40)
+    ] = []
     overlap: Annotated[float, Field(gt=0, lt=1)] = 0.7
     m_per_px: Annotated[float | None, Field(ge=1e-3, le=100)] = None
     views_per_second: Annotated[float, Field(ge=0.05, le=60)] = 5.0
@@ -93,7 +104,9 @@ class RunWish(BaseModel):
     @model_validator(mode="after")
     def _input_where_needed(self) -> "RunWish":
         if self.input is None and self.mission != "search":
-            raise ValueError("map, compare and watch need an input; search without one measures the site's flights")
+            raise ValueError(
+                "map, compare and watch need an input; search without one measures the site's flights"
+            )
         return self
 
 

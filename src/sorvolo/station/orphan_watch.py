@@ -19,7 +19,11 @@ _END_S = 30.0  # for a mission to end by itself, then its processes are killed
 
 @contextmanager
 def ended_when_orphaned(
-    folder: Path, run_id: str, end: Callable[[str], None], *, every_s: float = _LOOK_EVERY_S,
+    folder: Path,
+    run_id: str,
+    end: Callable[[str], None],
+    *,
+    every_s: float = _LOOK_EVERY_S,
 ) -> Iterator[None]:
     """Call `end` with the reason, from a thread, once nobody can know any more of the run in this folder.
 
@@ -27,7 +31,9 @@ def ended_when_orphaned(
     within 30 s, it and all that it started are killed.
     """
     leaving = threading.Event()
-    watching = threading.Thread(target=_watch, args=(folder, run_id, end, every_s, leaving), name="orphan", daemon=True)
+    watching = threading.Thread(
+        target=_watch, args=(folder, run_id, end, every_s, leaving), name="orphan", daemon=True
+    )
     watching.start()
     try:
         yield
@@ -41,14 +47,20 @@ def why_orphaned(folder: Path, run_id: str) -> str:
         return "the folder of this run was taken away"
     state = folder.parent.parent / STATE_FILE
     try:
-        with closing(sqlite3.connect(f"file:{quote(str(state))}?mode=ro", uri=True, timeout=5.0)) as connection:
-            known = connection.execute("SELECT count(*) FROM runs WHERE id = ?", (run_id,)).fetchone()[0]
+        with closing(
+            sqlite3.connect(f"file:{quote(str(state))}?mode=ro", uri=True, timeout=5.0)
+        ) as connection:
+            known = connection.execute(
+                "SELECT count(*) FROM runs WHERE id = ?", (run_id,)
+            ).fetchone()[0]
     except sqlite3.Error:  # it is being written, or damaged, or this is no station's folder
         return ""
     return "" if known else "the station has no record of this run"
 
 
-def _watch(folder: Path, run_id: str, end: Callable[[str], None], every_s: float, leaving: threading.Event) -> None:
+def _watch(
+    folder: Path, run_id: str, end: Callable[[str], None], every_s: float, leaving: threading.Event
+) -> None:
     looks = 0
     while looks < _LOOKS:
         if leaving.wait(every_s):
@@ -57,4 +69,6 @@ def _watch(folder: Path, run_id: str, end: Callable[[str], None], every_s: float
         looks = looks + 1 if why else 0
     end(f"{why}: nobody could stop it or see its result")
     if not leaving.wait(_END_S):
-        os.killpg(os.getpgrp(), signal.SIGKILL)  # a session of its own, led by the mission's process
+        os.killpg(
+            os.getpgrp(), signal.SIGKILL
+        )  # a session of its own, led by the mission's process

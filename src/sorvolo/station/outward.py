@@ -51,7 +51,9 @@ class Outward:
     Raises InputError for a TAK server's host that nothing knows, or certificates that cannot be used.
     """
 
-    def __init__(self, settings: OutwardSettings, events: EventLog, ingest: Ingest, folder: Path) -> None:
+    def __init__(
+        self, settings: OutwardSettings, events: EventLog, ingest: Ingest, folder: Path
+    ) -> None:
         self._ingest = ingest
         self._relays: list[Relay] = []
         self._mqtt: MqttSender | None = None
@@ -64,14 +66,22 @@ class Outward:
         if settings.mqtt:
             place = mqtt_place(settings.mqtt, settings.mqtt_password)
             self._mqtt = MqttSender(place, settings.mqtt_ca)
-            self._relays.append(Relay(str(place), self._mqtt.send, events, _place(folder, str(place))))
+            self._relays.append(
+                Relay(str(place), self._mqtt.send, events, _place(folder, str(place)))
+            )
         if settings.cot:
             target = cot_place(settings.cot)
             check_host(target)
             self._cot = CotRelay(
-                CotSender(target, settings.cot_tls), self._drones, CotSender(target, settings.cot_tls)
+                CotSender(target, settings.cot_tls),
+                self._drones,
+                CotSender(target, settings.cot_tls),
             )
-            self._relays.append(Relay(str(target), self._cot.send, events, _place(folder, str(target)), wanted=WANTED))
+            self._relays.append(
+                Relay(
+                    str(target), self._cot.send, events, _place(folder, str(target)), wanted=WANTED
+                )
+            )
 
     def start(self) -> None:
         """Begin to pass events on."""
@@ -95,7 +105,9 @@ class Outward:
 
     def _drones(self) -> Mapping[str, DroneView]:
         samples = self._ingest.samples()
-        views = {stream: view_of_sample(each.columns, each.stated) for stream, each in samples.items()}
+        views = {
+            stream: view_of_sample(each.columns, each.stated) for stream, each in samples.items()
+        }
         return {stream: view for stream, view in views.items() if view is not None}
 
 

@@ -30,14 +30,19 @@ _DAY_S = 86_400.0
 
 
 def place_routes(
-    shelf: SiteShelf, collections: SiteCollections, reviews: Reviews, videos: FlightVideos, index: PlaceIndex
+    shelf: SiteShelf,
+    collections: SiteCollections,
+    reviews: Reviews,
+    videos: FlightVideos,
+    index: PlaceIndex,
 ) -> APIRouter:
     """What is remembered of a place."""
     router = APIRouter(prefix="/api", tags=["memory"], dependencies=[Depends(needs(Role.VIEW))])
 
     @router.get("/place")
     def place_of_all(
-        lon: float = Query(ge=-360, le=360), lat: float = Query(ge=-90, le=90),
+        lon: float = Query(ge=-360, le=360),
+        lat: float = Query(ge=-90, le=90),
         within_m: float = Query(_NEAR_M, gt=0, le=10_000),
     ) -> list[dict[str, Any]]:
         """Every flight of every site that saw the place or found something within reach of it, in order of time.
@@ -52,7 +57,9 @@ def place_routes(
 
     @router.get("/sites/{site}/place")
     def place(
-        site: str, lon: float = Query(ge=-360, le=360), lat: float = Query(ge=-90, le=90),
+        site: str,
+        lon: float = Query(ge=-360, le=360),
+        lat: float = Query(ge=-90, le=90),
         most_per_flight: int = Query(12, ge=1, le=200),
     ) -> list[dict[str, Any]]:
         """Every frame that shows the place, in order of time, at most this many a flight: those that see it best.
@@ -63,7 +70,11 @@ def place_routes(
         known = index.of_site(site, Place(lat, lon, _NEAR_M))
         if known is None:
             views = _views(collections.get(site, "frames"), lon, lat)
-            kept = {(each.flight_id, each.index) for view in views for each in archive.keyframes(view.flight)}
+            kept = {
+                (each.flight_id, each.index)
+                for view in views
+                for each in archive.keyframes(view.flight)
+            }
             found = _near(site, Point(lon, lat), collections, reviews)
         else:
             seeing = [each.flight for each in known if each.frames]
@@ -71,13 +82,26 @@ def place_routes(
             views = [view for each in those.values() for view in _views(each.frames, lon, lat)]
             kept = {(flight, number) for flight, each in those.items() for number in each.kept}
             found = {each.flight: _things(site, each, reviews) for each in known}
-        place_m = archive.site().frame.ground_from_lonlat([(lon, lat)])[0] if archive.has_site else np.zeros(2)
-        chosen = [each for flight in views for each in _best(flight, Point(lon, lat), kept)[:most_per_flight]]
+        place_m = (
+            archive.site().frame.ground_from_lonlat([(lon, lat)])[0]
+            if archive.has_site
+            else np.zeros(2)
+        )
+        chosen = [
+            each
+            for flight in views
+            for each in _best(flight, Point(lon, lat), kept)[:most_per_flight]
+        ]
         flights = [each.flight for each in views]
         there = videos.of(archive, flights)
-        films = {flight: _Film(flight in there, _began(archive, flight, there)) for flight in flights}
+        films = {
+            flight: _Film(flight in there, _began(archive, flight, there)) for flight in flights
+        }
         base = f"/api/sites/{quote(site, safe=':')}"
-        rows = [_row(base, each, place_m, kept, films[each["properties"]["flight"]], found) for each in chosen]
+        rows = [
+            _row(base, each, place_m, kept, films[each["properties"]["flight"]], found)
+            for each in chosen
+        ]
         return sorted(rows, key=lambda each: (str(each["time"]), each["frame_id"]))
 
     return router
@@ -87,20 +111,32 @@ def _flight_row(site_id: str, found: FoundFlight, reviews: Reviews) -> dict[str,
     """A flight that saw the place, of any site."""
     things = _things(site_id, found, reviews)
     return {
-        "site": site_id, "site_name": found.site_name, "flight": found.flight, "frames": found.frames,
-        "first_time": utc_text(found.first_ns), "last_time": utc_text(found.last_ns),
-        "best_frame": found.best_frame or None, "place_url": f"/api/sites/{quote(site_id, safe=':')}/place",
+        "site": site_id,
+        "site_name": found.site_name,
+        "flight": found.flight,
+        "frames": found.frames,
+        "first_time": utc_text(found.first_ns),
+        "last_time": utc_text(found.last_ns),
+        "best_frame": found.best_frame or None,
+        "place_url": f"/api/sites/{quote(site_id, safe=':')}/place",
         **_found_here(things),
     }
 
 
 def _things(site_id: str, found: FoundFlight, reviews: Reviews) -> list[dict[str, Any]]:
     """What a flight found at the place, by the index, with the verdicts on it."""
-    verdicts = {kind: reviews.current(site_id, kind) for kind in {each.type for each in found.things}}
+    verdicts = {
+        kind: reviews.current(site_id, kind) for kind in {each.type for each in found.things}
+    }
     return [
         {
-            "type": each.type, "id": each.id, "class": each.label, "kind": each.kind or None, "score": each.score,
-            "first_seen": utc_text(each.first_ns), "last_seen": utc_text(each.last_ns),
+            "type": each.type,
+            "id": each.id,
+            "class": each.label,
+            "kind": each.kind or None,
+            "score": each.score,
+            "first_seen": utc_text(each.first_ns),
+            "last_seen": utc_text(each.last_ns),
             "review": _review(verdicts[each.type].get(each.id)),
         }
         for each in found.things
@@ -118,16 +154,26 @@ def _near(
         collection, verdicts = collections.get(site_id, name), reviews.current(site_id, kind)
         for each in _touching(collection, ring):
             values = each["properties"]
-            result.setdefault(values["flight"], []).append({
-                "type": kind, "id": each["id"], "class": values["class"], "kind": values.get("kind"),
-                "score": values.get("score"), "first_seen": values["datetime"], "last_seen": values["end_datetime"],
-                "review": _review(verdicts.get(str(each["id"]))),
-            })
+            result.setdefault(values["flight"], []).append(
+                {
+                    "type": kind,
+                    "id": each["id"],
+                    "class": values["class"],
+                    "kind": values.get("kind"),
+                    "score": values.get("score"),
+                    "first_seen": values["datetime"],
+                    "last_seen": values["end_datetime"],
+                    "review": _review(verdicts.get(str(each["id"]))),
+                }
+            )
     return result
 
 
 def _touching(collection: Collection, ring: Any) -> list[Feature]:
-    return [collection.features[int(each)] for each in sorted(collection.tree.query(ring, predicate="intersects"))]
+    return [
+        collection.features[int(each)]
+        for each in sorted(collection.tree.query(ring, predicate="intersects"))
+    ]
 
 
 def _review(review: Review | None) -> dict[str, Any] | None:
@@ -177,7 +223,11 @@ def _began(archive: Archive, flight: str, there: Container[str]) -> Any:
 
 
 def _row(
-    base: str, frame: Feature, place_m: PointsM, kept: set[tuple[str, int]], film: _Film,
+    base: str,
+    frame: Feature,
+    place_m: PointsM,
+    kept: set[tuple[str, int]],
+    film: _Film,
     found: Mapping[str, list[dict[str, Any]]],
 ) -> dict[str, Any]:
     """A frame that shows the place; `base` is the site's address."""
@@ -185,13 +235,24 @@ def _row(
     flight, name = values["flight"], values.get("frame")
     seconds = _seconds(values.get("time"), film.began) if film.is_there else None
     here, named = found.get(flight, []), quote(flight, safe="")
-    source = "frame" if (flight, name) in kept else "video" if seconds is not None and isinstance(name, int) else ""
+    source = (
+        "frame"
+        if (flight, name) in kept
+        else "video"
+        if seconds is not None and isinstance(name, int)
+        else ""
+    )
     east_mm, north_mm = (round(1000 * float(each)) for each in place_m)
     crop = f"{base}/crops/{source}/{named}/{name}/{east_mm}/{north_mm}.jpg" if source else None
     return {
-        "flight": flight, "time": values.get("time"), "frame_id": frame["id"], "crop_url": crop, "video_s": seconds,
+        "flight": flight,
+        "time": values.get("time"),
+        "frame_id": frame["id"],
+        "crop_url": crop,
+        "video_s": seconds,
         "video_url": f"{base}/flights/{named}/video" if film.is_there else None,
-        "height_m": values.get("height_above_ground_m"), "sigma_m": values.get("sigma_m"),
+        "height_m": values.get("height_above_ground_m"),
+        "sigma_m": values.get("sigma_m"),
         **_found_here(here),
     }
 
@@ -201,7 +262,9 @@ def _found_here(found: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any
     return {
         "changes": [each for each in found if each["type"] == "change"],
         "objects": [each for each in found if each["type"] == "object"],
-        "reviews": [each["review"] | {"id": each["id"]} for each in found if each["review"] is not None],
+        "reviews": [
+            each["review"] | {"id": each["id"]} for each in found if each["review"] is not None
+        ],
     }
 
 

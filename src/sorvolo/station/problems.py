@@ -11,18 +11,40 @@ from starlette.exceptions import HTTPException
 from sorvolo.errors import InputError, SettingsError, SorvoloError, StoreError
 
 _TITLES = {
-    400: "Bad request", 401: "Token needed", 403: "Not allowed", 404: "Not found", 405: "Method not allowed",
-    408: "Nothing came", 409: "Conflict", 410: "Gone", 412: "Changed meanwhile", 413: "Too large", 415: "Unknown kind",
-    421: "Misdirected request", 422: "Invalid request", 423: "In use", 428: "Look first", 429: "Too many attempts",
-    500: "Error in the station", 507: "Disk full",
+    400: "Bad request",
+    401: "Token needed",
+    403: "Not allowed",
+    404: "Not found",
+    405: "Method not allowed",
+    408: "Nothing came",
+    409: "Conflict",
+    410: "Gone",
+    412: "Changed meanwhile",
+    413: "Too large",
+    415: "Unknown kind",
+    421: "Misdirected request",
+    422: "Invalid request",
+    423: "In use",
+    428: "Look first",
+    429: "Too many attempts",
+    500: "Error in the station",
+    507: "Disk full",
 }
 _KIND = "application/problem+json"
 _SCHEMA = {
-    "type": "object", "required": ["title", "status", "detail"],
-    "properties": {"title": {"type": "string"}, "status": {"type": "integer"}, "detail": {"type": "string"}},
+    "type": "object",
+    "required": ["title", "status", "detail"],
+    "properties": {
+        "title": {"type": "string"},
+        "status": {"type": "integer"},
+        "detail": {"type": "string"},
+    },
 }
 PROBLEM_ANSWERS: dict[int | str, dict[str, Any]] = {
-    status: {"description": "What was found, needed, to do (RFC 9457)", "content": {_KIND: {"schema": _SCHEMA}}}
+    status: {
+        "description": "What was found, needed, to do (RFC 9457)",
+        "content": {_KIND: {"schema": _SCHEMA}},
+    }
     for status in (422, "4XX", "5XX")
 }
 """How the API's description announces problem documents."""
@@ -35,14 +57,27 @@ class Problem(Exception):
         self, status: int, detail: str, *, headers: Mapping[str, str] | None = None, **more: object
     ) -> None:
         super().__init__(detail)
-        self.status, self.detail, self.headers, self.more = status, detail, dict(headers or {}), more
+        self.status, self.detail, self.headers, self.more = (
+            status,
+            detail,
+            dict(headers or {}),
+            more,
+        )
 
 
 def problem_answer(
-    status: int, detail: str, headers: Mapping[str, str] | None = None, more: Mapping[str, object] | None = None
+    status: int,
+    detail: str,
+    headers: Mapping[str, str] | None = None,
+    more: Mapping[str, object] | None = None,
 ) -> JSONResponse:
     """The problem document of a status."""
-    body = {"title": _TITLES.get(status, "Error"), "status": status, "detail": detail, **(more or {})}
+    body = {
+        "title": _TITLES.get(status, "Error"),
+        "status": status,
+        "detail": detail,
+        **(more or {}),
+    }
     return JSONResponse(body, status, dict(headers or {}), media_type=_KIND)
 
 
@@ -72,7 +107,8 @@ def answer_problems(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def _of_request(_: Request, error: RequestValidationError) -> JSONResponse:
         faults = "; ".join(
-            f"{'.'.join(str(part) for part in each['loc'])}: {each['msg']}" for each in error.errors()[:4]
+            f"{'.'.join(str(part) for part in each['loc'])}: {each['msg']}"
+            for each in error.errors()[:4]
         )
         return problem_answer(422, f"{faults}; /openapi.json describes what each request needs")
 

@@ -31,14 +31,25 @@ class StationMetrics:
     """The figures of one station, in a registry of its own. `count` adds a request."""
 
     def __init__(
-        self, settings: StationSettings, ingest: Ingest, events: EventLog, runs: RunCounts, relays: Relays = lambda: (),
+        self,
+        settings: StationSettings,
+        ingest: Ingest,
+        events: EventLog,
+        runs: RunCounts,
+        relays: Relays = lambda: (),
     ) -> None:
         self.registry = CollectorRegistry()
         self._requests = Counter(
-            "sorvolo_http_requests", "Requests answered", ("route", "method", "status"), registry=self.registry
+            "sorvolo_http_requests",
+            "Requests answered",
+            ("route", "method", "status"),
+            registry=self.registry,
         )
         self._seconds = Histogram(
-            "sorvolo_http_request_seconds", "Time to answer a request", ("route",), registry=self.registry,
+            "sorvolo_http_request_seconds",
+            "Time to answer a request",
+            ("route",),
+            registry=self.registry,
             buckets=_SECONDS,
         )
         self.registry.register(_StationCollector(settings, ingest, events, runs, relays))
@@ -65,47 +76,81 @@ class _StationCollector(Collector):
     """Reads the figures when they are asked for."""
 
     def __init__(
-        self, settings: StationSettings, ingest: Ingest, events: EventLog, runs: RunCounts, relays: Relays,
+        self,
+        settings: StationSettings,
+        ingest: Ingest,
+        events: EventLog,
+        runs: RunCounts,
+        relays: Relays,
     ) -> None:
-        self._settings, self._ingest, self._events, self._runs, self._relays = settings, ingest, events, runs, relays
+        self._settings, self._ingest, self._events, self._runs, self._relays = (
+            settings,
+            ingest,
+            events,
+            runs,
+            relays,
+        )
 
     def collect(self) -> Iterator[Metric]:
         """See `prometheus_client.registry.Collector`."""
         free = shutil.disk_usage(self._settings.root).free
         yield GaugeMetricFamily("sorvolo_disk_free_bytes", "Free disk space", free)
         yield GaugeMetricFamily(
-            "sorvolo_disk_floor_bytes", "Free disk space below which nothing is taken in",
+            "sorvolo_disk_floor_bytes",
+            "Free disk space below which nothing is taken in",
             self._settings.free_floor_gb * 1e9,
         )
-        missions = GaugeMetricFamily("sorvolo_missions", "Missions by how they stand or ended", labels=["state"])
+        missions = GaugeMetricFamily(
+            "sorvolo_missions", "Missions by how they stand or ended", labels=["state"]
+        )
         for state, count in sorted(self._runs().items()):
             missions.add_metric([state], count)
         yield missions
         if (memory := memory_bytes()) is not None:
-            yield GaugeMetricFamily("sorvolo_memory_bytes", "Resident memory of the station's process", memory)
+            yield GaugeMetricFamily(
+                "sorvolo_memory_bytes", "Resident memory of the station's process", memory
+            )
         yield CounterMetricFamily("sorvolo_events", "Events so far", self._events.last)
         yield from self._of_streams()
         yield from self._of_relays()
 
     def _of_streams(self) -> Iterator[Metric]:
-        connected = GaugeMetricFamily("sorvolo_stream_connected", "Whether the drone sends", labels=["stream"])
-        frames = CounterMetricFamily("sorvolo_stream_frames", "Pictures taken from a drone", labels=["stream"])
-        rate = GaugeMetricFamily("sorvolo_stream_frames_per_second", "Pictures a second", labels=["stream"])
-        size = GaugeMetricFamily("sorvolo_stream_kept_bytes", "What is kept of a stream", labels=["stream"])
-        viewers = GaugeMetricFamily("sorvolo_stream_viewers", "Browsers that watch", labels=["stream"])
+        connected = GaugeMetricFamily(
+            "sorvolo_stream_connected", "Whether the drone sends", labels=["stream"]
+        )
+        frames = CounterMetricFamily(
+            "sorvolo_stream_frames", "Pictures taken from a drone", labels=["stream"]
+        )
+        rate = GaugeMetricFamily(
+            "sorvolo_stream_frames_per_second", "Pictures a second", labels=["stream"]
+        )
+        size = GaugeMetricFamily(
+            "sorvolo_stream_kept_bytes", "What is kept of a stream", labels=["stream"]
+        )
+        viewers = GaugeMetricFamily(
+            "sorvolo_stream_viewers", "Browsers that watch", labels=["stream"]
+        )
         for state in self._ingest.streams():
             label = [state["stream"]]
             connected.add_metric(label, float(state["is_connected"]))
             frames.add_metric(label, state.get("frames", 0))
-            rate.add_metric(label, (state.get("frames_per_s") or 0.0) if state["is_connected"] else 0.0)
+            rate.add_metric(
+                label, (state.get("frames_per_s") or 0.0) if state["is_connected"] else 0.0
+            )
             size.add_metric(label, self._ingest.kept_bytes(state["stream"]))
             viewers.add_metric(label, self._ingest.viewers(state["stream"]))
         yield from (connected, frames, rate, size, viewers)
 
     def _of_relays(self) -> Iterator[Metric]:
-        delivered = CounterMetricFamily("sorvolo_relay_delivered", "Events a receiver took", labels=["receiver"])
-        lost = CounterMetricFamily("sorvolo_relay_lost", "Events a receiver refused, or too old", labels=["receiver"])
-        waiting = GaugeMetricFamily("sorvolo_relay_waiting", "Events not looked at yet", labels=["receiver"])
+        delivered = CounterMetricFamily(
+            "sorvolo_relay_delivered", "Events a receiver took", labels=["receiver"]
+        )
+        lost = CounterMetricFamily(
+            "sorvolo_relay_lost", "Events a receiver refused, or too old", labels=["receiver"]
+        )
+        waiting = GaugeMetricFamily(
+            "sorvolo_relay_waiting", "Events not looked at yet", labels=["receiver"]
+        )
         for each in self._relays():
             delivered.add_metric([each.name], each.delivered)
             lost.add_metric([each.name], each.lost)

@@ -65,7 +65,10 @@ class Pyramid:
     """
 
     def __init__(
-        self, tiles: TileView, tile_px: int, cache: BytesCache[str, ImageRGBA],
+        self,
+        tiles: TileView,
+        tile_px: int,
+        cache: BytesCache[str, ImageRGBA],
         coarse: Callable[[int, TileIndex], ImageRGBA | None] | None = None,
     ) -> None:
         self._tiles, self._cache, self._coarse, self.tile_px = tiles, cache, coarse, tile_px
@@ -73,7 +76,9 @@ class Pyramid:
     @cached_property
     def revision(self) -> str:
         """What names this state of the map: the same tiles, the same revision."""
-        lines = sorted(f"{column},{row},{sha256}" for (column, row), sha256 in self._tiles.hashes.items())
+        lines = sorted(
+            f"{column},{row},{sha256}" for (column, row), sha256 in self._tiles.hashes.items()
+        )
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:12]
 
     @cached_property
@@ -88,9 +93,12 @@ class Pyramid:
             parts: dict[TileIndex, list[str]] = {}
             for (column, row), key in sorted(levels[-1].items()):
                 parts.setdefault((column // 2, row // 2), []).append(f"{column % 2}{row % 2}{key}")
-            levels.append({
-                index: hashlib.sha256("".join(each).encode()).hexdigest() for index, each in parts.items()
-            })
+            levels.append(
+                {
+                    index: hashlib.sha256("".join(each).encode()).hexdigest()
+                    for index, each in parts.items()
+                }
+            )
         return levels
 
     @cached_property
@@ -124,7 +132,11 @@ class Pyramid:
         Above level 0 a piece is a quarter of a tile: what one tile of the level below becomes. Where a map grows under
         a view, only the tiles under that view have to be read.
         """
-        return (self.tile_px, self.keys[0]) if level == 0 else (self.tile_px // 2, self.keys[level - 1])
+        return (
+            (self.tile_px, self.keys[0])
+            if level == 0
+            else (self.tile_px // 2, self.keys[level - 1])
+        )
 
     def piece(self, level: int, index: TileIndex) -> ImageRGBA | None:
         """A piece of a level; None where there is none. Raises as `picture` does."""
@@ -136,7 +148,7 @@ class Pyramid:
         if whole is None:
             return None
         left, top = half * (index[0] % 2), half * (index[1] % 2)
-        return whole[top:top + half, left:left + half]
+        return whole[top : top + half, left : left + half]
 
     def _half_of(self, level: int, index: TileIndex) -> ImageRGBA | None:
         """A tile made smaller, (tile_px / 2, tile_px / 2, 4); None where there is none."""
@@ -161,7 +173,9 @@ class Pyramid:
             for down in (0, 1):
                 part = self._half_of(level - 1, (2 * index[0] + right, 2 * index[1] + down))
                 if part is not None:
-                    result[down * half:(down + 1) * half, right * half:(right + 1) * half] = part
+                    result[down * half : (down + 1) * half, right * half : (right + 1) * half] = (
+                        part
+                    )
         result.setflags(write=False)
         return result
 
@@ -172,7 +186,9 @@ def halved(rgba: ImageRGBA) -> ImageRGBA:
     Colours are averaged by their alpha, so that the map's edges do not darken. That takes time and is only needed where
     the alphas of four pixels differ.
     """
-    small = np.asarray(cv2.resize(rgba, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+    small = np.asarray(
+        cv2.resize(rgba, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8
+    )
     fours = [rgba[down::2, right::2] for down in (0, 1) for right in (0, 1)]
     alphas = [each[..., 3] for each in fours]
     lowest, highest = np.minimum.reduce(alphas), np.maximum.reduce(alphas)
@@ -180,7 +196,9 @@ def halved(rgba: ImageRGBA) -> ImageRGBA:
     if len(at[0]):
         mixed = np.stack([each[at] for each in fours]).astype(np.float32)
         share = mixed[..., 3:]
-        colours = (mixed[..., :3] * share).sum(axis=0) / share.sum(axis=0)  # one alpha at least is above 0
+        colours = (mixed[..., :3] * share).sum(axis=0) / share.sum(
+            axis=0
+        )  # one alpha at least is above 0
         small[at] = np.round(np.column_stack([colours, share.mean(axis=0)])).astype(np.uint8)
     small.setflags(write=False)
     return small

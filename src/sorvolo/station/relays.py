@@ -15,10 +15,17 @@ from sorvolo.errors import StoreError
 from sorvolo.station.events import EventLog
 from sorvolo.store.atomic import atomic_write_bytes
 
-PASSED_ON = frozenset({
-    "object.found", "change.announced", "change.withdrawn", "review.changed",
-    "run.started", "run.finished", "run.failed",
-})
+PASSED_ON = frozenset(
+    {
+        "object.found",
+        "change.announced",
+        "change.withdrawn",
+        "review.changed",
+        "run.started",
+        "run.finished",
+        "run.failed",
+    }
+)
 """The events that other systems get: what was found, what became of it, which missions ran."""
 
 _LOG = logging.getLogger("sorvolo.station.relays")
@@ -53,7 +60,13 @@ class Relay:
     """
 
     def __init__(
-        self, name: str, send: Send, events: EventLog, path: Path, *, wanted: frozenset[str] = PASSED_ON,
+        self,
+        name: str,
+        send: Send,
+        events: EventLog,
+        path: Path,
+        *,
+        wanted: frozenset[str] = PASSED_ON,
         pause_s: float = 0.5,
     ) -> None:
         self.name, self._send, self._events, self._path = name, send, events, path
@@ -116,7 +129,9 @@ class Relay:
     def _lose(self, event: Mapping[str, Any], why: str) -> None:
         self._lost += 1
         self._words = why
-        _LOG.warning("%s does not take event %s (%s): %s", self.name, event["seq"], event["type"], why)
+        _LOG.warning(
+            "%s does not take event %s (%s): %s", self.name, event["seq"], event["type"], why
+        )
 
     def _note(self, why: str) -> None:
         words = " ".join(why.split())[:200]
@@ -126,8 +141,13 @@ class Relay:
 
     def _keep_place(self) -> None:
         try:
-            atomic_write_bytes(self._path, json.dumps({"name": self.name, "seq": self._seq}).encode())
-        except (OSError, StoreError) as error:  # a full disk costs events that are sent twice, not events
+            atomic_write_bytes(
+                self._path, json.dumps({"name": self.name, "seq": self._seq}).encode()
+            )
+        except (
+            OSError,
+            StoreError,
+        ) as error:  # a full disk costs events that are sent twice, not events
             _LOG.warning("cannot note what %s got: %s", self.name, error)
 
 

@@ -55,7 +55,9 @@ class Reviews:
     done (`settle`).
     """
 
-    def __init__(self, state: StationState, shelf: SiteShelf, events: EventLog, findings: Findings) -> None:
+    def __init__(
+        self, state: StationState, shelf: SiteShelf, events: EventLog, findings: Findings
+    ) -> None:
         self._state, self._shelf, self._events, self._findings = state, shelf, events, findings
         self._settling = threading.Lock()
         self._unsettled: set[str] = set()
@@ -65,7 +67,8 @@ class Reviews:
         """The newest verdict on each thing of a kind, by id; those given by the command line included."""
         rows = self._state.rows(
             "SELECT kind, id, MAX(revision) AS revision, verdict, note, who, at FROM reviews "
-            "WHERE site = ? AND made_utc = ? AND kind = ? GROUP BY id", (*self._key(site_id, kind), kind),
+            "WHERE site = ? AND made_utc = ? AND kind = ? GROUP BY id",
+            (*self._key(site_id, kind), kind),
         )
         found = {row["id"]: Review(**dict(row)) for row in rows}
         if kind == "change":
@@ -90,7 +93,10 @@ class Reviews:
         if wish.revision != revision:
             raise self._conflict(wish, now)
         made = Review(wish.kind, wish.id, revision + 1, wish.verdict, wish.note, who, utc_now())
-        event, key = NewEvent("review.changed", asdict(made), site_id), self._key(site_id, wish.kind)
+        event, key = (
+            NewEvent("review.changed", asdict(made), site_id),
+            self._key(site_id, wish.kind),
+        )
         try:
             with self._events.appending([event]) as connection:
                 if now is not None and now.who == _ELSEWHERE:
@@ -114,7 +120,8 @@ class Reviews:
             archive = self._shelf.open(site_id)
             inside = {each.id: (each.verdict, each.note) for each in archive.changes()}
             waiting = [
-                each for each in self.current(site_id, "change").values()
+                each
+                for each in self.current(site_id, "change").values()
                 if each.id in inside and inside[each.id] != (_as_stored(each), _stored_note(each))
             ]
             try:
@@ -165,7 +172,9 @@ class Reviews:
             if change.verdict is None:
                 continue
             ours, at = known.get(change.id), at_utc.get(change.id, "")
-            if ours is None or (at > ours.at and (change.verdict, change.note) != (_as_stored(ours), ours.note)):
+            if ours is None or (
+                at > ours.at and (change.verdict, change.note) != (_as_stored(ours), ours.note)
+            ):
                 revision = 1 if ours is None else ours.revision + 1
                 found[change.id] = Review(
                     "change", change.id, revision, change.verdict.value, change.note, _ELSEWHERE, at
@@ -186,9 +195,14 @@ class Reviews:
 
     @staticmethod
     def _conflict(wish: ReviewWish, now: Review | None) -> Problem:
-        newer = f"{now.who} gave the verdict {now.verdict}" if now is not None else "the verdict was withdrawn"
+        newer = (
+            f"{now.who} gave the verdict {now.verdict}"
+            if now is not None
+            else "the verdict was withdrawn"
+        )
         return Problem(
-            409, f"{newer} meanwhile; look at it, and give your verdict upon revision {now.revision if now else 0}",
+            409,
+            f"{newer} meanwhile; look at it, and give your verdict upon revision {now.revision if now else 0}",
             current=None if now is None else asdict(now),
         )
 
@@ -199,13 +213,17 @@ def review_routes(reviews: Reviews, shelf: SiteShelf) -> APIRouter:
 
     @router.get("", dependencies=[Depends(needs(Role.VIEW))])
     def history(
-        site: str, kind: Literal["", "object", "change", "finding"] = "", id: str = Query("", max_length=400),
+        site: str,
+        kind: Literal["", "object", "change", "finding"] = "",
+        id: str = Query("", max_length=400),
     ) -> list[dict[str, Any]]:
         """Every verdict of the site with who gave it and when, newest first."""
         return [asdict(each) for each in reviews.history(site, kind, id)]
 
     @router.post("", status_code=201)
-    def give(site: str, wish: ReviewWish, holder: Holder = Depends(needs(Role.REVIEW))) -> dict[str, Any]:  # noqa: B008
+    def give(
+        site: str, wish: ReviewWish, holder: Holder = Depends(needs(Role.REVIEW))
+    ) -> dict[str, Any]:
         """Confirm or reject an object, a change or a finding, or withdraw a verdict. 409 where another came first."""
         return asdict(reviews.give(site, wish, holder.name))
 
@@ -216,7 +234,16 @@ def _keep(connection: sqlite3.Connection, key: tuple[str, str], review: Review) 
     connection.execute(
         "INSERT INTO reviews (site, made_utc, kind, id, revision, verdict, note, who, at) "
         "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, review.kind, review.id, review.revision, review.verdict, review.note, review.who, review.at),
+        (
+            *key,
+            review.kind,
+            review.id,
+            review.revision,
+            review.verdict,
+            review.note,
+            review.who,
+            review.at,
+        ),
     )
 
 

@@ -23,13 +23,14 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
 
     @router.get("/api/runs", dependencies=[Depends(needs(Role.VIEW))])
     def all_runs(
-        site: str = Query("", max_length=200), limit: int = Query(200, ge=1, le=1000),
+        site: str = Query("", max_length=200),
+        limit: int = Query(200, ge=1, le=1000),
     ) -> list[dict[str, Any]]:
         """The newest missions first, of all sites or of one."""
         return [run_row(each) for each in runs.all(limit, site)]
 
     @router.post("/api/runs", status_code=201)
-    def start(wish: RunWish, holder: Holder = Depends(needs(Role.OPERATE))) -> dict[str, Any]:  # noqa: B008
+    def start(wish: RunWish, holder: Holder = Depends(needs(Role.OPERATE))) -> dict[str, Any]:
         """Start a mission: map, compare, watch or search. 409 while another one writes into the site."""
         return run_row(runs.start(wish, holder.name))
 
@@ -43,7 +44,9 @@ def run_routes(runs: Runs, inputs: Inputs, ingest: Ingest) -> APIRouter:
         """Ask it to end: a live flight is finished and kept, a recorded one is left out."""
         return run_row(runs.stop(run_id))
 
-    @router.delete("/api/runs/{run_id}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))])
+    @router.delete(
+        "/api/runs/{run_id}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))]
+    )
     async def delete(run_id: str) -> None:
         """Take a mission that is over away: its record, what a watch found, the recording of its camera. The map that
         it made stays. 409 while it runs, 423 while another mission reads the recording."""

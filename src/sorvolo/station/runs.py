@@ -47,7 +47,14 @@ from sorvolo.station.state import StationState, compact_json, utc_after, utc_now
 from sorvolo.store.atomic import writing
 from sorvolo.store.locks import take_lock
 
-RUNNING, FINISHED, INCOMPLETE, FAILED, STOPPED, LOST = "running", "finished", "incomplete", "failed", "stopped", "lost"
+RUNNING, FINISHED, INCOMPLETE, FAILED, STOPPED, LOST = (
+    "running",
+    "finished",
+    "incomplete",
+    "failed",
+    "stopped",
+    "lost",
+)
 """States of a run. Incomplete: finished and kept, but pictures of its flight are missing, as where the disk was full.
 Lost: its process ended without a word, as when the machine was switched off."""
 
@@ -91,16 +98,29 @@ class Runs:
     """The missions of a station. Only `look` changes what is known of one that runs; a thread calls it."""
 
     def __init__(
-        self, settings: StationSettings, state: StationState, shelf: SiteShelf, events: EventLog, inputs: Inputs,
+        self,
+        settings: StationSettings,
+        state: StationState,
+        shelf: SiteShelf,
+        events: EventLog,
+        inputs: Inputs,
         show: Callable[[str, Mapping[str, Any]], None] = lambda *_: None,
     ) -> None:
         self._show = show
-        self._settings, self._state, self._shelf, self._events, self._inputs = settings, state, shelf, events, inputs
+        self._settings, self._state, self._shelf, self._events, self._inputs = (
+            settings,
+            state,
+            shelf,
+            events,
+            inputs,
+        )
         self._folder = settings.state_folder / RUNS_FOLDER
         self._lock = threading.RLock()
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._ends: dict[str, int] = {}  # how far the journals of those that run were read
-        self._lingering_s: dict[str, float] = {}  # ended by their own journal, their processes not yet: since when
+        self._lingering_s: dict[
+            str, float
+        ] = {}  # ended by their own journal, their processes not yet: since when
         self._is_low = False
         self._reserve = Reserve(settings.state_folder / RESERVE_FILE)
         self._ending = threading.Event()
@@ -119,15 +139,17 @@ class Runs:
     def all(self, limit: int = 200, site: str = "") -> list[Run]:
         """The newest runs first, of one site or ("") of all."""
         rows = self._state.rows(
-            "SELECT record FROM runs WHERE ? IN ('', site) ORDER BY made_at DESC, id LIMIT ?", (site, limit)
+            "SELECT record FROM runs WHERE ? IN ('', site) ORDER BY made_at DESC, id LIMIT ?",
+            (site, limit),
         )
         return [Run(**json.loads(row["record"])) for row in rows]
 
     def counts(self) -> dict[str, int]:
         """How many missions there are in each state."""
-        return {row["state"]: row["count"] for row in self._state.rows(
-            "SELECT state, count(*) AS count FROM runs GROUP BY state"
-        )}
+        return {
+            row["state"]: row["count"]
+            for row in self._state.rows("SELECT state, count(*) AS count FROM runs GROUP BY state")
+        }
 
     def get(self, run_id: str) -> Run:
         """A run. Raises Problem (404)."""
@@ -144,7 +166,9 @@ class Runs:
         self._demand_room()
         with self._lock:
             self._demand_turn(wish)
-            makes_site = wish.mission in ("map", "watch") or (wish.mission == "search" and wish.input is not None)
+            makes_site = wish.mission in ("map", "watch") or (
+                wish.mission == "search" and wish.input is not None
+            )
             find = self._shelf.new_folder if makes_site else self._shelf.folder
             site = find(wish.site)
             run_id = secrets.token_hex(8)
@@ -154,14 +178,22 @@ class Runs:
                 folder.mkdir(parents=True)
             order.write(folder)
             run = Run(
-                run_id, wish.mission, wish.site, RUNNING, who, utc_now(), input=self._inputs.shown(wish.input),
+                run_id,
+                wish.mission,
+                wish.site,
+                RUNNING,
+                who,
+                utc_now(),
+                input=self._inputs.shown(wish.input),
                 options=wish.options.model_dump(mode="json", exclude_defaults=True),
             )
             process = _spawned(folder, order)
             run = replace(run, pid=process.pid)
             try:
                 self._begin(run)
-            except BaseException:  # a full disk: nobody would know of the mission, nor could stop it
+            except (
+                BaseException
+            ):  # a full disk: nobody would know of the mission, nor could stop it
                 process.kill()
                 process.wait()
                 raise
@@ -177,7 +209,9 @@ class Runs:
             run = self.get(run_id)
             if run.state != RUNNING:
                 raise Problem(409, f"this run is {run.state} already")
-            if run.pid is not None and not _has_ended(self._folder / run.id):  # the number is still its own
+            if run.pid is not None and not _has_ended(
+                self._folder / run.id
+            ):  # the number is still its own
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(run.pid, signal.SIGTERM)
             limits = self._settings.limits
@@ -221,8 +255,10 @@ class Runs:
             for run, _ in self._running():
                 if stream and run.id != but and stream == _order_stream(self._folder / run.id):
                     raise Problem(
-                        423, f"a {run.mission} that {run.who} started reads this stream; wait until it ends, or stop "
-                             "it", run=run.id,
+                        423,
+                        f"a {run.mission} that {run.who} started reads this stream; wait until it ends, or stop "
+                        "it",
+                        run=run.id,
                     )
             yield
 
@@ -237,8 +273,10 @@ class Runs:
             for run in self.of_site(site_id):
                 if run.state == RUNNING or not _has_ended(self._folder / run.id):
                     raise Problem(
-                        409, f"a {run.mission} that {run.who} started runs on the site {site_id!r}; wait until it "
-                             "ends, or stop it", run=run.id,
+                        409,
+                        f"a {run.mission} that {run.who} started runs on the site {site_id!r}; wait until it "
+                        "ends, or stop it",
+                        run=run.id,
                     )
             yield
 
@@ -249,8 +287,10 @@ class Runs:
             for run, _ in self._running():
                 if upload_id in _uploads_of(run):
                     raise Problem(
-                        423, f"a {run.mission} that {run.who} started reads this upload; wait until it ends, or stop "
-                             "it", run=run.id,
+                        423,
+                        f"a {run.mission} that {run.who} started reads this upload; wait until it ends, or stop "
+                        "it",
+                        run=run.id,
                     )
             yield
 
@@ -259,7 +299,10 @@ class Runs:
 
         Missions that run carry a notice meanwhile.
         """
-        free_gb, floor_gb = shutil.disk_usage(self._settings.root).free / 1e9, self._settings.free_floor_gb
+        free_gb, floor_gb = (
+            shutil.disk_usage(self._settings.root).free / 1e9,
+            self._settings.free_floor_gb,
+        )
         is_low = free_gb < floor_gb
         if not is_low:
             self._reserve.hold()
@@ -267,8 +310,11 @@ class Runs:
         if is_low != self._is_low:
             self._is_low = is_low
             _LOG.log(
-                logging.WARNING if is_low else logging.INFO, "disk %s: %.2f GB are free, %.2f GB must stay so",
-                "full" if is_low else "has room again", free_gb, floor_gb,
+                logging.WARNING if is_low else logging.INFO,
+                "disk %s: %.2f GB are free, %.2f GB must stay so",
+                "full" if is_low else "has room again",
+                free_gb,
+                floor_gb,
             )
             data = {"is_low": is_low, "free_gb": round(free_gb, 2), "floor_gb": floor_gb}
             self._events.append(NewEvent("station.disk", data))
@@ -286,12 +332,21 @@ class Runs:
         with self._events.appending([_event("run.started", run, run_row(run))]) as connection:
             connection.execute(
                 "INSERT INTO runs (id, made_at, site, mission, state, record) VALUES (?, ?, ?, ?, ?, ?)",
-                (run.id, run.started_at, run.site, run.mission, run.state, compact_json(asdict(run))),
+                (
+                    run.id,
+                    run.started_at,
+                    run.site,
+                    run.mission,
+                    run.state,
+                    compact_json(asdict(run)),
+                ),
             )
 
     def _running(self) -> list[tuple[Run, int]]:
         """The missions that run, each with how far its journal was read."""
-        rows = self._state.rows("SELECT record, journal_offset FROM runs WHERE state = ?", (RUNNING,))
+        rows = self._state.rows(
+            "SELECT record, journal_offset FROM runs WHERE state = ?", (RUNNING,)
+        )
         return [(Run(**json.loads(row["record"])), row["journal_offset"]) for row in rows]
 
     def _watch(self) -> None:
@@ -313,14 +368,18 @@ class Runs:
         until_s = time.monotonic() + _LOOK_EVERY_S
         while not self._ending.wait(_GLANCE_EVERY_S):
             ends = list(self._ends.items())
-            grown = (_size_bytes(self._folder / run_id / JOURNAL_FILE) > end for run_id, end in ends)
+            grown = (
+                _size_bytes(self._folder / run_id / JOURNAL_FILE) > end for run_id, end in ends
+            )
             if time.monotonic() >= until_s or any(grown):
                 return False
         return True
 
     def _look_at(self, run: Run, offset: int) -> Run:
         folder = self._folder / run.id
-        has_ended = _has_ended(folder)  # asked first: lines written before the end are then all there
+        has_ended = _has_ended(
+            folder
+        )  # asked first: lines written before the end are then all there
         with self._lock:
             lines, end = _new_lines(folder / JOURNAL_FILE, offset)
             run, events = self._advanced(self.get(run.id), lines)
@@ -370,7 +429,14 @@ class Runs:
         process = self._processes.get(run.id)
         code = process.poll() if process is not None else None
         if run.stop_asked:
-            run = replace(run, state=STOPPED, ended_at=utc_now(), exit_code=code, notice=None, headline=NOTHING_KEPT)
+            run = replace(
+                run,
+                state=STOPPED,
+                ended_at=utc_now(),
+                exit_code=code,
+                notice=None,
+                headline=NOTHING_KEPT,
+            )
             return run, _event("run.stopped", run, run_row(run))
         last = _tail(folder / LOG_FILE)
         words = "its process ended without a word"
@@ -381,7 +447,11 @@ class Runs:
         if short := shortage(self._settings.root, self._settings.free_floor_gb):
             words += f" while the disk was full ({short})"
         run = replace(
-            run, state=LOST if code is None else FAILED, ended_at=utc_now(), exit_code=code, notice=None,
+            run,
+            state=LOST if code is None else FAILED,
+            ended_at=utc_now(),
+            exit_code=code,
+            notice=None,
             error=f"{words}; the site is as it was before{': ' + last if last else ''}",
         )
         return run, _event("run.failed", run, run_row(run))
@@ -396,32 +466,54 @@ class Runs:
     def _demand_turn(self, wish: RunWish) -> None:
         running = [each for each, _ in self._running()]
         if len(running) >= self._settings.limits.most_missions:
-            raise Problem(409, f"{len(running)} missions run already; wait until one ends, or stop one")
+            raise Problem(
+                409, f"{len(running)} missions run already; wait until one ends, or stop one"
+            )
         for each in running if writes(wish.mission, has_input=wish.input is not None) else ():
             if each.site == wish.site and writes(each.mission, has_input=each.input is not None):
                 raise Problem(
-                    409, f"the site {wish.site!r} is being written by a {each.mission} that {each.who} started; wait "
-                         "until it ends, or stop it", run=each.id,
+                    409,
+                    f"the site {wish.site!r} is being written by a {each.mission} that {each.who} started; wait "
+                    "until it ends, or stop it",
+                    run=each.id,
                 )
 
     def _demand_room(self) -> None:
         if short := shortage(self._settings.root, self._settings.free_floor_gb):
-            raise Problem(507, f"{short}; delete uploads, recordings or flights that you no longer need")
+            raise Problem(
+                507, f"{short}; delete uploads, recordings or flights that you no longer need"
+            )
 
     def _order(self, wish: RunWish, run_id: str, site: Path, folder: Path) -> Order:
         options = wish.options
-        given = {name: "" if each is None else self._inputs.source(each) for name, each in (
-            ("source", wish.input), ("telemetry", options.telemetry), ("camera", options.camera_file),
-        )}
+        given = {
+            name: "" if each is None else self._inputs.source(each)
+            for name, each in (
+                ("source", wish.input),
+                ("telemetry", options.telemetry),
+                ("camera", options.camera_file),
+            )
+        }
         results = site / SEARCH_FOLDER if wish.mission == "search" else folder / "results"
         stream, door = (wish.input.stream if wish.input else None) or "", door_path(self._settings)
-        is_camera = wish.input is not None and wish.input.stream_url is not None and door.is_socket()
+        is_camera = (
+            wish.input is not None and wish.input.stream_url is not None and door.is_socket()
+        )
         return Order(
-            run_id, wish.mission, wish.site, str(site.resolve()), given["source"], given["telemetry"],
-            given["camera"] or options.camera or "", str(results.resolve()),
-            _stream_of_camera(given["source"], run_id) if is_camera else stream, options.model_dump(mode="json"),
-            str(door.resolve()) if is_camera else "", str((self._settings.root / STREAMS_FOLDER).resolve()),
-            self._settings.free_floor_gb, self._settings.limits.away_s,
+            run_id,
+            wish.mission,
+            wish.site,
+            str(site.resolve()),
+            given["source"],
+            given["telemetry"],
+            given["camera"] or options.camera or "",
+            str(results.resolve()),
+            _stream_of_camera(given["source"], run_id) if is_camera else stream,
+            options.model_dump(mode="json"),
+            str(door.resolve()) if is_camera else "",
+            str((self._settings.root / STREAMS_FOLDER).resolve()),
+            self._settings.free_floor_gb,
+            self._settings.limits.away_s,
         )
 
 
@@ -442,8 +534,13 @@ def _taken(run: Run, line: Mapping[str, Any]) -> tuple[Run, NewEvent]:
     elif kind in _ENDS:
         is_short = kind == "run.finished" and data["exit_code"] == TO_CHECK
         run = replace(
-            run, state=INCOMPLETE if is_short else _ENDS[kind], ended_at=utc_now(), headline=data["headline"],
-            exit_code=data["exit_code"], error=data["error"], notice=None,
+            run,
+            state=INCOMPLETE if is_short else _ENDS[kind],
+            ended_at=utc_now(),
+            headline=data["headline"],
+            exit_code=data["exit_code"],
+            error=data["error"],
+            notice=None,
         )
         return run, _event(kind, run, run_row(run))
     return run, _event(kind, run, data)
@@ -507,8 +604,13 @@ def _spawned(folder: Path, order: Order) -> "subprocess.Popen[bytes]":
         take_lock(lock)
         with (folder / LOG_FILE).open("ab") as log:
             return subprocess.Popen(
-                python_command("sorvolo.station.worker", str(folder.resolve())), cwd=folder,
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=(lock,),
+                python_command("sorvolo.station.worker", str(folder.resolve())),
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                pass_fds=(lock,),
                 env={**os.environ, LOCK_VARIABLE: str(lock), SOURCE_VARIABLE: order.source},
             )
     finally:

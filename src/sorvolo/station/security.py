@@ -44,8 +44,15 @@ class Doorkeeper:
     What passes carries a `Holder` in its state. Takes `upload_path`, a prefix whose bodies have limits of their own.
     """
 
-    def __init__(self, app: ASGIApp, settings: StationSettings, state: StationState, upload_path: str) -> None:
-        self._app, self._settings, self._state, self._upload_path = app, settings, state, upload_path
+    def __init__(
+        self, app: ASGIApp, settings: StationSettings, state: StationState, upload_path: str
+    ) -> None:
+        self._app, self._settings, self._state, self._upload_path = (
+            app,
+            settings,
+            state,
+            upload_path,
+        )
         self._guesses = Guesses()
         self._live: Counter[str] = Counter()  # channels that are open, by address
 
@@ -58,7 +65,9 @@ class Doorkeeper:
         connection = HTTPConnection(scope)
         try:
             check_host(connection.headers.get("host", ""), self._settings)
-            check_origin(connection, self._settings.public_origin, is_websocket=scope["type"] == "websocket")
+            check_origin(
+                connection, self._settings.public_origin, is_websocket=scope["type"] == "websocket"
+            )
             holder = await self._holder(connection)
             scope["state"] = {**scope.get("state", {}), "holder": holder, "doorkeeper": self}
             if not scope["path"].startswith(self._upload_path):
@@ -78,7 +87,9 @@ class Doorkeeper:
         address = address_group(connection.client.host if connection.client else "")
         most = self._settings.limits.most_live_per_address
         if self._live[address] >= most:
-            raise Problem(429, f"{address} keeps {most} live channels open already; close some of its pages")
+            raise Problem(
+                429, f"{address} keeps {most} live channels open already; close some of its pages"
+            )
         self._live[address] += 1
         try:
             yield
@@ -92,19 +103,25 @@ class Doorkeeper:
         if not await asyncio.to_thread(has_tokens, self._state):
             if self._settings.is_private:
                 return Holder("this machine", Role.OPERATE)
-            raise Problem(401, "this station needs tokens and has none; make one with `sorvolo token`")
-        if _ANYBODY.fullmatch(connection.scope["path"]):  # not looked at: an old cookie must not keep its owner out
+            raise Problem(
+                401, "this station needs tokens and has none; make one with `sorvolo token`"
+            )
+        if _ANYBODY.fullmatch(
+            connection.scope["path"]
+        ):  # not looked at: an old cookie must not keep its owner out
             return Holder("", Role.VIEW)
         token = sent_token(connection)
         if not token:
             raise Problem(
-                401, "a token is needed: send it as `Authorization: Bearer TOKEN`, or log in on the page",
+                401,
+                "a token is needed: send it as `Authorization: Bearer TOKEN`, or log in on the page",
                 headers={"WWW-Authenticate": "Bearer"},
             )
         holder = await self.look_at(token, connection.client.host if connection.client else "")
         if holder is None:
             raise Problem(
-                401, "this token is not known here, or has expired; ask who runs the station for another",
+                401,
+                "this token is not known here, or has expired; ask who runs the station for another",
                 headers={"WWW-Authenticate": "Bearer"},
             )
         return holder
@@ -119,7 +136,8 @@ class Doorkeeper:
         source = f"{address_group(address)} {known_id}"
         if (wait_s := self._guesses.wait_s(source)) > 0:
             raise Problem(
-                429, f"too many wrong tokens came from {address}; wait {wait_s:.0f} s and try again",
+                429,
+                f"too many wrong tokens came from {address}; wait {wait_s:.0f} s and try again",
                 headers={"Retry-After": str(int(wait_s) + 1)},
             )
         holder = await asyncio.to_thread(holder_of, self._state, token)
@@ -158,10 +176,15 @@ def holder_in(connection: HTTPConnection) -> Holder:
 def needs(role: Role) -> Callable[[HTTPConnection], Awaitable[Holder]]:
     """A route's demand: who asks has at least this role. Raises Problem (403)."""
 
-    async def demanded(connection: HTTPConnection) -> Holder:  # waits for nothing: a plain function costs a thread
+    async def demanded(
+        connection: HTTPConnection,
+    ) -> Holder:  # waits for nothing: a plain function costs a thread
         holder = holder_in(connection)
         if holder.role < role:
-            raise Problem(403, f"the role {role.word} is needed, this token has {holder.role.word}; ask for another")
+            raise Problem(
+                403,
+                f"the role {role.word} is needed, this token has {holder.role.word}; ask for another",
+            )
         return holder
 
     return demanded
@@ -176,12 +199,17 @@ def check_host(host: str, settings: StationSettings) -> None:
     name = _host_name(host)
     if name.lower() == "localhost" or name.lower() in settings.host_names:
         return
-    if not settings.is_loopback and (_is_address(name) or name.lower() == socket.gethostname().lower()):
+    if not settings.is_loopback and (
+        _is_address(name) or name.lower() == socket.gethostname().lower()
+    ):
         return
     if is_loopback(name):
         return
-    raise Problem(421, f"this station is not {name[:100] or 'without a name'}; open it by its address, or start it "
-                       "with --name")
+    raise Problem(
+        421,
+        f"this station is not {name[:100] or 'without a name'}; open it by its address, or start it "
+        "with --name",
+    )
 
 
 def check_origin(connection: HTTPConnection, public_origin: str, *, is_websocket: bool) -> None:
@@ -209,7 +237,9 @@ def _only_reads(connection: HTTPConnection) -> bool:
 
 def _own_origin(connection: HTTPConnection) -> str:
     """The origin of pages that came from the address that was asked, lower case."""
-    scheme = {"ws": "http", "wss": "https"}.get(connection.scope["scheme"], connection.scope["scheme"])
+    scheme = {"ws": "http", "wss": "https"}.get(
+        connection.scope["scheme"], connection.scope["scheme"]
+    )
     return f"{scheme}://{connection.headers.get('host', '').lower()}"
 
 
@@ -248,7 +278,9 @@ def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
     """`receive` that refuses a body of more than a megabyte, announced or not. Raises Problem (413)."""
     if connection.scope["type"] == "websocket":
         return receive
-    too_large = Problem(413, f"at most {_MOST_BODY_BYTES // 1000} kB were expected; flights go to /api/uploads")
+    too_large = Problem(
+        413, f"at most {_MOST_BODY_BYTES // 1000} kB were expected; flights go to /api/uploads"
+    )
     announced = connection.headers.get("content-length", "0")
     if not announced.isdecimal() or int(announced) > _MOST_BODY_BYTES:
         raise too_large
@@ -259,16 +291,26 @@ def _limited(connection: HTTPConnection, receive: Receive) -> Receive:
         message = await receive()
         taken += len(message.get("body", b""))
         if taken > _MOST_BODY_BYTES:
-            raise HTTPException(413, too_large.detail)  # what FastAPI passes on as it is while it reads a body
+            raise HTTPException(
+                413, too_large.detail
+            )  # what FastAPI passes on as it is while it reads a body
         return message
 
     return receiving
 
 
-async def _refuse(scope: Scope, receive: Receive, send: Callable[[Any], Awaitable[None]], problem: Problem) -> None:
+async def _refuse(
+    scope: Scope, receive: Receive, send: Callable[[Any], Awaitable[None]], problem: Problem
+) -> None:
     answer = problem_answer(problem.status, problem.detail, problem.headers, problem.more)
     if scope["type"] == "http" or "websocket.http.response" in scope.get("extensions", {}):
         await answer(scope, receive, send)
     else:
         await receive()
-        await send({"type": "websocket.close", "code": 4000 + problem.status % 1000, "reason": problem.detail[:120]})
+        await send(
+            {
+                "type": "websocket.close",
+                "code": 4000 + problem.status % 1000,
+                "reason": problem.detail[:120],
+            }
+        )

@@ -19,9 +19,11 @@ _MOST_MESSAGE_BYTES = 16_000_000  # of one WebSocket message: a key frame of 4K 
 
 
 def run_station(
-    settings: StationSettings, announce: Callable[[], None],
-    receivers: OutwardSettings = OutwardSettings(),  # noqa: B008 (frozen)
-    *, logs_json: bool = False,
+    settings: StationSettings,
+    announce: Callable[[], None],
+    receivers: OutwardSettings = OutwardSettings(),
+    *,
+    logs_json: bool = False,
 ) -> None:
     """Serve until Ctrl-C or SIGTERM; `announce` is called once it listens.
 
@@ -45,11 +47,22 @@ def run_station(
 def server_config(app: FastAPI, settings: StationSettings) -> uvicorn.Config:
     """How the application is served. Who asked is taken from a proxy's word only where the settings name one."""
     return uvicorn.Config(
-        app, settings.host, settings.port, log_level="warning", access_log=False, server_header=False,
-        log_config=None, ws="websockets-sansio", ws_max_size=_MOST_MESSAGE_BYTES,
-        proxy_headers=bool(settings.public_url), forwarded_allow_ips=["127.0.0.1", "::1"],
-        limit_concurrency=settings.limits.most_connections, timeout_graceful_shutdown=2,
-        ssl_certfile=settings.tls_cert, ssl_keyfile=settings.tls_key, h11_max_incomplete_event_size=64_000,
+        app,
+        settings.host,
+        settings.port,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        log_config=None,
+        ws="websockets-sansio",
+        ws_max_size=_MOST_MESSAGE_BYTES,
+        proxy_headers=bool(settings.public_url),
+        forwarded_allow_ips=["127.0.0.1", "::1"],
+        limit_concurrency=settings.limits.most_connections,
+        timeout_graceful_shutdown=2,
+        ssl_certfile=settings.tls_cert,
+        ssl_keyfile=settings.tls_key,
+        h11_max_incomplete_event_size=64_000,
     )
 
 

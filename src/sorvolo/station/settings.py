@@ -29,7 +29,9 @@ class StationLimits:
     """How much a station does at the same time, and how long it waits for missions that are to end."""
 
     most_connections: int = 1000  # of all clients; a browser opens six and a few live ones
-    most_live_per_address: int = 64  # event and video channels: a crew behind one router is one address
+    most_live_per_address: int = (
+        64  # event and video channels: a crew behind one router is one address
+    )
     most_missions: int = 4  # at the same time; each takes a core and a gigabyte or more
     most_streams: int = 16  # of drones that send at the same time
     most_uploads: int = 1000  # that are kept
@@ -40,8 +42,12 @@ class StationLimits:
 
     def __post_init__(self) -> None:
         counts = (
-            self.most_connections, self.most_live_per_address, self.most_missions, self.most_streams,
-            self.most_uploads, self.most_events,
+            self.most_connections,
+            self.most_live_per_address,
+            self.most_missions,
+            self.most_streams,
+            self.most_uploads,
+            self.most_events,
         )
         if min(counts) < 1 or min(self.stop_within_s, self.finish_within_s, self.away_s) <= 0:
             raise SettingsError("limits of a station are counts from 1 and seconds above 0")
@@ -73,7 +79,9 @@ class StationSettings:
     limits: StationLimits = StationLimits()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "root", self.root.absolute())  # missions run in folders of their own
+        object.__setattr__(
+            self, "root", self.root.absolute()
+        )  # missions run in folders of their own
         if not 0 < self.port < 65536:
             raise SettingsError(f"--port {self.port}: a port from 1 to 65535 was needed")
         if not (self.free_floor_gb >= 0 and self.upload_most_gb > 0):
@@ -84,7 +92,9 @@ class StationSettings:
         if self.public_url:
             _check_public(self.public_url)
         if self.base_map is not None and not _is_pmtiles(self.base_map):
-            raise SettingsError(f"--base-map {self.base_map}: a PMTiles file (version 3) was needed")
+            raise SettingsError(
+                f"--base-map {self.base_map}: a PMTiles file (version 3) was needed"
+            )
 
     @property
     def state_folder(self) -> Path:
@@ -116,7 +126,9 @@ class StationSettings:
     def host_names(self) -> frozenset[str]:
         """The names and addresses under which browsers may ask, lower case, besides this machine's own."""
         public = urlsplit(self.public_url).hostname
-        return frozenset(each.lower() for each in (self.host, *self.names, *([public] if public else [])))
+        return frozenset(
+            each.lower() for each in (self.host, *self.names, *([public] if public else []))
+        )
 
     @property
     def address(self) -> str:
@@ -142,7 +154,9 @@ def check_exposure(settings: StationSettings, *, has_tokens: bool) -> None:
         return
     where = f"{settings.public_url or settings.host} can be reached from other machines"
     if settings.is_loopback and not settings.public_url:
-        where = f"this station answers to {', '.join(settings.names)}, names that others may point here"
+        where = (
+            f"this station answers to {', '.join(settings.names)}, names that others may point here"
+        )
     if not has_tokens:
         raise SettingsError(
             f"{where}, and no token was made; make one first: sorvolo token {settings.root} NAME --role operate"
@@ -167,7 +181,9 @@ def _check_range(text: str) -> None:
     try:
         ipaddress.ip_network(text, strict=False)
     except ValueError as error:
-        raise SettingsError(f"--stream-from {text!r}: a network such as 192.168.1.0/24 was needed") from error
+        raise SettingsError(
+            f"--stream-from {text!r}: a network such as 192.168.1.0/24 was needed"
+        ) from error
 
 
 def _check_public(url: str) -> None:
@@ -177,7 +193,13 @@ def _check_public(url: str) -> None:
         is_right = parts.scheme == "https" and bool(parts.hostname) and (parts.port or 1) > 0
     except ValueError:
         is_right = False
-    if not is_right or parts.path not in ("", "/") or parts.query or parts.fragment or "@" in parts.netloc:
+    if (
+        not is_right
+        or parts.path not in ("", "/")
+        or parts.query
+        or parts.fragment
+        or "@" in parts.netloc
+    ):
         raise SettingsError(
             f"--public-url {url!r}: the address of a TLS proxy was needed, without a path: https://maps.example"
         )

@@ -56,7 +56,12 @@ class SiteDeletion:
     """Deletes sites. A folder that goes is moved into `bin_folder` first, so that nobody ever sees half a site."""
 
     def __init__(
-        self, shelf: SiteShelf, runs: Runs, reviews: Reviews, drawings: Drawings, bin_folder: Path,
+        self,
+        shelf: SiteShelf,
+        runs: Runs,
+        reviews: Reviews,
+        drawings: Drawings,
+        bin_folder: Path,
     ) -> None:
         self._shelf, self._runs, self._reviews, self._drawings = shelf, runs, reviews, drawings
         self._bin = bin_folder
@@ -70,7 +75,9 @@ class SiteDeletion:
             known = self._known(site_id, folder)
         sizes = [each.lstat().st_size for each in _files_below(folder)]
         missions = len(self._runs.of_site(site_id))
-        return SiteLoss(site_id, known.flights, known.versions, len(sizes), sum(sizes), missions), known.mark
+        return SiteLoss(
+            site_id, known.flights, known.versions, len(sizes), sum(sizes), missions
+        ), known.mark
 
     def delete(self, site_id: str, mark: str) -> None:
         """Delete the site as `loss` counted it.
@@ -80,7 +87,9 @@ class SiteDeletion:
         """
         with self._free(site_id) as folder:
             if mark != self._known(site_id, folder).mark:
-                raise Problem(412, f"the site {site_id!r} has changed since; look again at what would be lost")
+                raise Problem(
+                    412, f"the site {site_id!r} has changed since; look again at what would be lost"
+                )
             gone = self._moved_away(folder)
             try:
                 self._forget(site_id)
@@ -103,7 +112,9 @@ class SiteDeletion:
             try:
                 lock = lock_folder(folder)
             except BusyError as error:
-                raise Problem(409, f"another program writes the site {site_id!r}; wait until it is done") from error
+                raise Problem(
+                    409, f"another program writes the site {site_id!r}; wait until it is done"
+                ) from error
             try:
                 yield folder
             finally:
@@ -112,27 +123,49 @@ class SiteDeletion:
     def _demand_own(self, site_id: str, folder: Path) -> None:
         """Raise Problem (409) for a site of which the folder is not the whole, or more."""
         if folder == self._shelf.root:
-            raise Problem(409, f"the site {site_id!r} is the folder that the station serves; end it, and delete that")
+            raise Problem(
+                409,
+                f"the site {site_id!r} is the folder that the station serves; end it, and delete that",
+            )
         file = catalogue_file(folder)
         if file is None or file.name != CATALOGUE:
-            raise Problem(409, f"the catalogue of {site_id!r} lies in PostgreSQL; drop its schema, delete its folder")
+            raise Problem(
+                409,
+                f"the catalogue of {site_id!r} lies in PostgreSQL; drop its schema, delete its folder",
+            )
         if (folder / ORIGIN).exists():
-            raise Problem(409, f"{site_id!r} is a working copy of a site in a store, and would come back; delete that")
+            raise Problem(
+                409,
+                f"{site_id!r} is a working copy of a site in a store, and would come back; delete that",
+            )
         if (folder / COPYING).exists():
-            raise Problem(409, f"a copy is being made in {site_id!r}; finish it with the same `sorvolo site copy`")
+            raise Problem(
+                409,
+                f"a copy is being made in {site_id!r}; finish it with the same `sorvolo site copy`",
+            )
 
     def _known(self, site_id: str, folder: Path) -> "_Known":
         """What the site's catalogue holds. Raises Problem (410) where the folder goes meanwhile."""
         try:
             about = (folder / CATALOGUE).stat()
         except OSError as error:
-            raise Problem(410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others") from error
+            raise Problem(
+                410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others"
+            ) from error
         try:
             complete = [each for each in self._shelf.open(site_id).versions() if each.complete]
-        except (StoreError, Problem):  # damaged, or a stranger's with links in it: all the more it may go
+        except (
+            StoreError,
+            Problem,
+        ):  # damaged, or a stranger's with links in it: all the more it may go
             return _Known(None, None, _mark(about.st_dev, about.st_ino))
-        flights, newest = {each.flight_id for each in complete}, max((each.id for each in complete), default=0)
-        return _Known(len(flights), len(complete), _mark(about.st_dev, about.st_ino, len(flights), newest))
+        flights, newest = (
+            {each.flight_id for each in complete},
+            max((each.id for each in complete), default=0),
+        )
+        return _Known(
+            len(flights), len(complete), _mark(about.st_dev, about.st_ino, len(flights), newest)
+        )
 
     def _forget(self, site_id: str) -> None:
         """Drop what the station keeps of a site whose folder is gone."""
@@ -150,14 +183,22 @@ class SiteDeletion:
         try:
             folder.rename(gone)
         except OSError as error:
-            words = "it lies on another disk than the station's own" if error.errno == errno.EXDEV else error.strerror
-            raise StoreError(f"cannot delete {folder} ({words}); delete the folder itself") from error
+            words = (
+                "it lies on another disk than the station's own"
+                if error.errno == errno.EXDEV
+                else error.strerror
+            )
+            raise StoreError(
+                f"cannot delete {folder} ({words}); delete the folder itself"
+            ) from error
         return gone
 
 
 def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
     """What a site's deletion would take, and the deletion itself."""
-    router = APIRouter(prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.OPERATE))])
+    router = APIRouter(
+        prefix="/api/sites", tags=["sites"], dependencies=[Depends(needs(Role.OPERATE))]
+    )
 
     @router.get("/{site}/deletion")
     def loss(site: str, response: Response) -> dict[str, Any]:
@@ -173,7 +214,9 @@ def site_deletion_routes(deletion: SiteDeletion) -> APIRouter:
         found. Recordings and uploads stay. If-Match is the ETag of `/deletion` (428 without, 412 where a flight came
         since); 409 while a mission runs on it, or another program writes it."""
         if not if_match:
-            raise Problem(428, "send the ETag of what would be lost (GET below it: /deletion) as If-Match")
+            raise Problem(
+                428, "send the ETag of what would be lost (GET below it: /deletion) as If-Match"
+            )
         deletion.delete(site, if_match.removeprefix("W/").strip('"'))
         return Response(status_code=204)
 

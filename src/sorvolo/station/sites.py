@@ -67,7 +67,9 @@ class SiteShelf:
         if not is_plain_name(site_id) or ":" in site_id or is_taken:
             raise Problem(400, f"{site_id[:80]!r} cannot name a new site; give letters and digits")
         folder = self.root / site_id
-        if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
+        if folder.is_symlink() or (
+            folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+        ):
             raise Problem(409, f"{site_id!r} is there already and is no site; choose another name")
         return folder
 
@@ -78,7 +80,9 @@ class SiteShelf:
             about = (catalogue_file(folder) or folder / CATALOGUE).stat()
         except OSError as error:
             self.forget(site_id)
-            raise Problem(410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others") from error
+            raise Problem(
+                410, f"the site {site_id!r} was deleted meanwhile; /api/sites lists the others"
+            ) from error
         key = (about.st_dev, about.st_ino)
         with self._lock:
             known = self._open.get(site_id)
@@ -110,7 +114,8 @@ class SiteShelf:
 def _sites_below(root: Path) -> dict[str, Path]:
     return {
         ":".join(each.path.relative_to(root).parts) or root.resolve().name or "site": each.path
-        for each in folders_below(root, deepest=_DEEPEST, most=_MOST_FOLDERS) if each.is_site
+        for each in folders_below(root, deepest=_DEEPEST, most=_MOST_FOLDERS)
+        if each.is_site
     }
 
 
@@ -139,17 +144,30 @@ def site_summary(site_id: str, archive: Archive) -> dict[str, Any]:
     """A site as the list of sites has it."""
     if not archive.has_site:
         return {
-            "id": site_id, "name": archive.folder.name, "is_local": False, "center_wgs84": None,
-            "bounds_wgs84": None, "flights": 0, "versions": 0, "updated_at": None, "m_per_px": None,
+            "id": site_id,
+            "name": archive.folder.name,
+            "is_local": False,
+            "center_wgs84": None,
+            "bounds_wgs84": None,
+            "flights": 0,
+            "versions": 0,
+            "updated_at": None,
+            "m_per_px": None,
         }
     site = archive.site()
     complete = [each for each in archive.versions() if each.complete]
     bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
     center = None if bounds is None else [(bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2]
     return {
-        "id": site_id, "name": site.name, "is_local": site.is_local, "center_wgs84": center, "bounds_wgs84": bounds,
-        "flights": len({each.flight_id for each in complete}), "versions": len(complete),
-        "updated_at": complete[-1].created_utc if complete else None, "m_per_px": site.m_per_px,
+        "id": site_id,
+        "name": site.name,
+        "is_local": site.is_local,
+        "center_wgs84": center,
+        "bounds_wgs84": bounds,
+        "flights": len({each.flight_id for each in complete}),
+        "versions": len(complete),
+        "updated_at": complete[-1].created_utc if complete else None,
+        "m_per_px": site.m_per_px,
     }
 
 
@@ -161,16 +179,22 @@ def site_detail(site_id: str, archive: Archive) -> dict[str, Any]:
         **site_summary(site_id, archive),
         "versions": [version_row(each) for each in versions if each.complete],
         "flights": [
-            _flight_row(each, archive, versions, compared) for each in archive.flights() if each.status == "complete"
+            _flight_row(each, archive, versions, compared)
+            for each in archive.flights()
+            if each.status == "complete"
         ],
-        "has_heights": any(archive.height_path(each.flight_id, HeightFile.REPORT).exists() for each in versions),
+        "has_heights": any(
+            archive.height_path(each.flight_id, HeightFile.REPORT).exists() for each in versions
+        ),
     }
 
 
 def version_row(version: VersionEntry) -> dict[str, Any]:
     """A version of the map as the page lists it."""
     return {
-        "n": version.id, "flight": version.flight_id, "made_at": version.created_utc,
+        "n": version.id,
+        "flight": version.flight_id,
+        "made_at": version.created_utc,
         "flown_at": version.flown_utc or None,
     }
 
@@ -179,13 +203,25 @@ def _flight_row(
     flight: FlightEntry, archive: Archive, versions: Sequence[VersionEntry], compared: set[str]
 ) -> dict[str, Any]:
     frames: Mapping[str, Any] = archive.report(flight.id).get("frames") or {}
-    flown = next((each.flown_utc for each in reversed(versions) if each.flight_id == flight.id and each.complete), "")
+    flown = next(
+        (
+            each.flown_utc
+            for each in reversed(versions)
+            if each.flight_id == flight.id and each.complete
+        ),
+        "",
+    )
     reasons = frames.get("reasons")
     return {
-        "id": flight.id, "kind": "compare" if flight.id in compared else "map", "flown_at": flown or None,
-        "frames": sum(flight.frames.values()), "matched": flight.frames.get("vision", 0),
-        "by_gps": flight.frames.get("gps-only", 0), "rejected": flight.frames.get("rejected", 0),
-        "reasons": dict(reasons) if isinstance(reasons, Mapping) else {}, "notes": list(flight.notes),
+        "id": flight.id,
+        "kind": "compare" if flight.id in compared else "map",
+        "flown_at": flown or None,
+        "frames": sum(flight.frames.values()),
+        "matched": flight.frames.get("vision", 0),
+        "by_gps": flight.frames.get("gps-only", 0),
+        "rejected": flight.frames.get("rejected", 0),
+        "reasons": dict(reasons) if isinstance(reasons, Mapping) else {},
+        "notes": list(flight.notes),
     }
 
 

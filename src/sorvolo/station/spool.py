@@ -14,7 +14,9 @@ from sorvolo.errors import InputError
 from sorvolo.station.messages import Kind, Message, message_from_bytes
 
 _RECORD = struct.Struct(">IIq")  # length, checksum, when it was taken (UTC, ns)
-_SEGMENT_BYTES = 16_000_000  # of a file; what is acknowledged leaves the disk in such pieces; by choice
+_SEGMENT_BYTES = (
+    16_000_000  # of a file; what is acknowledged leaves the disk in such pieces; by choice
+)
 _FLIGHT, _HELLO, _LOCK = "flight", "hello.json", "lock"
 
 _Reason = Literal["late", "overflow"]
@@ -79,7 +81,14 @@ class Spool:
         return path.read_text(encoding="utf-8") if path.exists() else ""
 
     def append(
-        self, kind: Kind, pts_us: int, payload: bytes, *, taken_ns: int, is_key: bool = False, dts_us: int | None = None
+        self,
+        kind: Kind,
+        pts_us: int,
+        payload: bytes,
+        *,
+        taken_ns: int,
+        is_key: bool = False,
+        dts_us: int | None = None,
     ) -> None:
         """Add a message; the oldest pictures go where the limit is reached, and new ones where the disk is full."""
         with self._lock:
@@ -158,7 +167,9 @@ class Spool:
         """What it holds now, and what was dropped so far."""
         with self._lock:
             waiting = sum(each.is_video for queue in (self._waiting, self._sent) for each in queue)
-            return SpoolCounts(waiting, self._bytes, self._dropped["late"], self._dropped["overflow"])
+            return SpoolCounts(
+                waiting, self._bytes, self._dropped["late"], self._dropped["overflow"]
+            )
 
     def close(self) -> None:
         """Let go of the files; what is not acknowledged stays in them."""
@@ -191,9 +202,17 @@ class Spool:
         except OSError:
             self._file.truncate(begin)
             raise
-        self._keep(_Stored(
-            self.last_seq, kind is Kind.VIDEO, is_key, taken_ns, self._segment, begin + _RECORD.size, len(data)
-        ))
+        self._keep(
+            _Stored(
+                self.last_seq,
+                kind is Kind.VIDEO,
+                is_key,
+                taken_ns,
+                self._segment,
+                begin + _RECORD.size,
+                len(data),
+            )
+        )
 
     def _keep(self, stored: _Stored) -> None:
         self._waiting.append(stored)
@@ -217,7 +236,10 @@ class Spool:
         first = self._first_picture()
         if first is None:
             return False
-        until = next((each.seq for each in self._waiting if each.is_key and each.seq > first.seq), self.last_seq + 1)
+        until = next(
+            (each.seq for each in self._waiting if each.is_key and each.seq > first.seq),
+            self.last_seq + 1,
+        )
         self._drop(until, "overflow")
         return True
 
@@ -227,7 +249,9 @@ class Spool:
     def _drop(self, until_seq: int, reason: _Reason) -> None:
         """Drop the waiting pictures before a number."""
         dropped = [each for each in self._waiting if each.is_video and each.seq < until_seq]
-        self._waiting = deque(each for each in self._waiting if not (each.is_video and each.seq < until_seq))
+        self._waiting = deque(
+            each for each in self._waiting if not (each.is_video and each.seq < until_seq)
+        )
         for each in dropped:
             self._let_go(each)
         self._dropped[reason] += len(dropped)
@@ -246,12 +270,16 @@ class Spool:
 
     def _load(self) -> None:
         """Take up what an earlier run left; a record that was cut ends its file."""
-        numbers = sorted(int(each.stem) for each in self._folder.glob("*.spool") if each.stem.isdigit())
+        numbers = sorted(
+            int(each.stem) for each in self._folder.glob("*.spool") if each.stem.isdigit()
+        )
         self._segment = numbers[-1] + 1 if numbers else 0  # never behind a record that was cut
         for number in numbers:
             for message, taken_ns, offset, length in _records(self._path(number).read_bytes()):
                 is_video = message.kind is Kind.VIDEO
-                self._keep(_Stored(message.seq, is_video, message.is_key, taken_ns, number, offset, length))
+                self._keep(
+                    _Stored(message.seq, is_video, message.is_key, taken_ns, number, offset, length)
+                )
                 self.last_seq, self.last_taken_ns = message.seq, taken_ns
                 self.last_pts_us = max(self.last_pts_us, message.pts_us)
             self._remove_if_done(number)
@@ -289,7 +317,7 @@ def _records(data: bytes) -> Iterator[tuple[Message, int, int, int]]:
     while at + _RECORD.size <= len(data):
         length, crc, taken_ns = _RECORD.unpack_from(data, at)
         begin = at + _RECORD.size
-        body = data[begin: begin + length]
+        body = data[begin : begin + length]
         if len(body) < length or zlib.crc32(body) != crc:
             return
         try:
@@ -297,5 +325,3 @@ def _records(data: bytes) -> Iterator[tuple[Message, int, int, int]]:
         except InputError:
             return
         at = begin + length
-
-

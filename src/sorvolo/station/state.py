@@ -51,7 +51,9 @@ class StationState:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._lock = threading.RLock()
-        self._connection = sqlite3.connect(path, timeout=30, isolation_level=None, check_same_thread=False)
+        self._connection = sqlite3.connect(
+            path, timeout=30, isolation_level=None, check_same_thread=False
+        )
         self._connection.row_factory = sqlite3.Row
 
     @classmethod
@@ -79,7 +81,9 @@ class StationState:
                 state._connection.executescript(_TABLES)
                 run(f"PRAGMA user_version = {_FORMAT}")
         except sqlite3.Error as error:
-            raise StoreError(f"cannot use {path}: {error}; check the disk, or move the file away") from error
+            raise StoreError(
+                f"cannot use {path}: {error}; check the disk, or move the file away"
+            ) from error
         return state
 
     def close(self) -> None:
@@ -118,7 +122,11 @@ def utc_now() -> str:
 
 def utc_after(seconds: float) -> str:
     """The time in so many seconds, RFC 3339 UTC to the millisecond; such texts are in order as the times are."""
-    return (datetime.now(UTC) + timedelta(seconds=seconds)).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+    return (
+        (datetime.now(UTC) + timedelta(seconds=seconds))
+        .isoformat(timespec="milliseconds")
+        .replace("+00:00", "Z")
+    )
 
 
 def compact_json(value: Any) -> str:

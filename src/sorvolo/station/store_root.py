@@ -34,20 +34,30 @@ class StoreRoot:
         self._objects = open_objects(address)
         store = f"{os.environ.get('AWS_ENDPOINT_URL', '')} {self._objects.name}"
         name = re.sub(r"[^A-Za-z0-9._-]", "-", self._objects.name.removeprefix("s3://"))
-        self.folder = cache_folder() / "roots" / f"{name}-{hashlib.sha256(store.encode()).hexdigest()[:12]}"
+        self.folder = (
+            cache_folder() / "roots" / f"{name}-{hashlib.sha256(store.encode()).hexdigest()[:12]}"
+        )
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._sent: dict[str, tuple[int, int]] = {}  # by site, the state of its catalogue's files when it was in step
+        self._sent: dict[
+            str, tuple[int, int]
+        ] = {}  # by site, the state of its catalogue's files when it was in step
 
     def step(self) -> Generator[CopyUpdate, None, dict[str, str]]:
         """Bring every site up to date; by name those that could not be, and why. Raises StoreError without a store."""
         found = sites_at(self._objects)
         is_one = found == ["."]
-        here = [] if is_one else [each.name for each in self.folder.iterdir() if catalogue_file(each) is not None]
+        here = (
+            []
+            if is_one
+            else [each.name for each in self.folder.iterdir() if catalogue_file(each) is not None]
+        )
         faults = {}
         for name in sorted({*found, *here}):
             if name != "." and (not is_plain_name(name) or "-kept-" in name):
                 continue
-            working = WorkingCopy.of(self._objects.name if is_one else f"{self._objects.name}/{name}", self.folder)
+            working = WorkingCopy.of(
+                self._objects.name if is_one else f"{self._objects.name}/{name}", self.folder
+            )
             try:
                 yield from self._step_site(name, working)
             except BusyError:
@@ -80,7 +90,11 @@ class StoreRoot:
                 yield from working.fetch(Path(scratch))
             except OvertakenError:
                 kept = working.set_aside()
-                _LOG.warning("another writer has changed %s; what this station had added is kept in %s", name, kept)
+                _LOG.warning(
+                    "another writer has changed %s; what this station had added is kept in %s",
+                    name,
+                    kept,
+                )
                 yield from working.fetch(Path(scratch))
             self._sent[name] = _mark(working.folder) if mark == (0, 0) else mark
 

@@ -67,7 +67,9 @@ def _demand_allowed(host: str, found: Sequence[str], allowed: Sequence[Network])
 
 def _waited_for(url: str, scheme: str, port: int | None) -> str:
     if port is None or port < _LOWEST_PORT:
-        raise _refused("a stream without a host is waited for: udp, rtp, tcp or rtmp with a port from 1024 on")
+        raise _refused(
+            "a stream without a host is waited for: udp, rtp, tcp or rtmp with a port from 1024 on"
+        )
     if urlsplit(url).query:
         raise _refused("options behind a ? are not taken")
     return url
@@ -75,7 +77,11 @@ def _waited_for(url: str, scheme: str, port: int | None) -> str:
 
 def _resolved(host: str, port: int) -> list[str]:
     try:
-        return list(dict.fromkeys(str(each[4][0]) for each in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)))
+        return list(
+            dict.fromkeys(
+                str(each[4][0]) for each in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+            )
+        )
     except (OSError, UnicodeError):
         return []
 
@@ -88,7 +94,9 @@ def _plain(address: Address) -> Address:
 
 
 def _is_public(address: Address) -> bool:
-    return address.is_global and not (address.is_multicast or address.is_reserved or address.is_unspecified)
+    return address.is_global and not (
+        address.is_multicast or address.is_reserved or address.is_unspecified
+    )
 
 
 def _netloc(netloc: str, address: str, port: int | None) -> str:
@@ -98,4 +106,7 @@ def _netloc(netloc: str, address: str, port: int | None) -> str:
 
 
 def _refused(found: str) -> Problem:
-    return Problem(400, f"{found}; give an address such as rtsp://HOST:554/live, or udp://:5600 to wait for a sender")
+    return Problem(
+        400,
+        f"{found}; give an address such as rtsp://HOST:554/live, or udp://:5600 to wait for a sender",
+    )

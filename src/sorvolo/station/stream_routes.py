@@ -33,14 +33,18 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
         kept = {"viewers": ingest.viewers(stream), "bytes": ingest.kept_bytes(stream)}
         return ingest.state(stream) | kept | {"time_us": time.time_ns() // 1000}
 
-    @router.delete("/api/streams/{stream}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))])
+    @router.delete(
+        "/api/streams/{stream}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))]
+    )
     async def delete_all(stream: str) -> None:
         """Take all recordings of a stream away. 423 while a drone sends it, or a mission reads it."""
         with runs.unused_stream(stream):
             ingest.delete(stream)
 
     @router.delete(
-        "/api/streams/{stream}/flights/{flight}", status_code=204, dependencies=[Depends(needs(Role.OPERATE))],
+        "/api/streams/{stream}/flights/{flight}",
+        status_code=204,
+        dependencies=[Depends(needs(Role.OPERATE))],
     )
     async def delete_one(stream: str, flight: str) -> None:
         """Take one recording of a stream away. 423 while a drone sends it, or a mission reads the stream."""
@@ -48,14 +52,18 @@ def stream_routes(ingest: Ingest, runs: Runs) -> APIRouter:
             ingest.delete(stream, flight)
 
     @router.websocket("/api/ingest/{stream}")
-    async def take(websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.OPERATE))]) -> None:
+    async def take(
+        websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.OPERATE))]
+    ) -> None:
         """A drone's connection: binary messages as station/messages.py has them, acknowledged by number."""
         await websocket.accept()
         await ingest.serve(stream, _SocketLink(websocket))
 
     @router.websocket("/api/streams/{stream}/video")
     async def show(
-        websocket: WebSocket, stream: str, _: Annotated[object, Depends(needs(Role.VIEW))],
+        websocket: WebSocket,
+        stream: str,
+        _: Annotated[object, Depends(needs(Role.VIEW))],
         mode: Annotated[Literal["annexb", "fmp4"], Query()] = "annexb",
     ) -> None:
         """The pictures as they came: JSON about the format first, then each picture, from the last key frame on."""
@@ -84,10 +92,14 @@ def announcing(events: EventLog) -> Announce:
 
     An event names the newest flight alone: thousands of events are kept in memory.
     """
-    writing = ThreadPoolExecutor(1, thread_name_prefix="stream states")  # two threads could swap coming and going
+    writing = ThreadPoolExecutor(
+        1, thread_name_prefix="stream states"
+    )  # two threads could swap coming and going
 
     def announce(stream: str, state: Mapping[str, Any]) -> None:
-        event = NewEvent("stream.state", {**state, "stream": stream, "flights": list(state["flights"])[-1:]})
+        event = NewEvent(
+            "stream.state", {**state, "stream": stream, "flights": list(state["flights"])[-1:]}
+        )
         writing.submit(events.append, event)
 
     return announce

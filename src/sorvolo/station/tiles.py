@@ -18,7 +18,9 @@ from sorvolo.station.sites import SiteShelf, bounds_lonlat
 from sorvolo.store.site.archive import Archive
 
 TILE_PX = 256  # a side, as web maps have it
-_SHALLOWEST_ZOOM = 8  # a tile of 150 km: a map is less than a pixel there, and the site's plane is no plane
+_SHALLOWEST_ZOOM = (
+    8  # a tile of 150 km: a map is less than a pixel there, and the site's plane is no plane
+)
 _DEEPEST_ZOOM = 26  # 2 mm a pixel at the equator: finer than any map
 _LATTICE = 17  # places a side that are projected exactly; between them it is linear to a hundredth of a pixel
 _PICTURES_BYTES, _ANSWERS_BYTES = 192_000_000, 64_000_000
@@ -41,7 +43,9 @@ class WebTiles:
     def __init__(self, shelf: SiteShelf) -> None:
         self._shelf = shelf
         self._pictures = BytesCache[str, ImageRGBA](_PICTURES_BYTES, lambda each: int(each.nbytes))
-        self._answers = BytesCache[tuple[str, ...], bytes](_ANSWERS_BYTES, lambda each: len(each) + 100)
+        self._answers = BytesCache[tuple[str, ...], bytes](
+            _ANSWERS_BYTES, lambda each: len(each) + 100
+        )
         self._states: dict[tuple[str, str], tuple[object, Pyramid]] = {}
         self._lock = threading.Lock()
 
@@ -50,10 +54,15 @@ class WebTiles:
         archive = self._shelf.open(site_id)
         return self._state(site_id, "live", archive, archive.change_mark())
 
-    def tile(self, site_id: str, version: str, z: int, x: int, y: int, ending: str = ".webp") -> TileAnswer:
+    def tile(
+        self, site_id: str, version: str, z: int, x: int, y: int, ending: str = ".webp"
+    ) -> TileAnswer:
         """An XYZ tile of a version: its number, `live-REVISION` or `live`. Raises Problem (404), StoreError."""
         if not (0 <= z <= _DEEPEST_ZOOM and 0 <= x < 2**z and 0 <= y < 2**z):
-            raise Problem(404, f"no tile {z}/{x}/{y}: zooms go to {_DEEPEST_ZOOM}, columns and rows to 2^zoom - 1")
+            raise Problem(
+                404,
+                f"no tile {z}/{x}/{y}: zooms go to {_DEEPEST_ZOOM}, columns and rows to 2^zoom - 1",
+            )
         archive = self._shelf.open(site_id)
         if not archive.has_site:
             return TileAnswer(b"", False)
@@ -66,12 +75,18 @@ class WebTiles:
             raise Problem(404, f"no version {version[:40]!r}: a number or live-REVISION was needed")
         key = (site_id, state.revision, str(z), str(x), str(y), ending)
         grid = archive.site_grid()
-        return TileAnswer(self._answers.get(key, lambda: render(state, grid, z, x, y, ending)), is_final)
+        return TileAnswer(
+            self._answers.get(key, lambda: render(state, grid, z, x, y, ending)), is_final
+        )
 
     def _version(self, site_id: str, archive: Archive, number: int) -> Pyramid:
         if number not in {each.id for each in archive.versions() if each.complete}:
-            raise Problem(404, f"the map has no version {number}; /api/sites/{site_id} lists those there are")
-        return self._state(site_id, str(number), archive, archive)  # never changes while the site is the same
+            raise Problem(
+                404, f"the map has no version {number}; /api/sites/{site_id} lists those there are"
+            )
+        return self._state(
+            site_id, str(number), archive, archive
+        )  # never changes while the site is the same
 
     def _state(self, site_id: str, name: str, archive: Archive, mark: object) -> Pyramid:
         with self._lock:
@@ -82,7 +97,9 @@ class WebTiles:
         grid = archive.site_grid().grid
         made = Pyramid(tiles, grid.tile_px, self._pictures)
         if _is_exported(archive, name):
-            made = Pyramid(tiles, grid.tile_px, self._pictures, MapOverview(archive.mosaic_path, grid).tile)
+            made = Pyramid(
+                tiles, grid.tile_px, self._pictures, MapOverview(archive.mosaic_path, grid).tile
+            )
         with self._lock:
             if len(self._states) > 200:
                 self._states.clear()
@@ -98,7 +115,9 @@ def _is_exported(archive: Archive, name: str) -> bool:
     return str(shown) == str(newest) and newest == archive.exported_version
 
 
-def render(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: str = ".webp") -> bytes:
+def render(
+    state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: str = ".webp"
+) -> bytes:
     """An encoded tile of 256 x 256 pixels; b"" where the map has nothing there."""
     if z < _SHALLOWEST_ZOOM or not _meets_map(state, site_grid, z, x, y):
         return b""
@@ -115,11 +134,15 @@ def render(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int, ending: 
 
 def encoded(rgba: ImageRGBA, ending: str) -> bytes:
     """A picture as .webp or .png bytes."""
-    if ending == ".webp":  # by Pillow: OpenCV's has no choice of the method, and takes 2.5 times as long
+    if (
+        ending == ".webp"
+    ):  # by Pillow: OpenCV's has no choice of the method, and takes 2.5 times as long
         kept = BytesIO()
         Image.fromarray(rgba).save(kept, "WEBP", quality=_QUALITY, method=_QUICK_METHOD)
         return kept.getvalue()
-    done, data = cv2.imencode(ending, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    done, data = cv2.imencode(
+        ending, cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA), [cv2.IMWRITE_PNG_COMPRESSION, 3]
+    )
     assert done  # uint8 RGBA can always be encoded
     return data.tobytes()
 
@@ -131,7 +154,9 @@ def _grid_places(site_grid: SiteGrid, z: int, x: int, y: int) -> Floats:
     longitude = across / 2**z * 360.0 - 180.0
     latitude = np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * down / 2**z))))
     lonlat = np.column_stack([longitude.ravel(), latitude.ravel()])
-    return site_grid.grid_from_site(site_grid.frame.ground_from_lonlat(lonlat)).reshape(_LATTICE, _LATTICE, 2)
+    return site_grid.grid_from_site(site_grid.frame.ground_from_lonlat(lonlat)).reshape(
+        _LATTICE, _LATTICE, 2
+    )
 
 
 def _pixels_from_lattice(places: Floats32) -> Floats32:
@@ -149,15 +174,21 @@ def _meets_map(state: Pyramid, site_grid: SiteGrid, z: int, x: int, y: int) -> b
     if bounds is None:
         return False
     west, east = (each / 2**z * 360.0 - 180.0 for each in (x, x + 1))
-    south, north = (np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * each / 2**z)))) for each in (y + 1, y))
-    return bool(bounds[0] <= east and bounds[2] >= west and bounds[1] <= north and bounds[3] >= south)
+    south, north = (
+        np.degrees(np.arctan(np.sinh(np.pi * (1 - 2 * each / 2**z)))) for each in (y + 1, y)
+    )
+    return bool(
+        bounds[0] <= east and bounds[2] >= west and bounds[1] <= north and bounds[3] >= south
+    )
 
 
 def _gathered(state: Pyramid, level: int, places_px: Floats) -> tuple[ImageRGBA | None, Floats]:
     """The part of a level under these places in one picture, and where its first pixel lies; None without any."""
     size, there = state.pieces(level)
     flat = places_px.reshape(-1, 2)
-    low, high = (np.floor(each).astype(int) for each in (flat.min(axis=0) - 1, flat.max(axis=0) + 3))
+    low, high = (
+        np.floor(each).astype(int) for each in (flat.min(axis=0) - 1, flat.max(axis=0) + 3)
+    )
     first, last = low // size, (high - 1) // size
     width, height = high - low
     picture = np.zeros((height, width, 4), np.uint8)
@@ -171,7 +202,7 @@ def _gathered(state: Pyramid, level: int, places_px: Floats) -> tuple[ImageRGBA 
             x0, y0 = column * size - low[0], row * size - low[1]
             left, top = max(x0, 0), max(y0, 0)
             right, bottom = min(x0 + size, width), min(y0 + size, height)
-            picture[top:bottom, left:right] = part[top - y0:bottom - y0, left - x0:right - x0]
+            picture[top:bottom, left:right] = part[top - y0 : bottom - y0, left - x0 : right - x0]
     return (None if is_empty else picture), low.astype(np.float64)
 
 
@@ -179,7 +210,9 @@ def _resampled(source: ImageRGBA, places_px: Floats32) -> ImageRGBA:
     """A picture's pixels at places, (256, 256, 2), linear between them; transparent ones lend no colour."""
     across, down = (np.ascontiguousarray(places_px[..., axis]) for axis in (0, 1))
     if source[..., 3].min() == 255:
-        return cv2.remap(source, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT).astype(np.uint8)
+        return cv2.remap(
+            source, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+        ).astype(np.uint8)
     share = source[..., 3:].astype(np.float32) / 255
     weighted = np.dstack([source[..., :3] * share, share])
     mixed = cv2.remap(weighted, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)

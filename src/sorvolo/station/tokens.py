@@ -59,21 +59,36 @@ def make_token(state: StationState, name: str, role: str, days: float | None = N
     The secret has 256 random bits, so that a fast hash of it cannot be turned back.
     """
     if not (name.strip() and len(name) <= 80 and name.isprintable()):
-        raise SettingsError(f"{name!r} cannot name a token; give up to 80 letters, such as a person's name")
+        raise SettingsError(
+            f"{name!r} cannot name a token; give up to 80 letters, such as a person's name"
+        )
     if role.upper() not in Role.__members__:
         raise SettingsError(f"--role {role!r}: view, review or operate was needed")
     if days is not None and not 0 < days < 36_500:
         raise SettingsError(f"--days {days}: a number above 0 was needed")
     token_id, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
-    expires = None if days is None else (datetime.now(UTC) + timedelta(days=days)).isoformat(timespec="seconds")
+    expires = (
+        None
+        if days is None
+        else (datetime.now(UTC) + timedelta(days=days)).isoformat(timespec="seconds")
+    )
     try:
         with state.changing() as connection:
             connection.execute(
                 "INSERT INTO tokens VALUES (?, ?, ?, ?, ?, ?)",
-                (token_id, name, role.lower(), _hash(secret), utc_now(), expires and expires.replace("+00:00", "Z")),
+                (
+                    token_id,
+                    name,
+                    role.lower(),
+                    _hash(secret),
+                    utc_now(),
+                    expires and expires.replace("+00:00", "Z"),
+                ),
             )
     except sqlite3.IntegrityError as error:
-        raise InputError(f"there is a token named {name!r} already; revoke it first, or choose another name") from error
+        raise InputError(
+            f"there is a token named {name!r} already; revoke it first, or choose another name"
+        ) from error
     return f"{_PREFIX}_{token_id}_{secret}"
 
 
@@ -82,7 +97,9 @@ def revoke_token(state: StationState, name: str) -> None:
     with state.changing() as connection:
         gone = connection.execute("DELETE FROM tokens WHERE name = ?", (name,)).rowcount
     if not gone:
-        raise InputError(f"there is no token named {name!r}; `sorvolo token ROOT` lists those there are")
+        raise InputError(
+            f"there is no token named {name!r}; `sorvolo token ROOT` lists those there are"
+        )
 
 
 def list_tokens(state: StationState) -> list[TokenEntry]:
@@ -136,7 +153,11 @@ class Guesses:
             count, _ = self._wrong.pop(address, (0, 0.0))
             if right:
                 return
-            wait_s = 0.0 if count + 1 < _FREE_ATTEMPTS else min(2.0 ** (count + 1 - _FREE_ATTEMPTS), _LONGEST_WAIT_S)
+            wait_s = (
+                0.0
+                if count + 1 < _FREE_ATTEMPTS
+                else min(2.0 ** (count + 1 - _FREE_ATTEMPTS), _LONGEST_WAIT_S)
+            )
             self._wrong[address] = (count + 1, self._clock() + wait_s)
             while len(self._wrong) > _MOST_ADDRESSES:
                 self._wrong.popitem(last=False)

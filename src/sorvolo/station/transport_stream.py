@@ -17,7 +17,9 @@ from sorvolo.station.messages import Kind, Message, Sample, sample_from_json
 _PACKET, _BODY = 188, 184
 _PAT, _PMT, _VIDEO, _METADATA, _MARK = 0x0000, 0x1000, 0x0100, 0x0101, 0x1FE0
 _TYPES = {"h264": 0x1B, "hevc": 0x24}
-_FIRST_90KHZ = 900_000  # the flight's zero, 10 s: pictures that are decoded before they are shown stay above 0
+_FIRST_90KHZ = (
+    900_000  # the flight's zero, 10 s: pictures that are decoded before they are shown stay above 0
+)
 _PCR_LEAD_90KHZ = 18_000  # 0.2 s, what a receiver may hold back
 _MARK_HEAD = struct.Struct(">4sQqIIcB4B")
 _MARK_NAME = b"SVL1"
@@ -28,7 +30,9 @@ _SEARCHED_BYTES = 64_000_000  # at a file's end, for the last whole message
 class _Counters:
     """The continuity counters, which every packet of a PID increases by one (ISO 13818-1, 2.4.3.3)."""
 
-    by_pid: dict[int, int] = field(default_factory=lambda: dict.fromkeys((_PAT, _PMT, _VIDEO, _METADATA), 0))
+    by_pid: dict[int, int] = field(
+        default_factory=lambda: dict.fromkeys((_PAT, _PMT, _VIDEO, _METADATA), 0)
+    )
 
     def next(self, pid: int) -> int:
         number = self.by_pid[pid]
@@ -72,7 +76,9 @@ class FlightFile:
 
     def sync(self) -> None:
         """Wait until the disk has all that was written."""
-        os.fdatasync(self._file.fileno()) if hasattr(os, "fdatasync") else os.fsync(self._file.fileno())
+        os.fdatasync(self._file.fileno()) if hasattr(os, "fdatasync") else os.fsync(
+            self._file.fileno()
+        )
 
     def close(self) -> None:
         """Let go of the file, which the disk then has."""
@@ -97,7 +103,9 @@ class FlightFile:
         streams = struct.pack(">BHH", _TYPES[self._codec], 0xE000 | _VIDEO, 0xF000)
         klva = b"\x05\x04KLVA"
         streams += struct.pack(">BHH", 0x06, 0xE000 | _METADATA, 0xF000 | len(klva)) + klva
-        yield self._table(_PMT, 0x02, struct.pack(">HBBBHH", 1, 0xC1, 0, 0, 0xE000 | _VIDEO, 0xF000) + streams)
+        yield self._table(
+            _PMT, 0x02, struct.pack(">HBBBHH", 1, 0xC1, 0, 0, 0xE000 | _VIDEO, 0xF000) + streams
+        )
 
     def _table(self, pid: int, table: int, body: bytes) -> bytes:
         section = struct.pack(">BH", table, 0xB000 | len(body) + 4) + body
@@ -113,10 +121,10 @@ class FlightFile:
             room = _BODY - (1 + len(clock) if clock else 0)
             number = self._counters.next(pid)
             if left >= room and not clock:
-                yield struct.pack(">BHB", 0x47, start | pid, 0x10 | number) + data[at: at + _BODY]
+                yield struct.pack(">BHB", 0x47, start | pid, 0x10 | number) + data[at : at + _BODY]
                 at += _BODY
             else:
-                body = data[at: at + room]
+                body = data[at : at + room]
                 fill = _BODY - len(body) - 1  # of the adaptation field, behind its length
                 field = (clock or b"\x00").ljust(fill, b"\xff") if fill else b""
                 yield struct.pack(">BHBB", 0x47, start | pid, 0x30 | number, fill) + field + body
@@ -125,11 +133,19 @@ class FlightFile:
 
     def _mark(self, message: Message, chunk: bytes) -> bytes:
         body = _MARK_HEAD.pack(
-            _MARK_NAME, message.seq, message.pts_us, len(chunk), zlib.crc32(chunk), message.kind.encode(),
-            int(message.is_key), *(self._counters.by_pid[pid] for pid in (_PAT, _PMT, _VIDEO, _METADATA)),
+            _MARK_NAME,
+            message.seq,
+            message.pts_us,
+            len(chunk),
+            zlib.crc32(chunk),
+            message.kind.encode(),
+            int(message.is_key),
+            *(self._counters.by_pid[pid] for pid in (_PAT, _PMT, _VIDEO, _METADATA)),
         )
         body += zlib.crc32(body).to_bytes(4, "big")
-        return struct.pack(">BHB", 0x47, _MARK, 0x10 | message.seq & 15) + body.ljust(_BODY, b"\xff")
+        return struct.pack(">BHB", 0x47, _MARK, 0x10 | message.seq & 15) + body.ljust(
+            _BODY, b"\xff"
+        )
 
     def _recover(self, path: Path) -> None:
         """Cut the file behind its last whole message and take up its state."""
@@ -140,11 +156,15 @@ class FlightFile:
         end = _whole_end(tail, is_all=not first)
         if end is None and size:
             if first:
-                raise StoreError(f"{path}: no message in its last {_SEARCHED_BYTES:,} bytes; move it away")
+                raise StoreError(
+                    f"{path}: no message in its last {_SEARCHED_BYTES:,} bytes; move it away"
+                )
             end = 0
         if end:
-            mark = tail[end - _PACKET: end]
-            _, self.last_seq, self.last_pts_us, _, _, _, _, *numbers = _MARK_HEAD.unpack_from(mark, 4)
+            mark = tail[end - _PACKET : end]
+            _, self.last_seq, self.last_pts_us, _, _, _, _, *numbers = _MARK_HEAD.unpack_from(
+                mark, 4
+            )
             self._counters.by_pid = dict(zip((_PAT, _PMT, _VIDEO, _METADATA), numbers))
         keep = first + (end or 0)
         if keep < size:
@@ -163,7 +183,8 @@ def local_set(sample: Sample) -> bytes:
         values["sensor_longitude_deg"] = (values["sensor_longitude_deg"] + 180) % 360 - 180
     ranges = {item.name: (item.lowest, item.highest) for item in ITEMS.values()}
     usable = {
-        name: value for name, value in values.items()
+        name: value
+        for name, value in values.items()
         if name in ranges and isfinite(value) and ranges[name][0] <= value <= ranges[name][1]
     }
     return encode(sample.time_ns, usable)
@@ -175,8 +196,10 @@ def _tagged(columns: Mapping[str, float]) -> dict[str, float]:
     if all(name in columns for name in ("camera_yaw_deg", "camera_pitch_deg")):
         values |= {
             "platform_heading_deg": columns["camera_yaw_deg"] % 360,
-            "platform_pitch_deg": 0.0, "platform_roll_deg": 0.0,
-            "sensor_relative_azimuth_deg": 0.0, "sensor_relative_elevation_deg": columns["camera_pitch_deg"],
+            "platform_pitch_deg": 0.0,
+            "platform_roll_deg": 0.0,
+            "sensor_relative_azimuth_deg": 0.0,
+            "sensor_relative_elevation_deg": columns["camera_pitch_deg"],
             "sensor_relative_roll_deg": columns.get("camera_roll_deg", 0.0) % 360,
         }
     elif "body_yaw_deg" in columns:
@@ -187,23 +210,41 @@ def _tagged(columns: Mapping[str, float]) -> dict[str, float]:
 
 
 _TAGS = {
-    "sensor_latitude_deg": "latitude_deg", "sensor_longitude_deg": "longitude_deg",
-    "sensor_true_altitude_m": "orthometric_height_m", "sensor_ellipsoid_height_extended_m": "ellipsoidal_height_m",
-    **{name: name for name in (
-        "height_above_takeoff_m", "horizontal_sigma_m", "vertical_sigma_m", "tilt_sigma_deg", "heading_sigma_deg",
-        "course_deg", "speed_m_s",
-    )},
+    "sensor_latitude_deg": "latitude_deg",
+    "sensor_longitude_deg": "longitude_deg",
+    "sensor_true_altitude_m": "orthometric_height_m",
+    "sensor_ellipsoid_height_extended_m": "ellipsoidal_height_m",
+    **{
+        name: name
+        for name in (
+            "height_above_takeoff_m",
+            "horizontal_sigma_m",
+            "vertical_sigma_m",
+            "tilt_sigma_deg",
+            "heading_sigma_deg",
+            "course_deg",
+            "speed_m_s",
+        )
+    },
 }
 """Which column a tag states, by the tag's name."""
 
 
 def _pes(stream_id: int, data: bytes, pts_us: int, dts_us: int | None) -> bytes:
     """A packetised elementary stream's packet (ISO 13818-1, 2.4.3.6); a length of 0 stands for video's "unbounded"."""
-    stamps = _stamp(0x2, pts_us) if dts_us in (None, pts_us) else _stamp(0x3, pts_us) + _stamp(0x1, dts_us or 0)
+    stamps = (
+        _stamp(0x2, pts_us)
+        if dts_us in (None, pts_us)
+        else _stamp(0x3, pts_us) + _stamp(0x1, dts_us or 0)
+    )
     flags = 0x80 if len(stamps) == 5 else 0xC0
     length = 3 + len(stamps) + len(data)
     length = length if length < 65_536 else 0
-    return struct.pack(">3sBHBBB", b"\x00\x00\x01", stream_id, length, 0x84, flags, len(stamps)) + stamps + data
+    return (
+        struct.pack(">3sBHBBB", b"\x00\x00\x01", stream_id, length, 0x84, flags, len(stamps))
+        + stamps
+        + data
+    )
 
 
 def _ticks(time_us: int) -> int:
@@ -251,7 +292,7 @@ def _whole_end(tail: bytes, *, is_all: bool) -> int | None:
             continue
         length, crc = struct.unpack_from(">II", tail, at + 24)
         if end is not None:
-            if at - length != end or zlib.crc32(tail[at - length: at]) != crc:
+            if at - length != end or zlib.crc32(tail[at - length : at]) != crc:
                 break  # a hole that a power cut left, or bytes of something else
             found = True
         end = at + _PACKET
@@ -261,5 +302,8 @@ def _whole_end(tail: bytes, *, is_all: bool) -> int | None:
 def _is_mark(data: bytes, at: int) -> bool:
     if not (data.startswith(b"\x47\x1f\xe0", at) and data.startswith(_MARK_NAME, at + 4)):
         return False
-    body = data[at + 4: at + 4 + _MARK_HEAD.size]
-    return zlib.crc32(body).to_bytes(4, "big") == data[at + 4 + _MARK_HEAD.size: at + 8 + _MARK_HEAD.size]
+    body = data[at + 4 : at + 4 + _MARK_HEAD.size]
+    return (
+        zlib.crc32(body).to_bytes(4, "big")
+        == data[at + 4 + _MARK_HEAD.size : at + 8 + _MARK_HEAD.size]
+    )

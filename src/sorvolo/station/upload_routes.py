@@ -19,14 +19,21 @@ _MOST_LENGTH = 10**15  # bytes; the free disk is asked before one is taken
 
 def upload_routes(uploads: Uploads, runs: Runs) -> APIRouter:
     """Begin, continue, ask after, end an upload."""
-    router = APIRouter(prefix="/api/uploads", tags=["uploads"], dependencies=[Depends(needs(Role.OPERATE))])
+    router = APIRouter(
+        prefix="/api/uploads", tags=["uploads"], dependencies=[Depends(needs(Role.OPERATE))]
+    )
 
     @router.options("", status_code=204)
     def about() -> Response:
         """What this tus server can do."""
-        return _answer(204, {
-            "Tus-Version": _VERSION, "Tus-Extension": "creation,termination", "Tus-Max-Size": str(uploads.most_bytes),
-        })
+        return _answer(
+            204,
+            {
+                "Tus-Version": _VERSION,
+                "Tus-Extension": "creation,termination",
+                "Tus-Max-Size": str(uploads.most_bytes),
+            },
+        )
 
     @router.get("")
     def all_uploads() -> list[dict[str, Any]]:
@@ -35,8 +42,9 @@ def upload_routes(uploads: Uploads, runs: Runs) -> APIRouter:
 
     @router.post("", status_code=201)
     def begin(
-        upload_length: int = Header(ge=1, le=_MOST_LENGTH), upload_metadata: str = Header(max_length=4000),
-        holder: Holder = Depends(needs(Role.OPERATE)),  # noqa: B008
+        upload_length: int = Header(ge=1, le=_MOST_LENGTH),
+        upload_metadata: str = Header(max_length=4000),
+        holder: Holder = Depends(needs(Role.OPERATE)),
     ) -> Response:
         """Begin an upload of Upload-Length bytes; Upload-Metadata names its file (`filename BASE64`)."""
         made = uploads.create(upload_metadata, upload_length, holder.name)
@@ -46,7 +54,9 @@ def upload_routes(uploads: Uploads, runs: Runs) -> APIRouter:
     def where(upload_id: str) -> Response:
         """How much of an upload is here."""
         upload = uploads.get(upload_id)
-        return _answer(200, {"Upload-Offset": str(uploads.offset(upload)), "Upload-Length": str(upload.bytes)})
+        return _answer(
+            200, {"Upload-Offset": str(uploads.offset(upload)), "Upload-Length": str(upload.bytes)}
+        )
 
     @router.get("/{upload_id}")
     def one(upload_id: str) -> dict[str, Any]:
@@ -55,7 +65,9 @@ def upload_routes(uploads: Uploads, runs: Runs) -> APIRouter:
 
     @router.patch("/{upload_id}", status_code=204)
     async def send(
-        request: Request, upload_id: str, upload_offset: int = Header(ge=0, le=_MOST_LENGTH),
+        request: Request,
+        upload_id: str,
+        upload_offset: int = Header(ge=0, le=_MOST_LENGTH),
         content_type: str = Header(max_length=100),
     ) -> Response:
         """Append bytes at Upload-Offset."""

@@ -27,7 +27,19 @@ from sorvolo.store.site.names import is_plain_name
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".ts")
 """Files that are taken as videos."""
 
-TEXT_ENDINGS = (".srt", ".csv", ".gpx", ".txt", ".nmea", ".log", ".xml", ".yaml", ".yml", ".json", ".geojson")
+TEXT_ENDINGS = (
+    ".srt",
+    ".csv",
+    ".gpx",
+    ".txt",
+    ".nmea",
+    ".log",
+    ".xml",
+    ".yaml",
+    ".yml",
+    ".json",
+    ".geojson",
+)
 """Files that are taken as telemetry, cameras and areas."""
 
 _ARCHIVE_ENDINGS = (".zip",)
@@ -35,7 +47,9 @@ _MOST_TEXT_BYTES = 256_000_000  # of telemetry: half of what a reader takes
 _PART, _INFO, _FILES = "part", "info.json", "files"
 _CHECK_WITHIN_S = 1800.0  # for the check of a whole upload, by the clock; by choice
 _LOOK_EVERY_BYTES = 64_000_000  # written between two looks at the free space
-_SILENT_S = 30.0  # a request that sends nothing for so long has lost its link: another one may go on
+_SILENT_S = (
+    30.0  # a request that sends nothing for so long has lost its link: another one may go on
+)
 _ID = re.compile(r"[0-9a-f]{24}")
 
 
@@ -56,7 +70,13 @@ class Upload:
     def kind(self) -> str:
         """What it is by its name: "video", "photos" (a .zip) or "text"."""
         ending = Path(self.name).suffix.lower()
-        return "video" if ending in VIDEO_ENDINGS else "photos" if ending in _ARCHIVE_ENDINGS else "text"
+        return (
+            "video"
+            if ending in VIDEO_ENDINGS
+            else "photos"
+            if ending in _ARCHIVE_ENDINGS
+            else "text"
+        )
 
 
 class Uploads:
@@ -70,7 +90,9 @@ class Uploads:
         self._checking = ThreadPoolExecutor(1, thread_name_prefix="upload check")
         self._child = Child()
         for each in self.all():  # the station was stopped meanwhile
-            if each.state == "checking" or (each.state == "receiving" and self.offset(each) == each.bytes):
+            if each.state == "checking" or (
+                each.state == "receiving" and self.offset(each) == each.bytes
+            ):
                 self._begin_check(each)
 
     @property
@@ -84,7 +106,11 @@ class Uploads:
         for path in self._folder.glob(f"*/{_INFO}") if self._folder.is_dir() else ():
             try:
                 found.append(Upload(**json.loads(path.read_bytes())))
-            except (OSError, ValueError, TypeError):  # being taken away, or broken by somebody: no upload
+            except (
+                OSError,
+                ValueError,
+                TypeError,
+            ):  # being taken away, or broken by somebody: no upload
                 continue
         return sorted(found, key=lambda each: (each.made_at, each.id))
 
@@ -93,11 +119,15 @@ class Uploads:
         name = _checked_name(_metadata(metadata).get("filename", ""))
         made = Upload(secrets.token_hex(12), name, length, utc_now(), who)
         if not 0 < length <= self.most_bytes or (made.kind == "text" and length > _MOST_TEXT_BYTES):
-            raise Problem(413, f"{length} bytes: 1 to {self.most_bytes} are taken, of text {_MOST_TEXT_BYTES}")
+            raise Problem(
+                413, f"{length} bytes: 1 to {self.most_bytes} are taken, of text {_MOST_TEXT_BYTES}"
+            )
         self.demand_room(length)
         most = self._settings.limits.most_uploads
         if len(self.all()) >= most:
-            raise Problem(409, f"there are {most} uploads already; delete those that you no longer need")
+            raise Problem(
+                409, f"there are {most} uploads already; delete those that you no longer need"
+            )
         folder = self._folder / made.id
         with writing(folder):
             folder.mkdir(parents=True)
@@ -135,7 +165,10 @@ class Uploads:
         try:
             upload = self.get(upload.id)
             if upload.state != "receiving" or offset != self.offset(upload):
-                raise Problem(409, f"the upload ends at {self.offset(upload)}, not at {offset}; ask where it ends")
+                raise Problem(
+                    409,
+                    f"the upload ends at {self.offset(upload)}, not at {offset}; ask where it ends",
+                )
             here = await self._append(upload, offset, chunks)
             if here == upload.bytes:
                 self._begin_check(upload)
@@ -158,12 +191,18 @@ class Uploads:
         if upload.state == "refused":
             raise Problem(409, f"{upload.name} cannot be used: {upload.why}")
         if upload.state != "ready":
-            raise Problem(409, f"{upload.name} is not here yet ({upload.state}); wait until it is ready")
+            raise Problem(
+                409, f"{upload.name} is not here yet ({upload.state}); wait until it is ready"
+            )
         return self._target(upload)
 
     def videos(self) -> list[Path]:
         """The files of all uploads that are videos and ready."""
-        return [self._target(each) for each in self.all() if each.state == "ready" and each.kind == "video"]
+        return [
+            self._target(each)
+            for each in self.all()
+            if each.state == "ready" and each.kind == "video"
+        ]
 
     def name_of(self, upload_id: str) -> str:
         """The name of an upload's file; its id where it is gone."""
@@ -177,8 +216,9 @@ class Uploads:
         free = shutil.disk_usage(self._settings.root).free
         if free - more_bytes < self._settings.free_floor_gb * 1e9:
             raise Problem(
-                507, f"{free / 1e9:.1f} GB are free, and {self._settings.free_floor_gb:.1f} GB must stay so; delete "
-                     "uploads, recordings or flights that you no longer need"
+                507,
+                f"{free / 1e9:.1f} GB are free, and {self._settings.free_floor_gb:.1f} GB must stay so; delete "
+                "uploads, recordings or flights that you no longer need",
             )
 
     def close(self) -> None:
@@ -196,7 +236,9 @@ class Uploads:
                 await file.seek(offset)
                 async for chunk in _while_they_come(chunks):
                     if here + len(chunk) > upload.bytes:
-                        raise Problem(413, f"more came than the {upload.bytes} bytes that were announced")
+                        raise Problem(
+                            413, f"more came than the {upload.bytes} bytes that were announced"
+                        )
                     if here - looked > _LOOK_EVERY_BYTES:
                         self.demand_room(0)
                         looked = here
@@ -217,7 +259,11 @@ class Uploads:
             shutil.rmtree(target.parent, ignore_errors=True)  # of a check that was cut off
         keep_free_bytes = int(self._settings.free_floor_gb * 1e9)
         error, facts = checked_apart(
-            part if part.exists() else target, target, self.most_bytes, keep_free_bytes, self._child.run
+            part if part.exists() else target,
+            target,
+            self.most_bytes,
+            keep_free_bytes,
+            self._child.run,
         )
         if self._child.is_ended or not folder.is_dir():  # the station ends; deleted meanwhile
             return
@@ -226,7 +272,9 @@ class Uploads:
         elif upload.kind != "photos" and part.exists():
             target.parent.mkdir(exist_ok=True)
             part.rename(target)
-        done = replace(upload, state="ready" if error is None else "refused", why=error, facts=facts)
+        done = replace(
+            upload, state="ready" if error is None else "refused", why=error, facts=facts
+        )
         self._write(done)
         part.unlink(missing_ok=True)
         self._events.append(NewEvent("upload.checked", asdict(done)))
@@ -253,7 +301,10 @@ class Child:
             if self.is_ended:
                 return b""
             self._process = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
                 start_new_session=True,
             )
         with self._process as process:
@@ -272,11 +323,19 @@ class Child:
 
 
 def checked_apart(
-    part: Path, target: Path, most_bytes: int, keep_free_bytes: int, run: Callable[[Sequence[str], float], bytes]
+    part: Path,
+    target: Path,
+    most_bytes: int,
+    keep_free_bytes: int,
+    run: Callable[[Sequence[str], float], bytes],
 ) -> tuple[str | None, Mapping[str, Any] | None]:
     """What is wrong with an upload (None: nothing), and what it holds, found in a process with limits of its own."""
     command = python_command(
-        "sorvolo.station.check_upload", str(part), str(target), str(most_bytes), str(keep_free_bytes)
+        "sorvolo.station.check_upload",
+        str(part),
+        str(target),
+        str(most_bytes),
+        str(keep_free_bytes),
     )
     try:
         answer = json.loads(run(command, _CHECK_WITHIN_S))
@@ -284,7 +343,10 @@ def checked_apart(
     except subprocess.TimeoutExpired:
         return "looking into it took too long", None
     except (ValueError, KeyError, TypeError):
-        return "looking into it took more memory or time than a flight needs, or broke the decoder", None
+        return (
+            "looking into it took more memory or time than a flight needs, or broke the decoder",
+            None,
+        )
 
 
 async def _while_they_come(chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
@@ -294,7 +356,9 @@ async def _while_they_come(chunks: AsyncIterator[bytes]) -> AsyncIterator[bytes]
             with anyio.fail_after(_SILENT_S):
                 chunk = await anext(chunks, None)
         except TimeoutError:
-            raise Problem(408, f"nothing came for {_SILENT_S:.0f} s; ask where the upload ends, and go on") from None
+            raise Problem(
+                408, f"nothing came for {_SILENT_S:.0f} s; ask where the upload ends, and go on"
+            ) from None
         if chunk is None:
             return
         yield chunk
@@ -308,7 +372,9 @@ def _metadata(text: str) -> dict[str, str]:
         try:
             found[key] = base64.b64decode(value, validate=True).decode()
         except (binascii.Error, ValueError) as error:
-            raise Problem(400, "Upload-Metadata: names with values in base64 were needed (`filename ...`)") from error
+            raise Problem(
+                400, "Upload-Metadata: names with values in base64 were needed (`filename ...`)"
+            ) from error
     return found
 
 
@@ -316,10 +382,13 @@ def _checked_name(name: str) -> str:
     """A file's name without any folder. Raises Problem (400, 415)."""
     bare = PureWindowsPath(name).name
     if not is_plain_name(bare):
-        raise Problem(400, "Upload-Metadata: a `filename` of letters, digits and usual punctuation was needed")
+        raise Problem(
+            400, "Upload-Metadata: a `filename` of letters, digits and usual punctuation was needed"
+        )
     if Path(bare).suffix.lower() not in (*VIDEO_ENDINGS, *TEXT_ENDINGS, *_ARCHIVE_ENDINGS):
         raise Problem(
-            415, f"{bare[:80]}: a video ({', '.join(VIDEO_ENDINGS)}), photos as .zip, or telemetry and cameras "
-                 f"({', '.join(TEXT_ENDINGS)}) were needed"
+            415,
+            f"{bare[:80]}: a video ({', '.join(VIDEO_ENDINGS)}), photos as .zip, or telemetry and cameras "
+            f"({', '.join(TEXT_ENDINGS)}) were needed",
         )
     return bare

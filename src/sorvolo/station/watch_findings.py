@@ -40,11 +40,17 @@ class Findings:
     def crop(self, site_id: str, finding_id: str) -> bytes:
         """The picture of a finding, JPEG. Raises Problem (404)."""
         found = next((each for each in self.of_site(site_id) if each["id"] == finding_id), None)
-        name = str((found or {"properties": {}})["properties"].get("crop") or "").removeprefix(f"{CROPS}/")
+        name = str((found or {"properties": {}})["properties"].get("crop") or "").removeprefix(
+            f"{CROPS}/"
+        )
         if found is None or not is_plain_name(name):
-            raise Problem(404, "no such picture: of a finding that a watch of this site kept one of")
+            raise Problem(
+                404, "no such picture: of a finding that a watch of this site kept one of"
+            )
         try:
-            return read_below(self._folder / found["properties"]["run"] / _RESULTS, f"{CROPS}/{name}")
+            return read_below(
+                self._folder / found["properties"]["run"] / _RESULTS, f"{CROPS}/{name}"
+            )
         except FileNotFoundError as error:
             raise Problem(404, "this picture was not kept") from error
 
@@ -56,7 +62,14 @@ class Findings:
                 known = self._kept.get(run_id)
             if known is None or known[0] != mark:
                 content = json.loads(read_below(folder, f"{TRACKS}.geojson", _MOST_BYTES))
-                known = mark, [_finding(each, run_id) for each in content["features"] if each.get("geometry")]
+                known = (
+                    mark,
+                    [
+                        _finding(each, run_id)
+                        for each in content["features"]
+                        if each.get("geometry")
+                    ],
+                )
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             return []
         with self._lock:
@@ -66,10 +79,24 @@ class Findings:
 
 def _finding(track: Feature, run_id: str) -> Feature:
     """A track as a feature of the site: without the path that it took."""
-    values = {name: each for name, each in track["properties"].items() if name not in ("path", "class_scores")}
+    values = {
+        name: each
+        for name, each in track["properties"].items()
+        if name not in ("path", "class_scores")
+    }
     finding_id = f"{run_id}:{values['id']}"
     values |= {
-        "id": finding_id, "run": run_id, "watched": True, "review_kind": "finding", "flight": None,
-        "datetime": values["first_seen"], "end_datetime": values["last_seen"],
+        "id": finding_id,
+        "run": run_id,
+        "watched": True,
+        "review_kind": "finding",
+        "flight": None,
+        "datetime": values["first_seen"],
+        "end_datetime": values["last_seen"],
     }
-    return {"type": "Feature", "id": finding_id, "geometry": track["geometry"], "properties": values}
+    return {
+        "type": "Feature",
+        "id": finding_id,
+        "geometry": track["geometry"],
+        "properties": values,
+    }

@@ -24,18 +24,27 @@ def webhook(url: str, secret: str = "") -> Send:
     """A function that posts one event to the URL. Raises SettingsError for anything but an http or https URL."""
     try:
         parts = urlsplit(url)
-        is_wrong = parts.scheme not in ("http", "https") or not parts.hostname or parts.username or parts.port == 0
+        is_wrong = (
+            parts.scheme not in ("http", "https")
+            or not parts.hostname
+            or parts.username
+            or parts.port == 0
+        )
     except ValueError as error:
         raise SettingsError(f"--webhook: {error}; give one with http:// or https://") from error
     if is_wrong:
-        raise SettingsError(f"--webhook {webhook_name(url)} is no web address; give one with http:// or https://")
+        raise SettingsError(
+            f"--webhook {webhook_name(url)} is no web address; give one with http:// or https://"
+        )
     opener = urllib.request.build_opener(_NoRedirect)
 
     def post(event: Mapping[str, Any]) -> None:
         body = json.dumps(event, separators=(",", ":")).encode()
         headers = {"Content-Type": "application/json", "User-Agent": "sorvolo"}
         if secret:
-            headers[SIGNATURE] = f"sha256={hmac.new(secret.encode(), body, hashlib.sha256).hexdigest()}"
+            headers[SIGNATURE] = (
+                f"sha256={hmac.new(secret.encode(), body, hashlib.sha256).hexdigest()}"
+            )
         try:
             opener.open(urllib.request.Request(url, body, headers), timeout=_LIMIT_S).close()
         except urllib.error.HTTPError as error:
@@ -62,6 +71,10 @@ def webhook_name(url: str) -> str:
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
     """A redirected POST would become a GET without the event: it is refused instead."""
 
-    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> None:
+    def redirect_request(
+        self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> None:
         """Refuse. Raises NotTaken."""
-        raise NotTaken(f"HTTP {code}: the receiver sends events elsewhere; give that address instead")
+        raise NotTaken(
+            f"HTTP {code}: the receiver sends events elsewhere; give that address instead"
+        )

@@ -11,7 +11,9 @@ from sorvolo.station.tiles import TILE_PX
 from sorvolo.station.tokens import Role
 from sorvolo.store.site.archive import Archive
 
-_FIRST_SCALE = 559082264.0287178  # of zoom 0 at 0.28 mm a pixel: WMTS 1.0.0, annex E.4 (GoogleMapsCompatible)
+_FIRST_SCALE = (
+    559082264.0287178  # of zoom 0 at 0.28 mm a pixel: WMTS 1.0.0, annex E.4 (GoogleMapsCompatible)
+)
 _EDGE_M = 20037508.342789244  # half of the equator's length on the sphere of web maps (EPSG:3857)
 _ZOOMS = range(8, 25)
 _SET = "GoogleMapsCompatible"
@@ -25,7 +27,9 @@ class XmlResponse(Response):
 
 def wmts_routes(shelf: SiteShelf) -> APIRouter:
     """The capabilities of each site's tiles."""
-    router = APIRouter(prefix="/api/sites/{site}", tags=["rasters"], dependencies=[Depends(needs(Role.VIEW))])
+    router = APIRouter(
+        prefix="/api/sites/{site}", tags=["rasters"], dependencies=[Depends(needs(Role.VIEW))]
+    )
 
     @router.get("/WMTSCapabilities.xml", response_class=XmlResponse)
     def capabilities(request: Request, site: str) -> XmlResponse:
@@ -40,10 +44,18 @@ def document(archive: Archive, base: str) -> str:
     """The capabilities of a site whose address is `base`."""
     layers = []
     if archive.has_site:
-        names = {str(each.id): f"version {each.id}, {each.flown_utc or each.created_utc}, {each.flight_id}"
-                 for each in archive.versions() if each.complete}
+        names = {
+            str(
+                each.id
+            ): f"version {each.id}, {each.flown_utc or each.created_utc}, {each.flight_id}"
+            for each in archive.versions()
+            if each.complete
+        }
         bounds = bounds_lonlat(list(archive.live_tiles()), archive.site_grid())
-        layers = [_layer(name, title, bounds, base) for name, title in {"live": "the newest map", **names}.items()]
+        layers = [
+            _layer(name, title, bounds, base)
+            for name, title in {"live": "the newest map", **names}.items()
+        ]
     name = archive.site().name if archive.has_site else archive.folder.name
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'

@@ -26,7 +26,15 @@ from sorvolo.geometry.pose import gimbal_angles_from_rotation
 from sorvolo.station.camera import camera_opened
 from sorvolo.station.collections import on_earth
 from sorvolo.station.incomplete import cut_off, unsent
-from sorvolo.station.orders import BOXES, JOURNAL_FILE, LOCK_VARIABLE, MOTION, ORDER_FILE, TO_CHECK, Order
+from sorvolo.station.orders import (
+    BOXES,
+    JOURNAL_FILE,
+    LOCK_VARIABLE,
+    MOTION,
+    ORDER_FILE,
+    TO_CHECK,
+    Order,
+)
 from sorvolo.station.orphan_watch import ended_when_orphaned, why_orphaned
 from sorvolo.store.exports.change_files import changes_geojson
 from sorvolo.store.exports.detection_files import tracks_collection
@@ -65,7 +73,9 @@ class Journal:
 
     def add(self, kind: str, data: Mapping[str, Any]) -> None:
         """Append one line and hand it to the operating system."""
-        line = json.dumps({"type": kind, "data": plain_json(data)}, ensure_ascii=False, allow_nan=False)
+        line = json.dumps(
+            {"type": kind, "data": plain_json(data)}, ensure_ascii=False, allow_nan=False
+        )
         with self._adding:
             self._file.write(line.encode() + b"\n")
             self._file.flush()
@@ -124,19 +134,31 @@ def main(folder: Path) -> int:
             headline, why = _flown(order, folder, journal, stop.until)
     except KeyboardInterrupt:
         if stop.why:
-            journal.end(FAILED, {"exit_code": _WRONG, "error": f"{stop.why}; nothing was kept", "headline": None})
+            journal.end(
+                FAILED,
+                {"exit_code": _WRONG, "error": f"{stop.why}; nothing was kept", "headline": None},
+            )
             return _WRONG
-        journal.end(STOPPED, {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"})
+        journal.end(
+            STOPPED,
+            {"exit_code": _STOPPED_CODE, "error": None, "headline": "stopped; nothing was kept"},
+        )
         return _STOPPED_CODE
     except Exception as error:
         orphaned = "" if (folder / ORDER_FILE).exists() else why_orphaned(folder, order.run)
         words = _words_of(error, orphaned, order.source)
-        journal.end(FAILED, {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None})
+        journal.end(
+            FAILED,
+            {"exit_code": _WRONG, "error": without_secret(words, order.source), "headline": None},
+        )
         return _WRONG
     if stop.cuts_short:  # a watch keeps what it found
         headline = f"stopped before the flight's end: {headline}"
     if why:
-        journal.end(FINISHED, {"exit_code": TO_CHECK, "error": None, "headline": f"incomplete: {why}. {headline}"})
+        journal.end(
+            FINISHED,
+            {"exit_code": TO_CHECK, "error": None, "headline": f"incomplete: {why}. {headline}"},
+        )
         return TO_CHECK
     journal.end(FINISHED, {"exit_code": 0, "error": None, "headline": headline})
     return 0
@@ -150,7 +172,11 @@ def _words_of(error: Exception, orphaned: str, source: str) -> str:
     if isinstance(error, SorvoloError):
         return str(error)
     sys.stderr.write(without_secret(traceback.format_exc(), source))
-    return f"{error.strerror or error}" if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
+    return (
+        f"{error.strerror or error}"
+        if isinstance(error, OSError)
+        else f"{type(error).__name__}: {error}"
+    )
 
 
 def _flown(order: Order, folder: Path, journal: Journal, until: threading.Event) -> tuple[str, str]:
@@ -169,19 +195,34 @@ def _flown(order: Order, folder: Path, journal: Journal, until: threading.Event)
     return headline, "; ".join(filter(None, (why, unsent(camera.left()))))
 
 
-def _map(order: Order, journal: Journal, until: threading.Event, search: "SearchWhileFlying | None" = None) -> str:
+def _map(
+    order: Order,
+    journal: Journal,
+    until: threading.Event,
+    search: "SearchWhileFlying | None" = None,
+) -> str:
     from sorvolo.missions.flight.settings import MapSettings
     from sorvolo.missions.map.flights import map_flights
 
     wish, site = order.choices, Path(order.site)
     settings = MapSettings(
-        overlap=wish.overlap, m_per_px=wish.m_per_px, model=wish.model or "default", classes=tuple(wish.classes),
-        live_s=_LIVE_S, ground_elevation_m=wish.ground_elevation_m,
+        overlap=wish.overlap,
+        m_per_px=wish.m_per_px,
+        model=wish.model or "default",
+        classes=tuple(wish.classes),
+        live_s=_LIVE_S,
+        ground_elevation_m=wish.ground_elevation_m,
     )
     before = _newest(site)
     updates = map_flights(
-        [order.source], site, settings, telemetry=order.telemetry or None, camera=order.camera or None,
-        live=_live(order, keeps_all=True), until=until, search=search,
+        [order.source],
+        site,
+        settings,
+        telemetry=order.telemetry or None,
+        camera=order.camera or None,
+        live=_live(order, keeps_all=True),
+        until=until,
+        search=search,
     )
     with closing(updates):
         for update in updates:
@@ -196,16 +237,26 @@ def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
 
     wish, site = order.choices, Path(order.site)
     settings = CompareSettings(
-        views_per_second=wish.views_per_second, votes=wish.votes, voters=wish.voters, updates_map=wish.updates_map,
-        model=wish.model or "default", ground_elevation_m=wish.ground_elevation_m, classes=tuple(wish.classes),
+        views_per_second=wish.views_per_second,
+        votes=wish.votes,
+        voters=wish.voters,
+        updates_map=wish.updates_map,
+        model=wish.model or "default",
+        ground_elevation_m=wish.ground_elevation_m,
+        classes=tuple(wish.classes),
     )
     before = _newest(site)
     announced: dict[str, None] = {}  # their ids, in order
     with Archive.open(site, write=False) as archive:
         place = archive.site()
     updates = compare_flights(
-        [order.source], site, settings, telemetry=order.telemetry or None, camera=order.camera or None,
-        live=_live(order, keeps_all=True), until=until,
+        [order.source],
+        site,
+        settings,
+        telemetry=order.telemetry or None,
+        camera=order.camera or None,
+        live=_live(order, keeps_all=True),
+        until=until,
     )
     with closing(updates):
         for update in updates:
@@ -217,7 +268,9 @@ def _compare(order: Order, journal: Journal, until: threading.Event) -> str:
         flights = {each.flight_id for each in archive.versions() if each.id > before}
         kept = {each.id for each in archive.changes() if each.flight_id in flights}
     for change_id in announced.keys() - kept:
-        journal.add("change.withdrawn", {"id": change_id, "why": "not confirmed by the whole flight"})
+        journal.add(
+            "change.withdrawn", {"id": change_id, "why": "not confirmed by the whole flight"}
+        )
     return _headline(site, before)
 
 
@@ -227,13 +280,21 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
 
     wish = order.choices
     settings = WatchSettings(
-        model=wish.model or "default", classes=tuple(wish.classes), least_score=wish.least_score,
-        frames_per_second=wish.frames_per_second, ground_elevation_m=wish.ground_elevation_m,
+        model=wish.model or "default",
+        classes=tuple(wish.classes),
+        least_score=wish.least_score,
+        frames_per_second=wish.frames_per_second,
+        ground_elevation_m=wish.ground_elevation_m,
     )
     counts: Mapping[str, int] = {}
     updates = watch(
-        order.source, settings, WatchOutputs(Path(order.folder)), telemetry=order.telemetry or None,
-        camera=order.camera or None, live=_live(order), until=until,
+        order.source,
+        settings,
+        WatchOutputs(Path(order.folder)),
+        telemetry=order.telemetry or None,
+        camera=order.camera or None,
+        live=_live(order),
+        until=until,
         moved=partial(_moved, journal, order.stream) if order.stream else None,
         early=partial(_seen_early, journal, order.stream) if order.stream else None,
     )
@@ -242,11 +303,17 @@ def _watch(order: Order, journal: Journal, until: threading.Event) -> str:
             _placed(journal, update.view, update.frame_name, "watched")
             _seen(journal, update, order.stream)
             counts = update.counts
-            journal.progress({
-                "frames": update.frames_read, "frames_expected": update.frames_expected or None,
-                "searched": update.frames_detected, "objects": dict(counts), "seconds": update.seconds,
-                "latency_s": update.latency_s, "frames_per_second": _rate(update.frames_detected, update.seconds),
-            })
+            journal.progress(
+                {
+                    "frames": update.frames_read,
+                    "frames_expected": update.frames_expected or None,
+                    "searched": update.frames_detected,
+                    "objects": dict(counts),
+                    "seconds": update.seconds,
+                    "latency_s": update.latency_s,
+                    "frames_per_second": _rate(update.frames_detected, update.seconds),
+                }
+            )
     return f"{counted_list(counts)} found"
 
 
@@ -256,7 +323,9 @@ def _search(order: Order, journal: Journal, until: threading.Event) -> str:
     from sorvolo.missions.search.while_flying import SearchWhileFlying
 
     wish = order.choices
-    settings = SearchSettings(plants=wish.plants, classes=tuple(wish.classes), model=wish.model or "default")
+    settings = SearchSettings(
+        plants=wish.plants, classes=tuple(wish.classes), model=wish.model or "default"
+    )
     outputs = SearchOutputs(Path(order.folder))
     if order.source:  # a flight to map first; one in the air is measured meanwhile
         _map(order, journal, until, SearchWhileFlying(settings, outputs))
@@ -266,10 +335,15 @@ def _search(order: Order, journal: Journal, until: threading.Event) -> str:
             if isinstance(each, dict):
                 report = each
                 continue
-            journal.progress({
-                "frames": each.done, "frames_expected": each.total, "found": each.found, "planted": each.planted,
-                "flight": each.flight,
-            })
+            journal.progress(
+                {
+                    "frames": each.done,
+                    "frames_expected": each.total,
+                    "found": each.found,
+                    "planted": each.planted,
+                    "flight": each.flight,
+                }
+            )
     return str((report.get("headline") or {}).get("text", "measured"))
 
 
@@ -291,11 +365,19 @@ def _placed(journal: Journal, view: FrameView | None, name: str, status: str) ->
     )
     places = np.round(np.column_stack([longitudes, latitudes]), 8).tolist()
     heading_deg, pitch_deg, _ = gimbal_angles_from_rotation(view.site_from_camera.rotation)
-    journal.add("frame.placed", {
-        "frame": name, "status": status, "footprint": [*places[:4], places[0]], "position": places[4],
-        "height_m": round(float(view.site_from_camera.translation_m[2]), 2), "heading_deg": round(heading_deg, 1),
-        "pitch_deg": round(pitch_deg, 1), "time": utc_text(view.time_ns),
-    })
+    journal.add(
+        "frame.placed",
+        {
+            "frame": name,
+            "status": status,
+            "footprint": [*places[:4], places[0]],
+            "position": places[4],
+            "height_m": round(float(view.site_from_camera.translation_m[2]), 2),
+            "heading_deg": round(heading_deg, 1),
+            "pitch_deg": round(pitch_deg, 1),
+            "time": utc_text(view.time_ns),
+        },
+    )
 
 
 def _announce(journal: Journal, update: CompareUpdate, site: Site) -> None:
@@ -327,12 +409,18 @@ def _seen_early(journal: Journal, stream: str, found: "EarlyFound") -> None:
 def _boxes(seen: "WatchUpdate | EarlyFound", stream: str) -> dict[str, Any]:
     found = seen.detections
     return {
-        "stream": stream or None, "frame": seen.frame_name, "pts_us": seen.clip_ns // 1000,
-        "time": utc_text(seen.time_ns), "frame_size_px": list(seen.size_px), "latency_s": round(seen.latency_s, 3),
+        "stream": stream or None,
+        "frame": seen.frame_name,
+        "pts_us": seen.clip_ns // 1000,
+        "time": utc_text(seen.time_ns),
+        "frame_size_px": list(seen.size_px),
+        "latency_s": round(seen.latency_s, 3),
         "boxes": [
-            {"class": name, "score": round(float(score), 3), "xywh_px": [
-                round(float(each), 1) for each in (x0, y0, x1 - x0, y1 - y0)
-            ]}
+            {
+                "class": name,
+                "score": round(float(score), 3),
+                "xywh_px": [round(float(each), 1) for each in (x0, y0, x1 - x0, y1 - y0)],
+            }
             for name, score, (x0, y0, x1, y1) in zip(found.names, found.scores, found.boxes_px)
         ],
     }
@@ -341,25 +429,39 @@ def _boxes(seen: "WatchUpdate | EarlyFound", stream: str) -> dict[str, Any]:
 def _moved(journal: Journal, stream: str, step: "PictureStep") -> None:
     """Write how the picture moved since a tenth of a second before; in the thread that reads the stream."""
     with suppress(OSError):  # a disk that is full: the mission's own next line states it
-        journal.add(MOTION, {
-            "stream": stream, "from_time": utc_text(step.from_ns), "time": utc_text(step.to_ns),
-            "to_from": [float(f"{each:.9g}") for each in step.to_from.ravel()],
-        })
+        journal.add(
+            MOTION,
+            {
+                "stream": stream,
+                "from_time": utc_text(step.from_ns),
+                "time": utc_text(step.to_ns),
+                "to_from": [float(f"{each:.9g}") for each in step.to_from.ravel()],
+            },
+        )
 
 
 def _map_progress(update: MosaicUpdate) -> dict[str, Any]:
     return {
-        "frames": update.frames_read, "frames_expected": max(update.frames_expected, update.frames_read),
-        "selected": update.keyframes, "matched": update.by_vision, "seconds": update.seconds,
-        "frames_per_second": _rate(update.frames_read, update.seconds), "reason": update.reason or None,
+        "frames": update.frames_read,
+        "frames_expected": max(update.frames_expected, update.frames_read),
+        "selected": update.keyframes,
+        "matched": update.by_vision,
+        "seconds": update.seconds,
+        "frames_per_second": _rate(update.frames_read, update.seconds),
+        "reason": update.reason or None,
     }
 
 
 def _compare_progress(update: CompareUpdate, announced: int) -> dict[str, Any]:
     return {
-        "frames": update.frames_read, "frames_expected": max(update.frames_expected, update.frames_read),
-        "selected": update.views, "matched": update.compared, "changes": announced, "seconds": update.seconds,
-        "frames_per_second": _rate(update.frames_read, update.seconds), "reason": update.reason or None,
+        "frames": update.frames_read,
+        "frames_expected": max(update.frames_expected, update.frames_read),
+        "selected": update.views,
+        "matched": update.compared,
+        "changes": announced,
+        "seconds": update.seconds,
+        "frames_per_second": _rate(update.frames_read, update.seconds),
+        "reason": update.reason or None,
     }
 
 
@@ -377,7 +479,9 @@ def _newest(site: Path) -> int:
 def _headline(site: Path, before: int) -> str:
     """The headlines of the flights that came since."""
     with Archive.open(site, write=False) as archive:
-        flights = [each.flight_id for each in archive.versions() if each.complete and each.id > before]
+        flights = [
+            each.flight_id for each in archive.versions() if each.complete and each.id > before
+        ]
         texts = [_headline_of(archive.report(each)) for each in flights]
     return "; ".join(filter(None, texts)) or "finished"
 

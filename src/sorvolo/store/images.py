@@ -19,23 +19,34 @@ MOST_TILE_PX = 4096 * 4096
 _FLOAT_PX = 1 << 20  # of a picture, as floats at a time
 # 4:4:4 and 92: features found again on the stored keyframe sit where they sat; 4:2:0 shifts coloured edges.
 _JPEG = [
-    cv2.IMWRITE_JPEG_QUALITY, 92,
-    cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+    cv2.IMWRITE_JPEG_QUALITY,
+    92,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
 ]
 _JPEG_STEPS = {
-    1: cv2.IMREAD_COLOR, 2: cv2.IMREAD_REDUCED_COLOR_2, 4: cv2.IMREAD_REDUCED_COLOR_4, 8: cv2.IMREAD_REDUCED_COLOR_8,
+    1: cv2.IMREAD_COLOR,
+    2: cv2.IMREAD_REDUCED_COLOR_2,
+    4: cv2.IMREAD_REDUCED_COLOR_4,
+    8: cv2.IMREAD_REDUCED_COLOR_8,
 }
 # one filter for all rows: trying all of them on each row, as level 1 alone does here, takes twice as long
 _PNG_FAST = [
-    cv2.IMWRITE_PNG_COMPRESSION, 1,
-    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
-    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_AVG,
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_RLE,
+    cv2.IMWRITE_PNG_FILTER,
+    cv2.IMWRITE_PNG_FILTER_AVG,
 ]
 # rows that repeat the one above, as of a growing map's enlarged copies: a third of the time, and a fifth of the bytes
 _PNG_REPEATED = [
-    cv2.IMWRITE_PNG_COMPRESSION, 1,
-    cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT,
-    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP,
+    cv2.IMWRITE_PNG_COMPRESSION,
+    1,
+    cv2.IMWRITE_PNG_STRATEGY,
+    cv2.IMWRITE_PNG_STRATEGY_DEFAULT,
+    cv2.IMWRITE_PNG_FILTER,
+    cv2.IMWRITE_PNG_FILTER_UP,
 ]
 
 
@@ -56,14 +67,18 @@ def jpeg_from_rgba(rgba: ImageRGBA, most_px: int | None = None, ground: int = 23
     return jpeg_from_image(flat.astype(np.uint8), most_px)
 
 
-def image_from_jpeg(data: bytes, name: str, most_px: int = MOST_KEYFRAME_PX, step: int = 1) -> ImageRGB:
+def image_from_jpeg(
+    data: bytes, name: str, most_px: int = MOST_KEYFRAME_PX, step: int = 1
+) -> ImageRGB:
     """Decode a JPEG, at a `step`-th (1, 2, 4, 8) of its size, rounded up.
 
     Raises StoreError, naming `name`, when it is damaged or has more than `most_px` pixels.
     """
     image = _decoded(data, _jpeg_pixels, _JPEG_STEPS[step], name, most_px)
     if image is None:
-        raise StoreError(f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again")
+        raise StoreError(
+            f"{name} is damaged: no JPEG in its {len(data)} bytes; map its flight again"
+        )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
@@ -85,15 +100,21 @@ def rgba_from_png(data: bytes, name: str, most_px: int = MOST_TILE_PX) -> ImageR
     """Decode an RGBA PNG; raises StoreError, naming `name`, when it is damaged, too large, or has no alpha."""
     image = _decoded(data, _png_pixels, cv2.IMREAD_UNCHANGED, name, most_px)
     if image is None or image.ndim != 3 or image.shape[2] != 4:
-        raise StoreError(f"{name} is damaged: no RGBA PNG in its {len(data)} bytes; map its flight again")
+        raise StoreError(
+            f"{name} is damaged: no RGBA PNG in its {len(data)} bytes; map its flight again"
+        )
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA), dtype=np.uint8)
 
 
-def _decoded(data: bytes, size_of: Callable[[bytes], int], flags: int, name: str, most_px: int) -> MatLike | None:
+def _decoded(
+    data: bytes, size_of: Callable[[bytes], int], flags: int, name: str, most_px: int
+) -> MatLike | None:
     """The picture as OpenCV gives it; None for bytes of another form. The size in its header is looked at first."""
     pixels = size_of(data)
     if pixels > most_px:
-        raise StoreError(f"{name} has {pixels / 1e6:.0f} million pixels, at most {most_px / 1e6:.0f} were expected")
+        raise StoreError(
+            f"{name} has {pixels / 1e6:.0f} million pixels, at most {most_px / 1e6:.0f} were expected"
+        )
     return cv2.imdecode(np.frombuffer(data, np.uint8), flags) if pixels else None
 
 
@@ -109,12 +130,16 @@ def _jpeg_pixels(data: bytes) -> int:
     at = 2 if data[:2] == b"\xff\xd8" else len(data)
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD9:  # a filling byte, or a marker without a length
+        if (
+            marker == 0xFF or marker == 0x01 or 0xD0 <= marker <= 0xD9
+        ):  # a filling byte, or a marker without a length
             at += 1 if marker == 0xFF else 2
         elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            return int.from_bytes(data[at + 5:at + 7], "big") * int.from_bytes(data[at + 7:at + 9], "big")
+            return int.from_bytes(data[at + 5 : at + 7], "big") * int.from_bytes(
+                data[at + 7 : at + 9], "big"
+            )
         else:
-            at += 2 + int.from_bytes(data[at + 2:at + 4], "big")
+            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
     return 0
 
 
@@ -130,21 +155,33 @@ def shrink(rgba: ImageRGBA, width: int, height: int) -> ImageRGBA:
         return unweighted(cv2.resize(weighted(rgba), size, interpolation=cv2.INTER_AREA))
     if not _is_partly_seen(rgba).any():
         return _shrunk_rim(rgba, times)
-    rows = max(1, _FLOAT_PX // (times**2 * width))  # at a time: as floats the whole may be hundreds of megabytes
-    parts = [rgba[first * times:(first + rows) * times] for first in range(0, height, rows)]
-    return np.concatenate([
-        unweighted(cv2.resize(weighted(each), (width, len(each) // times), interpolation=cv2.INTER_AREA))
-        for each in parts
-    ])
+    rows = max(
+        1, _FLOAT_PX // (times**2 * width)
+    )  # at a time: as floats the whole may be hundreds of megabytes
+    parts = [rgba[first * times : (first + rows) * times] for first in range(0, height, rows)]
+    return np.concatenate(
+        [
+            unweighted(
+                cv2.resize(
+                    weighted(each), (width, len(each) // times), interpolation=cv2.INTER_AREA
+                )
+            )
+            for each in parts
+        ]
+    )
 
 
 def _shrunk_rim(rgba: ImageRGBA, times: int) -> ImageRGBA:
     """The image `times` smaller a side, each pixel of it seen or not: only where both meet do colours need weights."""
     seen = cv2.copyTo(rgba, rgba[..., 3])
-    small = np.asarray(cv2.resize(seen, None, fx=1 / times, fy=1 / times, interpolation=cv2.INTER_AREA), np.uint8)
+    small = np.asarray(
+        cv2.resize(seen, None, fx=1 / times, fy=1 / times, interpolation=cv2.INTER_AREA), np.uint8
+    )
     rows, columns = np.nonzero(_is_partly_seen(small))
     down, across = (each.ravel() for each in np.mgrid[:times, :times])
-    sums = seen[rows[:, None] * times + down, columns[:, None] * times + across].sum(axis=1, dtype=np.float32)
+    sums = seen[rows[:, None] * times + down, columns[:, None] * times + across].sum(
+        axis=1, dtype=np.float32
+    )
     small[rows, columns, :3] = np.rint(sums[:, :3] * 255 / sums[:, 3:])
     return small
 

@@ -8,7 +8,19 @@ import numpy as np
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask
 
-MASK_ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".pbm", ".ppm", ".gif"}
+MASK_ENDINGS = {
+    ".png",
+    ".jpg",
+    ".jpeg",
+    ".bmp",
+    ".tif",
+    ".tiff",
+    ".webp",
+    ".pgm",
+    ".pbm",
+    ".ppm",
+    ".gif",
+}
 """The files that are masks, in small letters."""
 
 _LOSSY = {".jpg", ".jpeg", ".webp"}

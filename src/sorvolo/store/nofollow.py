@@ -52,7 +52,9 @@ def _descriptor_below(folder: Path, relative: str) -> int:
     path = folder / relative
     parts = PurePosixPath(relative).parts
     if not parts or ".." in parts or parts[0] == "/":
-        raise StoreError(f"{relative!r} is no path below {folder}; the site is damaged or was made to do harm")
+        raise StoreError(
+            f"{relative!r} is no path below {folder}; the site is damaged or was made to do harm"
+        )
     try:
         descriptor = _descend(folder, parts)
     except FileNotFoundError as error:
@@ -60,7 +62,9 @@ def _descriptor_below(folder: Path, relative: str) -> int:
     except OSError as error:
         if error.errno in _LINK_ERRORS:
             raise _refused(path) from error
-        raise StoreError(f"cannot read {path} ({error.strerror}); check the disk and its permissions") from error
+        raise StoreError(
+            f"cannot read {path} ({error.strerror}); check the disk and its permissions"
+        ) from error
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise _refused(path)
@@ -88,7 +92,9 @@ def _entries(folder: Path) -> list["os.DirEntry[str]"]:
     except (FileNotFoundError, NotADirectoryError):  # a writer took it away meanwhile
         return []
     except OSError as error:
-        raise StoreError(f"cannot read {folder} ({error.strerror}); check the disk and its permissions") from error
+        raise StoreError(
+            f"cannot read {folder} ({error.strerror}); check the disk and its permissions"
+        ) from error
 
 
 def _refused(path: Path) -> StoreError:

@@ -29,7 +29,9 @@ class Area:
     def __post_init__(self) -> None:
         if not self.polygons_lonlat or not all(self.polygons_lonlat):
             raise GeometryError("an area needs at least one polygon")
-        polygons = tuple(tuple(_open_ring(ring) for ring in rings) for rings in self.polygons_lonlat)
+        polygons = tuple(
+            tuple(_open_ring(ring) for ring in rings) for rings in self.polygons_lonlat
+        )
         object.__setattr__(self, "polygons_lonlat", polygons)
         for rings_m in self.polygons_m(self.frame):
             for ring_m in rings_m:
@@ -63,22 +65,31 @@ class Area:
     def polygons_m(self, frame: LocalFrame) -> tuple[tuple[PointsM, ...], ...]:
         """The polygons' rings as east, north metres of `frame`, (N, 2) each."""
         return tuple(
-            tuple(_metres_from_lonlat(frame, ring)[:, :2] for ring in rings) for rings in self.polygons_lonlat
+            tuple(_metres_from_lonlat(frame, ring)[:, :2] for ring in rings)
+            for rings in self.polygons_lonlat
         )
 
     def distances_m(self, place: Geodetic) -> list[float]:
         """How far each polygon's nearest corner is from a place, along the chord, m; 0 where it holds the place."""
-        here_m = ecef_from_wgs84(*(np.array([each]) for each in (place.latitude_deg, place.longitude_deg, 0.0)))
+        here_m = ecef_from_wgs84(
+            *(np.array([each]) for each in (place.latitude_deg, place.longitude_deg, 0.0))
+        )
         distances_m = []
         for rings in self.polygons_lonlat:
             corners_m = ecef_from_wgs84(rings[0][:, 1], rings[0][:, 0], np.zeros(len(rings[0])))
-            inside = Area((rings,)).contains(np.array([[place.longitude_deg, place.latitude_deg]]))[0]
-            distances_m.append(0.0 if inside else float(np.linalg.norm(corners_m - here_m, axis=1).min()))
+            inside = Area((rings,)).contains(np.array([[place.longitude_deg, place.latitude_deg]]))[
+                0
+            ]
+            distances_m.append(
+                0.0 if inside else float(np.linalg.norm(corners_m - here_m, axis=1).min())
+            )
         return distances_m
 
     def contains(self, lonlat: Floats) -> NDArray[np.bool_]:
         """(N,) whether each place, (N, 2) longitude and latitude in degrees, lies inside; NaN does not."""
-        points_m = _metres_from_lonlat(self.frame, np.asarray(lonlat, dtype=np.float64).reshape(-1, 2))
+        points_m = _metres_from_lonlat(
+            self.frame, np.asarray(lonlat, dtype=np.float64).reshape(-1, 2)
+        )
         # the far side of the Earth has the same east and north
         near = points_m[:, 2] > -3e6
         return near & inside_any(self.polygons_m(self.frame), points_m[:, :2])

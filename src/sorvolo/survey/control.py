@@ -42,7 +42,9 @@ class GroundControl:
         if len(labels) < len(self.points):
             raise InputError(f"{self.name}: two control points have the same label")
         if unknown := {each.label for each in self.marks} - labels:
-            raise InputError(f"{self.name}: marks of points that it does not list: {', '.join(sorted(unknown))}")
+            raise InputError(
+                f"{self.name}: marks of points that it does not list: {', '.join(sorted(unknown))}"
+            )
 
     @property
     def middle(self) -> Geodetic:

@@ -63,7 +63,11 @@ class PathFit:
     @property
     def sure_turn_deg(self) -> float:
         """The turn where there surely is one, else 0."""
-        return self.turn_deg.value if abs(self.turn_deg.value) > max(3 * self.turn_deg.sigma, _LEAST_TURN_DEG) else 0.0
+        return (
+            self.turn_deg.value
+            if abs(self.turn_deg.value) > max(3 * self.turn_deg.sigma, _LEAST_TURN_DEG)
+            else 0.0
+        )
 
 
 AS_THE_MAP = PathFit(Bias(1.0, 0.0), Bias(0.0, 0.0))

@@ -90,10 +90,20 @@ class ComparedView:
 
     def __post_init__(self) -> None:
         size = self.image.shape[:2]
-        if not size == self.reference.shape[:2] == self.valid.shape == self.changed.shape == self.shade.shape:
-            raise GeometryError(f"view {self.name}: image, reference, valid, changed and shade differ in size")
+        if (
+            not size
+            == self.reference.shape[:2]
+            == self.valid.shape
+            == self.changed.shape
+            == self.shade.shape
+        ):
+            raise GeometryError(
+                f"view {self.name}: image, reference, valid, changed and shade differ in size"
+            )
         if len(self.boxes) != len(self.scores):
-            raise GeometryError(f"view {self.name}: {len(self.boxes)} boxes but {len(self.scores)} scores")
+            raise GeometryError(
+                f"view {self.name}: {len(self.boxes)} boxes but {len(self.scores)} scores"
+            )
 
     @cached_property
     def changed_share(self) -> float:
@@ -104,11 +114,12 @@ class ComparedView:
     def m_per_px(self) -> float:
         """Ground metres of a pixel in the middle of the view's picture."""
         height, width = self.changed.shape
-        middle = np.array([[width / 2, height / 2], [width / 2 + 1, height / 2], [width / 2, height / 2 + 1]])
+        middle = np.array(
+            [[width / 2, height / 2], [width / 2 + 1, height / 2], [width / 2, height / 2 + 1]]
+        )
         a, b, c = apply_homography(self.site_from_image, middle)
         across = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
         return float(np.sqrt(abs(across))) or 1.0
-
 
     @property
     def outline_m(self) -> PointsM:
@@ -137,14 +148,21 @@ class Patch:
     shade: ImageGray
 
     def __post_init__(self) -> None:
-        if not self.before.shape[:2] == self.after.shape[:2] == self.changed.shape == self.shade.shape:
+        if (
+            not self.before.shape[:2]
+            == self.after.shape[:2]
+            == self.changed.shape
+            == self.shade.shape
+        ):
             raise GeometryError("a patch's pictures differ in size")
 
     @property
     def site_from_patch(self) -> Matrix3:
         """(3, 3) affine map from the patch's pixels to site metres."""
         s = self.m_per_px
-        return np.array([[s, 0.0, self.west_m + s / 2], [0.0, -s, self.north_m - s / 2], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[s, 0.0, self.west_m + s / 2], [0.0, -s, self.north_m - s / 2], [0.0, 0.0, 1.0]]
+        )
 
 
 @dataclass(frozen=True)
@@ -203,7 +221,9 @@ class Change(ChangeFacts):
         object.__setattr__(self, "outline_m", frozen(self.outline_m))
         object.__setattr__(self, "velocity_m_s", frozen(self.velocity_m_s))
         if self.outline_m.ndim != 2 or self.outline_m.shape[1] != 2 or len(self.outline_m) < 3:
-            raise GeometryError(f"change {self.id}: an outline needs (N, 2) points, N >= 3, got {self.outline_m.shape}")
+            raise GeometryError(
+                f"change {self.id}: an outline needs (N, 2) points, N >= 3, got {self.outline_m.shape}"
+            )
         if not 0 <= self.score <= 1:
             raise GeometryError(f"change {self.id}: a score lies in 0 to 1, got {self.score}")
 

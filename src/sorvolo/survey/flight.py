@@ -11,13 +11,23 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 
 TELEMETRY_COLUMNS = (
-    "latitude_deg", "longitude_deg",
-    "ellipsoidal_height_m", "orthometric_height_m", "height_above_takeoff_m",
-    "horizontal_sigma_m", "vertical_sigma_m",
-    "camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg",
-    "body_yaw_deg", "body_pitch_deg", "body_roll_deg",
-    "tilt_sigma_deg", "heading_sigma_deg",
-    "course_deg", "speed_m_s",
+    "latitude_deg",
+    "longitude_deg",
+    "ellipsoidal_height_m",
+    "orthometric_height_m",
+    "height_above_takeoff_m",
+    "horizontal_sigma_m",
+    "vertical_sigma_m",
+    "camera_yaw_deg",
+    "camera_pitch_deg",
+    "camera_roll_deg",
+    "body_yaw_deg",
+    "body_pitch_deg",
+    "body_roll_deg",
+    "tilt_sigma_deg",
+    "heading_sigma_deg",
+    "course_deg",
+    "speed_m_s",
 )
 """Every number a telemetry sample can carry. NaN means that the source does not state it.
 
@@ -58,9 +68,13 @@ class Telemetry:
         if len(time_ns) > 1 and not (np.diff(time_ns) > 0).all():
             raise GeometryError("telemetry times must increase strictly")
         columns = {
-            name: frozen(self.columns.get(name, np.full(len(time_ns), np.nan))) for name in TELEMETRY_COLUMNS
+            name: frozen(self.columns.get(name, np.full(len(time_ns), np.nan)))
+            for name in TELEMETRY_COLUMNS
         }
-        video = frozen(np.full(len(time_ns), -1) if self.video_time_ns is None else self.video_time_ns, np.int64)
+        video = frozen(
+            np.full(len(time_ns), -1) if self.video_time_ns is None else self.video_time_ns,
+            np.int64,
+        )
         if any(len(column) != len(time_ns) for column in [*columns.values(), video]):
             raise GeometryError("telemetry columns differ in length")
         object.__setattr__(self, "time_ns", time_ns)
@@ -142,10 +156,18 @@ class CameraPrior:
     source: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("position_m", "position_sigma_m", "rotation", "attitude_sigma_deg", "velocity_m_s"):
+        for name in (
+            "position_m",
+            "position_sigma_m",
+            "rotation",
+            "attitude_sigma_deg",
+            "velocity_m_s",
+        ):
             object.__setattr__(self, name, frozen(getattr(self, name)))
         if not np.isfinite(self.position_m).all() or not np.isfinite(self.rotation).all():
-            raise GeometryError("a prior's numbers are finite; what is unknown has an infinite sigma")
+            raise GeometryError(
+                "a prior's numbers are finite; what is unknown has an infinite sigma"
+            )
 
     @property
     def knows_place(self) -> bool:

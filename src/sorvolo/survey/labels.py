@@ -30,10 +30,14 @@ class LabelledPicture:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "boxes_px", frozen(np.reshape(self.boxes_px, (-1, 4)), np.float32))
-        object.__setattr__(self, "ignored_px", frozen(np.reshape(self.ignored_px, (-1, 4)), np.float32))
+        object.__setattr__(
+            self, "ignored_px", frozen(np.reshape(self.ignored_px, (-1, 4)), np.float32)
+        )
         object.__setattr__(self, "labels", frozen(np.reshape(self.labels, -1), np.int64))
         if len(self.boxes_px) != len(self.labels):
-            raise InputError(f"{self.path}: {len(self.boxes_px)} boxes but {len(self.labels)} labels")
+            raise InputError(
+                f"{self.path}: {len(self.boxes_px)} boxes but {len(self.labels)} labels"
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -50,18 +50,26 @@ class MapObject:
         object.__setattr__(self, "position_m", frozen(self.position_m))
         object.__setattr__(self, "velocity_m_s", frozen(self.velocity_m_s))
         if self.position_m.shape != (2,) or not np.isfinite(self.position_m).all():
-            raise GeometryError(f"object {self.id}: a place is two finite numbers, got {self.position_m}")
+            raise GeometryError(
+                f"object {self.id}: a place is two finite numbers, got {self.position_m}"
+            )
         if not 0 <= self.score <= 1:
             raise GeometryError(f"object {self.id}: a score lies in 0 to 1, got {self.score}")
         if not 1 <= self.views <= self.possible_views:
-            raise GeometryError(f"object {self.id}: seen {self.views} times of {self.possible_views}")
+            raise GeometryError(
+                f"object {self.id}: seen {self.views} times of {self.possible_views}"
+            )
 
     def stands_where(self, other: "MapObject", sigma_m: float = 0.0) -> bool:
         """Whether it stands where another date's object did, by its own size and twice what both places may err apart:
         a car parked again. What moves stands nowhere."""
         if self.moving or other.moving:
             return False
-        reach_m = _BESIDE * float(np.nan_to_num(self.length_m)) + _BESIDE_M + 2 * float(np.nan_to_num(sigma_m))
+        reach_m = (
+            _BESIDE * float(np.nan_to_num(self.length_m))
+            + _BESIDE_M
+            + 2 * float(np.nan_to_num(sigma_m))
+        )
         return bool(np.hypot(*(self.position_m - other.position_m)) <= reach_m)
 
 
@@ -78,10 +86,15 @@ class SearchedFrames:
 
     @classmethod
     def of(
-        cls, frames: Sequence[PlacedFrame], looked_for: Sequence[Collection[str]], classes: Sequence[str]
+        cls,
+        frames: Sequence[PlacedFrame],
+        looked_for: Sequence[Collection[str]],
+        classes: Sequence[str],
     ) -> "SearchedFrames":
         """These frames, of which each was searched for those of the classes that stand at its place in `looked_for`."""
-        searched_for = {name: np.array([name in each for each in looked_for], bool) for name in classes}
+        searched_for = {
+            name: np.array([name in each for each in looked_for], bool) for name in classes
+        }
         return cls(np.array([each.outline_m for each in frames]), searched_for)
 
     def for_class(self, label: str) -> Floats:
@@ -113,7 +126,9 @@ def looked_at(places_m: PointsM, labels: Sequence[str], searches: Sequence[Searc
     result = np.zeros(len(places_m), bool)
     for label in set(labels):
         own = np.flatnonzero([each == label for each in labels])
-        outlines_m = np.concatenate([np.zeros((0, 4, 2)), *(each.for_class(label) for each in searches)])
+        outlines_m = np.concatenate(
+            [np.zeros((0, 4, 2)), *(each.for_class(label) for each in searches)]
+        )
         result[own] = _shown_often(places_m[own], outlines_m)
     return result
 

@@ -31,7 +31,9 @@ class Features:
 
     def __post_init__(self) -> None:
         if len(self.points_px) != len(self.descriptors):
-            raise GeometryError(f"{len(self.points_px)} points but {len(self.descriptors)} descriptors")
+            raise GeometryError(
+                f"{len(self.points_px)} points but {len(self.descriptors)} descriptors"
+            )
 
     def __len__(self) -> int:
         return len(self.points_px)
@@ -106,7 +108,9 @@ class PlacedFrame:
     status: Status
     reason: str
     camera: Camera
-    site_from_camera: Pose | None  # None: the method (thesis) or the status (rejected) has no 6-DoF pose
+    site_from_camera: (
+        Pose | None
+    )  # None: the method (thesis) or the status (rejected) has no 6-DoF pose
     site_from_image: Matrix3
     outline_m: PointsM
     residual_px: float
@@ -117,12 +121,27 @@ class PlacedFrame:
 
     @classmethod
     def rejected(
-        cls, index: int, name: str, time_ns: int, reason: str, camera: Camera, residual_px: float = float("nan")
+        cls,
+        index: int,
+        name: str,
+        time_ns: int,
+        reason: str,
+        camera: Camera,
+        residual_px: float = float("nan"),
     ) -> "PlacedFrame":
         """The record of a frame that has no place."""
         nowhere = np.full((3, 3), np.nan)
         return cls(
-            name, index, time_ns, Status.REJECTED, reason, camera, None, nowhere, np.full((4, 2), np.nan), residual_px,
+            name,
+            index,
+            time_ns,
+            Status.REJECTED,
+            reason,
+            camera,
+            None,
+            nowhere,
+            np.full((4, 2), np.nan),
+            residual_px,
             float("nan"),
         )
 

@@ -19,12 +19,16 @@ def named_values(
     for each in written:
         name, _, value = (part.strip() for part in each.partition("="))
         if not value or name.lower() not in known:
-            raise SettingsError(f"{each!r} is no setting of {owner}; write NAME=VALUE with {', '.join(names)}")
+            raise SettingsError(
+                f"{each!r} is no setting of {owner}; write NAME=VALUE with {', '.join(names)}"
+            )
         field, read = names[known[name.lower()]]
         try:
             chosen[field] = read(value)
         except ValueError as error:
-            raise SettingsError(f"{each!r} cannot be read; {known[name.lower()]} takes {error}") from error
+            raise SettingsError(
+                f"{each!r} cannot be read; {known[name.lower()]} takes {error}"
+            ) from error
     return chosen
 
 

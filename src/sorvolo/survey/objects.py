@@ -13,7 +13,10 @@ CLASSES = ("person", "car", "small object")
 """The classes of Sorvolo's own models, in the order of their labels; other models bring their own names."""
 
 TYPICAL_SIZE_M = {
-    "person": (0.6, 0.5, 1.7), "car": (4.4, 1.8, 1.5), "small object": (0.6, 0.45, 0.35), "truck": (8.0, 2.5, 3.2),
+    "person": (0.6, 0.5, 1.7),
+    "car": (4.4, 1.8, 1.5),
+    "small object": (0.6, 0.45, 0.35),
+    "truck": (8.0, 2.5, 3.2),
     "bus": (12.0, 2.55, 3.2),
 }
 """Length, width and height of a class's usual member; how high the middle of a box lies above the ground. Trucks and
@@ -39,7 +42,9 @@ class Detections:
         object.__setattr__(self, "labels", frozen(self.labels, np.int64))
         object.__setattr__(self, "classes", tuple(self.classes))
         if not len(boxes) == len(self.scores) == len(self.labels):
-            raise GeometryError(f"{len(boxes)} boxes, {len(self.scores)} scores, {len(self.labels)} labels")
+            raise GeometryError(
+                f"{len(boxes)} boxes, {len(self.scores)} scores, {len(self.labels)} labels"
+            )
         if len(self.labels) and not 0 <= self.labels.min() <= self.labels.max() < len(self.classes):
             raise GeometryError(f"labels must index the {len(self.classes)} classes")
 
@@ -54,7 +59,9 @@ class Detections:
     def only(self, keep: Mask | Rows | Sequence[int]) -> "Detections":
         """The rows that a mask or indices keep."""
         index = np.asarray(keep)
-        return Detections(self.boxes_px[index], self.scores[index], self.labels[index], self.classes)
+        return Detections(
+            self.boxes_px[index], self.scores[index], self.labels[index], self.classes
+        )
 
     def surest(self, most: int) -> "Detections":
         """At most this many rows, those of the highest scores first."""
@@ -67,7 +74,9 @@ Early: TypeAlias = Callable[[tuple[str, ...], Detections], None]
 
 def no_detections(classes: Sequence[str]) -> Detections:
     """An empty picture's."""
-    return Detections(np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64), tuple(classes))
+    return Detections(
+        np.zeros((0, 4), np.float32), np.zeros(0), np.zeros(0, np.int64), tuple(classes)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +106,9 @@ class Sighting:
             array = frozen(getattr(self, name))
             object.__setattr__(self, name, array)
             if array.shape != shape or not np.isfinite(array).all():
-                raise GeometryError(f"a sighting's {name} must be {shape} finite numbers, got {array}")
+                raise GeometryError(
+                    f"a sighting's {name} must be {shape} finite numbers, got {array}"
+                )
         object.__setattr__(self, "box_px", frozen(self.box_px, np.float32))
 
     @property

@@ -18,7 +18,9 @@ _SHUFFLES = 16  # few, so that seeds still differ; enough that no large video la
 _EXPORTED = re.compile(r"[_.](jpe?g|png|bmp|tiff?)(\.rf\.[0-9a-z]+)?$", re.IGNORECASE)
 
 
-def split_by_group(labelled: LabelledSet, shares: Mapping[str, float], seed: int = 0) -> dict[str, LabelledSet]:
+def split_by_group(
+    labelled: LabelledSet, shares: Mapping[str, float], seed: int = 0
+) -> dict[str, LabelledSet]:
     """Whole groups (videos, flights) to each part, such as {"train": 0.8, "test": 0.2} of the pictures, by chance.
 
     Every part gets at least one group; the shares are met as closely as whole groups allow. The same seed gives the
@@ -34,12 +36,17 @@ def split_by_group(labelled: LabelledSet, shares: Mapping[str, float], seed: int
         )
     part_of = _assigned(sizes, shares, seed)
     return {
-        part: labelled.only([each for each in labelled.pictures if part_of[each.group] == part]) for part in shares
+        part: labelled.only([each for each in labelled.pictures if part_of[each.group] == part])
+        for part in shares
     }
 
 
 def split_by_blocks(
-    labelled: LabelledSet, shares: Mapping[str, float], block: int = 100, gap: int = 10, seed: int = 0
+    labelled: LabelledSet,
+    shares: Mapping[str, float],
+    block: int = 100,
+    gap: int = 10,
+    seed: int = 0,
 ) -> dict[str, LabelledSet]:
     """Whole blocks of `block` pictures with consecutive frame numbers to each part, for sets of few, long videos.
 
@@ -60,12 +67,13 @@ def split_by_blocks(
         )
     chosen = _assigned({index: len(each) for index, each in enumerate(blocks)}, shares, seed)
     members = {
-        part: [row for index, each in enumerate(blocks) if chosen[index] == part for row in each] for part in shares
+        part: [row for index, each in enumerate(blocks) if chosen[index] == part for row in each]
+        for part in shares
     }
     by_share = sorted(shares, key=lambda part: -shares[part])
     parts = {}
     for part in shares:
-        smaller = [row for other in by_share[by_share.index(part) + 1:] for row in members[other]]
+        smaller = [row for other in by_share[by_share.index(part) + 1 :] for row in members[other]]
         kept = _far_from(members[part], smaller, places, gap)
         text = f"{{}} pictures of {part} are within {gap} frames of another part and were left out"
         parts[part] = _part_of(labelled, kept, len(members[part]) - len(kept), text)
@@ -80,15 +88,23 @@ def _part_of(labelled: LabelledSet, rows: Sequence[int], left_out: int, text: st
 
 def shared_groups(first: LabelledSet, second: LabelledSet) -> tuple[Notice, ...]:
     """A warning when pictures of one video lie in both sets, else nothing: neighbours look alike, so scores flatter."""
-    both = sorted({each.group for each in first.pictures} & {each.group for each in second.pictures})
+    both = sorted(
+        {each.group for each in first.pictures} & {each.group for each in second.pictures}
+    )
     if not both:
         return ()
     count = sum(each.group in both for each in second.pictures)
     names = ", ".join(both[:5]) + (", ..." if len(both) > 5 else "")
-    return (Notice("shared_groups", count, (
-        f"{len(both)} videos ({names}) lie in both {first.name} and {second.name}, with {count} pictures in the "
-        "latter; their frames look alike, so the score will be too good: split by video"
-    )),)
+    return (
+        Notice(
+            "shared_groups",
+            count,
+            (
+                f"{len(both)} videos ({names}) lie in both {first.name} and {second.name}, with {count} pictures in the "
+                "latter; their frames look alike, so the score will be too good: split by video"
+            ),
+        ),
+    )
 
 
 def shuffled(count: int, seed: int = 0) -> list[int]:
@@ -109,11 +125,17 @@ def stem_of(path: str) -> str:
 
 
 def _demand_shares(shares: Mapping[str, float]) -> None:
-    if not shares or not all(0 < share <= 1 for share in shares.values()) or abs(sum(shares.values()) - 1) > 1e-6:
+    if (
+        not shares
+        or not all(0 < share <= 1 for share in shares.values())
+        or abs(sum(shares.values()) - 1) > 1e-6
+    ):
         raise SettingsError(f"shares must be above 0 and sum up to 1, got {dict(shares)}")
 
 
-def _assigned(sizes: Mapping[_Group, int], shares: Mapping[str, float], seed: int) -> dict[_Group, str]:
+def _assigned(
+    sizes: Mapping[_Group, int], shares: Mapping[str, float], seed: int
+) -> dict[_Group, str]:
     """A part for every group: of a few shuffles the one that meets the shares best."""
     rng = np.random.default_rng(seed)
     groups = sorted(sizes, key=str)
@@ -122,7 +144,9 @@ def _assigned(sizes: Mapping[_Group, int], shares: Mapping[str, float], seed: in
     best: dict[_Group, str] = {}
     least = np.inf
     for _ in range(_SHUFFLES):
-        chosen, missed = _dealt([groups[index] for index in rng.permutation(len(groups))], sizes, wanted)
+        chosen, missed = _dealt(
+            [groups[index] for index in rng.permutation(len(groups))], sizes, wanted
+        )
         if missed < least:
             best, least = {group: parts[part] for group, part in chosen.items()}, missed
     return best
@@ -150,7 +174,9 @@ def _places(labelled: LabelledSet) -> list[tuple[str, int]]:
     for each in labelled.pictures:
         number = frame_number(each.path)
         if number is None:
-            raise InputError(f"{each.path}: no number in its name, so its neighbours in time are unknown")
+            raise InputError(
+                f"{each.path}: no number in its name, so its neighbours in time are unknown"
+            )
         numbers.append(number)
     is_one_sequence = len(set(numbers)) == len(numbers)
     groups = ["" if is_one_sequence else each.group for each in labelled.pictures]
@@ -164,11 +190,16 @@ def _blocks(places: Sequence[tuple[str, int]], block: int) -> list[list[int]]:
         sequences.setdefault(places[row][0], []).append(row)
     blocks: list[list[int]] = []
     for rows in sequences.values():
-        blocks += [each.tolist() for each in np.array_split(np.array(rows), max(1, round(len(rows) / block)))]
+        blocks += [
+            each.tolist()
+            for each in np.array_split(np.array(rows), max(1, round(len(rows) / block)))
+        ]
     return blocks
 
 
-def _far_from(rows: Sequence[int], others: Sequence[int], places: Sequence[tuple[str, int]], gap: int) -> list[int]:
+def _far_from(
+    rows: Sequence[int], others: Sequence[int], places: Sequence[tuple[str, int]], gap: int
+) -> list[int]:
     """The rows none of whose neighbours within `gap` frames is among the others."""
     taken: dict[str, list[int]] = {}
     for row in others:

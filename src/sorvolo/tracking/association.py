@@ -14,7 +14,9 @@ _NEVER = -1e6  # a logarithm of odds that adds nothing beside any other
 class PairSettings:
     """How place, class, size and looks speak for a pair; likelihoods as natural logarithms."""
 
-    gate: float = 11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
+    gate: float = (
+        11.8  # squared distance in sigmas, two axes: 3 in 1000 of one object's sightings lie beyond
+    )
     size_sigma: float = 0.4  # of the natural logarithm of the longer side
     least_size: float = -3.0  # a size that fits worse counts no less: boxes are cut, bodies turn
     looks_weight: float = 4.0  # for each unit that the cosine of the angle of two looks lacks
@@ -39,7 +41,11 @@ class Pairs:
 
 
 def place_likelihoods(
-    motions: Motions, places_m: PointsM, covariances_m2: Floats, offsets_m: PointsM, offsets_m2: Floats,
+    motions: Motions,
+    places_m: PointsM,
+    covariances_m2: Floats,
+    offsets_m: PointsM,
+    offsets_m2: Floats,
     settings: PairSettings,
 ) -> Floats:
     """(tracks, sightings) log density of each sighting's place if it is that track's; very low beyond the gate.
@@ -47,11 +53,15 @@ def place_likelihoods(
     `covariances_m2` (sightings, 2, 2) are the sightings' own; a track's sightings would lie `offsets_m` (tracks, 2)
     beside it, with variance `offsets_m2` (tracks,) per axis.
     """
-    gaps = places_m[None, None] - (motions.means[:, :, :2] + offsets_m[:, None])[:, :, None]  # (N, 2, M, 2)
+    gaps = (
+        places_m[None, None] - (motions.means[:, :, :2] + offsets_m[:, None])[:, :, None]
+    )  # (N, 2, M, 2)
     loose = offsets_m2[:, None, None, None, None] * np.eye(2)
     inverse = _inverse(motions.covariances[:, :, None, :2, :2] + covariances_m2[None, None] + loose)
     x, y = gaps[..., 0], gaps[..., 1]
-    squared = inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
+    squared = (
+        inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
+    )
     logs = -0.5 * (squared - np.log(_determinant(inverse))) - np.log(2 * np.pi)
     logs = np.where(squared <= settings.gate, logs + np.log(motions.weights)[:, :, None], _NEVER)
     return np.logaddexp(logs[:, 0], logs[:, 1])
@@ -59,7 +69,10 @@ def place_likelihoods(
 
 def size_likelihoods(track_sides_m: Floats, seen_sides_m: Floats, settings: PairSettings) -> Floats:
     """(tracks, sightings) how well longer sides fit, at best 0."""
-    ratio = np.log(np.maximum(seen_sides_m, 1e-3))[None] - np.log(np.maximum(track_sides_m, 1e-3))[:, None]
+    ratio = (
+        np.log(np.maximum(seen_sides_m, 1e-3))[None]
+        - np.log(np.maximum(track_sides_m, 1e-3))[:, None]
+    )
     return np.maximum(-0.5 * (ratio / settings.size_sigma) ** 2, settings.least_size)
 
 
@@ -96,8 +109,17 @@ def assigned(gains: Floats) -> Pairs:
 
 
 def voted_shift(
-    motions: Motions, places_m: PointsM, covariances_m2: Floats, shares: Floats, loose_m2: Floats, slow_m2: float,
-    fits: Floats, gains: Floats, new_log_density: float, settings: PairSettings, reluctance: float = 0.0,
+    motions: Motions,
+    places_m: PointsM,
+    covariances_m2: Floats,
+    shares: Floats,
+    loose_m2: Floats,
+    slow_m2: float,
+    fits: Floats,
+    gains: Floats,
+    new_log_density: float,
+    settings: PairSettings,
+    reluctance: float = 0.0,
 ) -> PointsM:
     """(2,) the error of the frame's shift under which the pattern of its sightings fits the tracks best.
 
@@ -109,17 +131,27 @@ def voted_shift(
     rows, columns = np.nonzero((gains > 0) & (shares > 0.3)[:, None])
     if not len(rows):
         return np.zeros(2)
-    best = np.argsort(-gains[rows, columns], kind="stable")[:settings.most_votes]
-    tracks_m, track_m2 = motions.places_m, motions.place_covariances_m2 + loose_m2[:, None, None] * np.eye(2)
+    best = np.argsort(-gains[rows, columns], kind="stable")[: settings.most_votes]
+    tracks_m, track_m2 = (
+        motions.places_m,
+        motions.place_covariances_m2 + loose_m2[:, None, None] * np.eye(2),
+    )
     asked = (places_m[columns[best]] - tracks_m[rows[best]]) / shares[rows[best], None]
     errors = np.concatenate([np.zeros((1, 2)), asked])
     near, seen = (np.unique(each) for each in np.nonzero(gains > 0))
     gaps = places_m[None, seen] - tracks_m[near][:, None]  # (N, M, 2)
     inverse = _inverse(track_m2[near][:, None] + covariances_m2[seen][None])
-    base = 0.5 * np.log(_determinant(inverse)) - np.log(2 * np.pi) + fits[np.ix_(near, seen)] - new_log_density
+    base = (
+        0.5 * np.log(_determinant(inverse))
+        - np.log(2 * np.pi)
+        + fits[np.ix_(near, seen)]
+        - new_log_density
+    )
     steps = errors[:, None, :] * shares[near][None, :, None]  # (S, N, 2)
     x, y = np.moveaxis(gaps[None] - steps[:, :, None], -1, 0)  # (S, N, M) each
-    squared = inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
+    squared = (
+        inverse[..., 0, 0] * x * x + 2 * inverse[..., 0, 1] * x * y + inverse[..., 1, 1] * y * y
+    )
     worth = np.maximum(base - 0.5 * squared, 0.0).max(axis=1).sum(axis=1)
     worth -= 0.5 * (errors**2).sum(axis=1) / max(slow_m2, 1e-9)
     worth[1:] -= reluctance

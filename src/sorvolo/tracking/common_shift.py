@@ -22,7 +22,9 @@ class ShiftSettings:
     """How frames' shifts wander and jump."""
 
     forgets_s: float = 60.0  # how long a GPS error lasts
-    first_jitter: float = 0.4  # of the shared sigma: what changes from frame to frame, until the frames show it ...
+    first_jitter: float = (
+        0.4  # of the shared sigma: what changes from frame to frame, until the frames show it ...
+    )
     least_jitter: float = 0.03  # ... and is never less
     learns: float = 0.05  # weight of a frame in what changes from frame to frame
     most_rows: int = 300  # places kept with what they share; those not seen for longest keep their own sigma only
@@ -133,21 +135,38 @@ class CommonShift:
         own_trust = np.diag(trusts)
         misses_m = solved / own_trust[:, None]  # what is seen less what all others predict
         return FittedShift(
-            misses_m, np.maximum(1 / own_trust - variances_m2, 0.0), rows, crosses @ trusts, crosses, gaps_m, solved,
-            trusts, self.jitter_m2 * solved.sum(axis=0),
+            misses_m,
+            np.maximum(1 / own_trust - variances_m2, 0.0),
+            rows,
+            crosses @ trusts,
+            crosses,
+            gaps_m,
+            solved,
+            trusts,
+            self.jitter_m2 * solved.sum(axis=0),
         )
 
     def offsets(self, fitted: FittedShift, ids: Sequence[int]) -> tuple[PointsM, Floats]:
         """How far beside place and shift a frame's sightings of tracks lie by the fit, (N, 2), with variance (N,)."""
         _, before = self.predict(ids)
-        lines = np.array([
-            fitted.crosses[self._rows[number]] if number in self._rows else np.zeros(fitted.crosses.shape[1])
-            for number in ids
-        ]).reshape(len(ids), -1) + fitted.crosses[0] + self.jitter_m2
+        lines = (
+            np.array(
+                [
+                    fitted.crosses[self._rows[number]]
+                    if number in self._rows
+                    else np.zeros(fitted.crosses.shape[1])
+                    for number in ids
+                ]
+            ).reshape(len(ids), -1)
+            + fitted.crosses[0]
+            + self.jitter_m2
+        )
         gained = np.einsum("nm,mk,nk->n", lines, fitted.trusts, lines)
         return lines @ fitted.solved, np.maximum(before + self.jitter_m2 - gained, 0.0)
 
-    def settle(self, fitted: FittedShift, ids: Sequence[int], movers: Sequence[int]) -> dict[int, Floats]:
+    def settle(
+        self, fitted: FittedShift, ids: Sequence[int], movers: Sequence[int]
+    ) -> dict[int, Floats]:
         """Take a fit over; how far places of tracks move by it, (2,) each, of those fitted by what the others show.
 
         Places of `movers` hold no map: they are new in every frame.
@@ -171,7 +190,8 @@ class CommonShift:
             self._seen[number] = self._frame
         self._freeze()
         return {
-            number: moved[row] for number, row in self._rows.items()
+            number: moved[row]
+            for number, row in self._rows.items()
             if row < len(moved) and abs(moved[row, 0]) + abs(moved[row, 1]) > 1e-4
         }
 
@@ -184,7 +204,9 @@ class CommonShift:
         self._lessons += 1
         rate = max(self._settings.learns, 1 / (self._lessons + 3))
         least_m2, most_m2 = self._settings.least_jitter**2 * self._shared_m2, self._shared_m2
-        self.jitter_m2 = float(np.clip((1 - rate) * self.jitter_m2 + rate * seen_m2, least_m2, most_m2))
+        self.jitter_m2 = float(
+            np.clip((1 - rate) * self.jitter_m2 + rate * seen_m2, least_m2, most_m2)
+        )
 
     def _known(self, ids: Sequence[int]) -> tuple[Floats, Floats]:
         """(N,) covariances with the shift and variances of places."""
@@ -204,7 +226,9 @@ class CommonShift:
     def _freeze(self) -> None:
         if len(self._rows) <= self._settings.most_rows + 50:
             return
-        oldest = sorted(self._seen, key=self._seen.__getitem__)[:len(self._rows) - self._settings.most_rows]
+        oldest = sorted(self._seen, key=self._seen.__getitem__)[
+            : len(self._rows) - self._settings.most_rows
+        ]
         kept = {number: self.variance_m2(number) for number in oldest}
         self.drop(oldest)
         self._frozen.update(kept)

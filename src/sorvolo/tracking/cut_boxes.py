@@ -23,7 +23,10 @@ class CutSettings:
 
 
 def cut_edges(
-    boxes_px: BoxesPx | Floats, width_px: int, height_px: int, least_px: float = CUT_PX,
+    boxes_px: BoxesPx | Floats,
+    width_px: int,
+    height_px: int,
+    least_px: float = CUT_PX,
     settings: CutSettings = CutSettings(),
 ) -> Mask:
     """(N, 4) bool: whether the left, top, right and bottom edges of boxes (N, 4) lie at the picture's, to `least_px`.
@@ -32,13 +35,20 @@ def cut_edges(
     """
     boxes = np.asarray(boxes_px, np.float64).reshape(-1, 4)
     margin_px = np.maximum(least_px, settings.cut_share * (boxes[:, 2:] - boxes[:, :2]))
-    to_edge_px = np.concatenate([boxes[:, :2], boxes[:, 2:] - np.array([width_px, height_px])], axis=1)
+    to_edge_px = np.concatenate(
+        [boxes[:, :2], boxes[:, 2:] - np.array([width_px, height_px])], axis=1
+    )
     cut: Mask = np.abs(to_edge_px) <= np.tile(margin_px, 2)
     return cut
 
 
 def beyond_edges(
-    names: Sequence[str], cut: Mask, axes: Floats, sides_m: Floats, *, has_metres: bool = True,
+    names: Sequence[str],
+    cut: Mask,
+    axes: Floats,
+    sides_m: Floats,
+    *,
+    has_metres: bool = True,
     settings: CutSettings = CutSettings(),
 ) -> tuple[Floats, Floats]:
     """How far beside its box an object's middle may lie that the picture's edge cuts: (N, 2) m, with (N, 2, 2) m2.
@@ -49,9 +59,13 @@ def beyond_edges(
     """
     outward_m, spread_m2 = np.zeros((len(names), 2)), np.zeros((len(names), 2, 2))
     for row, axis in np.argwhere(cut[:, :2] | cut[:, 2:]):
-        beyond_m = _unseen_m(names[row], float(sides_m[row, axis]), settings.as_much_again, has_metres=has_metres)
+        beyond_m = _unseen_m(
+            names[row], float(sides_m[row, axis]), settings.as_much_again, has_metres=has_metres
+        )
         out = axes[row, axis]
-        outward_m[row] += settings.beyond * (float(cut[row, 2 + axis]) - float(cut[row, axis])) * beyond_m * out
+        outward_m[row] += (
+            settings.beyond * (float(cut[row, 2 + axis]) - float(cut[row, axis])) * beyond_m * out
+        )
         spread_m2[row] += (settings.beyond_sigma * beyond_m) ** 2 * np.outer(out, out)
     return outward_m, spread_m2
 

@@ -20,19 +20,28 @@ pairs in validation pictures 4 were two."""
 class JoiningSettings:
     """When two boxes of a frame, or two tracks, are one object."""
 
-    same_box: float = 0.6  # overlap of two boxes from which they show one object, whatever their classes
+    same_box: float = (
+        0.6  # overlap of two boxes from which they show one object, whatever their classes
+    )
     least_nested: float = 0.5  # overlap of boxes of two classes, one within the other, from which they show one object
     within: float = WITHIN
     frames_apart: int = 5  # of two neighbours of which each frame sees one
-    overlap: float = 0.5  # nearer than this share of their longer sides two bodies have no room: ...
+    overlap: float = (
+        0.5  # nearer than this share of their longer sides two bodies have no room: ...
+    )
     frames_overlapping: int = 2  # ... fewer frames do
-    together_share: float = 0.15  # of frames with one of them: what is seen together more often is two objects
+    together_share: float = (
+        0.15  # of frames with one of them: what is seen together more often is two objects
+    )
     least_class_fit: float = 0.1  # 0 to 1, how alike the classes of two tracks are
     least_views: int = 4  # of a mover whose velocity is to be trusted
 
 
 def frame_doubles(
-    boxes_px: BoxesPx | Floats, labels: Sequence[str], scores: Floats, settings: JoiningSettings = JoiningSettings()
+    boxes_px: BoxesPx | Floats,
+    labels: Sequence[str],
+    scores: Floats,
+    settings: JoiningSettings = JoiningSettings(),
 ) -> dict[int, int]:
     """Rows whose box shows what a stronger row shows: weaker row to stronger row; (N, 4), N and N of one frame.
 
@@ -88,7 +97,10 @@ def neighbours(
 
 
 def double_of(
-    followed: Followed, by_id: Mapping[int, Followed], reach_m: float, settings: JoiningSettings = JoiningSettings()
+    followed: Followed,
+    by_id: Mapping[int, Followed],
+    reach_m: float,
+    settings: JoiningSettings = JoiningSettings(),
 ) -> Followed | None:
     """The track of the same object that ran beside this one: frames see one of both, never both.
 
@@ -109,7 +121,10 @@ def double_of(
 
 
 def earlier_mover(
-    followed: Followed, others: Sequence[Followed], new_per_m2: float, settings: JoiningSettings = JoiningSettings()
+    followed: Followed,
+    others: Sequence[Followed],
+    new_per_m2: float,
+    settings: JoiningSettings = JoiningSettings(),
 ) -> Followed | None:
     """The moving track, out of sight since before this one began, whose prediction this one continues best.
 
@@ -128,7 +143,9 @@ def earlier_mover(
             continue
         ahead = predicted(other.motion, np.array([(followed.motion_ns - other.motion_ns) / 1e9]))
         gap = state - ahead.means[0, MOVES]
-        fit = log_density(gap, spread + ahead.covariances[0, MOVES]) + np.log(max(_class_fit(followed, other), 1e-3))
+        fit = log_density(gap, spread + ahead.covariances[0, MOVES]) + np.log(
+            max(_class_fit(followed, other), 1e-3)
+        )
         gain = float(fit + np.log(ahead.weights[0, MOVES]) - new)
         if gain > most:
             best, most = other, gain

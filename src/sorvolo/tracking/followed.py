@@ -41,7 +41,9 @@ class Followed:
     path_m: list[PointsM] = field(default_factory=list)
     path_ns: list[int] = field(default_factory=list)
     together: dict[int, int] = field(default_factory=dict)  # neighbours by id: frames that saw both
-    apart: dict[int, int] = field(default_factory=dict)  # neighbours by id: frames that could see both and saw one
+    apart: dict[int, int] = field(
+        default_factory=dict
+    )  # neighbours by id: frames that could see both and saw one
     moves: bool = field(init=False)
     place_m: PointsM = field(init=False)
     rough: tuple[float, ...] = field(init=False)
@@ -82,7 +84,9 @@ class Followed:
         sides = np.log(np.maximum(sighting.size_m, 1e-3))
         self.log_sides = self.log_sides + (sides - self.log_sides) / self.views
         if looks is not None:
-            self.looks = looks if self.looks is None else self.looks + (looks - self.looks) / self.views
+            self.looks = (
+                looks if self.looks is None else self.looks + (looks - self.looks) / self.views
+            )
         clearness = _clearness(sighting)
         if clearness > self._clearest:
             self.best, self._clearest = sighting, clearness
@@ -110,7 +114,10 @@ class Followed:
         self._reported = None
         if other._clearest > self._clearest:
             self.best, self._clearest = other.best, other._clearest
-        self.first_ns, self.last_ns = min(self.first_ns, other.first_ns), max(self.last_ns, other.last_ns)
+        self.first_ns, self.last_ns = (
+            min(self.first_ns, other.first_ns),
+            max(self.last_ns, other.last_ns),
+        )
         order = np.argsort([*self.path_ns, *other.path_ns], kind="stable")
         places = [*self.path_m, *other.path_m]
         times = [*self.path_ns, *other.path_ns]
@@ -121,24 +128,42 @@ class Followed:
         motion = self.motion
         means = motion.means.copy()
         means[:, :, :2] += step_m
-        self.go_on(Motions(means, motion.covariances, motion.weights, motion.habits), self.motion_ns)
+        self.go_on(
+            Motions(means, motion.covariances, motion.weights, motion.habits), self.motion_ns
+        )
         self.path_m = [place + step_m for place in self.path_m] if self.moves else self.path_m
 
     def track(self, shared_m2: float) -> Track:
         """As it is known now; its place in the map has an error of `shared_m2` per axis beside its own."""
         place_m = self.place_m
         reported = self._reported
-        if reported is not None and reported.confirmed == self.confirmed and _is_near(
-            reported.position_m, place_m, shared_m2
+        if (
+            reported is not None
+            and reported.confirmed == self.confirmed
+            and _is_near(reported.position_m, place_m, shared_m2)
         ):
             return reported
         total = sum(self.scores.values())
-        path_m, path_ns = (np.array(self.path_m), self.path_ns) if self.moves else (place_m[None], [self.last_ns])
+        path_m, path_ns = (
+            (np.array(self.path_m), self.path_ns) if self.moves else (place_m[None], [self.last_ns])
+        )
         self._reported = Track(
-            self.id, self.label, self.score_sum / self.views, self.confirmed, self.moves, self.first_ns, self.last_ns,
-            self.views, self.passes, place_m, self.motion.place_covariances_m2[0] + shared_m2 * np.eye(2),
-            self.motion.means[0, MOVES, 2:] if self.moves else np.zeros(2), self.sides_m, self.best,
-            path_m.reshape(-1, 2), np.array(path_ns),
+            self.id,
+            self.label,
+            self.score_sum / self.views,
+            self.confirmed,
+            self.moves,
+            self.first_ns,
+            self.last_ns,
+            self.views,
+            self.passes,
+            place_m,
+            self.motion.place_covariances_m2[0] + shared_m2 * np.eye(2),
+            self.motion.means[0, MOVES, 2:] if self.moves else np.zeros(2),
+            self.sides_m,
+            self.best,
+            path_m.reshape(-1, 2),
+            np.array(path_ns),
             {label: score / total for label, score in sorted(self.scores.items())},
         )
         return self._reported

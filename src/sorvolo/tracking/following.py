@@ -19,7 +19,9 @@ from sorvolo.tracking.scene_scale import SceneScale
 from sorvolo.tracking.tracker import IN_PICTURES, Tracker, TrackerSettings, TrackUpdate
 
 _MOST_DRONE_PLACES = 200_000  # frames: an hour and fifty minutes at 30 a second; by choice
-_GIMBAL_TILT_SIGMA_DEG = 1.0  # a mapping doubts gimbals more, since its pictures measure tilt; here nothing else does
+_GIMBAL_TILT_SIGMA_DEG = (
+    1.0  # a mapping doubts gimbals more, since its pictures measure tilt; here nothing else does
+)
 _LEAST_DOWN = 0.1  # of the optical axis: nearer to the horizon a sampling distance means nothing
 _TURNS_DEG_S = 20.0  # a drone that turns faster has its heading not checked; by choice
 _CLOCK_OFF_NS = 1_000_000_000  # by which telemetry's clock may be off: so long after a turn headings are not checked
@@ -81,7 +83,12 @@ class GroundFollower:
     """
 
     def __init__(
-        self, camera: CameraModel, settings: TrackerSettings, ground: GroundHeight | None, *, knows_heading: bool,
+        self,
+        camera: CameraModel,
+        settings: TrackerSettings,
+        ground: GroundHeight | None,
+        *,
+        knows_heading: bool,
         is_video: bool,
     ) -> None:
         self._camera, self._ground = camera, ground
@@ -119,20 +126,36 @@ class GroundFollower:
         """Place a frame's detections, seen from `prior`, on the ground and give them to their tracks."""
         prior = self._with_heading(frame, time_ns, found, prior)
         sightings, unlocated = locate(
-            found, frame.index, frame.name, time_ns, self._camera.camera, prior, focal_sigma=self._camera.focal_sigma,
-            ground_height_m=self._ground or 0.0, settings=LocateSettings() if self._ground is None else _OVER_MODEL,
+            found,
+            frame.index,
+            frame.name,
+            time_ns,
+            self._camera.camera,
+            prior,
+            focal_sigma=self._camera.focal_sigma,
+            ground_height_m=self._ground or 0.0,
+            settings=LocateSettings() if self._ground is None else _OVER_MODEL,
         )
-        outline_m = footprint(self._camera.camera, Pose(prior.rotation, prior.position_m), self._below_m(prior))
-        return self.recall(Located(
-            time_ns, tuple(sightings), tuple(unlocated.items()), outline_m if np.isfinite(outline_m).all() else None,
-            prior.position_m[:2] if prior.knows_place else None, 0,
-        ))
+        outline_m = footprint(
+            self._camera.camera, Pose(prior.rotation, prior.position_m), self._below_m(prior)
+        )
+        return self.recall(
+            Located(
+                time_ns,
+                tuple(sightings),
+                tuple(unlocated.items()),
+                outline_m if np.isfinite(outline_m).all() else None,
+                prior.position_m[:2] if prior.knows_place else None,
+                0,
+            )
+        )
 
     def recall(self, located: Located) -> Taken:
         """Give detections that were placed already to their tracks."""
         self.unlocated.update(dict(located.unlocated))
         update = self._tracker.update(
-            [each for each in located.sightings if each is not None], time_ns=located.time_ns,
+            [each for each in located.sightings if each is not None],
+            time_ns=located.time_ns,
             footprint_m=located.outline_m,
         )
         if located.camera_m is not None:
@@ -154,13 +177,17 @@ class GroundFollower:
         """(N, 2) where the camera was, in site metres."""
         return np.array(self._path).reshape(-1, 2)
 
-    def _with_heading(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
+    def _with_heading(
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
+    ) -> CameraPrior:
         """The prior with its heading from the pictures, or with its compass corrected by what stands."""
         if self._heading is not None:
             return self._heading.take(frame, time_ns, found, prior)
         if self._check is not None:
             prior = self._check.take(frame, time_ns, found, prior)
-        site_from_read = rotation_from_vector(np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)]))
+        site_from_read = rotation_from_vector(
+            np.array([0.0, 0.0, np.radians(self._compass.clockwise_deg)])
+        )
         return replace(prior, rotation=site_from_read @ prior.rotation)
 
     def _below_m(self, prior: CameraPrior) -> float:
@@ -179,7 +206,9 @@ class _HeadingFromPictures:
         self._motion, self._heading = ImageMotion(), HeadingFromMotion()
         self._segments, self._guessed, self._over_guesses = 1, 0, over_guesses
 
-    def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
+    def take(
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
+    ) -> CameraPrior:
         """The prior with the heading in it, where that is known by now."""
         heading = self.heading(frame, time_ns, found, prior)
         if not np.isfinite(heading.sigma_deg):
@@ -215,7 +244,9 @@ class _HeadingCheck:
         self._steady_ns = 0  # the drone turns until then
         self.turns_deg: list[float] = []
 
-    def take(self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior) -> CameraPrior:
+    def take(
+        self, frame: Frame, time_ns: int, found: Detections, prior: CameraPrior
+    ) -> CameraPrior:
         """The prior, turned where its heading is wrong."""
         shown = self._pictures.heading(frame, time_ns, found, prior)
         if not is_checked(prior):
@@ -233,7 +264,11 @@ class _HeadingCheck:
         before, self._last = self._last, (time_ns, shown.heading_deg, turn.turn_deg)
         jump_deg = 0.0
         if before is not None and time_ns > before[0]:
-            turns_deg_s = abs(HeadingTurn(shown.heading_deg - before[1], 0.0).turn_deg) * 1e9 / (time_ns - before[0])
+            turns_deg_s = (
+                abs(HeadingTurn(shown.heading_deg - before[1], 0.0).turn_deg)
+                * 1e9
+                / (time_ns - before[0])
+            )
             jump_deg = abs(HeadingTurn(turn.turn_deg - before[2], 0.0).turn_deg)
             if turns_deg_s > _TURNS_DEG_S:
                 self._steady_ns = time_ns + _CLOCK_OFF_NS
@@ -267,7 +302,9 @@ class PictureFollower:
         is_impossible = self._judged(found, frame.image.shape[:2])
         sightings, outline = self._motion.locate(found, frame, time_ns)
         kept = tuple(None if out else each for each, out in zip(sightings, is_impossible))
-        return self._follow(Located(time_ns, kept, (), outline, None, self._recalled + self._motion.segments))
+        return self._follow(
+            Located(time_ns, kept, (), outline, None, self._recalled + self._motion.segments)
+        )
 
     def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
         """Give detections that an earlier process located to their tracks; `size_px` is the frame's height and width.
@@ -289,7 +326,8 @@ class PictureFollower:
         late = self._finished() if located.segment != self.segment else frozenset()
         self.segment = located.segment
         update = self._tracker.update(
-            [each for each in located.sightings if each is not None], time_ns=located.time_ns,
+            [each for each in located.sightings if each is not None],
+            time_ns=located.time_ns,
             footprint_m=located.outline_m,
         )
         taken = _taken(located, update)
@@ -319,4 +357,6 @@ class PictureFollower:
 def _taken(located: Located, update: TrackUpdate) -> Taken:
     ids = iter(update.track_ids)
     of_detections = [0 if each is None else next(ids) for each in located.sightings]
-    return Taken(located.sightings, of_detections, frozenset(update.new), frozenset(update.merged), located)
+    return Taken(
+        located.sightings, of_detections, frozenset(update.new), frozenset(update.merged), located
+    )

@@ -74,7 +74,11 @@ class HeadingFromMotion:
         fixes = np.array([point[2] for point in self._points])
         seen, fixes = seen - seen.mean(), fixes - fixes.mean()
         spread_px = float(np.sqrt(np.mean(np.abs(seen) ** 2)))
-        if len(seen) < 5 or float(np.sqrt(np.mean(np.abs(fixes) ** 2))) < self._settings.least_m or spread_px <= 0:
+        if (
+            len(seen) < 5
+            or float(np.sqrt(np.mean(np.abs(fixes) ** 2))) < self._settings.least_m
+            or spread_px <= 0
+        ):
             return Heading(0.0, float("inf"))
         turn = np.vdot(seen, fixes) / np.vdot(seen, seen).real
         reach_m = abs(turn) * spread_px
@@ -115,10 +119,16 @@ class CompassError:
         self._points.popleft()
         way_m2, rules = float(way_m @ way_m), self._settings
         # against the fixes' own wander a short way shows little
-        seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (way_m2 + rules.least_way_m**2)
+        seen_rad = float(way_m[0] * slip_m[1] - way_m[1] * slip_m[0]) / (
+            way_m2 + rules.least_way_m**2
+        )
         frame_s = time_s - self._points[-2][0] if len(self._points) > 1 else 0.0
-        gain = rules.gain_per_s * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / rules.learns_s))
+        gain = (
+            rules.gain_per_s * min(frame_s, 1.0) * float(np.exp(-self._learnt_s / rules.learns_s))
+        )
         self._learnt_s += frame_s * way_m2 / (way_m2 + rules.least_way_m**2)
         change_deg = gain * float(np.degrees(seen_rad))
-        self.clockwise_deg = float(np.clip(self.clockwise_deg + change_deg, -rules.most_deg, rules.most_deg))
+        self.clockwise_deg = float(
+            np.clip(self.clockwise_deg + change_deg, -rules.most_deg, rules.most_deg)
+        )
         return self.clockwise_deg

@@ -25,7 +25,11 @@ class HeadingTurn:
 
 def is_checked(prior: CameraPrior) -> bool:
     """Whether a camera's place and heading are known at all, and it looks about straight down."""
-    is_known = prior.knows_place and bool(np.isfinite(prior.attitude_sigma_deg[2])) and prior.position_m[2] > 0
+    is_known = (
+        prior.knows_place
+        and bool(np.isfinite(prior.attitude_sigma_deg[2]))
+        and prior.position_m[2] > 0
+    )
     return is_known and -float(prior.rotation[2, 2]) >= _LEAST_DOWN
 
 
@@ -42,6 +46,8 @@ def heading_deg(prior: CameraPrior) -> float:
 
 def turned(prior: CameraPrior, turn: HeadingTurn) -> CameraPrior:
     """The prior turned about the vertical, its heading as well known as the turn."""
-    rotation = rotation_from_vector(np.array([0.0, 0.0, -np.radians(turn.turn_deg)])) @ prior.rotation
+    rotation = (
+        rotation_from_vector(np.array([0.0, 0.0, -np.radians(turn.turn_deg)])) @ prior.rotation
+    )
     sigma_deg = np.array([*prior.attitude_sigma_deg[:2], turn.sigma_deg])
     return replace(prior, rotation=rotation, attitude_sigma_deg=sigma_deg)

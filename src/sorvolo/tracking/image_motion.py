@@ -36,7 +36,9 @@ class ImageMotionSettings:
     thumbnail_px: tuple[int, int] = (32, 18)  # columns, rows of those thumbnails
     box_sigma: float = 0.08  # of a box's middle, in shares of its side
     least_sigma_px: float = 1.0  # however small the box
-    drift_share: float = 0.004  # of the way gone over the ground, as one goes from points to new points
+    drift_share: float = (
+        0.004  # of the way gone over the ground, as one goes from points to new points
+    )
     guess_share: float = 0.3  # of a step that was guessed
     flow: FlowSettings = field(default_factory=FlowSettings)
 
@@ -69,27 +71,47 @@ class ImageMotion:
         self._way_px, self._guessed_px = 0.0, 0.0
         self._failures = 0
 
-    def locate(self, found: Detections, frame: Frame, time_ns: int) -> tuple[list[Sighting], PointsPx]:
+    def locate(
+        self, found: Detections, frame: Frame, time_ns: int
+    ) -> tuple[list[Sighting], PointsPx]:
         """Each detection's place in pixels of its segment's first picture, and (4, 2) what the picture shows of them.
 
         A sighting's `shared_sigma_m` is how far the way may have drifted since its segment began, in pixels.
         """
         height_px, width_px = frame.image.shape[:2]
         self._follow(frame.image, found.boxes_px.astype(np.float64))
-        outline = _moved(self._first_from_image, np.array([
-            [-0.5, -0.5], [width_px - 0.5, -0.5], [width_px - 0.5, height_px - 0.5], [-0.5, height_px - 0.5],
-        ]))
+        outline = _moved(
+            self._first_from_image,
+            np.array(
+                [
+                    [-0.5, -0.5],
+                    [width_px - 0.5, -0.5],
+                    [width_px - 0.5, height_px - 0.5],
+                    [-0.5, height_px - 0.5],
+                ]
+            ),
+        )
         scale = float(np.sqrt(abs(np.linalg.det(self._first_from_image[:, :2]))))
         drift_px = self._settings.drift_share * self._way_px + self._guessed_px
         boxes = found.boxes_px.astype(np.float64)
         places = _moved(self._first_from_image, (boxes[:, :2] + boxes[:, 2:]) / 2 - 0.5)
         sides = (boxes[:, 2:] - boxes[:, :2]) * scale
         turn = self._first_from_image[:, :2] / max(scale, 1e-9)
-        own = np.maximum(self._settings.box_sigma * sides, self._settings.least_sigma_px * scale) ** 2
+        own = (
+            np.maximum(self._settings.box_sigma * sides, self._settings.least_sigma_px * scale) ** 2
+        )
         return [
             Sighting(
-                frame.index, frame.name, time_ns, label, float(found.scores[row]), found.boxes_px[row], places[row],
-                turn @ np.diag(own[row]) @ turn.T + drift_px**2 * np.eye(2), np.sort(sides[row])[::-1], drift_px,
+                frame.index,
+                frame.name,
+                time_ns,
+                label,
+                float(found.scores[row]),
+                found.boxes_px[row],
+                places[row],
+                turn @ np.diag(own[row]) @ turn.T + drift_px**2 * np.eye(2),
+                np.sort(sides[row])[::-1],
+                drift_px,
             )
             for row, label in enumerate(found.names)
         ], outline
@@ -99,7 +121,9 @@ class ImageMotion:
         flow = self._settings.flow
         shrink = min(1.0, flow.width_px / image.shape[1])
         gray = _small_gray(image, shrink)
-        thumbnail = cv2.resize(gray, self._settings.thumbnail_px, interpolation=cv2.INTER_AREA).astype(np.float64)
+        thumbnail = cv2.resize(
+            gray, self._settings.thumbnail_px, interpolation=cv2.INTER_AREA
+        ).astype(np.float64)
         if self._last is None or self._last.gray.shape != gray.shape:
             if self._last is not None:
                 self._begin_segment()
@@ -146,20 +170,28 @@ class ImageMotion:
         self._first_from_image = np.eye(2, 3)
 
     def _look_anew(
-        self, gray: ImageGray, thumbnail: Floats, boxes_px: Floats, shrink: float, here: PointsPx, places: PointsPx
+        self,
+        gray: ImageGray,
+        thumbnail: Floats,
+        boxes_px: Floats,
+        shrink: float,
+        here: PointsPx,
+        places: PointsPx,
     ) -> None:
         """Keep a picture's points, new ones where there are few, none on objects."""
         flow = self._settings.flow
         if len(here) < flow.least_points:
             free = np.full(gray.shape, 255, np.uint8)
             for left, top, right, bottom in np.clip(boxes_px * shrink, 0, None).astype(int):
-                free[max(top - 2, 0):bottom + 3, max(left - 2, 0):right + 3] = 0
+                free[max(top - 2, 0) : bottom + 3, max(left - 2, 0) : right + 3] = 0
             for x, y in here.astype(int):
                 cv2.circle(free, (int(x), int(y)), 8, 0, -1)
             corners = cv2.goodFeaturesToTrack(gray, flow.points - len(here), 0.01, 8, mask=free)
             if corners is not None:
                 fresh = np.asarray(corners.reshape(-1, 2), np.float64)
-                first_from_small = _composed(self._first_from_image, _inverse(_small_from_full(shrink)))
+                first_from_small = _composed(
+                    self._first_from_image, _inverse(_small_from_full(shrink))
+                )
                 here = np.concatenate([here, fresh])
                 places = np.concatenate([places, _moved(first_from_small, fresh)])
         self._last = _View(gray, thumbnail, here, places)
@@ -187,7 +219,11 @@ def _followed(
 
 
 def followed_points(
-    last: ImageGray, gray: ImageGray, points_px: PointsPx, settings: FlowSettings, step_px: Floats | None = None
+    last: ImageGray,
+    gray: ImageGray,
+    points_px: PointsPx,
+    settings: FlowSettings,
+    step_px: Floats | None = None,
 ) -> tuple[PointsPx, Mask]:
     """Where points (N, 2) of one small picture lie in another, and which (N,) lead back to where they came from.
 
@@ -197,11 +233,23 @@ def followed_points(
     step = np.zeros(2, np.float32) if step_px is None else step_px.astype(np.float32)
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     end, there, _ = cv2.calcOpticalFlowPyrLK(
-        last, gray, start, start + step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
+        last,
+        gray,
+        start,
+        start + step,
+        winSize=settings.window_px,
+        maxLevel=settings.levels,
+        criteria=_UNTIL,
         flags=flags,
     )
     back, again, _ = cv2.calcOpticalFlowPyrLK(
-        gray, last, end, end - step, winSize=settings.window_px, maxLevel=settings.levels, criteria=_UNTIL,
+        gray,
+        last,
+        end,
+        end - step,
+        winSize=settings.window_px,
+        maxLevel=settings.levels,
+        criteria=_UNTIL,
         flags=flags,
     )
     miss = np.linalg.norm((back - start).reshape(-1, 2), axis=1)
@@ -216,7 +264,9 @@ def _whole_step(last: ImageGray, gray: ImageGray) -> Floats:
     return np.array([x, y])
 
 
-def _similarity(here: PointsPx, places: PointsPx, settings: FlowSettings) -> tuple[Floats | None, Floats]:
+def _similarity(
+    here: PointsPx, places: PointsPx, settings: FlowSettings
+) -> tuple[Floats | None, Floats]:
     """(2, 3) first picture from small picture by most points, and which (N,) they are; None where too few agree."""
     nothing = np.zeros(len(here), bool)
     if len(here) < settings.least_inliers:
@@ -225,8 +275,13 @@ def _similarity(here: PointsPx, places: PointsPx, settings: FlowSettings) -> tup
     spread = np.ptp(places, axis=0).max() / max(np.ptp(here, axis=0).max(), 1e-9)
     cv2.setRNGSeed(1)
     fit, kept = cv2.estimateAffinePartial2D(
-        here, places - origin, method=cv2.RANSAC, ransacReprojThreshold=settings.fit_px * max(spread, 1e-3),
-        maxIters=500, confidence=0.999, refineIters=10,
+        here,
+        places - origin,
+        method=cv2.RANSAC,
+        ransacReprojThreshold=settings.fit_px * max(spread, 1e-3),
+        maxIters=500,
+        confidence=0.999,
+        refineIters=10,
     )
     if fit is None:
         return None, nothing

@@ -53,7 +53,11 @@ class LaidSighting:
 
 
 def lay_on_ground(
-    seen: Detections, frame: PlacedFrame, *, has_metres: bool = True, settings: LayingSettings = LayingSettings()
+    seen: Detections,
+    frame: PlacedFrame,
+    *,
+    has_metres: bool = True,
+    settings: LayingSettings = LayingSettings(),
 ) -> list[LaidSighting | None]:
     """Where each detection of a frame stands on level ground, None where that is at the horizon or unknown.
 
@@ -66,10 +70,14 @@ def lay_on_ground(
     if pose is None or not len(seen):
         return [None] * len(seen)
     cut = cut_edges(
-        np.asarray(seen.boxes_px, np.float64), frame.camera.width_px, frame.camera.height_px, TOO_SHORT_CUT_PX
+        np.asarray(seen.boxes_px, np.float64),
+        frame.camera.width_px,
+        frame.camera.height_px,
+        TOO_SHORT_CUT_PX,
     )
     return [
-        _laid(seen, k, cut[k:k + 1], frame, pose, settings, has_metres=has_metres) for k in range(len(seen))
+        _laid(seen, k, cut[k : k + 1], frame, pose, settings, has_metres=has_metres)
+        for k in range(len(seen))
     ]
 
 
@@ -87,8 +95,12 @@ def shows(frame: PlacedFrame, places_m: PointsM, up_m: Floats, reach_m: Floats) 
     y = camera.fy_px * rays[:, 1] / np.where(in_front, rays[:, 2], 1.0) + camera.cy_px
     margin_px = reach_m * camera.fx_px / np.where(in_front, rays[:, 2], 1.0) + 2.0
     return np.asarray(
-        in_front & (x >= margin_px) & (y >= margin_px)
-        & (x <= camera.width_px - 1 - margin_px) & (y <= camera.height_px - 1 - margin_px), bool
+        in_front
+        & (x >= margin_px)
+        & (y >= margin_px)
+        & (x <= camera.width_px - 1 - margin_px)
+        & (y <= camera.height_px - 1 - margin_px),
+        bool,
     )
 
 
@@ -96,7 +108,9 @@ def pose_of(frame: PlacedFrame) -> Pose | None:
     """Where the frame's camera was; None for one that has no place, or none over level ground."""
     if frame.status is Status.REJECTED:
         return None
-    return frame.site_from_camera or pose_from_homography(frame.site_from_image, frame.camera.undistorted())
+    return frame.site_from_camera or pose_from_homography(
+        frame.site_from_image, frame.camera.undistorted()
+    )
 
 
 def usual_height_m(name: str) -> float:
@@ -105,11 +119,18 @@ def usual_height_m(name: str) -> float:
 
 
 def _laid(
-    seen: Detections, k: int, cut: Mask, frame: PlacedFrame, pose: Pose, settings: LayingSettings, *, has_metres: bool
+    seen: Detections,
+    k: int,
+    cut: Mask,
+    frame: PlacedFrame,
+    pose: Pose,
+    settings: LayingSettings,
+    *,
+    has_metres: bool,
 ) -> LaidSighting | None:
     """Detection `k` on the ground, None where it has no place; `cut` (1, 4) are the edges that cut it."""
     name = seen.names[k]
-    box_px = np.asarray(seen.boxes_px, np.float64)[k:k + 1]
+    box_px = np.asarray(seen.boxes_px, np.float64)[k : k + 1]
     height_m = usual_height_m(name) if has_metres else 0.0
     up_m = height_m / 2
     around_m = ground_from_pixels(frame.camera, pose, _cross(box_px), up_m)
@@ -125,27 +146,41 @@ def _laid(
         return None
     m_per_px = float(np.sqrt(np.prod(sides_m) / max(np.prod(box_px[0, 2:] - box_px[0, :2]), 1e-6)))
     axes = spans_m / np.maximum(sides_m, 1e-9)[:, None]
-    outward_m, beyond_m2 = (each[0] for each in beyond_edges(
-        (name,), cut, axes[None], sides_m[None], has_metres=has_metres
-    ))
+    outward_m, beyond_m2 = (
+        each[0]
+        for each in beyond_edges((name,), cut, axes[None], sides_m[None], has_metres=has_metres)
+    )
     beyond_m2 = beyond_m2 + settings.aside**2 * np.trace(beyond_m2) * np.eye(2)
     own_sigma_m = _own_sigma_m(sides_m, m_per_px, frame, settings)
     usual_sigma_m = settings.height_sigma * height_m * lean
     sighting = Sighting(
-        frame.index, frame.name, frame.time_ns, name, float(seen.scores[k]), seen.boxes_px[k],
-        place_m + outward_m, own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m) + beyond_m2,
+        frame.index,
+        frame.name,
+        frame.time_ns,
+        name,
+        float(seen.scores[k]),
+        seen.boxes_px[k],
+        place_m + outward_m,
+        own_sigma_m**2 * np.eye(2) + np.outer(usual_sigma_m, usual_sigma_m) + beyond_m2,
         np.sort(sides_m)[::-1],
     )
     own_sigma_m = float(np.hypot(own_sigma_m, np.sqrt(np.trace(beyond_m2) / 2)))
     return LaidSighting(sighting, up_m, lean, own_sigma_m, axes, sides_m, beyond_m2)
 
 
-def _own_sigma_m(sides_m: Floats, m_per_px: float, frame: PlacedFrame, settings: LayingSettings) -> float:
+def _own_sigma_m(
+    sides_m: Floats, m_per_px: float, frame: PlacedFrame, settings: LayingSettings
+) -> float:
     side_m = float(sides_m.mean())
     pose_m = frame.residual_px * m_per_px if np.isfinite(frame.residual_px) else 0.0
     if frame.status is Status.GPS_ONLY and np.isfinite(frame.sigma_m):
         pose_m = frame.sigma_m
-    parts = [settings.least_sigma_m, settings.least_sigma_px * m_per_px, settings.box_sigma * side_m, pose_m]
+    parts = [
+        settings.least_sigma_m,
+        settings.least_sigma_px * m_per_px,
+        settings.box_sigma * side_m,
+        pose_m,
+    ]
     return float(np.sqrt(np.sum(np.square(parts))))
 
 

@@ -23,8 +23,13 @@ class ObjectsOnMap:
 
 
 def objects_on_map(
-    laid: Sequence[LaidSighting], crops: Sequence[bytes], frames: Sequence[PlacedFrame], flight_id: str, *,
-    has_metres: bool, least: Mapping[str, float] | None = None,
+    laid: Sequence[LaidSighting],
+    crops: Sequence[bytes],
+    frames: Sequence[PlacedFrame],
+    flight_id: str,
+    *,
+    has_metres: bool,
+    least: Mapping[str, float] | None = None,
 ) -> ObjectsOnMap:
     """Each object once. `crops` are the pictures, JPEG, around each sighting; `least` is the score from which on each
     class is reported: weaker sightings are evidence only.
@@ -40,7 +45,10 @@ def objects_on_map(
         laid, crops = [laid[k] for k in kept], [crops[k] for k in kept]
     fused = fuse(laid, frames, least)
     flight_sigma_m = _gps_sigma_m(frames)
-    sigmas_m = {each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m for each in frames}
+    sigmas_m = {
+        each.index: each.sigma_m if math.isfinite(each.sigma_m) else flight_sigma_m
+        for each in frames
+    }
     objects = (
         _map_object(each, f"{flight_id}-o{number}", laid, crops, sigmas_m, has_metres=has_metres)
         for number, each in enumerate(fused.objects, start=1)
@@ -49,8 +57,13 @@ def objects_on_map(
 
 
 def _map_object(
-    each: Standing, object_id: str, laid: Sequence[LaidSighting], crops: Sequence[bytes],
-    sigmas_m: Mapping[int, float], *, has_metres: bool,
+    each: Standing,
+    object_id: str,
+    laid: Sequence[LaidSighting],
+    crops: Sequence[bytes],
+    sigmas_m: Mapping[int, float],
+    *,
+    has_metres: bool,
 ) -> MapObject:
     sightings = [laid[k].sighting for k in each.members]
     frames = {sighting.frame_index for sighting in sightings}
@@ -58,10 +71,22 @@ def _map_object(
     length_m, width_m = each.size_m if has_metres else (math.nan, math.nan)
     sigma_m = math.hypot(shared_m, each.sigma_m) if has_metres else math.nan
     return MapObject(
-        object_id, each.label, each.score, each.position_m, sigma_m, float(length_m), float(width_m), len(frames),
+        object_id,
+        each.label,
+        each.score,
+        each.position_m,
+        sigma_m,
+        float(length_m),
+        float(width_m),
+        len(frames),
         each.possible_views,
-        min(sighting.time_ns for sighting in sightings), max(sighting.time_ns for sighting in sightings),
-        each.moves, each.velocity_m_s, each.class_scores, laid[each.best].sighting.frame_name, crops[each.best],
+        min(sighting.time_ns for sighting in sightings),
+        max(sighting.time_ns for sighting in sightings),
+        each.moves,
+        each.velocity_m_s,
+        each.class_scores,
+        laid[each.best].sighting.frame_name,
+        crops[each.best],
     )
 
 

@@ -93,7 +93,10 @@ class ObjectMatch:
 
 
 def match_objects(
-    found: Sequence[JudgedObject], true: Sequence[JudgedObject], middle_ns: int, map_from_truth: Matrix3
+    found: Sequence[JudgedObject],
+    true: Sequence[JudgedObject],
+    middle_ns: int,
+    map_from_truth: Matrix3,
 ) -> ObjectMatch:
     """Pair found and true ones by their distances without the map's own shift, `map_from_truth` (3, 3).
 
@@ -102,17 +105,27 @@ def match_objects(
     if not found or not true:
         return ObjectMatch((), (), tuple(found))
     every = [(one, other) for one in found for other in true]
-    apart_m = np.hypot(*_offsets_m(every, middle_ns, map_from_truth).T).reshape(len(found), len(true))
+    apart_m = np.hypot(*_offsets_m(every, middle_ns, map_from_truth).T).reshape(
+        len(found), len(true)
+    )
     differs = np.array([one.label != other.label for one, other in every]).reshape(apart_m.shape)
     cost = np.where(apart_m <= _REACH_M, apart_m + _OTHER_CLASS_M * differs, _APART)
     rows, columns = least_cost(cost)
-    pairs = tuple((found[row], true[column]) for row, column in zip(rows, columns) if cost[row, column] < _APART)
+    pairs = tuple(
+        (found[row], true[column])
+        for row, column in zip(rows, columns)
+        if cost[row, column] < _APART
+    )
     return ObjectMatch(pairs, *_unpaired(found, pairs, (apart_m <= _REACH_M).any(axis=1)))
 
 
 def score_objects(
-    flight: str, found: Sequence[JudgedObject], true: Sequence[JudgedObject], middle_ns: int,
-    map_from_truth: Matrix3, map_shift_m: float,
+    flight: str,
+    found: Sequence[JudgedObject],
+    true: Sequence[JudgedObject],
+    middle_ns: int,
+    map_from_truth: Matrix3,
+    map_shift_m: float,
 ) -> FlightObjects:
     """The numbers of one flight; `map_from_truth` takes true places to where the map shows them."""
     match = match_objects(found, true, middle_ns, map_from_truth)
@@ -122,12 +135,25 @@ def score_objects(
     counted = [each for each in true if each.must_find]
     within, sigma_median_m = _within_two_sigma(pairs, offsets_m)
     return FlightObjects(
-        flight, {name: _counts(name, counted, match) for name in CLASSES}, _counts(None, counted, match),
+        flight,
+        {name: _counts(name, counted, match) for name in CLASSES},
+        _counts(None, counted, match),
         _count_error(found, counted, match),
-        _rms(distances_m), float(np.percentile(distances_m, 95)) if len(pairs) else math.nan,
-        _rms(np.hypot(*_offsets_m(pairs, middle_ns, map_from_truth).T)), map_shift_m, within, sigma_median_m,
-        _median([abs(one.length_m - other.length_m) for one, other in pairs if not math.isnan(one.length_m)]),
-        sum(other.moves for _, other in pairs), sum(one.moves == other.moves for one, other in pairs),
+        _rms(distances_m),
+        float(np.percentile(distances_m, 95)) if len(pairs) else math.nan,
+        _rms(np.hypot(*_offsets_m(pairs, middle_ns, map_from_truth).T)),
+        map_shift_m,
+        within,
+        sigma_median_m,
+        _median(
+            [
+                abs(one.length_m - other.length_m)
+                for one, other in pairs
+                if not math.isnan(one.length_m)
+            ]
+        ),
+        sum(other.moves for _, other in pairs),
+        sum(one.moves == other.moves for one, other in pairs),
         _missed(counted, match),
     )
 
@@ -141,29 +167,42 @@ def frames_over(outline_m: Floats, map_from_truth: Matrix3, outlines_m: Floats) 
     """How many frames' outlines on the map, (N, 4, 2), hold the middle of a true outline."""
     place_m = apply_homography(map_from_truth, middle_of(outline_m)[None])[0]
     return sum(
-        cv2.pointPolygonTest((each - place_m).astype(np.float32), (0.0, 0.0), False) > 0 for each in outlines_m
+        cv2.pointPolygonTest((each - place_m).astype(np.float32), (0.0, 0.0), False) > 0
+        for each in outlines_m
     )
 
 
 def _unpaired(
-    found: Sequence[JudgedObject], pairs: Sequence[tuple[JudgedObject, JudgedObject]], is_near: NDArray[np.bool_]
+    found: Sequence[JudgedObject],
+    pairs: Sequence[tuple[JudgedObject, JudgedObject]],
+    is_near: NDArray[np.bool_],
 ) -> tuple[tuple[JudgedObject, ...], tuple[JudgedObject, ...]]:
     """Found ones without a pair: those beside a true one, by `is_near` (found,), and those beside nothing."""
     taken = {id(one) for one, _ in pairs}
     left = [(each, near) for each, near in zip(found, is_near) if id(each) not in taken]
-    return tuple(each for each, near in left if near), tuple(each for each, near in left if not near)
+    return tuple(each for each, near in left if near), tuple(
+        each for each, near in left if not near
+    )
 
 
 def _within_two_sigma(
     pairs: Sequence[tuple[JudgedObject, JudgedObject]], offsets_m: Floats
 ) -> tuple[float, float]:
     """The share of single-axis errors under twice the stated sigma, and the median of these; NaN without any."""
-    stated = [(offset_m, one.sigma_m) for offset_m, (one, _) in zip(offsets_m, pairs) if math.isfinite(one.sigma_m)]
+    stated = [
+        (offset_m, one.sigma_m)
+        for offset_m, (one, _) in zip(offsets_m, pairs)
+        if math.isfinite(one.sigma_m)
+    ]
     within = [abs(error_m) <= 2 * sigma_m for offset_m, sigma_m in stated for error_m in offset_m]
-    return float(np.mean(within)) if within else math.nan, _median([sigma_m for _, sigma_m in stated])
+    return float(np.mean(within)) if within else math.nan, _median(
+        [sigma_m for _, sigma_m in stated]
+    )
 
 
-def _count_error(found: Sequence[JudgedObject], counted: Sequence[JudgedObject], match: ObjectMatch) -> float:
+def _count_error(
+    found: Sequence[JudgedObject], counted: Sequence[JudgedObject], match: ObjectMatch
+) -> float:
     optional = sum(not other.must_find for _, other in match.pairs)
     return (len(found) - optional - len(counted)) / len(counted) if counted else math.nan
 
@@ -175,7 +214,9 @@ def _missed(counted: Sequence[JudgedObject], match: ObjectMatch) -> tuple[str, .
 
 def _place_m(true: JudgedObject, found: JudgedObject, middle_ns: int) -> Floats:
     """(2,) where the true object was when the found one was last seen."""
-    return true.place_m + true.velocity_m_s * ((found.last_seen_ns - middle_ns) / 1e9 if true.moves else 0.0)
+    return true.place_m + true.velocity_m_s * (
+        (found.last_seen_ns - middle_ns) / 1e9 if true.moves else 0.0
+    )
 
 
 def _offsets_m(
@@ -183,7 +224,9 @@ def _offsets_m(
 ) -> Floats:
     """(N, 2) how far the found ones lie from the true ones, those moved as the map lies."""
     places_m = np.array([_place_m(other, one, middle_ns) for one, other in pairs]).reshape(-1, 2)
-    return np.array([one.place_m for one, _ in pairs]).reshape(-1, 2) - apply_homography(map_from_truth, places_m)
+    return np.array([one.place_m for one, _ in pairs]).reshape(-1, 2) - apply_homography(
+        map_from_truth, places_m
+    )
 
 
 def _counts(name: str | None, counted: Sequence[JudgedObject], match: ObjectMatch) -> ObjectCounts:
@@ -194,8 +237,11 @@ def _counts(name: str | None, counted: Sequence[JudgedObject], match: ObjectMatc
 
     hits = [(one, other) for one, other in match.pairs if other.must_find and of(other)]
     return ObjectCounts(
-        sum(map(of, counted)), len(hits), sum(one.label == other.label for one, other in hits),
-        sum(map(of, match.twice)), sum(map(of, match.false)),
+        sum(map(of, counted)),
+        len(hits),
+        sum(one.label == other.label for one, other in hits),
+        sum(map(of, match.twice)),
+        sum(map(of, match.false)),
     )
 
 

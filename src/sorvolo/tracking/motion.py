@@ -23,19 +23,25 @@ class Habits:
     speed_m_s: float
     unsteadiness: float
     moving_share: float
-    sway_m: float = 0.05  # per root second: people shift their weight, maps of neighbouring strips do not fit
+    sway_m: float = (
+        0.05  # per root second: people shift their weight, maps of neighbouring strips do not fit
+    )
 
 
 @dataclass(frozen=True)
 class TurnSettings:
     """How often objects start and stop."""
 
-    starts_every_s: float = 60.0  # of one whose class moves half of the time; seldom movers start more seldom
+    starts_every_s: float = (
+        60.0  # of one whose class moves half of the time; seldom movers start more seldom
+    )
     stops_every_s: float = 60.0  # by choice, as starts
 
 
 HABITS = {
-    "person": Habits(1.3, 0.15, 0.3), "car": Habits(8.0, 0.3, 0.2), "small object": Habits(0.6, 0.1, 0.02),
+    "person": Habits(1.3, 0.15, 0.3),
+    "car": Habits(8.0, 0.3, 0.2),
+    "small object": Habits(0.6, 0.1, 0.02),
 }
 OTHER_HABITS = Habits(3.0, 0.3, 0.2)
 
@@ -54,7 +60,9 @@ class Motions:
 
     def only(self, rows: Rows | slice) -> "Motions":
         """Some of the objects."""
-        return Motions(self.means[rows], self.covariances[rows], self.weights[rows], self.habits[rows])
+        return Motions(
+            self.means[rows], self.covariances[rows], self.weights[rows], self.habits[rows]
+        )
 
     @property
     def likelier(self) -> Rows:
@@ -75,7 +83,14 @@ class Motions:
 def habits_of(label: str, unit_m: float) -> Floats:
     """(4,) a class's habits where one unit of the place is `unit_m` metres: its Habits, and how far it sways."""
     usual = HABITS.get(label, OTHER_HABITS)
-    return np.array([usual.speed_m_s / unit_m, usual.unsteadiness / unit_m, usual.moving_share, usual.sway_m / unit_m])
+    return np.array(
+        [
+            usual.speed_m_s / unit_m,
+            usual.unsteadiness / unit_m,
+            usual.moving_share,
+            usual.sway_m / unit_m,
+        ]
+    )
 
 
 def begun(places_m: PointsM, covariances_m2: Floats, habits: Floats) -> Motions:
@@ -89,7 +104,9 @@ def begun(places_m: PointsM, covariances_m2: Floats, habits: Floats) -> Motions:
     return Motions(means, covariances, np.column_stack([1 - habits[:, 2], habits[:, 2]]), habits)
 
 
-def predicted(motions: Motions, elapsed_s: Floats, settings: TurnSettings = TurnSettings()) -> Motions:
+def predicted(
+    motions: Motions, elapsed_s: Floats, settings: TurnSettings = TurnSettings()
+) -> Motions:
     """The same objects (N,) seconds later: models mixed as objects start and stop, then each moved on."""
     if not len(motions):
         return motions
@@ -121,7 +138,12 @@ def corrected(motions: Motions, places_m: PointsM, covariances_m2: Floats) -> Mo
     covariances = (covariances + covariances.swapaxes(2, 3)) / 2
     fits = np.log(motions.weights) + log_density(gaps, spread)
     weights = np.maximum(np.exp(fits - fits.max(axis=1, keepdims=True)), _LEAST_WEIGHT)
-    return replace(motions, means=means, covariances=covariances, weights=weights / weights.sum(axis=1, keepdims=True))
+    return replace(
+        motions,
+        means=means,
+        covariances=covariances,
+        weights=weights / weights.sum(axis=1, keepdims=True),
+    )
 
 
 def log_density(gaps: Floats, spread: Floats) -> Floats:

@@ -18,7 +18,9 @@ from sorvolo.tracking.heading_check import HeadingTurn, is_checked, is_wrong, tu
 class PhotoHeadingSettings:
     """When the ground that two photos share shows a heading."""
 
-    least_sigma_deg: float = 4.0  # of what is shown, however far apart the photos; as of `heading.HeadingSettings`
+    least_sigma_deg: float = (
+        4.0  # of what is shown, however far apart the photos; as of `heading.HeadingSettings`
+    )
     most_sigma_deg: float = 20.0  # a heading shown less well is not used; by choice
     alike_deg: float = 45.0  # a photo that shows nothing shares its predecessor's error if their headings are as alike
 
@@ -43,7 +45,9 @@ class PhotoHeadings:
     `see` is given before. `turns_deg` are the turns, clockwise, of the photos that were corrected.
     """
 
-    def __init__(self, camera: Camera, settings: PhotoHeadingSettings = PhotoHeadingSettings()) -> None:
+    def __init__(
+        self, camera: Camera, settings: PhotoHeadingSettings = PhotoHeadingSettings()
+    ) -> None:
         self._camera, self._settings = camera, settings
         self._last: _Last | None = None
         self.turns_deg: list[float] = []
@@ -77,21 +81,32 @@ class PhotoHeadings:
         return shown if is_wrong(shown, prior) else None
 
     def _shown(
-        self, prior: CameraPrior, other: CameraPrior, other_size_px: tuple[int, int], here_from_other: Matrix3
+        self,
+        prior: CameraPrior,
+        other: CameraPrior,
+        other_size_px: tuple[int, int],
+        here_from_other: Matrix3,
     ) -> HeadingTurn | None:
         """What the middle of another photo shows of a photo's heading; None where that is known too badly."""
         middle_px = (np.array([other_size_px[::-1]], np.float64) - 1) / 2
-        seen_m = self._on_ground(apply_homography(here_from_other, middle_px), prior) - prior.position_m[:2]
+        seen_m = (
+            self._on_ground(apply_homography(here_from_other, middle_px), prior)
+            - prior.position_m[:2]
+        )
         true_m = self._on_ground(middle_px, other) - prior.position_m[:2]
         reach_m = min(float(np.linalg.norm(seen_m)), float(np.linalg.norm(true_m)))
         if not reach_m > 0:  # at the horizon there is none
             return None
         tilt_deg = max(each.attitude_sigma_deg[:2].max() for each in (prior, other))
         fix_m = max(each.position_sigma_m[:2].max() for each in (prior, other))
-        miss_m = np.sqrt(2) * np.hypot(fix_m, prior.position_m[2] * np.radians(tilt_deg))  # of both photos
+        miss_m = np.sqrt(2) * np.hypot(
+            fix_m, prior.position_m[2] * np.radians(tilt_deg)
+        )  # of both photos
         sigma_deg = float(np.hypot(np.degrees(miss_m / reach_m), self._settings.least_sigma_deg))
         turn_deg = _bearing_deg(true_m) - _bearing_deg(seen_m)
-        return HeadingTurn(turn_deg, sigma_deg) if sigma_deg <= self._settings.most_sigma_deg else None
+        return (
+            HeadingTurn(turn_deg, sigma_deg) if sigma_deg <= self._settings.most_sigma_deg else None
+        )
 
     def _on_ground(self, pixels: PointsPx, prior: CameraPrior) -> PointsM:
         """(2,) where a pixel, (1, 2), lies on the level ground."""
@@ -105,7 +120,9 @@ def _carried(before: _Last, prior: CameraPrior, alike_deg: float) -> HeadingTurn
     cosine = (np.trace(before.prior.rotation.T @ prior.rotation) - 1) / 2
     if np.degrees(np.arccos(np.clip(cosine, -1, 1))) > alike_deg:
         return None
-    return HeadingTurn(before.turn.turn_deg, float(np.hypot(before.turn.sigma_deg, prior.attitude_sigma_deg[2])))
+    return HeadingTurn(
+        before.turn.turn_deg, float(np.hypot(before.turn.sigma_deg, prior.attitude_sigma_deg[2]))
+    )
 
 
 def _bearing_deg(east_north_m: PointsM) -> float:

@@ -67,6 +67,12 @@ def _homography(last: ImageGray, gray: ImageGray) -> Matrix3 | None:
         return None
     cv2.setRNGSeed(1)
     found, kept = cv2.findHomography(start[good], end[good], cv2.RANSAC, _FLOW.fit_px, maxIters=500)
-    if found is None or kept.sum() < max(_FLOW.least_inliers, _FLOW.least_inlier_share * good.sum()):
+    if found is None or kept.sum() < max(
+        _FLOW.least_inliers, _FLOW.least_inlier_share * good.sum()
+    ):
         return None
-    return np.asarray(found, np.float64) if np.isfinite(found).all() and np.linalg.det(found) > 0 else None
+    return (
+        np.asarray(found, np.float64)
+        if np.isfinite(found).all() and np.linalg.det(found) > 0
+        else None
+    )

@@ -13,7 +13,10 @@ _AROUND = 0.3  # of a plant's sides: so far beside its box the middle of a detec
 
 
 def reported_plants(
-    laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame], boxes_px: Mapping[int, BoxesPx], labels: Sequence[str],
+    laid: Sequence[LaidSighting],
+    frames: Sequence[PlacedFrame],
+    boxes_px: Mapping[int, BoxesPx],
+    labels: Sequence[str],
     least: Mapping[str, float] | None = None,
 ) -> set[int]:
     """Which plants (rows) are reported as an object of their class, at least half of whose sightings are theirs.
@@ -29,7 +32,9 @@ def reported_plants(
     return reported
 
 
-def shown_plant(each: Standing, laid: Sequence[LaidSighting], boxes_px: Mapping[int, BoxesPx]) -> int | None:
+def shown_plant(
+    each: Standing, laid: Sequence[LaidSighting], boxes_px: Mapping[int, BoxesPx]
+) -> int | None:
     """The plant (row) that most of an object's known sightings show, if at least half of all are known."""
     owners = [_owner(laid[k], boxes_px) for k in each.members]
     known = [owner for owner in owners if owner is not None]

@@ -18,9 +18,13 @@ TOO_SHORT_CUT_PX = 3.0
 class SizeSettings:
     """Which sizes a class may have."""
 
-    least_length: float = 0.4  # of its usual length: what is shorter is none, however sure the detector is
+    least_length: float = (
+        0.4  # of its usual length: what is shorter is none, however sure the detector is
+    )
     most_width: float = 2.5  # times its largest dimension: what is wider is none; trucks are as wide as cars are long
-    scale_sigmas: float = 2.0  # by which heights may be off before something is called too short or too wide
+    scale_sigmas: float = (
+        2.0  # by which heights may be off before something is called too short or too wide
+    )
 
 
 @dataclass(frozen=True)
@@ -31,8 +35,12 @@ class LengthSettings:
     under 1 in 300 of them 0.36 or more.
     """
 
-    shorter_sigma: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({"car": 0.11}))
-    partly_seen: float = 0.05  # of a class's members, of which a tree or a roof hides a part; by choice
+    shorter_sigma: Mapping[str, float] = field(
+        default_factory=lambda: MappingProxyType({"car": 0.11})
+    )
+    partly_seen: float = (
+        0.05  # of a class's members, of which a tree or a roof hides a part; by choice
+    )
 
 
 def usual_length_m(name: str) -> float:
@@ -41,7 +49,10 @@ def usual_length_m(name: str) -> float:
 
 
 def impossible_size(
-    names: Sequence[str], sides_m: Floats, cut: Mask, scale_sigma: float | Floats = 0.0,
+    names: Sequence[str],
+    sides_m: Floats,
+    cut: Mask,
+    scale_sigma: float | Floats = 0.0,
     settings: SizeSettings = SizeSettings(),
 ) -> Mask:
     """(N,) bool: what is far too short or far too wide for its class, as a window or a lawn is for a car.
@@ -53,7 +64,9 @@ def impossible_size(
     longest_m = sides_m.max(axis=1, initial=0.0) * (1.0 + settings.scale_sigmas * scale_sigma)
     usual_m = np.array([usual_length_m(name) for name in names])
     short = ~cut.any(axis=1) & (longest_m < settings.least_length * usual_m)
-    shortest_m = sides_m.min(axis=1, initial=np.inf) * np.maximum(0.0, 1.0 - settings.scale_sigmas * scale_sigma)
+    shortest_m = sides_m.min(axis=1, initial=np.inf) * np.maximum(
+        0.0, 1.0 - settings.scale_sigmas * scale_sigma
+    )
     largest_m = np.array([max(TYPICAL_SIZE_M.get(name, (np.inf,))) for name in names])
     wide: Mask = shortest_m > settings.most_width * largest_m
     return np.asarray(short | wide, bool)

@@ -23,8 +23,12 @@ class SceneSettings:
     least_boxes: int = 8  # of a class; fewer may be mistakes, or all of one odd kind
     most_boxes: int = 400  # the newest: a drone climbs
     least_spread: float = 0.03  # of the sizes around the fit: boxes are no more exact
-    most_spread: float = 0.35  # of the sizes around the fit, in logarithms: beyond it boxes are no one kind of thing
-    fleet_sigma: float = 0.15  # by which a street's cars may be longer or shorter than the usual car
+    most_spread: float = (
+        0.35  # of the sizes around the fit, in logarithms: beyond it boxes are no one kind of thing
+    )
+    fleet_sigma: float = (
+        0.15  # by which a street's cars may be longer or shorter than the usual car
+    )
     rounds: int = 8  # of the robust fit
 
 
@@ -51,11 +55,16 @@ class SceneScale:
 
     def __init__(self, settings: SceneSettings = SceneSettings()) -> None:
         self._settings = settings
-        self._cars, self._people = (deque[tuple[float, float]](maxlen=settings.most_boxes) for _ in range(2))
+        self._cars, self._people = (
+            deque[tuple[float, float]](maxlen=settings.most_boxes) for _ in range(2)
+        )
         self.fit: SceneFit | None = None
 
     def see(
-        self, found: Detections, size_px: tuple[int, int], window_px: tuple[int, int, int, int] | None = None
+        self,
+        found: Detections,
+        size_px: tuple[int, int],
+        window_px: tuple[int, int, int, int] | None = None,
     ) -> None:
         """Take in what was detected in a picture, (height, width) `size_px`.
 
@@ -64,7 +73,9 @@ class SceneScale:
         height_px, width_px = size_px
         boxes = found.boxes_px.astype(np.float64)
         left, top, right, bottom = window_px or (0, 0, width_px, height_px)
-        cut = cut_edges(boxes - [left, top, left, top], right - left, bottom - top, TOO_SHORT_CUT_PX).any(axis=1)
+        cut = cut_edges(
+            boxes - [left, top, left, top], right - left, bottom - top, TOO_SHORT_CUT_PX
+        ).any(axis=1)
         for row in np.flatnonzero(~cut & (found.scores >= self._settings.least_score)).tolist():
             kept = {_CAR: self._cars, _PERSON: self._people}.get(found.names[row])
             if kept is not None:
@@ -112,7 +123,11 @@ class SceneScale:
         spread = _spread(off)
         if spread > settings.most_spread:
             return None
-        return SceneFit(float(middle), float(slope), float(np.hypot(settings.fleet_sigma, spread / len(down) ** 0.5)))
+        return SceneFit(
+            float(middle),
+            float(slope),
+            float(np.hypot(settings.fleet_sigma, spread / len(down) ** 0.5)),
+        )
 
 
 def _spread(off: Floats) -> float:
@@ -129,7 +144,10 @@ def impossible_beside_cars(
     they are too few, or of too many sizes, nothing is impossible.
     """
     longest = sides.max(axis=1, initial=0.0)
-    cars = np.log(longest[(np.array(names, object) == _CAR) & ~is_cut & (longest > 0)] / TYPICAL_SIZE_M[_CAR][0])
+    cars = np.log(
+        longest[(np.array(names, object) == _CAR) & ~is_cut & (longest > 0)]
+        / TYPICAL_SIZE_M[_CAR][0]
+    )
     if len(cars) < settings.least_boxes:
         return np.zeros(len(names), bool)
     spread = _spread(cars - np.median(cars))

@@ -29,11 +29,17 @@ _TURNS = np.radians(np.arange(0.0, 180.0, 5.0))
 class MatchSettings:
     """Which sightings of several frames are one object that stands."""
 
-    gate: float = 9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
+    gate: float = (
+        9.2  # squared distance in sigmas, two axes: 99 in 100 sightings of one object lie nearer
+    )
     other_class: float = 4.0  # added for a sighting of another class: rather another object, yet classes are mistaken
-    drift_m: float = 0.12  # by which frames of one map lie beside each other where they were not linked
+    drift_m: float = (
+        0.12  # by which frames of one map lie beside each other where they were not linked
+    )
     same_box: float = 0.55  # overlap of two boxes of one frame from which they show one object, whatever their classes
-    shared_frames: float = 0.25  # of the fewer views: what is seen twice in more frames than these is two objects
+    shared_frames: float = (
+        0.25  # of the fewer views: what is seen twice in more frames than these is two objects
+    )
 
 
 @dataclass(frozen=True)
@@ -50,9 +56,13 @@ class StandingSettings:
     """When an object stands where frames saw it, and which sightings are of it."""
 
     least_score: float = 0.3  # from which on a class is reported for which none is given
-    standing_share: float = 0.3  # of the frames that show a place: what so many saw there is no part of a way
+    standing_share: float = (
+        0.3  # of the frames that show a place: what so many saw there is no part of a way
+    )
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
-    scale_sigma: float = 0.1  # by which the map's lengths may be off, relative: that of GPS heights over a flight
+    scale_sigma: float = (
+        0.1  # by which the map's lengths may be off, relative: that of GPS heights over a flight
+    )
     matches: MatchSettings = field(default_factory=MatchSettings)
     bodies: BodySettings = field(default_factory=BodySettings)
     walks: WalkSettings = field(default_factory=WalkSettings)
@@ -95,7 +105,9 @@ class Fused:
 
 
 def fuse(
-    laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame], least: Mapping[str, float] | None = None,
+    laid: Sequence[LaidSighting],
+    frames: Sequence[PlacedFrame],
+    least: Mapping[str, float] | None = None,
     settings: StandingSettings = StandingSettings(),
 ) -> Fused:
     """The objects that the sightings of these frames show, each once, the surest first.
@@ -107,7 +119,12 @@ def fuse(
     if not laid:
         return Fused((), 0)
     least = least or {}
-    strong = np.array([each.sighting.score >= least.get(each.sighting.label, settings.least_score) for each in laid])
+    strong = np.array(
+        [
+            each.sighting.score >= least.get(each.sighting.label, settings.least_score)
+            for each in laid
+        ]
+    )
     groups = _reported(_merged(_gathered(laid, settings.matches), laid, settings.matches), strong)
     objects, unlikely = _standing_or_not(groups, laid, frames, least, settings)
     left = [k for k in unlikely if strong[k]]
@@ -144,7 +161,10 @@ def without_twins(
 
 
 def fitted_size_m(
-    laid: Sequence[LaidSighting], label: str, height_m: float, settings: BodySettings = BodySettings()
+    laid: Sequence[LaidSighting],
+    label: str,
+    height_m: float,
+    settings: BodySettings = BodySettings(),
 ) -> Floats:
     """(2,) the longer and the shorter side of a box on the ground that has the sightings' sides.
 
@@ -158,7 +178,9 @@ def fitted_size_m(
     usual_m = np.array(TYPICAL_SIZE_M[label][:2])
     axes = np.array([each.axes for each in whole]).reshape(-1, 2)
     leans = np.repeat(np.array([each.lean for each in whole]), 2, axis=0)
-    spans_m = np.maximum(sides_m.ravel() - settings.top * height_m * np.abs((axes * leans).sum(axis=1)), 0.05)
+    spans_m = np.maximum(
+        sides_m.ravel() - settings.top * height_m * np.abs((axes * leans).sum(axis=1)), 0.05
+    )
     angle = np.arctan2(axes[:, 1], axes[:, 0])
     weight = 1.0 / (0.05 + 0.08 * spans_m)
     prior = 1.0 / (settings.size_sigma * usual_m)
@@ -214,7 +236,11 @@ class _Gathering:
             self.weighted_m = self.weighted_m + other.weighted_m
             self.beyond_m2 = min(self.beyond_m2, other.beyond_m2, key=np.trace)
         elif self.is_cut:
-            self.information, self.weighted_m, self.beyond_m2 = other.information, other.weighted_m, other.beyond_m2
+            self.information, self.weighted_m, self.beyond_m2 = (
+                other.information,
+                other.weighted_m,
+                other.beyond_m2,
+            )
         for name, score in other.label_scores.items():
             self.label_scores[name] = self.label_scores.get(name, 0.0) + score
 
@@ -228,7 +254,9 @@ def _gathered(laid: Sequence[LaidSighting], settings: MatchSettings) -> list[_Ga
         new = [_begin([inside[k] for k in group], laid) for group in groups]
         costs = _costs(new, objects, places_m, laid, settings)
         rows, columns = least_cost(costs)
-        matched = {row: column for row, column in zip(rows, columns) if costs[row, column] < settings.gate}
+        matched = {
+            row: column for row, column in zip(rows, columns) if costs[row, column] < settings.gate
+        }
         for row, begun in enumerate(new):
             if row in matched:
                 objects[matched[row]].take(begun)
@@ -239,14 +267,21 @@ def _gathered(laid: Sequence[LaidSighting], settings: MatchSettings) -> list[_Ga
 
 
 def _costs(
-    new: Sequence[_Gathering], objects: Sequence[_Gathering], places_m: PointsM, laid: Sequence[LaidSighting],
+    new: Sequence[_Gathering],
+    objects: Sequence[_Gathering],
+    places_m: PointsM,
+    laid: Sequence[LaidSighting],
     settings: MatchSettings,
 ) -> Floats:
     """(new, objects) squared distances in sigmas, at most the gate; `places_m` (objects, 2) are the objects' places."""
     costs = np.full((len(new), len(objects)), settings.gate)
     for row, begun in enumerate(new):
-        for column in np.flatnonzero(np.hypot(*(places_m - begun.place_m).T) < _reach_m(begun, laid)):
-            costs[row, column] = min(settings.gate, _distance(begun, objects[int(column)], settings))
+        for column in np.flatnonzero(
+            np.hypot(*(places_m - begun.place_m).T) < _reach_m(begun, laid)
+        ):
+            costs[row, column] = min(
+                settings.gate, _distance(begun, objects[int(column)], settings)
+            )
     return costs
 
 
@@ -266,12 +301,18 @@ def _begin(members: list[int], laid: Sequence[LaidSighting]) -> _Gathering:
     for k in members:
         each = laid[k].sighting
         scores[each.label] = scores.get(each.label, 0.0) + each.score
-    return _Gathering(members, information, information @ first.position_m, scores, laid[members[0]].beyond_m2)
+    return _Gathering(
+        members, information, information @ first.position_m, scores, laid[members[0]].beyond_m2
+    )
 
 
 def _reach_m(each: _Gathering, laid: Sequence[LaidSighting]) -> float:
     """Beyond this nothing is asked whether it is the same."""
-    return max(3.0, 2.0 * float(laid[each.members[0]].sighting.size_m[0]), 6.0 * laid[each.members[0]].own_sigma_m)
+    return max(
+        3.0,
+        2.0 * float(laid[each.members[0]].sighting.size_m[0]),
+        6.0 * laid[each.members[0]].own_sigma_m,
+    )
 
 
 def _distance(one: _Gathering, other: _Gathering, settings: MatchSettings) -> float:
@@ -291,7 +332,10 @@ def _merged(
     while True:
         pairs = _near_pairs(alive, frames, laid, settings)
         if not pairs:
-            return [sorted(each.members, key=lambda k: laid[k].sighting.time_ns) for each in alive.values()]
+            return [
+                sorted(each.members, key=lambda k: laid[k].sighting.time_ns)
+                for each in alive.values()
+            ]
         taken: set[int] = set()
         for _, one, other in sorted(pairs):
             if not {one, other} & taken:
@@ -301,14 +345,18 @@ def _merged(
 
 
 def _near_pairs(
-    alive: dict[int, _Gathering], frames: dict[int, set[int]], laid: Sequence[LaidSighting],
+    alive: dict[int, _Gathering],
+    frames: dict[int, set[int]],
+    laid: Sequence[LaidSighting],
     settings: MatchSettings,
 ) -> list[tuple[float, int, int]]:
     keys = list(alive)
     places_m = np.array([alive[key].place_m for key in keys])
     pairs = []
     for row, one in enumerate(keys):
-        near = np.flatnonzero(np.hypot(*(places_m[row + 1:] - places_m[row]).T) < _reach_m(alive[one], laid))
+        near = np.flatnonzero(
+            np.hypot(*(places_m[row + 1 :] - places_m[row]).T) < _reach_m(alive[one], laid)
+        )
         for other in (keys[row + 1 + int(k)] for k in near):
             shared = len(frames[one] & frames[other])
             distance = _distance(alive[one], alive[other], settings)
@@ -339,14 +387,21 @@ def _possible_views(
     for frame in frames:
         counts += shows(frame, places_m, up_m, reach_m).astype(int)
     seen = [len(_frames_of(group, laid)) for group in groups]
-    return [int(n + views) if is_open else max(int(n), views) for n, views, is_open in zip(counts, seen, open_m > 0)]
+    return [
+        int(n + views) if is_open else max(int(n), views)
+        for n, views, is_open in zip(counts, seen, open_m > 0)
+    ]
 
 
 def _usual_bodies(groups: Sequence[Sequence[LaidSighting]]) -> tuple[PointsM, Floats, Floats]:
     """The medians of each group's places (N, 2), heights of their middles (N,) and half lengths (N,)."""
-    places_m = np.array([np.median([each.sighting.position_m for each in group], axis=0) for group in groups])
+    places_m = np.array(
+        [np.median([each.sighting.position_m for each in group], axis=0) for group in groups]
+    )
     up_m = np.array([np.median([each.middle_up_m for each in group]) for group in groups])
-    reach_m = np.array([np.median([each.sighting.size_m[0] for each in group]) for group in groups]) / 2
+    reach_m = (
+        np.array([np.median([each.sighting.size_m[0] for each in group]) for group in groups]) / 2
+    )
     return places_m, up_m, reach_m
 
 
@@ -361,8 +416,11 @@ def _reported(groups: Sequence[list[int]], strong: Mask) -> list[list[int]]:
 
 
 def _standing_or_not(
-    groups: Sequence[Sequence[int]], laid: Sequence[LaidSighting], frames: Sequence[PlacedFrame],
-    least: Mapping[str, float], settings: StandingSettings,
+    groups: Sequence[Sequence[int]],
+    laid: Sequence[LaidSighting],
+    frames: Sequence[PlacedFrame],
+    least: Mapping[str, float],
+    settings: StandingSettings,
 ) -> tuple[list[Standing], list[int]]:
     """The objects that stand, and the sightings of other groups that may be on the way of something that moves."""
     if not groups:
@@ -389,7 +447,9 @@ def _score(
         seen = laid[k].sighting
         if seen.label == label:
             best[seen.frame_index] = max(seen.score, best.get(seen.frame_index, 0.0))
-    of_length = length_log_odds(label, _seen_length_m([laid[k] for k in group]), settings.scale_sigma)
+    of_length = length_log_odds(
+        label, _seen_length_m([laid[k] for k in group]), settings.scale_sigma
+    )
     return label, score_from_views(list(best.values()), possible, settings.evidence, of_length)
 
 
@@ -399,7 +459,9 @@ def _seen_length_m(chosen: Sequence[LaidSighting]) -> float:
     return float(np.median(whole_m)) if whole_m else float("nan")
 
 
-def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, float, dict[str, float]]:
+def _named(
+    members: Sequence[int], laid: Sequence[LaidSighting]
+) -> tuple[str, float, dict[str, float]]:
     """Class by summed scores, that class's mean score, and each class's share."""
     scores: dict[str, list[float]] = defaultdict(list)
     for k in members:
@@ -407,12 +469,18 @@ def _named(members: Sequence[int], laid: Sequence[LaidSighting]) -> tuple[str, f
     sums = {name: sum(each) for name, each in scores.items()}
     label = max(sums, key=sums.__getitem__)
     total = max(sum(sums.values()), 1e-9)
-    shares = {name: value / total for name, value in sorted(sums.items(), key=lambda item: -item[1])}
+    shares = {
+        name: value / total for name, value in sorted(sums.items(), key=lambda item: -item[1])
+    }
     return label, float(np.mean(scores[label])), shares
 
 
 def _standing(
-    members: Sequence[int], laid: Sequence[LaidSighting], possible: int, score: float, settings: StandingSettings
+    members: Sequence[int],
+    laid: Sequence[LaidSighting],
+    possible: int,
+    score: float,
+    settings: StandingSettings,
 ) -> Standing:
     """One object that stands, from all its sightings."""
     label, _, shares = _named(members, laid)
@@ -422,12 +490,23 @@ def _standing(
     usual_up_m = usual_height_m(label) / 2 if has_metres else 0.0
     answer, covariance = _place_and_rise(whole, usual_up_m, settings)
     height_m = 2 * max(usual_up_m + float(answer[2]), 0.0)
-    size_m = fitted_size_m(chosen, label, height_m, settings.bodies) if has_metres else _median_sides(chosen)
+    size_m = (
+        fitted_size_m(chosen, label, height_m, settings.bodies)
+        if has_metres
+        else _median_sides(chosen)
+    )
     if all(each.is_cut for each in whole):  # no frame shows it whole: how long it is nobody saw
         size_m = np.full(2, np.nan)
     return Standing(
-        tuple(members), _best(members, laid, label), label, score, shares, answer[:2],
-        float(np.sqrt(np.trace(covariance) / 2)), size_m, possible,
+        tuple(members),
+        _best(members, laid, label),
+        label,
+        score,
+        shares,
+        answer[:2],
+        float(np.sqrt(np.trace(covariance) / 2)),
+        size_m,
+        possible,
     )
 
 
@@ -448,7 +527,9 @@ def _place_and_rise(
     right.append(np.zeros(1))
     normal = (matrix := np.concatenate(rows)).T @ matrix
     answer = np.asarray(np.linalg.solve(normal, matrix.T @ np.concatenate(right)), np.float64)
-    return answer, np.linalg.inv(normal)[:2, :2] + min((each.beyond_m2 for each in whole), key=np.trace)
+    return answer, np.linalg.inv(normal)[:2, :2] + min(
+        (each.beyond_m2 for each in whole), key=np.trace
+    )
 
 
 def _moving(members: Sequence[int], walk: Walk, laid: Sequence[LaidSighting]) -> Standing:
@@ -456,8 +537,16 @@ def _moving(members: Sequence[int], walk: Walk, laid: Sequence[LaidSighting]) ->
     chosen = [laid[k] for k in members]
     size_m = fitted_size_m(chosen, label, usual_height_m(label))
     return Standing(
-        tuple(members), _best(members, laid, label), label, score, shares, walk.position_m, walk.sigma_m, size_m,
-        walk.possible_views, walk.velocity_m_s,
+        tuple(members),
+        _best(members, laid, label),
+        label,
+        score,
+        shares,
+        walk.position_m,
+        walk.sigma_m,
+        size_m,
+        walk.possible_views,
+        walk.velocity_m_s,
     )
 
 
@@ -467,6 +556,7 @@ def _median_sides(chosen: Sequence[LaidSighting]) -> Floats:
 
 def _best(members: Sequence[int], laid: Sequence[LaidSighting], label: str) -> int:
     """The clearest sighting: sure, large in its picture, and not cut by its edge."""
+
     def clearness(k: int) -> float:
         each = laid[k]
         left, top, right, bottom = each.sighting.box_px

@@ -21,7 +21,14 @@ from sorvolo.tracking.association import (
     voted_shift,
 )
 from sorvolo.tracking.common_shift import CommonShift, ShiftSettings
-from sorvolo.tracking.doubles import JoiningSettings, double_of, earlier_mover, frame_doubles, inward_m, neighbours
+from sorvolo.tracking.doubles import (
+    JoiningSettings,
+    double_of,
+    earlier_mover,
+    frame_doubles,
+    inward_m,
+    neighbours,
+)
 from sorvolo.tracking.followed import Followed
 from sorvolo.tracking.motion import MOVES, Motions, begun, corrected, habits_of, predicted
 from sorvolo.tracking.view_evidence import USUAL_LOG_ODDS
@@ -60,7 +67,9 @@ class TrackerSettings:
     shows a place is enough: photos, which may show it once; empty for a video, which shows it in many frames.
     """
 
-    sure_score: float = 0.3  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
+    sure_score: float = (
+        0.3  # sightings below this only prolong tracks (Zhang et al. 2022, ByteTrack)
+    )
     least_views: int = 3  # two are enough where they lie a second apart
     least_evidence: float = 2.5  # odds of about two to one, where views err apart
     missed: float = 0.4  # people by day are reported in a third of the views that show them
@@ -120,7 +129,11 @@ class Tracker:
         self._classes: list[str] = []
 
     def update(
-        self, sightings: Sequence[Sighting], *, time_ns: int, footprint_m: PointsM | None = None,
+        self,
+        sightings: Sequence[Sighting],
+        *,
+        time_ns: int,
+        footprint_m: PointsM | None = None,
         appearance: Floats | None = None,
     ) -> TrackUpdate:
         """Take in one frame's sightings; a frame dated before the last one counts as taken with it.
@@ -130,7 +143,9 @@ class Tracker:
         objects, rows of NaN for those without. Raises GeometryError for one of another length.
         """
         if appearance is not None and len(appearance) != len(sightings):
-            raise GeometryError(f"{len(sightings)} sightings but {len(appearance)} appearance vectors")
+            raise GeometryError(
+                f"{len(sightings)} sightings but {len(appearance)} appearance vectors"
+            )
         seen = _Seen(sightings, appearance, self._settings)
         time_ns, elapsed_s = self._move_on(seen, time_ns)
         near = self._near(seen, time_ns, footprint_m)
@@ -147,10 +162,15 @@ class Tracker:
         ids[pairs.sightings] = [each.id for each in prolonged]
         ids[fresh] = [each.id for each in started]
         merged = self._join(prolonged + started, missing)
-        ids = np.array([merged.get(each, each) for each in seen.with_doubles(ids).tolist()], np.int64)
+        ids = np.array(
+            [merged.get(each, each) for each in seen.with_doubles(ids).tolist()], np.int64
+        )
         return TrackUpdate(
-            tuple(ids.tolist()), tuple(each for each in new if each not in merged),
-            tuple(sorted(set(ids.tolist()) - {0})), tuple(each for each in ended if each not in merged), merged,
+            tuple(ids.tolist()),
+            tuple(each for each in new if each not in merged),
+            tuple(sorted(set(ids.tolist()) - {0})),
+            tuple(each for each in ended if each not in merged),
+            merged,
         )
 
     @property
@@ -188,7 +208,9 @@ class Tracker:
         for row, column in zip(pairs.tracks, pairs.sightings):
             followed = near[row]
             followed.go_on(motions.only(slice(row, row + 1)), time_ns)
-            weight = min(1.0, (time_ns - followed.last_ns) / 1e9 / self._settings.evidence.usual_step_s)
+            weight = min(
+                1.0, (time_ns - followed.last_ns) / 1e9 / self._settings.evidence.usual_step_s
+            )
             if self._record(followed, seen, int(column), weight):
                 new.append(followed.id)
         return new
@@ -211,16 +233,22 @@ class Tracker:
             chosen = np.linalg.norm(places_m - middle_m, axis=1) < reach_m + slack_m
         return [each for each, is_near in zip(self._followed, chosen) if is_near]
 
-    def _matched(self, near: list[Followed], motions: Motions, seen: "_Seen") -> tuple[Pairs, Motions]:
+    def _matched(
+        self, near: list[Followed], motions: Motions, seen: "_Seen"
+    ) -> tuple[Pairs, Motions]:
         """Which sightings are which tracks, and the tracks' motions with those taken in."""
         none = Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64))
         if not near or not len(seen.places_m):
             return none, motions
         ids = [each.id for each in near]
         odds = _PairOdds(
-            motions, seen.places_m - self._shift.mean_m, seen.own_m2, self._fits(near, seen),
+            motions,
+            seen.places_m - self._shift.mean_m,
+            seen.own_m2,
+            self._fits(near, seen),
             float(np.log(self._settings.new_per_m2 * self._settings.unit_m**2)),
-            seen.scores >= self._settings.sure_score, self._settings.pairs,
+            seen.scores >= self._settings.sure_score,
+            self._settings.pairs,
         )
         pairs = self._paired(odds, ids)
         if not len(pairs):
@@ -238,7 +266,9 @@ class Tracker:
         if is_puzzled and self._shared_m > 0:
             jump_m2 = self._shared_m**2
             wide = odds.gains(none_m, loose_m2 + shift.jitter_m2 + jump_m2)
-            if odds.vote(np.ones(len(ids)), loose_m2 + shift.jitter_m2, jump_m2, wide, rules.jump_reluctance).any():
+            if odds.vote(
+                np.ones(len(ids)), loose_m2 + shift.jitter_m2, jump_m2, wide, rules.jump_reluctance
+            ).any():
                 shift.loosen(jump_m2)
                 shares, loose_m2 = shift.predict(ids)
                 gain = wide
@@ -258,10 +288,18 @@ class Tracker:
         motions = odds.motions
         matched, gaps_m, variances_m2 = self._misses(odds, ids, pairs)
         fitted = self._shift.fit(matched, gaps_m, variances_m2)
-        movers = [number for number, row in zip(matched, pairs.tracks) if motions.weights[row, MOVES] > 0.5]
+        movers = [
+            number
+            for number, row in zip(matched, pairs.tracks)
+            if motions.weights[row, MOVES] > 0.5
+        ]
         steps_m = self._shift.settle(fitted, matched, movers)
         by_id = {each: row for row, each in enumerate(ids)}
-        means, covariances, weights = motions.means.copy(), motions.covariances.copy(), motions.weights.copy()
+        means, covariances, weights = (
+            motions.means.copy(),
+            motions.covariances.copy(),
+            motions.weights.copy(),
+        )
         for followed in self._followed:
             if followed.id in steps_m:
                 followed.shift(steps_m[followed.id])
@@ -269,21 +307,25 @@ class Tracker:
                     means[by_id[followed.id], :, :2] += steps_m[followed.id]
         before = replace(motions, means=means).only(pairs.tracks)
         better = corrected(
-            before, before.places_m + fitted.of_others_m,
+            before,
+            before.places_m + fitted.of_others_m,
             odds.own_m2[pairs.sightings] + fitted.of_others_m2[:, None, None] * np.eye(2),
         )
         means[pairs.tracks], covariances[pairs.tracks] = better.means, better.covariances
         weights[pairs.tracks] = better.weights
         return replace(motions, means=means, covariances=covariances, weights=weights)
 
-    def _misses(self, odds: "_PairOdds", ids: list[int], pairs: Pairs) -> tuple[list[int], PointsM, Floats]:
+    def _misses(
+        self, odds: "_PairOdds", ids: list[int], pairs: Pairs
+    ) -> tuple[list[int], PointsM, Floats]:
         """How far pairs miss each other: ids, seen less known places (M, 2), and their variances (M,)."""
         matched = odds.motions.only(pairs.tracks)
         known_m2 = np.trace(matched.place_covariances_m2, axis1=1, axis2=2) / 2
         # a mover knows no place of its own that could hold the map
         restless_m2 = matched.weights[:, MOVES] * self._shared_m**2
         return (
-            [ids[row] for row in pairs.tracks], odds.places_m[pairs.sightings] - matched.places_m,
+            [ids[row] for row in pairs.tracks],
+            odds.places_m[pairs.sightings] - matched.places_m,
             odds.mean_own_m2[pairs.sightings] + known_m2 + restless_m2,
         )
 
@@ -292,9 +334,13 @@ class Tracker:
         shares = np.array([[each.scores.get(name, 0.0) for name in self._classes] for each in near])
         shares /= shares.sum(axis=1, keepdims=True)
         rules = self._settings.pairs
-        fits = class_likelihoods(shares, np.array([self._classes.index(label) for label in seen.labels]), rules)
+        fits = class_likelihoods(
+            shares, np.array([self._classes.index(label) for label in seen.labels]), rules
+        )
         fits += size_likelihoods(np.array([each.sides_m[0] for each in near]), seen.sides_m, rules)
-        fits += np.array([self._settings.evidence.ended if each.ended else 0.0 for each in near])[:, None]
+        fits += np.array([self._settings.evidence.ended if each.ended else 0.0 for each in near])[
+            :, None
+        ]
         if seen.looks is not None:
             unknown = np.full(seen.looks.shape[1], np.nan)
             known = np.array([unknown if each.looks is None else each.looks for each in near])
@@ -311,13 +357,19 @@ class Tracker:
         for row, stronger in seen.doubles.items():
             if stronger == column:
                 followed.vote(seen.labels[row], float(seen.scores[row]))
-        followed.evidence = min(followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), rules.most)
+        followed.evidence = min(
+            followed.evidence + max(weight, 0.3) * _log_odds(seen.scores[column]), rules.most
+        )
         followed.ended = False
         is_long = followed.last_ns - followed.first_ns >= rules.long_s * 1e9
         least_views = min(settings.least_views, 2) if is_long else settings.least_views
         if followed.moves:
             least_views = max(least_views, rules.mover_views)
-        if followed.confirmed or followed.views < least_views or followed.evidence < settings.least_evidence:
+        if (
+            followed.confirmed
+            or followed.views < least_views
+            or followed.evidence < settings.least_evidence
+        ):
             return False
         followed.confirmed = True
         return True
@@ -327,7 +379,11 @@ class Tracker:
         confirmed = []
         for followed in gone:
             least = self._settings.alone.get(followed.label, np.inf)
-            if followed.views == 1 and not (followed.confirmed or followed.was_missed) and followed.score_sum >= least:
+            if (
+                followed.views == 1
+                and not (followed.confirmed or followed.was_missed)
+                and followed.score_sum >= least
+            ):
                 followed.confirmed = True
                 confirmed.append(followed.id)
         return confirmed
@@ -338,13 +394,20 @@ class Tracker:
             return []
         habits = np.array([habits_of(seen.labels[row], self._settings.unit_m) for row in fresh])
         shift = self._shift
-        motions = begun(seen.places_m[fresh] - shift.mean_m - shift.jump_m, seen.own_m2[fresh], habits)
+        motions = begun(
+            seen.places_m[fresh] - shift.mean_m - shift.jump_m, seen.own_m2[fresh], habits
+        )
         started = []
         for index, row in enumerate(fresh):
             sighting = seen.sightings[row]
             followed = Followed(
-                self.next_id, motions.only(slice(index, index + 1)), sighting.time_ns, 0.0, sighting.time_ns,
-                sighting.time_ns, sighting,
+                self.next_id,
+                motions.only(slice(index, index + 1)),
+                sighting.time_ns,
+                0.0,
+                sighting.time_ns,
+                sighting.time_ns,
+                sighting,
             )
             self.next_id += 1
             self._record(followed, seen, row, 1.0)
@@ -354,7 +417,12 @@ class Tracker:
         return started
 
     def _missed(
-        self, near: list[Followed], motions: Motions, rows: Rows, time_ns: int, elapsed_s: float,
+        self,
+        near: list[Followed],
+        motions: Motions,
+        rows: Rows,
+        time_ns: int,
+        elapsed_s: float,
         footprint_m: PointsM | None,
     ) -> tuple[list[Followed], list[int]]:
         """Tracks whose places the frame shows without them, and the ids of the confirmed that end with it.
@@ -363,7 +431,9 @@ class Tracker:
         """
         missing, ended = [], []
         sigmas = np.sqrt(np.trace(motions.place_covariances_m2[rows], axis1=1, axis2=2) / 2)
-        depths_m = self._depths_m([near[row] for row in rows], motions.only(rows), time_ns, footprint_m)
+        depths_m = self._depths_m(
+            [near[row] for row in rows], motions.only(rows), time_ns, footprint_m
+        )
         for row, depth, sigma in zip(rows, depths_m, sigmas):
             followed = near[row]
             if depth < 0:
@@ -373,7 +443,9 @@ class Tracker:
             if depth > 2 * sigma + followed.sides_m[0] / 2 or footprint_m is None:
                 usual_step_s = self._settings.evidence.usual_step_s
                 followed.was_missed = True
-                followed.evidence -= self._settings.missed * min(1.0, max(elapsed_s, 0.02) / usual_step_s)
+                followed.evidence -= self._settings.missed * min(
+                    1.0, max(elapsed_s, 0.02) / usual_step_s
+                )
                 if followed.confirmed and not followed.ended and followed.evidence < 0:
                     followed.ended = True
                     ended.append(followed.id)
@@ -395,10 +467,13 @@ class Tracker:
         for followed in self._followed:
             followed.is_out |= followed.id not in near_ids and followed.last_ns < time_ns
         oldest_ns = time_ns - self._settings.evidence.forgotten_s * 1e9
-        self._keep([
-            each for each in self._followed
-            if each.confirmed or (each.evidence >= 0 and each.last_ns > oldest_ns)
-        ])
+        self._keep(
+            [
+                each
+                for each in self._followed
+                if each.confirmed or (each.evidence >= 0 and each.last_ns > oldest_ns)
+            ]
+        )
 
     def _join(self, now: list[Followed], missing: list[Followed]) -> dict[int, int]:
         """Merge tracks that turn out to be one object; the earlier id stays."""
@@ -421,8 +496,17 @@ class Tracker:
 
     def _same_object(self, followed: Followed, by_id: Mapping[int, Followed]) -> Followed | None:
         """Another track of the same object, if there is one."""
-        other = double_of(followed, by_id, self._settings.neighbour_m / self._settings.unit_m, self._settings.joining)
-        if other is None and followed.moves and followed.views <= self._settings.evidence.first_views:
+        other = double_of(
+            followed,
+            by_id,
+            self._settings.neighbour_m / self._settings.unit_m,
+            self._settings.joining,
+        )
+        if (
+            other is None
+            and followed.moves
+            and followed.views <= self._settings.evidence.first_views
+        ):
             density = self._settings.new_per_m2 * self._settings.unit_m**2
             other = earlier_mover(followed, self._followed, density, self._settings.joining)
         return other
@@ -457,7 +541,9 @@ class _PairOdds:
 
     def gains(self, offsets_m: PointsM, offsets_m2: Floats) -> Floats:
         """(tracks, sightings) how much likelier pairs are than new objects, tracks off by so much, (N, 2) and (N,)."""
-        near = place_likelihoods(self.motions, self.places_m, self.own_m2, offsets_m, offsets_m2, self.settings)
+        near = place_likelihoods(
+            self.motions, self.places_m, self.own_m2, offsets_m, offsets_m2, self.settings
+        )
         return near + self.fits - self.unseen
 
     def assign(self, gain: Floats) -> Pairs:
@@ -467,19 +553,35 @@ class _PairOdds:
         gain[first.tracks], gain[:, first.sightings], gain[:, self.sure] = -1.0, -1.0, -1.0
         return first.joined(assigned(gain))
 
-    def vote(self, shares: Floats, left_m2: Floats, slow_m2: float, gain: Floats, reluctance: float) -> PointsM:
+    def vote(
+        self, shares: Floats, left_m2: Floats, slow_m2: float, gain: Floats, reluctance: float
+    ) -> PointsM:
         """The shift that most pairs agree in (`voted_shift`)."""
         return voted_shift(
-            self.motions, self.places_m, self.own_m2, shares, left_m2, slow_m2, self.fits, gain, self.unseen,
-            self.settings, reluctance,
+            self.motions,
+            self.places_m,
+            self.own_m2,
+            shares,
+            left_m2,
+            slow_m2,
+            self.fits,
+            gain,
+            self.unseen,
+            self.settings,
+            reluctance,
         )
 
 
 class _Seen:
     """One frame's sightings as columns."""
 
-    def __init__(self, sightings: Sequence[Sighting], looks: Floats | None, settings: TrackerSettings) -> None:
-        self.sightings, self.looks = sightings, None if looks is None else np.asarray(looks, np.float64)
+    def __init__(
+        self, sightings: Sequence[Sighting], looks: Floats | None, settings: TrackerSettings
+    ) -> None:
+        self.sightings, self.looks = (
+            sightings,
+            None if looks is None else np.asarray(looks, np.float64),
+        )
         self.places_m = np.array([each.position_m for each in sightings]).reshape(-1, 2)
         self.scores = np.array([each.score for each in sightings])
         self.labels = [each.label for each in sightings]
@@ -497,7 +599,9 @@ class _Seen:
     def fresh_rows(self, matched: Rows, sure_score: float) -> list[int]:
         """The sure sightings that are neither matched nor doubles: each begins a track."""
         known = {*matched.tolist(), *self.doubles}
-        return [row for row, score in enumerate(self.scores) if row not in known and score >= sure_score]
+        return [
+            row for row, score in enumerate(self.scores) if row not in known and score >= sure_score
+        ]
 
     def with_doubles(self, ids: Labels) -> Labels:
         """(sightings,) the ids, those of doubles being the stronger sighting's, where that has one."""
@@ -524,18 +628,25 @@ def _own_covariances(sightings: Sequence[Sighting], errors: SharedErrorSettings)
     shared = np.array([each.shared_sigma_m for each in sightings])
     values, vectors = np.linalg.eigh(whole)
     least = np.maximum(errors.least_own_share * values.mean(axis=1), 1e-6)
-    own = np.maximum(values - shared[:, None] ** 2, least[:, None]) + (errors.uneven * shared[:, None]) ** 2
+    own = (
+        np.maximum(values - shared[:, None] ** 2, least[:, None])
+        + (errors.uneven * shared[:, None]) ** 2
+    )
     return (vectors * own[:, None, :]) @ vectors.swapaxes(1, 2)
 
 
 def _stacked(near: list[Followed], time_ns: int) -> Motions:
     """All tracks' motions, moved on to one moment."""
     if not near:
-        return Motions(np.zeros((0, 2, 4)), np.zeros((0, 2, 4, 4)), np.zeros((0, 2)), np.zeros((0, 4)))
+        return Motions(
+            np.zeros((0, 2, 4)), np.zeros((0, 2, 4, 4)), np.zeros((0, 2)), np.zeros((0, 4))
+        )
     motions = [each.motion for each in near]
     together = Motions(
-        np.concatenate([each.means for each in motions]), np.concatenate([each.covariances for each in motions]),
-        np.concatenate([each.weights for each in motions]), np.concatenate([each.habits for each in motions]),
+        np.concatenate([each.means for each in motions]),
+        np.concatenate([each.covariances for each in motions]),
+        np.concatenate([each.weights for each in motions]),
+        np.concatenate([each.habits for each in motions]),
     )
     return predicted(together, np.array([(time_ns - each.motion_ns) / 1e9 for each in near]))
 

@@ -17,11 +17,16 @@ class EvidenceSettings:
 
     least_seen: float = 0.05  # weaker sightings are none, and none counts as this
     usual: float = USUAL_LOG_ODDS  # of whatever a view shows: what is beyond it speaks for the thing, below it against
-    shared: float = 0.63  # share of the variance of log-odds that lies between things, not between views of one
+    shared: float = (
+        0.63  # share of the variance of log-odds that lies between things, not between views of one
+    )
 
 
 def score_from_views(
-    scores: Sequence[float], views: int, settings: EvidenceSettings = EvidenceSettings(), more_log_odds: float = 0.0
+    scores: Sequence[float],
+    views: int,
+    settings: EvidenceSettings = EvidenceSettings(),
+    more_log_odds: float = 0.0,
 ) -> float:
     """The score, 0 to 1, of a thing that views of these scores show, of `views` that could show it.
 
@@ -30,13 +35,17 @@ def score_from_views(
     that n of them count as n / (1 + (n - 1) shared): the design effect of a sample drawn in clusters (Kish 1965). One
     view counts for what it is.
     """
-    every = np.concatenate([np.asarray(scores, np.float64), np.full(views - len(scores), settings.least_seen)])
+    every = np.concatenate(
+        [np.asarray(scores, np.float64), np.full(views - len(scores), settings.least_seen)]
+    )
     inside = np.clip(every, 1e-3, 1 - 1e-3)
     beyond = float((np.log(inside / (1 - inside)) - settings.usual).sum())
     odds = settings.usual + beyond / (1 + (views - 1) * settings.shared) + more_log_odds
     return float(1 / (1 + np.exp(-odds)))
 
 
-def least_seen(thresholds: Mapping[str, float], settings: EvidenceSettings = EvidenceSettings()) -> float:
+def least_seen(
+    thresholds: Mapping[str, float], settings: EvidenceSettings = EvidenceSettings()
+) -> float:
     """From which score on a view's sightings are evidence, where each class is reported from `thresholds` on."""
     return min([settings.least_seen, *thresholds.values()])

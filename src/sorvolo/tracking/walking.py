@@ -18,7 +18,9 @@ class WalkSettings:
 
     least_m_s: float = 0.25  # slower is a place badly known
     longest_gap_s: float = 6.0  # between two sightings of a way
-    least_views: int = 3  # two sightings lie on a straight line whatever they are: these must be whole and ...
+    least_views: int = (
+        3  # two sightings lie on a straight line whatever they are: these must be whole and ...
+    )
     sure_score: float = 0.5  # ... of this score
     again_s: float = 60.0  # what walks on as it did is known again after so long ...
     swerve: float = 0.35  # ... within so much of the way that it goes meanwhile
@@ -48,7 +50,7 @@ def walks(laid: Sequence[LaidSighting], settings: WalkSettings = WalkSettings())
     order: Rows = np.argsort(times_s, kind="stable")
     candidates = []
     for at, first in enumerate(order):
-        for second in order[at + 1:]:
+        for second in order[at + 1 :]:
             gap_s = times_s[second] - times_s[first]
             if gap_s > settings.longest_gap_s:
                 break
@@ -66,7 +68,11 @@ def walks(laid: Sequence[LaidSighting], settings: WalkSettings = WalkSettings())
 
 
 def _followed(
-    first: int, second: int, laid: Sequence[LaidSighting], times_s: Floats, order: Rows,
+    first: int,
+    second: int,
+    laid: Sequence[LaidSighting],
+    times_s: Floats,
+    order: Rows,
     settings: WalkSettings,
 ) -> tuple[list[int], float] | None:
     """The sightings on the way that two begin, and how far they lie off it, rms in sigmas; None where it is no way."""
@@ -80,7 +86,9 @@ def _followed(
         return None
     members = _prolonged([first, second], laid, times_s, order, settings)
     if len(members) < settings.least_views:
-        is_sure = all(laid[k].sighting.score >= settings.sure_score and not laid[k].is_cut for k in members)
+        is_sure = all(
+            laid[k].sighting.score >= settings.sure_score and not laid[k].is_cut for k in members
+        )
         return (members, 0.0) if is_sure else None
     _, velocity_m_s, _ = _line(members, laid, times_s, float(times_s[members[-1]]))
     off = _off(members, laid, times_s, settings.wobble_m_s2)
@@ -90,18 +98,24 @@ def _followed(
 
 
 def _prolonged(
-    way: list[int], laid: Sequence[LaidSighting], times_s: Floats, order: Rows, settings: WalkSettings
+    way: list[int],
+    laid: Sequence[LaidSighting],
+    times_s: Floats,
+    order: Rows,
+    settings: WalkSettings,
 ) -> list[int]:
     """A way with the later sightings of its class that lie on it."""
     members, label = list(way), laid[way[0]].sighting.label
-    for k in order[np.searchsorted(times_s[order], times_s[way[-1]], side="right"):]:
+    for k in order[np.searchsorted(times_s[order], times_s[way[-1]], side="right") :]:
         after_s = float(times_s[k] - times_s[members[-1]])
         if after_s > settings.longest_gap_s:
             break
         if after_s <= 0 or laid[k].sighting.label != label:
             continue
         expected_m, _, spread = _line(members, laid, times_s, float(times_s[k]))
-        sigma_m = np.hypot(np.hypot(spread, _sigma_m(laid[k])), 0.5 * settings.wobble_m_s2 * after_s**2)
+        sigma_m = np.hypot(
+            np.hypot(spread, _sigma_m(laid[k])), 0.5 * settings.wobble_m_s2 * after_s**2
+        )
         if np.hypot(*(laid[k].sighting.position_m - expected_m)) < settings.most_off * sigma_m:
             members.append(int(k))
     return members
@@ -150,15 +164,21 @@ def _line(
     return solution[0], solution[1], float(np.sqrt(max(covariance[0, 0], 0.0)))
 
 
-def _off(members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats, wobble_m_s2: float) -> float:
+def _off(
+    members: Sequence[int], laid: Sequence[LaidSighting], times_s: Floats, wobble_m_s2: float
+) -> float:
     """How far the sightings lie from even motion through their neighbours in time, rms in sigmas."""
     squares = []
     for before, k, after in zip(members, members[1:], members[2:]):
         share = (times_s[k] - times_s[before]) / (times_s[after] - times_s[before])
-        expected_m = (1 - share) * laid[before].sighting.position_m + share * laid[after].sighting.position_m
+        expected_m = (1 - share) * laid[before].sighting.position_m + share * laid[
+            after
+        ].sighting.position_m
         wobble_m = 0.5 * wobble_m_s2 * (times_s[after] - times_s[before]) ** 2 / 4
         sigma_m = np.hypot(1.5 * _sigma_m(laid[k]), wobble_m)
-        squares.append(float(((laid[k].sighting.position_m - expected_m) ** 2).sum()) / sigma_m**2 / 2)
+        squares.append(
+            float(((laid[k].sighting.position_m - expected_m) ** 2).sum()) / sigma_m**2 / 2
+        )
     return float(np.sqrt(np.mean(squares)))
 
 

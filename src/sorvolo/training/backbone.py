@@ -9,7 +9,12 @@ from sorvolo.training.depthwise import depthwise
 
 _EPSILON = 1e-3  # of EfficientNet-Lite's batch norms
 _BLOCKS = (  # repeats, kernel, stride, growth, out channels
-    (1, 3, 1, 1, 16), (2, 3, 2, 6, 24), (2, 5, 2, 6, 40), (3, 3, 2, 6, 80), (3, 5, 1, 6, 112), (4, 5, 2, 6, 192),
+    (1, 3, 1, 1, 16),
+    (2, 3, 2, 6, 24),
+    (2, 5, 2, 6, 40),
+    (3, 3, 2, 6, 80),
+    (3, 5, 1, 6, 112),
+    (4, 5, 2, 6, 192),
     (1, 3, 1, 6, 320),
 )
 
@@ -21,7 +26,13 @@ class _OneNode(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: object, features: Tensor, weight: Tensor, bias: Tensor, stride: int, pads: tuple[int, int], groups: int
+        ctx: object,
+        features: Tensor,
+        weight: Tensor,
+        bias: Tensor,
+        stride: int,
+        pads: tuple[int, int],
+        groups: int,
     ) -> Tensor:
         before, after = pads
         padded = functional.pad(features, (before, after, before, after))
@@ -31,7 +42,12 @@ class _OneNode(torch.autograd.Function):
     def symbolic(g, features, weight, bias, stride: int, pads: tuple[int, int], groups: int):  # type: ignore[no-untyped-def]
         before, after = pads
         return g.op(
-            "Conv", features, weight, bias, strides_i=[stride, stride], pads_i=[before, before, after, after],
+            "Conv",
+            features,
+            weight,
+            bias,
+            strides_i=[stride, stride],
+            pads_i=[before, before, after, after],
             group_i=groups,
         )
 
@@ -104,11 +120,17 @@ class EfficientNetLite0(nn.Module):
         self.channels = (24, 40, 112, 320) if deep else (24, 40, 112)
         self.strides = (4, 8, 16, 32) if deep else (4, 8, 16)
         for layer in self.modules():
-            if isinstance(layer, nn.Conv2d):  # without norms a net from nothing needs its signals kept at one size
+            if isinstance(
+                layer, nn.Conv2d
+            ):  # without norms a net from nothing needs its signals kept at one size
                 nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
                 nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
         if not thaw_all:
-            for module in (self._conv_stem, blocks[0], *(each._depthwise_conv for each in blocks[1:_STRIDE_8])):
+            for module in (
+                self._conv_stem,
+                blocks[0],
+                *(each._depthwise_conv for each in blocks[1:_STRIDE_8]),
+            ):
                 module.requires_grad_(False)
 
     def forward(self, images: Tensor) -> list[Tensor]:
@@ -126,7 +148,12 @@ class EfficientNetLite0(nn.Module):
 
         Raises KeyError when a layer of this net is missing there.
         """
-        norms = {"_conv_stem": "_bn0", "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2"}
+        norms = {
+            "_conv_stem": "_bn0",
+            "_expand_conv": "_bn0",
+            "_depthwise_conv": "_bn1",
+            "_project_conv": "_bn2",
+        }
         folded = {}
         for name in self.state_dict():
             layer, kind = name.rsplit(".", 1)

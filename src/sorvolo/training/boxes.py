@@ -24,7 +24,10 @@ def cover_matrix(a: Tensor, b: Tensor) -> Tensor:
 def _shared(a: Tensor, b: Tensor) -> Tensor:
     a, b = a.detach(), b.detach()
     far = [torch.minimum(a[:, None, axis], b[None, :, axis]) for axis in (2, 3)]
-    sides = [side.sub_(torch.maximum(a[:, None, axis], b[None, :, axis])) for side, axis in zip(far, (0, 1))]
+    sides = [
+        side.sub_(torch.maximum(a[:, None, axis], b[None, :, axis]))
+        for side, axis in zip(far, (0, 1))
+    ]
     return sides[0].clamp_(min=0).mul_(sides[1].clamp_(min=0))
 
 
@@ -59,7 +62,10 @@ def clipped(boxes: Tensor, height_px: Tensor | int, width_px: Tensor | int) -> T
 
 def giou_loss(boxes: Tensor, wanted: Tensor) -> Tensor:
     """(N,) one minus the generalised intersection over union of box pairs (Rezatofighi et al. 2019, eq. 5)."""
-    corner, far = torch.maximum(boxes[:, :2], wanted[:, :2]), torch.minimum(boxes[:, 2:], wanted[:, 2:])
+    corner, far = (
+        torch.maximum(boxes[:, :2], wanted[:, :2]),
+        torch.minimum(boxes[:, 2:], wanted[:, 2:]),
+    )
     shared = (far - corner).clamp(min=0).prod(1)
     union = (area(boxes) + area(wanted) - shared).clamp(min=1e-6)
     hull = torch.maximum(boxes[:, 2:], wanted[:, 2:]) - torch.minimum(boxes[:, :2], wanted[:, :2])
@@ -87,7 +93,9 @@ def _suppressed(boxes: Floats, scores: Floats, most: int, iou: float, least_scor
     return np.array(rows, np.int64).reshape(-1, 3)
 
 
-def suppress_all_pairs(boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float) -> Tensor:
+def suppress_all_pairs(
+    boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float
+) -> Tensor:
     """(K, 3) rows of 0, class and index, as `suppress` keeps them, in few steps over all pairs of boxes (N, 4): for a
     GPU, where many small steps wait for each other. Scores are (C, N).
 
@@ -117,27 +125,36 @@ class _Suppress(torch.autograd.Function):
     """Greedy suppression as ONNX's NonMaxSuppression does it."""
 
     @staticmethod
-    def forward(ctx: object, boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float) -> Tensor:
+    def forward(
+        ctx: object, boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float
+    ) -> Tensor:
         """(K, 3) rows of 0, class, index for boxes (N, 4), scores (C, N); by class, then best first."""
         if boxes.is_cuda:
             return suppress_all_pairs(boxes.detach(), scores.detach(), most, iou, least_score)
         # in NumPy, so that an export records one node and none of this
-        return torch.from_numpy(_suppressed(boxes.detach().numpy(), scores.detach().numpy(), most, iou, least_score))
+        return torch.from_numpy(
+            _suppressed(boxes.detach().numpy(), scores.detach().numpy(), most, iou, least_score)
+        )
 
     @staticmethod
     def symbolic(g, boxes, scores, most: int, iou: float, least_score: float):  # type: ignore[no-untyped-def]
         """The same as a node of the exported graph."""
         lead = g.op("Constant", value_t=torch.tensor([0]))
         return g.op(
-            "NonMaxSuppression", g.op("Unsqueeze", boxes, lead), g.op("Unsqueeze", scores, lead),
-            g.op("Constant", value_t=torch.tensor([most])), g.op("Constant", value_t=torch.tensor([iou])),
-            g.op("Constant", value_t=torch.tensor([least_score])), center_point_box_i=0,
+            "NonMaxSuppression",
+            g.op("Unsqueeze", boxes, lead),
+            g.op("Unsqueeze", scores, lead),
+            g.op("Constant", value_t=torch.tensor([most])),
+            g.op("Constant", value_t=torch.tensor([iou])),
+            g.op("Constant", value_t=torch.tensor([least_score])),
+            center_point_box_i=0,
         )
 
 
 def suppress(boxes: Tensor, scores: Tensor, most: int, iou: float, least_score: float) -> Tensor:
     """(K, 2) class and index of what is kept of boxes (N, 4) with scores (C, N), class by class."""
     return _Suppress.apply(boxes, scores, most, iou, least_score)[:, 1:]  # type: ignore[no-untyped-call]
+
 
 def at_most(most: int, values: Tensor) -> int:
     """`most`, or how many values there are if fewer: for a topk that the exported graph can do with any picture."""

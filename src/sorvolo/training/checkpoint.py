@@ -18,7 +18,13 @@ from sorvolo.training.progress import History, Learner
 _FORMAT = 1
 
 UNREADABLE = (
-    pickle.UnpicklingError, struct.error, RuntimeError, EOFError, ValueError, LookupError, AttributeError,
+    pickle.UnpicklingError,
+    struct.error,
+    RuntimeError,
+    EOFError,
+    ValueError,
+    LookupError,
+    AttributeError,
     AssertionError,
 )
 """What `torch.load(weights_only=True)` raises on damaged files: its reader of pickles trusts their bytes."""
@@ -36,7 +42,9 @@ class Checkpoint:
 def checkpoint_bytes(learner: Learner, settings: Mapping[str, Any], history: History) -> bytes:
     """All of a run at this step; `settings` are plain values (JSON), those that another run must share to go on."""
     content = {
-        "format": _FORMAT, "state": learner.state(), "torch_random": torch.get_rng_state(),
+        "format": _FORMAT,
+        "state": learner.state(),
+        "torch_random": torch.get_rng_state(),
         "about": json.dumps({"settings": dict(settings), "history": history.plain()}),
     }
     out = BytesIO()
@@ -49,7 +57,9 @@ def read_checkpoint(data: bytes, name: str) -> Checkpoint:
     try:
         content = torch.load(BytesIO(data), map_location="cpu", weights_only=True)
         if content["format"] > _FORMAT:
-            raise InputError(f"{name} is a checkpoint of a newer sorvolo (format {content['format']}); update sorvolo")
+            raise InputError(
+                f"{name} is a checkpoint of a newer sorvolo (format {content['format']}); update sorvolo"
+            )
         about = json.loads(content["about"])
         history = History.from_plain(about["history"])
         state = {**content["state"], "torch_random": content["torch_random"]}
@@ -70,7 +80,8 @@ def restore(learner: Learner, checkpoint: Checkpoint, settings: Mapping[str, Any
     now = json.loads(json.dumps(dict(settings)))
     differing = [
         f"{name} was {checkpoint.settings.get(name)!r}, is {now.get(name)!r}"
-        for name in sorted({*now, *checkpoint.settings}) if now.get(name) != checkpoint.settings.get(name)
+        for name in sorted({*now, *checkpoint.settings})
+        if now.get(name) != checkpoint.settings.get(name)
     ]
     if differing:
         raise SettingsError(
@@ -80,13 +91,17 @@ def restore(learner: Learner, checkpoint: Checkpoint, settings: Mapping[str, Any
         learner.load_state(checkpoint.state)
     except (RuntimeError, KeyError, ValueError) as error:
         first = str(error).strip().split("\n")[0][:160]
-        raise InputError(f"the checkpoint does not fit this network ({first}); start anew without --resume") from error
+        raise InputError(
+            f"the checkpoint does not fit this network ({first}); start anew without --resume"
+        ) from error
     torch.set_rng_state(checkpoint.state["torch_random"])
 
 
 def weights_bytes(model: FasterRCNN) -> bytes:
     """The network's weights alone, as a safetensors file."""
-    return safetensors.torch.save({name: value.cpu().contiguous() for name, value in model.state_dict().items()})
+    return safetensors.torch.save(
+        {name: value.cpu().contiguous() for name, value in model.state_dict().items()}
+    )
 
 
 def load_weights_bytes(model: FasterRCNN, data: bytes, name: str) -> None:
@@ -95,4 +110,6 @@ def load_weights_bytes(model: FasterRCNN, data: bytes, name: str) -> None:
         model.load_state_dict(safetensors.torch.load(data))
     except (safetensors.SafetensorError, RuntimeError) as error:
         first = str(error).strip().split("\n")[0][:160]
-        raise InputError(f"{name} does not hold this network's weights, or is damaged ({first}); train anew") from error
+        raise InputError(
+            f"{name} does not hold this network's weights, or is damaged ({first}); train anew"
+        ) from error

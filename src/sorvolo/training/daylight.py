@@ -23,7 +23,9 @@ class Softened(nn.Module):
         self.reach = math.ceil(2.5 * sigma_px)
         across = torch.arange(-self.reach, self.reach + 1, dtype=torch.float32)
         bell = torch.exp(-(across**2) / (2 * sigma_px**2))
-        self.register_buffer("bell", torch.outer(bell, bell).div(bell.sum() ** 2).expand(3, 1, -1, -1).contiguous())
+        self.register_buffer(
+            "bell", torch.outer(bell, bell).div(bell.sum() ** 2).expand(3, 1, -1, -1).contiguous()
+        )
 
     def forward(self, images: Tensor) -> Tensor:
         """(N, 3, H, W) of the pictures (N, 3, H, W); beyond their edges they go on as at them."""
@@ -51,15 +53,21 @@ class Judge(nn.Module):
         channels = [NanoDetBackbone.channels[level] for level in settings.levels]
         inputs = sum(each * cells**2 for each, cells in zip(channels, settings.cells))
         self.look = nn.Linear(inputs, settings.width)
-        self.decide = nn.Sequential(nn.Linear(settings.width + classes + 1, 32), nn.ReLU(), nn.Linear(32, classes))
+        self.decide = nn.Sequential(
+            nn.Linear(settings.width + classes + 1, 32), nn.ReLU(), nn.Linear(32, classes)
+        )
 
     def pooled(self, levels: Sequence[Tensor], boxes: Tensor) -> Tensor:
         """(R, inputs) one picture's features in and around boxes (R, 4) px."""
         middle, half = (boxes[:, :2] + boxes[:, 2:]) / 2, (boxes[:, 2:] - boxes[:, :2]) / 2
         parts = []
-        for level, grown, cells in zip(self.settings.levels, self.settings.grown, self.settings.cells):
+        for level, grown, cells in zip(
+            self.settings.levels, self.settings.grown, self.settings.cells
+        ):
             around = torch.cat([middle - grown * half, middle + grown * half], 1)
-            parts.append(roi_means(levels[level], around, NanoDetBackbone.strides[level], cells).flatten(1))
+            parts.append(
+                roi_means(levels[level], around, NanoDetBackbone.strides[level], cells).flatten(1)
+            )
         return torch.cat(parts, 1)
 
     def forward(self, pooled: Tensor, boxes: Tensor, scores: Tensor, labels: Tensor) -> Tensor:
@@ -100,9 +108,15 @@ class Daylight(nn.Module):
     stride = 32
 
     def __init__(
-        self, aerial: FasterRCNN, coco: CocoDetector, judge: Judge, judged: Mapping[int, Calibration],
-        person: Calibration, aerial_person: Calibration = Calibration(),
-        settings: DaylightSettings = DaylightSettings(), people: NanoDetHead | None = None,
+        self,
+        aerial: FasterRCNN,
+        coco: CocoDetector,
+        judge: Judge,
+        judged: Mapping[int, Calibration],
+        person: Calibration,
+        aerial_person: Calibration = Calibration(),
+        settings: DaylightSettings = DaylightSettings(),
+        people: NanoDetHead | None = None,
     ) -> None:
         """`coco` finds people alone. `judged`: classes whose aerial candidates the judge scores again.
 
@@ -117,15 +131,21 @@ class Daylight(nn.Module):
         """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
         levels = self.coco.backbone(images)
         outputs = self.coco.head(levels)
-        people, opinions, supporting = self.people_of(levels, outputs, (images.shape[2], images.shape[3]))
+        people, opinions, supporting = self.people_of(
+            levels, outputs, (images.shape[2], images.shape[3])
+        )
         people_scores = _calibrated(opinions, self.person, supporting)
         boxes, scores, labels = self.aerial(self.softened(images))
         scores = self._scored(levels, outputs, boxes, scores, labels)
         boxes, scores = torch.cat([people, boxes]), torch.cat([people_scores, scores])
-        labels = torch.cat([torch.full_like(people_scores, self.settings.person).to(labels.dtype), labels])
+        labels = torch.cat(
+            [torch.full_like(people_scores, self.settings.person).to(labels.dtype), labels]
+        )
         by_class = (scores[:, None] * one_hot(labels, self.judge.classes)).T
         reach = self.settings
-        kept = suppress(boxes, by_class.contiguous(), reach.most, reach.suppress_iou, reach.least_score)
+        kept = suppress(
+            boxes, by_class.contiguous(), reach.most, reach.suppress_iou, reach.least_score
+        )
         rows = kept[:, 1]
         best, order = torch.topk(scores[rows], at_most(reach.most, scores[rows]))
         return boxes[rows][order], best, kept[:, 0][order]
@@ -143,7 +163,12 @@ class Daylight(nn.Module):
         return boxes, odds_from_scores(scores), support(outputs, self.coco.head.strides, boxes, row)
 
     def _scored(
-        self, levels: Sequence[Tensor], outputs: Sequence[Tensor], boxes: Tensor, scores: Tensor, labels: Tensor
+        self,
+        levels: Sequence[Tensor],
+        outputs: Sequence[Tensor],
+        boxes: Tensor,
+        scores: Tensor,
+        labels: Tensor,
     ) -> Tensor:
         """(R,) the aerial candidates' scores, those of people and of judged classes with NanoDet's share."""
         own = odds_from_scores(scores)
@@ -152,7 +177,9 @@ class Daylight(nn.Module):
         person = _calibrated(own, self.aerial_person, supporting)
         out = torch.where(labels == self.settings.person, person, scores)
         for label, calibration in self.judged.items():
-            out = torch.where(labels == label, _calibrated((own + answers[:, label]) / 2, calibration), out)
+            out = torch.where(
+                labels == label, _calibrated((own + answers[:, label]) / 2, calibration), out
+            )
         return out
 
 

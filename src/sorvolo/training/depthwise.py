@@ -27,7 +27,12 @@ class _Depthwise(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             kind = grown.dtype if stride == 1 else torch.float32
             to_features = torch.ops.aten.convolution_backward(
-                grown.to(kind), features.to(kind), weight.to(kind), None, *places, [True, False, False]
+                grown.to(kind),
+                features.to(kind),
+                weight.to(kind),
+                None,
+                *places,
+                [True, False, False],
             )[0].to(features.dtype)
         if ctx.needs_input_grad[1]:
             to_weight = torch.ops.aten.convolution_backward(
@@ -36,7 +41,9 @@ class _Depthwise(torch.autograd.Function):
         return to_features, to_weight, None, None
 
 
-def depthwise(features: Tensor, weight: Tensor, bias: Tensor | None, stride: int, padding: int) -> Tensor:
+def depthwise(
+    features: Tensor, weight: Tensor, bias: Tensor | None, stride: int, padding: int
+) -> Tensor:
     """(N, C, H, W) filtered channel by channel with `weight` (C, 1, k, k), as torch.nn.functional.conv2d does it."""
     learns = torch.is_grad_enabled() and (features.requires_grad or weight.requires_grad)
     is_quick = weight.shape[-1] <= _QUICK_KERNEL and stride == 1  # in bfloat16 too
@@ -50,7 +57,9 @@ class Depthwise(nn.Conv2d):
     """A convolution (channels, 1, k, k) of each channel by itself that keeps the size; without a bias."""
 
     def __init__(self, channels: int, kernel: int) -> None:
-        super().__init__(channels, channels, kernel, padding=kernel // 2, groups=channels, bias=False)
+        super().__init__(
+            channels, channels, kernel, padding=kernel // 2, groups=channels, bias=False
+        )
 
     def forward(self, features: Tensor) -> Tensor:
         """(N, C, H, W) -> (N, C, H, W)."""

@@ -45,8 +45,15 @@ def draws(shares: Sequence[Share], seed: int, start: int = 0) -> Iterator[Draw]:
 
 
 def batches_from(
-    shares: Sequence[Share], classes: Sequence[str], read: Callable[[str], ImageRGB], augmentation: Augmentation, *,
-    seed: int, batch: int, start: int = 0, threads: int = 1,
+    shares: Sequence[Share],
+    classes: Sequence[str],
+    read: Callable[[str], ImageRGB],
+    augmentation: Augmentation,
+    *,
+    seed: int,
+    batch: int,
+    start: int = 0,
+    threads: int = 1,
 ) -> Generator[list[Sample], None, None]:
     """Endless batches from number `start` on, the next ones cut on other threads meanwhile.
 
@@ -72,7 +79,9 @@ def batches_from(
         executor.shutdown(cancel_futures=True)
 
 
-def _readable(share: Share, first: int, read: Callable[[str], ImageRGB]) -> tuple[LabelledPicture, ImageRGB]:
+def _readable(
+    share: Share, first: int, read: Callable[[str], ImageRGB]
+) -> tuple[LabelledPicture, ImageRGB]:
     """The first picture from `first` on, round and round, that is not damaged."""
     pictures = share.labelled.pictures
     for picture in (*pictures[first:], *pictures[:first]):

@@ -37,8 +37,11 @@ class DrawnRegions:
         scores, offsets = model.classify(levels, torch.cat(self.regions), batch)
         score_sum, box_sum = scores.new_zeros(()), scores.new_zeros(())
         parts = zip(
-            torch.split(scores, counts), torch.split(offsets, counts),
-            self.regions, self.matches, answers,
+            torch.split(scores, counts),
+            torch.split(offsets, counts),
+            self.regions,
+            self.matches,
+            answers,
         )
         for each in parts:
             score, box = region_loss(*each, overlap=overlap)
@@ -48,8 +51,16 @@ class DrawnRegions:
 
 @torch.no_grad()
 def draw_regions(
-    model: FasterRCNN, levels: Sequence[Tensor], proposed: Proposed, answers: Sequence[Answer],
-    generator: torch.Generator, *, before: int, after: int, count: int, most_positive: float,
+    model: FasterRCNN,
+    levels: Sequence[Tensor],
+    proposed: Proposed,
+    answers: Sequence[Answer],
+    generator: torch.Generator,
+    *,
+    before: int,
+    after: int,
+    count: int,
+    most_positive: float,
 ) -> DrawnRegions:
     """Of each picture `count` regions, positives among them up to their share; the true boxes may be drawn, too.
 

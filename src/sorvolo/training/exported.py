@@ -18,7 +18,9 @@ from sorvolo.training.faster_rcnn import FasterRCNN
 _WEIGHTED = ("Conv", "Gemm")
 _AERIAL = "/aerial/"  # of a model of two networks, such as the packaged one, the part that can be learnt on from
 _OTHER_PARTS = {
-    "backbone": "NanoDet's network", "coco": "NanoDet's network", "judge": "the judge of cars",
+    "backbone": "NanoDet's network",
+    "coco": "NanoDet's network",
+    "judge": "the judge of cars",
     "softened": "the softening of sharp pictures",
 }
 _OF_CLASSES = "head.scores"  # the one layer with a row for each class; the background's comes last
@@ -63,7 +65,11 @@ def load_exported(
     model with batch norms that do not learn (ResNet-50's of the presets `accurate` and `thesis`).
     """
     graph, known = _read(exported)
-    layers = {name: each for name, each in model.named_modules() if isinstance(each, nn.Conv2d | nn.Linear)}
+    layers = {
+        name: each
+        for name, each in model.named_modules()
+        if isinstance(each, nn.Conv2d | nn.Linear)
+    }
     norms = _norms_after(model)
     loaded = _loaded(graph, list(layers))
     if foreign := [name for name in loaded if name not in layers]:
@@ -85,7 +91,11 @@ def other_networks(exported: bytes) -> tuple[str, ...]:
     names = [node.name for node in _read(exported)[0].node]
     if not any(name.startswith(_AERIAL) for name in names):
         return ()
-    found = (words for part, words in _OTHER_PARTS.items() if any(name.startswith(f"/{part}/") for name in names))
+    found = (
+        words
+        for part, words in _OTHER_PARTS.items()
+        if any(name.startswith(f"/{part}/") for name in names)
+    )
     return tuple(dict.fromkeys(found))
 
 
@@ -96,7 +106,9 @@ def _read(exported: bytes) -> tuple[Any, tuple[str, ...]]:
         about = next(each.value for each in file.metadata_props if each.key == "sorvolo")
         return file.graph, tuple(map(str, json.loads(about)["classes"]))
     except (DecodeError, StopIteration, ValueError, LookupError, TypeError) as error:
-        raise InputError("the model file is damaged, or none that `sorvolo train` wrote; give one of those") from error
+        raise InputError(
+            "the model file is damaged, or none that `sorvolo train` wrote; give one of those"
+        ) from error
 
 
 def _loaded(graph: Any, names: Sequence[str]) -> dict[str, list[Tensor]]:
@@ -105,7 +117,9 @@ def _loaded(graph: Any, names: Sequence[str]) -> dict[str, list[Tensor]]:
     values = _values(graph)
     part = _AERIAL if any(node.name.startswith(_AERIAL) for node in graph.node) else ""
     loaded: dict[str, list[Tensor]] = {}
-    for node in (each for each in graph.node if each.op_type in _WEIGHTED and each.name.startswith(part)):
+    for node in (
+        each for each in graph.node if each.op_type in _WEIGHTED and each.name.startswith(part)
+    ):
         if own := _tensors(node, values):
             name = _module_of(node.name.removeprefix(part.rstrip("/")), names) or node.name
             loaded[name] = own
@@ -123,7 +137,8 @@ def _values(graph: Any) -> dict[str, Any]:
     values = {each.name: each for each in graph.initializer}
     return values | {
         node.output[0]: values[node.input[0]]
-        for node in graph.node if node.op_type == "Identity" and node.input[0] in values
+        for node in graph.node
+        if node.op_type == "Identity" and node.input[0] in values
     }
 
 
@@ -131,7 +146,9 @@ def _demand_fitting(name: str, layer: nn.Conv2d | nn.Linear, found: Sequence[Ten
     """Raise InputError unless `found` is a weight of the layer's shape, and a bias."""
     if len(found) != 2 or found[0].shape != layer.weight.shape:
         shape = " x ".join(map(str, found[0].shape)) if found else "nothing"
-        raise _unfitting(f"its layer {name} should be {' x '.join(map(str, layer.weight.shape))}, and is {shape}")
+        raise _unfitting(
+            f"its layer {name} should be {' x '.join(map(str, layer.weight.shape))}, and is {shape}"
+        )
 
 
 def _unfitting(reason: str) -> InputError:
@@ -146,7 +163,9 @@ def _rows_of(
 ) -> list[Tensor]:
     """The class layer's weights and bias: rows of classes of the same name and of the background are the file's."""
     if len(found[0]) != len(known) + 1 or found[0].shape[1:] != layer.weight.shape[1:]:  # type: ignore[index]
-        raise _unfitting(f"its {len(found[0])} rows of classes are not those of {', '.join(known)} and the background")
+        raise _unfitting(
+            f"its {len(found[0])} rows of classes are not those of {', '.join(known)} and the background"
+        )
     theirs = [*(known.index(name) for name in classes if name in known), len(known)]
     own = [*(row for row, name in enumerate(classes) if name in known), len(classes)]
     filled = [layer.weight.detach().clone(), layer.bias.detach().clone()]  # type: ignore[operator]
@@ -156,7 +175,9 @@ def _rows_of(
 
 
 @torch.no_grad()
-def _fill(name: str, layer: nn.Module, norm: nn.BatchNorm2d | None, weight: Tensor, bias: Tensor) -> None:
+def _fill(
+    name: str, layer: nn.Module, norm: nn.BatchNorm2d | None, weight: Tensor, bias: Tensor
+) -> None:
     """The layer's weight, and its bias: of one without a bias the shift of the norm, which else changes nothing."""
     layer.weight.copy_(weight)  # type: ignore[operator]
     if layer.bias is not None:
@@ -179,7 +200,9 @@ def _norms_after(model: nn.Module) -> dict[str, nn.BatchNorm2d]:
     return {
         name: following
         for (name, each), (_, following) in pairwise(leaves)
-        if isinstance(each, nn.Conv2d) and each.bias is None and isinstance(following, nn.BatchNorm2d)
+        if isinstance(each, nn.Conv2d)
+        and each.bias is None
+        and isinstance(following, nn.BatchNorm2d)
     }
 
 
@@ -201,6 +224,7 @@ def _module_of(node: str, names: Sequence[str]) -> str | None:
 @torch.no_grad()
 def _settle(model: FasterRCNN, norms: Sequence[nn.BatchNorm2d], pictures: Tensor) -> None:
     """Give each norm the mean and variance of what reaches it, and the gain and shift that take them out again."""
+
     def settle(norm: nn.Module, inputs: tuple[Tensor, ...]) -> None:
         mean, variance = inputs[0].mean((0, 2, 3)), inputs[0].var((0, 2, 3), correction=0)
         norm.running_mean.copy_(mean)  # type: ignore[operator]

@@ -28,20 +28,34 @@ class FasterRCNN(nn.Module):
     """
 
     def __init__(
-        self, backbone: nn.Module, neck: nn.Module, proposals: ProposalNetwork, head: TwoLayerHead | StageHead,
+        self,
+        backbone: nn.Module,
+        neck: nn.Module,
+        proposals: ProposalNetwork,
+        head: TwoLayerHead | StageHead,
         reach: Reach = Reach(),
     ) -> None:
         super().__init__()
-        self.backbone, self.neck, self.proposals, self.head, self.reach = backbone, neck, proposals, head, reach
+        self.backbone, self.neck, self.proposals, self.head, self.reach = (
+            backbone,
+            neck,
+            proposals,
+            head,
+            reach,
+        )
         self.stride = max(32, *proposals.strides)
 
     def features(self, images: Tensor) -> list[Tensor]:
         """What all later parts share: pictures (N, 3, H, W), RGB 0 to 255, to a tensor per level."""
         return self.neck(self.backbone(images.float()))
 
-    def classify(self, levels: list[Tensor], regions: Tensor, batch: Tensor) -> tuple[Tensor, Tensor]:
+    def classify(
+        self, levels: list[Tensor], regions: Tensor, batch: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Scores (R, classes + 1) before the softmax and offsets (R, 4) of regions (R, 4) of pictures `batch` (R,)."""
-        return self.head(pooled_levels(levels, self.proposals.strides, regions, batch, self.head.side))
+        return self.head(
+            pooled_levels(levels, self.proposals.strides, regions, batch, self.head.side)
+        )
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
@@ -54,10 +68,14 @@ class FasterRCNN(nn.Module):
         """What `forward` gives for a picture of that height and width, by its features and what is proposed in it."""
         reach = self.reach
         regions, _ = propose(proposed, 0, size_px, before=reach.before, after=reach.regions)
-        scores, offsets = self.classify(levels, regions, torch.zeros_like(regions[:, 0], dtype=torch.int64))
+        scores, offsets = self.classify(
+            levels, regions, torch.zeros_like(regions[:, 0], dtype=torch.int64)
+        )
         boxes = clipped(boxes_from_offsets(offsets, regions), *size_px)
         shares = scores.softmax(1)[:, :-1].T
-        kept = suppress(boxes, shares.contiguous(), reach.most, reach.suppress_iou, reach.least_score)
+        kept = suppress(
+            boxes, shares.contiguous(), reach.most, reach.suppress_iou, reach.least_score
+        )
         labels, rows = kept[:, 0], kept[:, 1]
         found = shares.T[rows, labels]
         best, order = torch.topk(found, at_most(reach.most, found))

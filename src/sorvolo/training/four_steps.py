@@ -38,13 +38,17 @@ class FourStepSettings:
 
     def __post_init__(self) -> None:
         if self.steps < 4:
-            raise SettingsError(f"the four-step schedule needs at least 4 steps, one of each kind; got {self.steps}")
+            raise SettingsError(
+                f"the four-step schedule needs at least 4 steps, one of each kind; got {self.steps}"
+            )
 
 
 class FourStepTraining:
     """A model on its way through the four steps. Only `learn` changes it; `average` is the model itself."""
 
-    def __init__(self, model: FasterRCNN, settings: FourStepSettings, seed: int, device: str = "cpu") -> None:
+    def __init__(
+        self, model: FasterRCNN, settings: FourStepSettings, seed: int, device: str = "cpu"
+    ) -> None:
         self.model, self.settings, self.device = model.to(device), settings, device
         self.step = 0
         self.generator = torch.Generator().manual_seed(seed)
@@ -86,16 +90,25 @@ class FourStepTraining:
         self.step += 1
         values = [float(part.detach()) for part in parts]
         return Progress(
-            self.step, values[0], values[1], values[2], values[3], time.monotonic() - self._started_s,
+            self.step,
+            values[0],
+            values[1],
+            values[2],
+            values[3],
+            time.monotonic() - self._started_s,
             self.settings.steps,
         )
 
     def state(self) -> dict[str, object]:
         """All that is needed to go on: tensors, numbers and text only."""
         return {
-            "model": self.model.state_dict(), "step": self.step, "stage": self._stage,
-            "optimiser": self.optimiser.state_dict(), "generator": self.generator.get_state(),
-            "imagenet": self._imagenet, "proposer": None if self._proposer is None else self._proposer.state_dict(),
+            "model": self.model.state_dict(),
+            "step": self.step,
+            "stage": self._stage,
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+            "imagenet": self._imagenet,
+            "proposer": None if self._proposer is None else self._proposer.state_dict(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -123,8 +136,12 @@ class FourStepTraining:
         self._new_optimiser()
 
     def _new_optimiser(self) -> None:
-        weights = [each for part in self._learning() for each in part.parameters() if each.requires_grad]
-        self.optimiser = torch.optim.SGD(weights, lr=self.settings.rate, momentum=self.settings.momentum)
+        weights = [
+            each for part in self._learning() for each in part.parameters() if each.requires_grad
+        ]
+        self.optimiser = torch.optim.SGD(
+            weights, lr=self.settings.rate, momentum=self.settings.momentum
+        )
 
     def _learning(self) -> tuple[nn.Module, ...]:
         model = self.model
@@ -149,8 +166,15 @@ class FourStepTraining:
     ) -> tuple[Tensor, Tensor]:
         """Eq. 4.2 for the classifier: both sums over the number of regions drawn."""
         drawn = draw_regions(
-            self.model, levels, proposed, answers, self.generator, before=2000, after=self.settings.proposed,
-            count=self.settings.regions, most_positive=0.25,
+            self.model,
+            levels,
+            proposed,
+            answers,
+            self.generator,
+            before=2000,
+            after=self.settings.proposed,
+            count=self.settings.regions,
+            most_positive=0.25,
         )
         score, box = drawn.losses(self.model, levels, answers, overlap=False)
         return score / max(1, drawn.count), box / max(1, drawn.count)

@@ -7,7 +7,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-_CANONICAL_PX = 56.0  # a box of this size is looked at on the level of stride 8 (Lin et al. 2017, eq. 1)
+_CANONICAL_PX = (
+    56.0  # a box of this size is looked at on the level of stride 8 (Lin et al. 2017, eq. 1)
+)
 _SAMPLES = 2  # a side of a cell, averaged: Mask R-CNN's four points (He et al. 2017)
 
 
@@ -22,11 +24,21 @@ class _RoiAlign(torch.autograd.Function):
 
     @staticmethod
     def symbolic(g, features, boxes, scale: float, side: int):  # type: ignore[no-untyped-def]
-        rows = g.op("Gather", g.op("Shape", boxes), g.op("Constant", value_t=torch.tensor([0])), axis_i=0)
+        rows = g.op(
+            "Gather", g.op("Shape", boxes), g.op("Constant", value_t=torch.tensor([0])), axis_i=0
+        )
         batch = g.op("ConstantOfShape", rows, value_t=torch.tensor([0]))
         return g.op(
-            "RoiAlign", features, boxes, batch, output_height_i=side, output_width_i=side, sampling_ratio_i=_SAMPLES,
-            spatial_scale_f=scale, mode_s="avg", coordinate_transformation_mode_s="half_pixel",
+            "RoiAlign",
+            features,
+            boxes,
+            batch,
+            output_height_i=side,
+            output_width_i=side,
+            sampling_ratio_i=_SAMPLES,
+            spatial_scale_f=scale,
+            mode_s="avg",
+            coordinate_transformation_mode_s="half_pixel",
         )
 
 
@@ -42,7 +54,9 @@ def roi_align(features: Tensor, boxes: Tensor, batch: Tensor, stride: int, side:
 
 def _sampled(features: Tensor, boxes: Tensor, batch: Tensor, scale: float, side: int) -> Tensor:
     height, width = features.shape[-2:]
-    steps = (torch.arange(side * _SAMPLES, dtype=features.dtype, device=features.device) + 0.5) / (side * _SAMPLES)
+    steps = (torch.arange(side * _SAMPLES, dtype=features.dtype, device=features.device) + 0.5) / (
+        side * _SAMPLES
+    )
     x = boxes[:, 0:1] * scale + steps * (boxes[:, 2:3] - boxes[:, 0:1]) * scale
     y = boxes[:, 1:2] * scale + steps * (boxes[:, 3:4] - boxes[:, 1:2]) * scale
     x, y = x.clamp(0.5, width - 0.5) * 2 / width - 1, y.clamp(0.5, height - 0.5) * 2 / height - 1
@@ -70,15 +84,23 @@ def roi_means(features: Tensor, boxes: Tensor, stride: int, side: int) -> Tensor
     # one box more, dropped in the end: in an exported graph a Reshape of no boxes at all fails
     boxes = torch.cat([boxes, boxes.new_zeros(1, 4)])
     height, width = features.shape[-2], features.shape[-1]
-    steps = (torch.arange(side * _SAMPLES, dtype=features.dtype, device=features.device) + 0.5) / (side * _SAMPLES)
+    steps = (torch.arange(side * _SAMPLES, dtype=features.dtype, device=features.device) + 0.5) / (
+        side * _SAMPLES
+    )
     x = (boxes[:, 0:1] + steps * (boxes[:, 2:3] - boxes[:, 0:1])) / stride
     y = (boxes[:, 1:2] + steps * (boxes[:, 3:4] - boxes[:, 1:2])) / stride
     x, y = x * 2 / width - 1, y * 2 / height - 1
     columns = x[:, None, :] + 0 * y[:, :, None]
     lines = y[:, :, None] + 0 * x[:, None, :]
-    grid = torch.stack([columns, lines], -1).reshape(1, boxes.shape[0] * side * _SAMPLES, side * _SAMPLES, 2)
+    grid = torch.stack([columns, lines], -1).reshape(
+        1, boxes.shape[0] * side * _SAMPLES, side * _SAMPLES, 2
+    )
     seen = functional.grid_sample(features, grid, padding_mode="border", align_corners=False)
-    seen = seen[0].reshape(features.shape[1], boxes.shape[0], side * _SAMPLES, side * _SAMPLES).transpose(0, 1)
+    seen = (
+        seen[0]
+        .reshape(features.shape[1], boxes.shape[0], side * _SAMPLES, side * _SAMPLES)
+        .transpose(0, 1)
+    )
     return functional.avg_pool2d(seen, _SAMPLES)[:-1]
 
 
@@ -90,7 +112,9 @@ def pooled_levels(
         return roi_align(levels[0], boxes, batch, strides[0], side)
     size = torch.sqrt(((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).clamp(min=1.0))
     wanted = torch.floor(torch.log2(size / _CANONICAL_PX) + 3.0)  # log2 of the stride
-    least, most = (int(torch.log2(torch.tensor(float(each))).round()) for each in (strides[0], strides[-1]))
+    least, most = (
+        int(torch.log2(torch.tensor(float(each))).round()) for each in (strides[0], strides[-1])
+    )
     wanted = wanted.clamp(least, most)
     if not torch.onnx.is_in_onnx_export():
         out = levels[0].new_zeros(len(boxes), levels[0].shape[1], side, side)
@@ -100,7 +124,8 @@ def pooled_levels(
         return out
     places = [(wanted == float(stride.bit_length() - 1)).nonzero()[:, 0] for stride in strides]
     parts = [
-        roi_align(level, boxes[rows], batch, stride, side) for level, stride, rows in zip(levels, strides, places)
+        roi_align(level, boxes[rows], batch, stride, side)
+        for level, stride, rows in zip(levels, strides, places)
     ]
     # the exporter has no index_copy: put together, then back in order
     return torch.cat(parts)[torch.cat(places).argsort()]
@@ -113,7 +138,10 @@ class TwoLayerHead(nn.Module):
         super().__init__()
         self.side = side
         self.layers = nn.Sequential(
-            nn.Flatten(), nn.Linear(channels * side * side, width), nn.ReLU(inplace=True), nn.Linear(width, width),
+            nn.Flatten(),
+            nn.Linear(channels * side * side, width),
+            nn.ReLU(inplace=True),
+            nn.Linear(width, width),
             nn.ReLU(inplace=True),
         )
         self.scores = nn.Linear(width, classes + 1)

@@ -14,10 +14,15 @@ from sorvolo.training.feature_pyramid import convolution, separable
 Stem = Literal["standard", "extended", "extended-residual"]
 
 _TABLE_3_2 = (  # of each layer, its branches: filters, kernel
-    ((64, 1), (96, 3), (64, 5)), ((64, 1), (96, 3), (64, 5)), ((64, 1), (96, 3), (64, 5)),
-    ((192, 1), (192, 7), (192, 7)), ((192, 1), (192, 7), (192, 7)), ((192, 1), (192, 7), (192, 7)),
+    ((64, 1), (96, 3), (64, 5)),
+    ((64, 1), (96, 3), (64, 5)),
+    ((64, 1), (96, 3), (64, 5)),
     ((192, 1), (192, 7), (192, 7)),
-    ((320, 1), (384, 3), (384, 3), (384, 3), (384, 3)), ((320, 1), (384, 3), (384, 3), (384, 3), (384, 3)),
+    ((192, 1), (192, 7), (192, 7)),
+    ((192, 1), (192, 7), (192, 7)),
+    ((192, 1), (192, 7), (192, 7)),
+    ((320, 1), (384, 3), (384, 3), (384, 3), (384, 3)),
+    ((320, 1), (384, 3), (384, 3), (384, 3), (384, 3)),
 )
 _POOLED_LAYER = 2  # layer 3 has a branch more, which pools
 _REDUCED = {5: 48, 3: 64}  # channels in front of the larger kernels of layers 1 to 3
@@ -27,7 +32,9 @@ class InceptionA(nn.Module):
     """Layers 1 to 3: 1x1, 3x3 and 5x5 side by side, a 1x1 in front of the larger ones; in layer 3 the pooled input as
     well, for which the table gives no filters."""
 
-    def __init__(self, channels: int, branches: Sequence[tuple[int, int]], scale: float, *, pools: bool) -> None:
+    def __init__(
+        self, channels: int, branches: Sequence[tuple[int, int]], scale: float, *, pools: bool
+    ) -> None:
         super().__init__()
         self.branches = nn.ModuleList()
         self.channels = 0
@@ -37,7 +44,9 @@ class InceptionA(nn.Module):
                 self.branches.append(convolution(channels, out, 1))
             else:
                 inner = _scaled(_REDUCED[kernel], scale)
-                self.branches.append(nn.Sequential(convolution(channels, inner, 1), convolution(inner, out, kernel)))
+                self.branches.append(
+                    nn.Sequential(convolution(channels, inner, 1), convolution(inner, out, kernel))
+                )
             self.channels += out
         self.pools = pools
         self.channels += channels if pools else 0
@@ -58,8 +67,12 @@ class InceptionB(nn.Module):
         out = _scaled(branches[0][0], scale)
         inner = _scaled(128, scale)
         self.first = convolution(channels, out, 1)
-        self.second = nn.Sequential(convolution(channels, inner, 1), _line(inner, inner, 1, 7), _line(inner, out, 7, 1))
-        self.third = nn.Sequential(convolution(channels, inner, 1), _line(inner, inner, 7, 1), _line(inner, out, 1, 7))
+        self.second = nn.Sequential(
+            convolution(channels, inner, 1), _line(inner, inner, 1, 7), _line(inner, out, 7, 1)
+        )
+        self.third = nn.Sequential(
+            convolution(channels, inner, 1), _line(inner, inner, 7, 1), _line(inner, out, 1, 7)
+        )
         self.channels = 3 * out
 
     def forward(self, features: Tensor) -> Tensor:
@@ -72,7 +85,11 @@ class InceptionC(nn.Module):
 
     def __init__(self, channels: int, branches: Sequence[tuple[int, int]], scale: float) -> None:
         super().__init__()
-        narrow, out, inner = _scaled(branches[0][0], scale), _scaled(branches[1][0], scale), _scaled(448, scale)
+        narrow, out, inner = (
+            _scaled(branches[0][0], scale),
+            _scaled(branches[1][0], scale),
+            _scaled(448, scale),
+        )
         self.first = convolution(channels, narrow, 1)
         self.near = convolution(channels, out, 1)
         self.far = nn.Sequential(convolution(channels, inner, 1), convolution(inner, out, 3))
@@ -85,7 +102,10 @@ class InceptionC(nn.Module):
         """(N, channels, H, W) -> (N, self.channels, H, W)."""
         near, far = self.near(features), self.far(features)
         inputs = (near, near, far, far)
-        return torch.cat([self.first(features), *(branch(each) for branch, each in zip(self.branches, inputs))], 1)
+        return torch.cat(
+            [self.first(features), *(branch(each) for branch, each in zip(self.branches, inputs))],
+            1,
+        )
 
 
 class ExtendedStack(nn.Module):
@@ -130,17 +150,23 @@ class ResidualStack(nn.Module):
     mixes the three with its input. Else the modules are the table's, `scale` times as wide.
     """
 
-    def __init__(self, channels: int, out: int, *, light: bool, modules: int = 1, scale: float = 0.25) -> None:
+    def __init__(
+        self, channels: int, out: int, *, light: bool, modules: int = 1, scale: float = 0.25
+    ) -> None:
         super().__init__()
         self.channels = out
-        self.standard: nn.Module = separable(channels, 3) if light else convolution(channels, out, 3)
+        self.standard: nn.Module = (
+            separable(channels, 3) if light else convolution(channels, out, 3)
+        )
         if light:
             if channels != out:
                 raise ValueError(f"a light stack keeps its width, {channels}; got {out}")
             self.added = nn.Sequential(*(_LightInception(channels) for _ in range(modules)))
         else:
             stack = ExtendedStack(channels, scale)
-            self.added = nn.Sequential(stack, nn.Conv2d(stack.channels, out, 1, bias=False), nn.BatchNorm2d(out))
+            self.added = nn.Sequential(
+                stack, nn.Conv2d(stack.channels, out, 1, bias=False), nn.BatchNorm2d(out)
+            )
             nn.init.zeros_(self.added[2].weight)  # type: ignore[arg-type]
 
     def forward(self, features: Tensor) -> Tensor:
@@ -156,11 +182,15 @@ class _LightInception(nn.Module):
         super().__init__()
         self.branches = nn.ModuleList(
             nn.Sequential(
-                Depthwise(channels, kernel), nn.BatchNorm2d(channels), nn.ReLU(inplace=True),
+                Depthwise(channels, kernel),
+                nn.BatchNorm2d(channels),
+                nn.ReLU(inplace=True),
             )
             for kernel in (3, 5, 7)
         )
-        self.mix = nn.Sequential(nn.Conv2d(3 * channels, channels, 1, bias=False), nn.BatchNorm2d(channels))
+        self.mix = nn.Sequential(
+            nn.Conv2d(3 * channels, channels, 1, bias=False), nn.BatchNorm2d(channels)
+        )
         nn.init.zeros_(self.mix[1].weight)  # type: ignore[arg-type]
 
     def forward(self, features: Tensor) -> Tensor:
@@ -184,7 +214,8 @@ def proposal_stem(kind: Stem, channels: int, out: int, *, light: bool) -> nn.Mod
 def _line(channels: int, out: int, rows: int, columns: int) -> nn.Sequential:
     """A convolution of rows x columns, batch norm, ReLU."""
     return nn.Sequential(
-        nn.Conv2d(channels, out, (rows, columns), padding=(rows // 2, columns // 2), bias=False), nn.BatchNorm2d(out),
+        nn.Conv2d(channels, out, (rows, columns), padding=(rows // 2, columns // 2), bias=False),
+        nn.BatchNorm2d(out),
         nn.ReLU(inplace=True),
     )
 

@@ -43,7 +43,9 @@ class Progress(LossRow):
 class JointTraining:
     """A model on its way, with its optimiser and the mean of its weights. Only `learn` changes it."""
 
-    def __init__(self, model: FasterRCNN, settings: JointSettings, seed: int, device: str = "cpu") -> None:
+    def __init__(
+        self, model: FasterRCNN, settings: JointSettings, seed: int, device: str = "cpu"
+    ) -> None:
         self.model, self.settings, self.device = model.to(device), settings, device
         self.average = deepcopy(model).eval()
         self.step = 0
@@ -52,8 +54,13 @@ class JointTraining:
         own = {id(each) for each in model.backbone.parameters()}
         others = [each for each in model.parameters() if id(each) not in own]
         self.optimiser = torch.optim.AdamW(
-            [{"params": others, "rate": settings.rate}, {"params": backbone, "rate": settings.backbone_rate}],
-            lr=settings.rate, weight_decay=settings.decay, fused=True,
+            [
+                {"params": others, "rate": settings.rate},
+                {"params": backbone, "rate": settings.backbone_rate},
+            ],
+            lr=settings.rate,
+            weight_decay=settings.decay,
+            fused=True,
         )
         self._started_s = time.monotonic()
 
@@ -69,7 +76,9 @@ class JointTraining:
             levels = self.model.features(images)
             proposed = self.model.proposals(levels)
         levels = [level.float() for level in levels]
-        proposed = replace(proposed, scores=proposed.scores.float(), offsets=proposed.offsets.float())
+        proposed = replace(
+            proposed, scores=proposed.scores.float(), offsets=proposed.offsets.float()
+        )
         parts = self._losses(levels, proposed, answers)
         self.optimiser.zero_grad(set_to_none=True)
         torch.stack(parts).sum().backward()  # type: ignore[no-untyped-call]
@@ -79,15 +88,23 @@ class JointTraining:
         self._average()
         values = [float(part.detach()) for part in parts]
         return Progress(
-            self.step, values[0], values[1], values[2], values[3], time.monotonic() - self._started_s,
+            self.step,
+            values[0],
+            values[1],
+            values[2],
+            values[3],
+            time.monotonic() - self._started_s,
             self.settings.steps,
         )
 
     def state(self) -> dict[str, object]:
         """All that is needed to go on: tensors, numbers and text only."""
         return {
-            "model": self.model.state_dict(), "average": self.average.state_dict(), "step": self.step,
-            "optimiser": self.optimiser.state_dict(), "generator": self.generator.get_state(),
+            "model": self.model.state_dict(),
+            "average": self.average.state_dict(),
+            "step": self.step,
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
@@ -98,14 +115,28 @@ class JointTraining:
         self.generator.set_state(state["generator"])
         self.step = int(state["step"])
 
-    def _losses(self, levels: list[Tensor], proposed: Proposed, answers: Sequence[Answer]) -> list[Tensor]:
+    def _losses(
+        self, levels: list[Tensor], proposed: Proposed, answers: Sequence[Answer]
+    ) -> list[Tensor]:
         proposal_score, proposal_box = joint_proposal_loss(proposed, answers)
         drawn = draw_regions(
-            self.model, levels, proposed, answers, self.generator, before=500, after=200,
-            count=self.settings.regions, most_positive=1 / 3,
+            self.model,
+            levels,
+            proposed,
+            answers,
+            self.generator,
+            before=500,
+            after=200,
+            count=self.settings.regions,
+            most_positive=1 / 3,
         )
         score, box = drawn.losses(self.model, levels, answers, overlap=True)
-        return [proposal_score, proposal_box, score / max(1, drawn.count) * 2, box / max(1, drawn.positives)]
+        return [
+            proposal_score,
+            proposal_box,
+            score / max(1, drawn.count) * 2,
+            box / max(1, drawn.positives),
+        ]
 
     def _share_of_rate(self) -> float:
         """Up in a straight line, then down half a cosine."""
@@ -128,11 +159,15 @@ class JointTraining:
 
 def collate(batch: Sequence[Sample], device: str) -> tuple[Tensor, list[Answer]]:
     """Samples as the picture tensor (N, 3, H, W) and their answers."""
-    images = torch.from_numpy(np.stack([each.image for each in batch])).permute(0, 3, 1, 2).to(device)
+    images = (
+        torch.from_numpy(np.stack([each.image for each in batch])).permute(0, 3, 1, 2).to(device)
+    )
     answers = [
         Answer(
-            torch.from_numpy(each.boxes.astype(np.float32)).to(device), torch.from_numpy(each.labels).to(device),
-            torch.from_numpy(each.ignored.astype(np.float32)).to(device), torch.from_numpy(each.known).to(device),
+            torch.from_numpy(each.boxes.astype(np.float32)).to(device),
+            torch.from_numpy(each.labels).to(device),
+            torch.from_numpy(each.ignored.astype(np.float32)).to(device),
+            torch.from_numpy(each.known).to(device),
         )
         for each in batch
     ]

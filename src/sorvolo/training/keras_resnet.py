@@ -12,11 +12,17 @@ from sorvolo.geometry.arrays import Numbers
 _MEAN_RGB = (123.68, 116.779, 103.939)  # Keras' "caffe" input: BGR 0 to 255 minus these
 _EPSILON = 1e-5  # of our batch norms
 _REPEATS = {2: 3, 3: 4, 4: 6, 5: 3}
-_BRANCHES = {"branch2a": ("conv1", "bn1"), "branch2b": ("conv2", "bn2"), "branch2c": ("conv3", "bn3")}
+_BRANCHES = {
+    "branch2a": ("conv1", "bn1"),
+    "branch2b": ("conv2", "bn2"),
+    "branch2c": ("conv3", "bn3"),
+}
 _SHORT = ("downsample.0", "downsample.1")
 
 
-def resnet50_from_keras(layers: Mapping[str, Numbers], places: Mapping[str, Mapping[str, Any]]) -> dict[str, Tensor]:
+def resnet50_from_keras(
+    layers: Mapping[str, Numbers], places: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Tensor]:
     """The state dict of `resnet.ResNet50(original=True)` from Keras' arrays ("res2a_branch2a/kernel", ...).
 
     `places` gives each layer's settings, of which the batch norms' epsilon is used: it is folded into their variance,
@@ -29,8 +35,12 @@ def resnet50_from_keras(layers: Mapping[str, Numbers], places: Mapping[str, Mapp
         out[f"{ours}.weight"] = _tensor(layers[f"{conv}/kernel"].transpose(3, 2, 0, 1))
         out[f"{own_norm}.weight"] = _tensor(layers[f"{norm}/gamma"])
         out[f"{own_norm}.bias"] = _tensor(layers[f"{norm}/beta"])
-        out[f"{own_norm}.running_mean"] = _tensor(layers[f"{norm}/moving_mean"] - layers[f"{conv}/bias"])
-        out[f"{own_norm}.running_var"] = _tensor(layers[f"{norm}/moving_variance"] + np.float32(epsilon - _EPSILON))
+        out[f"{own_norm}.running_mean"] = _tensor(
+            layers[f"{norm}/moving_mean"] - layers[f"{conv}/bias"]
+        )
+        out[f"{own_norm}.running_var"] = _tensor(
+            layers[f"{norm}/moving_variance"] + np.float32(epsilon - _EPSILON)
+        )
 
     take("conv1", "bn_conv1", "conv1", "bn1")
     out["conv1.weight"] = out["conv1.weight"].flip(1).contiguous()

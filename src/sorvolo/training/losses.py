@@ -7,10 +7,18 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sorvolo.training.boxes import boxes_from_offsets, cover_matrix, giou_loss, iou_matrix, offsets_from_boxes
+from sorvolo.training.boxes import (
+    boxes_from_offsets,
+    cover_matrix,
+    giou_loss,
+    iou_matrix,
+    offsets_from_boxes,
+)
 from sorvolo.training.proposals import Proposed
 
-_IGNORED_SHARE = 0.5  # an anchor or region that lies by this much in an ignored region teaches nothing
+_IGNORED_SHARE = (
+    0.5  # an anchor or region that lies by this much in an ignored region teaches nothing
+)
 _FOCAL_ALPHA, _FOCAL_GAMMA = 0.25, 2.0
 
 
@@ -54,7 +62,9 @@ class Match:
         return self.target >= 0
 
 
-def match_boxes(boxes: Tensor, answer: Answer, *, over: float, under: float, best_too: bool) -> Match:
+def match_boxes(
+    boxes: Tensor, answer: Answer, *, over: float, under: float, best_too: bool
+) -> Match:
     """Boxes (K, 4) that overlap a true one by more than `over` are positives, by less than `under` background.
 
     `best_too`: every true box has at least its best-overlapping ones (Ren et al. 2015, 3.1.2).
@@ -81,18 +91,26 @@ def joint_proposal_loss(proposed: Proposed, answers: Sequence[Answer]) -> tuple[
 
     Where a class goes unlabelled, background teaches nothing: what is there may be of that class.
     """
-    matches = [match_boxes(proposed.anchors, each, over=0.5, under=0.4, best_too=True) for each in answers]
+    matches = [
+        match_boxes(proposed.anchors, each, over=0.5, under=0.4, best_too=True) for each in answers
+    ]
     target = torch.stack([each.target for each in matches])
     wanted = (target >= 0).to(proposed.scores.dtype)
-    trust = torch.tensor([1.0 if bool(each.known.all()) else 0.1 for each in answers], device=target.device)
-    weight = torch.where(target >= 0, _FOCAL_ALPHA, (1 - _FOCAL_ALPHA) * trust[:, None]) * (target != -2)
+    trust = torch.tensor(
+        [1.0 if bool(each.known.all()) else 0.1 for each in answers], device=target.device
+    )
+    weight = torch.where(target >= 0, _FOCAL_ALPHA, (1 - _FOCAL_ALPHA) * trust[:, None]) * (
+        target != -2
+    )
     wrong = torch.sigmoid(proposed.scores.detach()).sub_(wanted).abs_()
     each = functional.binary_cross_entropy_with_logits(proposed.scores, wanted, reduction="none")
     score_loss = (weight * wrong**_FOCAL_GAMMA * each).sum()
     picture, anchor = (target >= 0).nonzero(as_tuple=True)
     if not len(picture):
         return score_loss, proposed.offsets.sum() * 0
-    goals = torch.cat([own.boxes[match.target[match.positive]] for own, match in zip(answers, matches)])
+    goals = torch.cat(
+        [own.boxes[match.target[match.positive]] for own, match in zip(answers, matches)]
+    )
     offsets = proposed.offsets.flatten(0, 1).index_select(0, picture * target.shape[1] + anchor)
     box_loss = giou_loss(boxes_from_offsets(offsets, proposed.anchors[anchor]), goals).sum()
     return score_loss / len(picture), box_loss / len(picture)
@@ -111,7 +129,9 @@ def thesis_proposal_loss(
         match = match_boxes(proposed.anchors, answer, over=0.7, under=0.3, best_too=False)
         chosen = sample(match, sampled, 0.5, generator)
         wanted = match.positive[chosen].to(proposed.scores.dtype)
-        score_losses.append(functional.binary_cross_entropy_with_logits(proposed.scores[index][chosen], wanted))
+        score_losses.append(
+            functional.binary_cross_entropy_with_logits(proposed.scores[index][chosen], wanted)
+        )
         rows = chosen[match.positive[chosen]]
         offsets = proposed.offsets[index][rows]
         box_losses.append(_smooth_l1(offsets, proposed.anchors[rows], match, rows, answer, sampled))
@@ -147,7 +167,9 @@ def sample(match: Match, count: int, most_positive: float, generator: torch.Gene
     """(S,) indices of at most `count` boxes, positives among them up to their share, the rest background."""
     positive = match.positive.nonzero()[:, 0]
     negative = (match.target == -1).nonzero()[:, 0]
-    positive = positive[torch.randperm(len(positive), generator=generator)[: int(count * most_positive)]]
+    positive = positive[
+        torch.randperm(len(positive), generator=generator)[: int(count * most_positive)]
+    ]
     negative = negative[torch.randperm(len(negative), generator=generator)[: count - len(positive)]]
     return torch.cat([positive, negative])
 

@@ -27,7 +27,9 @@ class CocoSettings:
 
     before: int = 1000  # cells kept by their score before suppression (NanoDet's own number)
     most: int = 300  # detections of one picture
-    suppress_iou: float = 0.6  # NanoDet's own; of two boxes of a class that overlap more, the better one stays
+    suppress_iou: float = (
+        0.6  # NanoDet's own; of two boxes of a class that overlap more, the better one stays
+    )
     least_score: float = 0.02  # thresholds are far above
 
 
@@ -42,7 +44,9 @@ class NanoDetBackbone(nn.Module):
         self.register_buffer("mean", torch.tensor(_MEAN_BGR[::-1]).reshape(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(_STD_BGR[::-1]).reshape(1, 3, 1, 1))
         self.stem = _convolution(3, 32, 2)
-        self.stages = nn.ModuleList([_Stage(32, 1, 1), _Stage(64, 2, 2), _Stage(128, 2, 2), _Stage(256, 3, 2)])
+        self.stages = nn.ModuleList(
+            [_Stage(32, 1, 1), _Stage(64, 2, 2), _Stage(128, 2, 2), _Stage(256, 3, 2)]
+        )
 
     def forward(self, images: Tensor) -> list[Tensor]:
         """Pictures (N, 3, H, W), sides multiples of 32, to features (N, C, H / stride, W / stride), fine first."""
@@ -64,10 +68,14 @@ class NanoDetHead(nn.Module):
 
     strides = (8, 16, 32)
 
-    def __init__(self, classes: int = COCO_CLASSES, width: int = 128, *, deeper: bool = False) -> None:
+    def __init__(
+        self, classes: int = COCO_CLASSES, width: int = 128, *, deeper: bool = False
+    ) -> None:
         super().__init__()
         self.classes = classes
-        self.sideways = nn.ModuleList(nn.Conv2d(each, width, 1) for each in NanoDetBackbone.channels[1:])
+        self.sideways = nn.ModuleList(
+            nn.Conv2d(each, width, 1) for each in NanoDetBackbone.channels[1:]
+        )
         self.more = nn.ModuleList(_convolution(width, width) for _ in self.strides if deeper)
         for each in self.more:
             nn.init.zeros_(each.weight)  # type: ignore[arg-type]
@@ -93,7 +101,9 @@ class NanoDetHead(nn.Module):
         paths = [p3, n4, n5]
         for index, layer in enumerate(self.more):
             paths[index] = paths[index] + functional.leaky_relu(layer(paths[index]), _SLOPE)
-        towers = [functional.leaky_relu(tower(each), _SLOPE) for tower, each in zip(self.towers, paths)]
+        towers = [
+            functional.leaky_relu(tower(each), _SLOPE) for tower, each in zip(self.towers, paths)
+        ]
         return [layer(each) for layer, each in zip(self.outputs, towers)]
 
 
@@ -135,7 +145,9 @@ def head_of_class(head: NanoDetHead, row: int) -> NanoDetHead:
     return own
 
 
-def cells(outputs: Sequence[Tensor], strides: Sequence[int], classes: int) -> tuple[Tensor, Tensor, Tensor]:
+def cells(
+    outputs: Sequence[Tensor], strides: Sequence[int], classes: int
+) -> tuple[Tensor, Tensor, Tensor]:
     """Every cell's scores before the sigmoid (N, K, classes), bins (N, K, 4, 11), and x, y, stride px (K, 3)."""
     scores, bins, places = [], [], []
     for output, stride in zip(outputs, strides):
@@ -162,7 +174,10 @@ class CocoDetector(nn.Module):
     stride = 32
 
     def __init__(
-        self, backbone: NanoDetBackbone, head: NanoDetHead | FinerNanoDetHead, coco_of_class: Sequence[Sequence[int]],
+        self,
+        backbone: NanoDetBackbone,
+        head: NanoDetHead | FinerNanoDetHead,
+        coco_of_class: Sequence[Sequence[int]],
         settings: CocoSettings = CocoSettings(),
     ) -> None:
         """`coco_of_class`: for each of our classes the COCO classes (0 to 79) that it stands for."""
@@ -174,14 +189,22 @@ class CocoDetector(nn.Module):
         """One picture (1, 3, H, W), RGB 0 to 255: boxes (K, 4) px, scores (K,), labels (K,), best first."""
         return self.found(self.head(self.backbone(images)), (images.shape[2], images.shape[3]))
 
-    def found(self, outputs: Sequence[Tensor], size_px: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    def found(
+        self, outputs: Sequence[Tensor], size_px: tuple[int, int]
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """What `forward` gives, from the head's outputs for a picture of this (height, width)."""
         scores, bins, places = cells(outputs, self.head.strides, self.head.classes)
         own = torch.stack([scores[0][:, rows].amax(1) for rows in self.coco_of_class]).sigmoid()
         boxes = clipped(boxes_from_bins(bins[0], places), *size_px)
         best, cell = torch.topk(own.amax(0), at_most(self.settings.before, own[0]))
         reach = self.settings
-        kept = suppress(boxes[cell], own[:, cell].contiguous(), reach.most, reach.suppress_iou, reach.least_score)
+        kept = suppress(
+            boxes[cell],
+            own[:, cell].contiguous(),
+            reach.most,
+            reach.suppress_iou,
+            reach.least_score,
+        )
         labels, rows = kept[:, 0], cell[kept[:, 1]]
         found = own[labels, rows]
         best, order = torch.topk(found, at_most(self.settings.most, found))
@@ -196,7 +219,8 @@ class _Stage(nn.Module):
         self.first = _convolution(channels, channels, stride)
         half = channels // 2
         self.pairs = nn.ModuleList(
-            nn.ModuleList([_convolution(channels, half), _convolution(half, half)]) for _ in range(blocks)
+            nn.ModuleList([_convolution(channels, half), _convolution(half, half)])
+            for _ in range(blocks)
         )
         self.last = _convolution(channels, channels)
 

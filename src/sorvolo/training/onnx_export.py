@@ -56,7 +56,12 @@ def export_onnx(model: FasterRCNN, info: dict[str, Any], *, regions: int | None 
     if regions is not None and regions < 1:
         raise SettingsError(f"a head looks at one region or more, not {regions}")
     own = _reaching(deepcopy(model).eval().cpu(), regions or model.reach.regions)
-    full = {"stride": model.stride, "least_score": model.reach.least_score, "regions": own.reach.regions, **info}
+    full = {
+        "stride": model.stride,
+        "least_score": model.reach.least_score,
+        "regions": own.reach.regions,
+        **info,
+    }
     return onnx_from_module(own, full)
 
 
@@ -69,11 +74,17 @@ def onnx_from_module(model: nn.Module, info: dict[str, Any]) -> bytes:
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            model, (picture,), buffer, dynamo=False,  # type: ignore[arg-type]
-            opset_version=OPSET, input_names=["image"],
+            model,
+            (picture,),
+            buffer,
+            dynamo=False,  # type: ignore[arg-type]
+            opset_version=OPSET,
+            input_names=["image"],
             output_names=["boxes", "scores", "labels"],
             dynamic_axes={
-                "image": {2: "height", 3: "width"}, "boxes": {0: "count"}, "scores": {0: "count"},
+                "image": {2: "height", 3: "width"},
+                "boxes": {0: "count"},
+                "scores": {0: "count"},
                 "labels": {0: "count"},
             },
         )
@@ -137,7 +148,9 @@ def _seen_and_shaken(model: FasterRCNN, planes: NDArray[np.uint8]) -> list[_Foun
     hook = model.head.register_forward_hook(lambda _, __, out: (shaken(out[0]), out[1]))
     try:
         for _ in range(_SHAKES):
-            found.append(model.detect(levels, replace(proposed, scores=shaken(proposed.scores)), size_px))
+            found.append(
+                model.detect(levels, replace(proposed, scores=shaken(proposed.scores)), size_px)
+            )
     finally:
         hook.remove()
     return [(boxes.numpy(), scores.numpy(), labels.numpy()) for boxes, scores, labels in found]

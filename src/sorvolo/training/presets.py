@@ -16,15 +16,25 @@ from sorvolo.training.weights import ImageNetWeights, Net
 
 Preset = Literal["fast", "accurate", "thesis"]
 
-_FAST_ANCHORS = (AnchorSettings((7, 11, 17)), AnchorSettings((25, 37, 54)), AnchorSettings((80, 120, 190)))
+_FAST_ANCHORS = (
+    AnchorSettings((7, 11, 17)),
+    AnchorSettings((25, 37, 54)),
+    AnchorSettings((80, 120, 190)),
+)
 _FAST_WIDTH = 64  # channels of the pyramid; by choice, for speed
 _RATIOS = (0.5, 1.0, 2.0)  # of height to width: Faster R-CNN's (Ren et al. 2015)
-_ACCURATE_ANCHORS = tuple(AnchorSettings(sizes, _RATIOS) for sizes in ((10, 16), (25, 40), (63, 100), (160, 250)))
+_ACCURATE_ANCHORS = tuple(
+    AnchorSettings(sizes, _RATIOS) for sizes in ((10, 16), (25, 40), (63, 100), (160, 250))
+)
 _THESIS_REGIONS = 75  # for six frames a second on two cores; crowds need more (docs/detector.md)
-_THESIS_ANCHORS = (AnchorSettings((16, 32, 64, 128, 256), _RATIOS),)  # of Faster R-CNN, an octave finer on either side
+_THESIS_ANCHORS = (
+    AnchorSettings((16, 32, 64, 128, 256), _RATIOS),
+)  # of Faster R-CNN, an octave finer on either side
 
 
-def fast(classes: Sequence[str], rpn: Stem = "extended-residual", *, thaw_all: bool = False) -> FasterRCNN:
+def fast(
+    classes: Sequence[str], rpn: Stem = "extended-residual", *, thaw_all: bool = False
+) -> FasterRCNN:
     """For a laptop without a GPU: EfficientNet-Lite0 up to stride 16, a light pyramid down to stride 4, slim stacks."""
     backbone = EfficientNetLite0(thaw_all=thaw_all)
     neck = Pyramid(backbone.channels, _FAST_WIDTH, light=True)
@@ -36,7 +46,11 @@ def fast(classes: Sequence[str], rpn: Stem = "extended-residual", *, thaw_all: b
 
 
 def accurate(
-    classes: Sequence[str], rpn: Stem = "extended-residual", *, original: bool = False, frozen: bool = True
+    classes: Sequence[str],
+    rpn: Stem = "extended-residual",
+    *,
+    original: bool = False,
+    frozen: bool = True,
 ) -> FasterRCNN:
     """For a GPU: ResNet-50 with a pyramid of strides 4 to 32 (P2 to P5), a stack on each, two fully connected layers.
 
@@ -45,7 +59,9 @@ def accurate(
     """
     backbone = ResNet50(deep=True, original=original, frozen_norms=frozen, thaw_all=not frozen)
     neck = Pyramid(backbone.channels, 256, light=False)
-    proposals = ProposalNetwork(neck.channels, backbone.strides, _ACCURATE_ANCHORS, rpn, 256, light=False)
+    proposals = ProposalNetwork(
+        neck.channels, backbone.strides, _ACCURATE_ANCHORS, rpn, 256, light=False
+    )
     head = TwoLayerHead(256, 1024, len(classes))
     return FasterRCNN(backbone, neck, proposals, head, Reach(before=2000, regions=500))
 
@@ -58,11 +74,15 @@ def thesis(
     `original` and `frozen` as for `accurate`.
     """
     backbone = ResNet50(original=original, frozen_norms=frozen, thaw_all=not frozen)
-    proposals = ProposalNetwork(backbone.channels, backbone.strides, _THESIS_ANCHORS, rpn, 512, light=False)
+    proposals = ProposalNetwork(
+        backbone.channels, backbone.strides, _THESIS_ANCHORS, rpn, 512, light=False
+    )
     # cut out at the 7x7 that res5's stride would leave of 14x14: a quarter as much to sample, and all of it is used
     stage = resnet_stage(4, original=original, frozen_norms=frozen, halves=False)
     head = StageHead(stage, 2048, len(classes))
-    return FasterRCNN(backbone, torch.nn.Identity(), proposals, head, Reach(before=2000, regions=_THESIS_REGIONS))
+    return FasterRCNN(
+        backbone, torch.nn.Identity(), proposals, head, Reach(before=2000, regions=_THESIS_REGIONS)
+    )
 
 
 NETS: Mapping[Preset, Net] = {"fast": "lite0", "accurate": "resnet50", "thesis": "resnet50"}
@@ -72,7 +92,12 @@ _RESNETS: Mapping[str, Callable[..., FasterRCNN]] = {"accurate": accurate, "thes
 
 
 def build(
-    preset: Preset, classes: Sequence[str], rpn: Stem, weights: ImageNetWeights | None, *, original: bool = False
+    preset: Preset,
+    classes: Sequence[str],
+    rpn: Stem,
+    weights: ImageNetWeights | None,
+    *,
+    original: bool = False,
 ) -> FasterRCNN:
     """The preset's network, its backbone (and the thesis's head) with `weights`; without, as chance has it.
 
@@ -82,7 +107,11 @@ def build(
         if preset == "fast":
             return fast(classes, rpn, thaw_all=True)
         return _RESNETS[preset](classes, rpn, original=original, frozen=False)
-    model = fast(classes, rpn) if preset == "fast" else _RESNETS[preset](classes, rpn, original=weights.original)
+    model = (
+        fast(classes, rpn)
+        if preset == "fast"
+        else _RESNETS[preset](classes, rpn, original=weights.original)
+    )
     model.backbone.load_imagenet(dict(weights.layers))  # type: ignore[operator]
     if isinstance(model.head, StageHead):
         load_stage(model.head.stage, 4, weights.layers)  # type: ignore[arg-type]

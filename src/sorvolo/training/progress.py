@@ -52,14 +52,26 @@ class History:
 
     def after(self, done: Progress, seconds: float, *, every: int) -> "History":
         """With one step more; a row is closed after each `every` steps and the last. `seconds` are of all runs."""
-        pending = (*self.pending, LossRow(
-            done.step, done.proposal_score, done.proposal_box, done.region_score, done.region_box, seconds
-        ))
+        pending = (
+            *self.pending,
+            LossRow(
+                done.step,
+                done.proposal_score,
+                done.proposal_box,
+                done.region_score,
+                done.region_box,
+                seconds,
+            ),
+        )
         if done.step % every and done.step != done.steps:
             return History(self.rows, self.checks, pending)
         row = LossRow(
-            done.step, _mean(r.proposal_score for r in pending), _mean(r.proposal_box for r in pending),
-            _mean(r.region_score for r in pending), _mean(r.region_box for r in pending), seconds,
+            done.step,
+            _mean(r.proposal_score for r in pending),
+            _mean(r.proposal_box for r in pending),
+            _mean(r.region_score for r in pending),
+            _mean(r.region_box for r in pending),
+            seconds,
         )
         return History((*self.rows, row), self.checks)
 
@@ -92,7 +104,8 @@ class History:
     def from_plain(plain: Mapping[str, Any]) -> "History":
         """The inverse of `plain`. Raises TypeError or KeyError for anything else."""
         return History(
-            tuple(LossRow(**each) for each in plain["rows"]), tuple(Check(**each) for each in plain["checks"]),
+            tuple(LossRow(**each) for each in plain["rows"]),
+            tuple(Check(**each) for each in plain["checks"]),
             tuple(LossRow(**each) for each in plain["pending"]),
         )
 

@@ -20,8 +20,14 @@ class AnchorSettings:
     def shapes(self) -> Tensor:
         """(A, 4) boxes around the origin."""
         rows = [
-            (-size / ratio**0.5 / 2, -size * ratio**0.5 / 2, size / ratio**0.5 / 2, size * ratio**0.5 / 2)
-            for size in self.sizes_px for ratio in self.ratios
+            (
+                -size / ratio**0.5 / 2,
+                -size * ratio**0.5 / 2,
+                size / ratio**0.5 / 2,
+                size * ratio**0.5 / 2,
+            )
+            for size in self.sizes_px
+            for ratio in self.ratios
         ]
         return torch.tensor(rows)
 
@@ -40,18 +46,28 @@ class ProposalNetwork(nn.Module):
     """For each level a stem of its own (`inception.proposal_stem`), then the scores and offsets of its anchors."""
 
     def __init__(
-        self, channels: Sequence[int], strides: Sequence[int], anchors: Sequence[AnchorSettings], stem: Stem,
-        width: int, *, light: bool,
+        self,
+        channels: Sequence[int],
+        strides: Sequence[int],
+        anchors: Sequence[AnchorSettings],
+        stem: Stem,
+        width: int,
+        *,
+        light: bool,
     ) -> None:
         super().__init__()
         self.strides = tuple(strides)
-        self.stems = nn.ModuleList(proposal_stem(stem, each, width, light=light) for each in channels)
+        self.stems = nn.ModuleList(
+            proposal_stem(stem, each, width, light=light) for each in channels
+        )
         self.scores, self.offsets = nn.ModuleList(), nn.ModuleList()
         for index, (own, each) in enumerate(zip(self.stems, anchors)):
             shapes = each.shapes()
             self.register_buffer(f"shapes_{index}", shapes, persistent=False)
             out: int = own.channels  # type: ignore[assignment]
-            self.scores.append(_predictor(out, len(shapes), 0.01, -4.0))  # rare objects (Focal Loss, 4.1)
+            self.scores.append(
+                _predictor(out, len(shapes), 0.01, -4.0)
+            )  # rare objects (Focal Loss, 4.1)
             self.offsets.append(_predictor(out, 4 * len(shapes), 0.001, 0.0))
 
     def forward(self, levels: Sequence[Tensor]) -> Proposed:
@@ -67,7 +83,12 @@ class ProposalNetwork(nn.Module):
 
 
 def propose(
-    proposed: Proposed, index: int, size_px: tuple[Tensor | int, Tensor | int], *, before: int, after: int,
+    proposed: Proposed,
+    index: int,
+    size_px: tuple[Tensor | int, Tensor | int],
+    *,
+    before: int,
+    after: int,
     iou: float = 0.7,
 ) -> tuple[Tensor, Tensor]:
     """The best regions of picture `index`, (R, 4) px within its (height, width), and their scores 0 to 1, (R,).

@@ -26,21 +26,34 @@ class FrozenNorm(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        for name, value in (("weight", 1.0), ("bias", 0.0), ("running_mean", 0.0), ("running_var", 1.0)):
+        for name, value in (
+            ("weight", 1.0),
+            ("bias", 0.0),
+            ("running_mean", 0.0),
+            ("running_var", 1.0),
+        ):
             self.register_buffer(name, torch.full((channels,), value))
 
     def forward(self, features: Tensor) -> Tensor:
         """(N, C, H, W) -> the same shape."""
         # as one known operation, so that an export folds it into the convolution before
         return functional.batch_norm(
-            features, self.running_mean, self.running_var, self.weight, self.bias, training=False, eps=_EPSILON
+            features,
+            self.running_mean,
+            self.running_var,
+            self.weight,
+            self.bias,
+            training=False,
+            eps=_EPSILON,
         )
 
 
 class _Bottleneck(nn.Module):
     """1x1, 3x3, 1x1 beside a shortcut. The stride sits in the first 1x1 if `original`, else in the 3x3."""
 
-    def __init__(self, channels: int, inner: int, stride: int, *, original: bool, frozen_norms: bool) -> None:
+    def __init__(
+        self, channels: int, inner: int, stride: int, *, original: bool, frozen_norms: bool
+    ) -> None:
         super().__init__()
         norm = FrozenNorm if frozen_norms else nn.BatchNorm2d
         out = inner * _GROWTH
@@ -53,16 +66,22 @@ class _Bottleneck(nn.Module):
         self.bn3 = norm(out)
         self.downsample: nn.Sequential | None = None
         if stride != 1 or channels != out:
-            self.downsample = nn.Sequential(nn.Conv2d(channels, out, 1, stride, bias=False), norm(out))
+            self.downsample = nn.Sequential(
+                nn.Conv2d(channels, out, 1, stride, bias=False), norm(out)
+            )
 
     def forward(self, features: Tensor) -> Tensor:
         x = functional.relu(self.bn1(self.conv1(features)))
         x = functional.relu(self.bn2(self.conv2(x)))
         x = self.bn3(self.conv3(x))
-        return functional.relu(x + (features if self.downsample is None else self.downsample(features)))
+        return functional.relu(
+            x + (features if self.downsample is None else self.downsample(features))
+        )
 
 
-def resnet_stage(index: int, *, original: bool, frozen_norms: bool = True, halves: bool = True) -> nn.Sequential:
+def resnet_stage(
+    index: int, *, original: bool, frozen_norms: bool = True, halves: bool = True
+) -> nn.Sequential:
     """Stage `index` 1 to 4 (res2 to res5): 64, 256, 512 or 1024 channels in, four times its width out.
 
     All but the first halve the picture, unless `halves` is False.
@@ -72,7 +91,9 @@ def resnet_stage(index: int, *, original: bool, frozen_norms: bool = True, halve
     rows = []
     for block in range(blocks):
         stride = 2 if halves and block == 0 and index > 1 else 1
-        rows.append(_Bottleneck(channels, inner, stride, original=original, frozen_norms=frozen_norms))
+        rows.append(
+            _Bottleneck(channels, inner, stride, original=original, frozen_norms=frozen_norms)
+        )
         channels = inner * _GROWTH
     stage = nn.Sequential(*rows)
     for module in stage.modules():
@@ -92,7 +113,12 @@ class ResNet50(nn.Module):
     mean: Tensor
 
     def __init__(
-        self, *, deep: bool = False, original: bool = False, frozen_norms: bool = True, thaw_all: bool = False
+        self,
+        *,
+        deep: bool = False,
+        original: bool = False,
+        frozen_norms: bool = True,
+        thaw_all: bool = False,
     ) -> None:
         super().__init__()
         self.original, self.deep = original, deep
@@ -100,7 +126,9 @@ class ResNet50(nn.Module):
         self.bn1 = FrozenNorm(64) if frozen_norms else nn.BatchNorm2d(64)
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN) * 255)
         for index in range(1, 5 if deep else 4):
-            self.add_module(f"layer{index}", resnet_stage(index, original=original, frozen_norms=frozen_norms))
+            self.add_module(
+                f"layer{index}", resnet_stage(index, original=original, frozen_norms=frozen_norms)
+            )
         nn.init.kaiming_normal_(self.conv1.weight, mode="fan_out", nonlinearity="relu")
         with torch.no_grad():  # what torchvision does to its input: (value / 255 - mean) / std
             self.conv1.weight /= torch.tensor(IMAGENET_STD)[None, :, None, None] * 255
@@ -135,5 +163,7 @@ def load_stage(stage: nn.Sequential, index: int, weights: Mapping[str, Tensor]) 
 
 def _load(module: nn.Module, weights: Mapping[str, Tensor], prefix: str) -> None:
     counters = ("num_batches_tracked",)
-    own = {name: weights[prefix + name] for name in module.state_dict() if not name.endswith(counters)}
+    own = {
+        name: weights[prefix + name] for name in module.state_dict() if not name.endswith(counters)
+    }
     module.load_state_dict(own, strict=False)

@@ -54,7 +54,11 @@ class Sample:
 
 
 def cut_sample(
-    image: ImageRGB, picture: LabelledPicture, share: Share, classes: Sequence[str], augmentation: Augmentation,
+    image: ImageRGB,
+    picture: LabelledPicture,
+    share: Share,
+    classes: Sequence[str],
+    augmentation: Augmentation,
     rng: np.random.Generator,
 ) -> Sample:
     """One random crop of a picture (H, W, 3) with what is labelled in it."""
@@ -68,7 +72,9 @@ def cut_sample(
     crop_from_picture = _placement(image.shape[:2], boxes, share.scale, side, turns, rng)
     out, crop_from_picture = _warped(image, crop_from_picture, side)
     boxes, seen = boxes_in_crop(boxes, crop_from_picture, side)
-    ignored, in_sight = boxes_in_crop(np.asarray(picture.ignored_px, float), crop_from_picture, side)
+    ignored, in_sight = boxes_in_crop(
+        np.asarray(picture.ignored_px, float), crop_from_picture, side
+    )
     small = np.max(boxes[:, 2:] - boxes[:, :2], axis=1, initial=0) < _LEAST_PX
     keep = (seen >= _LEAST_SEEN) & ~small
     spoilt = boxes[~keep & (seen > 0.02)]
@@ -86,7 +92,12 @@ def cut_sample(
 
 
 def _placement(
-    size: tuple[int, int], boxes: Floats, scales: tuple[float, float], side: int, turns: bool, rng: np.random.Generator
+    size: tuple[int, int],
+    boxes: Floats,
+    scales: tuple[float, float],
+    side: int,
+    turns: bool,
+    rng: np.random.Generator,
 ) -> Matrix3:
     """(3, 3) crop_from_picture: where the crop lies, around an object three times of four."""
     height, width = size
@@ -100,7 +111,9 @@ def _placement(
         centre = rng.uniform(0, 1, 2) * (width, height)
     reach = side / scale / 2
     for axis, length in enumerate((width, height)):
-        centre[axis] = np.clip(centre[axis], min(reach, length / 2), max(length - reach, length / 2))
+        centre[axis] = np.clip(
+            centre[axis], min(reach, length / 2), max(length - reach, length / 2)
+        )
     angle = 0.0
     if turns:
         angle = rng.uniform(0, 2 * np.pi) if rng.random() < 0.35 else rng.integers(4) * np.pi / 2
@@ -117,12 +130,20 @@ def _warped(image: ImageRGB, crop_from_picture: Matrix3, side: int) -> tuple[Ima
     source, to_source = image, np.eye(3)
     if scale < 0.7:  # made smaller by areas first, or edges would break up
         factor = max(scale * 1.2, 0.05)
-        source = np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
-        to_source = np.diag([source.shape[1] / image.shape[1], source.shape[0] / image.shape[0], 1.0])
+        source = np.asarray(
+            cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8
+        )
+        to_source = np.diag(
+            [source.shape[1] / image.shape[1], source.shape[0] / image.shape[0], 1.0]
+        )
     corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # edges to pixel centres and back
     matrix = np.linalg.inv(corner) @ crop_from_picture @ np.linalg.inv(to_source) @ corner
     out = cv2.warpAffine(
-        source, matrix[:2], (side, side), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT,
+        source,
+        matrix[:2],
+        (side, side),
+        flags=cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_CONSTANT,
         borderValue=(114, 114, 114),
     )
     return np.asarray(out, np.uint8), crop_from_picture
@@ -142,7 +163,9 @@ def boxes_in_crop(boxes: Floats, crop_from_picture: Matrix3, side: int) -> tuple
     return cut, sides.prod(1) / np.maximum((2 * half).prod(1), 1e-6)
 
 
-def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, thermal: bool) -> ImageRGB:
+def _weathered(
+    image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, thermal: bool
+) -> ImageRGB:
     """Light, colour, polarity, blur, haze and noise."""
     x = image.astype(np.float32)
     if thermal:
@@ -163,7 +186,9 @@ def _weathered(image: ImageRGB, how: Augmentation, rng: np.random.Generator, *, 
             length = int(rng.integers(3, 10))
             kernel = np.zeros((length, length), np.float32)
             kernel[length // 2] = 1 / length
-            turn = cv2.getRotationMatrix2D(((length - 1) / 2, (length - 1) / 2), rng.uniform(0, 180), 1)
+            turn = cv2.getRotationMatrix2D(
+                ((length - 1) / 2, (length - 1) / 2), rng.uniform(0, 180), 1
+            )
             kernel = np.asarray(cv2.warpAffine(kernel, turn, (length, length)), np.float32)
             x = np.asarray(cv2.filter2D(x, -1, kernel / max(float(kernel.sum()), 1e-3)), np.float32)
         else:

@@ -15,14 +15,18 @@ _FILL = 114  # grey, as around samples
 
 
 @torch.no_grad()
-def see(model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: str = "cpu") -> Detections:
+def see(
+    model: FasterRCNN, classes: Sequence[str], picture: ImageRGB, device: str = "cpu"
+) -> Detections:
     """What the network finds in one picture (H, W, 3), padded to its stride; above 1280 px in a smaller copy."""
     model.eval()
     height, width = picture.shape[:2]
     scale = min(1.0, _LONGEST_PX / max(height, width))
     seen = picture
     if scale < 1:
-        seen = np.asarray(cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+        seen = np.asarray(
+            cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
+        )
     down, right = (-side % model.stride for side in seen.shape[:2])
     padded = np.pad(seen, ((0, down), (0, right), (0, 0)), constant_values=_FILL)
     planes = torch.from_numpy(np.ascontiguousarray(padded.transpose(2, 0, 1))[None]).to(device)

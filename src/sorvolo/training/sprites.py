@@ -15,7 +15,9 @@ _MOST = 5  # objects of a picture; by choice
 _FINE = 4  # sub-pixels a side while drawing
 
 
-def paste_small_objects(image: ImageRGB, taken: Floats, rng: np.random.Generator) -> tuple[ImageRGB, Floats]:
+def paste_small_objects(
+    image: ImageRGB, taken: Floats, rng: np.random.Generator
+) -> tuple[ImageRGB, Floats]:
     """The picture (H, W, 3) with a few boxes, cases, bags and tyres drawn on it, and their boxes (N, 4) px.
 
     `taken` (M, 4) is where others stand; nothing is drawn there. Shadows of one picture fall the same way.
@@ -33,9 +35,15 @@ def paste_small_objects(image: ImageRGB, taken: Floats, rng: np.random.Generator
         centre = rng.uniform(size, np.array([width, height]) - size)
         near = np.array([*(centre - size), *(centre + size)])
         others = np.vstack([taken.reshape(-1, 4), *placed]) if placed else taken.reshape(-1, 4)
-        if len(others) and (
-            (others[:, 0] < near[2]) & (others[:, 2] > near[0]) & (others[:, 1] < near[3]) & (others[:, 3] > near[1])
-        ).any():
+        if (
+            len(others)
+            and (
+                (others[:, 0] < near[2])
+                & (others[:, 2] > near[0])
+                & (others[:, 1] < near[3])
+                & (others[:, 3] > near[1])
+            ).any()
+        ):
             continue
         placed.append(_draw(out, centre, size, ratio, sun, long, rng)[None])
     boxes = np.vstack(placed) if placed else np.zeros((0, 4))
@@ -43,7 +51,12 @@ def paste_small_objects(image: ImageRGB, taken: Floats, rng: np.random.Generator
 
 
 def _draw(
-    out: Pixels, centre: Floats, size: float, ratio: float, sun: float, long: float,
+    out: Pixels,
+    centre: Floats,
+    size: float,
+    ratio: float,
+    sun: float,
+    long: float,
     rng: np.random.Generator,
 ) -> Floats:
     """Draw one object and its shadow into `out`; its box (4,)."""
@@ -94,7 +107,9 @@ def _filled(shapes: list[Floats], side: int) -> Pixels:
     fine = np.zeros((side * _FINE, side * _FINE), np.uint8)
     hull = cv2.convexHull((np.vstack(shapes) * _FINE).astype(np.float32))
     cv2.fillConvexPoly(fine, hull.astype(np.int32), 255)
-    return np.asarray(cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), np.float32) / 255
+    return (
+        np.asarray(cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), np.float32) / 255
+    )
 
 
 def _window(out: Pixels, x0: int, y0: int, side: int) -> Pixels:

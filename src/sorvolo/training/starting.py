@@ -18,21 +18,27 @@ from sorvolo.training.progress import Learner
 from sorvolo.training.samples import Sample
 from sorvolo.training.weights import ImageNetWeights
 
-_RATES = {"fast": 1e-3, "accurate": 2e-4, "thesis": 2e-4}  # of AdamW at its height; large networks need less
+_RATES = {
+    "fast": 1e-3,
+    "accurate": 2e-4,
+    "thesis": 2e-4,
+}  # of AdamW at its height; large networks need less
 _BACKBONE_SHARE = 0.2  # of that rate, for layers that ImageNet taught
 _TUNED_SHARE = 0.5  # of that rate, for a model that has learnt already
 _SETTLING_PX = 6_000_000  # of pictures by which the norms of such a model are settled: a gigabyte or two of memory
 
 
 def device_of(wanted: str) -> str:
-    """"cpu" or "cuda"; "auto" takes a GPU where there is one. Raises SettingsError for a device that is not there."""
+    """ "cpu" or "cuda"; "auto" takes a GPU where there is one. Raises SettingsError for a device that is not there."""
     if wanted == "auto":
         return "cuda" if torch.cuda.is_available() else "cpu"
     kind, _, number = wanted.partition(":")
     if wanted != "cpu" and not (kind == "cuda" and (number.isdecimal() or wanted == "cuda")):
         raise SettingsError(f"device must be auto, cpu or cuda, got {wanted!r}")
     if kind == "cuda" and not torch.cuda.is_available():
-        raise SettingsError(f"device {wanted} asked for, but this torch sees no GPU; use --device cpu")
+        raise SettingsError(
+            f"device {wanted} asked for, but this torch sees no GPU; use --device cpu"
+        )
     return wanted
 
 
@@ -50,9 +56,17 @@ def without_denormals() -> Iterator[None]:
 
 
 def start_learner(
-    preset: Preset, classes: Sequence[str], rpn: Stem, schedule: Literal["joint", "four-steps"],
-    start: ImageNetWeights | ExportedModel | None, first: Iterator[Sequence[Sample]], *, steps: int, batch: int,
-    seed: int, device: str,
+    preset: Preset,
+    classes: Sequence[str],
+    rpn: Stem,
+    schedule: Literal["joint", "four-steps"],
+    start: ImageNetWeights | ExportedModel | None,
+    first: Iterator[Sequence[Sample]],
+    *,
+    steps: int,
+    batch: int,
+    seed: int,
+    device: str,
 ) -> Learner:
     """The preset's network before its first step; what is not from `start` follows from the seed.
 
@@ -70,14 +84,22 @@ def start_learner(
     if schedule == "four-steps":
         return FourStepTraining(model, FourStepSettings(steps=steps), seed, device)
     settings = JointSettings(
-        steps=steps, batch=batch, rate=rate, backbone_rate=rate if start is None else _BACKBONE_SHARE * rate,
-        warm_steps=min(200, max(1, steps // 10)), mixed_precision=device != "cpu" or _has_bfloat16(),
+        steps=steps,
+        batch=batch,
+        rate=rate,
+        backbone_rate=rate if start is None else _BACKBONE_SHARE * rate,
+        warm_steps=min(200, max(1, steps // 10)),
+        mixed_precision=device != "cpu" or _has_bfloat16(),
     )
     return JointTraining(model, settings, seed, device)
 
 
 def _learnt_on(
-    preset: Preset, classes: Sequence[str], rpn: Stem, start: ExportedModel, first: Iterator[Sequence[Sample]]
+    preset: Preset,
+    classes: Sequence[str],
+    rpn: Stem,
+    start: ExportedModel,
+    first: Iterator[Sequence[Sample]],
 ) -> FasterRCNN:
     """The network with an exported model's weights, its norms settled by the first pictures."""
     if preset != "fast":
@@ -88,7 +110,9 @@ def _learnt_on(
     model = fast(classes, rpn)
     samples = [*next(first)]
     size_px = samples[0].image.shape[0] * samples[0].image.shape[1]
-    samples += islice((each for batch in first for each in batch), max(0, _SETTLING_PX // size_px - len(samples)))
+    samples += islice(
+        (each for batch in first for each in batch), max(0, _SETTLING_PX // size_px - len(samples))
+    )
     load_exported(model, start.content, collate(samples, "cpu")[0], classes)
     return model
 

@@ -49,17 +49,23 @@ def read_graph(path: Path) -> TfjsGraph:
             data = b"".join(_shard(path, each) for each in group["paths"])
             constants.update(_weights(group["weights"], data))
         signature = described.get("signature", {}).get("outputs", {})
-        return TfjsGraph(nodes, constants, tuple(sorted(each.split(":")[0] for each in signature)), str(path))
+        return TfjsGraph(
+            nodes, constants, tuple(sorted(each.split(":")[0] for each in signature)), str(path)
+        )
     except OSError as error:
         place = error.filename or path
-        raise InputError(f"no graph model at {place}: the .json and its .bin files are needed") from error
+        raise InputError(
+            f"no graph model at {place}: the .json and its .bin files are needed"
+        ) from error
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path} is no TensorFlow.js graph model with plain weights ({type(error).__name__}: {error})"
         ) from error
 
 
-def run_graph(graph: TfjsGraph, feed: Mapping[str, Numbers], wanted: Sequence[str]) -> dict[str, Numbers]:
+def run_graph(
+    graph: TfjsGraph, feed: Mapping[str, Numbers], wanted: Sequence[str]
+) -> dict[str, Numbers]:
     """The values of the nodes `wanted` when the placeholders have the values of `feed`, computed in NumPy.
 
     Follows TensorFlow's definitions node by node; slow. Raises InputError for an operation that is not known here.
@@ -75,7 +81,9 @@ def run_graph(graph: TfjsGraph, feed: Mapping[str, Numbers], wanted: Sequence[st
             values[node.name] = [graph.constants[node.name]]
         elif node.name not in values:
             if node.op not in _OPERATIONS:
-                raise InputError(f"{graph.origin}: {node.op} ({node.name}) is no operation that is known here")
+                raise InputError(
+                    f"{graph.origin}: {node.op} ({node.name}) is no operation that is known here"
+                )
             out = _OPERATIONS[node.op](node, [value(each) for each in node.inputs])
             values[node.name] = out if isinstance(out, list) else [out]
     return {name: value(name) for name in wanted}
@@ -149,7 +157,11 @@ def _windows(x: Numbers, height: int, width: int, strides: Sequence[int]) -> Num
 
 def _valid_nhwc(node: Node, strides_key: str = "strides") -> list[int]:
     dilations = _numbers(node, "dilations") if "dilations" in node.attributes else [1]
-    if _text(node, "padding") != "VALID" or _text(node, "data_format") != "NHWC" or max(dilations) > 1:
+    if (
+        _text(node, "padding") != "VALID"
+        or _text(node, "data_format") != "NHWC"
+        or max(dilations) > 1
+    ):
         raise InputError(f"{node.name}: only undilated NHWC windows without padding are known here")
     return _numbers(node, strides_key)
 
@@ -180,7 +192,11 @@ def _resized(node: Node, inputs: Sequence[Numbers]) -> Numbers:
         own = out.shape[axis]
         place = (np.arange(length) + 0.5) * own / length - 0.5
         low = np.floor(place)
-        share = (place - low).reshape([-1 if each == axis else 1 for each in range(4)]).astype(np.float32)
+        share = (
+            (place - low)
+            .reshape([-1 if each == axis else 1 for each in range(4)])
+            .astype(np.float32)
+        )
         first, second = (np.clip(low + step, 0, own - 1).astype(int) for step in (0, 1))
         out = out.take(first, axis) * (1 - share) + out.take(second, axis) * share
     return out
@@ -204,7 +220,9 @@ _OPERATIONS: Mapping[str, Callable[[Node, Sequence[Numbers]], Any]] = {
     "ConcatV2": lambda _, x: np.concatenate(x[:-1], int(x[-1])),
     "Conv2D": _convolved,
     "Identity": lambda _, x: x[0],
-    "LeakyRelu": lambda node, x: np.where(x[0] > 0, x[0], np.float32(node.attributes["alpha"]["f"]) * x[0]),
+    "LeakyRelu": lambda node, x: np.where(
+        x[0] > 0, x[0], np.float32(node.attributes["alpha"]["f"]) * x[0]
+    ),
     "MaxPool": _pooled,
     "Pad": _padded,
     "PadV2": _padded,

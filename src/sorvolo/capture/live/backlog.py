@@ -15,8 +15,12 @@ class BacklogSettings:
 
     most_behind_s: float = 1.5  # so much more than lately: from there on packets are left out
     lately_s: float = 30.0  # the least delay of this time is what the stream itself takes
-    looked_at_s: float = 0.5  # of packets that are left out: so long their stamps are held against the clock
-    live_rate: float = 1.5  # stamps that run no faster than that come from the sender, not from what waited
+    looked_at_s: float = (
+        0.5  # of packets that are left out: so long their stamps are held against the clock
+    )
+    live_rate: float = (
+        1.5  # stamps that run no faster than that come from the sender, not from what waited
+    )
 
 
 class Backlog:
@@ -29,7 +33,9 @@ class Backlog:
 
     def __init__(self, settings: BacklogSettings = BacklogSettings()) -> None:
         self._settings = settings
-        self._delays_s: deque[tuple[float, float]] = deque()  # when, and how much: ever more, so the first is the least
+        self._delays_s: deque[tuple[float, float]] = (
+            deque()
+        )  # when, and how much: ever more, so the first is the least
         self._stamp_ns: int | None = None
         self._leaves_out_since: tuple[float, float] | None = None  # the clock and the stamp
         self._has_caught_up = False

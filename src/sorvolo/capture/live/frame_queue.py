@@ -31,7 +31,11 @@ class FrameQueue:
     """
 
     def __init__(self, *, holds_all: bool, most_bytes: int, blocks: bool) -> None:
-        self._holds_all, self._most_bytes, self._blocks = holds_all, most_bytes, blocks and holds_all
+        self._holds_all, self._most_bytes, self._blocks = (
+            holds_all,
+            most_bytes,
+            blocks and holds_all,
+        )
         self._waiting: deque[Arrived] = deque()
         self._held_bytes = 0
         self._changed = threading.Condition()

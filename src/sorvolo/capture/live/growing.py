@@ -14,7 +14,9 @@ _POLL_S = 0.01  # pictures wait for it
 _PACKET_BYTES = 188  # ISO/IEC 13818-1
 _TABLE = b"\x47\x00\x00"  # a packet of the program association table: its first bytes without their flags
 _SEARCHED_PACKETS = 10_000  # at a time
-_NEWEST_BYTES = 16_000_000  # of a transport stream, some ten seconds: who wants the newest frames begins there
+_NEWEST_BYTES = (
+    16_000_000  # of a transport stream, some ten seconds: who wants the newest frames begins there
+)
 
 
 class GrowingFile:
@@ -26,7 +28,9 @@ class GrowingFile:
     between two of these places nothing in it can be decoded.
     """
 
-    def __init__(self, path: Path, settings: LiveSettings, outages: Outages, stop: threading.Event) -> None:
+    def __init__(
+        self, path: Path, settings: LiveSettings, outages: Outages, stop: threading.Event
+    ) -> None:
         self._file = path.open("rb")
         self._ended = path.with_name(path.name + ENDED_SUFFIX)
         self._settings, self._outages, self._stop = settings, outages, stop

@@ -128,7 +128,11 @@ class GrowingFolder:
         """What was found so far and survived."""
         return (
             *notice("corrupt_photo", self._corrupt, "damaged photos that could not be decoded: {}"),
-            *notice("photo_without_time", self._untimed, "photos without a time, timed by when they came: {}"),
+            *notice(
+                "photo_without_time",
+                self._untimed,
+                "photos without a time, timed by when they came: {}",
+            ),
         )
 
     def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
@@ -136,7 +140,9 @@ class GrowingFolder:
         for _, each in self.arrivals(wanted):
             yield each
 
-    def arrivals(self, wanted: Callable[[int, int], bool]) -> Iterator[tuple[float, Frame | LostFrame]]:
+    def arrivals(
+        self, wanted: Callable[[int, int], bool]
+    ) -> Iterator[tuple[float, Frame | LostFrame]]:
         """The same as `frames`, each with when it was whole (monotonic clock)."""
         self._heard_s = time.monotonic()
         while not self._is_ended:
@@ -187,7 +193,11 @@ class GrowingFolder:
     def _look(self) -> None:
         """Note the photos that are whole by now."""
         for path in sorted(self._folder.iterdir()):
-            if path.suffix.lower() not in PHOTO_SUFFIXES or path.name[0] == "." or path in self._seen:
+            if (
+                path.suffix.lower() not in PHOTO_SUFFIXES
+                or path.name[0] == "."
+                or path in self._seen
+            ):
                 continue
             state = path.stat()
             size, age_s = state.st_size, time.time() - state.st_mtime
@@ -207,7 +217,9 @@ class GrowingFolder:
             return LostFrame(index, path.name, self._last_ns, f"corrupt: {error}")
         self._untimed += not (metadata.utc_ns or metadata.local_ns)
         is_first = path == self._first
-        time_ns = self._last_ns = max(self.start_ns if is_first else _time_ns(metadata), self._last_ns + 1)
+        time_ns = self._last_ns = max(
+            self.start_ns if is_first else _time_ns(metadata), self._last_ns + 1
+        )
         if not is_first:
             self._note_place(time_ns, metadata)
         if not wanted(index, time_ns):
@@ -221,7 +233,9 @@ class GrowingFolder:
         if own_px != self.size_px:
             if not is_same_shape(own_px, self.size_px):
                 return LostFrame(index, path.name, time_ns, other_size(own_px, self.size_px))
-            image = np.asarray(cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            image = np.asarray(
+                cv2.resize(image, self.size_px, interpolation=cv2.INTER_AREA), dtype=np.uint8
+            )
         return Frame(index, path.name, time_ns, image)
 
     def _note_place(self, time_ns: int, metadata: PhotoMetadata) -> None:
@@ -241,8 +255,11 @@ def _has_its_end(path: Path) -> bool:
 
 
 def open_growing_folder(
-    folder: Path, camera: Callable[[int, int], CameraModel | None],
-    guess: Callable[[int, int, PhotoMetadata], CameraModel], settings: LiveSettings, until: threading.Event,
+    folder: Path,
+    camera: Callable[[int, int], CameraModel | None],
+    guess: Callable[[int, int, PhotoMetadata], CameraModel],
+    settings: LiveSettings,
+    until: threading.Event,
 ) -> GrowingFolder:
     """The flight whose photos come into the folder; those that are there already are its first.
 

@@ -89,7 +89,7 @@ def local_sets(data: bytes, counts: Counter[str]) -> Iterator[LocalSet]:
             length, body = _ber_length(data, after)
             if length > _LONGEST_SET_BYTES or body + length > len(data):
                 raise InputError("a local set that is cut")
-            found = _local_set(data[start: body + length], body - start)
+            found = _local_set(data[start : body + length], body - start)
         except InputError:
             counts["damaged"] += 1
         else:
@@ -154,7 +154,7 @@ def _items_in(packet: bytes, at: int) -> Iterator[tuple[int, int, bytes]]:
         length, at = _ber_length(packet, at)
         if at + length > len(packet):
             raise InputError("an item that is longer than its set")
-        yield tag, at, packet[at: at + length]
+        yield tag, at, packet[at : at + length]
         at += length
 
 
@@ -165,8 +165,12 @@ def _number(item: Item, value: bytes) -> float:
         return _from_imapb(item, value)
     if item.is_signed:
         whole = int.from_bytes(value, "big", signed=True)
-        return nan if whole == -(1 << (bits - 1)) else item.highest * whole / ((1 << (bits - 1)) - 1)
-    return item.lowest + (item.highest - item.lowest) * int.from_bytes(value, "big") / ((1 << bits) - 1)
+        return (
+            nan if whole == -(1 << (bits - 1)) else item.highest * whole / ((1 << (bits - 1)) - 1)
+        )
+    return item.lowest + (item.highest - item.lowest) * int.from_bytes(value, "big") / (
+        (1 << bits) - 1
+    )
 
 
 def _bytes_of(item: Item, value: float) -> bytes:
@@ -174,12 +178,16 @@ def _bytes_of(item: Item, value: float) -> bytes:
     if not isfinite(value):
         return (1 << (bits - 1)).to_bytes(item.length, "big")
     if not item.lowest <= value <= item.highest:
-        raise InputError(f"{item.name} = {value:g} lies outside its tag's {item.lowest:g} to {item.highest:g}")
+        raise InputError(
+            f"{item.name} = {value:g} lies outside its tag's {item.lowest:g} to {item.highest:g}"
+        )
     if item.is_imapb:
         forward, offset = _imapb(item, item.length)
         return int(forward * (value - item.lowest) + offset).to_bytes(item.length, "big")
     if item.is_signed:
-        return round(value / item.highest * ((1 << (bits - 1)) - 1)).to_bytes(item.length, "big", signed=True)
+        return round(value / item.highest * ((1 << (bits - 1)) - 1)).to_bytes(
+            item.length, "big", signed=True
+        )
     share = (value - item.lowest) / (item.highest - item.lowest)
     return round(share * ((1 << bits) - 1)).to_bytes(item.length, "big")
 
@@ -205,7 +213,9 @@ def _ceil_log2(span: float) -> int:
 
 
 def _tagged(tag: int, value: bytes) -> bytes:
-    return bytes([tag, len(value)] if tag < 128 else [0x80 | tag >> 7, tag & 0x7F, len(value)]) + value
+    return (
+        bytes([tag, len(value)] if tag < 128 else [0x80 | tag >> 7, tag & 0x7F, len(value)]) + value
+    )
 
 
 def _written_length(length: int) -> bytes:
@@ -225,7 +235,7 @@ def _ber_length(data: bytes, at: int) -> tuple[int, int]:
     size = first & 0x7F
     if size == 0 or size > 4 or at + 1 + size > len(data):
         raise InputError("a length in no definite form")
-    return int.from_bytes(data[at + 1: at + 1 + size], "big"), at + 1 + size
+    return int.from_bytes(data[at + 1 : at + 1 + size], "big"), at + 1 + size
 
 
 def _ber_oid(data: bytes, at: int) -> tuple[int, int]:

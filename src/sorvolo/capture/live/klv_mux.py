@@ -21,7 +21,11 @@ _COPIED = ("h264", "hevc", "mpeg2video", "mpeg4", "av1")  # pictures that a tran
 
 
 def mux_klv(
-    video: Path, target: Path, samples: Sequence[CorrectedFrame], headings_deg: Sequence[float], height_reference: str
+    video: Path,
+    target: Path,
+    samples: Sequence[CorrectedFrame],
+    headings_deg: Sequence[float],
+    height_reference: str,
 ) -> None:
     """Write `target`, an MPEG transport stream with the video's own packets and these samples as MISB ST 0601.
 
@@ -59,16 +63,22 @@ def packet_of(sample: CorrectedFrame, heading_deg: float, height_reference: str)
         platform_deg, site_from_gimbal_rotation(sample.yaw_deg, sample.pitch_deg, sample.roll_deg)
     )
     values = {
-        "platform_heading_deg": platform_deg[0], "platform_pitch_deg": 0.0, "platform_roll_deg": 0.0,
-        "sensor_latitude_deg": sample.latitude_deg, "sensor_longitude_deg": (sample.longitude_deg + 180) % 360 - 180,
-        "sensor_horizontal_fov_deg": sample.horizontal_fov_deg, "sensor_vertical_fov_deg": sample.vertical_fov_deg,
-        "sensor_relative_azimuth_deg": azimuth_deg, "sensor_relative_elevation_deg": elevation_deg,
+        "platform_heading_deg": platform_deg[0],
+        "platform_pitch_deg": 0.0,
+        "platform_roll_deg": 0.0,
+        "sensor_latitude_deg": sample.latitude_deg,
+        "sensor_longitude_deg": (sample.longitude_deg + 180) % 360 - 180,
+        "sensor_horizontal_fov_deg": sample.horizontal_fov_deg,
+        "sensor_vertical_fov_deg": sample.vertical_fov_deg,
+        "sensor_relative_azimuth_deg": azimuth_deg,
+        "sensor_relative_elevation_deg": elevation_deg,
         "sensor_relative_roll_deg": roll_deg % 360,
     }
     ground_m = sample.height_m - sample.above_ground_m
     if height_reference == "ellipsoidal":
         values |= {
-            "sensor_ellipsoid_height_m": sample.height_m, "sensor_ellipsoid_height_extended_m": sample.height_m,
+            "sensor_ellipsoid_height_m": sample.height_m,
+            "sensor_ellipsoid_height_extended_m": sample.height_m,
             "frame_center_ellipsoid_height_m": ground_m,
         }
     elif height_reference == "orthometric":
@@ -77,7 +87,10 @@ def packet_of(sample: CorrectedFrame, heading_deg: float, height_reference: str)
 
 
 def _copy(
-    source: av.container.InputContainer, pictures: av.VideoStream, target: Path, samples: Sequence[_Sample],
+    source: av.container.InputContainer,
+    pictures: av.VideoStream,
+    target: Path,
+    samples: Sequence[_Sample],
 ) -> None:
     metadata = klv_streams(source)
     known = [stream for stream in (pictures, *source.streams.audio) if stream not in metadata]
@@ -113,7 +126,9 @@ def _seconds(packet: Any) -> float:
     return float((stamp or 0) * (packet.time_base or _CLOCK))
 
 
-def _mux(output: av.container.OutputContainer, stream: av.stream.Stream, sample: _Sample, first_s: float) -> None:
+def _mux(
+    output: av.container.OutputContainer, stream: av.stream.Stream, sample: _Sample, first_s: float
+) -> None:
     video_s, local_set = sample
     packet = av.Packet(local_set)
     stamp = max(0, round((first_s + video_s) / _CLOCK))

@@ -21,10 +21,17 @@ FORMAT = "klv"
 """The name that `Telemetry.format` carries."""
 
 _OWN_TAGS = (
-    "height_above_takeoff_m", "horizontal_sigma_m", "vertical_sigma_m", "tilt_sigma_deg", "heading_sigma_deg",
-    "course_deg", "speed_m_s",
+    "height_above_takeoff_m",
+    "horizontal_sigma_m",
+    "vertical_sigma_m",
+    "tilt_sigma_deg",
+    "heading_sigma_deg",
+    "course_deg",
+    "speed_m_s",
 )  # named as their columns
-_FOV_SIGMA = 0.03  # of a focal length from the field of view: operators round it, and zooms lag behind it
+_FOV_SIGMA = (
+    0.03  # of a focal length from the field of view: operators round it, and zooms lag behind it
+)
 _LEVEL_FROM_CAMERA = site_from_gimbal_rotation(0.0, 0.0, 0.0)
 
 
@@ -37,7 +44,8 @@ def columns_of(stated: LocalSet) -> dict[str, float]:
     """
     full_m = stated["sensor_ellipsoid_height_extended_m"]
     columns = {
-        "latitude_deg": stated["sensor_latitude_deg"], "longitude_deg": stated["sensor_longitude_deg"],
+        "latitude_deg": stated["sensor_latitude_deg"],
+        "longitude_deg": stated["sensor_longitude_deg"],
         "orthometric_height_m": stated["sensor_true_altitude_m"],
         "ellipsoidal_height_m": full_m if isfinite(full_m) else stated["sensor_ellipsoid_height_m"],
         **{name: stated[name] for name in _OWN_TAGS},
@@ -50,7 +58,10 @@ def columns_of(stated: LocalSet) -> dict[str, float]:
         rotation = site_from_sensor_rotation(
             (heading, pitch, roll), (*relative, own_roll if isfinite(own_roll) else 0.0)
         )
-        columns |= zip(("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"), gimbal_angles_from_rotation(rotation))
+        columns |= zip(
+            ("camera_yaw_deg", "camera_pitch_deg", "camera_roll_deg"),
+            gimbal_angles_from_rotation(rotation),
+        )
     return {name: value for name, value in columns.items() if isfinite(value)}
 
 
@@ -63,7 +74,11 @@ def site_from_sensor_rotation(
     platform's axes. With level = site_from_camera of a camera that looks level to the north,
     site_from_platform = turn(platform) level^-1 and the whole is turn(platform) level^-1 turn(relative).
     """
-    return site_from_gimbal_rotation(*platform_deg) @ _LEVEL_FROM_CAMERA.T @ site_from_gimbal_rotation(*relative_deg)
+    return (
+        site_from_gimbal_rotation(*platform_deg)
+        @ _LEVEL_FROM_CAMERA.T
+        @ site_from_gimbal_rotation(*relative_deg)
+    )
 
 
 def relative_angles(
@@ -105,9 +120,19 @@ def camera_of(stated: LocalSet, width_px: int, height_px: int) -> CameraModel | 
 def klv_notices(counts: Mapping[str, int]) -> list[Notice]:
     """What was wrong with the local sets that `klv.local_sets` counted."""
     return [
-        *notice("bad_checksum", counts.get("bad_checksum", 0), "{} metadata packets dropped: bad or missing checksum"),
-        *notice("unreadable_line", counts.get("damaged", 0), "{} metadata packets dropped: damaged or cut"),
-        *notice("no_time", counts.get("no_time", 0), "{} metadata packets dropped: no time in them"),
+        *notice(
+            "bad_checksum",
+            counts.get("bad_checksum", 0),
+            "{} metadata packets dropped: bad or missing checksum",
+        ),
+        *notice(
+            "unreadable_line",
+            counts.get("damaged", 0),
+            "{} metadata packets dropped: damaged or cut",
+        ),
+        *notice(
+            "no_time", counts.get("no_time", 0), "{} metadata packets dropped: no time in them"
+        ),
     ]
 
 
@@ -140,7 +165,9 @@ def read_klv_file(path: Path) -> FileMetadata | None:
     return metadata_of(sets, counts, path.name) if sets or counts else None
 
 
-def metadata_of(sets: Sequence[tuple[int, LocalSet]], counts: Counter[str], name: str) -> FileMetadata:
+def metadata_of(
+    sets: Sequence[tuple[int, LocalSet]], counts: Counter[str], name: str
+) -> FileMetadata:
     """What local sets state, each with its time in the video (ns; negative where the packet has none).
 
     `counts` are what `klv.local_sets` counted. Raises InputError, which calls the file `name`, without a usable sample.
@@ -150,7 +177,11 @@ def metadata_of(sets: Sequence[tuple[int, LocalSet]], counts: Counter[str], name
     timed, video_ns = [each for _, each in dated], [stamp_ns for stamp_ns, _ in dated]
     is_tied = min(video_ns, default=-1) >= 0  # for all samples or for none
     telemetry = clean(
-        FORMAT, name, [each.time_ns for each in timed], _columns_of_all(timed), video_ns if is_tied else None,
+        FORMAT,
+        name,
+        [each.time_ns for each in timed],
+        _columns_of_all(timed),
+        video_ns if is_tied else None,
         notices=klv_notices(counts),
     )
     lens = next((each for each in timed if isfinite(each["sensor_horizontal_fov_deg"])), None)

@@ -43,7 +43,9 @@ class NmeaLink:
     computer's clock. A link that is silent for `silent_s` is reported, and one that breaks is opened anew.
     """
 
-    def __init__(self, address: str, settings: LiveSettings, heard: Callable[[int, Epoch], None]) -> None:
+    def __init__(
+        self, address: str, settings: LiveSettings, heard: Callable[[int, Epoch], None]
+    ) -> None:
         self._open = _opener(address)
         self._address, self._settings, self._heard = address, settings, heard
         self.outages = Outages(address)
@@ -66,8 +68,14 @@ class NmeaLink:
         """What was wrong with the sentences, and when the link was silent."""
         counts = self._counts
         return [
-            *notice("bad_checksum", counts["bad_checksum"], "{} sentences dropped: bad or missing checksum"),
-            *notice("unreadable_line", counts["unreadable_line"], "{} sentences dropped: not readable"),
+            *notice(
+                "bad_checksum",
+                counts["bad_checksum"],
+                "{} sentences dropped: bad or missing checksum",
+            ),
+            *notice(
+                "unreadable_line", counts["unreadable_line"], "{} sentences dropped: not readable"
+            ),
             *notice("no_time", counts["no_time"], "{} sentences dropped: no readable time"),
             *self.outages.notices("telemetry_outage"),
         ]
@@ -121,7 +129,11 @@ class SentenceBuffer:
             self._rest = b""
         self._pending += messages_in(whole + newline, self._counts) if newline else []
         is_open = data and self._pending  # more of the last moment may come
-        held = [each for each in self._pending if each.time == self._pending[-1].time] if is_open else []
+        held = (
+            [each for each in self._pending if each.time == self._pending[-1].time]
+            if is_open
+            else []
+        )
         done, self._pending = self._pending[: len(self._pending) - len(held)], held
         epochs = epochs_of(done)[0] if done else []
         for epoch in epochs:
@@ -146,13 +158,17 @@ def _opener(address: str) -> Callable[[], Wire]:
     if scheme == "follow":
         path = Path(rest)
         if not path.is_file():
-            raise InputError(f"--telemetry {address}: no such file; give the log that is being written")
+            raise InputError(
+                f"--telemetry {address}: no such file; give the log that is being written"
+            )
         return lambda: _FollowedLog(path)
     try:
         parts = urlsplit(address)
         host, port = parts.hostname or "", parts.port
     except ValueError as error:
-        raise InputError(f"--telemetry {address}: no address ({error}); give {LINK_FORMS}") from error
+        raise InputError(
+            f"--telemetry {address}: no address ({error}); give {LINK_FORMS}"
+        ) from error
     if port is None or scheme not in ("tcp", "udp") or (scheme == "tcp" and not host):
         raise InputError(f"--telemetry {address}: no link; give {LINK_FORMS}")
     if scheme == "udp":
@@ -164,15 +180,21 @@ def _serial_opener(device: str, options: Mapping[str, str]) -> Callable[[], Wire
     try:
         import serial
     except ImportError as error:
-        raise SettingsError("reading a serial port needs pyserial: pip install 'sorvolo[serial]'") from error
+        raise SettingsError(
+            "reading a serial port needs pyserial: pip install 'sorvolo[serial]'"
+        ) from error
     try:
         baud = int(options.get("baud", _DEFAULT_BAUD))
     except ValueError as error:
-        raise InputError(f"serial:{device}: baud={options['baud']} is no number; give for instance 9600") from error
+        raise InputError(
+            f"serial:{device}: baud={options['baud']} is no number; give for instance 9600"
+        ) from error
     if unknown := set(options) - {"baud"}:
         raise InputError(f"serial:{device}: unknown option {sorted(unknown)[0]}; give ?baud=9600")
     if not Path(device).exists():
-        raise InputError(f"no such serial port: {device or '(nothing)'}; plug the receiver in, or give another")
+        raise InputError(
+            f"no such serial port: {device or '(nothing)'}; plug the receiver in, or give another"
+        )
     return lambda: _Serial(serial.Serial(device, baud, timeout=_POLL_S))  # its errors are OSError
 
 

@@ -21,8 +21,11 @@ from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import Notice
 
 REFUSALS = (
-    av.error.ProtocolNotFoundError, av.error.HTTPUnauthorizedError, av.error.HTTPForbiddenError,
-    av.error.HTTPNotFoundError, av.error.PermissionError,
+    av.error.ProtocolNotFoundError,
+    av.error.HTTPUnauthorizedError,
+    av.error.HTTPForbiddenError,
+    av.error.HTTPNotFoundError,
+    av.error.PermissionError,
 )
 """FFmpeg's errors for an other side that will not have us, however often it is asked."""
 
@@ -72,7 +75,11 @@ class StreamReader:
     """
 
     def __init__(
-        self, address: StreamAddress, listener: StreamListener, settings: LiveSettings, stop: threading.Event,
+        self,
+        address: StreamAddress,
+        listener: StreamListener,
+        settings: LiveSettings,
+        stop: threading.Event,
         file: Callable[[Outages], Any] | None = None,
     ) -> None:
         self._address, self._listener, self._settings = address, listener, settings
@@ -86,7 +93,9 @@ class StreamReader:
         self._has_spoken = False
         self._stamp_ns = -1
         self._step_ns = SECOND_NS // 25
-        self._thread = threading.Thread(target=self._run, name=f"reading {address.shown}", daemon=True)
+        self._thread = threading.Thread(
+            target=self._run, name=f"reading {address.shown}", daemon=True
+        )
 
     def start(self) -> None:
         """Begin to read."""
@@ -106,10 +115,15 @@ class StreamReader:
             *notice("decode_error", counts["packet"], "damaged places in the stream, skipped: {}"),
             *notice("damaged_frame", counts["frame"], "frames damaged in part: {}"),
             *notice(
-                "behind", counts["behind"],
+                "behind",
+                counts["behind"],
                 "frames that came faster than this computer decodes them, left out up to the next key frame: {}",
             ),
-            *notice("missing_pts", counts["missing"], "frames without a time stamp, set by the usual step: {}"),
+            *notice(
+                "missing_pts",
+                counts["missing"],
+                "frames without a time stamp, set by the usual step: {}",
+            ),
         ]
 
     @property
@@ -148,7 +162,9 @@ class StreamReader:
                 self._listener.opened(_facts_of(container, video, metadata))
                 self._listener.restarted()
                 self._stamp_ns = -1
-                self._step_ns = round(SECOND_NS / float(video.average_rate or video.guessed_rate or 25))
+                self._step_ns = round(
+                    SECOND_NS / float(video.average_rate or video.guessed_rate or 25)
+                )
                 # frames in threads would hold several back; a stripe each does not
                 video.thread_type = "SLICE"
                 backlog = Backlog()
@@ -174,10 +190,14 @@ class StreamReader:
             file = stack.enter_context(closing(self._file(self.outages)))
             return stack.enter_context(av.open(file, options=dict(self._address.options)))
         open_s = min(self._address.opens_s, max(0.2, self._left_s()))
-        return stack.enter_context(av.open(
-            self._address.url, format=self._address.container, options=dict(self._address.options),
-            timeout=(open_s, self._settings.silent_s),
-        ))
+        return stack.enter_context(
+            av.open(
+                self._address.url,
+                format=self._address.container,
+                options=dict(self._address.options),
+                timeout=(open_s, self._settings.silent_s),
+            )
+        )
 
     def _lost(self, reason: str) -> None:
         self.failure = reason
@@ -242,7 +262,9 @@ class StreamReader:
         if not packet.has_sidedata("prft"):
             return
         stamp_ns = _stamp_of(packet, packet.time_base)
-        microseconds = int.from_bytes(bytes(packet.get_sidedata("prft"))[:_WALLCLOCK_BYTES], "little", signed=True)
+        microseconds = int.from_bytes(
+            bytes(packet.get_sidedata("prft"))[:_WALLCLOCK_BYTES], "little", signed=True
+        )
         if stamp_ns is not None and microseconds > 0:
             self._listener.reported(stamp_ns, microseconds * 1000)
 
@@ -256,7 +278,9 @@ def _streams_of(container: Any) -> tuple[Any, list[Any]]:
 def _facts_of(container: Any, video: Any, metadata: list[Any]) -> StreamFacts:
     rate = video.average_rate or video.guessed_rate
     name = container.format.name.split(",")[0]
-    return StreamFacts(video.codec_context.name, name, float(rate) if rate else 25.0, bool(metadata))
+    return StreamFacts(
+        video.codec_context.name, name, float(rate) if rate else 25.0, bool(metadata)
+    )
 
 
 def _stamp_of(timed: Any, time_base: Any, *, by_order: bool = False) -> int | None:

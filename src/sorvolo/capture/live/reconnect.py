@@ -17,19 +17,31 @@ _LOG = logging.getLogger("sorvolo.live")
 class LiveSettings:
     """How a live source is read."""
 
-    keeps_all: bool = False  # every wanted frame waits for its turn (mapping); else the newest wins (watching)
-    silent_s: float = 3.0  # without a packet: the source counts as silent, which is reported, and is opened anew
+    keeps_all: bool = (
+        False  # every wanted frame waits for its turn (mapping); else the newest wins (watching)
+    )
+    silent_s: float = (
+        3.0  # without a packet: the source counts as silent, which is reported, and is opened anew
+    )
     first_s: float = 20.0  # to wait for the first frame before giving up
     give_up_s: float = 30.0  # a source that was silent for so long has ended
-    fix_wait_s: float = 1.0  # a frame waits so long for the fix that follows it, if every frame is kept
+    fix_wait_s: float = (
+        1.0  # a frame waits so long for the fix that follows it, if every frame is kept
+    )
     most_bytes: int = 256_000_000  # of decoded frames that wait
-    most_bytes_of_file: int = 32_000_000  # the same of a growing file, which itself keeps what nobody has read yet
-    same_flight_s: float = 900.0  # a run that was killed goes on with a stream that returns within so long
+    most_bytes_of_file: int = (
+        32_000_000  # the same of a growing file, which itself keeps what nobody has read yet
+    )
+    same_flight_s: float = (
+        900.0  # a run that was killed goes on with a stream that returns within so long
+    )
 
     def __post_init__(self) -> None:
         for name in ("silent_s", "first_s", "give_up_s"):
             if not 0.05 <= getattr(self, name) <= 86_400:
-                raise SettingsError(f"{name} must lie in 0.05 to 86400 s, got {getattr(self, name)}")
+                raise SettingsError(
+                    f"{name} must lie in 0.05 to 86400 s, got {getattr(self, name)}"
+                )
 
 
 class Outages:
@@ -94,7 +106,9 @@ class Backoff:
 
     def next_s(self) -> float:
         """The pause before the next attempt."""
-        pause_s = self._next_s * random.uniform(0.75, 1.25)  # so that many ground stations do not knock at once
+        pause_s = self._next_s * random.uniform(
+            0.75, 1.25
+        )  # so that many ground stations do not knock at once
         self._next_s = min(2 * self._next_s, self._most_s)
         return pause_s
 

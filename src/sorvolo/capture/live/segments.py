@@ -37,7 +37,9 @@ def joined_samples(parts: Sequence[tuple[TimesNs, Floats]]) -> tuple[TimesNs, Fl
     """
     columns = len(TELEMETRY_COLUMNS)
     times_ns = np.concatenate([np.zeros(0, np.int64), *(each for each, _ in parts)])
-    return times_ns, np.concatenate([np.zeros((0, columns)), *(each.reshape(-1, columns) for _, each in parts)])
+    return times_ns, np.concatenate(
+        [np.zeros((0, columns)), *(each.reshape(-1, columns) for _, each in parts)]
+    )
 
 
 def segment_notices(gaps_s: Sequence[float]) -> tuple[Notice, ...]:

@@ -20,7 +20,13 @@ from sorvolo.capture.live.clock import StreamClock, Tie
 from sorvolo.capture.live.frame_queue import Arrived, FrameQueue
 from sorvolo.capture.live.growing import GrowingFile
 from sorvolo.capture.live.klv import LocalSet
-from sorvolo.capture.live.klv_telemetry import FORMAT, camera_of, columns_of, ground_elevation_m, klv_notices
+from sorvolo.capture.live.klv_telemetry import (
+    FORMAT,
+    camera_of,
+    columns_of,
+    ground_elevation_m,
+    klv_notices,
+)
 from sorvolo.capture.live.links import NmeaLink
 from sorvolo.capture.live.reader import StreamFacts, StreamReader
 from sorvolo.capture.live.reconnect import LiveSettings, Outages
@@ -39,11 +45,17 @@ _HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it states the frames' t
 _FIRST_FIXES = 2  # enough for where a flight begins, and how fast
 _FIRST_FIXES_S = 10.0  # waited for them; then the flight begins without
 _CLOCKS_AGREE_NS = 5_000_000_000  # further apart, one of the two clocks was set wrong; by choice
-_DELAYS_KEPT = 60  # of the newest fixes, whose least delay ties the clocks: a minute at one a second
-_NEWEST_SAMPLES = 4096  # of telemetry, which place the frames that come: seven minutes at ten a second; by choice
+_DELAYS_KEPT = (
+    60  # of the newest fixes, whose least delay ties the clocks: a minute at one a second
+)
+_NEWEST_SAMPLES = (
+    4096  # of telemetry, which place the frames that come: seven minutes at ten a second; by choice
+)
 _ZOOMED = 0.03  # relative change of the field of view: more than its rounding in the metadata
 _POLL_S = 0.25  # how soon an end is noticed; by choice
-_TIMELY_NS = 5_000_000  # a frame so little before its turn is taken: the next one comes a whole frame later
+_TIMELY_NS = (
+    5_000_000  # a frame so little before its turn is taken: the next one comes a whole frame later
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +70,9 @@ class _Held:
 class _Glance:
     """Gives a small copy of a frame every so often. Only `show` changes it, in the reading thread."""
 
-    def __init__(self, every_ns: int, width_px: int, take: Callable[[int, ImageGray], None]) -> None:
+    def __init__(
+        self, every_ns: int, width_px: int, take: Callable[[int, ImageGray], None]
+    ) -> None:
         self._every_ns, self._width_px, self._take = every_ns, width_px, take
         self._next_ns = 0
 
@@ -89,13 +103,19 @@ class LiveStream:
     is_live = True
 
     def __init__(
-        self, address: StreamAddress, link: str | None, settings: LiveSettings, until: threading.Event,
+        self,
+        address: StreamAddress,
+        link: str | None,
+        settings: LiveSettings,
+        until: threading.Event,
         path: Path | None,
     ) -> None:
         self._settings, self._until, self._is_file = settings, until, path is not None
         self._closing = threading.Event()
         most_bytes = settings.most_bytes_of_file if self._is_file else settings.most_bytes
-        self._queue = FrameQueue(holds_all=settings.keeps_all, most_bytes=most_bytes, blocks=self._is_file)
+        self._queue = FrameQueue(
+            holds_all=settings.keeps_all, most_bytes=most_bytes, blocks=self._is_file
+        )
         self._clock = StreamClock()
         self._log = TelemetryLog("nmea" if link else FORMAT, link or address.shown)
         self._link = NmeaLink(link, settings, self._fix) if link else None
@@ -107,7 +127,9 @@ class LiveStream:
             self._is_whole = file.is_whole
             return file
 
-        self._reader = StreamReader(address, self, settings, self._closing, None if path is None else opened)
+        self._reader = StreamReader(
+            address, self, settings, self._closing, None if path is None else opened
+        )
         self._facts: StreamFacts | None = None
         self._lock = threading.RLock()
         self._held: list[_Held] | None = []
@@ -126,7 +148,11 @@ class LiveStream:
         self._size_px = (0, 0)
         self._lens: LocalSet | None = None
         self._grounds_m: deque[float] = deque(maxlen=1000)
-        self.name, self.fingerprint, self.inputs = "", "", (address.shown, *([link] if link else []))
+        self.name, self.fingerprint, self.inputs = (
+            "",
+            "",
+            (address.shown, *([link] if link else [])),
+        )
         self.start_ns, self.start_origin = 0, ""
         self.camera: CameraModel = None  # type: ignore[assignment]  # set by `open_stream` once the size is known
         self.gaps_s: tuple[float, ...] = ()
@@ -228,7 +254,9 @@ class LiveStream:
         Only where every frame is kept: where the newest wins, what is known so far has to do.
         """
         if self._settings.keeps_all and self._log.version:
-            self._log.wait_past(time_ns - self._later_ns, self._arrived_s + self._settings.fix_wait_s)
+            self._log.wait_past(
+                time_ns - self._later_ns, self._arrived_s + self._settings.fix_wait_s
+            )
 
     def samples(self, since: int) -> tuple[TimesNs, Floats]:
         """Telemetry after the first so many samples, as `FlightSoFar` has it."""
@@ -247,7 +275,9 @@ class LiveStream:
     def continue_from(self, so_far: FlightSoFar) -> None:
         """Go on with a flight that an earlier process read; before `frames` is asked for, and telemetry."""
         if self._is_whole and self._clock.tie is Tie.ARRIVAL:
-            self._later_ns = so_far.start_ns - self.start_ns  # each process has timed it by when it began to read
+            self._later_ns = (
+                so_far.start_ns - self.start_ns
+            )  # each process has timed it by when it began to read
         if not self.is_reread:
             self._first_index = so_far.next_index
             began_ns = self.start_ns + self._later_ns
@@ -265,10 +295,22 @@ class LiveStream:
             *self._reader.notices(),
             *segment_notices(self.gaps_s),
             *notice("arrival_times", int(arrival), words),
-            *notice("size_changed", self._resized, "frames of another size, brought to the first one's: {}"),
+            *notice(
+                "size_changed",
+                self._resized,
+                "frames of another size, brought to the first one's: {}",
+            ),
             *notice("other_shape", self._lost, "frames of another shape, not used: {}"),
-            *notice("zoom", self._zooms, "metadata packets that state another field of view than the first: {}"),
-            *notice("skipped_frame", self.skipped, "frames that came faster than they could be looked at: {}"),
+            *notice(
+                "zoom",
+                self._zooms,
+                "metadata packets that state another field of view than the first: {}",
+            ),
+            *notice(
+                "skipped_frame",
+                self.skipped,
+                "frames that came faster than they could be looked at: {}",
+            ),
         )
 
     def frames(self, wanted: Callable[[int, int], bool]) -> Iterator[Frame | LostFrame]:
@@ -279,8 +321,11 @@ class LiveStream:
         for _, each in self.arrivals(wanted):
             yield each
 
-    def arrivals(self, wanted: Callable[[int, int], bool]) -> Iterator[tuple[float, Frame | LostFrame]]:
+    def arrivals(
+        self, wanted: Callable[[int, int], bool]
+    ) -> Iterator[tuple[float, Frame | LostFrame]]:
         """The same as `frames`, each with when it was there (monotonic clock)."""
+
         def is_wanted(index: int, time_ns: int) -> bool:
             index, time_ns = index + self._first_index, time_ns + self._later_ns
             return time_ns > self._after_ns and wanted(index, time_ns)
@@ -330,7 +375,9 @@ class LiveStream:
         try:
             while not self._is_ready.wait(_POLL_S):
                 if self._reader.refused:
-                    raise InputError(f"{shown}: {self._reader.refused}; check the address, the name and the password")
+                    raise InputError(
+                        f"{shown}: {self._reader.refused}; check the address, the name and the password"
+                    )
                 if self._reader.is_over.is_set() and not self._is_ready.is_set():
                     why = self._reader.failure or "nothing came"
                     raise InputError(
@@ -383,7 +430,9 @@ class LiveStream:
 
     def frame(self, decoded: av.VideoFrame, stamp_ns: int, arrived_s: float) -> None:
         """See `reader.StreamListener`."""
-        if not self._is_file or self._held_since is None:  # a file is read faster than it was written
+        if (
+            not self._is_file or self._held_since is None
+        ):  # a file is read faster than it was written
             self._clock.arrived(stamp_ns, time.time_ns())
         held = _Held(decoded, stamp_ns, arrived_s)
         if self._held is None:
@@ -400,13 +449,19 @@ class LiveStream:
         since_s, since_ns = self._held_since
         stated = sum(bool(each.time_ns) for _, each in self._held_metadata)
         if self._is_file:  # its frames come at once: what counts is how much of the flight was read
-            passed_s, usual_s, is_stated = (newest.stamp_ns - since_ns) / 1e9, 0.0, stated >= _FIRST_FIXES
+            passed_s, usual_s, is_stated = (
+                (newest.stamp_ns - since_ns) / 1e9,
+                0.0,
+                stated >= _FIRST_FIXES,
+            )
         else:
             passed_s, usual_s, is_stated = newest.arrived_s - since_s, _HOLD_S, stated > 0
         held_bytes = len(self._held) * newest.decoded.width * newest.decoded.height * 3 // 2
         if held_bytes > self._settings.most_bytes // 2:
             return True
-        return passed_s >= (_HOLD_FOR_METADATA_S if self.facts.has_metadata and not is_stated else usual_s)
+        return passed_s >= (
+            _HOLD_FOR_METADATA_S if self.facts.has_metadata and not is_stated else usual_s
+        )
 
     def _settle(self) -> None:
         """The frames held so far decide how the stream's clock is tied; from here on they are given on as they come."""
@@ -418,8 +473,10 @@ class LiveStream:
                 self._size_px = first.decoded.width, first.decoded.height
                 tie = self._clock.settle()
                 self.start_ns = self._clock.utc_ns(first.stamp_ns)
-                self.start_origin = tie.words if not (self._is_file and tie is Tie.ARRIVAL) else (
-                    "when reading began: the file states no time"
+                self.start_origin = (
+                    tie.words
+                    if not (self._is_file and tie is Tie.ARRIVAL)
+                    else ("when reading began: the file states no time")
                 )
         self._deliver_held()
 
@@ -468,7 +525,9 @@ class LiveStream:
         if self._link is not None:
             return
         states_time = self._clock.tie is Tie.METADATA and stated.time_ns
-        self._log.add(stated.time_ns if states_time else self._clock.utc_ns(stamp_ns), columns_of(stated))
+        self._log.add(
+            stated.time_ns if states_time else self._clock.utc_ns(stamp_ns), columns_of(stated)
+        )
 
     def _fix(self, arrived_ns: int, epoch: Epoch) -> None:
         """A receiver's moment, in the link's thread."""
@@ -483,13 +542,21 @@ class LiveStream:
         self._delays_ns.append(arrived_ns - epoch.time_ns)
         least_ns = min(self._delays_ns)
         ahead_ns = self._clock.host_from_tie_ns()
-        self._clocks_agree = self._clock.tie is not Tie.ARRIVAL and abs(least_ns - ahead_ns) < _CLOCKS_AGREE_NS
-        self._log.add(epoch.time_ns + (0 if self._clocks_agree else least_ns - ahead_ns), epoch.values)
+        self._clocks_agree = (
+            self._clock.tie is not Tie.ARRIVAL and abs(least_ns - ahead_ns) < _CLOCKS_AGREE_NS
+        )
+        self._log.add(
+            epoch.time_ns + (0 if self._clocks_agree else least_ns - ahead_ns), epoch.values
+        )
 
     # ---- pictures ---------------------------------------------------------------------------------------------
 
     def _converted(self, arrived: Arrived) -> Frame | LostFrame:
-        index, time_ns, decoded = arrived.index + self._first_index, arrived.time_ns + self._later_ns, arrived.decoded
+        index, time_ns, decoded = (
+            arrived.index + self._first_index,
+            arrived.time_ns + self._later_ns,
+            arrived.decoded,
+        )
         name = str(index)
         width_px, height_px = self._size_px
         fitted: dict[str, Any] = {}
@@ -509,8 +576,13 @@ class LiveStream:
 
 
 def open_stream(
-    address: StreamAddress, link: str | None, camera: Callable[[int, int], CameraModel | None],
-    guess: Callable[[int, int], CameraModel], settings: LiveSettings, until: threading.Event, path: Path | None = None,
+    address: StreamAddress,
+    link: str | None,
+    camera: Callable[[int, int], CameraModel | None],
+    guess: Callable[[int, int], CameraModel],
+    settings: LiveSettings,
+    until: threading.Event,
+    path: Path | None = None,
 ) -> LiveStream:
     """The flight at an address, or in a video file that is being written (`path`), reading already.
 
@@ -532,5 +604,7 @@ def open_stream(
     else:
         began = datetime.fromtimestamp(time.time(), UTC)
         stream.name = f"{address.shown.partition('://')[2] or address.shown}_{began:%Y%m%dT%H%M%SZ}"
-        stream.fingerprint = hashlib.sha256(f"{address.shown} {stream.start_ns}".encode()).hexdigest()
+        stream.fingerprint = hashlib.sha256(
+            f"{address.shown} {stream.start_ns}".encode()
+        ).hexdigest()
     return stream

@@ -65,7 +65,9 @@ class TelemetryLog:
     def samples(self, since: int) -> tuple[TimesNs, Floats]:
         """The times (N,) and samples (N, columns of `TELEMETRY_COLUMNS`) after the first this many."""
         with self._changed:
-            return self._times_ns[since : self._count].copy(), self._rows[since : self._count].copy()
+            return self._times_ns[since : self._count].copy(), self._rows[
+                since : self._count
+            ].copy()
 
     @property
     def version(self) -> int:
@@ -81,8 +83,13 @@ class TelemetryLog:
             chosen = (0 if newest is None else max(0, self._count - newest), self._count)
             if chosen == self._known_rows:
                 return self._known
-            times_ns, rows = self._times_ns[slice(*chosen)].copy(), self._rows[slice(*chosen)].copy()
-            late = notice("backward_time", self._late, "{} samples came out of order and are not used")
+            times_ns, rows = (
+                self._times_ns[slice(*chosen)].copy(),
+                self._rows[slice(*chosen)].copy(),
+            )
+            late = notice(
+                "backward_time", self._late, "{} samples came out of order and are not used"
+            )
         try:
             columns = {name: rows[:, place] for place, name in enumerate(TELEMETRY_COLUMNS)}
             found = clean(self._reader, self._name, times_ns, columns, notices=[*notices, *late])
@@ -94,16 +101,23 @@ class TelemetryLog:
     def wait_for_fixes(self, count: int, until_s: float) -> bool:
         """Wait for so many samples with a place, until that moment (monotonic clock) at most; whether they came."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._fixes >= count, max(0.0, until_s - time.monotonic()))
+            return self._changed.wait_for(
+                lambda: self._fixes >= count, max(0.0, until_s - time.monotonic())
+            )
 
     def wait_past(self, time_ns: int, until_s: float) -> bool:
         """Wait for a sample at or after a time (UTC), at most until that moment; whether there is one."""
         with self._changed:
-            return self._changed.wait_for(lambda: self._newest_ns >= time_ns, max(0.0, until_s - time.monotonic()))
+            return self._changed.wait_for(
+                lambda: self._newest_ns >= time_ns, max(0.0, until_s - time.monotonic())
+            )
 
     def _hold(self, times_ns: TimesNs, samples: Floats) -> None:
         """Keep these, with room for as many more."""
         self._count = len(times_ns)
         room = max(_FIRST_ROWS, 2 * self._count)
-        self._times_ns, self._rows = np.empty(room, np.int64), np.empty((room, len(TELEMETRY_COLUMNS)))
+        self._times_ns, self._rows = (
+            np.empty(room, np.int64),
+            np.empty((room, len(TELEMETRY_COLUMNS))),
+        )
         self._times_ns[: self._count], self._rows[: self._count] = times_ns, samples

@@ -11,12 +11,22 @@ from sorvolo.survey.flight import Telemetry
 LARGEST_FILE_BYTES = 500_000_000
 """A telemetry file beyond this is some other file; a day at 10 Hz with 60 columns is a tenth of it."""
 
-_HEAD_BYTES = 65_536  # of a file, by which its format is recognised; a flight table's header has thousands
+_HEAD_BYTES = (
+    65_536  # of a file, by which its format is recognised; a flight table's header has thousands
+)
 _SUFFIXES = (".srt", ".csv", ".nmea", ".gpx", ".log", ".txt", ".tsv", ".gps", ".dat")
 _VIDEO_SUFFIXES = frozenset(
     (".mp4", ".mov", ".mkv", ".avi", ".ts", ".m2ts", ".mts", ".m4v", ".webm", ".mpg", ".mpeg")
 )
-_BESIDE = ("{}_telemetry", "{}-telemetry", "{}.telemetry", "{}_gps", "{}-gps", "{}_nmea", "telemetry_{}")
+_BESIDE = (
+    "{}_telemetry",
+    "{}-telemetry",
+    "{}.telemetry",
+    "{}_gps",
+    "{}-gps",
+    "{}_nmea",
+    "telemetry_{}",
+)
 
 
 class Reader(Protocol):
@@ -30,7 +40,12 @@ class Reader(Protocol):
 
 
 # Order matters where a file fits two: a table may hold NMEA sentences in one of its columns.
-TELEMETRY_READERS: dict[str, Reader] = {"dji_srt": dji_srt, "gpx": gpx, "table": flight_table, "nmea": nmea}
+TELEMETRY_READERS: dict[str, Reader] = {
+    "dji_srt": dji_srt,
+    "gpx": gpx,
+    "table": flight_table,
+    "nmea": nmea,
+}
 """Every format that is read, by the name that `Telemetry.format` carries."""
 
 
@@ -106,8 +121,12 @@ def unusable_files_beside(video: Path) -> list[Path]:
     stem = video.stem.lower()
     names = {stem, video.name.lower(), *(pattern.format(stem) for pattern in _BESIDE)}
     return sorted(
-        each for each in video.parent.iterdir()
-        if each.suffix.lower() in _SUFFIXES and each.stem.lower() in names and each.is_file() and not is_telemetry(each)
+        each
+        for each in video.parent.iterdir()
+        if each.suffix.lower() in _SUFFIXES
+        and each.stem.lower() in names
+        and each.is_file()
+        and not is_telemetry(each)
     )
 
 
@@ -125,14 +144,18 @@ def _bytes_of(path: Path) -> bytes:
     except FileNotFoundError as error:
         raise InputError(f"{path}: no such telemetry file; check the name") from error
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check its permissions") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions"
+        ) from error
     if not data:
         raise InputError(f"{path}: an empty file (0 bytes); copy it from the drone again")
     return data
 
 
 def _reader_for(head: bytes) -> str | None:
-    return next((name for name, reader in TELEMETRY_READERS.items() if reader.recognises(head)), None)
+    return next(
+        (name for name, reader in TELEMETRY_READERS.items() if reader.recognises(head)), None
+    )
 
 
 def _unknown(data: bytes) -> str:

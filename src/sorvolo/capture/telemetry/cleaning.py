@@ -79,7 +79,9 @@ def clean(
     found = list(notices)
     times = np.asarray(time_ns, dtype=np.int64)
     table = {key: np.array(value, dtype=np.float64) for key, value in columns.items()}
-    video = np.asarray(np.full(len(times), -1) if video_time_ns is None else video_time_ns, dtype=np.int64)
+    video = np.asarray(
+        np.full(len(times), -1) if video_time_ns is None else video_time_ns, dtype=np.int64
+    )
 
     keep = increasing(times)
     found += _clock_notices(times, keep)
@@ -101,7 +103,9 @@ def clean(
     return Telemetry(reader, times, table, video, tuple(found))
 
 
-def _cleaned_fixes(times: TimesNs, table: _Table, decimals: int | None) -> tuple[_Table, list[Notice]]:
+def _cleaned_fixes(
+    times: TimesNs, table: _Table, decimals: int | None
+) -> tuple[_Table, list[Notice]]:
     """The table with only the fixes that the flight made, their sigma no smaller than their rounding."""
     table, found = _without_null_fixes(table)
     if decimals is not None and decimals <= _COARSE_DECIMALS:
@@ -183,7 +187,9 @@ def fill_stamps(stamps_ns: TimesNs, counter_ns: TimesNs) -> TimesNs:
     stamped = np.flatnonzero((stamps_ns != NO_TIME_NS) & (counter_ns != NO_TIME_NS))
     if not len(stamped):
         return np.where(stamps_ns == NO_TIME_NS, counter_ns, stamps_ns)
-    near = stamped[np.clip(np.searchsorted(stamped, np.arange(len(stamps_ns)), side="right") - 1, 0, None)]
+    near = stamped[
+        np.clip(np.searchsorted(stamped, np.arange(len(stamps_ns)), side="right") - 1, 0, None)
+    ]
     filled = stamps_ns[near] - counter_ns[near] + counter_ns
     return np.where((stamps_ns == NO_TIME_NS) & (counter_ns != NO_TIME_NS), filled, stamps_ns)
 
@@ -232,7 +238,9 @@ def _clock_notices(times: TimesNs, keep: Mask) -> list[Notice]:
     twice = int(np.isin(dropped, times[keep]).sum())
     return [
         *notice("duplicate_time", twice, "{} samples dropped: another one has the same time"),
-        *notice("backward_time", len(dropped) - twice, "{} samples dropped: their clock runs backward"),
+        *notice(
+            "backward_time", len(dropped) - twice, "{} samples dropped: their clock runs backward"
+        ),
     ]
 
 
@@ -245,8 +253,12 @@ def _believable(table: _Table) -> tuple[_Table, list[Notice]]:
         kept[key] = np.where(bad, np.nan, values)
     if "longitude_deg" in kept:
         longitude = kept["longitude_deg"]
-        kept["longitude_deg"] = np.where(np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude)
-    return kept, notice("out_of_range", count, "{} values lie outside any possible range and are taken as unknown")
+        kept["longitude_deg"] = np.where(
+            np.abs(longitude) > 180, (longitude + 180) % 360 - 180, longitude
+        )
+    return kept, notice(
+        "out_of_range", count, "{} values lie outside any possible range and are taken as unknown"
+    )
 
 
 def _without_null_fixes(table: _Table) -> tuple[_Table, list[Notice]]:
@@ -255,7 +267,11 @@ def _without_null_fixes(table: _Table) -> tuple[_Table, list[Notice]]:
     null = (np.abs(latitude) < 1e-6) & (np.abs(longitude) < 1e-6)
     return _without_fixes(table, unknown | null), [
         *notice("no_fix", int(unknown.sum()), "{} samples have no position"),
-        *notice("null_fix", int(null.sum()), "{} positions are 0/0, written before the receiver's first fix"),
+        *notice(
+            "null_fix",
+            int(null.sum()),
+            "{} positions are 0/0, written before the receiver's first fix",
+        ),
     ]
 
 
@@ -289,21 +305,28 @@ def _without_jumps(times: TimesNs, table: _Table) -> tuple[_Table, list[Notice]]
     fixes = np.flatnonzero(np.isfinite(latitude))
     if len(fixes) < 2:
         return table, []
-    lat, lon, seconds = latitude[fixes], longitude[fixes], (times[fixes] - times[fixes[0]]) / SECOND_NS
+    lat, lon, seconds = (
+        latitude[fixes],
+        longitude[fixes],
+        (times[fixes] - times[fixes[0]]) / SECOND_NS,
+    )
     sigma = np.nan_to_num(table.get("horizontal_sigma_m", np.zeros(len(times)))[fixes])
     fresh = np.concatenate([[True], (np.diff(lat) != 0) | (np.diff(lon) != 0)])
     starts = np.flatnonzero(fresh)  # one run per distinct fix, from its first sample to its last
     ends = np.concatenate([starts[1:], [len(fixes)]]) - 1
     repeats = len(fixes) - len(starts)
     found = notice(
-        "repeated_fix", repeats if 10 * repeats > len(fixes) else 0,
+        "repeated_fix",
+        repeats if 10 * repeats > len(fixes) else 0,
         f"{{}} samples repeat the position before; distinct fixes: {len(starts)}",
     )
 
     def fits(old: Rows, new: Rows) -> Mask:
         turn = (lon[starts[new]] - lon[starts[old]] + 180) % 360 - 180
         scale = np.cos(np.radians((lat[starts[new]] + lat[starts[old]]) / 2))
-        distance_m = np.hypot(lat[starts[new]] - lat[starts[old]], turn * scale) * M_PER_DEG_LATITUDE
+        distance_m = (
+            np.hypot(lat[starts[new]] - lat[starts[old]], turn * scale) * M_PER_DEG_LATITUDE
+        )
         made = np.maximum(seconds[starts[old]], seconds[ends[old]] - _HELD_FIX_S)
         slack_m = _JUMP_SLACK_M + 3 * (sigma[starts[new]] + sigma[starts[old]])
         return distance_m <= FASTEST_M_S * (seconds[starts[new]] - made) + slack_m
@@ -325,14 +348,18 @@ def _without_jumps(times: TimesNs, table: _Table) -> tuple[_Table, list[Notice]]
     flight = np.zeros(len(fixes), dtype=np.bool_)
     segment = int(np.argmax(best))
     while segment >= 0:
-        flight[starts[first[segment]]: ends[final[segment]] + 1] = True
+        flight[starts[first[segment]] : ends[final[segment]] + 1] = True
         segment = int(before[segment])
     text = f"{{}} positions jump away faster than {FASTEST_M_S:g} m/s and are not used"
     return _without_fixes(table, fixes[~flight]), found + notice("jump", int((~flight).sum()), text)
 
 
 def _gaps(times: TimesNs, latitude: Floats | None) -> list[Notice]:
-    placed = times if latitude is None or not np.isfinite(latitude).any() else times[np.isfinite(latitude)]
+    placed = (
+        times
+        if latitude is None or not np.isfinite(latitude).any()
+        else times[np.isfinite(latitude)]
+    )
     steps_s = np.diff(placed) / SECOND_NS
     if not len(steps_s):
         return []

@@ -108,7 +108,11 @@ def read(data: bytes, name: str) -> Telemetry:
     times_ns, refined = refine_clock(fill_stamps(stamps_ns, video_ns), video_ns)
     counts["refined"] = len(cues) if refined else 0
     return clean(
-        "dji_srt", name, times_ns, _columns_of(cues), video_ns,
+        "dji_srt",
+        name,
+        times_ns,
+        _columns_of(cues),
+        video_ns,
         notices=_notices(counts, int((stamps_ns != NO_TIME_NS).sum()), len(cues)),
         position_decimals=max(decimals) or None,
     )
@@ -128,20 +132,24 @@ def _notices(counts: Counter[str], dated: int, cues: int) -> list[Notice]:
     return [
         *notice("truncated", counts["truncated"], "the last cue is cut off"),
         *notice(
-            "time_zone_unknown", dated - counts["zoned"],
+            "time_zone_unknown",
+            dated - counts["zoned"],
             "{} cues print a time without its zone; it is taken as UTC and may be hours off",
         ),
         *notice(
-            "no_date", cues - dated,
+            "no_date",
+            cues - dated,
             "{} cues print no date; they are stamped by their place in the video"
             + ("" if dated else ", which dates them, else they count from 1970-01-01"),
         ),
         *notice(
-            "clock_refined", counts["refined"],
+            "clock_refined",
+            counts["refined"],
             "times are printed in whole seconds; the {} samples are timed by their cues instead",
         ),
         *notice(
-            "latitude_first", counts["latitude_first"],
+            "latitude_first",
+            counts["latitude_first"],
             "{} positions are followed by a height: such files put latitude before longitude",
         ),
     ]
@@ -152,12 +160,14 @@ def _cues_in(text: str, name: str) -> Iterator[tuple[re.Match[str], str]]:
     before = None
     for count, match in enumerate(_CUE.finditer(text)):
         if count >= _MOST_CUES:
-            raise InputError(f"{name}: more than {_MOST_CUES} subtitles; no flight has so many, cut the file")
+            raise InputError(
+                f"{name}: more than {_MOST_CUES} subtitles; no flight has so many, cut the file"
+            )
         if before is not None:
-            yield before, text[before.end():min(match.start(), before.end() + _LONGEST_CUE)]
+            yield before, text[before.end() : min(match.start(), before.end() + _LONGEST_CUE)]
         before = match
     if before is not None:
-        yield before, text[before.end():before.end() + _LONGEST_CUE]
+        yield before, text[before.end() : before.end() + _LONGEST_CUE]
 
 
 def _cue(match: re.Match[str], body: str, counts: Counter[str], decimals: list[int]) -> _Cue:
@@ -209,7 +219,9 @@ def _place(group: str) -> _Place | None:
     number is the count of satellites, in files that put longitude first; a height ("0.0M", the Matrice 300)
     comes after latitude and longitude.
     """
-    parts = [match for match in map(_COORDINATE.fullmatch, map(str.strip, group.split(","))) if match]
+    parts = [
+        match for match in map(_COORDINATE.fullmatch, map(str.strip, group.split(","))) if match
+    ]
     if len(parts) < 2 or len(parts) != group.count(",") + 1:
         return None
     first, second = parts[0], parts[1]
@@ -218,7 +230,8 @@ def _place(group: str) -> _Place | None:
     is_latitude_first = _latitude_comes_first(first, second, has_height=has_height)
     latitude, longitude = (first, second) if is_latitude_first else (second, first)
     return _Place(
-        _signed(latitude), _signed(longitude),
+        _signed(latitude),
+        _signed(longitude),
         height_m=float(parts[2][2]) if has_height else float("nan"),
         decimals=max(decimals_of(first[2]), decimals_of(second[2])),
         is_latitude_first=is_latitude_first and not has_letters,

@@ -30,7 +30,9 @@ _DATASET_RATE_HZ = 10.0  # thesis, section 2.2
 # DatCon's Tick# is the flight controller's counter, of later drones or of the Phantom 3. DatCon writes 200 rows a
 # second at most: the step between rows shows which it is, and a smaller one counts rows.
 _TICK_RATES_HZ = ((20_000.0, 4_500_000.0), (3.0, 600.0))
-_SAME_HEIGHT_M = 1.5  # DJI's apps write the height above take-off into the column of altitudes as well
+_SAME_HEIGHT_M = (
+    1.5  # DJI's apps write the height above take-off into the column of altitudes as well
+)
 _LONGEST_HEADER = 20_000  # characters; a log of hundreds of columns has thousands; by choice
 _LARGEST_S = 1e9  # a counter beyond thirty years is broken
 _EPOCH_S = (3e8, 7e9)  # 1979 to 2191: what a number must be to count as a time since 1970
@@ -40,8 +42,12 @@ _CLOCK = re.compile(r"(\d{1,2}):(\d{2}):(\d{2})([.,]\d{1,9})?\s*([AP]M)?", re.IG
 _UNKNOWN_WORDS = {"", "nan", "na", "n/a", "null", "none", "-", "--"}
 
 _DIRECT_COLUMNS = {
-    "latitude": "latitude_deg", "longitude": "longitude_deg", "altitude": "orthometric_height_m",
-    "relative_height": "height_above_takeoff_m", "speed": "speed_m_s", "course": "course_deg",
+    "latitude": "latitude_deg",
+    "longitude": "longitude_deg",
+    "altitude": "orthometric_height_m",
+    "relative_height": "height_above_takeoff_m",
+    "speed": "speed_m_s",
+    "course": "course_deg",
     **{key: f"{key}_deg" for key in COLUMN_NAMES if key.startswith(("camera_", "body_"))},
 }
 
@@ -84,19 +90,29 @@ def read(data: bytes, name: str) -> Telemetry:
     messages. Raises InputError when there is no such table or no usable row.
     """
     table = _table(text_from_bytes(data), name)
-    numbers = {key: _numbers(table, key) for key in table.cells if key not in ("utc", "time", "date")}
+    numbers = {
+        key: _numbers(table, key) for key in table.cells if key not in ("utc", "time", "date")
+    }
     if "time" in table.cells:
         numbers["time"] = _numbers(table, "time", is_text_allowed=True)
     unreadable = np.zeros(len(table.rows), dtype=np.bool_)
     for _, bad in numbers.values():
         unreadable |= bad
     columns, notices = _columns({key: values for key, (values, _) in numbers.items()})
-    times_ns, video_ns, clock = _times(table, {key: numbers[key][0] for key in COUNTERS if key in numbers})
+    times_ns, video_ns, clock = _times(
+        table, {key: numbers[key][0] for key in COUNTERS if key in numbers}
+    )
     return clean(
-        "table", name, times_ns, columns, video_ns,
+        "table",
+        name,
+        times_ns,
+        columns,
+        video_ns,
         notices=[
             *table.notices,
-            *notice("unreadable_line", int(unreadable.sum()), "{} rows have cells that are no numbers"),
+            *notice(
+                "unreadable_line", int(unreadable.sum()), "{} rows have cells that are no numbers"
+            ),
             *clock,
             *notices,
         ],
@@ -122,7 +138,9 @@ def _header(text: str) -> _Header | None:
                 continue
             columns = [plain_name(cell) for cell in _split(line[0], delimiter)]
             plain = {column for column, _ in columns}
-            if plain.intersection(COLUMN_NAMES["latitude"]) and plain.intersection(COLUMN_NAMES["longitude"]):
+            if plain.intersection(COLUMN_NAMES["latitude"]) and plain.intersection(
+                COLUMN_NAMES["longitude"]
+            ):
                 return _Header(line.end(), delimiter, columns)
     return None
 
@@ -136,10 +154,16 @@ def _table(text: str, name: str) -> _Table:
         )
     places, factors, notices = _known_columns(header)
     if "latitude" not in places or "longitude" not in places:
-        raise InputError(f"{name}: {notices[0].text}; latitude and longitude must be in degrees or radians")
+        raise InputError(
+            f"{name}: {notices[0].text}; latitude and longitude must be in degrees or radians"
+        )
     is_utc = "utc" in places and bool(re.search("utc|gps", " ".join(header.columns[places["utc"]])))
-    rows, found = _rows(text, header, list(places.values()), 1 + max(places["latitude"], places["longitude"]))
-    return _Table({key: index for index, key in enumerate(places)}, factors, is_utc, rows, notices + found)
+    rows, found = _rows(
+        text, header, list(places.values()), 1 + max(places["latitude"], places["longitude"])
+    )
+    return _Table(
+        {key: index for index, key in enumerate(places)}, factors, is_utc, rows, notices + found
+    )
 
 
 def _known_columns(header: _Header) -> tuple[dict[str, int], dict[str, float], list[Notice]]:
@@ -155,20 +179,26 @@ def _known_columns(header: _Header) -> tuple[dict[str, int], dict[str, float], l
         unit = header.columns[labels.index(label)][1]
         factor = unit_factor(key, unit)
         if factor is None:
-            notices += notice("unknown_unit", 1, f"column {label} is not used: its unit ({unit}) is unknown")
+            notices += notice(
+                "unknown_unit", 1, f"column {label} is not used: its unit ({unit}) is unknown"
+            )
         else:
             places[key], factors[key] = labels.index(label), factor
     return places, factors, notices
 
 
-def _rows(text: str, header: _Header, places: list[int], needed: int) -> tuple[list[list[str]], list[Notice]]:
+def _rows(
+    text: str, header: _Header, places: list[int], needed: int
+) -> tuple[list[list[str]], list[Notice]]:
     """The cells at `places` of the rows that reach the position's columns, decimal commas made points."""
     rows: list[list[str]] = []
     short = width = 0
     for line in _LINE.finditer(text, header.rows_from):
         if not line[0].strip():
             continue
-        cells = _split(line[0] if header.delimiter == "," else line[0].replace(",", "."), header.delimiter)
+        cells = _split(
+            line[0] if header.delimiter == "," else line[0].replace(",", "."), header.delimiter
+        )
         width = len(cells)
         if width < needed:
             short += 1
@@ -180,7 +210,11 @@ def _rows(text: str, header: _Header, places: list[int], needed: int) -> tuple[l
         rows.pop()
     return rows, [
         *notice("truncated", int(is_cut), "the last row is cut off"),
-        *notice("short_row", short - (is_cut and width < needed), "{} rows dropped: they end before the position"),
+        *notice(
+            "short_row",
+            short - (is_cut and width < needed),
+            "{} rows dropped: they end before the position",
+        ),
     ]
 
 
@@ -204,7 +238,9 @@ def _numbers(table: _Table, key: str, is_text_allowed: bool = False) -> tuple[Fl
 
 def _columns(numbers: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Notice]]:
     """The telemetry's columns from the table's."""
-    columns = {_DIRECT_COLUMNS[key]: values for key, values in numbers.items() if key in _DIRECT_COLUMNS}
+    columns = {
+        _DIRECT_COLUMNS[key]: values for key, values in numbers.items() if key in _DIRECT_COLUMNS
+    }
     if _repeats_height(columns):
         del columns["orthometric_height_m"]
     notices: list[Notice] = []
@@ -213,7 +249,8 @@ def _columns(numbers: Mapping[str, Floats]) -> tuple[dict[str, Floats], list[Not
         known = np.flatnonzero(np.isfinite(barometer))
         columns["height_above_takeoff_m"] = barometer - barometer[known[0]]
         notices += notice(
-            "height_from_barometer", len(known),
+            "height_from_barometer",
+            len(known),
             "no relativeHeight: heights are baroAlt above the first sample, perhaps not above take-off",
         )
     if "velocity_north" in numbers and "velocity_east" in numbers:
@@ -249,14 +286,18 @@ def _angles(w: Floats, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats,
     """Yaw, pitch, roll (deg, z-y-x) of quaternions from body to north-east-down; NaN for no rotation."""
     norm = np.sqrt(w * w + x * x + y * y + z * z)
     with np.errstate(divide="ignore", invalid="ignore"):
-        w, x, y, z = (np.where(np.abs(norm - 1) < 0.1, each / norm, np.nan) for each in (w, x, y, z))
+        w, x, y, z = (
+            np.where(np.abs(norm - 1) < 0.1, each / norm, np.nan) for each in (w, x, y, z)
+        )
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     return np.degrees(yaw) % 360, np.degrees(pitch), np.degrees(roll)
 
 
-def _times(table: _Table, counters: Mapping[str, Floats]) -> tuple[TimesNs, TimesNs | None, list[Notice]]:
+def _times(
+    table: _Table, counters: Mapping[str, Floats]
+) -> tuple[TimesNs, TimesNs | None, list[Notice]]:
     """Each row's time, its time in the video where the table is tied to one, and the notices."""
     rows = len(table.rows)
     stamps_ns, zoned = _stamps(table)
@@ -264,26 +305,43 @@ def _times(table: _Table, counters: Mapping[str, Floats]) -> tuple[TimesNs, Time
     stamped = int((stamps_ns != NO_TIME_NS).sum())
     if stamped:
         times_ns, refined = refine_clock(fill_stamps(stamps_ns, counter_ns), counter_ns)
-        return times_ns, None, [
-            *notice(
-                "time_zone_unknown", 0 if table.is_utc else stamped - zoned,
-                "{} rows print a time without its zone; it is taken as UTC and may be hours off",
-            ),
-            *notice(
-                "clock_refined", rows if refined else 0,
-                "times are printed in whole seconds; the {} rows are timed by the finer counter instead",
-            ),
-            *notice("no_time", int((times_ns == NO_TIME_NS).sum()), "{} rows dropped: no readable time"),
-        ]
+        return (
+            times_ns,
+            None,
+            [
+                *notice(
+                    "time_zone_unknown",
+                    0 if table.is_utc else stamped - zoned,
+                    "{} rows print a time without its zone; it is taken as UTC and may be hours off",
+                ),
+                *notice(
+                    "clock_refined",
+                    rows if refined else 0,
+                    "times are printed in whole seconds; the {} rows are timed by the finer counter instead",
+                ),
+                *notice(
+                    "no_time",
+                    int((times_ns == NO_TIME_NS).sum()),
+                    "{} rows dropped: no readable time",
+                ),
+            ],
+        )
     known = counter_ns != NO_TIME_NS
-    notices = notice("no_date", rows, "the table has no date: its {} rows take the video's if it has one, else 1970")
+    notices = notice(
+        "no_date",
+        rows,
+        "the table has no date: its {} rows take the video's if it has one, else 1970",
+    )
     if known.any():
-        relative_ns = np.where(known, counter_ns - counter_ns[increasing(counter_ns)][0], NO_TIME_NS)
+        relative_ns = np.where(
+            known, counter_ns - counter_ns[increasing(counter_ns)][0], NO_TIME_NS
+        )
         notices += notice("no_time", int((~known).sum()), "{} rows dropped: no readable time")
     else:
         relative_ns = np.round(np.arange(rows) * (SECOND_NS / _DATASET_RATE_HZ)).astype(np.int64)
         notices += notice(
-            "assumed_rate", rows,
+            "assumed_rate",
+            rows,
             f"the table has no column of times: its {{}} rows are taken as {_DATASET_RATE_HZ:g} a second",
         )
     return relative_ns, relative_ns, notices
@@ -358,5 +416,7 @@ def _tick_rate_hz(ticks: Floats) -> float:
 def _position_decimals(table: _Table) -> int | None:
     if table.factors["latitude"] != 1 or not table.rows:
         return None
-    printed = max(decimals_of(text) for key in ("latitude", "longitude") for text in _texts(table, key))
+    printed = max(
+        decimals_of(text) for key in ("latitude", "longitude") for text in _texts(table, key)
+    )
     return printed or None

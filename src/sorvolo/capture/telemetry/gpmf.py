@@ -31,7 +31,18 @@ from sorvolo.survey.flight import Telemetry
 FORMAT = "gpmf"
 """The name that `Telemetry.format` carries."""
 
-_CODES = {"b": "b", "B": "B", "s": "h", "S": "H", "l": "i", "L": "I", "j": "q", "J": "Q", "f": "f", "d": "d"}
+_CODES = {
+    "b": "b",
+    "B": "B",
+    "s": "h",
+    "S": "H",
+    "l": "i",
+    "L": "I",
+    "j": "q",
+    "J": "Q",
+    "f": "f",
+    "d": "d",
+}
 _HEAD_BYTES = 8  # of an item: key, type, size, repeats
 _MOST_ITEMS = 100_000  # of one level; far more than GoPro writes; by choice
 _EPOCH_2000_NS = 946_684_800 * SECOND_NS
@@ -111,12 +122,20 @@ def read_payloads(payloads: Sequence[Payload], name: str) -> Telemetry:
     zero_ns = int(np.median((stamps_ns - video_ns)[dated])) if dated.any() else 0
     names = sorted({key for sample in samples for key in sample.columns})
     return clean(
-        FORMAT, name, video_ns + zero_ns, {key: [each.columns.get(key, nan) for each in samples] for key in names},
+        FORMAT,
+        name,
+        video_ns + zero_ns,
+        {key: [each.columns.get(key, nan) for each in samples] for key in names},
         video_ns,
         notices=[
-            *notice("unreadable_line", counts["damaged"], "{} telemetry packets read in part: damaged or cut"),
             *notice(
-                "no_date", 0 if dated.any() else len(samples),
+                "unreadable_line",
+                counts["damaged"],
+                "{} telemetry packets read in part: damaged or cut",
+            ),
+            *notice(
+                "no_date",
+                0 if dated.any() else len(samples),
                 "{} samples have no date; they are stamped by their place in the video",
             ),
         ],
@@ -125,7 +144,9 @@ def read_payloads(payloads: Sequence[Payload], name: str) -> Telemetry:
 
 def _payloads_in(container: Any) -> Iterator[Payload]:
     """The payloads of a container's GPMF stream, if it has one."""
-    streams = [each for each in container.streams if each.type == "data" and each.name == "bin_data"]
+    streams = [
+        each for each in container.streams if each.type == "data" and each.name == "bin_data"
+    ]
     if not streams or not container.streams.video:
         return
     for each in container.streams:
@@ -142,7 +163,11 @@ def _payload_of(packet: Any, first_ns: int) -> Payload | None:
     if not is_gpmf(data) or packet.pts is None or not packet.time_base:
         return None
     base_ns = packet.time_base * SECOND_NS
-    return Payload(max(0, round(packet.pts * base_ns) - first_ns), round((packet.duration or 0) * base_ns), data)
+    return Payload(
+        max(0, round(packet.pts * base_ns) - first_ns),
+        round((packet.duration or 0) * base_ns),
+        data,
+    )
 
 
 def _samples_of(payload: Payload, streams: Sequence[_Stream]) -> list[_Sample]:
@@ -165,10 +190,12 @@ def _gps5_samples(payload: Payload, stream: _Stream) -> list[_Sample]:
     height = _height_column(stream)
     return [
         _Sample(
-            when_ns, utc_ns + (when_ns - payload.video_time_ns) if utc_ns != NO_TIME_NS else NO_TIME_NS,
+            when_ns,
+            utc_ns + (when_ns - payload.video_time_ns) if utc_ns != NO_TIME_NS else NO_TIME_NS,
             _fix_columns(row[:2], fix, height, row[2], row[3], dop),
         )
-        for when_ns, row in _spread(payload, rows) if len(row) >= 4
+        for when_ns, row in _spread(payload, rows)
+        if len(row) >= 4
     ]
 
 
@@ -176,8 +203,13 @@ def _gps9_samples(payload: Payload, stream: _Stream) -> list[_Sample]:
     """As GPS5, and days since 2000, seconds of the day, precision and fix of each sample."""
     height = _height_column(stream)
     return [
-        _Sample(when_ns, _utc_of_days(row[5], row[6]), _fix_columns(row[:2], row[8], height, row[2], row[3], row[7]))
-        for when_ns, row in _spread(payload, stream.values["GPS9"]) if len(row) >= 9
+        _Sample(
+            when_ns,
+            _utc_of_days(row[5], row[6]),
+            _fix_columns(row[:2], row[8], height, row[2], row[3], row[7]),
+        )
+        for when_ns, row in _spread(payload, stream.values["GPS9"])
+        if len(row) >= 9
     ]
 
 
@@ -188,14 +220,20 @@ def _fix_columns(
     if fix < 2:
         return {}
     columns = {
-        "latitude_deg": place[0], "longitude_deg": place[1], "speed_m_s": speed_m_s,
+        "latitude_deg": place[0],
+        "longitude_deg": place[1],
+        "speed_m_s": speed_m_s,
         "horizontal_sigma_m": sigma_from_hdop_m(dop),
     }
     return columns | ({height: height_m} if fix >= 3 else {})
 
 
 def _height_column(stream: _Stream) -> str:
-    return "orthometric_height_m" if stream.texts.get("GPSA", "").startswith("MSL") else "ellipsoidal_height_m"
+    return (
+        "orthometric_height_m"
+        if stream.texts.get("GPSA", "").startswith("MSL")
+        else "ellipsoidal_height_m"
+    )
 
 
 def _karma_samples(payload: Payload, streams: Sequence[_Stream], fused: _Stream) -> list[_Sample]:
@@ -206,26 +244,41 @@ def _karma_samples(payload: Payload, streams: Sequence[_Stream], fused: _Stream)
     """
     utc_from_start_ns = _system_time_ns(streams)
     attitudes = _rows_by_time(streams, "ATTD", 4)
-    errors = [row[4:6] for stream in streams for row in stream.values.get("GPRI", []) if len(row) >= 6]
+    errors = [
+        row[4:6] for stream in streams for row in stream.values.get("GPRI", []) if len(row) >= 6
+    ]
     # it states 0.25 m, which no receiver without corrections reaches
-    sigma_m = [max(float(np.median(column)), SMALLEST_HDOP_SIGMA_M) for column in zip(*errors)] or [nan, nan]
+    sigma_m = [max(float(np.median(column)), SMALLEST_HDOP_SIGMA_M) for column in zip(*errors)] or [
+        nan,
+        nan,
+    ]
     samples = []
     for when_ns, row in _spread(payload, fused.values["GLPI"]):
         if len(row) < 9:
             continue
         north_m_s, east_m_s = row[5], row[6]
         columns = {
-            "latitude_deg": row[1], "longitude_deg": row[2], "orthometric_height_m": row[3],
-            "height_above_takeoff_m": row[4], "speed_m_s": hypot(north_m_s, east_m_s),
-            "course_deg": degrees(np.arctan2(east_m_s, north_m_s)) % 360, "body_yaw_deg": row[8],
-            "horizontal_sigma_m": sigma_m[0], "vertical_sigma_m": sigma_m[1],
+            "latitude_deg": row[1],
+            "longitude_deg": row[2],
+            "orthometric_height_m": row[3],
+            "height_above_takeoff_m": row[4],
+            "speed_m_s": hypot(north_m_s, east_m_s),
+            "course_deg": degrees(np.arctan2(east_m_s, north_m_s)) % 360,
+            "body_yaw_deg": row[8],
+            "horizontal_sigma_m": sigma_m[0],
+            "vertical_sigma_m": sigma_m[1],
         }
         if attitude := _nearest(attitudes, row[0]):
             columns |= {
-                "body_roll_deg": degrees(attitude[1]), "body_pitch_deg": degrees(attitude[2]),
+                "body_roll_deg": degrees(attitude[1]),
+                "body_pitch_deg": degrees(attitude[2]),
                 "body_yaw_deg": degrees(attitude[3]) % 360,
             }
-        utc_ns = NO_TIME_NS if utc_from_start_ns is None else utc_from_start_ns + round(row[0] * SECOND_NS)
+        utc_ns = (
+            NO_TIME_NS
+            if utc_from_start_ns is None
+            else utc_from_start_ns + round(row[0] * SECOND_NS)
+        )
         samples.append(_Sample(when_ns, utc_ns, columns))
     return samples
 
@@ -312,9 +365,13 @@ def _items(data: bytes) -> Iterator[tuple[str, str, int, int, bytes]]:
         end = at + _HEAD_BYTES + size * count
         if end > len(data):
             raise _DamagedError
-        yield key.decode("latin-1"), "" if kind == b"\0" else kind.decode("latin-1"), size, count, data[
-            at + _HEAD_BYTES:end
-        ]
+        yield (
+            key.decode("latin-1"),
+            "" if kind == b"\0" else kind.decode("latin-1"),
+            size,
+            count,
+            data[at + _HEAD_BYTES : end],
+        )
         at = end + -end % 4
 
 
@@ -326,11 +383,15 @@ def _stream(data: bytes) -> _Stream:
         elif key == "SCAL":
             stream.scales = tuple(float(row[0]) for row in _rows(value, kind, size, count))
         elif kind == "?":
-            stream.values[key] = _scaled(_rows(value, stream.texts.get("TYPE", ""), size, count), stream.scales)
+            stream.values[key] = _scaled(
+                _rows(value, stream.texts.get("TYPE", ""), size, count), stream.scales
+            )
         elif kind:
             # samples are scaled; single sticky values (GPSF, GPSP) are not
             is_single = size <= struct.calcsize(f">{_CODES.get(kind, 'b')}")
-            stream.values[key] = _scaled(_rows(value, kind, size, count), () if is_single else stream.scales)
+            stream.values[key] = _scaled(
+                _rows(value, kind, size, count), () if is_single else stream.scales
+            )
     return stream
 
 
@@ -351,5 +412,9 @@ def _scaled(rows: list[tuple[Any, ...]], scales: tuple[float, ...]) -> Values:
     found: Values = []
     for row in rows:
         divisors = scales * len(row) if len(scales) == 1 else (*scales, *[1.0] * len(row))
-        found.append(tuple(float(value) / divisor if divisor else nan for value, divisor in zip(row, divisors)))
+        found.append(
+            tuple(
+                float(value) / divisor if divisor else nan for value, divisor in zip(row, divisors)
+            )
+        )
     return found

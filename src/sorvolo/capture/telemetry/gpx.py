@@ -24,7 +24,10 @@ _ROOT = re.compile(rb"<(?:[A-Za-z_][\w.-]*:)?gpx[\s>]")
 _ROOT_WIDE = re.compile("<(?:[A-Za-z_][\\w.-]*:)?gpx[\\s>]")
 _END_OF_POINT = re.compile(rb"</((?:[A-Za-z_][\w.-]*:)?)(trkpt|rtept)\s*>")
 _TAG_OF_COLUMN = {
-    "latitude_deg": "lat", "longitude_deg": "lon", "orthometric_height_m": "ele", "speed_m_s": "speed",
+    "latitude_deg": "lat",
+    "longitude_deg": "lon",
+    "orthometric_height_m": "ele",
+    "speed_m_s": "speed",
     "course_deg": "course",
 }
 _CLOSING = {b"trkpt": (b"trkseg", b"trk", b"gpx"), b"rtept": (b"rte", b"gpx")}
@@ -49,7 +52,9 @@ def read(data: bytes, name: str) -> Telemetry:
     root = _root(data, name, counts)
     points = list(_elements(root, "trkpt")) or list(_elements(root, "rtept"))
     if not points:
-        raise InputError(f"{name}: a GPX file without track points; export the flight as a track with times")
+        raise InputError(
+            f"{name}: a GPX file without track points; export the flight as a track with times"
+        )
     texts = [_values(point) for point in points]
     stamps_ns = [_time_ns(each) for each in texts]
     timed = [each for each, stamp_ns in zip(texts, stamps_ns) if stamp_ns != NO_TIME_NS]
@@ -60,18 +65,31 @@ def read(data: bytes, name: str) -> Telemetry:
         )
     decimals = max(decimals_of(each.get(axis, "")) for each in timed for axis in ("lat", "lon"))
     return clean(
-        "gpx", name, stamps_ns, _columns_of(texts),
+        "gpx",
+        name,
+        stamps_ns,
+        _columns_of(texts),
         notices=[
-            *notice("truncated", counts["truncated"], "the file is cut off; read up to its last whole point"),
-            *notice("unreadable_line", len(points) - len(timed), "{} points dropped: no readable <time>"),
+            *notice(
+                "truncated",
+                counts["truncated"],
+                "the file is cut off; read up to its last whole point",
+            ),
+            *notice(
+                "unreadable_line", len(points) - len(timed), "{} points dropped: no readable <time>"
+            ),
         ],
         position_decimals=decimals or None,
     )
 
 
 def _columns_of(points: list[dict[str, str]]) -> dict[str, list[float]]:
-    columns = {column: [_number(each, tag) for each in points] for column, tag in _TAG_OF_COLUMN.items()}
-    return columns | {"horizontal_sigma_m": [sigma_from_hdop_m(_number(each, "hdop")) for each in points]}
+    columns = {
+        column: [_number(each, tag) for each in points] for column, tag in _TAG_OF_COLUMN.items()
+    }
+    return columns | {
+        "horizontal_sigma_m": [sigma_from_hdop_m(_number(each, "hdop")) for each in points]
+    }
 
 
 def _time_ns(texts: dict[str, str]) -> int:

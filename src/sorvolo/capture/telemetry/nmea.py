@@ -57,16 +57,24 @@ def read(data: bytes, name: str) -> Telemetry:
     epochs, dated = epochs_of(messages)
     names = sorted({key for epoch in epochs for key in epoch.values})
     return clean(
-        "nmea", name,
+        "nmea",
+        name,
         [epoch.time_ns for epoch in epochs],
         {key: [epoch.values.get(key, float("nan")) for epoch in epochs] for key in names},
         notices=[
-            *notice("bad_checksum", counts["bad_checksum"], "{} sentences dropped: bad or missing checksum"),
-            *notice("unreadable_line", counts["unreadable_line"], "{} sentences dropped: not readable"),
+            *notice(
+                "bad_checksum",
+                counts["bad_checksum"],
+                "{} sentences dropped: bad or missing checksum",
+            ),
+            *notice(
+                "unreadable_line", counts["unreadable_line"], "{} sentences dropped: not readable"
+            ),
             *notice("truncated", counts["truncated"], "the last sentence is cut off"),
             *notice("no_time", counts["no_time"], "{} sentences dropped: no readable time"),
             *notice(
-                "no_date", 0 if dated else len(epochs),
+                "no_date",
+                0 if dated else len(epochs),
                 "no sentence states the date: the video dates the {} samples, else they count from 1970-01-01",
             ),
         ],
@@ -77,7 +85,7 @@ def read(data: bytes, name: str) -> Telemetry:
 def messages_in(data: bytes, counts: Counter[str]) -> list[Any]:
     """The intact GGA and RMC sentences in the bytes that state a time; what is wrong with others is counted."""
     messages = []
-    tail = data[data.rfind(b"$"):]
+    tail = data[data.rfind(b"$") :]
     is_cut = tail.startswith(b"$") and len(tail) < _LONGEST_TAIL and not _FINISHED.search(tail)
     counts["truncated"] += is_cut
     for match in _SENTENCE.finditer(data[: len(data) - len(tail)] if is_cut else data):
@@ -106,7 +114,9 @@ def epochs_of(messages: list[Any]) -> tuple[list[Epoch], bool]:
     now_ns = _stamp(trusted[0]) if trusted else _time_of_day_ns(messages[0])
     epochs: list[Epoch] = []
     for message in messages:
-        now_ns = _stamp(message) if id(message) in days else nearest_ns(_time_of_day_ns(message), now_ns)
+        now_ns = (
+            _stamp(message) if id(message) in days else nearest_ns(_time_of_day_ns(message), now_ns)
+        )
         if not epochs or epochs[-1].time_ns != now_ns or message.msgID in epochs[-1].kinds:
             epochs.append(Epoch(now_ns))
         epochs[-1].kinds.add(message.msgID)
@@ -151,7 +161,10 @@ def _add(epoch: Epoch, message: Any) -> None:
             "course_deg": _number(message, "cog"),
         }
         if "GGA" not in epoch.kinds:
-            values |= {"latitude_deg": _number(message, "lat"), "longitude_deg": _number(message, "lon")}
+            values |= {
+                "latitude_deg": _number(message, "lat"),
+                "longitude_deg": _number(message, "lon"),
+            }
     epoch.values |= values
 
 
@@ -182,5 +195,5 @@ def _position_decimals(messages: list[Any]) -> int | None:
     printed = 0
     for message in messages[:1000]:
         place = 1 if message.msgID == "GGA" else 2
-        printed = max([printed, *map(decimals_of, message.payload[place: place + 1])])
+        printed = max([printed, *map(decimals_of, message.payload[place : place + 1])])
     return printed + 2 if printed else None

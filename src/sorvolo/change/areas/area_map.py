@@ -30,7 +30,9 @@ class AreaVotes:
 
     least_views: int = 2  # that saw a cell
     agreeing_views: float = 2.5  # on the mean that show an area by themselves: two may lean alike
-    agreeing_share: float = 0.5  # of the views of an area's ground must differ from the map there, each by itself
+    agreeing_share: float = (
+        0.5  # of the views of an area's ground must differ from the map there, each by itself
+    )
     own_units: float = 2.0  # by which a view alone differs
     sure_units: float = 6.0  # an area that differs by so much is sure
     least_score: float = 0.3  # 0 to 1
@@ -68,18 +70,28 @@ class AreaMap:
     def add(self, view: ComparedView, leans: Mask | None = None) -> None:
         """Take in one view, of which earlier pictures show that some ground `leans` (h, w)."""
         settings = self._settings
-        cell_m = settings.cell_px * view.m_per_px * max(1.0, max(view.valid.shape) / settings.signs.side_px)
+        cell_m = (
+            settings.cell_px
+            * view.m_per_px
+            * max(1.0, max(view.valid.shape) / settings.signs.side_px)
+        )
         window = self._ground.window_of(view, cell_m, cell_m / settings.picture_px)
         if window is None:
             return
         signs = area_signs(view, leans, settings.signs)
         planes = {
-            "agree": _differs(signs, settings.segments, settings.votes.own_units), "likeness": signs.likeness,
-            "blue": signs.colour[..., 0], "red": signs.colour[..., 1], "detail": signs.detail,
-            "blue_now": signs.surface[..., 0], "red_now": signs.surface[..., 1],
+            "agree": _differs(signs, settings.segments, settings.votes.own_units),
+            "likeness": signs.likeness,
+            "blue": signs.colour[..., 0],
+            "red": signs.colour[..., 1],
+            "detail": signs.detail,
+            "blue_now": signs.surface[..., 0],
+            "red_now": signs.surface[..., 1],
         }
         known = signs.known.astype(np.float32)
-        laid = self._ground.add(view, window, view.site_from_image @ signs.view_from_signs, planes, known)
+        laid = self._ground.add(
+            view, window, view.site_from_image @ signs.view_from_signs, planes, known
+        )
         self._ground.show(view, window, laid["agree"] != 0)
 
     def conclude(self, id_prefix: str, first_number: int) -> tuple[Change, ...]:
@@ -89,8 +101,14 @@ class AreaMap:
         if not seen.size:
             return ()
         known = seen >= votes.least_views
-        mean = {name: np.asarray(values / np.maximum(seen, 1), np.float32) for name, values in sums.items()}
-        colour, surface = np.dstack([mean["blue"], mean["red"]]), np.dstack([mean["blue_now"], mean["red_now"]])
+        mean = {
+            name: np.asarray(values / np.maximum(seen, 1), np.float32)
+            for name, values in sums.items()
+        }
+        colour, surface = (
+            np.dstack([mean["blue"], mean["red"]]),
+            np.dstack([mean["blue_now"], mean["red_now"]]),
+        )
         signs = GroundSigns(mean["likeness"], colour, mean["detail"], surface, known)
         found = []
         for cells, units in segments(signs, self._settings.segments):
@@ -103,7 +121,10 @@ class AreaMap:
             if is_shown and score >= votes.least_score:
                 found.append(self._record(cells, score))
         found.sort(key=lambda each: -each.area_m2)
-        return tuple(replace(each, id=f"{id_prefix}-{first_number + place}") for place, each in enumerate(found))
+        return tuple(
+            replace(each, id=f"{id_prefix}-{first_number + place}")
+            for place, each in enumerate(found)
+        )
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -115,9 +136,15 @@ class AreaMap:
             raise AssertionError("an area has cells")
         size = measures(outline_m)
         return Change(
-            "", ChangeKind.AREA, score, outline_m, *self._ground.span_ns,
-            round(float(self._ground.sums["agree"][cells].mean())), float(np.count_nonzero(cells)) * cell_m**2,
-            size.length_m, place_sigma_m(self._ground.residual_m, cell_m, 0.0),
+            "",
+            ChangeKind.AREA,
+            score,
+            outline_m,
+            *self._ground.span_ns,
+            round(float(self._ground.sums["agree"][cells].mean())),
+            float(np.count_nonzero(cells)) * cell_m**2,
+            size.length_m,
+            place_sigma_m(self._ground.residual_m, cell_m, 0.0),
             self._ground.patch(outline_m),
         )
 
@@ -131,13 +158,18 @@ def _differs(signs: AreaSigns, settings: AreaSettings, own_units: float) -> NDAr
     if np.count_nonzero(same) > 100:
         middle = float(np.median(signs.detail[same]))
         colour = max(colour, float(np.percentile(length[same], settings.quiet_percent)))
-        detail = max(detail, float(np.percentile(np.abs(signs.detail[same] - middle), settings.quiet_percent)))
+        detail = max(
+            detail,
+            float(np.percentile(np.abs(signs.detail[same] - middle), settings.quiet_percent)),
+        )
     differs = np.hypot(length / colour, (signs.detail - middle) / detail) > own_units
     return (differs & signs.known & (signs.likeness < settings.other)).astype(np.float32)
 
 
 def with_areas(
-    changes: Sequence[Change], areas: Sequence[Change], settings: ApartSettings = ApartSettings(),
+    changes: Sequence[Change],
+    areas: Sequence[Change],
+    settings: ApartSettings = ApartSettings(),
     lies_apart: Callable[[PointsM], bool] = lambda _: False,
 ) -> list[Change]:
     """Changes and areas, each piece of ground reported once.
@@ -147,7 +179,8 @@ def with_areas(
     most part is left out itself.
     """
     parts = [
-        each for each in changes
+        each
+        for each in changes
         if each.kind is not ChangeKind.MOVING
         and any(_inside(each, area.outline_m) > settings.inside for area in areas)
         and not _is_thing(each.patch, settings.stands_out)

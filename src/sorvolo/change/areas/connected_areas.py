@@ -16,16 +16,23 @@ Cells = NDArray[np.float32]
 class AreaSettings:
     """When ground is reported as an area. Lengths in cells: a view's longer side is about 160 of them."""
 
-    least_cells: int = 110  # an area's size: of a view 140 m wide 85 m2; smaller things are found by their outline
+    least_cells: int = (
+        110  # an area's size: of a view 140 m wide 85 m2; smaller things are found by their outline
+    )
     least_m2: float = 25.0  # nor smaller, however low the flight: a car has 8 m2, what leans beside a roof 5 to 10
     same: float = 0.5  # likeness from which ground is surely the same
     other: float = 0.55  # likeness from which on a difference counts less and less ...
     other_range: float = 0.2  # ... and this much below in full
     scales: tuple[int, ...] = (3, 7, 11)  # sides of the windows over which a difference is averaged
     quiet_percent: float = 80.0  # of the same ground differs less than one unit
-    least_units: tuple[float, float] = (0.05, 0.25)  # octaves of colour and of detail: no unit is smaller
+    least_units: tuple[float, float] = (
+        0.05,
+        0.25,
+    )  # octaves of colour and of detail: no unit is smaller
     seed: float = 3.0  # units by which an area's core differs
-    recoloured: float = 2.0  # units by which the colour differs of ground that belongs to an area by its colour now
+    recoloured: float = (
+        2.0  # units by which the colour differs of ground that belongs to an area by its colour now
+    )
     most: float = 6.0  # units that one sign counts at most
     least_contact: float = 0.1  # of its rim lies on another area: they are one
     contact: int = 4  # how near that is
@@ -33,7 +40,9 @@ class AreaSettings:
     gap: int = 3  # ... how near that is ...
     one_surface: float = 0.15  # ... whose colours are so many octaves apart at most
     light: int = 71  # over which light, camera and season differ smoothly: seen where ground is surely the same ...
-    least_same: float = 0.05  # ... in this share of a window; where less is, a wider window counts as well
+    least_same: float = (
+        0.05  # ... in this share of a window; where less is, a wider window counts as well
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +68,9 @@ def segments(signs: GroundSigns, settings: AreaSettings) -> Iterator[tuple[Mask,
     same = signs.known & (signs.likeness > settings.same)
     trust = np.where(same, signs.likeness, 0).astype(np.float32) if same.any() else known
     signs_of = np.dstack([signs.colour, signs.detail]).astype(np.float32)
-    change = np.asarray((signs_of - _light(signs_of, trust, settings)) * known[..., None], np.float32)
+    change = np.asarray(
+        (signs_of - _light(signs_of, trust, settings)) * known[..., None], np.float32
+    )
     core = np.zeros(known.shape, np.float32)
     for side in settings.scales:
         mean = _smooth(change, known, side) / _scale(_smooth(change, known, side), same, settings)
@@ -67,13 +78,21 @@ def segments(signs: GroundSigns, settings: AreaSettings) -> Iterator[tuple[Mask,
         np.maximum(core, _units(mean, settings) * _otherness(likeness, mean, settings), out=core)
     finest = settings.scales[0]
     near = np.asarray(_smooth(change, known, finest) / _scale(change, same, settings), np.float32)
-    free = signs.known & (_otherness(_smooth(signs.likeness[..., None], known, finest)[..., 0], near, settings) > 0)
-    cores = cv2.morphologyEx((core > settings.seed).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    for cells in _joined(list(_grown(cores > 0, near, free, signs.surface, settings)), signs.surface, settings):
+    free = signs.known & (
+        _otherness(_smooth(signs.likeness[..., None], known, finest)[..., 0], near, settings) > 0
+    )
+    cores = cv2.morphologyEx(
+        (core > settings.seed).view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+    )
+    for cells in _joined(
+        list(_grown(cores > 0, near, free, signs.surface, settings)), signs.surface, settings
+    ):
         yield cells, float(np.mean(core[cells]))
 
 
-def _grown(cores: Mask, near: Cells, free: Mask, surface: Cells, settings: AreaSettings) -> Iterator[Mask]:
+def _grown(
+    cores: Mask, near: Cells, free: Mask, surface: Cells, settings: AreaSettings
+) -> Iterator[Mask]:
     """Areas around cores, the largest core first; ground belongs to one of them only.
 
     Ground belongs to an area when its change is nearer to the core's than to none, or when its colour changed and is
@@ -103,8 +122,10 @@ def _joined(areas: list[Mask], surface: Cells, settings: AreaSettings) -> list[M
     for cells in sorted(areas, key=lambda each: -int(np.count_nonzero(each))):
         near, wide = (_rim(cells, reach) for reach in (settings.contact, settings.gap))
         beside = [
-            _share(wide, each) > settings.touches if _is_one_surface(cells, each, surface, settings)
-            else _share(near, each) > settings.least_contact for each in joined
+            _share(wide, each) > settings.touches
+            if _is_one_surface(cells, each, surface, settings)
+            else _share(near, each) > settings.least_contact
+            for each in joined
         ]
         if any(beside):
             first = beside.index(True)
@@ -127,7 +148,9 @@ def _share(rim: Mask, cells: Mask) -> float:
 
 def _rim(cells: Mask, reach: int) -> Mask:
     """The cells around, up to this many away."""
-    return np.asarray((cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0) & ~cells)
+    return np.asarray(
+        (cv2.dilate(cells.view(np.uint8), np.ones((2 * reach + 1,) * 2, np.uint8)) > 0) & ~cells
+    )
 
 
 def _connected(cells: Mask, own: Mask) -> Mask:
@@ -141,8 +164,12 @@ def _connected(cells: Mask, own: Mask) -> Mask:
 def _whole(cells: Mask, gap: int = 2) -> Mask:
     """The cells without gaps up to twice `gap` wide, and without small holes."""
     window = np.ones((2 * gap + 1,) * 2, np.uint8)
-    padded = cv2.copyMakeBorder(cells.view(np.uint8), gap, gap, gap, gap, cv2.BORDER_CONSTANT, value=0)
-    closed = np.ascontiguousarray(cv2.morphologyEx(padded, cv2.MORPH_CLOSE, window)[gap:-gap, gap:-gap])
+    padded = cv2.copyMakeBorder(
+        cells.view(np.uint8), gap, gap, gap, gap, cv2.BORDER_CONSTANT, value=0
+    )
+    closed = np.ascontiguousarray(
+        cv2.morphologyEx(padded, cv2.MORPH_CLOSE, window)[gap:-gap, gap:-gap]
+    )
     outlines, _ = cv2.findContours(closed, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
         if cv2.contourArea(outline) < 40:
@@ -181,7 +208,11 @@ def _light(values: Cells, trust: Cells, settings: AreaSettings) -> Cells:
     while missing.any():
         share = cv2.blur(trust, (side, side), borderType=cv2.BORDER_CONSTANT)
         is_last = side > 2 * max(trust.shape)
-        enough = missing if is_last else missing * np.minimum(np.asarray(share, np.float32) / settings.least_same, 1)
+        enough = (
+            missing
+            if is_last
+            else missing * np.minimum(np.asarray(share, np.float32) / settings.least_same, 1)
+        )
         light += enough[..., None] * _smooth(values, trust, side)
         missing = missing - enough
         side = 2 * side + 1
@@ -192,5 +223,9 @@ def _smooth(values: Cells, weights: Cells, side: int) -> Cells:
     """Values (rows, columns, n) averaged with weights over windows of a side."""
     weights = np.asarray(weights, np.float32)
     total = cv2.blur(weights, (side, side), borderType=cv2.BORDER_CONSTANT)
-    stack = cv2.blur(np.asarray(values * weights[..., None], np.float32), (side, side), borderType=cv2.BORDER_CONSTANT)
+    stack = cv2.blur(
+        np.asarray(values * weights[..., None], np.float32),
+        (side, side),
+        borderType=cv2.BORDER_CONSTANT,
+    )
     return np.asarray(stack.reshape(values.shape) / np.maximum(total, 1e-9)[..., None], np.float32)

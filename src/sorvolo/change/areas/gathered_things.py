@@ -18,10 +18,18 @@ from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade
 
 _SUMS = ("seen", "apart", "agree", "came", "left")
-_SHADES = {"came": Shade.LATER_DARK, "left": Shade.EARLIER_DARK}  # shade of the later date alone, of the earlier alone
-_APART = ChangeKind.MOVING, ChangeKind.AREA  # what moves is no thing of the ground, and an area is more than one
+_SHADES = {
+    "came": Shade.LATER_DARK,
+    "left": Shade.EARLIER_DARK,
+}  # shade of the later date alone, of the earlier alone
+_APART = (
+    ChangeKind.MOVING,
+    ChangeKind.AREA,
+)  # what moves is no thing of the ground, and an area is more than one
 _HIGHEST = 95.0  # percentile of what lies farthest apart
-_CIRCLE = np.column_stack([wave(np.linspace(0, 2 * np.pi, 24, endpoint=False)) for wave in (np.cos, np.sin)])
+_CIRCLE = np.column_stack(
+    [wave(np.linspace(0, 2 * np.pi, 24, endpoint=False)) for wave in (np.cos, np.sin)]
+)
 
 
 @dataclass(frozen=True)
@@ -29,11 +37,17 @@ class GatherThingSettings:
     """Which gathered ground is a thing (0035). Spreads: see `learned_difference`."""
 
     cell_px: int = 3  # a cell's side, in pixels of the views
-    most_cells: int = 12_000_000  # of the raster, which bounds its memory (190 MB): views beyond are left out
+    most_cells: int = (
+        12_000_000  # of the raster, which bounds its memory (190 MB): views beyond are left out
+    )
     least_views: int = 2  # what one view alone shows is not announced
     spreads: float = 1.0  # by which the views of a cell lie apart on the mean
-    in_area: float = 0.7  # 0086: the same of a thing that stands out within an area, and is a region already
-    of_height: float = 0.6  # its outline runs where this part of what lies farthest apart in it is left
+    in_area: float = (
+        0.7  # 0086: the same of a thing that stands out within an area, and is a region already
+    )
+    of_height: float = (
+        0.6  # its outline runs where this part of what lies farthest apart in it is left
+    )
     own_spreads: float = 0.5  # from which on a view by itself agrees
     least_cells: int = 44  # smaller things are found by their outline
     most_of_cells: int = 2000  # larger ground is an area
@@ -42,8 +56,12 @@ class GatherThingSettings:
     tallest_m: float = 5.0  # 0056: what may throw a moved shadow; of higher things too many shades lie along the way
     sure_spreads: float = 1.8  # what lies so far apart is sure
     held: float = 0.3  # 0085: share of another change that things hold: it is reported as they are
-    least_apart: float = 0.4  # 0085: spreads; ground of another change that lies less apart is the same
-    least_of_object: float = 0.2  # 0086: spreads; an object that one date alone shows is evidence of its own
+    least_apart: float = (
+        0.4  # 0085: spreads; ground of another change that lies less apart is the same
+    )
+    least_of_object: float = (
+        0.2  # 0086: spreads; an object that one date alone shows is evidence of its own
+    )
     learned: LearnedSettings = field(default_factory=LearnedSettings)
     pictures: GroundPictureSettings = field(default_factory=GroundPictureSettings)
 
@@ -51,7 +69,9 @@ class GatherThingSettings:
 class GatheredThings:
     """What a flight's views show together. Only `add` changes it. Views are looked at `larger` times as large."""
 
-    def __init__(self, larger: float = 1.0, settings: GatherThingSettings = GatherThingSettings()) -> None:
+    def __init__(
+        self, larger: float = 1.0, settings: GatherThingSettings = GatherThingSettings()
+    ) -> None:
         self._larger, self._settings = larger, settings
         self._ground = GroundSums(_SUMS, settings.most_cells, settings.pictures)
 
@@ -64,15 +84,23 @@ class GatheredThings:
             return
         if self._larger > 1:
             view, leans = _enlarged(view, leans, self._larger)
-        before, after = (np.ascontiguousarray(each[..., ::-1]) for each in (view.reference, view.image))
+        before, after = (
+            np.ascontiguousarray(each[..., ::-1]) for each in (view.reference, view.image)
+        )
         apart = learned_difference(before, after, view.valid, settings.learned)
         if leans is not None:
             apart[leans] = np.minimum(apart[leans], 0)
         planes = {
-            "apart": apart, "agree": (apart > settings.own_spreads).astype(np.float32),
-            **{name: ((view.shade & np.uint8(bit)) > 0).astype(np.float32) for name, bit in _SHADES.items()},
+            "apart": apart,
+            "agree": (apart > settings.own_spreads).astype(np.float32),
+            **{
+                name: ((view.shade & np.uint8(bit)) > 0).astype(np.float32)
+                for name, bit in _SHADES.items()
+            },
         }
-        laid = self._ground.add(view, window, view.site_from_image, planes, view.valid.astype(np.float32))
+        laid = self._ground.add(
+            view, window, view.site_from_image, planes, view.valid.astype(np.float32)
+        )
         self._ground.show(view, window, laid["apart"] > settings.spreads)
 
     def shows_once(self, outline_m: PointsM) -> bool:
@@ -85,14 +113,18 @@ class GatheredThings:
         own = mask_of(outline_m, site_from_cell, self._ground.window.shape) & (sums["seen"] > 0)
         if not own.any() or np.median(sums["seen"][own]) > 1:
             return False
-        apart, came, left = (float((sums[name][own] / sums["seen"][own]).mean()) for name in ("apart", *_SHADES))
+        apart, came, left = (
+            float((sums[name][own] / sums["seen"][own]).mean()) for name in ("apart", *_SHADES)
+        )
         return apart >= settings.own_spreads and came + left <= settings.most_dark
 
     def lies_apart(self, outline_m: PointsM) -> bool:
         """Whether an outline's ground, (N, 2), differs on the mean as much as a thing within an area must."""
         return self._mean_apart(*self._around(outline_m)) > self._settings.in_area
 
-    def standing_at(self, place_m: Floats, length_m: float, others: Sequence[Change]) -> Change | None:
+    def standing_at(
+        self, place_m: Floats, length_m: float, others: Sequence[Change]
+    ) -> Change | None:
         """What an object of this length at a place (2,) changed, a change without an id (0086): the ground within half
         a length that lies farthest apart. None where `others` hold it, or two views did not see it, or its ground is
         the same by its features."""
@@ -103,14 +135,19 @@ class GatheredThings:
         if not self._mean_apart(part, own) >= settings.least_of_object:
             return None
         standing = [each.outline_m for each in others if each.kind not in _APART]
-        if any(max(overlap(around_m, each)[1], overlap(each, around_m)[1]) >= settings.held for each in standing):
+        if any(
+            max(overlap(around_m, each)[1], overlap(each, around_m)[1]) >= settings.held
+            for each in standing
+        ):
             return None
         apart = self._ground.sums["apart"][part] / np.maximum(self._ground.sums["seen"][part], 1)
         own &= apart > settings.of_height * float(np.percentile(apart[own], _HIGHEST))
         change = self._record(own, (part[1].start, part[0].start), 1.0)
         if change is None:
             return None
-        lit = np.zeros_like(change.patch.shade)  # what is dark in its outline is the object, not its shadow
+        lit = np.zeros_like(
+            change.patch.shade
+        )  # what is dark in its outline is the object, not its shadow
         return replace(change, patch=replace(change.patch, shade=lit))
 
     def is_moved_shadow(self, outline_m: PointsM, earlier: Floats, later: Floats) -> bool:
@@ -126,24 +163,40 @@ class GatheredThings:
         for name, other, along in (("came", "left", step), ("left", "came", -step)):
             shade = own & shades[name]
             if np.count_nonzero(shade) > settings.is_moved * np.count_nonzero(own):
-                return share_moved(shade, shades[other], along, settings.tallest_m) > settings.is_moved
+                return (
+                    share_moved(shade, shades[other], along, settings.tallest_m) > settings.is_moved
+                )
         return False
 
-    def _around(self, outline_m: PointsM, margin_m: float = 0.0) -> tuple[tuple[slice, slice], Mask]:
+    def _around(
+        self, outline_m: PointsM, margin_m: float = 0.0
+    ) -> tuple[tuple[slice, slice], Mask]:
         """The part of the raster around an outline, (N, 2), and which cells of it are the outline's and were seen."""
         if self._ground.is_empty:
             return np.s_[:0, :0], np.zeros((0, 0), bool)
         site_from_cell = self._ground.window.site_from_cell(self._ground.cell_m)
-        at, margin = apply_homography(np.linalg.inv(site_from_cell), outline_m), margin_m / self._ground.cell_m + 1
-        (left, top), (right, low) = (at.min(axis=0) - margin).astype(int).clip(0), (at.max(axis=0) + margin).astype(int)
+        at, margin = (
+            apply_homography(np.linalg.inv(site_from_cell), outline_m),
+            margin_m / self._ground.cell_m + 1,
+        )
+        (left, top), (right, low) = (
+            (at.min(axis=0) - margin).astype(int).clip(0),
+            (at.max(axis=0) + margin).astype(int),
+        )
         part = np.s_[top : max(low, top), left : max(right, left)]
         seen = self._ground.sums["seen"][part] > 0
         if not seen.any():
             return part, seen
-        own = mask_of(outline_m, site_from_cell @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]]), seen.shape)
+        own = mask_of(
+            outline_m,
+            site_from_cell @ np.array([[1, 0, left], [0, 1, top], [0, 0, 1.0]]),
+            seen.shape,
+        )
         return part, own & seen
 
-    def conclude(self, id_prefix: str, numbers: Iterator[int], others: Sequence[Change]) -> list[Change]:
+    def conclude(
+        self, id_prefix: str, numbers: Iterator[int], others: Sequence[Change]
+    ) -> list[Change]:
         """After the last view: the things that all views together show, and those of `others` that they do not hold.
 
         A thing that holds others goes on as the one it holds most of, with its id and times; others get
@@ -167,11 +220,15 @@ class GatheredThings:
                 kept.append(each)
             elif len(in_things) >= self._settings.held * len(cells):
                 place = int(np.bincount(in_things).argmax())
-                held[place] = max(held.get(place, (0, each)), (len(in_things), each), key=lambda of: of[0])
+                held[place] = max(
+                    held.get(place, (0, each)), (len(in_things), each), key=lambda of: of[0]
+                )
             elif self._mean_apart(part, own) >= self._settings.least_apart:
                 kept.append(each)
         return kept + [
-            _going_on(thing, held[place][1]) if place in held else replace(thing, id=f"{id_prefix}-{next(numbers)}")
+            _going_on(thing, held[place][1])
+            if place in held
+            else replace(thing, id=f"{id_prefix}-{next(numbers)}")
             for place, thing in enumerate(things, 1)
         ]
 
@@ -206,7 +263,9 @@ class GatheredThings:
     def _record(self, cells: Mask, corner: tuple[int, int], score: float) -> Change | None:
         cell_m = self._ground.cell_m
         cell_from_own = np.array([[1, 0, corner[0]], [0, 1, corner[1]], [0, 0, 1.0]])
-        outline_m = outline_of(cells, self._ground.window.site_from_cell(cell_m) @ cell_from_own, 0.5, 1.0)
+        outline_m = outline_of(
+            cells, self._ground.window.site_from_cell(cell_m) @ cell_from_own, 0.5, 1.0
+        )
         if outline_m is None:
             return None
         patch, size = self._ground.patch(outline_m), measures(outline_m)
@@ -214,17 +273,29 @@ class GatheredThings:
         sigma_m = place_sigma_m(self._ground.residual_m, np.sqrt(12) * cell_m, 0.0)
         views = float(self._ground.sums["agree"][rows + corner[1], columns + corner[0]].mean())
         return Change(
-            "", kind_of(patch), score, outline_m, *self._ground.span_ns, max(round(views), 1), size.area_m2,
-            size.length_m, sigma_m, patch,
+            "",
+            kind_of(patch),
+            score,
+            outline_m,
+            *self._ground.span_ns,
+            max(round(views), 1),
+            size.area_m2,
+            size.length_m,
+            sigma_m,
+            patch,
         )
 
 
-def _enlarged(view: ComparedView, leans: Mask | None, times: float) -> tuple[ComparedView, Mask | None]:
+def _enlarged(
+    view: ComparedView, leans: Mask | None, times: float
+) -> tuple[ComparedView, Mask | None]:
     """A view, and what leans in it, with more pixels."""
     height, width = view.valid.shape
     size = round(width * times), round(height * times)
     x, y = size[0] / width, size[1] / height
-    view_from_large = np.array([[1 / x, 0, (1 - x) / (2 * x)], [0, 1 / y, (1 - y) / (2 * y)], [0, 0, 1.0]])
+    view_from_large = np.array(
+        [[1 / x, 0, (1 - x) / (2 * x)], [0, 1 / y, (1 - y) / (2 * y)], [0, 0, 1.0]]
+    )
 
     def picture(image: ImageRGB) -> ImageRGB:
         return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -236,10 +307,15 @@ def _enlarged(view: ComparedView, leans: Mask | None, times: float) -> tuple[Com
         return np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_NEAREST), np.uint8)
 
     large = replace(
-        view, site_from_image=view.site_from_image @ view_from_large, image=picture(view.image),
-        reference=picture(view.reference), valid=mask(view.valid), changed=levels(view.changed),
+        view,
+        site_from_image=view.site_from_image @ view_from_large,
+        image=picture(view.image),
+        reference=picture(view.reference),
+        valid=mask(view.valid),
+        changed=levels(view.changed),
         boxes=np.rint(view.boxes * np.array([x, y, x, y])).astype(view.boxes.dtype),
-        residual_px=view.residual_px * times, shade=levels(view.shade),
+        residual_px=view.residual_px * times,
+        shade=levels(view.shade),
     )
     return large, None if leans is None else mask(leans)
 
@@ -247,6 +323,9 @@ def _enlarged(view: ComparedView, leans: Mask | None, times: float) -> tuple[Com
 def _going_on(thing: Change, known: Change) -> Change:
     """A thing as the change that is known already, perhaps to those who follow the flight."""
     return replace(
-        thing, id=known.id, first_seen_ns=known.first_seen_ns, last_seen_ns=known.last_seen_ns,
+        thing,
+        id=known.id,
+        first_seen_ns=known.first_seen_ns,
+        last_seen_ns=known.last_seen_ns,
         announced_ns=known.announced_ns,
     )

@@ -19,9 +19,13 @@ class GroundSums:
     `window_of`, `add` and `show` change it. `cell_m` is 0 before the first view.
     """
 
-    def __init__(self, names: tuple[str, ...], most_cells: int, pictures: GroundPictureSettings) -> None:
+    def __init__(
+        self, names: tuple[str, ...], most_cells: int, pictures: GroundPictureSettings
+    ) -> None:
         self.cell_m, self.window = 0.0, CellWindow(0, 0, 0, 0)
-        self.sums: dict[str, NDArray[np.float32]] = {name: np.zeros((0, 0), np.float32) for name in names}
+        self.sums: dict[str, NDArray[np.float32]] = {
+            name: np.zeros((0, 0), np.float32) for name in names
+        }
         self._most_cells = most_cells
         self._picture_settings = pictures
         self._pictures = GroundPictures(1.0, pictures)
@@ -54,7 +58,11 @@ class GroundSums:
         return window if self._make_room(window) else None
 
     def add(
-        self, view: ComparedView, window: CellWindow, site_from_planes: Matrix3, planes: dict[str, Floats32],
+        self,
+        view: ComparedView,
+        window: CellWindow,
+        site_from_planes: Matrix3,
+        planes: dict[str, Floats32],
         known: Floats32,
     ) -> dict[str, Floats32]:
         """Add a view's planes (h, w) by name where they are `known` (h, w, 1 or 0), and to `seen` how often each cell
@@ -62,9 +70,16 @@ class GroundSums:
         cell_from_planes = np.linalg.inv(window.site_from_cell(self.cell_m)) @ site_from_planes
 
         def laid(values: Floats32) -> Floats32:
-            return np.asarray(cv2.warpPerspective(
-                values, cell_from_planes, window.shape[::-1], flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
-            ), np.float32)
+            return np.asarray(
+                cv2.warpPerspective(
+                    values,
+                    cell_from_planes,
+                    window.shape[::-1],
+                    flags=cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_CONSTANT,
+                ),
+                np.float32,
+            )
 
         seen = (laid(known) > _ALL).astype(np.float32)
         added = {"seen": seen, **{name: laid(values) * seen for name, values in planes.items()}}
@@ -95,10 +110,14 @@ class GroundSums:
             return True
         spare = max(new.shape) // 4
         new = CellWindow(
-            *(min(new.x0, old.x0 - spare if new.x0 < old.x0 else new.x0),
-              min(new.y0, old.y0 - spare if new.y0 < old.y0 else new.y0)),
-            *(max(new.x1, old.x1 + spare if new.x1 > old.x1 else new.x1),
-              max(new.y1, old.y1 + spare if new.y1 > old.y1 else new.y1)),
+            *(
+                min(new.x0, old.x0 - spare if new.x0 < old.x0 else new.x0),
+                min(new.y0, old.y0 - spare if new.y0 < old.y0 else new.y0),
+            ),
+            *(
+                max(new.x1, old.x1 + spare if new.x1 > old.x1 else new.x1),
+                max(new.y1, old.y1 + spare if new.y1 > old.y1 else new.y1),
+            ),
         )
         if new.shape[0] * new.shape[1] > self._most_cells:
             return False

@@ -19,7 +19,10 @@ def share_moved(own: Mask, other: Mask, step: Floats, most: float) -> float:
         return 0.0
     best = 0
     for times in np.arange(1.0, longest + 1) / longest * most:
-        x, y = (np.rint(each + times * along).astype(int) for each, along in ((columns, step[0]), (rows, step[1])))
+        x, y = (
+            np.rint(each + times * along).astype(int)
+            for each, along in ((columns, step[0]), (rows, step[1]))
+        )
         inside = (x >= 0) & (y >= 0) & (x < other.shape[1]) & (y < other.shape[0])
         best = max(best, int(np.count_nonzero(other[y[inside], x[inside]])))
     return best / len(rows)

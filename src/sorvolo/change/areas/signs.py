@@ -11,7 +11,9 @@ from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.survey.findings import ComparedView
 
 _OCTAVES = np.log2(np.arange(256, dtype=np.float32) + np.float32(BLACK_LEVEL))  # of each grey level
-_SKY = np.array([0.7, -0.7], np.float32)  # blue and red over green, by which light from the sky differs from the sun's
+_SKY = np.array(
+    [0.7, -0.7], np.float32
+)  # blue and red over green, by which light from the sky differs from the sun's
 
 Signs = NDArray[np.float32]
 
@@ -34,7 +36,9 @@ class SignSettings:
     between_px: tuple[int, int] = (1, 7)  # structure is what lies between these sizes
     most_detail: float = 0.2  # octaves: the rim of a shadow is no more than a coarse texture
     colour_px: int = 7  # over which colour and brightness are averaged
-    noise_levels: float = 1.5  # grey levels of detail that noise and compression make, in the darker of both pictures
+    noise_levels: float = (
+        1.5  # grey levels of detail that noise and compression make, in the darker of both pictures
+    )
     leans: float = 0.3  # likeness of one date's pictures below which ground leans ...
     rough: float = 6.0  # ... where its detail has so many times the power of noise
     sky: SkySettings = field(default_factory=SkySettings)
@@ -64,7 +68,9 @@ def area_signs(
     height, width = view.valid.shape
     size = _small(view.image, settings)
     valid = view.valid if leans is None else view.valid & ~leans
-    known = np.asarray(cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255)
+    known = np.asarray(
+        cv2.resize(valid.view(np.uint8) * np.uint8(255), size, interpolation=cv2.INTER_AREA) == 255
+    )
     before, after = (_octaves(image, size) for image in (view.reference, view.image))
     levels = [_level(each) for each in (before, after)]
     likeness, detail, _ = _structure(levels[0], levels[1], settings)
@@ -73,7 +79,14 @@ def area_signs(
     colour = _centred(_blurred(surface - _colour(before), settings.colour_px), known)
     x, y = width / size[0], height / size[1]
     view_from_signs = np.array([[x, 0, (x - 1) / 2], [0, y, (y - 1) / 2], [0, 0, 1.0]])
-    return AreaSigns(likeness, _without_sky(colour, brighter, settings.sky), detail, surface, known, view_from_signs)
+    return AreaSigns(
+        likeness,
+        _without_sky(colour, brighter, settings.sky),
+        detail,
+        surface,
+        known,
+        view_from_signs,
+    )
 
 
 def level_of(picture: ImageRGB, settings: SignSettings = SignSettings()) -> Signs:
@@ -92,7 +105,9 @@ def leaning(
     found = (likeness < settings.leans) & (rough > settings.rough)
     window = np.ones((settings.window_px, settings.window_px), np.uint8)
     whole = cv2.morphologyEx(found.view(np.uint8), cv2.MORPH_CLOSE, window)
-    return np.asarray((cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen)
+    return np.asarray(
+        (cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST) > 0) & seen
+    )
 
 
 def _small(picture: ImageRGB, settings: SignSettings) -> tuple[int, int]:
@@ -108,14 +123,18 @@ def _structure(before: Signs, after: Signs, settings: SignSettings) -> tuple[Sig
     window, most = (settings.window_px, settings.window_px), np.float32(settings.most_detail)
     fine, coarse = ((side, side) for side in settings.between_px)
     details = [
-        np.clip(cv2.blur(each, fine) - cv2.blur(each, coarse), -most, most) for each in (before, after)
+        np.clip(cv2.blur(each, fine) - cv2.blur(each, coarse), -most, most)
+        for each in (before, after)
     ]
-    noise = np.square(np.float32(settings.noise_levels / np.log(2)) * np.exp2(-np.minimum(before, after)))
+    noise = np.square(
+        np.float32(settings.noise_levels / np.log(2)) * np.exp2(-np.minimum(before, after))
+    )
     power = [cv2.blur(each * each + noise, window) for each in details]
     best = np.full(before.shape, -1.0, np.float32)
     pad = settings.reach_px
     shifted, their_power = (
-        cv2.copyMakeBorder(each, pad, pad, pad, pad, cv2.BORDER_REFLECT_101) for each in (details[0], power[0])
+        cv2.copyMakeBorder(each, pad, pad, pad, pad, cv2.BORDER_REFLECT_101)
+        for each in (details[0], power[0])
     )
     height, width = before.shape
     for dy in range(2 * pad + 1):
@@ -124,7 +143,11 @@ def _structure(before: Signs, after: Signs, settings: SignSettings) -> tuple[Sig
             products = cv2.blur(details[1] * shifted[part], window)
             np.maximum(best, products / np.sqrt(power[1] * their_power[part]), out=best)
     rough = np.minimum(*power) / cv2.blur(noise, window)
-    return best, np.asarray(0.5 * np.log2(power[1] / power[0]), np.float32), np.asarray(rough, np.float32)
+    return (
+        best,
+        np.asarray(0.5 * np.log2(power[1] / power[0]), np.float32),
+        np.asarray(rough, np.float32),
+    )
 
 
 def _blurred(values: Signs, side_px: int) -> Signs:
@@ -133,7 +156,9 @@ def _blurred(values: Signs, side_px: int) -> Signs:
 
 def _centred(values: Signs, known: Mask) -> Signs:
     """Values less their middle one on known ground."""
-    return np.asarray(values - np.median(values[known], axis=0), np.float32) if known.any() else values
+    return (
+        np.asarray(values - np.median(values[known], axis=0), np.float32) if known.any() else values
+    )
 
 
 def _without_sky(colour: Signs, brighter: Signs, settings: SkySettings) -> Signs:
@@ -149,7 +174,10 @@ def _without_sky(colour: Signs, brighter: Signs, settings: SkySettings) -> Signs
 
 def _colour(octaves: Signs) -> Signs:
     """(h, w, 2) blue and red over green."""
-    return np.asarray(np.dstack([octaves[..., 2] - octaves[..., 1], octaves[..., 0] - octaves[..., 1]]), np.float32)
+    return np.asarray(
+        np.dstack([octaves[..., 2] - octaves[..., 1], octaves[..., 0] - octaves[..., 1]]),
+        np.float32,
+    )
 
 
 def _octaves(image: NDArray[np.uint8], size: tuple[int, int]) -> Signs:
@@ -159,4 +187,6 @@ def _octaves(image: NDArray[np.uint8], size: tuple[int, int]) -> Signs:
 
 def _level(octaves: Signs) -> Signs:
     """(h, w) the mean of the three colours; a sum of planes is five times as fast as NumPy's along a short axis."""
-    return np.asarray((octaves[..., 0] + octaves[..., 1] + octaves[..., 2]) / np.float32(3), np.float32)
+    return np.asarray(
+        (octaves[..., 0] + octaves[..., 1] + octaves[..., 2]) / np.float32(3), np.float32
+    )

@@ -41,10 +41,28 @@ class CoverageSettings:
     black: float = 14.0  # mean grey level of ground in whose shadow nothing can be seen
     least_sharpness: float = 0.5  # of the flight's usual one: a view with less is blurred
     black_px: int = 15  # over how many pixels that mean is taken
-    differs: float = 0.5  # of the views that compared a cell flag it: it is changed, or not explained
-    widens: float = 1.0  # cells around a reported change that it explains: outlines are good to about one
-    smooth_cells: int = 7  # over which the roughness of ground is averaged: what differs from cell to cell is luck
-    steps_m: tuple[float, ...] = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0)  # in which sizes are written
+    differs: float = (
+        0.5  # of the views that compared a cell flag it: it is changed, or not explained
+    )
+    widens: float = (
+        1.0  # cells around a reported change that it explains: outlines are good to about one
+    )
+    smooth_cells: int = (
+        7  # over which the roughness of ground is averaged: what differs from cell to cell is luck
+    )
+    steps_m: tuple[float, ...] = (
+        0.1,
+        0.2,
+        0.3,
+        0.5,
+        0.7,
+        1.0,
+        1.5,
+        2.0,
+        3.0,
+        5.0,
+        10.0,
+    )  # in which sizes are written
     planting: PlantingSettings = field(default_factory=PlantingSettings)
 
 
@@ -75,7 +93,11 @@ class GroundCoverage:
         self.unplaced = 0  # views that nobody knows the ground of
 
     def compare(
-        self, view: ComparedView, *, is_dark: bool = False, doubted: Mask | None = None,
+        self,
+        view: ComparedView,
+        *,
+        is_dark: bool = False,
+        doubted: Mask | None = None,
         planted: Sequence[Planted] = (),
     ) -> None:
         """Count a compared view. `doubted` (h, w) is what differs from the map and is contradicted by earlier pictures;
@@ -84,7 +106,9 @@ class GroundCoverage:
         self._unknown.append(1.0 - float(view.valid.mean()))
         height, width = view.valid.shape
         window = window_around(view.outline_m, self._settings.cell_m)
-        cell_from_image = np.linalg.inv(window.site_from_cell(self._settings.cell_m)) @ view.site_from_image
+        cell_from_image = (
+            np.linalg.inv(window.site_from_cell(self._settings.cell_m)) @ view.site_from_image
+        )
         size = window.shape[::-1]
         marks = self._marks(view, is_dark=is_dark, doubted=doubted)
         laid = cv2.warpPerspective(marks, cell_from_image, size, flags=cv2.INTER_NEAREST)
@@ -92,7 +116,11 @@ class GroundCoverage:
         rough = texture(view)
         image_from_rough = _resized(width / rough.shape[1], height / rough.shape[0])
         rough_laid = cv2.warpPerspective(
-            rough, cell_from_image @ image_from_rough, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            rough,
+            cell_from_image @ image_from_rough,
+            size,
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
         )
         for chunk, inside, part in self._pieces(window):
             mine = laid[part]
@@ -155,7 +183,9 @@ class GroundCoverage:
         area_m2 = float(((boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])).sum())
         polygons = tuple(tuple(rings) for rings in union_of_boxes(boxes))
         if kind == _CLEAN:
-            return CoveredGround(polygons, area_m2, None, "", self._step_m(first), self._step_m(second))
+            return CoveredGround(
+                polygons, area_m2, None, "", self._step_m(first), self._step_m(second)
+            )
         gap = list(Gap)[kind]
         why = self._reasons[first - 1] if gap is Gap.REJECTED else ""
         return CoveredGround(polygons, area_m2, gap, why, np.nan, np.nan)
@@ -188,7 +218,9 @@ class GroundCoverage:
             rough = np.divide(*cv2.blur(near, (self._settings.smooth_cells,) * 2)[clean].T)
             sizes_m = [each.smallest_px(rough) * chunk.finest[clean] for each in (plain, faint)]
             labels[clean, 1], labels[clean, 2] = (self._step_of(each) for each in sizes_m)
-            labels[clean, 0] = np.where(plain.is_blind(rough), list(Gap).index(Gap.INSENSITIVE), _CLEAN)
+            labels[clean, 0] = np.where(
+                plain.is_blind(rough), list(Gap).index(Gap.INSENSITIVE), _CLEAN
+            )
             labels[labels[..., 0] == list(Gap).index(Gap.INSENSITIVE), 1:] = 0
         return labels
 
@@ -205,28 +237,38 @@ class GroundCoverage:
         """(rows, columns): `_CLEAN`, the place of a gap among all, or -1 where no view was."""
         names = list(Gap)
         clean = chunk.clean.astype(np.int32)
-        hidden = np.stack([chunk.gaps[gap] for gap in (Gap.DARK, Gap.LEANING, Gap.BLURRED)]).astype(np.int32)
+        hidden = np.stack([chunk.gaps[gap] for gap in (Gap.DARK, Gap.LEANING, Gap.BLURRED)]).astype(
+            np.int32
+        )
         classes = np.full(clean.shape, -1, np.int32)
         classes[chunk.rejected > 0] = names.index(Gap.REJECTED)
         classes[chunk.gaps[Gap.NO_MAP] > 0] = names.index(Gap.NO_MAP)
         classes[clean > 0] = names.index(Gap.ONE_VIEW)
-        most = np.array([names.index(gap) for gap in (Gap.DARK, Gap.LEANING, Gap.BLURRED)])[hidden.argmax(axis=0)]
+        most = np.array([names.index(gap) for gap in (Gap.DARK, Gap.LEANING, Gap.BLURRED)])[
+            hidden.argmax(axis=0)
+        ]
         classes = np.where(hidden.sum(axis=0) > 0, most, classes)
         is_compared = (clean >= self._settings.least_views) & (clean >= hidden.sum(axis=0))
         classes = np.where(is_compared, _CLEAN, classes)
         differs = is_compared & ~explained & (chunk.differs >= self._settings.differs * clean)
-        whole = cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+        whole = (
+            cv2.morphologyEx(differs.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+        )
         return np.where(whole, names.index(Gap.UNEXPLAINED), classes)
 
-    def _marks(self, view: ComparedView, *, is_dark: bool, doubted: Mask | None) -> NDArray[np.uint8]:
-        """A view's pixels, (h, w): 255 compared, else 1 + the place of what kept it from that; 0 where it sees nothing.
-        """
+    def _marks(
+        self, view: ComparedView, *, is_dark: bool, doubted: Mask | None
+    ) -> NDArray[np.uint8]:
+        """A view's pixels, (h, w): 255 compared, else 1 + the place of what kept it from that; 0 where it sees nothing."""
+
         def mark(gap: Gap) -> int:
             return 1 + _COUNTED.index(gap)
 
         marks = np.full(view.valid.shape, _CLEAN, np.uint8)
         gray = cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY)
-        is_black = np.minimum(*(_mean_grey(each, self._settings.black_px) for each in (view.image, view.reference)))
+        is_black = np.minimum(
+            *(_mean_grey(each, self._settings.black_px) for each in (view.image, view.reference))
+        )
         marks[is_black < self._settings.black] = mark(Gap.DARK)
         if doubted is not None:
             marks[doubted] = mark(Gap.LEANING)
@@ -243,15 +285,24 @@ class GroundCoverage:
             self._reasons.append(why)
         return 1 + self._reasons.index(why) if why in self._reasons else _MOST_REASONS
 
-    def _pieces(self, window: CellWindow) -> Iterator[tuple[_Chunk, tuple[slice, slice], tuple[slice, slice]]]:
+    def _pieces(
+        self, window: CellWindow
+    ) -> Iterator[tuple[_Chunk, tuple[slice, slice], tuple[slice, slice]]]:
         """Chunks, what of them lies in a window, and where that is in the window's raster."""
         for row in range(window.y0 // _CHUNK, -(-window.y1 // _CHUNK)):
             y0, y1 = max(window.y0, row * _CHUNK), min(window.y1, (row + 1) * _CHUNK)
             for column in range(window.x0 // _CHUNK, -(-window.x1 // _CHUNK)):
                 x0, x1 = max(window.x0, column * _CHUNK), min(window.x1, (column + 1) * _CHUNK)
                 chunk = self._chunks.setdefault((column, row), _Chunk())
-                inside = np.s_[y0 - row * _CHUNK : y1 - row * _CHUNK, x0 - column * _CHUNK : x1 - column * _CHUNK]
-                yield chunk, inside, np.s_[y0 - window.y0 : y1 - window.y0, x0 - window.x0 : x1 - window.x0]
+                inside = np.s_[
+                    y0 - row * _CHUNK : y1 - row * _CHUNK,
+                    x0 - column * _CHUNK : x1 - column * _CHUNK,
+                ]
+                yield (
+                    chunk,
+                    inside,
+                    np.s_[y0 - window.y0 : y1 - window.y0, x0 - window.x0 : x1 - window.x0],
+                )
 
 
 def coverage_summary(
@@ -262,17 +313,22 @@ def coverage_summary(
     `large_found` is the share found of plain things of the largest size that was drawn, None where too few were drawn
     to know; `faint_known` whether enough faint ones were.
     """
-    plain_known, faint_known = (are_enough(planted, contrast) for contrast in PlantingSettings().contrasts[:2])
+    plain_known, faint_known = (
+        are_enough(planted, contrast) for contrast in PlantingSettings().contrasts[:2]
+    )
     compared = [each for each in parts if each.gap is None]
     gaps_m2 = _gaps_m2(parts)
     compared_m2, missing_m2 = sum(each.area_m2 for each in compared), sum(gaps_m2.values())
     on_map_m2 = compared_m2 + missing_m2 - gaps_m2.get(Gap.NO_MAP.value, 0.0)
     return {
-        "compared_m2": compared_m2, "not_compared_m2": missing_m2,
-        "gaps_m2": gaps_m2, "views_without_a_place": unplaced,
+        "compared_m2": compared_m2,
+        "not_compared_m2": missing_m2,
+        "gaps_m2": gaps_m2,
+        "views_without_a_place": unplaced,
         "smallest_m": _middle([(each.smallest_m, each.area_m2) for each in compared]),
         "faint_m": _middle([(each.faint_m, each.area_m2) for each in compared]),
-        "large_found": _large_found(planted) if plain_known else None, "faint_known": faint_known,
+        "large_found": _large_found(planted) if plain_known else None,
+        "faint_known": faint_known,
         "is_enough": compared_m2 >= 0.5 * on_map_m2 and compared_m2 > 0,
     }
 
@@ -280,7 +336,9 @@ def coverage_summary(
 def _gaps_m2(parts: Sequence[CoveredGround]) -> dict[str, float]:
     """The ground that was not compared by reason, the largest part first."""
     areas_m2 = {gap.value: sum(each.area_m2 for each in parts if each.gap is gap) for gap in Gap}
-    return {name: area for name, area in sorted(areas_m2.items(), key=lambda item: -item[1]) if area}
+    return {
+        name: area for name, area in sorted(areas_m2.items(), key=lambda item: -item[1]) if area
+    }
 
 
 def _large_found(planted: Sequence[Planted]) -> float | None:
@@ -311,7 +369,9 @@ def _runs(labels: NDArray[np.int32]) -> Iterator[tuple[tuple[int, int, int], int
 
 
 def _mean_grey(image: ImageRGB, side_px: int) -> NDArray[np.uint8]:
-    return np.asarray(cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (side_px, side_px)), np.uint8)
+    return np.asarray(
+        cv2.blur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), (side_px, side_px)), np.uint8
+    )
 
 
 def _resized(x: float, y: float) -> Floats:

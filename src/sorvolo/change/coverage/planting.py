@@ -12,9 +12,18 @@ from sorvolo.change.pair.illumination import BLACK_LEVEL
 from sorvolo.geometry.arrays import Floats, ImageRGB, Mask
 from sorvolo.survey.findings import ComparedView
 
-_COLOURS = np.array([  # of cars, clothes and tarpaulins: white, silver, black, red, blue, yellow, green
-    [235, 235, 230], [180, 182, 184], [28, 28, 32], [190, 40, 35], [40, 75, 160], [220, 180, 40], [60, 110, 60],
-], np.float32)
+_COLOURS = np.array(
+    [  # of cars, clothes and tarpaulins: white, silver, black, red, blue, yellow, green
+        [235, 235, 230],
+        [180, 182, 184],
+        [28, 28, 32],
+        [190, 40, 35],
+        [40, 75, 160],
+        [220, 180, 40],
+        [60, 110, 60],
+    ],
+    np.float32,
+)
 
 
 @dataclass(frozen=True)
@@ -33,10 +42,15 @@ class PlantingSettings:
     """What is drawn into which views. Sizes are the longer sides of things in pixels of a compared view."""
 
     sizes_px: tuple[float, ...] = (5.0, 7.0, 10.0, 14.0, 20.0, 28.0, 40.0)
-    contrasts: tuple[float, ...] = (1.0, 0.35)  # plain and faint: of the thing's own colour, the rest is the ground's
+    contrasts: tuple[float, ...] = (
+        1.0,
+        0.35,
+    )  # plain and faint: of the thing's own colour, the rest is the ground's
     apart_px: int = 100  # a grid of this side, so that each thing stands on ground of its own
     first_step: int = 4  # every fourth view at first ...
-    steps_alike: int = 6  # ... and after this many a half of them: planting costs a third of a comparison
+    steps_alike: int = (
+        6  # ... and after this many a half of them: planting costs a third of a comparison
+    )
     shown: float = 0.25  # of a thing's pixels marked as changed: found
     wanted: float = 0.8  # of the things of a size found: that size is found
     drawn: DrawnThing = field(default_factory=DrawnThing)
@@ -80,9 +94,13 @@ class Sensitivity:
         """Whether on ground of these textures most of the largest things are missed."""
         if not self.is_known:
             return np.zeros(len(texture), bool)
-        logit = self.weights @ np.array([
-            np.ones(len(texture)), np.full(len(texture), np.log(max(self.settings.sizes_px))), np.log(texture)
-        ])
+        logit = self.weights @ np.array(
+            [
+                np.ones(len(texture)),
+                np.full(len(texture), np.log(max(self.settings.sizes_px))),
+                np.log(texture),
+            ]
+        )
         needed = np.log(self.settings.least / (1 - self.settings.least))
         return ~np.asarray(logit >= needed)
 
@@ -114,7 +132,10 @@ class Planting:
 
 
 def planted_in(
-    view: ComparedView, find: Callable[[ImageRGB], Mask], settings: PlantingSettings, rng: np.random.Generator
+    view: ComparedView,
+    find: Callable[[ImageRGB], Mask],
+    settings: PlantingSettings,
+    rng: np.random.Generator,
 ) -> tuple[Planted, ...]:
     """Draw things of all sizes and contrasts where the view shows no change, and see which are found."""
     rough = texture(view)
@@ -126,7 +147,10 @@ def planted_in(
         contrast = settings.contrasts[number // len(settings.sizes_px) % len(settings.contrasts)]
         window, mask = _draw(picture, place, size, contrast, settings, rng)
         scale = rough.shape[0] / view.valid.shape[0]
-        here = rough[min(int(place[1] * scale), rough.shape[0] - 1), min(int(place[0] * scale), rough.shape[1] - 1)]
+        here = rough[
+            min(int(place[1] * scale), rough.shape[0] - 1),
+            min(int(place[0] * scale), rough.shape[1] - 1),
+        ]
         drawn.append((size, contrast, float(here), window, mask))
     if not drawn:
         return ()
@@ -140,7 +164,13 @@ def planted_in(
 def texture(view: ComparedView) -> NDArray[np.float32]:
     """How rough the ground is that a view shows, (h / 8, w / 8): the mean distance of a pixel from its surroundings in
     octaves of light, never less than what the eight bits of a picture leave."""
-    gray = cv2.resize(cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    gray = cv2.resize(
+        cv2.cvtColor(view.image, cv2.COLOR_RGB2GRAY),
+        None,
+        fx=0.5,
+        fy=0.5,
+        interpolation=cv2.INTER_AREA,
+    )
     level = np.log2(gray.astype(np.float32) + np.float32(BLACK_LEVEL))
     detail = cv2.absdiff(level, cv2.blur(level, (9, 9)))
     size = max(1, gray.shape[1] // 4), max(1, gray.shape[0] // 4)
@@ -148,14 +178,20 @@ def texture(view: ComparedView) -> NDArray[np.float32]:
     return np.asarray(np.maximum(coarse, 2e-3), np.float32)
 
 
-def are_enough(planted: Sequence[Planted], contrast: float, settings: PlantingSettings = PlantingSettings()) -> bool:
+def are_enough(
+    planted: Sequence[Planted], contrast: float, settings: PlantingSettings = PlantingSettings()
+) -> bool:
     """Whether so many things of this contrast were planted that they show how small a thing is found."""
     return sum(each.contrast == contrast for each in planted) >= settings.least_planted
 
 
-def sensitivities(planted: Sequence[Planted], settings: PlantingSettings) -> tuple[Sensitivity, ...]:
+def sensitivities(
+    planted: Sequence[Planted], settings: PlantingSettings
+) -> tuple[Sensitivity, ...]:
     """What was found of everything planted, a record for each contrast."""
-    of_contrast = [[each for each in planted if each.contrast == contrast] for contrast in settings.contrasts]
+    of_contrast = [
+        [each for each in planted if each.contrast == contrast] for contrast in settings.contrasts
+    ]
     return tuple(
         Sensitivity(contrast, are_enough(planted, contrast, settings), _weights(own), settings)
         for contrast, own in zip(settings.contrasts, of_contrast, strict=True)
@@ -167,12 +203,18 @@ def recall_curve(planted: Sequence[Planted], settings: PlantingSettings) -> list
     curve = []
     for contrast in settings.contrasts:
         for size in settings.sizes_px:
-            found = [each.found for each in planted if (each.contrast, each.size_px) == (contrast, size)]
-            curve.append({"contrast": contrast, "size_px": size, "planted": len(found), "found": sum(found)})
+            found = [
+                each.found for each in planted if (each.contrast, each.size_px) == (contrast, size)
+            ]
+            curve.append(
+                {"contrast": contrast, "size_px": size, "planted": len(found), "found": sum(found)}
+            )
     return curve
 
 
-def _places(free: Mask, settings: PlantingSettings, rng: np.random.Generator) -> list[tuple[float, float]]:
+def _places(
+    free: Mask, settings: PlantingSettings, rng: np.random.Generator
+) -> list[tuple[float, float]]:
     """Middles of things in random order, x and y: on known ground without change, each in a square of its own."""
     half = settings.apart_px // 2
     around = int(max(settings.sizes_px)) + 4
@@ -186,7 +228,11 @@ def _places(free: Mask, settings: PlantingSettings, rng: np.random.Generator) ->
 
 
 def _draw(
-    picture: ImageRGB, place: tuple[float, float], size_px: float, contrast: float, settings: PlantingSettings,
+    picture: ImageRGB,
+    place: tuple[float, float],
+    size_px: float,
+    contrast: float,
+    settings: PlantingSettings,
     rng: np.random.Generator,
 ) -> tuple[tuple[slice, slice], Mask]:
     """Paint a thing over the ground, seen from above with its shadow: where that is, and which pixels are the thing's.
@@ -202,9 +248,15 @@ def _draw(
     turn_deg = float(rng.uniform(0, 180))
     body, band, shadow = (
         _rectangle(len(ground), centre, size, turn_deg)[..., None]
-        for centre, size in ((middle, sides), (middle, sides * drawn.band), (middle + drawn.shadow * size_px, sides))
+        for centre, size in (
+            (middle, sides),
+            (middle, sides * drawn.band),
+            (middle + drawn.shadow * size_px, sides),
+        )
     )
-    thing = _COLOURS[rng.integers(len(_COLOURS))] * (1 - drawn.band_shade * band) + rng.normal(0, 2.0, ground.shape)
+    thing = _COLOURS[rng.integers(len(_COLOURS))] * (1 - drawn.band_shade * band) + rng.normal(
+        0, 2.0, ground.shape
+    )
     under = ground * (1 - drawn.shade * contrast * shadow)
     painted = under * (1 - body) + body * (ground + contrast * (thing - ground))
     picture[window] = np.clip(np.rint(painted), 0, 255).astype(np.uint8)
@@ -216,7 +268,9 @@ def _rectangle(side_px: int, middle: Floats, sides: Floats, turn_deg: float) -> 
     corners = cv2.boxPoints((middle.tolist(), sides.tolist(), turn_deg))
     fine: NDArray[np.uint8] = np.zeros((8 * side_px,) * 2, np.uint8)
     cv2.fillPoly(fine, [np.rint(corners * 8).astype(np.int32)], 255)
-    mask = cv2.resize(fine, (side_px, side_px), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    mask = (
+        cv2.resize(fine, (side_px, side_px), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
+    )
     return np.asarray(cv2.GaussianBlur(mask, (0, 0), 0.6), np.float32)
 
 

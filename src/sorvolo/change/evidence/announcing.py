@@ -16,7 +16,9 @@ class Reason(StrEnum):
     TOO_FEW_VIEWS = "too few views show it"
     UNSURE = "its score is too low"
     LARGE_AND_UNSURE = "it is large and its score is low, like a wall that leans"
-    RELIEF = "earlier pictures show it from another side, where a wall or a roof would differ as well"
+    RELIEF = (
+        "earlier pictures show it from another side, where a wall or a roof would differ as well"
+    )
     SHADOW = "it is the moved shadow of something that stays"
     MOVES = "most views that show it show something that moves"
 
@@ -51,11 +53,17 @@ class AnnounceSettings:
 
     least_score: float = 0.38  # 0007: half of what the trees asked for that had seen no flights
     large_m2: float = 2.0  # 0018: from this size on ...
-    large_score: float = 0.52  # 0018: ... and shorter than the flying height, a less sure one is a wall that leans
-    restless_half: float = 0.05  # share of views that flag the ground around for nothing: half the score is left
+    large_score: float = (
+        0.52  # 0018: ... and shorter than the flying height, a less sure one is a wall that leans
+    )
+    restless_half: float = (
+        0.05  # share of views that flag the ground around for nothing: half the score is left
+    )
     doubt: float = 2.0  # 0007: restless ground counts in full where half of the score is missing
     cut_off: float = 0.5  # 0007: of the score is left where no view shows all of it
-    one_place: float = 0.05  # flying heights: views no wider apart see the same ghost, and count half
+    one_place: float = (
+        0.05  # flying heights: views no wider apart see the same ghost, and count half
+    )
 
     def __post_init__(self) -> None:
         if not 0 <= self.least_score <= 1:
@@ -100,9 +108,13 @@ class Tally:
     def with_view(self, time_ns: int, score: float, residual_m: float, camera_m: Floats) -> "Tally":
         """One more view shows it."""
         return replace(
-            self, views=self.views + 1, asked=self.asked + 1, score_sum=self.score_sum + score,
+            self,
+            views=self.views + 1,
+            asked=self.asked + 1,
+            score_sum=self.score_sum + score,
             residual_m_sum=self.residual_m_sum + residual_m,
-            first_seen_ns=min(self.first_seen_ns, time_ns), last_seen_ns=max(self.last_seen_ns, time_ns),
+            first_seen_ns=min(self.first_seen_ns, time_ns),
+            last_seen_ns=max(self.last_seen_ns, time_ns),
             camera_low_m=_three(np.minimum(self.camera_low_m, camera_m)),
             camera_high_m=_three(np.maximum(self.camera_high_m, camera_m)),
         )
@@ -115,9 +127,14 @@ class Tally:
         views, whole = (sum(getattr(each, name) for each in taken) for name in ("views", "whole"))
         left = max(self.views - views, 0)
         return replace(
-            self, views=left, asked=max(self.asked - views, left), whole=min(max(self.whole - whole, 0), left),
+            self,
+            views=left,
+            asked=max(self.asked - views, left),
+            whole=min(max(self.whole - whole, 0), left),
             score_sum=max(self.score_sum - sum(each.score_sum for each in taken), 0.0),
-            residual_m_sum=max(self.residual_m_sum - sum(each.residual_m_sum for each in taken), 0.0),
+            residual_m_sum=max(
+                self.residual_m_sum - sum(each.residual_m_sum for each in taken), 0.0
+            ),
             moved=self.views - left,
         )
 
@@ -130,7 +147,11 @@ class Tally:
         views, asked = max(views, 1), max(asked, views, 1)
         part = views / max(self.views, 1)
         return replace(
-            self, views=views, asked=asked, score_sum=self.score_sum * part, whole=round(self.whole * part),
+            self,
+            views=views,
+            asked=asked,
+            score_sum=self.score_sum * part,
+            whole=round(self.whole * part),
             residual_m_sum=self.residual_m_sum * part,
         )
 
@@ -175,7 +196,9 @@ def views_score(tally: Tally, settings: AnnounceSettings, calm: float = 1.0) -> 
         return 0.0
     score = tally.score_sum / tally.views * (tally.views + 1) / (tally.asked + 2) * calm
     wholeness = settings.cut_off + (1 - settings.cut_off) * min(2 * tally.whole / tally.views, 1.0)
-    return float(np.clip(score * (0.5 if tally.is_from_one_place(settings) else 1.0) * wholeness, 0, 1))
+    return float(
+        np.clip(score * (0.5 if tally.is_from_one_place(settings) else 1.0) * wholeness, 0, 1)
+    )
 
 
 def _objection(tally: Tally, settings: AnnounceSettings) -> Reason | None:
@@ -186,13 +209,17 @@ def _objection(tally: Tally, settings: AnnounceSettings) -> Reason | None:
     return None if look is None else _objection_to_look(look, score, tally, settings)
 
 
-def _objection_to_look(look: Look, score: float, tally: Tally, settings: AnnounceSettings) -> Reason | None:
+def _objection_to_look(
+    look: Look, score: float, tally: Tally, settings: AnnounceSettings
+) -> Reason | None:
     """The first rule that what its pictures and outline show fails."""
     if look.may_be_relief:
         return Reason.RELIEF
     if look.is_moved_shadow:
         return Reason.SHADOW
-    may_be_a_wall = look.area_m2 >= settings.large_m2 and look.length_m < tally.flying_height_m  # snow is longer
+    may_be_a_wall = (
+        look.area_m2 >= settings.large_m2 and look.length_m < tally.flying_height_m
+    )  # snow is longer
     if may_be_a_wall and score < settings.large_score and not tally.is_from_one_place(settings):
         return Reason.LARGE_AND_UNSURE
     return None

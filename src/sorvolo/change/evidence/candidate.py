@@ -10,7 +10,14 @@ import numpy as np
 
 from sorvolo.change.evidence.announcing import Tally
 from sorvolo.change.evidence.candidate_pictures import Pictures, PictureSettings
-from sorvolo.change.evidence.cells import CellEvidence, CellGrid, CellReport, CellWindow, LaidView, pieces
+from sorvolo.change.evidence.cells import (
+    CellEvidence,
+    CellGrid,
+    CellReport,
+    CellWindow,
+    LaidView,
+    pieces,
+)
 from sorvolo.change.evidence.levelness import Sights
 from sorvolo.change.shape.kinds import kind_of
 from sorvolo.change.shape.outlines import measures
@@ -30,7 +37,9 @@ class CandidateSettings:
     most_cameras: int = 256  # of views that show it; of more every second one is kept
     most_legs: int = 64  # of followed blobs that showed it; the oldest are forgotten
     most_seeds: int = 256  # uncertain candidates that are kept in any case ...
-    most_seeds_px: int = 8_000_000  # ... and while their pictures have no more pixels (110 MB); the oldest go first
+    most_seeds_px: int = (
+        8_000_000  # ... and while their pictures have no more pixels (110 MB); the oldest go first
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +64,12 @@ class Candidate:
     """
 
     def __init__(
-        self, number: int, cells: CellWindow, first_seen_ns: int, settings: CandidateSettings = CandidateSettings(),
-        pictures: PictureSettings = PictureSettings(),  # noqa: B008 (frozen)
+        self,
+        number: int,
+        cells: CellWindow,
+        first_seen_ns: int,
+        settings: CandidateSettings = CandidateSettings(),
+        pictures: PictureSettings = PictureSettings(),
     ) -> None:
         self.number = number
         self.pictures = Pictures(pictures)
@@ -66,7 +79,9 @@ class Candidate:
         self._tally = Tally(first_seen_ns, first_seen_ns)
         self._places: list[Floats] = []
         self._cameras: list[Floats] = []
-        self._shown_by: dict[int, Tally] = {}  # the views in which a followed blob showed it, by its leg
+        self._shown_by: dict[
+            int, Tally
+        ] = {}  # the views in which a followed blob showed it, by its leg
         self._kind: ChangeKind | None = None
         self._kind_outline: PointsM | None = None
 
@@ -125,7 +140,11 @@ class Candidate:
         report = view.laid.report(self._cells, cells, cell_m)
         if report.flagged >= max(self._settings.shows * report.seen, 1e-9):
             leg = self._count(
-                view, report, cells, view.residual_m, knows_place=report.seen > self._settings.all_seen
+                view,
+                report,
+                cells,
+                view.residual_m,
+                knows_place=report.seen > self._settings.all_seen,
             )
             self.pictures.vote(view.site_from_image, view.changed, view.valid)
             self._note_rim(view, cells, leg)
@@ -168,12 +187,24 @@ class Candidate:
             self._kind, self._kind_outline = kind_of(patch), outline_m
         size = measures(outline_m)
         residual_m = tally.residual_m_sum / max(tally.views, 1)
-        spread_m = float(np.sqrt(np.mean(np.var(self._places, axis=0)))) if len(self._places) > 1 else 0.0
+        spread_m = (
+            float(np.sqrt(np.mean(np.var(self._places, axis=0)))) if len(self._places) > 1 else 0.0
+        )
         placed_m = place_sigma_m(residual_m, cell_m, aside_of(outline_m, self.cameras_m))
         sigma_m = np.hypot(placed_m, spread_m / np.sqrt(max(len(self._places), 1)))
         return Change(
-            f"{id_prefix}-{self.number}", self._kind, score, outline_m, tally.first_seen_ns, tally.last_seen_ns,
-            tally.views, size.area_m2, size.length_m, float(sigma_m), patch, announced_ns=announced_ns,
+            f"{id_prefix}-{self.number}",
+            self._kind,
+            score,
+            outline_m,
+            tally.first_seen_ns,
+            tally.last_seen_ns,
+            tally.views,
+            size.area_m2,
+            size.length_m,
+            float(sigma_m),
+            patch,
+            announced_ns=announced_ns,
         )
 
     def joined(self, other: "Candidate", number: int) -> "Candidate":
@@ -183,14 +214,21 @@ class Candidate:
         """
         self.number = number
         self._tally = replace(
-            self._tally, first_seen_ns=min(self._tally.first_seen_ns, other.tally.first_seen_ns),
+            self._tally,
+            first_seen_ns=min(self._tally.first_seen_ns, other.tally.first_seen_ns),
             last_seen_ns=max(self._tally.last_seen_ns, other.tally.last_seen_ns),
         )
         self.extend(other.cells)
         return self
 
     def _count(
-        self, view: KeptView, report: CellReport, cells: Mask, residual_m: float, *, knows_place: bool
+        self,
+        view: KeptView,
+        report: CellReport,
+        cells: Mask,
+        residual_m: float,
+        *,
+        knows_place: bool,
     ) -> int:
         """Count a view that shows it; the leg of the followed blob that shows it there, 0 for none."""
         seen = view.time_ns, report.score, residual_m, view.camera_m
@@ -223,8 +261,14 @@ class Seeds:
     """
 
     def __init__(
-        self, grid: CellGrid, cell_m: float, gap: int, least_cells: float, m_per_px: float,
-        settings: CandidateSettings, pictures: PictureSettings,
+        self,
+        grid: CellGrid,
+        cell_m: float,
+        gap: int,
+        least_cells: float,
+        m_per_px: float,
+        settings: CandidateSettings,
+        pictures: PictureSettings,
     ) -> None:
         self._grid, self._cell_m, self._gap, self._least_cells = grid, cell_m, gap, least_cells
         self._m_per_px, self._settings, self._pictures = m_per_px, settings, pictures
@@ -239,7 +283,9 @@ class Seeds:
         there = (each.sights for each in self._seeds if 0 not in each.cells.overlap(window).shape)
         return max(there, key=lambda each: len(each.pictures), default=None)
 
-    def keep(self, view: ComparedView, kept_view: KeptView, evidence: CellEvidence, most_pictures: int) -> None:
+    def keep(
+        self, view: ComparedView, kept_view: KeptView, evidence: CellEvidence, most_pictures: int
+    ) -> None:
         """Ask the view about the seeds, forget those that no view flags any more or that a candidate owns by now, and
         keep what the view flags besides, the surest first, with at most `most_pictures`."""
         laid = kept_view.laid
@@ -278,7 +324,10 @@ class Seeds:
     def _new(self, laid: LaidView, weak: Mask) -> list[CellWindow]:
         """The windows of large enough `weak` pieces, the surest first."""
         found = [
-            (float(laid.score[part][piece & weak[part]].max(initial=0)) / 255, laid.window.part(part))
+            (
+                float(laid.score[part][piece & weak[part]].max(initial=0)) / 255,
+                laid.window.part(part),
+            )
             for piece, part in pieces(weak, self._gap)
             if np.count_nonzero(piece & weak[part]) >= self._least_cells
         ]

@@ -26,7 +26,9 @@ class PictureSettings:
     good: float = 0.75  # quality, 0 to 1, beyond which no better pictures are searched for
     most_px: int = 512  # longest side of a picture
     enough_votes: int = 40  # masks; more hardly move the outline
-    least_majority: float = 0.3  # of the area of its cells: if masks agree on less, the cells are the outline
+    least_majority: float = (
+        0.3  # of the area of its cells: if masks agree on less, the cells are the outline
+    )
     a_view: int = 6  # cut anew at most, which bounds the time a view takes ...
     most_a_view: int = 30  # ... and as many where views are seldom: there is more time
     views_s: float = 5.0  # views a second up to which there is time for more than `a_view`
@@ -84,10 +86,19 @@ class Pictures:
         self._votes += 1
         patch_from_image = np.linalg.inv(self._window.site_from_patch) @ site_from_image
         size = self._window.size_px
-        self._yes += cv2.warpPerspective(changed, patch_from_image, size, flags=cv2.INTER_LINEAR) >= 128
-        self._asked += cv2.warpPerspective(valid.view(np.uint8), patch_from_image, size, flags=cv2.INTER_NEAREST) > 0
+        self._yes += (
+            cv2.warpPerspective(changed, patch_from_image, size, flags=cv2.INTER_LINEAR) >= 128
+        )
+        self._asked += (
+            cv2.warpPerspective(
+                valid.view(np.uint8), patch_from_image, size, flags=cv2.INTER_NEAREST
+            )
+            > 0
+        )
 
-    def outline_m(self, window: CellWindow, cells: Mask, cell_m: float, join_m: float) -> PointsM | None:
+    def outline_m(
+        self, window: CellWindow, cells: Mask, cell_m: float, join_m: float
+    ) -> PointsM | None:
         """(N, 2) the outline: what most masks call changed, on or beside the candidate's `cells` in a window; that of
         the cells alone if masks agree on too little."""
         majority = self._majority(window, cells, cell_m)
@@ -104,7 +115,13 @@ class Pictures:
         return patch_of(self._window, self._best, outline_m)
 
     def parted(
-        self, whole: Change, window: CellWindow, cells: Mask, cell_m: float, join_m: float, settings: ThingSettings
+        self,
+        whole: Change,
+        window: CellWindow,
+        cells: Mask,
+        cell_m: float,
+        join_m: float,
+        settings: ThingSettings,
     ) -> list[Change]:
         """The records of the things that `whole` holds, the largest first, all under its id; `whole` if it is one."""
         majority = self._majority(window, cells, cell_m)
@@ -122,10 +139,16 @@ class Pictures:
             around = PatchWindow.around(low_m, high_m, own.m_per_px, self._settings.most_px)
             near = best.moved(around, own)
             size = measures(outline_m)
-            parts.append(replace(
-                whole, kind=kind, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m,
-                patch=patch_of(around, near, outline_m),
-            ))
+            parts.append(
+                replace(
+                    whole,
+                    kind=kind,
+                    outline_m=outline_m,
+                    area_m2=size.area_m2,
+                    length_m=size.length_m,
+                    patch=patch_of(around, near, outline_m),
+                )
+            )
         return parts
 
     def _grow(self, low_m: Floats, high_m: Floats, m_per_px: float) -> PatchWindow:
@@ -147,12 +170,16 @@ class Pictures:
         window = self._window
         if window is None or not self._votes:
             return None
-        padded = cv2.copyMakeBorder(cells.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+        padded = cv2.copyMakeBorder(
+            cells.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0
+        )
         grown = cv2.dilate(padded, np.ones((3, 3), np.uint8))
         cells_from_padded = np.array([[1, 0, -1], [0, 1, -1], [0, 0, 1.0]])
         site_from_padded = cell_window.site_from_cell(cell_m) @ cells_from_padded
         patch_from_cells = np.linalg.inv(window.site_from_patch) @ site_from_padded
-        near = cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
+        near = (
+            cv2.warpAffine(grown, patch_from_cells[:2], window.size_px, flags=cv2.INTER_NEAREST) > 0
+        )
         majority = np.asarray((2 * self._yes.astype(np.int16) > self._asked) & near)
         least_m2 = self._settings.least_majority * np.count_nonzero(cells) * cell_m**2
         return majority if np.count_nonzero(majority) * window.m_per_px**2 >= least_m2 else None
@@ -161,7 +188,9 @@ class Pictures:
 def quality(view: ComparedView, low_m: Floats, high_m: Floats) -> float:
     """How well a view shows a box of ground: the more central and the less oblique the better, half if cut off."""
     height, width = view.changed.shape
-    corners = np.array([[low_m[0], low_m[1]], [high_m[0], low_m[1]], [high_m[0], high_m[1]], [low_m[0], high_m[1]]])
+    corners = np.array(
+        [[low_m[0], low_m[1]], [high_m[0], low_m[1]], [high_m[0], high_m[1]], [low_m[0], high_m[1]]]
+    )
     pixels = apply_homography(np.linalg.inv(view.site_from_image), corners)
     if not np.isfinite(pixels).all():
         return 1e-3

@@ -24,7 +24,9 @@ class CellSettings:
 
     side_px: int = 3  # pixels of changes' pictures, along a cell's side
     least_m: float = 0.05  # along a cell's side
-    far_heights: float = 5.0  # flying heights: ground further away shows nothing that a cell could hold
+    far_heights: float = (
+        5.0  # flying heights: ground further away shows nothing that a cell could hold
+    )
     most: int = 2_000_000  # cells of one view, which bounds its memory
 
     def side_m(self, m_per_px: float) -> float:
@@ -49,13 +51,19 @@ class CellWindow:
     def joined(self, other: "CellWindow") -> "CellWindow":
         """The smallest window that holds both."""
         return CellWindow(
-            min(self.x0, other.x0), min(self.y0, other.y0), max(self.x1, other.x1), max(self.y1, other.y1)
+            min(self.x0, other.x0),
+            min(self.y0, other.y0),
+            max(self.x1, other.x1),
+            max(self.y1, other.y1),
         )
 
     def overlap(self, other: "CellWindow") -> "CellWindow":
         """The cells that lie in both; its shape has a 0 where there are none."""
         return CellWindow(
-            max(self.x0, other.x0), max(self.y0, other.y0), min(self.x1, other.x1), min(self.y1, other.y1)
+            max(self.x0, other.x0),
+            max(self.y0, other.y0),
+            min(self.x1, other.x1),
+            min(self.y1, other.y1),
         )
 
     def grown(self, cells: int) -> "CellWindow":
@@ -66,7 +74,10 @@ class CellWindow:
         """The window of a part, rows and columns, of this window's raster."""
         rows, columns = part
         return CellWindow(
-            self.x0 + columns.start, self.y0 + rows.start, self.x0 + columns.stop, self.y0 + rows.stop
+            self.x0 + columns.start,
+            self.y0 + rows.start,
+            self.x0 + columns.stop,
+            self.y0 + rows.stop,
         )
 
     def within(self, outer: "CellWindow") -> tuple[slice, slice]:
@@ -82,17 +93,23 @@ class CellWindow:
 
     def site_from_cell(self, cell_m: float) -> Matrix3:
         """(3, 3) affine map from a raster of this window, (0, 0) the centre of its first cell, to site metres."""
-        return np.array([
-            [cell_m, 0.0, (self.x0 + 0.5) * cell_m], [0.0, -cell_m, -(self.y0 + 0.5) * cell_m], [0.0, 0.0, 1.0]
-        ])
+        return np.array(
+            [
+                [cell_m, 0.0, (self.x0 + 0.5) * cell_m],
+                [0.0, -cell_m, -(self.y0 + 0.5) * cell_m],
+                [0.0, 0.0, 1.0],
+            ]
+        )
 
 
 def window_around(points_m: PointsM, cell_m: float) -> CellWindow:
     """The cells of the box around points, shape (N, 2), in site metres."""
     columns, rows = points_m[:, 0] / cell_m, -points_m[:, 1] / cell_m
     return CellWindow(
-        int(np.floor(columns.min())), int(np.floor(rows.min())),
-        int(np.ceil(columns.max())), int(np.ceil(rows.max())),
+        int(np.floor(columns.min())),
+        int(np.floor(rows.min())),
+        int(np.ceil(columns.max())),
+        int(np.ceil(rows.max())),
     )
 
 
@@ -135,11 +152,15 @@ class LaidView:
 
     @cached_property
     def _labels(self) -> NDArray[np.int32]:
-        return np.asarray(cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)[1], np.int32)
+        return np.asarray(
+            cv2.connectedComponents(self.flagged.view(np.uint8), connectivity=8)[1], np.int32
+        )
 
     @cached_property
     def _beside_unseen(self) -> Mask:
-        unseen = cv2.copyMakeBorder((~self.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+        unseen = cv2.copyMakeBorder(
+            (~self.seen).view(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1
+        )
         return np.asarray(cv2.dilate(unseen, np.ones((3, 3), np.uint8))[1:-1, 1:-1] > 0)
 
     def _pieces_that(self, reach: Mask) -> Mask:
@@ -164,8 +185,12 @@ class LaidView:
         if not flagged.any():
             return CellReport(seen, 0.0, 0.0, np.zeros(2))
         rows, columns = np.nonzero(flagged)
-        middle = np.array([columns.mean() + inner.x0 + 0.5, -(rows.mean() + inner.y0 + 0.5)]) * cell_m
-        return CellReport(seen, len(rows) / total, float(self.score[there][flagged].max()) / 255, middle)
+        middle = (
+            np.array([columns.mean() + inner.x0 + 0.5, -(rows.mean() + inner.y0 + 0.5)]) * cell_m
+        )
+        return CellReport(
+            seen, len(rows) / total, float(self.score[there][flagged].max()) / 255, middle
+        )
 
     def part_of(self, marked: Mask, window: CellWindow, cells: Mask) -> Mask:
         """Which of some `cells` of a window the view has `marked`, as far as it reaches."""
@@ -173,7 +198,11 @@ class LaidView:
 
 
 def lay(
-    view: ComparedView, cell_m: float, ignored: Mask, held: Mask, legs: Labels,
+    view: ComparedView,
+    cell_m: float,
+    ignored: Mask,
+    held: Mask,
+    legs: Labels,
     settings: CellSettings = CellSettings(),
 ) -> LaidView:
     """The view as cells of the ground.
@@ -208,10 +237,12 @@ def lay(
         if held[index]:
             in_held[part] = 255
     window = _window_of(view, cell_m, settings)
-    image_from_small = np.array([
-        [shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]
-    ])
-    cell_from_small = np.linalg.inv(window.site_from_cell(cell_m)) @ view.site_from_image @ image_from_small
+    image_from_small = np.array(
+        [[shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]]
+    )
+    cell_from_small = (
+        np.linalg.inv(window.site_from_cell(cell_m)) @ view.site_from_image @ image_from_small
+    )
     size = window.shape[::-1]
 
     def laid(image: ImageGray, how: int) -> ImageGray:
@@ -221,17 +252,26 @@ def lay(
     _clear_behind(seen, cell_from_small)
     flagged = (laid(changed, cv2.INTER_LINEAR) >= 128) & seen
     may_move = laid(in_held, cv2.INTER_NEAREST) > 0 if held.any() else np.zeros_like(seen)
-    in_shade = (view.shade[::shrink, ::shrink][:rows, :columns] & (Shade.LATER | Shade.EARLIER) > 0).view(np.uint8)
+    in_shade = (
+        view.shade[::shrink, ::shrink][:rows, :columns] & (Shade.LATER | Shade.EARLIER) > 0
+    ).view(np.uint8)
     return LaidView(
-        window, flagged, seen, np.where(flagged, laid(score, cv2.INTER_NEAREST), 0), may_move,
-        laid(in_shade, cv2.INTER_NEAREST) > 0, numbers[laid(followed, cv2.INTER_NEAREST)].astype(np.int32),
+        window,
+        flagged,
+        seen,
+        np.where(flagged, laid(score, cv2.INTER_NEAREST), 0),
+        may_move,
+        laid(in_shade, cv2.INTER_NEAREST) > 0,
+        numbers[laid(followed, cv2.INTER_NEAREST)].astype(np.int32),
     )
 
 
 def pieces(cells: Mask, gap: int) -> Iterator[tuple[Mask, tuple[slice, slice]]]:
     """The connected pieces of cells, gaps of up to `gap` cells closed: each with the raster's part that holds it."""
     side = 2 * ((gap + 1) // 2) + 1  # odd: an even one would shift the cells
-    closed = cv2.morphologyEx(cells.view(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8))
+    closed = cv2.morphologyEx(
+        cells.view(np.uint8), cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)
+    )
     count, labels, stats, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     for label in range(1, count):
         x, y, w, h = (int(each) for each in stats[label, :4])
@@ -250,7 +290,9 @@ def _window_of(view: ComparedView, cell_m: float, settings: CellSettings) -> Cel
     if not near.any():
         return CellWindow(0, 0, 1, 1)
     if not near.all():
-        ground_m = np.vstack([ground_m[near], low, high])  # part of the view lies beyond the horizon
+        ground_m = np.vstack(
+            [ground_m[near], low, high]
+        )  # part of the view lies beyond the horizon
     return window_around(np.clip(ground_m, low, high), cell_m)
 
 
@@ -294,7 +336,9 @@ class CellGrid:
         self._kept_bits = np.uint8((1 << n) - 1)
         self._most_chunks = most_chunks
         self._chunks: OrderedDict[tuple[int, int], _Chunk] = OrderedDict()
-        self._quiet: dict[tuple[int, int], int] = {}  # views of chunks in which nothing ever changed
+        self._quiet: dict[
+            tuple[int, int], int
+        ] = {}  # views of chunks in which nothing ever changed
 
     def record(self, laid: LaidView, counts: bool) -> CellEvidence:
         """Shift one view into the cells' histories; the counts over all views take it in if it `counts`."""
@@ -350,7 +394,10 @@ class CellGrid:
 def _no_evidence(window: CellWindow) -> CellEvidence:
     shape = window.shape
     return CellEvidence(
-        np.zeros(shape, np.uint8), np.zeros(shape, np.uint16), np.zeros(shape, np.uint16), np.zeros(shape, np.int32)
+        np.zeros(shape, np.uint8),
+        np.zeros(shape, np.uint16),
+        np.zeros(shape, np.uint16),
+        np.zeros(shape, np.int32),
     )
 
 
@@ -360,7 +407,10 @@ def _pieces(
     """Chunk, its part inside the window, and where that part lies in a raster of the window."""
     for row in range(window.y0 // _CHUNK, -(-window.y1 // _CHUNK)):
         y0, y1 = max(window.y0, row * _CHUNK), min(window.y1, (row + 1) * _CHUNK)
-        rows, rows_here = slice(y0 - row * _CHUNK, y1 - row * _CHUNK), slice(y0 - window.y0, y1 - window.y0)
+        rows, rows_here = (
+            slice(y0 - row * _CHUNK, y1 - row * _CHUNK),
+            slice(y0 - window.y0, y1 - window.y0),
+        )
         for column in range(window.x0 // _CHUNK, -(-window.x1 // _CHUNK)):
             x0, x1 = max(window.x0, column * _CHUNK), min(window.x1, (column + 1) * _CHUNK)
             inside = (rows, slice(x0 - column * _CHUNK, x1 - column * _CHUNK))

@@ -51,7 +51,9 @@ from sorvolo.survey.findings import Change, ComparedView
 class PassingSettings:
     """Which cells are no part of a change: what leaned over its place for a few views (0015)."""
 
-    share: float = 0.5  # flagged in a share of views so many times as large as the surest cells' ...
+    share: float = (
+        0.5  # flagged in a share of views so many times as large as the surest cells' ...
+    )
     views: int = 8  # ... of at least this many views
     surest_percent: float = 97  # percentile of its cells' shares that is that of the surest
 
@@ -62,15 +64,21 @@ class RestlessSettings:
 
     around_m: float = 5.0  # a crown's width
     apart_m: float = 0.5  # nearer lies the change's own rim
-    changed_itself: float = 0.5  # of its views: ground that more of them flag is changed itself, not restless
+    changed_itself: float = (
+        0.5  # of its views: ground that more of them flag is changed itself, not restless
+    )
 
 
 @dataclass(frozen=True)
 class GatherSettings:
     """How views become cells, and cells candidates."""
 
-    moved_heights: float = 0.01  # flying heights that the camera moves until a view counts anew (before 0014)
-    all_changed: float = 0.5  # share of a frame beyond which nothing in it can be followed (before 0014)
+    moved_heights: float = (
+        0.01  # flying heights that the camera moves until a view counts anew (before 0014)
+    )
+    all_changed: float = (
+        0.5  # share of a frame beyond which nothing in it can be followed (before 0014)
+    )
     stands_s: float = 2.0  # what the same ground shows for so long stands there, however unsteady its blobs are (0017)
     cells: CellSettings = field(default_factory=CellSettings)
     candidates: CandidateSettings = field(default_factory=CandidateSettings)
@@ -89,7 +97,9 @@ class EvidenceSettings:
     least_views_apart_s: float = 0.1  # frames nearer in time see the same thing and are no news
     least_area_m2: float = 0.02  # 14 cm a side: smaller things are not looked for; by choice
     join_m: float = 0.3  # a smaller gap does not make two things of one
-    single_view_score: float = 0.9  # what one view shows, and no other could, must be so sure, and confirmed: 0048
+    single_view_score: float = (
+        0.9  # what one view shows, and no other could, must be so sure, and confirmed: 0048
+    )
     gathering: GatherSettings = field(default_factory=GatherSettings)
     moving: MovingSettings = field(default_factory=MovingSettings)
     announcing: AnnounceSettings = field(default_factory=AnnounceSettings)
@@ -97,9 +107,13 @@ class EvidenceSettings:
 
     def __post_init__(self) -> None:
         if not 1 <= self.k <= self.n <= 8:
-            raise SettingsError(f"evidence needs 1 <= k <= n <= 8 views, got k = {self.k}, n = {self.n}")
+            raise SettingsError(
+                f"evidence needs 1 <= k <= n <= 8 views, got k = {self.k}, n = {self.n}"
+            )
         if not 1 <= self.least_views <= self.k:
-            raise SettingsError(f"least_views must lie in 1 to k = {self.k}, got {self.least_views}")
+            raise SettingsError(
+                f"least_views must lie in 1 to k = {self.k}, got {self.least_views}"
+            )
         if min(self.least_views_apart_s, self.least_area_m2, self.join_m) < 0:
             raise SettingsError("times, areas and gaps of the evidence must not be negative")
 
@@ -113,13 +127,19 @@ class EvidenceMap:
     """
 
     def __init__(
-        self, m_per_px: float, settings: EvidenceSettings, id_prefix: str, earlier: EarlierPictures | None = None,
+        self,
+        m_per_px: float,
+        settings: EvidenceSettings,
+        id_prefix: str,
+        earlier: EarlierPictures | None = None,
         sun_at: SunAt = lambda _: None,
     ) -> None:
         self._settings, self._prefix = settings, id_prefix
         self._rules, self._gathering = settings.announcing, settings.gathering
         self._m_per_px = m_per_px
-        self._relief = None if earlier is None or earlier.knows_relief else ReliefDoubt(earlier, m_per_px)
+        self._relief = (
+            None if earlier is None or earlier.knows_relief else ReliefDoubt(earlier, m_per_px)
+        )
         self._shadows = None if earlier is None else ShadowDoubt(earlier, sun_at)
         self._cell_m = self._gathering.cells.side_m(m_per_px)
         self._join_m = max(settings.join_m, 3 * self._cell_m) if settings.join_m else 0.0
@@ -129,18 +149,29 @@ class EvidenceMap:
         self._found: dict[int, Candidate] = {}  # by number, in order
         self._merged: dict[int, int] = {}
         self._announced_ns: dict[int, int] = {}  # by the number of the candidate
-        self._parts: dict[int, Parts] = {}  # the things that an announced change holds, by its number
+        self._parts: dict[
+            int, Parts
+        ] = {}  # the things that an announced change holds, by its number
         self._stopped: dict[int, Verdict] = {}  # at the flight's end, by number
-        self._seen_once: set[int] = set()  # the numbers of those with ground that one view alone shows
+        self._seen_once: set[int] = (
+            set()
+        )  # the numbers of those with ground that one view alone shows
         self._movers = Movers(id_prefix, m_per_px, self._cell_m)
         self._least_cells = max(2, settings.least_area_m2 / self._cell_m**2)
         self._seeds = Seeds(
-            self._grid, self._cell_m, self._gap, self._least_cells, m_per_px, self._gathering.candidates,
+            self._grid,
+            self._cell_m,
+            self._gap,
+            self._least_cells,
+            m_per_px,
+            self._gathering.candidates,
             self._gathering.pictures,
         )
         self._recent: deque[KeptView] = deque(maxlen=settings.n)
         self._number = 0
-        self._last: tuple[int, int, Floats] | None = None  # index, time, camera of the last view that counted
+        self._last: tuple[int, int, Floats] | None = (
+            None  # index, time, camera of the last view that counted
+        )
         self._counted_at_m: Floats | None = None
 
     def add(self, view: ComparedView) -> tuple[Change, ...]:
@@ -155,7 +186,9 @@ class EvidenceMap:
         self._recent.append(kept_view)
         begun = self._gather(view, kept_view, earlier, evidence)
         new = {each for each in begun if self._current(each) == each}
-        shown, pictures = self._update(view, kept_view, evidence.owner, new, most_pictures - len(begun))
+        shown, pictures = self._update(
+            view, kept_view, evidence.owner, new, most_pictures - len(begun)
+        )
         announced = [change for each in shown for change in self._announce(each, view.time_ns)]
         announced += self._movers.see(view, moving, self._named)
         self._seeds.keep(view, kept_view, evidence, most_pictures - len(begun) - pictures)
@@ -176,7 +209,9 @@ class EvidenceMap:
         no other could, is announced if that view was very sure and evidence of another kind `confirms` its outline,
         (N, 2).
         """
-        for seed in sorted(self._seeds, key=self._score, reverse=True):  # one piece of ground may have several
+        for seed in sorted(
+            self._seeds, key=self._score, reverse=True
+        ):  # one piece of ground may have several
             self._grow_late(seed, confirms)
         for number, candidate in self._found.items():
             if number not in self._announced_ns:
@@ -198,16 +233,22 @@ class EvidenceMap:
         """What became of the candidates, for a report after `conclude`: how many changes are `announced`, those that
         stay in place and those that move; by reason how many candidates were `withdrawn`, or `never_announced`."""
         reasons = {
-            number: verdict.reason.value for number, verdict in self._stopped.items()
+            number: verdict.reason.value
+            for number, verdict in self._stopped.items()
             if not isinstance(verdict, Announce)
         }
-        withdrawn = Counter(each for number, each in reasons.items() if number in self._announced_ns)
-        never = Counter(each for number, each in reasons.items() if number not in self._announced_ns)
+        withdrawn = Counter(
+            each for number, each in reasons.items() if number in self._announced_ns
+        )
+        never = Counter(
+            each for number, each in reasons.items() if number not in self._announced_ns
+        )
         never[Reason.TOO_FEW_VIEWS.value] += sum(each.number == 0 for each in self._seeds)
         moving = len(self._movers.changes)
         announced = {"still": len(self.changes()) - moving, "moving": moving}
         return {
-            "announced": announced, "withdrawn": dict(withdrawn.most_common()),
+            "announced": announced,
+            "withdrawn": dict(withdrawn.most_common()),
             "never_announced": {name: count for name, count in never.most_common() if count},
         }
 
@@ -232,16 +273,22 @@ class EvidenceMap:
         """The view as cells, without what moves, and what moves in it."""
         most = self._gathering.all_changed * int(np.count_nonzero(view.valid))
         may_follow = np.count_nonzero(view.changed) < most
-        followed = self._tracker.follow(view if may_follow else replace(
-            view, boxes=view.boxes[:0], scores=view.scores[:0]
-        ))
+        followed = self._tracker.follow(
+            view if may_follow else replace(view, boxes=view.boxes[:0], scores=view.scores[:0])
+        )
         nothing = np.zeros(len(view.boxes), bool)
         moving, held = (followed.is_moving, followed.may_move) if may_follow else (nothing, nothing)
         legs = followed.legs if may_follow else np.zeros(len(view.boxes), np.int64)
         laid = lay(view, self._cell_m, moving, held, legs, self._gathering.cells)
         residual_m = view.residual_px * view.m_per_px if np.isfinite(view.residual_px) else 0.0
         kept_view = KeptView(
-            view.time_ns, laid, view.camera_m, view.site_from_image, view.changed, view.valid, residual_m,
+            view.time_ns,
+            laid,
+            view.camera_m,
+            view.site_from_image,
+            view.changed,
+            view.valid,
+            residual_m,
             self._is_new_place(view),
         )
         return kept_view, followed
@@ -256,7 +303,11 @@ class EvidenceMap:
     # ---- from cells to candidates -----------------------------------------------------------------------------
 
     def _gather(
-        self, view: ComparedView, kept_view: KeptView, earlier: Sequence[KeptView], evidence: CellEvidence
+        self,
+        view: ComparedView,
+        kept_view: KeptView,
+        earlier: Sequence[KeptView],
+        evidence: CellEvidence,
     ) -> list[int]:
         """Give the cells that are certain to the candidates that they belong to, in `evidence` as well; the numbers of
         the candidates that begin with this view."""
@@ -268,10 +319,14 @@ class EvidenceMap:
         for piece, part in pieces(sure | (evidence.owner > 0), self._gap):
             cells = sure[part] & piece
             owner = evidence.owner[part]
-            owners = sorted({self._current(int(each)) for each in np.unique(owner[piece & (owner > 0)])})
+            owners = sorted(
+                {self._current(int(each)) for each in np.unique(owner[piece & (owner > 0)])}
+            )
             fresh = cells & (owner == 0)
             owned = piece & (owner > 0)
-            if not fresh.any() or (owners and _is_passing(evidence, part, owned, fresh, self._gathering.passing)):
+            if not fresh.any() or (
+                owners and _is_passing(evidence, part, owned, fresh, self._gathering.passing)
+            ):
                 continue
             window = laid.window.part(part)
             if owners:
@@ -289,30 +344,50 @@ class EvidenceMap:
         return begun
 
     def _may_begin(
-        self, kept_view: KeptView, earlier: Sequence[KeptView], evidence: CellEvidence, part: tuple[slice, slice],
+        self,
+        kept_view: KeptView,
+        earlier: Sequence[KeptView],
+        evidence: CellEvidence,
+        part: tuple[slice, slice],
         cells: Mask,
     ) -> bool:
         """Whether certain cells that nobody owns are a new candidate: large enough, standing, and all of it in view."""
         laid = kept_view.laid
         if np.count_nonzero(cells) < self._least_cells:
             return False
-        if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(kept_view, earlier, part, cells):
+        if np.mean(laid.held[part][cells]) > 0.5 and not self._stands(
+            kept_view, earlier, part, cells
+        ):
             return False
         # of what ends at a rim more will come into view soon
         is_at_rim = (cells & laid.at_rim[part]).any()
         return not is_at_rim or int(evidence.votes[part][cells].max()) >= self._settings.n
 
     def _stands(
-        self, kept_view: KeptView, earlier: Sequence[KeptView], part: tuple[slice, slice], cells: Mask
+        self,
+        kept_view: KeptView,
+        earlier: Sequence[KeptView],
+        part: tuple[slice, slice],
+        cells: Mask,
     ) -> bool:
         """Whether views over a long enough time show these very cells."""
         window = kept_view.laid.window.part(part)
-        long_ago = (each for each in earlier if (kept_view.time_ns - each.time_ns) * 1e-9 >= self._gathering.stands_s)
+        long_ago = (
+            each
+            for each in earlier
+            if (kept_view.time_ns - each.time_ns) * 1e-9 >= self._gathering.stands_s
+        )
         return any(each.laid.report(window, cells, self._cell_m).flagged > 0.5 for each in long_ago)
 
-    def _begin(self, view: ComparedView, earlier: Sequence[KeptView], window: CellWindow, cells: Mask) -> int:
+    def _begin(
+        self, view: ComparedView, earlier: Sequence[KeptView], window: CellWindow, cells: Mask
+    ) -> int:
         candidate = Candidate(
-            self._next_number(), window, view.time_ns, self._gathering.candidates, self._gathering.pictures
+            self._next_number(),
+            window,
+            view.time_ns,
+            self._gathering.candidates,
+            self._gathering.pictures,
         )
         self._found[candidate.number] = candidate
         candidate.sights = self._seeds.sights_at(window) or candidate.sights
@@ -338,7 +413,9 @@ class EvidenceMap:
             self._announced_ns.setdefault(number, announced_ns)
         self._merged[gone] = number
         del self._found[gone]
-        surer, other = (younger, older) if self._score(younger) > self._score(older) else (older, younger)
+        surer, other = (
+            (younger, older) if self._score(younger) > self._score(older) else (older, younger)
+        )
         self._found[number] = surer.joined(other, number)
 
     def _current(self, number: int) -> int:
@@ -352,14 +429,23 @@ class EvidenceMap:
         x, y = int(columns.mean()) + here.x0, int(rows.mean()) + here.y0
         for number, candidate in self._found.items():
             box = candidate.cells
-            if box.x0 <= x < box.x1 and box.y0 <= y < box.y1 and not self._cells_of(candidate).any():
+            if (
+                box.x0 <= x < box.x1
+                and box.y0 <= y < box.y1
+                and not self._cells_of(candidate).any()
+            ):
                 return number
         return 0
 
     # ---- candidates brought up to date ------------------------------------------------------------------------
 
     def _update(
-        self, view: ComparedView, kept_view: KeptView, owner: NDArray[np.int32], new: set[int], most_pictures: int
+        self,
+        view: ComparedView,
+        kept_view: KeptView,
+        owner: NDArray[np.int32],
+        new: set[int],
+        most_pictures: int,
     ) -> tuple[list[Candidate], int]:
         """Bring the candidates in view up to date; those that it shows, in the order of their numbers, and how many
         pictures were cut."""
@@ -381,11 +467,18 @@ class EvidenceMap:
             self._found[number].pictures.vote(view.site_from_image, view.changed, view.valid)
         return shown, pictures
 
-    def _cut_pictures(self, view: ComparedView, shown: Sequence[Candidate], most_pictures: int) -> int:
+    def _cut_pictures(
+        self, view: ComparedView, shown: Sequence[Candidate], most_pictures: int
+    ) -> int:
         """Take the view's pictures of those candidates that gain most by it; how many."""
-        gains = [(each.pictures.gain(*each.cells.box_m(self._cell_m), view), -each.number) for each in shown]
+        gains = [
+            (each.pictures.gain(*each.cells.box_m(self._cell_m), view), -each.number)
+            for each in shown
+        ]
         better = self._gathering.pictures.better
-        wanted = [-number for gain, number in sorted(gains, reverse=True) if gain > better][: max(most_pictures, 0)]
+        wanted = [-number for gain, number in sorted(gains, reverse=True) if gain > better][
+            : max(most_pictures, 0)
+        ]
         for number in wanted:
             candidate = self._found[number]
             candidate.pictures.show(view, *candidate.cells.box_m(self._cell_m), self._m_per_px)
@@ -402,7 +495,12 @@ class EvidenceMap:
         return passing if lost and held - lost >= self._least_cells else None
 
     def _give_up(
-        self, candidate: Candidate, passing: Mask, evidence: CellEvidence, own: Mask, kept_view: KeptView
+        self,
+        candidate: Candidate,
+        passing: Mask,
+        evidence: CellEvidence,
+        own: Mask,
+        kept_view: KeptView,
     ) -> None:
         """Take cells from a candidate whose `own` ones stay. The views that are counted then are those that its own
         cells had, if it lost most."""
@@ -410,7 +508,9 @@ class EvidenceMap:
         if np.count_nonzero(passing) <= np.count_nonzero(own):
             return
         now = int(kept_view.counts)  # this view is counted apart
-        changed, seen = (int(np.median(each[own])) - now for each in (evidence.changed, evidence.seen))
+        changed, seen = (
+            int(np.median(each[own])) - now for each in (evidence.changed, evidence.seen)
+        )
         candidate.recount(changed, seen)
         if candidate.number in self._parts:
             self._parts[candidate.number].join(())  # with fewer views: search for its things again
@@ -443,20 +543,30 @@ class EvidenceMap:
         whole = self._record(candidate) if isinstance(verdict, Announce) else None
         if whole is None:
             return verdict, None
-        return judge(replace(tally, look=self._look(candidate, whole)), rules, is_over=is_over), whole
+        return judge(
+            replace(tally, look=self._look(candidate, whole)), rules, is_over=is_over
+        ), whole
 
     def _look(self, candidate: Candidate, whole: Change) -> Look:
         may_be_relief = self._relief is not None and self._relief.explains(
             candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
         )
-        is_shadow = not may_be_relief and self._shadows is not None and self._shadows.explains(
-            candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
+        is_shadow = (
+            not may_be_relief
+            and self._shadows is not None
+            and self._shadows.explains(
+                candidate.number, whole.outline_m, candidate.cameras_m, candidate.sights
+            )
         )
         return Look(whole.area_m2, whole.length_m, may_be_relief, is_shadow)
 
     def _restlessness(self, candidate: Candidate) -> float:
         return restlessness(
-            self._grid, candidate.cells, self._cells_of(candidate), self._cell_m, self._gathering.restless
+            self._grid,
+            candidate.cells,
+            self._cells_of(candidate),
+            self._cell_m,
+            self._gathering.restless,
         )
 
     def _part(self, candidate: Candidate, now_ns: int, whole: Change | None) -> list[Change]:
@@ -464,10 +574,17 @@ class EvidenceMap:
         if whole is None:
             return []
         things = candidate.pictures.parted(
-            whole, candidate.cells, self._cells_of(candidate), self._cell_m, self._join_m, self._settings.things
+            whole,
+            candidate.cells,
+            self._cells_of(candidate),
+            self._cell_m,
+            self._join_m,
+            self._settings.things,
         )
         parts = self._parts.setdefault(candidate.number, Parts())
-        return parts.take(things, candidate.tally.views, now_ns, lambda: f"{self._prefix}-{self._next_number()}")
+        return parts.take(
+            things, candidate.tally.views, now_ns, lambda: f"{self._prefix}-{self._next_number()}"
+        )
 
     def _records(self, candidate: Candidate) -> list[Change]:
         """An announced change as it is known now: its things, where it holds several."""
@@ -476,12 +593,18 @@ class EvidenceMap:
         if not things:
             whole = self._record(candidate)
             things = [] if whole is None else [whole]
-        return [self._as_seen(candidate, each) for each in things] if candidate.number in self._seen_once else things
+        return (
+            [self._as_seen(candidate, each) for each in things]
+            if candidate.number in self._seen_once
+            else things
+        )
 
     def _as_seen(self, candidate: Candidate, thing: Change) -> Change:
         """A thing of a candidate that several views show, with one view and the score of one, where no other saw it."""
         evidence = self._grid.read(candidate.cells)
-        own = mask_of(thing.outline_m, candidate.cells.site_from_cell(self._cell_m), candidate.cells.shape)
+        own = mask_of(
+            thing.outline_m, candidate.cells.site_from_cell(self._cell_m), candidate.cells.shape
+        )
         own &= evidence.owner == candidate.number
         if own.any() and np.median(evidence.seen[own]) > 1:
             return thing
@@ -493,7 +616,9 @@ class EvidenceMap:
         if outline_m is None:
             return None
         announced_ns = self._announced_ns.get(candidate.number, -1)
-        return candidate.record(self._prefix, outline_m, self._cell_m, self._score(candidate), announced_ns)
+        return candidate.record(
+            self._prefix, outline_m, self._cell_m, self._score(candidate), announced_ns
+        )
 
     def _score(self, candidate: Candidate) -> float:
         return sureness(self._tally_of(candidate), self._rules)
@@ -531,7 +656,9 @@ class EvidenceMap:
         if seed.number:
             return
         cells, single = self._late_cells(seed, evidence), self._single_cells(seed, evidence)
-        is_seen_once = np.count_nonzero(single) >= self._least_cells and self._is_confirmed(seed, single, confirms)
+        is_seen_once = np.count_nonzero(single) >= self._least_cells and self._is_confirmed(
+            seed, single, confirms
+        )
         if is_seen_once:
             cells |= single
         for piece, part in pieces(cells, self._gap):
@@ -551,18 +678,28 @@ class EvidenceMap:
     def _late_cells(self, seed: Candidate, evidence: CellEvidence) -> Mask:
         """The cells of a seed that enough of the few views show."""
         settings, seen = self._settings, evidence.seen.astype(float)
-        needed = np.maximum(settings.least_views, np.ceil(settings.k * np.minimum(seen, settings.n) / settings.n))
-        enough = ((evidence.changed >= needed) & (seen < settings.n)) | (evidence.votes >= settings.k)
+        needed = np.maximum(
+            settings.least_views, np.ceil(settings.k * np.minimum(seen, settings.n) / settings.n)
+        )
+        enough = ((evidence.changed >= needed) & (seen < settings.n)) | (
+            evidence.votes >= settings.k
+        )
         return np.asarray(enough & (evidence.owner == 0))
 
     def _single_cells(self, seed: Candidate, evidence: CellEvidence) -> Mask:
         """The cells of a seed that one view shows, where no other saw them; none unless it is very sure and shows all
         of it: at a rim walls lean in whole."""
         tally = seed.tally
-        is_sure = tally.score_sum >= self._settings.single_view_score * tally.views and tally.whole > 0
-        return np.asarray((evidence.owner == 0) & (evidence.changed == 1) & (evidence.seen == 1) & is_sure)
+        is_sure = (
+            tally.score_sum >= self._settings.single_view_score * tally.views and tally.whole > 0
+        )
+        return np.asarray(
+            (evidence.owner == 0) & (evidence.changed == 1) & (evidence.seen == 1) & is_sure
+        )
 
-    def _is_confirmed(self, seed: Candidate, cells: Mask, confirms: Callable[[PointsM], bool]) -> bool:
+    def _is_confirmed(
+        self, seed: Candidate, cells: Mask, confirms: Callable[[PointsM], bool]
+    ) -> bool:
         outline_m = seed.outline_m(cells, self._cell_m, self._join_m)
         return outline_m is not None and confirms(outline_m)
 
@@ -575,14 +712,24 @@ class EvidenceMap:
         whole = candidate.cells.joined(window)
         evidence, there = self._grid.read(whole), np.zeros(whole.shape, bool)
         there[window.within(whole)] = cells
-        if not _is_passing(evidence, np.s_[:, :], evidence.owner == candidate.number, there, self._gathering.passing):
+        if not _is_passing(
+            evidence,
+            np.s_[:, :],
+            evidence.owner == candidate.number,
+            there,
+            self._gathering.passing,
+        ):
             self._grid.own(window, cells, candidate.number)
             candidate.extend(window)
         return True
 
 
 def restlessness(
-    grid: CellGrid, window: CellWindow, own: Mask, cell_m: float, settings: RestlessSettings = RestlessSettings(),
+    grid: CellGrid,
+    window: CellWindow,
+    own: Mask,
+    cell_m: float,
+    settings: RestlessSettings = RestlessSettings(),
 ) -> float:
     """The share of the views of the ground around a change that flag it although most others do not, 0 to 1.
 
@@ -592,9 +739,15 @@ def restlessness(
     """
     reach = int(np.ceil((settings.apart_m + settings.around_m) / cell_m))
     evidence = grid.read(window.grown(reach))
-    free = cv2.copyMakeBorder((~own).view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=1)
+    free = cv2.copyMakeBorder(
+        (~own).view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=1
+    )
     away_m = cv2.distanceTransform(free, cv2.DIST_L2, 5) * cell_m
-    around = (away_m > settings.apart_m) & (away_m <= settings.apart_m + settings.around_m) & (evidence.seen >= 2)
+    around = (
+        (away_m > settings.apart_m)
+        & (away_m <= settings.apart_m + settings.around_m)
+        & (evidence.seen >= 2)
+    )
     seen, changed = evidence.seen[around].astype(float), evidence.changed[around]
     if not seen.size:
         return 0.0
@@ -602,7 +755,11 @@ def restlessness(
 
 
 def _is_passing(
-    evidence: CellEvidence, part: tuple[slice, slice], own: Mask, fresh: Mask, settings: PassingSettings
+    evidence: CellEvidence,
+    part: tuple[slice, slice],
+    own: Mask,
+    fresh: Mask,
+    settings: PassingSettings,
 ) -> bool:
     """Whether `fresh` cells are flagged so much more seldom than those that candidates `own` that they are no part."""
     seen, changed = np.maximum(evidence.seen[part], 1), evidence.changed[part]

@@ -27,12 +27,21 @@ class LevelSettings:
     tallest_m: float = 6.0  # 0038: what stands so high (eaves of two storeys) may be anywhere
     most_pictures: int = 3  # of a place and a date, from places apart from each other by ...
     apart_heights: float = 0.15  # ... flying heights at least
-    reach_m: float = 6.0  # around a place that is kept: what a camera of the other date could see in its place
+    reach_m: float = (
+        6.0  # around a place that is kept: what a camera of the other date could see in its place
+    )
     most_px: int = 192  # longest side of a kept picture, which is made coarser for that ...
     coarsest: float = 4.0  # ... up to so many times; what is larger is not asked for
-    window_px: tuple[int, int] = (7, 15)  # least and largest side of what is compared; between them a thing's width
-    least_move: float = 1 / 3  # of a thing's width, from one date to the other: lower relief does not explain it
-    off_px: int = 4  # pictures of one date may lie off each other, where that is not taken for a height
+    window_px: tuple[int, int] = (
+        7,
+        15,
+    )  # least and largest side of what is compared; between them a thing's width
+    least_move: float = (
+        1 / 3
+    )  # of a thing's width, from one date to the other: lower relief does not explain it
+    off_px: int = (
+        4  # pictures of one date may lie off each other, where that is not taken for a height
+    )
     least_px: float = 1.5  # what moves by less cannot be distinguished from that
     detail: int = 5  # windows: what varies more slowly is light
     least_likeness: float = 0.5  # of what agrees ...
@@ -53,7 +62,9 @@ class LaidPicture:
     time_ns: int = 0
 
     @classmethod
-    def of(cls, rgb: ImageRGB, known: Mask, window: PatchWindow, camera_m: Vector3, time_ns: int = 0) -> "LaidPicture":
+    def of(
+        cls, rgb: ImageRGB, known: Mask, window: PatchWindow, camera_m: Vector3, time_ns: int = 0
+    ) -> "LaidPicture":
         """A picture (h, w, 3) of the window, and where (h, w) it shows anything."""
         gray = np.maximum(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), 1)
         return cls(window, np.where(known, gray, 0).astype(np.uint8), camera_m, time_ns)
@@ -91,12 +102,17 @@ class Sights:
             self._pictures = [kept[each] for each in chosen]
 
 
-def apart(cameras_m: PointsM, order: Sequence[int], settings: LevelSettings = LevelSettings()) -> list[int]:
+def apart(
+    cameras_m: PointsM, order: Sequence[int], settings: LevelSettings = LevelSettings()
+) -> list[int]:
     """Of cameras, (N, 3), in an order, the first few that lie apart from each other."""
     found: list[int] = []
     for each in order:
         ways_m = np.hypot(*(cameras_m[found, :2] - cameras_m[each, :2]).T)
-        if len(found) < settings.most_pictures and (ways_m >= settings.apart_heights * cameras_m[each, 2]).all():
+        if (
+            len(found) < settings.most_pictures
+            and (ways_m >= settings.apart_heights * cameras_m[each, 2]).all()
+        ):
             found.append(each)
     return found
 
@@ -107,7 +123,9 @@ def _laid(view: ComparedView, window: PatchWindow) -> LaidPicture:
     valid = cv2.warpPerspective(
         view.valid.view(np.uint8), patch_from_image, window.size_px, flags=cv2.INTER_NEAREST
     )
-    return LaidPicture.of(np.asarray(rgb, np.uint8), np.asarray(valid > 0), window, view.camera_m, view.time_ns)
+    return LaidPicture.of(
+        np.asarray(rgb, np.uint8), np.asarray(valid > 0), window, view.camera_m, view.time_ns
+    )
 
 
 def surroundings(
@@ -125,7 +143,10 @@ def surroundings(
 
 
 def is_level(
-    pictures: Sequence[LaidPicture], outline_m: PointsM, other_m: Vector3, settings: LevelSettings = LevelSettings()
+    pictures: Sequence[LaidPicture],
+    outline_m: PointsM,
+    other_m: Vector3,
+    settings: LevelSettings = LevelSettings(),
 ) -> bool:
     """Whether pictures of one date, all of one window, show that a camera of the other date at `other_m` sees the
     ground in an outline, (N, 2)."""
@@ -136,7 +157,11 @@ def is_level(
 
 
 def level_share(
-    first: LaidPicture, second: LaidPicture, outline_m: PointsM, other_m: Vector3, settings: LevelSettings
+    first: LaidPicture,
+    second: LaidPicture,
+    outline_m: PointsM,
+    other_m: Vector3,
+    settings: LevelSettings,
 ) -> float:
     """The share that two pictures of one date show to be level of what hides an outline from a camera at `other_m`,
     at the least of the heights that this might have."""
@@ -145,17 +170,24 @@ def level_share(
     # where the first camera sees what hides the outline, and where the second sees what the first sees there
     hides_m = seen_at_m(middle_m, other_m, tallest_m, first.camera_m) - middle_m
     there_m = middle_m + hides_m
-    moves_px = (seen_at_m(there_m, first.camera_m, tallest_m, second.camera_m) - there_m) * [1, -1] / s
+    moves_px = (
+        (seen_at_m(there_m, first.camera_m, tallest_m, second.camera_m) - there_m) * [1, -1] / s
+    )
     wide_m = width_m(outline_m)
     # relief that moves by less from one date to the other makes no difference so wide, both of its rims together
     low = settings.least_move * wide_m / max(float(np.linalg.norm(hides_m)), 1e-6)
     if low * np.linalg.norm(moves_px) < settings.least_px:
         return 0.0
     site_from_patch, shape = first.window.site_from_patch, first.gray.shape
-    parts = np.array([
-        mask_of(outline_m + share * hides_m, site_from_patch, shape) for share in np.linspace(0, 1, settings.parts)
-    ])
-    pair = _Pair.around(np.asarray(parts.any(axis=0)), first.gray, second.gray, wide_m / s, moves_px, settings)
+    parts = np.array(
+        [
+            mask_of(outline_m + share * hides_m, site_from_patch, shape)
+            for share in np.linspace(0, 1, settings.parts)
+        ]
+    )
+    pair = _Pair.around(
+        np.asarray(parts.any(axis=0)), first.gray, second.gray, wide_m / s, moves_px, settings
+    )
     if pair is None:
         return 0.0
     level = _level(pair, moves_px, low, settings)
@@ -204,7 +236,12 @@ class _Pair(NamedTuple):
 
     @classmethod
     def around(
-        cls, region: Mask, first: ImageGray, second: ImageGray, wide_px: float, moves_px: Floats,
+        cls,
+        region: Mask,
+        first: ImageGray,
+        second: ImageGray,
+        wide_px: float,
+        moves_px: Floats,
         settings: LevelSettings,
     ) -> "_Pair | None":
         """The pair around a region of two pictures; None where that lies outside."""
@@ -212,15 +249,24 @@ class _Pair(NamedTuple):
         if not len(rows):
             return None
         side = int(np.clip(wide_px, *settings.window_px)) | 1
-        low, high = np.array([rows[0], columns[0]]) - side, np.array([rows[-1], columns[-1]]) + side + 1
+        low, high = (
+            np.array([rows[0], columns[0]]) - side,
+            np.array([rows[-1], columns[-1]]) + side + 1,
+        )
         low, high = np.maximum(low, 0), np.minimum(high, region.shape)
         box = slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
         detail, unknown = _Texture.of(first, side, settings)
         reach = settings.off_px + 1 + int(np.ceil(np.abs(moves_px).max()))
         other = _Texture.of(second, side, settings)
         beyond = _Texture(
-            np.asarray(cv2.copyMakeBorder(other.detail, *(reach,) * 4, cv2.BORDER_CONSTANT, value=0.0), np.float32),
-            cv2.copyMakeBorder(other.unknown.view(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=1) > 0,
+            np.asarray(
+                cv2.copyMakeBorder(other.detail, *(reach,) * 4, cv2.BORDER_CONSTANT, value=0.0),
+                np.float32,
+            ),
+            cv2.copyMakeBorder(
+                other.unknown.view(np.uint8), *(reach,) * 4, cv2.BORDER_CONSTANT, value=1
+            )
+            > 0,
         )
         return cls(_Texture(detail[box], unknown[box]), beyond, side, box, reach, region[box])
 
@@ -228,7 +274,9 @@ class _Pair(NamedTuple):
         """(h, w) the mean square of what the second, pixel (x, y) of which comes to (0, 0), differs by around each
         pixel, and where that is unknown."""
         there = self._there(x, y)
-        return self._mean((self.first.detail - there.detail) ** 2), there.unknown | self.first.unknown
+        return self._mean(
+            (self.first.detail - there.detail) ** 2
+        ), there.unknown | self.first.unknown
 
     def power(self, x: int, y: int) -> Floats32:
         """(h, w) the mean square by which two such textures would differ that have nothing to do with each other."""
@@ -236,8 +284,10 @@ class _Pair(NamedTuple):
 
     def _there(self, x: int, y: int) -> _Texture:
         rows, columns = self.box
-        part = (slice(rows.start + y + self.reach, rows.stop + y + self.reach),
-                slice(columns.start + x + self.reach, columns.stop + x + self.reach))
+        part = (
+            slice(rows.start + y + self.reach, rows.stop + y + self.reach),
+            slice(columns.start + x + self.reach, columns.stop + x + self.reach),
+        )
         return _Texture(self.second.detail[part], self.second.unknown[part])
 
     def _mean(self, raster: Floats32) -> Floats32:
@@ -275,5 +325,11 @@ def _offset(pair: _Pair, most_px: float, settings: LevelSettings) -> tuple[int, 
 def _steps(moves_px: Floats, low: float) -> Iterator[tuple[int, int]]:
     """The whole pixels on a way, from the share `low` of it to its end."""
     count = max(int(np.ceil(np.abs(moves_px).max())), 1)
-    shares = np.linspace(low, 1.0, max(int(np.ceil((1 - low) * count)), 1) + 1) if low < 1 else np.array([low])
-    yield from dict.fromkeys((round(each * moves_px[0]), round(each * moves_px[1])) for each in shares.tolist())
+    shares = (
+        np.linspace(low, 1.0, max(int(np.ceil((1 - low) * count)), 1) + 1)
+        if low < 1
+        else np.array([low])
+    )
+    yield from dict.fromkeys(
+        (round(each * moves_px[0]), round(each * moves_px[1])) for each in shares.tolist()
+    )

@@ -3,7 +3,14 @@
 import numpy as np
 
 from sorvolo.change.earlier_pictures import EarlierPictures, Vantage
-from sorvolo.change.evidence.levelness import LevelSettings, Sights, is_level, seen_at_m, surroundings, width_m
+from sorvolo.change.evidence.levelness import (
+    LevelSettings,
+    Sights,
+    is_level,
+    seen_at_m,
+    surroundings,
+    width_m,
+)
 from sorvolo.geometry.arrays import PointsM
 
 
@@ -15,8 +22,10 @@ class ReliefDoubt:
     """
 
     def __init__(
-        self, earlier: EarlierPictures, m_per_px: float,
-        settings: LevelSettings = LevelSettings(),  # noqa: B008 (frozen)
+        self,
+        earlier: EarlierPictures,
+        m_per_px: float,
+        settings: LevelSettings = LevelSettings(),
     ) -> None:
         self._earlier, self._m_per_px, self._settings = earlier, m_per_px, settings
         self._known: dict[tuple[int, int, int], bool] = {}
@@ -44,7 +53,9 @@ class ReliefDoubt:
     def _is_level(self, vantage: Vantage, outline_m: PointsM, sights: Sights) -> bool:
         if is_level(sights.pictures, outline_m, vantage.earlier_m, self._settings):
             return True
-        window = surroundings(outline_m.min(axis=0), outline_m.max(axis=0), self._m_per_px, self._settings)
+        window = surroundings(
+            outline_m.min(axis=0), outline_m.max(axis=0), self._m_per_px, self._settings
+        )
         if window is None:
             return False
         earlier = list(self._earlier.laid(vantage, window, self._settings))

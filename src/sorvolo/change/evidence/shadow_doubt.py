@@ -50,8 +50,12 @@ class BrighterSettings:
 class ShadowSettings:
     """When moved shadows explain a difference (decision 0045)."""
 
-    likeness: float = 0.7  # correlation of what differs with both shadows: one of them alone has 0.71 at most
-    covered: float = 0.8  # share of what differs in the outline that the shadows, and the thing itself, cover
+    likeness: float = (
+        0.7  # correlation of what differs with both shadows: one of them alone has 0.71 at most
+    )
+    covered: float = (
+        0.8  # share of what differs in the outline that the shadows, and the thing itself, cover
+    )
     least_depth: float = 0.25  # octaves: of the shadow on either date, and ...
     least_part: float = 0.5  # ... of the fainter one as a part of the deeper one
     nearer: float = 0.15  # flying heights by which a later picture is taken nearer above the place: it is asked anew
@@ -77,7 +81,10 @@ class ShadowDoubt:
     """What pictures of both dates show of shadows where candidates lie. `explains` keeps what it found out."""
 
     def __init__(
-        self, earlier: EarlierPictures, sun_at: SunAt, settings: ShadowSettings = ShadowSettings(),
+        self,
+        earlier: EarlierPictures,
+        sun_at: SunAt,
+        settings: ShadowSettings = ShadowSettings(),
     ) -> None:
         self._earlier, self._sun_at, self._settings = earlier, sun_at, settings
         self._known: dict[tuple[int, PatchWindow, int, int], bool] = {}
@@ -89,12 +96,15 @@ class ShadowDoubt:
         if vantage is None or not sights.pictures:
             return False
         later = sights.pictures[0]
-        aside = float(np.hypot(*(outline_m.mean(axis=0) - later.camera_m[:2]))) / float(later.camera_m[2])
+        aside = float(np.hypot(*(outline_m.mean(axis=0) - later.camera_m[:2]))) / float(
+            later.camera_m[2]
+        )
         asked = number, later.window, vantage.shows[0], int(aside / self._settings.nearer)
         if asked not in self._known:
             pictures = self._earlier.laid(vantage, later.window, LevelSettings(most_pictures=1))
             self._known[asked] = any(
-                is_shadow(match, self._settings) for each in pictures
+                is_shadow(match, self._settings)
+                for each in pictures
                 for match in shadow_matches(each, later, outline_m, self._sun_at, self._settings)
             )
         return self._known[asked]
@@ -104,13 +114,17 @@ def is_shadow(match: ShadowMatch, settings: ShadowSettings = ShadowSettings()) -
     """Whether a match is good enough on both dates."""
     fainter, deeper = sorted((match.brighter, match.darker))
     return bool(
-        match.likeness >= settings.likeness and match.covered >= settings.covered
+        match.likeness >= settings.likeness
+        and match.covered >= settings.covered
         and fainter >= max(settings.least_depth, settings.least_part * deeper)
     )
 
 
 def shadow_matches(
-    earlier: LaidPicture, later: LaidPicture, outline_m: PointsM, sun_at: SunAt,
+    earlier: LaidPicture,
+    later: LaidPicture,
+    outline_m: PointsM,
+    sun_at: SunAt,
     settings: ShadowSettings = ShadowSettings(),
 ) -> Iterator[ShadowMatch]:
     """For each width and height the best match of two pictures of one window, of what differs in an outline, (N, 2)."""
@@ -119,7 +133,9 @@ def shadow_matches(
         return
     step = max(1, int(settings.brighter.side_m / later.window.m_per_px))
     difference = _Difference.of(earlier, later, outline_m, step, settings)
-    for radius_m, height_m, pattern in _patterns(one, other, later.window.m_per_px * step, settings.casters):
+    for radius_m, height_m, pattern in _patterns(
+        one, other, later.window.m_per_px * step, settings.casters
+    ):
         match = difference.match(pattern, settings.covered)
         if match is not None:
             yield ShadowMatch(*match, radius_m, height_m)
@@ -151,18 +167,32 @@ class _Pattern(NamedTuple):
     darker: Floats32
 
     @classmethod
-    def of(cls, earlier_px: Floats, later_px: Floats, radius_px: float, margin_px: float) -> "_Pattern | None":
+    def of(
+        cls, earlier_px: Floats, later_px: Floats, radius_px: float, margin_px: float
+    ) -> "_Pattern | None":
         """The shadows end at (east, north) pixels from the foot; None where they hide each other."""
-        half = int(np.ceil(max(np.abs(earlier_px).max(), np.abs(later_px).max()) + radius_px + margin_px)) + 1
+        half = (
+            int(
+                np.ceil(
+                    max(np.abs(earlier_px).max(), np.abs(later_px).max()) + radius_px + margin_px
+                )
+            )
+            + 1
+        )
         one, other = (_shadow(each, radius_px, half) for each in (earlier_px, later_px))
         thing = _shadow(np.zeros(2), radius_px + 0.5, half)
-        left, came = (np.where(each & ~hides & ~thing, 1.0, 0.0) for each, hides in ((one, other), (other, one)))
+        left, came = (
+            np.where(each & ~hides & ~thing, 1.0, 0.0)
+            for each, hides in ((one, other), (other, one))
+        )
         if min(left.sum(), came.sum()) < max(4.0, 0.2 * one.sum()):
             return None
         size = 2 * round(margin_px) + 1
         around = np.where(_grown(one | other | thing, size) & ~thing, 1.0, 0.0)
         brighter, darker = (_grown(each | thing, 3) for each in (one, other))
-        return cls(*(np.asarray(each, np.float32) for each in (left, came, around, brighter, darker)))
+        return cls(
+            *(np.asarray(each, np.float32) for each in (left, came, around, brighter, darker))
+        )
 
 
 def _grown(mask: Mask, size: int) -> Mask:
@@ -192,22 +222,40 @@ class _Difference(NamedTuple):
 
     @classmethod
     def of(
-        cls, earlier: LaidPicture, later: LaidPicture, outline_m: PointsM, step: int, settings: ShadowSettings
+        cls,
+        earlier: LaidPicture,
+        later: LaidPicture,
+        outline_m: PointsM,
+        step: int,
+        settings: ShadowSettings,
     ) -> "_Difference":
         """Of two pictures of one window, `step` pixels of it taken together."""
         both = (earlier.gray > 0) & (later.gray > 0)
         known = _shrunk(both.astype(np.float32), step) > 0.5
         cell_m = later.window.m_per_px * step
         one, other = _beside_ground(
-            [_octaves(each.gray, both, step, settings.brighter) for each in (earlier, later)], known, cell_m,
+            [_octaves(each.gray, both, step, settings.brighter) for each in (earlier, later)],
+            known,
+            cell_m,
             settings.brighter,
         )
-        octaves = np.where(known, np.clip(other - one, -settings.brighter.most, settings.brighter.most), 0)
+        octaves = np.where(
+            known, np.clip(other - one, -settings.brighter.most, settings.brighter.most), 0
+        )
         left = np.minimum(np.maximum(octaves, 0), np.maximum(-one, 0))
         came = np.minimum(np.maximum(-octaves, 0), np.maximum(-other, 0))
-        inside = _shrunk(mask_of(outline_m, later.window.site_from_patch, both.shape).astype(np.float32), step)
-        brighter, darker = ((inside > 0.5) & (each > settings.least_depth) for each in (octaves, -octaves))
-        return cls(*(np.asarray(each, np.float32) for each in (octaves, left - came, known, brighter, darker)))
+        inside = _shrunk(
+            mask_of(outline_m, later.window.site_from_patch, both.shape).astype(np.float32), step
+        )
+        brighter, darker = (
+            (inside > 0.5) & (each > settings.least_depth) for each in (octaves, -octaves)
+        )
+        return cls(
+            *(
+                np.asarray(each, np.float32)
+                for each in (octaves, left - came, known, brighter, darker)
+            )
+        )
 
     def match(self, pattern: _Pattern, enough: float) -> tuple[float, float, float, float] | None:
         """Likeness, how much brighter, how much darker, and the covered share, at the foot where the pattern fits best
@@ -217,14 +265,21 @@ class _Difference(NamedTuple):
             return None
         left_px, came_px = (_sums(self.known, each) for each in (pattern.left, pattern.came))
         power = _sums(self.octaves**2, pattern.around) * np.maximum(left_px + came_px, 1.0)
-        likeness = _sums(self.octaves, pattern.left - pattern.came) / np.sqrt(np.maximum(power, 1e-6))
+        likeness = _sums(self.octaves, pattern.left - pattern.came) / np.sqrt(
+            np.maximum(power, 1e-6)
+        )
         shown = (left_px > 0.6 * pattern.left.sum()) & (came_px > 0.6 * pattern.came.sum())
         worth = np.where(shown, np.minimum(covered, enough) + likeness, -1.0)
         at = np.unravel_index(int(worth.argmax()), worth.shape)
         if not shown[at]:
             return None
         left, came = (_sums(self.shaded, each)[at] for each in (pattern.left, pattern.came))
-        return float(likeness[at]), float(left / left_px[at]), float(-came / came_px[at]), float(covered[at])
+        return (
+            float(likeness[at]),
+            float(left / left_px[at]),
+            float(-came / came_px[at]),
+            float(covered[at]),
+        )
 
     def _covered(self, pattern: _Pattern) -> Floats32 | None:
         """(h, w) the share that a pattern there covers of what is brighter, or of what is darker, the lesser one; what
@@ -232,19 +287,25 @@ class _Difference(NamedTuple):
         parts = [(self.brighter, pattern.brighter), (self.darker, pattern.darker)]
         cells = [float(each.sum()) for each, _ in parts]
         shares = [
-            _sums(asked, covers) / count for (asked, covers), count in zip(parts, cells) if count > 0.1 * sum(cells)
+            _sums(asked, covers) / count
+            for (asked, covers), count in zip(parts, cells)
+            if count > 0.1 * sum(cells)
         ]
         return np.asarray(np.min(shares, axis=0), np.float32) if shares else None
 
 
 def _octaves(gray: ImageGray, known: Mask, step: int, settings: BrighterSettings) -> Floats32:
     """The mean logarithms of a picture, (h, w), where it is known, `step` pixels taken together."""
-    octaves = np.where(known, np.log2(gray.astype(np.float32) + np.float32(settings.black)), 0).astype(np.float32)
+    octaves = np.where(
+        known, np.log2(gray.astype(np.float32) + np.float32(settings.black)), 0
+    ).astype(np.float32)
     share = np.maximum(_shrunk(known.astype(np.float32), step), np.float32(1e-3))
     return np.asarray(_shrunk(octaves, step) / share, np.float32)
 
 
-def _beside_ground(octaves: Sequence[Floats32], known: Mask, cell_m: float, settings: BrighterSettings) -> list[Floats]:
+def _beside_ground(
+    octaves: Sequence[Floats32], known: Mask, cell_m: float, settings: BrighterSettings
+) -> list[Floats]:
     """By how many octaves cells, (h, w) of either date, are brighter than the unchanged ground around them."""
     change = octaves[1] - octaves[0]
     middle = np.median(change[known]) if known.any() else 0.0
@@ -256,11 +317,16 @@ def _beside_ground(octaves: Sequence[Floats32], known: Mask, cell_m: float, sett
 
 def _sums(raster: Floats32, pattern: Floats32) -> Floats32:
     """(h, w) the sums of a raster times a pattern around each cell, nothing being outside."""
-    return np.asarray(cv2.filter2D(raster, cv2.CV_32F, pattern, borderType=cv2.BORDER_CONSTANT), np.float32)
+    return np.asarray(
+        cv2.filter2D(raster, cv2.CV_32F, pattern, borderType=cv2.BORDER_CONSTANT), np.float32
+    )
 
 
 def _shrunk(raster: MatLike, step: int) -> Floats32:
     rows, columns = raster.shape[0] // step, raster.shape[1] // step
     return np.asarray(
-        cv2.resize(raster[: rows * step, : columns * step], (columns, rows), interpolation=cv2.INTER_AREA), np.float32
+        cv2.resize(
+            raster[: rows * step, : columns * step], (columns, rows), interpolation=cv2.INTER_AREA
+        ),
+        np.float32,
     )

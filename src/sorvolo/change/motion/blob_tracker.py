@@ -32,12 +32,18 @@ class SightingSettings:
     """How a blob becomes a sighting of something that may move; as measured from view to view (0026)."""
 
     place_m: float = 0.03  # sigma of its place: what alignment leaves ...
-    place_share: float = 0.05  # ... and this share of its length: its outline is drawn anew in each view
+    place_share: float = (
+        0.05  # ... and this share of its length: its outline is drawn anew in each view
+    )
     car_m: float = 2.5  # what is longer may move as cars do, the rest as people do
-    colour_levels: float = 40.0  # grey levels that turn a blob's looks by a radian: 19 in 20 keep theirs within 20
-    tracker: TrackerSettings = field(default_factory=lambda: TrackerSettings(
-        sure_score=0.0, new_per_m2=1e-3, pairs=PairSettings(size_sigma=0.25, least_size=-4.0)
-    ))
+    colour_levels: float = (
+        40.0  # grey levels that turn a blob's looks by a radian: 19 in 20 keep theirs within 20
+    )
+    tracker: TrackerSettings = field(
+        default_factory=lambda: TrackerSettings(
+            sure_score=0.0, new_per_m2=1e-3, pairs=PairSettings(size_sigma=0.25, least_size=-4.0)
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -45,16 +51,22 @@ class MovingSettings:
     """When something counts as moving."""
 
     least_views: int = 5  # of a video
-    least_photos: int = 3  # of views so far apart in time as photos are: chance seldom fits three of them
+    least_photos: int = (
+        3  # of views so far apart in time as photos are: chance seldom fits three of them
+    )
     least_move_m: float = 1.0  # beyond what alignment and a swaying crown do
-    least_lengths: float = 1.0  # of its own: then its places do not overlap, and nothing that grew explains it
+    least_lengths: float = (
+        1.0  # of its own: then its places do not overlap, and nothing that grew explains it
+    )
     least_length_m: float = 0.3  # a person from above; smaller specks jump about
     most_speed_m_s: float = 3.0  # of something small ...
     most_lengths_s: float = 4.0  # ... and lengths a second more: a car of 4 m may go 19 m/s
     forget_s: float = 2.5  # what was not seen for so long is judged anew ...
     forget_views: int = 2  # ... and for so many views
     points: int = 12  # of a track are judged, the last ones ...
-    slow_points: int = 36  # ... or, as something long may need so many views to go its own length, so many
+    slow_points: int = (
+        36  # ... or, as something long may need so many views to go its own length, so many
+    )
     parallax: ParallaxSettings = field(default_factory=ParallaxSettings)
     blobs: BlobSettings = field(default_factory=BlobSettings)
     sightings: SightingSettings = field(default_factory=SightingSettings)
@@ -101,22 +113,34 @@ class BlobTrack:
         """(2,) over its last points; zeros while there is but one."""
         return motion(self.points).velocity_m_s if len(self.points) > 1 else np.zeros(2)
 
-    def with_point(self, point: TrackPoint, oldest_ns: int, settings: MovingSettings) -> "BlobTrack":
+    def with_point(
+        self, point: TrackPoint, oldest_ns: int, settings: MovingSettings
+    ) -> "BlobTrack":
         """The track, one view longer; points from before a gap, last seen before `oldest_ns`, are judged no more."""
         known = (*self.older, *self.points) if self.last.time_ns >= oldest_ns else ()
         points = (*known, point)[-settings.slow_points :]
         return replace(
-            self, points=points[-settings.points :], older=points[: -settings.points], count=self.count + 1,
-            score_sum=self.score_sum + point.blob.score, moves_now=self.moves_now and bool(known),
+            self,
+            points=points[-settings.points :],
+            older=points[: -settings.points],
+            count=self.count + 1,
+            score_sum=self.score_sum + point.blob.score,
+            moves_now=self.moves_now and bool(known),
         )
 
     def joined(self, gone: "BlobTrack") -> "BlobTrack":
         """This track and another of the same thing; the points of the one seen last count."""
         first, last = sorted((self, gone), key=lambda each: each.last.time_ns)
         return BlobTrack(
-            self.number, min(self.first, gone.first, key=lambda each: each.time_ns), last.points,
-            first.count + last.count, first.score_sum + last.score_sum, last.leg, self.moves or gone.moves,
-            last.moves_now, last.older,
+            self.number,
+            min(self.first, gone.first, key=lambda each: each.time_ns),
+            last.points,
+            first.count + last.count,
+            first.score_sum + last.score_sum,
+            last.leg,
+            self.moves or gone.moves,
+            last.moves_now,
+            last.older,
         )
 
 
@@ -150,10 +174,14 @@ class BlobTracker:
         oldest_ns = min([now_ns - round(settings.forget_s * 1e9), *self._times_ns])
         self._times_ns.append(now_ns)
         blobs = blobs_of(view, settings.blobs)
-        colours = np.array([each.colour for each in blobs]).reshape(-1, 3) / settings.sightings.colour_levels
+        colours = (
+            np.array([each.colour for each in blobs]).reshape(-1, 3)
+            / settings.sightings.colour_levels
+        )
         sees_horizon = not np.isfinite(view.outline_m).all()
         update = self._tracker.update(
-            [_sighting(view, each, settings.sightings) for each in blobs], time_ns=now_ns,
+            [_sighting(view, each, settings.sightings) for each in blobs],
+            time_ns=now_ns,
             footprint_m=None if sees_horizon else view.outline_m,
             appearance=np.hstack([np.cos(colours), np.sin(colours)]),
         )
@@ -163,7 +191,9 @@ class BlobTracker:
         shown: dict[int, BlobTrack] = {}
         for blob, number in zip(blobs, update.track_ids):
             if number not in shown:  # else it is a part of a surer blob
-                shown[number] = self._prolonged(number, TrackPoint(now_ns, blob, camera_m), oldest_ns)
+                shown[number] = self._prolonged(
+                    number, TrackPoint(now_ns, blob, camera_m), oldest_ns
+                )
             track = shown[number]
             legs[blob.box] = track.leg
             held[blob.box] = may_move(track.points, settings.parallax)
@@ -178,7 +208,9 @@ class BlobTracker:
             younger = self._tracks.pop(gone, None)
             older = self._tracks.get(kept)
             if younger is not None:
-                self._tracks[kept] = replace(younger, number=kept) if older is None else older.joined(younger)
+                self._tracks[kept] = (
+                    replace(younger, number=kept) if older is None else older.joined(younger)
+                )
 
     def _prolonged(self, number: int, point: TrackPoint, oldest_ns: int) -> BlobTrack:
         """The track with one more point, judged anew."""
@@ -198,28 +230,41 @@ class BlobTracker:
     def _forget(self, oldest_ns: int) -> None:
         """Only movers are remembered for longer: what stands is judged anew when it comes back into view."""
         self._tracks = {
-            number: each for number, each in self._tracks.items() if each.moves or each.last.time_ns >= oldest_ns
+            number: each
+            for number, each in self._tracks.items()
+            if each.moves or each.last.time_ns >= oldest_ns
         }
 
     def _is_mover(self, track: BlobTrack) -> bool:
         """Whether enough views show a plausible thing that moves steadily, by more than parallax explains."""
-        are_photos, alone = self._are_photos(track), shown_alone(track.points, self._settings.parallax)
-        if self._moves(track.points, are_photos) or (len(alone) < len(track.points) and self._moves(alone, are_photos)):
+        are_photos, alone = (
+            self._are_photos(track),
+            shown_alone(track.points, self._settings.parallax),
+        )
+        if self._moves(track.points, are_photos) or (
+            len(alone) < len(track.points) and self._moves(alone, are_photos)
+        ):
             return True
         slow = (*track.older, *track.points)
         length_m = float(np.median([each.blob.length_m for each in track.points]))
-        return bool(track.older) and self._goes_its_length(slow, motion(slow, self._settings.parallax), length_m)
+        return bool(track.older) and self._goes_its_length(
+            slow, motion(slow, self._settings.parallax), length_m
+        )
 
     def _moves(self, points: Sequence[TrackPoint], are_photos: bool) -> bool:
         """Whether points show it: a motion of its own, or a size that keeps what leans could not keep."""
         settings, parallax = self._settings, self._settings.parallax
         if len(points) < (settings.least_photos if are_photos else settings.least_views):
             return False
-        move, length_m = motion(points, parallax), float(np.median([each.blob.length_m for each in points]))
+        move, length_m = (
+            motion(points, parallax),
+            float(np.median([each.blob.length_m for each in points])),
+        )
         if self._goes_its_length(points, move, length_m):
             return True
         return _is_plausible(points, move, length_m, settings) and (
-            is_rigid(points, length_m, parallax) or (are_photos and floats(points, move, length_m, parallax))
+            is_rigid(points, length_m, parallax)
+            or (are_photos and floats(points, move, length_m, parallax))
         )
 
     def _goes_its_length(self, points: Sequence[TrackPoint], move: Motion, length_m: float) -> bool:
@@ -232,7 +277,9 @@ class BlobTracker:
     def _are_photos(self, track: BlobTrack) -> bool:
         """Whether the views were taken seldom while the track lasted."""
         seen = [each for each in self._times_ns if each >= track.points[0].time_ns]
-        return len(seen) > 1 and (seen[-1] - seen[0]) * 1e-9 >= self._settings.parallax.photos_apart_s * (len(seen) - 1)
+        return len(seen) > 1 and (
+            seen[-1] - seen[0]
+        ) * 1e-9 >= self._settings.parallax.photos_apart_s * (len(seen) - 1)
 
 
 def _sighting(view: ComparedView, blob: Blob, settings: SightingSettings) -> Sighting:
@@ -240,15 +287,25 @@ def _sighting(view: ComparedView, blob: Blob, settings: SightingSettings) -> Sig
     x, y, w, h = (float(each) for each in view.boxes[blob.box])
     sigma_m = settings.place_m + settings.place_share * blob.length_m
     return Sighting(
-        view.index, view.name, view.time_ns, "car" if blob.length_m >= settings.car_m else "person",
-        float(np.clip(blob.score, 0, 1)), np.array([x, y, x + w, y + h]), blob.place_m, sigma_m**2 * np.eye(2),
+        view.index,
+        view.name,
+        view.time_ns,
+        "car" if blob.length_m >= settings.car_m else "person",
+        float(np.clip(blob.score, 0, 1)),
+        np.array([x, y, x + w, y + h]),
+        blob.place_m,
+        sigma_m**2 * np.eye(2),
         np.array([blob.length_m, blob.area_m2 / max(blob.length_m, 1e-6)]),
     )
 
 
-def _is_plausible(points: Sequence[TrackPoint], move: Motion, length_m: float, settings: MovingSettings) -> bool:
+def _is_plausible(
+    points: Sequence[TrackPoint], move: Motion, length_m: float, settings: MovingSettings
+) -> bool:
     """Whether a thing of this length may be so fast, goes steadily enough, and not about as the camera does."""
     seconds = (points[-1].time_ns - points[0].time_ns) * 1e-9
     is_steady = move.error_m < 0.05 + 0.03 * (move.speed_m_s * seconds + length_m)
-    is_possible = settings.least_length_m <= length_m and move.speed_m_s <= settings.fastest_m_s(length_m)
+    is_possible = settings.least_length_m <= length_m and move.speed_m_s <= settings.fastest_m_s(
+        length_m
+    )
     return is_possible and is_steady and not goes_with_camera(move)

@@ -40,8 +40,12 @@ class Blob:
 
 def blobs_of(view: ComparedView, settings: BlobSettings = BlobSettings()) -> list[Blob]:
     """The blobs that lie whole inside the view; one cut by its rim would seem to move with the camera."""
-    chosen = np.argsort(-view.scores, kind="stable")[:settings.most_boxes]
-    blobs = [_blob(view, int(index), settings) for index in chosen if _is_whole(view, int(index), settings)]
+    chosen = np.argsort(-view.scores, kind="stable")[: settings.most_boxes]
+    blobs = [
+        _blob(view, int(index), settings)
+        for index in chosen
+        if _is_whole(view, int(index), settings)
+    ]
     return [each for each in blobs if each is not None]
 
 
@@ -52,7 +56,9 @@ def _is_whole(view: ComparedView, index: int, settings: BlobSettings) -> bool:
     rim = settings.rim_px
     is_inside = x >= rim and y >= rim and x + w <= width - rim and y + h <= height - rim
     is_small = w * h <= settings.most_of_view * width * height
-    return is_inside and is_small and _is_known_around(view.valid, x, y, w, h, settings.most_unknown)
+    return (
+        is_inside and is_small and _is_known_around(view.valid, x, y, w, h, settings.most_unknown)
+    )
 
 
 def _blob(view: ComparedView, index: int, settings: BlobSettings) -> Blob | None:
@@ -62,7 +68,7 @@ def _blob(view: ComparedView, index: int, settings: BlobSettings) -> Blob | None
     if not len(xs):
         return None
     x, y, w, h = left + int(xs.min()), top + int(ys.min()), int(np.ptp(xs)) + 1, int(np.ptp(ys)) + 1
-    part = thing[ys.min():ys.max() + 1, xs.min():xs.max() + 1].view(np.uint8) * np.uint8(255)
+    part = thing[ys.min() : ys.max() + 1, xs.min() : xs.max() + 1].view(np.uint8) * np.uint8(255)
     moments = cv2.moments(part, binaryImage=True)
     hull = hull_of(part) + np.array([x, y])
     hull_m = apply_homography(view.site_from_image, hull.astype(np.float64))
@@ -74,7 +80,9 @@ def _blob(view: ComparedView, index: int, settings: BlobSettings) -> Blob | None
     place_m = place_m if foot_m is None else foot_m.mean(axis=0)
     colour = np.array(cv2.mean(view.image[y : y + h, x : x + w], part)[:3])
     area_m2 = moments["m00"] * view.m_per_px**2
-    return Blob(index, place_m, max(w, h) * view.m_per_px, area_m2, colour, float(view.scores[index]))
+    return Blob(
+        index, place_m, max(w, h) * view.m_per_px, area_m2, colour, float(view.scores[index])
+    )
 
 
 def standing_outline_m(
@@ -86,13 +94,16 @@ def standing_outline_m(
     if not thing.any():
         return None
     all_m, thing_m = (
-        apply_homography(view.site_from_image, np.argwhere(mask)[:, ::-1] + [left, top]) for mask in (changed, thing)
+        apply_homography(view.site_from_image, np.argwhere(mask)[:, ::-1] + [left, top])
+        for mask in (changed, thing)
     )
     if not np.isfinite(all_m).all():
         return None
     outline_m = _foot_m(thing_m, all_m, view.camera_m, view.m_per_px, settings)
     if outline_m is None:
-        outline_m = np.asarray(cv2.convexHull(thing_m.astype(np.float32)).reshape(-1, 2), np.float64)
+        outline_m = np.asarray(
+            cv2.convexHull(thing_m.astype(np.float32)).reshape(-1, 2), np.float64
+        )
     return outline_m if len(outline_m) >= 3 and abs(signed_area(outline_m)) > 0 else None
 
 
@@ -124,7 +135,9 @@ def _foot_m(
     width_m = right - left + m_per_px
     person_m = settings.person_m
     nearest = far * (1 - person_m / max(float(camera_m[2]), 2 * person_m)) - width_m
-    behind = changed[(changed[:, 1] >= left) & (changed[:, 1] <= right) & (changed[:, 0] >= nearest), 0]
+    behind = changed[
+        (changed[:, 1] >= left) & (changed[:, 1] <= right) & (changed[:, 0] >= nearest), 0
+    ]
     near = float(behind.min(initial=far))
     if width_m > settings.upright_m or far - near <= width_m:
         return None

@@ -36,7 +36,10 @@ class Movers:
         return leg in self._legs
 
     def see(
-        self, view: ComparedView, moving: MovingBlobs, named: Callable[[int], tuple[int, int | None]]
+        self,
+        view: ComparedView,
+        moving: MovingBlobs,
+        named: Callable[[int], tuple[int, int | None]],
     ) -> list[Change]:
         """Bring what moves in this view up to date; those announced first. `named` gives the number of the change that
         a leg of a track becomes, and when that was announced already; None if it was not."""
@@ -58,7 +61,9 @@ class Movers:
             else:
                 change = self._change(view, track, known.id)
                 change = replace(
-                    change, first_seen_ns=known.first_seen_ns, views=max(change.views, known.views + 1),
+                    change,
+                    first_seen_ns=known.first_seen_ns,
+                    views=max(change.views, known.views + 1),
                     announced_ns=known.announced_ns,
                 )
             self._known[track.number] = change
@@ -70,16 +75,26 @@ class Movers:
         outline_m = standing_outline_m(view, track.last.blob)
         if outline_m is None:
             outline_m = _square(track.last.blob.place_m, self._cell_m)
-        window = PatchWindow.around(outline_m.min(axis=0), outline_m.max(axis=0), self._m_per_px, 512)
+        window = PatchWindow.around(
+            outline_m.min(axis=0), outline_m.max(axis=0), self._m_per_px, 512
+        )
         size = measures(outline_m)
         residual_m = view.residual_px * m_per_px if np.isfinite(view.residual_px) else 0.0
         score = track.score_sum / track.count * (track.count + 1) / (track.count + 2)
         return Change(
-            change_id, ChangeKind.MOVING, float(np.clip(score, 0, 1)), outline_m, track.first.time_ns,
-            track.last.time_ns, track.count, size.area_m2, size.length_m,
+            change_id,
+            ChangeKind.MOVING,
+            float(np.clip(score, 0, 1)),
+            outline_m,
+            track.first.time_ns,
+            track.last.time_ns,
+            track.count,
+            size.area_m2,
+            size.length_m,
             place_sigma_m(residual_m, self._cell_m, aside_of(outline_m, view.camera_m[None])),
             patch_of(window, cut(view, window), outline_m),
-            track.velocity_m_s, announced_ns=view.time_ns,
+            track.velocity_m_s,
+            announced_ns=view.time_ns,
         )
 
 

@@ -26,10 +26,14 @@ class ParallaxSettings:
     unlikely: float = 0.5  # h = H / 3: no thing that came is so high
     least_own: float = 0.35  # of a mover's speed that no height explains
     rigid_views: int = 5  # a blob that keeps its size over so many views, ...
-    rigid_lengths: float = 2.0  # ... on a way of so many of its lengths, moves whatever its direction ...
+    rigid_lengths: float = (
+        2.0  # ... on a way of so many of its lengths, moves whatever its direction ...
+    )
     rigid_m: float = 2.5  # ... if it is no longer, m
     photos_apart_s: float = 0.7  # views that are seldom, on average; they may show a blob ...
-    floats_m: float = 1.3  # ... no longer than this, m, too far from any foot that it could stand on
+    floats_m: float = (
+        1.3  # ... no longer than this, m, too far from any foot that it could stand on
+    )
     steady_area: float = 1.7  # the largest by the smallest of one that keeps its size, and ...
     steady_length: float = 1.35  # ... the longest by the shortest
 
@@ -78,11 +82,16 @@ def motion(points: Sequence[TrackPoint], settings: ParallaxSettings = ParallaxSe
     centre = sum(places) / count
     rest = sum(abs(place - centre - s * velocity) ** 2 for s, place in zip(spread, places))
     against = -(velocity * camera.conjugate()).real
-    parallax = min(max(against / abs(camera) ** 2, 0.0), settings.most) if abs(camera) > 1e-2 else 0.0
+    parallax = (
+        min(max(against / abs(camera) ** 2, 0.0), settings.most) if abs(camera) > 1e-2 else 0.0
+    )
     own = velocity + parallax * camera
     return Motion(
-        np.array([velocity.real, velocity.imag]), np.array([camera.real, camera.imag]),
-        np.array([own.real, own.imag]), abs(own) * times[-1], (rest / count) ** 0.5,
+        np.array([velocity.real, velocity.imag]),
+        np.array([camera.real, camera.imag]),
+        np.array([own.real, own.imag]),
+        abs(own) * times[-1],
+        (rest / count) ** 0.5,
     )
 
 
@@ -113,10 +122,14 @@ def is_rigid(points: Sequence[TrackPoint], length_m: float, settings: ParallaxSe
     """
     if len(points) < settings.rigid_views or length_m > settings.rigid_m:
         return False
-    return _way_m(points) > max(1.0, settings.rigid_lengths * length_m) and _keeps_its_size(points, settings)
+    return _way_m(points) > max(1.0, settings.rigid_lengths * length_m) and _keeps_its_size(
+        points, settings
+    )
 
 
-def floats(points: Sequence[TrackPoint], move: Motion, length_m: float, settings: ParallaxSettings) -> bool:
+def floats(
+    points: Sequence[TrackPoint], move: Motion, length_m: float, settings: ParallaxSettings
+) -> bool:
     """Whether a small blob of steady size is far from where anything tall enough to move so would stand.
 
     What leans is seen from its foot to its top; the foot of a thing whose top moves against the camera's way with a
@@ -126,8 +139,12 @@ def floats(points: Sequence[TrackPoint], move: Motion, length_m: float, settings
     k = -float(move.velocity_m_s @ move.camera_m_s) / max(camera_m_s, 1e-6) ** 2
     if length_m > settings.floats_m or k <= 0 or not _keeps_its_size(points, settings):
         return False  # where k is not above 0, no height explains it
-    apart_m = [k / (1 + k) * float(np.hypot(*(each.blob.place_m - each.camera_m))) for each in points]
-    return _way_m(points) > settings.rigid_lengths * length_m and float(np.median(apart_m)) > length_m
+    apart_m = [
+        k / (1 + k) * float(np.hypot(*(each.blob.place_m - each.camera_m))) for each in points
+    ]
+    return (
+        _way_m(points) > settings.rigid_lengths * length_m and float(np.median(apart_m)) > length_m
+    )
 
 
 def shown_alone(points: Sequence[TrackPoint], settings: ParallaxSettings) -> tuple[TrackPoint, ...]:
@@ -137,7 +154,9 @@ def shown_alone(points: Sequence[TrackPoint], settings: ParallaxSettings) -> tup
     for point, after in pairwise(points[1:]):
         before_m, here_m, after_m = (each.blob.length_m for each in (kept[-1], point, after))
         around = sorted((before_m, after_m))
-        is_other = not around[1] / settings.steady_length <= here_m <= around[0] * settings.steady_length
+        is_other = (
+            not around[1] / settings.steady_length <= here_m <= around[0] * settings.steady_length
+        )
         if not is_other or around[1] >= settings.steady_length * around[0]:
             kept.append(point)
     return (*kept, *points[1:][-1:])
@@ -152,4 +171,6 @@ def _keeps_its_size(points: Sequence[TrackPoint], settings: ParallaxSettings) ->
     """Whether a blob's area and length have hardly changed: nothing that grew explains its motion."""
     areas = [each.blob.area_m2 for each in points]
     lengths = [each.blob.length_m for each in points]
-    return max(areas) < settings.steady_area * min(areas) and max(lengths) < settings.steady_length * min(lengths)
+    return max(areas) < settings.steady_area * min(areas) and max(
+        lengths
+    ) < settings.steady_length * min(lengths)

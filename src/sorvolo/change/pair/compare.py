@@ -37,7 +37,9 @@ def compare_images(
     _check_choice(method, settings, threads)
     if isinstance(reference, ThesisReference) and method != "thesis":
         raise InputError("the reference is a ThesisReference; method 'robust' needs a picture")
-    before = _checked("reference", reference.picture if isinstance(reference, ThesisReference) else reference)
+    before = _checked(
+        "reference", reference.picture if isinstance(reference, ThesisReference) else reference
+    )
     query = _checked("query", query)
     if before.shape != query.shape:
         raise InputError(
@@ -45,28 +47,39 @@ def compare_images(
         )
     _check_valid(valid, query)
     if method == "robust":
-        robust = compare_robust(before, query, valid, settings if isinstance(settings, RobustSettings) else None)
+        robust = compare_robust(
+            before, query, valid, settings if isinstance(settings, RobustSettings) else None
+        )
         return Comparison(robust.mask, robust.boxes)
     found = compare_thesis(
-        reference if isinstance(reference, ThesisReference) else before, query, valid,
-        settings if isinstance(settings, ThesisSettings) else None, threads,
+        reference if isinstance(reference, ThesisReference) else before,
+        query,
+        valid,
+        settings if isinstance(settings, ThesisSettings) else None,
+        threads,
     )
     return Comparison(found.mask, found.boxes)
 
 
-def _check_choice(method: str, settings: ThesisSettings | RobustSettings | None, threads: int) -> None:
+def _check_choice(
+    method: str, settings: ThesisSettings | RobustSettings | None, threads: int
+) -> None:
     if method not in METHODS:
         raise SettingsError(f"method is {method!r}; give one of {', '.join(METHODS)}")
     wanted = ThesisSettings if method == "thesis" else RobustSettings
     if settings is not None and not isinstance(settings, wanted):
-        raise SettingsError(f"settings are {type(settings).__name__}; method {method!r} needs {wanted.__name__}")
+        raise SettingsError(
+            f"settings are {type(settings).__name__}; method {method!r} needs {wanted.__name__}"
+        )
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
         raise SettingsError(f"threads is {threads!r}; give a whole number from 1")
 
 
 def _checked(name: str, image: Any) -> NDArray[np.uint8]:
     if not isinstance(image, np.ndarray):
-        raise InputError(f"{name} is a {type(image).__name__}; give a NumPy array (height, width, 3) of uint8, BGR")
+        raise InputError(
+            f"{name} is a {type(image).__name__}; give a NumPy array (height, width, 3) of uint8, BGR"
+        )
     if image.dtype != np.uint8:
         raise InputError(f"{name} holds {image.dtype}; give uint8, 0 to 255")
     if image.ndim != 3 or image.shape[2] != 3:
@@ -80,8 +93,14 @@ def _check_valid(valid: Any, query: NDArray[np.uint8]) -> None:
     if valid is None:
         return
     if not isinstance(valid, np.ndarray) or valid.dtype != np.bool_:
-        found = f"n array of {valid.dtype}" if isinstance(valid, np.ndarray) else f" {type(valid).__name__}"
-        raise InputError(f"valid is a{found}; give a NumPy array of bool, True where both pictures are known")
+        found = (
+            f"n array of {valid.dtype}"
+            if isinstance(valid, np.ndarray)
+            else f" {type(valid).__name__}"
+        )
+        raise InputError(
+            f"valid is a{found}; give a NumPy array of bool, True where both pictures are known"
+        )
     if valid.shape != query.shape[:2]:
         raise InputError(f"valid has the shape {valid.shape}; the pictures need {query.shape[:2]}")
 

@@ -16,7 +16,9 @@ _MAP = 0  # the first of the opinions
 class CorroborationSettings:
     """When differences confirm each other; scores and shares lie in 0 to 1 (0007, 0009; a single opinion 0016)."""
 
-    least_score: float = 0.2  # from which on a difference is an opinion: an unsure one may confirm a sure one
+    least_score: float = (
+        0.2  # from which on a difference is an opinion: an unsure one may confirm a sure one
+    )
     sure: float = 0.5  # score of a difference that others confirm
     very_sure: float = 0.9  # score of one that nobody needs to confirm
     near_px: int = 9  # what leans a little another way lies a few pixels beside
@@ -39,7 +41,8 @@ class _Opinion(NamedTuple):
 
 
 def believed(
-    by_map: tuple[Difference, Mask], earlier: Sequence[tuple[Difference, Mask]],
+    by_map: tuple[Difference, Mask],
+    earlier: Sequence[tuple[Difference, Mask]],
     settings: CorroborationSettings = CorroborationSettings(),
 ) -> Difference:
     """The differences of a frame from the map or from an earlier picture that the others confirm.
@@ -50,12 +53,16 @@ def believed(
     the map knows no ground.
     """
     window = np.ones((settings.near_px, settings.near_px), np.uint8)
-    opinions = [_Opinion(each, sees, cv2.dilate(each.mask, window) > 0) for each, sees in (by_map, *earlier)]
+    opinions = [
+        _Opinion(each, sees, cv2.dilate(each.mask, window) > 0) for each, sees in (by_map, *earlier)
+    ]
     known = by_map[1]
     mask = np.zeros_like(by_map[0].mask)
     boxes, scores = [], []
     for own, opinion in enumerate(opinions):
-        kept = mask > 0  # of others: two regions of one opinion are two things, though boxes overlap
+        kept = (
+            mask > 0
+        )  # of others: two regions of one opinion are two things, though boxes overlap
         for k in np.flatnonzero(opinion.difference.scores >= settings.sure):
             x, y, w, h = opinion.difference.boxes[k]
             part = np.s_[y : y + h, x : x + w]
@@ -71,7 +78,9 @@ def believed(
 
 
 def unwitnessed(
-    by_map: Difference, seen: Sequence[Mask], settings: CorroborationSettings = CorroborationSettings()
+    by_map: Difference,
+    seen: Sequence[Mask],
+    settings: CorroborationSettings = CorroborationSettings(),
 ) -> list[tuple[slice, slice]]:
     """The parts of the picture with sure differences from the map that no earlier picture shows whole.
 
@@ -87,7 +96,10 @@ def unwitnessed(
 
 
 def is_whole(
-    mask: ImageGray, part: tuple[slice, slice], seen: Mask, settings: CorroborationSettings = CorroborationSettings()
+    mask: ImageGray,
+    part: tuple[slice, slice],
+    seen: Mask,
+    settings: CorroborationSettings = CorroborationSettings(),
 ) -> bool:
     """Whether a picture that shows the `seen` ground shows all that differs in a part of it."""
     shown = mask[part] > 0
@@ -95,7 +107,11 @@ def is_whole(
 
 
 def _is_confirmed(
-    shown: Mask, part: tuple[slice, slice], own: int, opinions: Sequence[_Opinion], score: float,
+    shown: Mask,
+    part: tuple[slice, slice],
+    own: int,
+    opinions: Sequence[_Opinion],
+    score: float,
     settings: CorroborationSettings,
 ) -> bool:
     """Whether the opinions that see a part of the picture confirm what one, the `own`, shows there."""

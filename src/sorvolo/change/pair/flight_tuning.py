@@ -15,7 +15,9 @@ class TuningLimits:
     calm_px: float = 0.12  # rest of the flow below: values count as known one pixel around
     restless_px: float = 0.9  # rest of the flow above: three pixels around
     frames_to_settle: int = 10  # frames that must agree before less is tolerated than at first
-    memory_frames: int = 50  # light and wind change within minutes: older frames do not show how it is now
+    memory_frames: int = (
+        50  # light and wind change within minutes: older frames do not show how it is now
+    )
     least_known: float = 0.05  # share of a frame that must be known for its measures to count
 
 
@@ -35,8 +37,12 @@ class PairMeasures:
         """Those of a comparison, without its pictures."""
         light, settling = result.light, result.settling
         return cls(
-            float(result.known), float(result.noise), float(settling.moved_px), float(settling.rest_px),
-            light.brightness, float(light.unevenness),
+            float(result.known),
+            float(result.noise),
+            float(settling.moved_px),
+            float(settling.rest_px),
+            light.brightness,
+            float(light.unevenness),
         )
 
 
@@ -47,7 +53,9 @@ class FlightTuning:
     that one odd frame (a gust, a cloud, a frame changed all over) does not decide for itself.
     """
 
-    def __init__(self, settings: RobustSettings | None = None, limits: TuningLimits | None = None) -> None:
+    def __init__(
+        self, settings: RobustSettings | None = None, limits: TuningLimits | None = None
+    ) -> None:
         self._base = settings or RobustSettings()
         self._limits = limits or TuningLimits()
         self._seen: deque[PairMeasures] = deque(maxlen=self._limits.memory_frames)
@@ -69,7 +77,9 @@ class FlightTuning:
             reach_px += 1
         elif rest_px < self._limits.calm_px and len(self._seen) >= self._limits.frames_to_settle:
             reach_px = max(1, reach_px - 1)
-        regions = replace(self._base.regions, reach_px=reach_px, least_noise=round(self._noise() / 2, 1))
+        regions = replace(
+            self._base.regions, reach_px=reach_px, least_noise=round(self._noise() / 2, 1)
+        )
         return replace(self._base, regions=regions)
 
     def chosen(self) -> dict[str, float | int | str]:
@@ -77,7 +87,9 @@ class FlightTuning:
         settings = self.settings()
         if not self._seen:
             return {"frames": self._frames, "settings": "those given: nothing was compared yet"}
-        brightness = [float(median(float(each.brightness[band]) for each in self._seen)) for band in range(3)]
+        brightness = [
+            float(median(float(each.brightness[band]) for each in self._seen)) for band in range(3)
+        ]
         return {
             "frames": self._frames,
             "noise_levels": round(self._noise(), 1),
@@ -88,7 +100,8 @@ class FlightTuning:
             "search_px": 2 * settings.regions.reach_px,
             "least_difference_levels": round(
                 settings.regions.least_difference
-                + settings.regions.noise_factor * max(self._noise(), settings.regions.least_noise), 1
+                + settings.regions.noise_factor * max(self._noise(), settings.regions.least_noise),
+                1,
             ),
             "least_score": settings.least_score,
         }
@@ -96,7 +109,11 @@ class FlightTuning:
     @property
     def brightness(self) -> float:
         """How many times as bright as the reference a middle grey is on this flight; NaN while nothing was seen."""
-        return float(median(float(each.brightness.mean()) for each in self._seen)) if self._seen else float("nan")
+        return (
+            float(median(float(each.brightness.mean()) for each in self._seen))
+            if self._seen
+            else float("nan")
+        )
 
     def _noise(self) -> float:
         return float(median(each.noise for each in self._seen))

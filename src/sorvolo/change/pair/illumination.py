@@ -28,13 +28,24 @@ class LightSettings:
     """How the light is fitted (0007). Lengths in px of the half size pictures, or in cells."""
 
     cell_px: int = 8  # side of a cell that has one gain
-    fine: int = 4  # pixels of a cell each way, where structure is compared and moved shadows are looked for
+    fine: int = (
+        4  # pixels of a cell each way, where structure is compared and moved shadows are looked for
+    )
     detail_px: int = 9  # details of the finest structure are what is smaller; fine pixels
     median_cells: int = 5  # what is smaller than half of it cannot change the local gain
-    no_slope: float = 2e-4  # squared octaves a cell by which a slope is drawn to one where there is little to see
-    alike: tuple[float, float] = (0.25, 0.5)  # correlation of details: the ground is another one, and surely the same
-    flat: float = 6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
-    flat_trust: float = 0.003  # of cells without any structure: they count where nothing better is near
+    no_slope: float = (
+        2e-4  # squared octaves a cell by which a slope is drawn to one where there is little to see
+    )
+    alike: tuple[float, float] = (
+        0.25,
+        0.5,
+    )  # correlation of details: the ground is another one, and surely the same
+    flat: float = (
+        6.0  # what noise leaves of the variance of details, in squared steps of the logarithm
+    )
+    flat_trust: float = (
+        0.003  # of cells without any structure: they count where nothing better is near
+    )
     reaches: tuple[tuple[int, float], ...] = ((3, 1.0), (7, 0.1), (17, 0.01), (49, 1e-3))
     # cells each way within which a cell's gain counts for its neighbours', and with what weight
     moved: MovedShadowSettings = field(default_factory=MovedShadowSettings)
@@ -83,14 +94,18 @@ def fit_light(
     detail_after = _chosen(after - cv2.blur(after, window), sure)[::2]
     # the ratio of spreads, the geometric mean of the regressions of each on the other: that of the query on the
     # reference alone would be too low by what noise, misalignment and clouds add to the spread of the reference
-    exponents = slopes(detail_before, detail_after, settings.no_slope * len(detail_before)).clip(0.5, 2.0)
+    exponents = slopes(detail_before, detail_after, settings.no_slope * len(detail_before)).clip(
+        0.5, 2.0
+    )
     offset = after - exponents.astype(np.float32) * before
     kept = _chosen(offset, sure)
     offsets = np.median(kept, axis=0).astype(np.float64)
     shades = _shades(reference, query, exponents, offsets, known, settings.moved)
     if shades is not None:
         offset -= cv2.resize(shades, size, interpolation=cv2.INTER_AREA)
-    local = np.clip(np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255).astype(np.uint8)
+    local = np.clip(
+        np.rint((offset - offsets.astype(np.float32)) * STEPS_PER_OCTAVE + 128), 0, 255
+    ).astype(np.uint8)
     same = _sameness(reference, query, settings)
     if sure is not None:
         same[~sure] = 0
@@ -116,11 +131,17 @@ def _curves_and_gains(light: Light, width: int) -> tuple[NDArray[np.int32], NDAr
         gains = cv2.resize(grid, light.shades.shape[1::-1], interpolation=cv2.INTER_LINEAR)
         grid = np.asarray(cv2.multiply(light.shades, gains), np.float32)
     steps = np.clip(np.rint(grid * GAIN_ONE), 0, 65535).astype(np.float32)
-    return table, np.asarray(cv2.resize(steps, (width, len(steps)), interpolation=cv2.INTER_LINEAR), np.float32)
+    return table, np.asarray(
+        cv2.resize(steps, (width, len(steps)), interpolation=cv2.INTER_LINEAR), np.float32
+    )
 
 
 def _shades(
-    reference: Bgr, query: Bgr, exponents: Floats, offsets: Floats, known: Mask | None,
+    reference: Bgr,
+    query: Bgr,
+    exponents: Floats,
+    offsets: Floats,
+    known: Mask | None,
     settings: MovedShadowSettings,
 ) -> NDArray[np.float32] | None:
     """Octaves (h, w, 3) by which shadows that moved changed the ground of two pictures (h, w, 3); None if nowhere."""
@@ -129,8 +150,12 @@ def _shades(
         np.clip(np.rint((each - black) * 2 * STEPS), 0, 255).astype(np.uint8)[None]
         for each in (exponents * levels + offsets, np.repeat(levels, 3, axis=1))
     )
-    before, after = (np.asarray(cv2.LUT(*each), np.uint8) for each in zip((reference, query), tables))
-    return moved_shades(before, after, _surely(known, (reference.shape[1], reference.shape[0])), settings)
+    before, after = (
+        np.asarray(cv2.LUT(*each), np.uint8) for each in zip((reference, query), tables)
+    )
+    return moved_shades(
+        before, after, _surely(known, (reference.shape[1], reference.shape[0])), settings
+    )
 
 
 def _chosen(values: NDArray[np.float32], sure: Mask | None) -> NDArray[np.float32]:

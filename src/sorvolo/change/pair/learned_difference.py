@@ -25,15 +25,24 @@ class LearnedSettings:
     """How features are compared (0035)."""
 
     reach: int = 1  # cells of a layer that a feature is looked for around: alignment is good to less than a cell
-    least_middle: tuple[float, float] = (0.8, 0.55)  # of distance, in features' standard deviations, and of 1 - cosine:
-    least_spread: tuple[float, float] = (0.25, 0.17)  # two dates have these at least; no pair is taken as calmer
+    least_middle: tuple[float, float] = (
+        0.8,
+        0.55,
+    )  # of distance, in features' standard deviations, and of 1 - cosine:
+    least_spread: tuple[float, float] = (
+        0.25,
+        0.17,
+    )  # two dates have these at least; no pair is taken as calmer
     least_known: int = 64  # cells of a layer; too few to know unchanged ground by
     most: float = 8.0  # spreads; beyond, more means no more
     direction: float = 2.0  # weight of the angle between features, beside 1 of their distance
 
 
 def learned_difference(
-    reference: Image, query: Image, known: Mask | None, settings: LearnedSettings = LearnedSettings(),
+    reference: Image,
+    query: Image,
+    known: Mask | None,
+    settings: LearnedSettings = LearnedSettings(),
     features: Callable[[Image], list[Floats32]] | None = None,
 ) -> Floats32:
     """(h, w) by how many spreads the features of two aligned pictures lie farther apart than they mostly do.
@@ -59,9 +68,15 @@ def learned_difference(
         apart = _apart(one[:, :rows, :columns], other[:, :rows, :columns], held, settings.reach)
         for row, weight in enumerate((1.0, settings.direction)):
             spreads = np.float32(weight) * _in_spreads(
-                apart[row], held, settings.least_middle[row], settings.least_spread[row], settings.most
+                apart[row],
+                held,
+                settings.least_middle[row],
+                settings.least_spread[row],
+                settings.most,
             )
-            larger = cv2.resize(spreads, (columns * stride, rows * stride), interpolation=cv2.INTER_LINEAR)
+            larger = cv2.resize(
+                spreads, (columns * stride, rows * stride), interpolation=cv2.INTER_LINEAR
+            )
             total += larger[:height, :width]
     total /= np.float32(len(_LAYERS) * (1 + settings.direction))
     total[~seen] = 0
@@ -71,7 +86,9 @@ def learned_difference(
 def learned_features(image: Image) -> list[Floats32]:
     """The layers (channels, rows, columns) of a picture; about 50 ms for 800 x 450 on one core."""
     height, width = image.shape[:2]
-    padded = cv2.copyMakeBorder(image, 0, -height % _WHOLE_PX, 0, -width % _WHOLE_PX, cv2.BORDER_REFLECT_101)
+    padded = cv2.copyMakeBorder(
+        image, 0, -height % _WHOLE_PX, 0, -width % _WHOLE_PX, cv2.BORDER_REFLECT_101
+    )
     planes = np.ascontiguousarray(padded[..., ::-1].transpose(2, 0, 1))
     return [each[0] for each in _network().run(list(_LAYERS), {"image": planes[None]})]
 
@@ -84,14 +101,19 @@ def _stride(layer: Floats32, width: int) -> int:
 def _padded(image: NDArray[np.uint8], stride: int) -> NDArray[np.uint8]:
     height, width = image.shape
     return np.asarray(
-        cv2.copyMakeBorder(image, 0, -height % stride, 0, -width % stride, cv2.BORDER_REPLICATE), np.uint8
+        cv2.copyMakeBorder(image, 0, -height % stride, 0, -width % stride, cv2.BORDER_REPLICATE),
+        np.uint8,
     )
 
 
-def _in_spreads(measure: Floats32, held: Mask, least_middle: float, least_spread: float, most: float) -> Floats32:
+def _in_spreads(
+    measure: Floats32, held: Mask, least_middle: float, least_spread: float, most: float
+) -> Floats32:
     """A measure (rows, columns) less its median where `held`, in spreads, at most this many."""
     median = float(np.median(measure[held]))
-    spread = max(SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(measure[held] - median))), least_spread)
+    spread = max(
+        SIGMA_PER_MEDIAN_DEVIATION * float(np.median(np.abs(measure[held] - median))), least_spread
+    )
     away = (measure - np.float32(max(median, least_middle))) / np.float32(spread)
     return np.asarray(np.clip(away, -most, most), np.float32)
 
@@ -99,15 +121,23 @@ def _in_spreads(measure: Floats32, held: Mask, least_middle: float, least_spread
 def _apart(one: Floats32, other: Floats32, held: Mask, reach: int) -> tuple[Floats32, Floats32]:
     """How far each feature of `one` (channels, rows, columns) lies from the nearest of `other` around it: root of the
     mean square over channels, and one less the cosine, (rows, columns) each."""
-    deviation = np.sqrt((one[:, held].var(axis=1) + other[:, held].var(axis=1)) / 2) + np.float32(1e-4)
+    deviation = np.sqrt((one[:, held].var(axis=1) + other[:, held].var(axis=1)) / 2) + np.float32(
+        1e-4
+    )
     ours, theirs = (
-        np.asarray((each - each[:, held].mean(axis=1)[:, None, None]) / deviation[:, None, None], np.float32)
+        np.asarray(
+            (each - each[:, held].mean(axis=1)[:, None, None]) / deviation[:, None, None],
+            np.float32,
+        )
         for each in (one, other)
     )
     _, rows, columns = ours.shape
     around = np.pad(theirs, ((0, 0), (reach, reach), (reach, reach)), mode="edge")
     own, power = (np.square(each).sum(axis=0) for each in (ours, around))
-    nearest, likest = np.full((rows, columns), np.inf, np.float32), np.full((rows, columns), -1.0, np.float32)
+    nearest, likest = (
+        np.full((rows, columns), np.inf, np.float32),
+        np.full((rows, columns), -1.0, np.float32),
+    )
     for dy in range(2 * reach + 1):
         for dx in range(2 * reach + 1):
             part = np.s_[dy : dy + rows, dx : dx + columns]

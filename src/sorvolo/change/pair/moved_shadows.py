@@ -21,12 +21,20 @@ class MovedShadowSettings:
     Depths are in steps, `STEPS` to an octave.
     """
 
-    levels: tuple[int, ...] = (8, 14, 22)  # darker or brighter by so much: more comes free of what it touches
+    levels: tuple[int, ...] = (
+        8,
+        14,
+        22,
+    )  # darker or brighter by so much: more comes free of what it touches
     most_tint: int = 15  # between the colours: a shadow takes somewhat less of blue
-    least_width_px: int = 5  # narrower shadows are those of people and small things, which reveal them
+    least_width_px: int = (
+        5  # narrower shadows are those of people and small things, which reveal them
+    )
     least_alike: float = 0.35  # correlation of the ground's details within, at least, and ...
     alike_of_few: float = 2.5  # ... so much more, by the root of the number of pixels
-    sharp: float = 0.4  # of its depth is left beside a shadow, at most, along as large a share of its edge
+    sharp: float = (
+        0.4  # of its depth is left beside a shadow, at most, along as large a share of its edge
+    )
     largest: float = 0.05  # of the picture: what is larger is a cloud, and smooth gains follow it
     near_px: int = 15  # how far the depth of a shadow is the same
     most_apart: int = 6  # from a shadow's depth: ground beside it that it covers, too
@@ -34,7 +42,10 @@ class MovedShadowSettings:
 
 
 def moved_shades(
-    before: Image, after: Image, known: Mask | None, settings: MovedShadowSettings = MovedShadowSettings()
+    before: Image,
+    after: Image,
+    known: Mask | None,
+    settings: MovedShadowSettings = MovedShadowSettings(),
 ) -> NDArray[np.float32] | None:
     """Octaves (h, w, 3) by which ground is brighter that a shadow left (below 0: darker, it came); None if nowhere.
 
@@ -56,7 +67,10 @@ def moved_shades(
             octaves = np.zeros(apart.shape, np.float32) if octaves is None else octaves
             x, y, wide, high = cv2.boundingRect(shaded)
             near = settings.near_px
-            part = slice(max(0, y - near), y + high + near), slice(max(0, x - near), x + wide + near)
+            part = (
+                slice(max(0, y - near), y + high + near),
+                slice(max(0, x - near), x + wide + near),
+            )
             octaves[part] += _octaves(shaded[part], apart[part], settings)
     if octaves is not None and known is not None:
         octaves[~known] = 0
@@ -64,7 +78,11 @@ def moved_shades(
 
 
 def _shaded(
-    middle: MatLike, alike: MatLike, sign: int, pictures: tuple[Image, Image], settings: MovedShadowSettings
+    middle: MatLike,
+    alike: MatLike,
+    sign: int,
+    pictures: tuple[Image, Image],
+    settings: MovedShadowSettings,
 ) -> Image:
     """Where (h, w), 255 or 0, ground became brighter (`sign` 1) or darker (-1) under another shadow.
 
@@ -75,7 +93,9 @@ def _shaded(
     details: tuple[Image, Image] | None = None
     for level in settings.levels:
         differs = cv2.threshold(brighter, ALIKE + level, 255, cv2.THRESH_BINARY)[1]
-        pieces = _Pieces(cv2.min(cv2.min(differs, alike), cv2.bitwise_not(shaded)), middle, settings)
+        pieces = _Pieces(
+            cv2.min(cv2.min(differs, alike), cv2.bitwise_not(shaded)), middle, settings
+        )
         if pieces.count == 1:
             break
         kept = pieces.are_shadows()
@@ -98,7 +118,9 @@ class _Pieces:
         self.count, self.labels = 1, self._opened
         if cv2.countNonZero(self._opened) == 0:
             return
-        self.count, self.labels = cv2.connectedComponents(self._opened, connectivity=4, ltype=cv2.CV_16U)
+        self.count, self.labels = cv2.connectedComponents(
+            self._opened, connectivity=4, ltype=cv2.CV_16U
+        )
         # some of the pixels that lie within pieces, 4000 at most, and whose they are
         places = _places(cv2.erode(self._opened, np.ones((3, 3), np.uint8)))
         step = max(1, -(-len(places) // 4000))
@@ -123,10 +145,14 @@ class _Pieces:
         outer[cv2.dilate(self._opened, np.ones((3, 3), np.uint8)) > 0] = 0
         ring = _places(outer)
         own, sharp = outer.ravel()[ring], self._settings.sharp
-        ends = np.bincount(own, np.abs(_steps(self._middle, ring)) < sharp * np.abs(self._depth)[own], self.count)
+        ends = np.bincount(
+            own, np.abs(_steps(self._middle, ring)) < sharp * np.abs(self._depth)[own], self.count
+        )
         return fits & (ends >= sharp * np.maximum(np.bincount(own, minlength=self.count), 1))
 
-    def show_the_same(self, asked: NDArray[np.bool_], before: Image, after: Image) -> NDArray[np.bool_]:
+    def show_the_same(
+        self, asked: NDArray[np.bool_], before: Image, after: Image
+    ) -> NDArray[np.bool_]:
         """Which (count,) of those `asked` show the same structure in the details (h, w) of both pictures.
 
         They may be a pixel apart.
@@ -148,7 +174,9 @@ class _Pieces:
         energies = np.add.reduceat(a * a, starts) * np.add.reduceat(b * b, starts, axis=1)
         alike = np.add.reduceat(a * b, starts, axis=1) / np.sqrt(energies + 1e-9)
         same = np.zeros(self.count, bool)
-        same[kept] = alike.max(axis=0) > self._settings.least_alike + self._settings.alike_of_few / np.sqrt(number)
+        same[kept] = alike.max(
+            axis=0
+        ) > self._settings.least_alike + self._settings.alike_of_few / np.sqrt(number)
         return same
 
     def _mean(self, values: Floats) -> Floats:
@@ -173,7 +201,10 @@ def _details(logarithm: Image) -> Image:
 
 def _octaves(shaded: Image, apart: Image, settings: MovedShadowSettings) -> NDArray[np.float32]:
     """(h, w, 3) how deep the shadow is where `shaded`, smooth; about its rim the part of it that all colours show."""
-    near, rim = (settings.near_px, settings.near_px), np.ones((2 * settings.rim_px + 1,) * 2, np.uint8)
+    near, rim = (
+        (settings.near_px, settings.near_px),
+        np.ones((2 * settings.rim_px + 1,) * 2, np.uint8),
+    )
     steps = apart.astype(np.float32) - ALIKE
     known = np.asarray(cv2.blur(shaded.astype(np.float32), near))
     share = np.maximum(known, np.float32(1e-3))

@@ -21,16 +21,26 @@ class ExtentSettings:
     """How far a thing reaches from where it differs most (0007). Lengths in px of the half size pictures."""
 
     reach_px: int = 20  # around a region and half of its length more: the ground that is looked at
-    least_levels: float = 5.0  # grey levels: what differs less is no part of the thing, nor what differs by less ...
+    least_levels: float = (
+        5.0  # grey levels: what differs less is no part of the thing, nor what differs by less ...
+    )
     of_top: float = 0.07  # ... than this part of the region's largest difference, or ...
     of_quiet: float = 2.0  # ... so many times as much as 90 % of the quiet ground
     step: float = 1.4  # factor from limit to limit, up to ...
-    highest: float = 0.7  # ... this part of the largest difference; what passes it is the thing for sure
+    highest: float = (
+        0.7  # ... this part of the largest difference; what passes it is the thing for sure
+    )
     convexity: float = 0.8  # part of its hull that a thing fills
     beside: float = 0.5  # of the limit, that three quarters of what lies beside a thing do not pass: light fades slowly
-    shade_of_top: float = 0.35  # of the largest difference: what differs less and is darker is the thing's shadow
-    shade: ShadeSettings = field(default_factory=lambda: ShadeSettings(no_brighter=1.0, alike=0.1))  # 0024
-    blurred: float = 0.2  # of the largest difference within 5 px: what differs less is a thing's blurred rim
+    shade_of_top: float = (
+        0.35  # of the largest difference: what differs less and is darker is the thing's shadow
+    )
+    shade: ShadeSettings = field(
+        default_factory=lambda: ShadeSettings(no_brighter=1.0, alike=0.1)
+    )  # 0024
+    blurred: float = (
+        0.2  # of the largest difference within 5 px: what differs less is a thing's blurred rim
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +54,9 @@ class Views:
     @cached_property
     def shade(self) -> ImageGray:
         """The pair's shade mask (h, w), bits of `Shade`, of both pictures blurred as differences are: made once."""
-        lit, after = (np.asarray(cv2.blur(each, (3, 3)), np.uint8) for each in (self.lit, self.after))
+        lit, after = (
+            np.asarray(cv2.blur(each, (3, 3)), np.uint8) for each in (self.lit, self.after)
+        )
         return shade_between(lit, after, self.limits)
 
 
@@ -62,7 +74,9 @@ class Piece:
         return x + self.window[1].start, y + self.window[0].start, wide, high
 
 
-def grown(regions: Regions, region: int, came: bool, views: Views, settings: ExtentSettings) -> Piece | None:
+def grown(
+    regions: Regions, region: int, came: bool, views: Views, settings: ExtentSettings
+) -> Piece | None:
     """The thing that `region` (0 .. N - 1) is a part of; None where it does not stand out from what is around.
 
     Its difference stands out of that of the quiet ground near: at the lowest limit at which it is one nearly convex
@@ -79,10 +93,16 @@ def grown(regions: Regions, region: int, came: bool, views: Views, settings: Ext
     darker = (views.shade[window] & np.uint8(Shade.LATER if came else Shade.EARLIER)) > 0
     shadow = darker & (strength < ceil(settings.shade_of_top * top)) & ~core
     bare = strength * ~shadow
-    limit = max(settings.least_levels, settings.of_top * top, settings.of_quiet * _quantile(bare, quiet, 0.9))
+    limit = max(
+        settings.least_levels,
+        settings.of_top * top,
+        settings.of_quiet * _quantile(bare, quiet, 0.9),
+    )
     while limit < settings.highest * top:
         over = cv2.threshold(bare, floor(limit), 255, cv2.THRESH_BINARY)[1]
-        above = np.asarray(cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8)
+        above = np.asarray(
+            cv2.morphologyEx(over, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), np.uint8
+        )
         thing = held_parts(above | surely, surely)
         if _is_thing(thing, bare, limit, settings):
             largest_near = cv2.dilate(strength, np.ones((5, 5), np.uint8))
@@ -108,7 +128,9 @@ def with_weak_ground(regions: Regions, region: int, reach_px: int) -> Piece:
 def _is_thing(mask: Image, strength: Image, limit: float, settings: ExtentSettings) -> bool:
     """Whether a piece is nearly convex, and a few pixels off it the difference is gone: light fades away slowly."""
     outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    if cv2.countNonZero(mask) < settings.convexity * cv2.contourArea(cv2.convexHull(np.concatenate(outlines))):
+    if cv2.countNonZero(mask) < settings.convexity * cv2.contourArea(
+        cv2.convexHull(np.concatenate(outlines))
+    ):
         return False
     inner, outer = (cv2.dilate(mask, np.ones((px, px), np.uint8)) for px in (5, 9))
     beside = np.asarray(outer > inner)
@@ -120,7 +142,8 @@ def _window(regions: Regions, region: int, reach_px: int) -> Window:
     margin = reach_px + max(wide, high) // 2
     height, width = regions.labels.shape
     return np.s_[
-        max(0, y - margin) : min(height, y + high + margin), max(0, x - margin) : min(width, x + wide + margin)
+        max(0, y - margin) : min(height, y + high + margin),
+        max(0, x - margin) : min(width, x + wide + margin),
     ]
 
 

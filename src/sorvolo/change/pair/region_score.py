@@ -31,7 +31,9 @@ def how_sure(features: Floats, names: tuple[str, ...], trees: Trees | None = Non
     """
     trees = trees or trained_trees()
     if trees.names != names:
-        raise SettingsError("the trees of region_score.json were trained on other features; train them again")
+        raise SettingsError(
+            "the trees of region_score.json were trained on other features; train them again"
+        )
     if len(features) == 0:
         return np.zeros(0)
     margin = trees.prior + tree_margins(features, trees.features, trees.thresholds, trees.leaves)
@@ -43,6 +45,9 @@ def trained_trees() -> Trees:
     """The trees that come with the package."""
     stored = json.loads(files("sorvolo.change.pair").joinpath("region_score.json").read_text())
     return Trees(
-        tuple(stored["names"]), float(stored["prior"]), np.array(stored["features"], np.int32),
-        np.array(stored["thresholds"]), np.array(stored["leaves"]),
+        tuple(stored["names"]),
+        float(stored["prior"]),
+        np.array(stored["features"], np.int32),
+        np.array(stored["thresholds"]),
+        np.array(stored["leaves"]),
     )

@@ -13,8 +13,12 @@ from sorvolo.geometry.arrays import Mask, Matrix3
 from sorvolo.kernels import fit_moves, flow_on_grid
 
 _GRID = (28, 16)  # columns and rows of the flow that is fitted; the cached `_rows` are its
-_RIDGE = 1e-4 * np.array([0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1])  # parts of the size: bends are small, or seen
-_LEAST_FLOW_PX = 32  # OpenCV's flow crashes on pictures that are wide and less high than four of its patches
+_RIDGE = 1e-4 * np.array(
+    [0, 0.01, 0.01, 0, 0.01, 0.01, 1, 1]
+)  # parts of the size: bends are small, or seen
+_LEAST_FLOW_PX = (
+    32  # OpenCV's flow crashes on pictures that are wide and less high than four of its patches
+)
 _LOG = np.clip(np.rint(np.log2((np.arange(256) + 8) / 8) * 50), 0, 255).astype(np.uint8)
 
 
@@ -41,28 +45,41 @@ class Settling:
 
 
 def settle(
-    reference: NDArray[np.uint8], query: NDArray[np.uint8], known: Mask | None = None,
+    reference: NDArray[np.uint8],
+    query: NDArray[np.uint8],
+    known: Mask | None = None,
     settings: SettlingSettings = SettlingSettings(),
 ) -> Settling:
     """Settle two gray pictures (h, w) uint8 that are a few pixels apart, whatever their light."""
     height, width = query.shape
     small = max(16, width // 2), max(16, height // 2)
     scale = np.array([width / small[0], height / small[1]])
-    details = [_details(cv2.resize(image, small, interpolation=cv2.INTER_AREA)) for image in (reference, query)]
+    details = [
+        _details(cv2.resize(image, small, interpolation=cv2.INTER_AREA))
+        for image in (reference, query)
+    ]
     if min(small) < _LEAST_FLOW_PX:
         return Settling(np.eye(3), 0.0, 0.0)
     start: Any = None
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(details[1], details[0], start)
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST).calc(
+        details[1], details[0], start
+    )
     grid = flow_on_grid(np.asarray(flow, np.float32), details[1], *_GRID[::-1]).reshape(-1, 3)
     flow_px, texture = grid[:, :2] * scale, grid[:, 2]
     trust = np.clip(texture.astype(np.float64) / 8, 0.05, 1)
     if known is not None:
-        trust *= cv2.resize(known.astype(np.float32), _GRID, interpolation=cv2.INTER_AREA).ravel() > 0.99
+        trust *= (
+            cv2.resize(known.astype(np.float32), _GRID, interpolation=cv2.INTER_AREA).ravel() > 0.99
+        )
     if np.count_nonzero(trust) < settings.least_places:
         return Settling(np.eye(3), 0.0, 0.0)
     matrix, rest_px = _near_homography(flow_px / (width, height), trust, (width, height))
     corners = np.array([[0.0, 0, 1], [width, 0, 1], [0, height, 1], [width, height, 1]]) @ matrix.T
-    moved_px = float(np.abs(corners[:, :2] / corners[:, 2:] - [[0, 0], [width, 0], [0, height], [width, height]]).max())
+    moved_px = float(
+        np.abs(
+            corners[:, :2] / corners[:, 2:] - [[0, 0], [width, 0], [0, height], [width, height]]
+        ).max()
+    )
     if not settings.smallest_px <= moved_px <= settings.largest_px:
         return Settling(np.eye(3), 0.0, rest_px)
     return Settling(matrix, moved_px, rest_px)
@@ -71,7 +88,9 @@ def settle(
 def _details(gray: MatLike) -> NDArray[np.uint8]:
     """What is finer than clouds, in logarithms: light falls out of it."""
     logarithm = cv2.LUT(gray, _LOG)
-    return np.asarray(cv2.addWeighted(logarithm, 2, cv2.blur(logarithm, (15, 15)), -2, 128), np.uint8)
+    return np.asarray(
+        cv2.addWeighted(logarithm, 2, cv2.blur(logarithm, (15, 15)), -2, 128), np.uint8
+    )
 
 
 @lru_cache(maxsize=1)
@@ -90,7 +109,12 @@ def _near_homography(
     rows_x, rows_y = _rows()
     a, rest_px = fit_moves(rows_x, rows_y, moves, trust, _RIDGE, *size_px)
     near = np.array([[1 + a[1], a[2], a[0]], [a[4], 1 + a[5], a[3]], [-a[6], -a[7], 1.0]])
-    parts_from_px = np.array([[1 / size_px[0], 0, 0.5 / size_px[0] - 0.5], [0, 1 / size_px[1], 0.5 / size_px[1] - 0.5],
-                              [0, 0, 1.0]])
+    parts_from_px = np.array(
+        [
+            [1 / size_px[0], 0, 0.5 / size_px[0] - 0.5],
+            [0, 1 / size_px[1], 0.5 / size_px[1] - 0.5],
+            [0, 0, 1.0],
+        ]
+    )
     matrix = np.linalg.inv(parts_from_px) @ near @ parts_from_px
     return np.asarray(matrix / matrix[2, 2]), rest_px

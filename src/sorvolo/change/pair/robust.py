@@ -22,10 +22,14 @@ from sorvolo.geometry.arrays import Boxes, Floats, ImageGray, Mask
 class MaskSettings:
     """How regions become masks (0007). Lengths in px of the half size pictures."""
 
-    least_grown: float = 0.5  # score: what is doubted is shown as it differs, and takes no ground from around
+    least_grown: float = (
+        0.5  # score: what is doubted is shown as it differs, and takes no ground from around
+    )
     convexity: float = 0.5  # part of its hull: what fills more fills all of it, for it may have the ground's colours
     rim_px: int = 5  # side of the window within which an outline is drawn, where half of the difference is left ...
-    slack_levels: float = 5.0  # ... of what it was before the ground's own range, grey levels, was taken off ...
+    slack_levels: float = (
+        5.0  # ... of what it was before the ground's own range, grey levels, was taken off ...
+    )
     least_share: float = 0.4  # ... at least this share
     same_place_px: float = 0.6  # a reference displaced by more shows what left at its own pixels
 
@@ -63,7 +67,9 @@ class RobustResult:
 
 
 def compare_robust(
-    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None = None,
+    reference: NDArray[np.uint8],
+    query: NDArray[np.uint8],
+    valid: Mask | None = None,
     settings: RobustSettings | None = None,
 ) -> RobustResult:
     """Compare two aligned BGR pictures (h, w, 3) uint8 of at least 32 px; up to about 5 px apart is fine.
@@ -90,7 +96,10 @@ class Examined(NamedTuple):
 
 
 def examine(
-    reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None, settings: RobustSettings,
+    reference: NDArray[np.uint8],
+    query: NDArray[np.uint8],
+    valid: Mask | None,
+    settings: RobustSettings,
     scratch: Scratch | None = None,
 ) -> Examined:
     """Look at a pair of pictures as `compare_robust` does. Pictures and strengths of the result lie in `scratch`, in
@@ -116,12 +125,20 @@ def examine(
         four, moved = (scratch.take(name, size, (4,)) for name in ("four", "moved"))
         cv2.cvtColor(before, cv2.COLOR_BGR2BGRA, dst=four)
         cv2.warpPerspective(
-            four, settling.reference_from_query, half, dst=moved, flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            four,
+            settling.reference_from_query,
+            half,
+            dst=moved,
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
         cv2.cvtColor(moved, cv2.COLOR_BGRA2BGR, dst=before)
     light = fit_light(before, after, known, settings.light)
-    known = None if known is None else _without_rim(known, settings.unknown_px + int(np.ceil(settling.moved_px)))
+    known = (
+        None
+        if known is None
+        else _without_rim(known, settings.unknown_px + int(np.ceil(settling.moved_px)))
+    )
     lit = relit(before, light, spare)
     # where hardly anything moves values need not be looked for as far around, and less is hidden by them
     reach_px = settings.regions.reach_px - int(settling.rest_px < settings.calm_px)
@@ -134,14 +151,22 @@ def examine(
 def _check(reference: NDArray[np.uint8], query: NDArray[np.uint8], valid: Mask | None) -> None:
     for name, image in (("reference", reference), ("query", query)):
         if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
-            raise InputError(f"{name}: found {image.dtype} of shape {image.shape}; give a BGR picture, (h, w, 3) uint8")
+            raise InputError(
+                f"{name}: found {image.dtype} of shape {image.shape}; give a BGR picture, (h, w, 3) uint8"
+            )
     if reference.shape != query.shape:
-        raise InputError(f"the reference is {reference.shape}, the query {query.shape}; align them to the same pixels")
+        raise InputError(
+            f"the reference is {reference.shape}, the query {query.shape}; align them to the same pixels"
+        )
     height, width = query.shape[:2]
     if min(height, width) < 32:
-        raise InputError(f"the pictures are {width} x {height} px; at least 32 px are needed each way")
+        raise InputError(
+            f"the pictures are {width} x {height} px; at least 32 px are needed each way"
+        )
     if valid is not None and (valid.shape != query.shape[:2] or valid.dtype != np.bool_):
-        raise InputError(f"valid: found {valid.dtype} of shape {valid.shape}; give a bool mask of {query.shape[:2]}")
+        raise InputError(
+            f"valid: found {valid.dtype} of shape {valid.shape}; give a bool mask of {query.shape[:2]}"
+        )
 
 
 def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
@@ -151,7 +176,9 @@ def _half_known(valid: Mask | None, half: tuple[int, int]) -> Mask | None:
     if height % 2 == 0 and width % 2 == 0:
         pairs = np.ascontiguousarray(valid).view(np.uint16) == 0x0101  # two True side by side
         return np.logical_and(pairs[::2], pairs[1::2])
-    return np.asarray(cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255)
+    return np.asarray(
+        cv2.resize(valid.astype(np.uint8) * 255, half, interpolation=cv2.INTER_AREA) == 255
+    )
 
 
 def _without_rim(known: Mask, rim_px: int) -> Mask:
@@ -160,7 +187,11 @@ def _without_rim(known: Mask, rim_px: int) -> Mask:
 
 
 def _result(
-    examined: Examined, scores: Floats, settings: RobustSettings, size: tuple[int, int], scratch: Scratch
+    examined: Examined,
+    scores: Floats,
+    settings: RobustSettings,
+    size: tuple[int, int],
+    scratch: Scratch,
 ) -> RobustResult:
     """The answer at full `size` (w, h): the regions whose scores (N,) suffice."""
     regions, light, settling, known, views = examined
@@ -175,13 +206,16 @@ def _result(
         if piece is not None:
             pieces[int(region)] = piece
     half = regions.labels.shape[::-1]
-    boxes_px = np.array([_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64)
+    boxes_px = np.array(
+        [_around(box, pieces.get(each)) for each, box in enumerate(regions.boxes)], np.float64
+    )
     if settling.moved_px < masks.same_place_px or not (sure & went).any():
         half_mask = _filled(sure, regions, pieces, settings)
     else:  # what disappeared is seen in the reference: it keeps the reference's pixels
         gone = _filled(sure & went, regions, pieces, settings)
         gone = np.asarray(
-            cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR), np.uint8
+            cv2.warpPerspective(gone, settling.reference_from_query, half, flags=cv2.INTER_LINEAR),
+            np.uint8,
         )
         stays = sure & ~went
         half_mask = gone
@@ -216,7 +250,10 @@ def _enlarged(half_mask: ImageGray, size: tuple[int, int]) -> ImageGray:
     top, left, bottom, right = max(0, y - 1), max(0, x - 1), y + high + 1, x + wide + 1
     window, place = half_mask, mask
     if size[0] % 2 == 0 and size[1] % 2 == 0:
-        window, place = half_mask[top:bottom, left:right], mask[2 * top : 2 * bottom, 2 * left : 2 * right]
+        window, place = (
+            half_mask[top:bottom, left:right],
+            mask[2 * top : 2 * bottom, 2 * left : 2 * right],
+        )
     larger = cv2.resize(window, place.shape[::-1], interpolation=cv2.INTER_LINEAR)
     place[:] = cv2.threshold(larger, 127, 255, cv2.THRESH_BINARY)[1]
     return mask
@@ -245,7 +282,9 @@ def _filled(
     size = regions.labels.shape[0], regions.labels.shape[1]
     masks, around = settings.masks, np.zeros(size, np.uint8)
     for region in np.flatnonzero(chosen):
-        piece = pieces.get(int(region)) or with_weak_ground(regions, int(region), settings.extent.reach_px)
+        piece = pieces.get(int(region)) or with_weak_ground(
+            regions, int(region), settings.extent.reach_px
+        )
         around[piece.window][piece.mask] = 255
     outlines, _ = cv2.findContours(around, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     for outline in outlines:
@@ -253,8 +292,10 @@ def _filled(
         is_full = cv2.contourArea(outline) > masks.convexity * cv2.contourArea(hull)
         cv2.drawContours(around, [hull if is_full else outline], -1, 255.0, cv2.FILLED)
     x, y, wide, high = cv2.boundingRect(around)
-    things = np.s_[max(0, y - masks.rim_px) : y + high + masks.rim_px,
-                   max(0, x - masks.rim_px) : x + wide + masks.rim_px]
+    things = np.s_[
+        max(0, y - masks.rim_px) : y + high + masks.rim_px,
+        max(0, x - masks.rim_px) : x + wide + masks.rim_px,
+    ]
     outlined = np.zeros(size, np.uint8)
     outlined[things] = _outlined(around[things], regions.strength[things], masks)
     if regions.known is not None:

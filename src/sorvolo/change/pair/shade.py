@@ -19,7 +19,9 @@ class ShadeSettings:
     """What is as dark as a shadow. Parts are of the light on the other date; black is lifted first."""
 
     black: float = 8.0  # grey levels: below it a camera shows noise, not light
-    no_brighter: float = 1.08  # part; a shadow's rim, and what is as dark as a shadow, keep so much at most
+    no_brighter: float = (
+        1.08  # part; a shadow's rim, and what is as dark as a shadow, keep so much at most
+    )
     alike: float = 0.22  # from the part of one colour to that of another: a shadow takes about the same of each
     dark: float = 0.8  # part; clearly darker, a shadow's core
 
@@ -31,27 +33,43 @@ def shade_of_view(
 
     The map's picture is brought to the view's light first; 0 where not `valid` (h, w).
     """
-    before, after = (np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2BGR), np.uint8) for each in (reference, image))
-    half = before.shape[1] // 2, before.shape[0] // 2
-    known = None if valid.all() else cv2.resize(valid.view(np.uint8), half, interpolation=cv2.INTER_NEAREST) > 0
-    small_before, small_after = (
-        np.asarray(cv2.resize(each, half, interpolation=cv2.INTER_AREA), np.uint8) for each in (before, after)
+    before, after = (
+        np.asarray(cv2.cvtColor(each, cv2.COLOR_RGB2BGR), np.uint8) for each in (reference, image)
     )
-    shade = shade_between(relit(before, fit_light(small_before, small_after, known)), after, settings)
+    half = before.shape[1] // 2, before.shape[0] // 2
+    known = (
+        None
+        if valid.all()
+        else cv2.resize(valid.view(np.uint8), half, interpolation=cv2.INTER_NEAREST) > 0
+    )
+    small_before, small_after = (
+        np.asarray(cv2.resize(each, half, interpolation=cv2.INTER_AREA), np.uint8)
+        for each in (before, after)
+    )
+    shade = shade_between(
+        relit(before, fit_light(small_before, small_after, known)), after, settings
+    )
     return np.asarray(cv2.copyTo(shade, valid.view(np.uint8)), np.uint8)
 
 
-def shade_between(before: ImageRGB, after: ImageRGB, settings: ShadeSettings = ShadeSettings()) -> ImageGray:
+def shade_between(
+    before: ImageRGB, after: ImageRGB, settings: ShadeSettings = ShadeSettings()
+) -> ImageGray:
     """The shade mask (h, w), bits of `Shade`, of two pictures (h, w, 3) uint8 in the same light."""
-    one, other = (cv2.convertScaleAbs(each, alpha=1.0, beta=settings.black) for each in (before, after))
+    one, other = (
+        cv2.convertScaleAbs(each, alpha=1.0, beta=settings.black) for each in (before, after)
+    )
     shade = np.zeros(before.shape[:2], np.uint8)
     for lighter, darker, bit, dark_bit in (
-        (one, other, Shade.LATER, Shade.LATER_DARK), (other, one, Shade.EARLIER, Shade.EARLIER_DARK),
+        (one, other, Shade.LATER, Shade.LATER_DARK),
+        (other, one, Shade.EARLIER, Shade.EARLIER_DARK),
     ):
         most, spread = _parts(lighter, darker)
         alike = _below(spread, settings.alike * _ONE, 255)
         for limit, marks in ((settings.no_brighter, bit), (settings.dark, dark_bit)):
-            cv2.bitwise_or(shade, cv2.bitwise_and(alike, _below(most, limit * _ONE, int(marks))), dst=shade)
+            cv2.bitwise_or(
+                shade, cv2.bitwise_and(alike, _below(most, limit * _ONE, int(marks))), dst=shade
+            )
     return shade
 
 
@@ -64,5 +82,8 @@ def _parts(lighter: MatLike, darker: MatLike) -> tuple[ImageGray, ImageGray]:
     """What part of the light of one picture another has in the colour that keeps most, and less in the one that keeps
     least: (h, w) each, `_ONE` is all of it; from 255 on they are cut off."""
     parts = cv2.split(cv2.divide(darker, lighter, scale=_ONE))
-    most, least = cv2.max(cv2.max(parts[0], parts[1]), parts[2]), cv2.min(cv2.min(parts[0], parts[1]), parts[2])
+    most, least = (
+        cv2.max(cv2.max(parts[0], parts[1]), parts[2]),
+        cv2.min(cv2.min(parts[0], parts[1]), parts[2]),
+    )
     return np.asarray(most, np.uint8), np.asarray(cv2.subtract(most, least), np.uint8)

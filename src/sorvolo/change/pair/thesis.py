@@ -24,11 +24,17 @@ class ThesisSettings:
 
     averaging_px: tuple[int, int] = (10, 10)  # W_a
     pattern_px: tuple[int, int] = (15, 15)  # W_l
-    gray_threshold: int | None = _TABLE_LEVEL  # T_gray, called T_diff in section 3.2; None: from each pair's light
-    hamming_share: float | None = _TABLE_SHARE  # T_H, of the three strings together; None: from each pair's light
+    gray_threshold: int | None = (
+        _TABLE_LEVEL  # T_gray, called T_diff in section 3.2; None: from each pair's light
+    )
+    hamming_share: float | None = (
+        _TABLE_SHARE  # T_H, of the three strings together; None: from each pair's light
+    )
     isolation_px: tuple[int, int] = (37, 37)  # W_i
     isolation_share: float = 0.25  # T_iso
-    isolation_as_printed: bool = False  # at most T_iso of a window black; else at least T_iso white: see docs/errata.md
+    isolation_as_printed: bool = (
+        False  # at most T_iso of a window black; else at least T_iso white: see docs/errata.md
+    )
     area_share: float = 0.000648  # T_area, of the frame
     least_distance: float = 0.3  # T_B
 
@@ -112,15 +118,22 @@ class ThesisSteps:
     def pictures(self) -> dict[str, NDArray[np.uint8]]:
         """The pictures by name, in the figure's order; BGR or gray."""
         return {
-            "a-reference-equalised": self.reference_equalised, "b-query-equalised": self.query_equalised,
-            "c-reference-averaged": self.reference_averaged, "d-query-averaged": self.query_averaged,
-            "e-difference": self.difference, "f-without-isolations": self.without_isolations,
-            "g-changes": self.changes, "h-highlighted": self.highlighted,
+            "a-reference-equalised": self.reference_equalised,
+            "b-query-equalised": self.query_equalised,
+            "c-reference-averaged": self.reference_averaged,
+            "d-query-averaged": self.query_averaged,
+            "e-difference": self.difference,
+            "f-without-isolations": self.without_isolations,
+            "g-changes": self.changes,
+            "h-highlighted": self.highlighted,
         }
 
 
 def prepare_reference(
-    picture: Picture, valid: Mask | None = None, settings: ThesisSettings | None = None, threads: int = 1
+    picture: Picture,
+    valid: Mask | None = None,
+    settings: ThesisSettings | None = None,
+    threads: int = 1,
 ) -> ThesisReference:
     """The pre-processing of one BGR picture (h, w, 3): equalised by channel, then averaged over W_a.
 
@@ -163,8 +176,14 @@ def thesis_steps(
     marked = run.changes.mask > 0
     highlighted[marked] = query[marked]
     return ThesisSteps(
-        _looked_up(run.reference), _looked_up(run.query), _interleaved(run.reference.planes),
-        _interleaved(run.query.planes), run.difference, run.without_isolations, run.changes.mask, highlighted,
+        _looked_up(run.reference),
+        _looked_up(run.query),
+        _interleaved(run.reference.planes),
+        _interleaved(run.query.planes),
+        run.difference,
+        run.without_isolations,
+        run.changes.mask,
+        highlighted,
         run.changes.boxes,
     )
 
@@ -200,7 +219,11 @@ class _Run(NamedTuple):
 
 
 def _compare(
-    reference: Picture | ThesisReference, query: Picture, valid: Mask | None, settings: ThesisSettings, threads: int
+    reference: Picture | ThesisReference,
+    query: Picture,
+    valid: Mask | None,
+    settings: ThesisSettings,
+    threads: int,
 ) -> _Run:
     before = reference
     if not isinstance(before, ThesisReference):
@@ -210,17 +233,23 @@ def _compare(
             f"the reference was prepared with averaging_px {before.averaging_px}, the settings have "
             f"{settings.averaging_px}; prepare it with these settings"
         )
-    if before.picture.shape != query.shape or (valid is not None and valid.shape != query.shape[:2]):
+    if before.picture.shape != query.shape or (
+        valid is not None and valid.shape != query.shape[:2]
+    ):
         raise InputError(
             f"reference {before.picture.shape}, query {query.shape} and valid "
             f"{None if valid is None else valid.shape} differ in size; give aligned pictures of one size"
         )
     if before.known is not None:
-        valid = before.known.view(np.bool_) if valid is None else valid & before.known.view(np.bool_)
+        valid = (
+            before.known.view(np.bool_) if valid is None else valid & before.known.view(np.bool_)
+        )
     after = prepare_reference(query, valid, settings, threads)
     settings = settings.in_light(light_difference(before, after))
     difference = _differences(before, after, settings, threads)
-    kept = kernels.without_isolations(difference, *settings.isolation_px, settings.most_black, threads)
+    kept = kernels.without_isolations(
+        difference, *settings.isolation_px, settings.most_black, threads
+    )
     if after.known is not None:
         kept[after.known == 0] = 0
     return _Run(before, after, difference, kept, _similar_removed(before, after, kept, settings))
@@ -232,14 +261,21 @@ def _differences(
     """M_diff: equation 3.19, and where its D is 1 the Hamming distance of the strings of equation 3.20."""
     assert settings.gray_threshold is not None  # `in_light` made it a number
     apart = cv2.absdiff(before.gray, after.gray)
-    different = np.asarray(cv2.threshold(apart, settings.gray_threshold - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+    different = np.asarray(
+        cv2.threshold(apart, settings.gray_threshold - 1, 255, cv2.THRESH_BINARY)[1], np.uint8
+    )
     if after.known is not None:
         width, height = settings.averaging_px
         # the reach of W_a to both sides, so that no average that saw the unknown is looked at
         window = np.ones((2 * (height // 2) + 1, 2 * (width // 2) + 1), np.uint8)
         different[cv2.erode(after.known, window, borderValue=1) == 0] = 0
     return kernels.texture_changes(
-        before.planes, after.planes, different, *settings.pattern_px, settings.most_differing_bits, threads
+        before.planes,
+        after.planes,
+        different,
+        *settings.pattern_px,
+        settings.most_differing_bits,
+        threads,
     )
 
 
@@ -252,12 +288,15 @@ def _similar_removed(
     _blacken(mask, boxes[small])
     boxes = boxes[~small]
     histograms = [
-        kernels.gray_histograms(each.picture, each.tables, boxes, after.known) for each in (before, after)
+        kernels.gray_histograms(each.picture, each.tables, boxes, after.known)
+        for each in (before, after)
     ]
     similar = bhattacharyya_distances(*histograms) < settings.least_distance
     _blacken(mask, boxes[similar])
     boxes = boxes[~similar]
-    white = np.array([mask[y : y + height, x : x + width].any() for x, y, width, height in boxes], bool)
+    white = np.array(
+        [mask[y : y + height, x : x + width].any() for x, y, width, height in boxes], bool
+    )
     return ThesisChanges(mask, boxes[white])
 
 
@@ -276,9 +315,15 @@ def _interleaved(planes: NDArray[np.uint8]) -> Picture:
 
 def _check_window(name: str, window: object) -> None:
     most = kernels.LARGEST_WINDOW_PX
-    whole = isinstance(window, tuple) and len(window) == 2 and all(isinstance(side, int) for side in window)
+    whole = (
+        isinstance(window, tuple)
+        and len(window) == 2
+        and all(isinstance(side, int) for side in window)
+    )
     if not whole or not all(1 <= side <= most for side in window):  # type: ignore[attr-defined]
-        raise SettingsError(f"{name} is {window}; give width and height as whole numbers from 1 to {most}")
+        raise SettingsError(
+            f"{name} is {window}; give width and height as whole numbers from 1 to {most}"
+        )
 
 
 def _whole_share(share: float, count: int) -> int:

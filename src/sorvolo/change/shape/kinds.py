@@ -17,7 +17,9 @@ from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
 from sorvolo.survey.findings import ChangeKind, Patch
 
 _SIGNS = 6  # that are measured of each date's picture, see `_signs`
-_REPLACED_PRIOR = 0.5  # seldom does one thing leave where another comes; else snow is a hundred things
+_REPLACED_PRIOR = (
+    0.5  # seldom does one thing leave where another comes; else snow is a hundred things
+)
 # seeds 241 and 242 of the presets compare, compare-urban and compare-dirt with 44 changes each: as they are, in another
 # light, with the thing's contrast shrunk to 45 %, and replaced by a thing of other colours
 _OWN = np.array([0.88, 0.39, 0.61, 1.53, 1.5, 0.17])  # of the date's own signs
@@ -86,14 +88,21 @@ def _signs(picture: ImageRGBA, region: "_Region | None") -> Floats:
     lab = lab8.astype(np.float32)
     far = np.minimum(_length((lab[inside] - middle) / spread), 12.0)
     shift = float(np.linalg.norm((middle_and_deviation(lab8, inside)[0] - middle) / spread))
-    slope_x, slope_y = cv2.Sobel(lab, cv2.CV_32F, 1, 0, scale=0.25), cv2.Sobel(lab, cv2.CV_32F, 0, 1, scale=0.25)
+    slope_x, slope_y = (
+        cv2.Sobel(lab, cv2.CV_32F, 1, 0, scale=0.25),
+        cv2.Sobel(lab, cv2.CV_32F, 0, 1, scale=0.25),
+    )
     slope = _length(np.asarray(cv2.magnitude(slope_x, slope_y), np.float32))
     across_x, across_y = (each[rim, None] for each in region.outwards)
     outward = _length(slope_x[rim] * across_x + slope_y[rim] * across_y)
     rest = float(np.mean(slope[around])) + 1.0
     signs = [
-        float(np.mean(far)), shift, float(np.mean(far > 3.0)) + 0.02,
-        float(np.mean(slope[rim])) / rest, float(np.mean(outward)) / rest, float(np.mean(slope[inside])) / rest,
+        float(np.mean(far)),
+        shift,
+        float(np.mean(far > 3.0)) + 0.02,
+        float(np.mean(slope[rim])) / rest,
+        float(np.mean(outward)) / rest,
+        float(np.mean(slope[inside])) / rest,
     ]
     return np.log(np.array(signs) + 0.05)
 
@@ -137,13 +146,17 @@ def _chance(own: Floats, other: Floats) -> float:
 
 def _outwards(marked: np.ndarray[tuple[int, int], np.dtype[np.uint8]]) -> tuple[Floats32, Floats32]:
     """Unit vectors away from the region: the gradient of the distance to it, inside and outside."""
-    distance = cv2.distanceTransform(1 - marked, cv2.DIST_L2, 3) - cv2.distanceTransform(marked, cv2.DIST_L2, 3)
+    distance = cv2.distanceTransform(1 - marked, cv2.DIST_L2, 3) - cv2.distanceTransform(
+        marked, cv2.DIST_L2, 3
+    )
     x, y = cv2.Sobel(distance, cv2.CV_32F, 1, 0), cv2.Sobel(distance, cv2.CV_32F, 0, 1)
     length = np.hypot(x, y) + 1e-6
     return np.asarray(x / length, np.float32), np.asarray(y / length, np.float32)
 
 
-def middle_and_deviation(picture: NDArray[np.uint8], where: Mask) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def middle_and_deviation(
+    picture: NDArray[np.uint8], where: Mask
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Medians (3,) of a picture's channels, (h, w, 3), and of how far they stray from these, in some pixels.
 
     `where` (h, w) marks the pixels that count, in one at least.

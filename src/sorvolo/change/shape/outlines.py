@@ -37,11 +37,15 @@ def measures(outline_m: PointsM) -> Measures:
     origin = outline_m.mean(axis=0)
     centre, size, _ = cv2.minAreaRect((outline_m - origin).astype(np.float32))
     return Measures(
-        abs(signed_area(outline_m)), float(max(size)), (float(centre[0] + origin[0]), float(centre[1] + origin[1]))
+        abs(signed_area(outline_m)),
+        float(max(size)),
+        (float(centre[0] + origin[0]), float(centre[1] + origin[1])),
     )
 
 
-def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px: float) -> PointsM | None:
+def outline_of(
+    mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px: float
+) -> PointsM | None:
     """The outline, (N, 2) in site metres, of the changed pixels; None when there are none.
 
     It runs along the pixels' outer edges, simplified by at most `tolerance_px`. Pieces less than `join_px` apart are
@@ -52,11 +56,15 @@ def outline_of(mask: Mask, site_from_mask: Matrix3, tolerance_px: float, join_px
         return None
     (y0, x0), (y1, x1) = found.min(axis=0), found.max(axis=0) + 1
     pad = int(np.ceil(join_px)) + 1
-    part = cv2.copyMakeBorder(mask[y0:y1, x0:x1].astype(np.uint8), pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=0)
+    part = cv2.copyMakeBorder(
+        mask[y0:y1, x0:x1].astype(np.uint8), pad, pad, pad, pad, cv2.BORDER_CONSTANT, value=0
+    )
     part = cv2.resize(part, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)
     if join_px >= 1:
         size = 2 * round(join_px) + 1
-        part = cv2.morphologyEx(part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size)))
+        part = cv2.morphologyEx(
+            part, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+        )
     ring = _ring_around(np.asarray(part, np.uint8))
     simple = cv2.approxPolyDP(ring, max(2 * tolerance_px, 0.5), True).reshape(-1, 2)
     points = simple.astype(np.float64) / 2 - 0.25 - pad + np.array([x0, y0])
@@ -72,7 +80,9 @@ def hull_of(mask: Mask | NDArray[np.uint8]) -> NDArray[np.int32]:
     rows = np.flatnonzero(mask.any(axis=1))
     part = mask[rows] != 0
     left, right = part.argmax(axis=1), part.shape[1] - 1 - part[:, ::-1].argmax(axis=1)
-    ends = np.column_stack([np.concatenate([left, right]), np.concatenate([rows, rows])])  # no others can be corners
+    ends = np.column_stack(
+        [np.concatenate([left, right]), np.concatenate([rows, rows])]
+    )  # no others can be corners
     return np.asarray(cv2.convexHull(ends.astype(np.int32)).reshape(-1, 2), np.int32)
 
 
@@ -110,4 +120,6 @@ def is_known(outline_m: PointsM, kind: ChangeKind, places: Sequence[KnownPlace])
 
     It is where the outlines' intersection is more than half of the change's own area or of their union.
     """
-    return any(max(overlap(outline_m, each.outline_m)) > 0.5 for each in places if each.kind == kind)
+    return any(
+        max(overlap(outline_m, each.outline_m)) > 0.5 for each in places if each.kind == kind
+    )

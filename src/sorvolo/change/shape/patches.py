@@ -10,7 +10,9 @@ from sorvolo.change.shape.outlines import mask_of
 from sorvolo.geometry.arrays import ImageGray, ImageRGB, ImageRGBA, Matrix3, PointsM
 from sorvolo.survey.findings import ComparedView, Patch
 
-_LEAST_MARGIN_M = 0.5  # of ground around a change in its pictures, for a person to recognise the place
+_LEAST_MARGIN_M = (
+    0.5  # of ground around a change in its pictures, for a person to recognise the place
+)
 _MARGIN_SHARE = 0.5  # of the change's longer side, where that is more
 _LEAST_PART = 1e-6  # of a pixel: less is a rounding error
 
@@ -26,7 +28,9 @@ class PatchWindow:
     height_px: int
 
     @classmethod
-    def around(cls, low_m: PointsM, high_m: PointsM, m_per_px: float, most_px: int) -> "PatchWindow":
+    def around(
+        cls, low_m: PointsM, high_m: PointsM, m_per_px: float, most_px: int
+    ) -> "PatchWindow":
         """The window of a box and of some ground around it; coarser than asked for where it would grow too large."""
         margin_m = max(_LEAST_MARGIN_M, _MARGIN_SHARE * float((high_m - low_m).max()))
         low_m, high_m = low_m - margin_m, high_m + margin_m
@@ -35,13 +39,21 @@ class PatchWindow:
             coarse *= 2
         west, south = np.floor(low_m / coarse)
         east, north = np.ceil(high_m / coarse)
-        return cls(float(west * coarse), float(north * coarse), coarse, int(east - west), int(north - south))
+        return cls(
+            float(west * coarse),
+            float(north * coarse),
+            coarse,
+            int(east - west),
+            int(north - south),
+        )
 
     @property
     def site_from_patch(self) -> Matrix3:
         """(3, 3) affine map from the window's pixels to site metres."""
         s = self.m_per_px
-        return np.array([[s, 0.0, self.west_m + s / 2], [0.0, -s, self.north_m - s / 2], [0.0, 0.0, 1.0]])
+        return np.array(
+            [[s, 0.0, self.west_m + s / 2], [0.0, -s, self.north_m - s / 2], [0.0, 0.0, 1.0]]
+        )
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -67,8 +79,10 @@ class PatchWindow:
         west, north = self.west_m, self.north_m
         east, south = west + self.width_px * self.m_per_px, north - self.height_px * self.m_per_px
         return bool(
-            low_m[0] - spare_m >= west and low_m[1] - spare_m >= south
-            and high_m[0] + spare_m <= east and high_m[1] + spare_m <= north
+            low_m[0] - spare_m >= west
+            and low_m[1] - spare_m >= south
+            and high_m[0] + spare_m <= east
+            and high_m[1] + spare_m <= north
         )
 
 
@@ -91,36 +105,52 @@ class Cut:
 
     def moved(self, new: "PatchWindow", old: "PatchWindow") -> "Cut":
         """The cut of one window as another one has it."""
-        return Cut(moved(self.before, new, old), moved(self.after, new, old), moved(self.shade, new, old))
+        return Cut(
+            moved(self.before, new, old), moved(self.after, new, old), moved(self.shade, new, old)
+        )
 
 
 def cut(view: ComparedView, window: PatchWindow) -> Cut:
     """The view's pictures of both dates, resampled to a window of the ground."""
     shrink = max(1, int(window.m_per_px / view.m_per_px))
     patch_from_image = np.linalg.inv(window.site_from_patch) @ view.site_from_image
-    shade = cv2.warpPerspective(view.shade, patch_from_image, window.size_px, flags=cv2.INTER_NEAREST)
+    shade = cv2.warpPerspective(
+        view.shade, patch_from_image, window.size_px, flags=cv2.INTER_NEAREST
+    )
     valid = view.valid.view(np.uint8) * np.uint8(255)
     before, after = view.reference, view.image
     if shrink > 1:
         before, after, valid = (_shrunk(each, shrink) for each in (before, after, valid))
-        patch_from_image = patch_from_image @ np.array([
-            [shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]
-        ])
-    known = cv2.warpPerspective(valid, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR) >= 250
+        patch_from_image = patch_from_image @ np.array(
+            [[shrink, 0, (shrink - 1) / 2], [0, shrink, (shrink - 1) / 2], [0, 0, 1.0]]
+        )
+    known = (
+        cv2.warpPerspective(valid, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR) >= 250
+    )
 
     def laid(image: ImageRGB) -> ImageRGBA:
         rgb = cv2.warpPerspective(
-            image, patch_from_image, window.size_px, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+            image,
+            patch_from_image,
+            window.size_px,
+            flags=cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
         )
-        return np.asarray(cv2.copyTo(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), known.view(np.uint8)), np.uint8)
+        return np.asarray(
+            cv2.copyTo(cv2.cvtColor(rgb, cv2.COLOR_RGB2RGBA), known.view(np.uint8)), np.uint8
+        )
 
-    return Cut(laid(before), laid(after), np.asarray(cv2.copyTo(shade, known.view(np.uint8)), np.uint8))
+    return Cut(
+        laid(before), laid(after), np.asarray(cv2.copyTo(shade, known.view(np.uint8)), np.uint8)
+    )
 
 
 def moved(image: NDArray[np.uint8], new: PatchWindow, old: PatchWindow) -> NDArray[np.uint8]:
     """A raster of one window as another window has it, 0 where they do not overlap."""
     new_from_old = np.linalg.inv(new.site_from_patch) @ old.site_from_patch
-    return np.asarray(cv2.warpAffine(image, new_from_old[:2], new.size_px, flags=cv2.INTER_NEAREST), np.uint8)
+    return np.asarray(
+        cv2.warpAffine(image, new_from_old[:2], new.size_px, flags=cv2.INTER_NEAREST), np.uint8
+    )
 
 
 def patch_of(window: PatchWindow, pictures: Cut, outline_m: PointsM) -> Patch:

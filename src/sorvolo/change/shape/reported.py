@@ -11,7 +11,9 @@ from sorvolo.change.shape.shadows import without_shadow
 from sorvolo.survey.findings import Change, ChangeKind
 
 
-def reported(changes: Iterable[Change], map_sigma_m: float, rejected: Sequence[KnownPlace]) -> list[Change]:
+def reported(
+    changes: Iterable[Change], map_sigma_m: float, rejected: Sequence[KnownPlace]
+) -> list[Change]:
     """The changes without their shadows, with their sigmas in the map, and in the world, the map's own joined; m per
     axis.
 
@@ -19,7 +21,9 @@ def reported(changes: Iterable[Change], map_sigma_m: float, rejected: Sequence[K
     """
     finished = [each if each.kind is ChangeKind.AREA else without_shadow(each) for each in changes]
     return [
-        _with_sigmas(each, map_sigma_m) for each in finished if not is_known(each.outline_m, each.kind, rejected)
+        _with_sigmas(each, map_sigma_m)
+        for each in finished
+        if not is_known(each.outline_m, each.kind, rejected)
     ]
 
 

@@ -13,7 +13,10 @@ from sorvolo.change.shape.outlines import hull_of, measures, outline_of
 from sorvolo.geometry.arrays import Floats32, Mask
 from sorvolo.survey.findings import Change, ChangeKind, Patch, Shade
 
-_CONTRARY = {ChangeKind.APPEARED: ChangeKind.DISAPPEARED, ChangeKind.DISAPPEARED: ChangeKind.APPEARED}
+_CONTRARY = {
+    ChangeKind.APPEARED: ChangeKind.DISAPPEARED,
+    ChangeKind.DISAPPEARED: ChangeKind.APPEARED,
+}
 
 
 @dataclass(frozen=True)
@@ -22,11 +25,18 @@ class ThingSettings:
 
     least_px: int = 6  # bare of shadow: with fewer, or less than ...
     least_share: float = 0.02  # ... this of the change, all of it is a dark thing
-    least_piece: float = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
+    least_piece: float = (
+        0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
+    )
     apart_m: float = 0.5  # things so far from each other are two ...
     least_m2: float = 0.035  # 0018: ... if each is as large as a football at least ...
-    solid: float = 0.45  # 0018: ... fills so much of its hull, for specks of a dark thing scatter, ...
-    car_m: tuple[float, float] = (1.2, 6.0)  # ... and all is not as wide and as long as one dark car with bright parts
+    solid: float = (
+        0.45  # 0018: ... fills so much of its hull, for specks of a dark thing scatter, ...
+    )
+    car_m: tuple[float, float] = (
+        1.2,
+        6.0,
+    )  # ... and all is not as wide and as long as one dark car with bright parts
     gap_m: float = 0.4  # 0016: pieces that lie so far apart are not one
 
 
@@ -62,13 +72,17 @@ def thing_of(changed: Mask, shadow: Mask, settings: ThingSettings = ThingSetting
     """The part of the change that is the thing, not its shadow; `changed` itself where hardly anything would stay."""
     lit = changed & ~shadow
     opened = cv2.morphologyEx(lit.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
-    if np.count_nonzero(opened) < max(settings.least_px, settings.least_share * np.count_nonzero(changed)):
+    if np.count_nonzero(opened) < max(
+        settings.least_px, settings.least_share * np.count_nonzero(changed)
+    ):
         return changed
     _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = -1  # the ground: no piece, however small pieces may be
     kept = (areas >= settings.least_piece * areas.max())[labels].view(np.uint8)
-    return np.asarray((cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed)
+    return np.asarray(
+        (cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed
+    )
 
 
 def things_of(
@@ -82,7 +96,9 @@ def things_of(
     of about its size stays whole, unless something left beside what came.
     """
     groups = _groups(patch, changed, settings) or [(changed, kind)]
-    found = [each for group, own in groups for each in _things_of_group(patch, own, group, settings)]
+    found = [
+        each for group, own in groups for each in _things_of_group(patch, own, group, settings)
+    ]
     return sorted(found, key=lambda each: -np.count_nonzero(each[0]))
 
 
@@ -132,7 +148,10 @@ def _things_of_group(
     contrary = _CONTRARY.get(kind)
     kinds = [kind_of(replace(patch, changed=_hull(each) & changed)) for each in things]
     if contrary is not None and any(each is not contrary for each in kinds):
-        distances = [np.where(shadow & (own is contrary), np.inf, each) for own, each in zip(kinds, distances)]
+        distances = [
+            np.where(shadow & (own is contrary), np.inf, each)
+            for own, each in zip(kinds, distances)
+        ]
     nearest = np.argmin(distances, axis=0)
     return [(changed & (nearest == index), own) for index, own in enumerate(kinds)]
 
@@ -142,8 +161,16 @@ def _lit_things(bare: Mask, m_per_px: float, settings: ThingSettings) -> list[Ma
     lit = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     labels = _joined(np.asarray(lit > 0), m_per_px, settings.apart_m)
     areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
-    large = [(labels == each) & (lit > 0) for each in np.argsort(-areas_m2) if areas_m2[each] >= settings.least_m2]
-    return [each for each in large if np.count_nonzero(each) >= settings.solid * np.count_nonzero(_hull(each))]
+    large = [
+        (labels == each) & (lit > 0)
+        for each in np.argsort(-areas_m2)
+        if areas_m2[each] >= settings.least_m2
+    ]
+    return [
+        each
+        for each in large
+        if np.count_nonzero(each) >= settings.solid * np.count_nonzero(_hull(each))
+    ]
 
 
 def _distance(mask: Mask) -> Floats32:
@@ -160,12 +187,18 @@ def _hull(mask: Mask | NDArray[np.uint8]) -> Mask:
 def _joined(mask: Mask, m_per_px: float, apart_m: float) -> NDArray[np.int32]:
     """The number from 1 on of the thing that each pixel of a mask (h, w) belongs to, and those near it; else 0."""
     reach = 2 * round(apart_m / 2 / m_per_px) + 1
-    padded = cv2.copyMakeBorder(mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0)
+    padded = cv2.copyMakeBorder(
+        mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0
+    )
     joined = cv2.dilate(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
-    return np.asarray(cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)[1], np.int32)
+    return np.asarray(
+        cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)[1], np.int32
+    )
 
 
 def _may_be_a_car(changed: Mask, m_per_px: float, settings: ThingSettings) -> bool:
-    short_m, long_m = sorted(float(each) * m_per_px for each in cv2.minAreaRect(hull_of(changed))[1])
+    short_m, long_m = sorted(
+        float(each) * m_per_px for each in cv2.minAreaRect(hull_of(changed))[1]
+    )
     narrowest_m, longest_m = settings.car_m
     return short_m >= narrowest_m and long_m <= longest_m

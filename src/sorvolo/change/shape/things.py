@@ -55,7 +55,12 @@ class Parts:
         return new
 
     def _new_at(
-        self, row: int, thing: Change, named: dict[int, Change], now_ns: int, next_id: Callable[[], str]
+        self,
+        row: int,
+        thing: Change,
+        named: dict[int, Change],
+        now_ns: int,
+        next_id: Callable[[], str],
     ) -> dict[int, Change]:
         """A thing without a known id, by its row: under the whole's id where none of the `named` has it, else under a
         new one; nothing where it was not there when last looked at."""

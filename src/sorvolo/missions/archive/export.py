@@ -46,7 +46,9 @@ def export_archive(root: str, out: Path) -> Generator[ExportUpdate, None, Export
     """
     demand_pyarrow()
     if out.suffix.lower() != ".parquet":
-        raise SettingsError(f"{out.name}: the table is written as .parquet; give a file name with that ending")
+        raise SettingsError(
+            f"{out.name}: the table is written as .parquet; give a file name with that ending"
+        )
     if not out.resolve().parent.is_dir():
         raise InputError(f"no folder {out.resolve().parent} to write {out.name} to; make it first")
     names = _sites(root)
@@ -72,7 +74,9 @@ def _sites(root: str) -> list[str]:
     return sorted(sites_below(Path(root)))
 
 
-def _site(root: str, name: str, out: Path, outcome: ExportOutcome) -> Generator[ExportUpdate, None, list[StacItem]]:
+def _site(
+    root: str, name: str, out: Path, outcome: ExportOutcome
+) -> Generator[ExportUpdate, None, list[StacItem]]:
     """The items of one site; none of one that is local or cannot be read, which the outcome names."""
     try:
         folder = yield from _folder(root, name)

@@ -11,7 +11,13 @@ _MICROSECOND_NS = 1000
 
 
 def find_place(
-    root: Path, at: str, *, first: str = "", last: str = "", classes: tuple[str, ...] = (), within_m: float = 2.0
+    root: Path,
+    at: str,
+    *,
+    first: str = "",
+    last: str = "",
+    classes: tuple[str, ...] = (),
+    within_m: float = 2.0,
 ) -> list[FoundFlight]:
     """The flights that saw the place `at`, "LATITUDE, LONGITUDE", in order of time, by the archive's index.
 
@@ -23,8 +29,11 @@ def find_place(
         raise InputError(f"{root} is not a folder; give the one that holds the site folders")
     latitude_deg, longitude_deg = _degrees(at)
     place = Place(
-        latitude_deg, longitude_deg, within_m,
-        _nanoseconds(first, time.min) if first else EARLIEST_NS, _nanoseconds(last, time.max) if last else LATEST_NS,
+        latitude_deg,
+        longitude_deg,
+        within_m,
+        _nanoseconds(first, time.min) if first else EARLIEST_NS,
+        _nanoseconds(last, time.max) if last else LATEST_NS,
         frozenset(classes),
     )
     with ArchiveIndex.open(root, write=False) as index:
@@ -35,7 +44,9 @@ def _degrees(text: str) -> tuple[float, float]:
     try:
         latitude_deg, longitude_deg = (float(each) for each in text.split(","))
     except ValueError as error:
-        raise SettingsError(f"--at {text!r}: give latitude and longitude in degrees, such as 46.5,13.25") from error
+        raise SettingsError(
+            f"--at {text!r}: give latitude and longitude in degrees, such as 46.5,13.25"
+        ) from error
     return latitude_deg, longitude_deg
 
 
@@ -47,8 +58,12 @@ def _nanoseconds(text: str, of_day: time) -> int:
         try:
             moment = datetime.fromisoformat(text)
         except ValueError as error:
-            raise SettingsError(f"{text!r} is not a date; give 2026-05-31, or 2026-05-31T12:00") from error
+            raise SettingsError(
+                f"{text!r} is not a date; give 2026-05-31, or 2026-05-31T12:00"
+            ) from error
     moment = moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    nanoseconds = ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * _MICROSECOND_NS
+    nanoseconds = (
+        (since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds
+    ) * _MICROSECOND_NS
     return min(max(nanoseconds, EARLIEST_NS), LATEST_NS)

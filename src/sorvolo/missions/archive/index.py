@@ -73,7 +73,9 @@ def sites_below(root: Path) -> Iterator[str]:
         folders[:] = [each for each in folders if not each.startswith(".")]
 
 
-def update_site(index: ArchiveIndex, path: str, known: IndexedSite | None, archive: Archive) -> tuple[int, int]:
+def update_site(
+    index: ArchiveIndex, path: str, known: IndexedSite | None, archive: Archive
+) -> tuple[int, int]:
     """Bring what the index has of one open site up to date: how many of its flights came, and how many went.
 
     `path` is the site's, `known` what the index knows of it. Raises StoreError for a site that cannot be read.
@@ -90,7 +92,13 @@ def update_site(index: ArchiveIndex, path: str, known: IndexedSite | None, archi
 
 
 def _update_site(
-    root: Path, path: str, index: ArchiveIndex, known: IndexedSite | None, catalogues: Catalogues, done: int, count: int
+    root: Path,
+    path: str,
+    index: ArchiveIndex,
+    known: IndexedSite | None,
+    catalogues: Catalogues,
+    done: int,
+    count: int,
 ) -> IndexUpdate:
     try:
         with Archive.open(root / path, write=False, catalogues=catalogues) as archive:

@@ -23,12 +23,21 @@ def with_height_changes(
     if before is None or later is None:
         return list(changes), []
     earlier = read_field(archive, before, HeightFile.SURFACE)
-    found = height_changes(earlier, later, [each.outline_m for each in areas], [each.outline_m for each in changes])
+    found = height_changes(
+        earlier, later, [each.outline_m for each in areas], [each.outline_m for each in changes]
+    )
     risen = dict(zip((each.id for each in areas), found))
     missing = sum(each is None for each in found)
-    notices = [] if not missing else [Notice(
-        "no_height_change", missing,
-        f"{missing} of {len(found)} changed areas have no height change: half of their ground has no heights on one of "
-        "the dates (water, smooth or dark ground), or too little ground beside them stayed to tie both flights",
-    )]
+    notices = (
+        []
+        if not missing
+        else [
+            Notice(
+                "no_height_change",
+                missing,
+                f"{missing} of {len(found)} changed areas have no height change: half of their ground has no heights on one of "
+                "the dates (water, smooth or dark ground), or too little ground beside them stayed to tie both flights",
+            )
+        ]
+    )
     return [replace(each, height_change=risen.get(each.id)) for each in changes], notices

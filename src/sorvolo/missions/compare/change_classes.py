@@ -3,7 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sorvolo.change.classes import ClassSettings, can_show, class_of_change, enlarged, object_at, seen_at, stands_in
+from sorvolo.change.classes import (
+    ClassSettings,
+    can_show,
+    class_of_change,
+    enlarged,
+    object_at,
+    seen_at,
+    stands_in,
+)
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.survey.findings import Change, ChangeKind
@@ -21,7 +29,9 @@ class ChangeClasses:
     reports on request alone: there the ground itself shows that something changed.
     """
 
-    def __init__(self, detector: ObjectDetector, known: Sequence[MapObject], classes: Sequence[str] = ()) -> None:
+    def __init__(
+        self, detector: ObjectDetector, known: Sequence[MapObject], classes: Sequence[str] = ()
+    ) -> None:
         self._detector, self._known, self._wanted = detector, known, tuple(classes) or None
         self._settings = ClassSettings()
 
@@ -29,22 +39,34 @@ class ChangeClasses:
         """The change with its classes by its own pictures and the known objects alone: while the flight goes on."""
         return self.final(change, (), ())
 
-    def final(self, change: Change, found: Sequence[MapObject], sightings: Sequence[Sighting]) -> Change:
+    def final(
+        self, change: Change, found: Sequence[MapObject], sightings: Sequence[Sighting]
+    ) -> Change:
         """The change with its classes, "" where nothing is recognised: of the objects that were there before or after;
         else of the flight's sightings there; else of what the detector finds in the change's own pictures.
 
         `found` and `sightings` are those of the flight, by its frames' final places. Where something left and a found
         object of about its size stands in its outline, or something came where a known one stood, it was replaced.
         """
-        others = {ChangeKind.DISAPPEARED: found, ChangeKind.APPEARED: self._known}.get(change.kind, ())
+        others = {ChangeKind.DISAPPEARED: found, ChangeKind.APPEARED: self._known}.get(
+            change.kind, ()
+        )
         if any(stands_in(change, each, self._settings) for each in others):
             change = replace(change, kind=ChangeKind.REPLACED)
         before = after = ""
         if change.kind in _HAS_BEFORE:
-            before = object_at(change, self._known, self._settings) or self._in_picture(change, change.patch.before)
+            before = object_at(change, self._known, self._settings) or self._in_picture(
+                change, change.patch.before
+            )
         if change.kind in _HAS_AFTER:
-            after = "" if change.kind is ChangeKind.MOVING else object_at(change, found, self._settings)
-            after = after or seen_at(change, sightings, self._settings) or self._in_picture(change, change.patch.after)
+            after = (
+                "" if change.kind is ChangeKind.MOVING else object_at(change, found, self._settings)
+            )
+            after = (
+                after
+                or seen_at(change, sightings, self._settings)
+                or self._in_picture(change, change.patch.after)
+            )
         return replace(change, class_before=before, class_after=after)
 
     def _in_picture(self, change: Change, rgba: ImageRGBA) -> str:
@@ -54,8 +76,11 @@ class ChangeClasses:
         picture, offset_px = enlarged(rgba, self._settings)
         thresholds = self._detector.thresholds_for(picture)
         seen = self._detector.detect(
-            picture, tiles="auto", m_per_px=change.patch.m_per_px,
-            least_score=self._settings.lenient * min(thresholds.values(), default=0.5), classes=self._wanted,
+            picture,
+            tiles="auto",
+            m_per_px=change.patch.m_per_px,
+            least_score=self._settings.lenient * min(thresholds.values(), default=0.5),
+            classes=self._wanted,
             is_part=True,
         )
         return class_of_change(change.patch, seen, thresholds, offset_px, self._settings)

@@ -27,14 +27,21 @@ class MapExtension:
     """The part of a comparison that extends the map: `add` takes frames as they come, `complete` places them."""
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: CompareSettings, writer: FlightWriter, views: ViewMaker
+        self,
+        setup: FlightSetup,
+        archive: Archive,
+        settings: CompareSettings,
+        writer: FlightWriter,
+        views: ViewMaker,
     ) -> None:
         self._setup, self._archive, self._settings, self._writer = setup, archive, settings, writer
         self._views = views
         self._selection = StretchSelection(_OVERLAP, keep_all=setup.source.kind != "video")
         self._run: PlanarRun | None = None
         self._last = -1
-        self._shown_by: dict[int, int] = {}  # frames that show new ground as another, which extends the map, shows it
+        self._shown_by: dict[
+            int, int
+        ] = {}  # frames that show new ground as another, which extends the map, shows it
         self._frames: tuple[PlacedFrame, ...] = ()
 
     @property
@@ -47,7 +54,9 @@ class MapExtension:
         """The frames that extend the map, once that is complete."""
         return self._frames
 
-    def add(self, posed: PosedFrame, outcome: ViewOutcome, earlier: ComparedFrame | None = None) -> Taken | None:
+    def add(
+        self, posed: PosedFrame, outcome: ViewOutcome, earlier: ComparedFrame | None = None
+    ) -> Taken | None:
         """Take a frame that shows new ground; those that do not, or that show what the last one did, are left.
 
         `earlier` is the frame as a killed run compared and registered it; returned is how it is registered now, None
@@ -60,7 +69,9 @@ class MapExtension:
             return None
         self._last = posed.frame.index
         if self._run is None:
-            self._run = PlanarRun(self._setup, self._archive, self._settings.mapping, writer=self._writer)
+            self._run = PlanarRun(
+                self._setup, self._archive, self._settings.mapping, writer=self._writer
+            )
         taken = _taken_again(self._run, self._views.turned_as_found(posed, outcome), earlier)
         if outcome.site_from_image is not None:
             self._run.note_found(posed.frame.index, outcome.site_from_image, outcome.residual_px)
@@ -78,7 +89,9 @@ class MapExtension:
     def complete(self) -> Sequence[PlacedFrame]:
         """Place the frames for good and paint them; those that extend the map."""
         if self._run is not None and self._settings.updates_map:
-            self._frames = tuple(each for each in self._run.complete() if each.status is not Status.REJECTED)
+            self._frames = tuple(
+                each for each in self._run.complete() if each.status is not Status.REJECTED
+            )
         return self._frames
 
     def shown_as_well(self, placed: Mapping[int, PlacedFrame]) -> list[int]:
@@ -86,13 +99,17 @@ class MapExtension:
         selected frames, as in a first flight."""
         extend = {each.index for each in self._frames}
         return [
-            index for index, by in self._shown_by.items() if by in extend and placed[index].status is Status.REJECTED
+            index
+            for index, by in self._shown_by.items()
+            if by in extend and placed[index].status is Status.REJECTED
         ]
 
     def grown_m2(self, base_version: int) -> float:
         """Ground under the frames that the map shows now and did not show in that version."""
         return grown_m2(
-            (each.outline_m for each in self._frames), self._archive.tiles(base_version), self._writer.tiles,
+            (each.outline_m for each in self._frames),
+            self._archive.tiles(base_version),
+            self._writer.tiles,
             self._archive.site_grid(),
         )
 
@@ -105,7 +122,9 @@ def _taken_again(run: PlanarRun, posed: PosedFrame, earlier: ComparedFrame | Non
         if run.again(step) is not None:
             return earlier.taken
     if earlier is not None and not earlier.is_whole:
-        run.lose(frame.index, frame.name, frame.time_ns, "its picture was lost when a run was stopped")
+        run.lose(
+            frame.index, frame.name, frame.time_ns, "its picture was lost when a run was stopped"
+        )
         return None
     run.add(posed)
     return run.taken

@@ -37,7 +37,12 @@ class FlightChanges:
     """
 
     def __init__(
-        self, flight: str, views: ViewMaker, site: Site, settings: CompareSettings, gathering: Gathering | None
+        self,
+        flight: str,
+        views: ViewMaker,
+        site: Site,
+        settings: CompareSettings,
+        gathering: Gathering | None,
     ) -> None:
         self._flight, self._views, self._site, self._settings = flight, views, site, settings
         self._evidence: EvidenceMap | None = None
@@ -45,15 +50,19 @@ class FlightChanges:
         self._gathered = None if gathering is None else GatheredThings(gathering.larger)
         overlap = None if gathering is None else gathering.overlap
         self._selection = StretchSelection(overlap or 0.0, keep_all=overlap is None)
-        self._numbers = itertools.count(1)  # of the changes' ids that are still free, after `conclude`
+        self._numbers = itertools.count(
+            1
+        )  # of the changes' ids that are still free, after `conclude`
 
     def add(self, view: ComparedView, leans: Mask | None) -> Sequence[Change]:
         """Add a compared view to the evidence; the changes announced by it."""
         if self._evidence is None:
             self._evidence = EvidenceMap(
                 self._views.change_m_per_px(view),
-                EvidenceSettings(k=self._settings.votes, n=self._settings.voters), self._flight,
-                self._views.earlier_pictures, partial(sun_over, self._site),
+                EvidenceSettings(k=self._settings.votes, n=self._settings.voters),
+                self._flight,
+                self._views.earlier_pictures,
+                partial(sun_over, self._site),
             )
         announced = self._evidence.add(view)
         if self._settings.method != "thesis":
@@ -78,7 +87,9 @@ class FlightChanges:
         found = gathered.conclude(self._flight, self._numbers, found)
         return [each for each in found if not self._is_moved_shadow(each, gathered)]
 
-    def of_objects(self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, MapObject]]) -> list[Change]:
+    def of_objects(
+        self, changes: Sequence[Change], objects: Sequence[tuple[ChangeKind, MapObject]]
+    ) -> list[Change]:
         """After `conclude`: those objects, found on one date alone, that none of `changes`, as they are reported,
         holds, on ground that differs as well. Only where learned differences are gathered."""
         result: list[Change] = []
@@ -88,7 +99,9 @@ class FlightChanges:
             change = self._gathered.standing_at(each.position_m, each.length_m, [*changes, *result])
             if change is not None:
                 number = next(self._numbers)
-                result.append(replace(change, id=f"{self._flight}-{number}", kind=kind, score=each.score))
+                result.append(
+                    replace(change, id=f"{self._flight}-{number}", kind=kind, score=each.score)
+                )
         return result
 
     def candidates(self) -> dict[str, Any] | None:
@@ -101,7 +114,9 @@ class FlightChanges:
         before_ns = None if earlier is None else earlier.time_ns(change.outline_m)
         if before_ns is None or change.kind is ChangeKind.MOVING:
             return False
-        before, after = (slide_of(sun_over(self._site, each)) for each in (before_ns, change.first_seen_ns))
+        before, after = (
+            slide_of(sun_over(self._site, each)) for each in (before_ns, change.first_seen_ns)
+        )
         if before is None or after is None:
             return False
         return gathered.is_moved_shadow(change.outline_m, before, after)

@@ -27,7 +27,13 @@ from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import check_classes, open_detector
 from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
 from sorvolo.missions.flight.settings import CompareSettings
-from sorvolo.missions.flight.setup import FlightSetup, known_flights, known_ground_m, prepare, repeated
+from sorvolo.missions.flight.setup import (
+    FlightSetup,
+    known_flights,
+    known_ground_m,
+    prepare,
+    repeated,
+)
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
 from sorvolo.missions.map.journal import begun_journal, go_on_live
 from sorvolo.mosaic.selection import StretchSelection, every
@@ -43,10 +49,17 @@ _DECODED = 1  # frames of a video that wait to be compared
 
 
 def compare_flights(
-    inputs: Sequence[Path | str], site: Path, settings: CompareSettings = CompareSettings(), *,  # noqa: B008 (frozen)
-    telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
-    steps: Path | None = None, detector: ObjectDetector | None = None,
-    live: LiveSettings = LiveSettings(keeps_all=True), until: threading.Event | None = None,  # noqa: B008 (frozen)
+    inputs: Sequence[Path | str],
+    site: Path,
+    settings: CompareSettings = CompareSettings(),
+    *,
+    telemetry: Path | str | None = None,
+    camera: Path | str | None = None,
+    area: Path | None = None,
+    steps: Path | None = None,
+    detector: ObjectDetector | None = None,
+    live: LiveSettings = LiveSettings(keeps_all=True),
+    until: threading.Event | None = None,
     again: bool = False,
 ) -> Generator[CompareUpdate, None, tuple[AlreadyDone, ...]]:
     """Compare one or more later flights with the map in the site folder, yielding an update for each frame compared.
@@ -69,18 +82,30 @@ def compare_flights(
     looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
     check_classes(looks, settings.classes)
     opened = opened_sources(
-        inputs, telemetry, camera, known_flights(site), live=live, until=until,
+        inputs,
+        telemetry,
+        camera,
+        known_flights(site),
+        live=live,
+        until=until,
         better_camera=lambda guess: known_camera(guess, archive),
     )
     with Archive.open(site, write=True) as archive, opened as sources, single_threaded_opencv():
         known = []
         for source in sources:
             base, is_newest = _base_version(archive, source)
-            stamps = heights_stamp(archive, but=source.name), own_heights_stamp(archive, source.name)
+            stamps = (
+                heights_stamp(archive, but=source.name),
+                own_heights_stamp(archive, source.name),
+            )
             asked = settings, wanted, looks, base, _reviews(archive), stamps, steps
             samples = go_on_live(source, archive, asked, live.same_flight_s, anew=again)
             setup = prepare(
-                source, settings.mapping, archive.site(), telemetry_named=telemetry is not None, finds_itself=True,
+                source,
+                settings.mapping,
+                archive.site(),
+                telemetry_named=telemetry is not None,
+                finds_itself=True,
                 ground_m=known_ground_m(archive),
             )
             request = request_of(setup, *asked)
@@ -88,9 +113,19 @@ def compare_flights(
             if compared and not again:
                 known.append(compared)
                 continue
-            own = settings if is_newest else replace(settings, updates_map=False)  # what later flights painted stays
+            own = (
+                settings if is_newest else replace(settings, updates_map=False)
+            )  # what later flights painted stays
             yield from _compare_one(
-                setup, archive, own, wanted, steps, looks, base, request, anew=again and compared is None,
+                setup,
+                archive,
+                own,
+                wanted,
+                steps,
+                looks,
+                base,
+                request,
+                anew=again and compared is None,
                 samples=samples,
             )
         return tuple(known)
@@ -103,15 +138,21 @@ def _reviews(archive: Archive) -> list[tuple[str, str]]:
 def _check_steps(steps: Path, site: Path, settings: CompareSettings) -> None:
     """Raise SettingsError where the intermediate pictures cannot be made, or not there."""
     if settings.method != "thesis":
-        raise SettingsError("the steps are those of the thesis's method: give --method thesis as well")
+        raise SettingsError(
+            "the steps are those of the thesis's method: give --method thesis as well"
+        )
     if steps.resolve().is_relative_to(site.resolve()):
-        raise SettingsError(f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder")
+        raise SettingsError(
+            f"{steps} lies in the site folder {site}, which is sorvolo's own; name another folder"
+        )
 
 
 def _check_map(archive: Archive, site: Path, settings: CompareSettings) -> None:
     """Raise StoreError where there is no map, or one that contradicts itself: changes on it would be its own faults."""
     if not archive.tiles():
-        raise StoreError(f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}")
+        raise StoreError(
+            f"{site} holds no map yet; make one of an earlier flight: sorvolo map INPUT --site {site}"
+        )
     if settings.trusts_map:
         return
     for each in archive.flights():
@@ -128,19 +169,35 @@ def _without_heights(archive: Archive, flight: str) -> tuple[Notice, ...]:
     damaged = damaged_heights(archive, but=flight)
     if not damaged:
         return ()
-    return (Notice(
-        "damaged heights", len(damaged),
-        f"the heights of {', '.join(damaged)} cannot be read and were left out (heights.json is damaged); make them "
-        f"again: sorvolo heights {archive.folder} --flight {damaged[0]}",
-    ),)
+    return (
+        Notice(
+            "damaged heights",
+            len(damaged),
+            f"the heights of {', '.join(damaged)} cannot be read and were left out (heights.json is damaged); make them "
+            f"again: sorvolo heights {archive.folder} --flight {damaged[0]}",
+        ),
+    )
 
 
 def _compare_one(
-    setup: FlightSetup, archive: Archive, settings: CompareSettings, area: Area | None, steps: Path | None,
-    detector: ObjectDetector | None, base: int, request: str, *, anew: bool, samples: int,
+    setup: FlightSetup,
+    archive: Archive,
+    settings: CompareSettings,
+    area: Area | None,
+    steps: Path | None,
+    detector: ObjectDetector | None,
+    base: int,
+    request: str,
+    *,
+    anew: bool,
+    samples: int,
 ) -> Generator[CompareUpdate]:
     started_s, source = time.monotonic(), setup.source
-    notices = (*setup.notices, *repeated(archive, source, "compared"), *_without_heights(archive, source.name))
+    notices = (
+        *setup.notices,
+        *repeated(archive, source, "compared"),
+        *_without_heights(archive, source.name),
+    )
     setup = replace(setup, notices=notices)
     if settings.updates_map:
         check_room(setup, archive, archive.site().m_per_px, keeps_pictures=False)
@@ -152,18 +209,38 @@ def _compare_one(
     journal = CompareJournal(file, notes, keeps_pictures=keeps_pictures)
     with CompareRun(setup, archive, settings, base, steps, detector, request, journal) as run:
 
-        def ahead() -> int:  # a live view's changes are announced at once, unless the next view waits already
+        def ahead() -> (
+            int
+        ):  # a live view's changes are announced at once, unless the next view waits already
             return 0 if isinstance(source, LiveSource) and not source.is_behind else _AHEAD
 
         def updated(
-            frame: Frame | LostFrame, status: ViewStatus, reason: str, residual_px: float = float("nan"),
-            announced: tuple[Change, ...] = (), view: FrameView | None = None, *, is_resumed: bool = False,
+            frame: Frame | LostFrame,
+            status: ViewStatus,
+            reason: str,
+            residual_px: float = float("nan"),
+            announced: tuple[Change, ...] = (),
+            view: FrameView | None = None,
+            *,
+            is_resumed: bool = False,
             comes_again: bool = False,
         ) -> CompareUpdate:
             return CompareUpdate(
-                source.name, frame.name, setup.utc_ns(frame.time_ns), status, reason, residual_px, announced,
-                frame.index + 1, source.frame_count, run.views, run.compared, time.monotonic() - started_s, view,
-                is_resumed, comes_again,
+                source.name,
+                frame.name,
+                setup.utc_ns(frame.time_ns),
+                status,
+                reason,
+                residual_px,
+                announced,
+                frame.index + 1,
+                source.frame_count,
+                run.views,
+                run.compared,
+                time.monotonic() - started_s,
+                view,
+                is_resumed,
+                comes_again,
             )
 
         for each in _ended(source, step_s, setup, inside, run, ahead):
@@ -172,20 +249,32 @@ def _compare_one(
                 yield updated(each, ViewStatus.LOST, each.reason)
             elif isinstance(each, Again):
                 yield updated(
-                    each.posed.frame, ViewStatus.NOT_ALIGNED, "it is looked for again with all of its flight",
-                    is_resumed=each.is_resumed, comes_again=True,
+                    each.posed.frame,
+                    ViewStatus.NOT_ALIGNED,
+                    "it is looked for again with all of its flight",
+                    is_resumed=each.is_resumed,
+                    comes_again=True,
                 )
             else:
                 outcome, announced = run.add(each)
                 yield updated(
-                    each.posed.frame, outcome.status, outcome.reason, outcome.residual_px, announced,
-                    run.view(each.posed), is_resumed=each.earlier is not None,
+                    each.posed.frame,
+                    outcome.status,
+                    outcome.reason,
+                    outcome.residual_px,
+                    announced,
+                    run.view(each.posed),
+                    is_resumed=each.earlier is not None,
                 )
         run.finish(source.notices(), started_s)
 
 
 def _ended(
-    source: Source, step_s: float, setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
+    source: Source,
+    step_s: float,
+    setup: FlightSetup,
+    inside: Callable[[PosedFrame], bool],
+    run: CompareRun,
     ahead: Callable[[], int],
 ) -> Iterator[Pending | LostFrame | Again]:
     """The frames as their comparisons end. What was not found on the map is tried again after the others, with the
@@ -228,7 +317,9 @@ def _ended(
     if places and not is_photos:
         run.leave_out(len(again - chosen))  # those that overlap show their ground
         again &= chosen
-    yield from _begun(source.frames(lambda index, _: index in again), setup, inside, run, ahead, places)
+    yield from _begun(
+        source.frames(lambda index, _: index in again), setup, inside, run, ahead, places
+    )
 
 
 def _posed(
@@ -236,7 +327,9 @@ def _posed(
 ) -> Iterator[PosedFrame]:
     """The frames inside of the area with what telemetry has of their cameras; lost ones were counted before."""
     for each in frames:
-        if isinstance(each, Frame) and inside(posed := PosedFrame(each, setup.prior(each, first=False))):
+        if isinstance(each, Frame) and inside(
+            posed := PosedFrame(each, setup.prior(each, first=False))
+        ):
             yield posed
 
 
@@ -251,8 +344,12 @@ def _frames(source: Source, step_s: float) -> Generator[Frame | LostFrame]:
 
 
 def _begun(
-    frames: Iterable[Frame | LostFrame], setup: FlightSetup, inside: Callable[[PosedFrame], bool], run: CompareRun,
-    ahead: Callable[[], int], places: Mapping[int, FlightPlace] = MappingProxyType({}),
+    frames: Iterable[Frame | LostFrame],
+    setup: FlightSetup,
+    inside: Callable[[PosedFrame], bool],
+    run: CompareRun,
+    ahead: Callable[[], int],
+    places: Mapping[int, FlightPlace] = MappingProxyType({}),
     caution: Caution = Caution.NEVER,
 ) -> Iterator[Pending | LostFrame]:
     """The frames inside of the area in order, each with its comparison begun, and that of up to `ahead()` after it."""
@@ -270,7 +367,9 @@ def _begun(
 def _base_version(archive: Archive, source: Source) -> tuple[int, bool]:
     """The version to compare with, and whether the flight may paint: the newest, or the one before its own."""
     complete = [version for version in archive.versions() if version.complete]
-    own = next((version for version in reversed(complete) if version.flight_id == source.name), None)
+    own = next(
+        (version for version in reversed(complete) if version.flight_id == source.name), None
+    )
     if own is None:
         return complete[-1].id, True
     if own.parent_id == 0:

@@ -65,7 +65,10 @@ class CompareJournal(MapJournal):
         self.keep_source()
         packer = RecordPacker()
         values: dict[str, Any] = {
-            "index": frame.index, "name": name, "time_ns": time_ns, "record": packer.packed(frame.record),
+            "index": frame.index,
+            "name": name,
+            "time_ns": time_ns,
+            "record": packer.packed(frame.record),
             "kept": packer.packed(frame.kept),
         }
         if frame.taken is not None:
@@ -97,6 +100,8 @@ def _frame(entry: Entry) -> ComparedFrame:
         raise ValueError("a comparison leaves traces")
     kept = entry.values["kept"]
     return ComparedFrame(
-        int(entry.values["index"]), record, taken_in(entry),
+        int(entry.values["index"]),
+        record,
+        taken_in(entry),
         None if kept is None else unpacked(KeptFrame, kept, entry.arrays),
     )

@@ -8,7 +8,12 @@ from sorvolo.change.object_changes import SearchedGround, on_one_date
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.map_objects import (
+    FrameDetections,
+    ObjectFinder,
+    search_summary,
+    why_not_searched,
+)
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
@@ -25,7 +30,11 @@ class ComparisonObjects:
     """A detector's part in one comparison; without a detector nothing is searched and no change has a class."""
 
     def __init__(
-        self, detector: ObjectDetector | None, setup: FlightSetup, archive: Archive, base_version: int,
+        self,
+        detector: ObjectDetector | None,
+        setup: FlightSetup,
+        archive: Archive,
+        base_version: int,
         settings: CompareSettings,
     ) -> None:
         """`settings.classes` are looked for, in frames as in the changes' own pictures."""
@@ -35,9 +44,17 @@ class ComparisonObjects:
         self._classes: ChangeClasses | None = None
         self._before = SearchedGround()
         if detector is not None:
-            before = {each.flight_id for each in archive.versions() if each.complete and each.id <= base_version}
+            before = {
+                each.flight_id
+                for each in archive.versions()
+                if each.complete and each.id <= base_version
+            }
             known = [each.thing for each in archive.newest_objects(before - {self._name})]
-            searched = [each.frames for each in archive.searches() if each.flight_id in before - {self._name}]
+            searched = [
+                each.frames
+                for each in archive.searches()
+                if each.flight_id in before - {self._name}
+            ]
             self._before = SearchedGround(known, searched)
             self._classes = ChangeClasses(detector, known, settings.classes)
             live_folder = archive.folder if isinstance(setup.source, LiveSource) else None
@@ -65,9 +82,10 @@ class ComparisonObjects:
         """What was found in frames since this was asked last."""
         return () if self._finder is None else self._finder.news()
 
-    def search(self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker, *, may_look: bool = True) -> None:
-        """Have a frame that fits the map searched, each stretch of ground in a few of them; not unless it `may_look`.
-        """
+    def search(
+        self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker, *, may_look: bool = True
+    ) -> None:
+        """Have a frame that fits the map searched, each stretch of ground in a few of them; not unless it `may_look`."""
         if self._finder is None or outcome.site_from_image is None:
             return
         outline_m = views.pixels.ground_m(posed, outcome.site_from_image)
@@ -97,7 +115,9 @@ class ComparisonObjects:
         """The changes with their classes, after `conclude`."""
         if self._finder is None or self._classes is None or search is None:
             return list(changes)
-        return [self._classes.final(each, search.objects, self._finder.sightings) for each in changes]
+        return [
+            self._classes.final(each, search.objects, self._finder.sightings) for each in changes
+        ]
 
     def summary(self, search: ObjectSearch | None) -> dict[str, Any]:
         """The report's part on objects."""

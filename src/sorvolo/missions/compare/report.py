@@ -4,7 +4,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sorvolo.change.coverage.ground_coverage import CoverageSettings, GroundCoverage, coverage_summary
+from sorvolo.change.coverage.ground_coverage import (
+    CoverageSettings,
+    GroundCoverage,
+    coverage_summary,
+)
 from sorvolo.change.coverage.planting import recall_curve
 from sorvolo.change.flight_on_map import FlightFit
 from sorvolo.change.views import ViewMaker, ViewOutcome
@@ -53,7 +57,9 @@ class ViewCounts:
         if outcome.view is not None:
             is_dark = outcome.brightness < NIGHT
             self._differing.append(outcome.view.changed_share)
-            self.ground.compare(outcome.view, is_dark=is_dark, doubted=outcome.doubted, planted=outcome.planted)
+            self.ground.compare(
+                outcome.view, is_dark=is_dark, doubted=outcome.doubted, planted=outcome.planted
+            )
         else:
             gap = Gap.NO_MAP if outcome.status is ViewStatus.OUTSIDE else Gap.REJECTED
             self.ground.reject(outline_m, gap, outcome.reason.partition(":")[0])
@@ -83,18 +89,27 @@ class ViewCounts:
             "reasons": dict(self._reasons.most_common()),
             "differing_share": self.differing_share,
             "residual_px": {
-                "median": median_of_known(self._residuals_px), "p95": percentile_of_known(self._residuals_px, 95),
+                "median": median_of_known(self._residuals_px),
+                "p95": percentile_of_known(self._residuals_px, 95),
             },
             "local_fit": {
-                "views": len(self._local_m), "median_m": median_of_known(self._local_m),
+                "views": len(self._local_m),
+                "median_m": median_of_known(self._local_m),
                 "p95_m": percentile_of_known(self._local_m, 95),
             },
         }
 
 
 def comparison_summary(
-    changes: Sequence[Change], suppressed: int, counts: ViewCounts, views: ViewMaker, settings: CompareSettings,
-    base_version: int, ground: Sequence[CoveredGround], *, is_local: bool,
+    changes: Sequence[Change],
+    suppressed: int,
+    counts: ViewCounts,
+    views: ViewMaker,
+    settings: CompareSettings,
+    base_version: int,
+    ground: Sequence[CoveredGround],
+    *,
+    is_local: bool,
 ) -> dict[str, Any]:
     """The report's part on the comparison; specified in docs/formats.md. `suppressed` changes were not reported: a
     person rejected them on an earlier flight."""
@@ -111,9 +126,11 @@ def comparison_summary(
         "suppressed": suppressed,
         "compared_area_m2": coverage["compared_m2"],
         "headline": comparison_headline(len(changes), coverage, is_local=is_local),
-        "coverage": coverage | {"planted": recall_curve(counts.ground.planted, CoverageSettings().planting)},
+        "coverage": coverage
+        | {"planted": recall_curve(counts.ground.planted, CoverageSettings().planting)},
         "unknown_share": counts.ground.unknown_share,
-        "votes": settings.votes, "voters": settings.voters,
+        "votes": settings.votes,
+        "voters": settings.voters,
         "chosen": views.chosen(),
         "map_updated": settings.updates_map,
         "most_missed": views.brightness < NIGHT,
@@ -126,7 +143,10 @@ def flight_summary(counts: ViewCounts, fit: FlightFit | None) -> dict[str, Any]:
     if fit is None:
         return {"views": 0, "left_out": 0, "ratio": None, "residual_m": None}
     return {
-        "views": counts.with_flight, "left_out": counts.left_out, "ratio": fit.ratio, "residual_m": fit.residual_m,
+        "views": counts.with_flight,
+        "left_out": counts.left_out,
+        "ratio": fit.ratio,
+        "residual_m": fit.residual_m,
     }
 
 
@@ -141,14 +161,20 @@ def flight_notices(counts: ViewCounts, fit: FlightFit | None) -> list[Notice]:
     return [Notice("placed_with_flight", counts.with_flight, text)]
 
 
-def comparison_headline(changes: int, coverage: Mapping[str, Any], *, is_local: bool) -> dict[str, str]:
+def comparison_headline(
+    changes: int, coverage: Mapping[str, Any], *, is_local: bool
+) -> dict[str, str]:
     """The first line of a comparison: its `quality`, "compared" or "doubtful", and its `text`.
 
     It is doubtful when most of the ground under the views that the map shows could not be compared, or is other ground
     now: then the number of changes proves nothing about the site. `coverage` is that of the report.
     """
-    compared, missing = (area_text(coverage[name], is_local=is_local) for name in ("compared_m2", "not_compared_m2"))
-    found = f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"
+    compared, missing = (
+        area_text(coverage[name], is_local=is_local) for name in ("compared_m2", "not_compared_m2")
+    )
+    found = (
+        f"{changes:,} {plural('change', changes)} in {compared}; {missing} could not be compared"
+    )
     if not coverage["is_enough"]:
         doubt = "most of the ground could not be compared"
     elif coverage["other_ground_m2"] > _OTHER_GROUND * coverage["compared_m2"]:
@@ -194,7 +220,9 @@ def _ground_warnings(counts: ViewCounts) -> list[str]:
         )
     unmatched = counts[ViewStatus.NOT_ALIGNED] + counts[ViewStatus.LOST]
     if unmatched > 0.3 * views:
-        warnings.append(f"{unmatched} of {views} views could not be matched with the map; `reasons` lists why")
+        warnings.append(
+            f"{unmatched} of {views} views could not be matched with the map; `reasons` lists why"
+        )
     all_changed = counts[ViewStatus.ALL_CHANGED]
     if all_changed > 0.1 * views:
         warnings.append(

@@ -63,11 +63,17 @@ from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 class ViewSizes:
     """How large frames are compared where nothing else is asked for; how much of earlier pictures is kept at hand."""
 
-    video_px: int = 1280  # longest side; a video's frames come faster than photos, and show a place more often
+    video_px: int = (
+        1280  # longest side; a video's frames come faster than photos, and show a place more often
+    )
     photo_px: int = 1600  # photos are fewer and show more ground
     finer: float = 2.0  # times a photo's and the map's own pixels, at most: the robust method sees half of them
-    video_overlap: float = 0.8  # of a video's frames of which learned differences are gathered, as photos overlap
-    fine_m_per_px: float = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses (decision 0022)
+    video_overlap: float = (
+        0.8  # of a video's frames of which learned differences are gathered, as photos overlap
+    )
+    fine_m_per_px: float = (
+        0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses (decision 0022)
+    )
     cache_bytes: int = 128 * 2**20
 
 
@@ -105,14 +111,22 @@ class CompareRun:
     """
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, steps: Path | None,
-        detector: ObjectDetector | None = None, request: str = "", journal: CompareJournal | None = None,
+        self,
+        setup: FlightSetup,
+        archive: Archive,
+        settings: CompareSettings,
+        base_version: int,
+        steps: Path | None,
+        detector: ObjectDetector | None = None,
+        request: str = "",
+        journal: CompareJournal | None = None,
     ) -> None:
         self._setup, self._archive, self._settings, self._steps = setup, archive, settings, steps
         self._base_version = base_version
         source = setup.source
         self._writer: FlightWriter = archive.begin_flight(
-            source.name, source.fingerprint,
+            source.name,
+            source.fingerprint,
             {**vars(settings), "method": f"compare-{settings.method}", REQUEST: request},
             journal=None if journal is None else journal.file,
         )
@@ -122,7 +136,8 @@ class CompareRun:
             source.name, self._views, archive.site(), settings, _gathering(setup, archive, settings)
         )
         self._rejected = [
-            KnownPlace(each.outline_m, each.kind) for each in archive.reviews()
+            KnownPlace(each.outline_m, each.kind)
+            for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
         ]
         self._objects = ComparisonObjects(detector, setup, archive, base_version, settings)
@@ -136,14 +151,18 @@ class CompareRun:
         sigmas_m = [each.sigma_m for each in archive.keyframes() if each.flight_id != source.name]
         self._map_sigma_m = median_of_known(sigmas_m) or 0.0
         self._comparing, self._corroborating = (
-            ThreadPoolExecutor(1, thread_name_prefix=each) for each in ("comparing", "corroborating")
+            ThreadPoolExecutor(1, thread_name_prefix=each)
+            for each in ("comparing", "corroborating")
         )
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         try:
             self._comparing.shutdown(cancel_futures=True)
@@ -169,7 +188,9 @@ class CompareRun:
         self._counts.end(ViewStatus.LOST, lost.reason)
         camera = self._setup.source.camera.camera
         time_ns = self._setup.utc_ns(lost.time_ns)
-        self._placed[lost.index] = PlacedFrame.rejected(lost.index, lost.name, time_ns, lost.reason, camera)
+        self._placed[lost.index] = PlacedFrame.rejected(
+            lost.index, lost.name, time_ns, lost.reason, camera
+        )
 
     def begin(
         self, posed: PosedFrame, place: FlightPlace | None = None, caution: Caution = Caution.NEVER
@@ -184,15 +205,21 @@ class CompareRun:
             )
             return Pending(posed, recalled, earlier)
         compared = self._comparing.submit(self._views.compare_with_map, posed, place, caution)
-        return Pending(posed, self._corroborating.submit(lambda: self._views.corroborate(compared.result())))
+        return Pending(
+            posed, self._corroborating.submit(lambda: self._views.corroborate(compared.result()))
+        )
 
     def recalled(self) -> Iterator[Pending]:
         """The frames of a run that was killed which nobody can read again."""
         for each in () if self._journal is None else self._journal.kept_frames():
             assert each.kept is not None
             image = image_from_jpeg(bytes(each.kept.jpeg), each.kept.name)
-            posed = PosedFrame(Frame(each.index, each.kept.name, each.kept.time_ns, image), each.kept.prior)
-            yield Pending(posed, self._comparing.submit(self._views.recall, posed, image, each.record), each)
+            posed = PosedFrame(
+                Frame(each.index, each.kept.name, each.kept.time_ns, image), each.kept.prior
+            )
+            yield Pending(
+                posed, self._comparing.submit(self._views.recall, posed, image, each.record), each
+            )
 
     def add(self, pending: Pending) -> tuple[ViewOutcome, tuple[Change, ...]]:
         """Take one frame's comparison in; how that ended, and the changes that it was the last missing proof of."""
@@ -202,7 +229,9 @@ class CompareRun:
         self._counts.take(outcome, self._views.pixels.ground_m(posed, outcome.site_from_image))
         self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
         with self._log.stage(Stage.DETECT):
-            self._objects.search(posed, outcome, self._views, may_look=earlier is None or earlier.is_whole)
+            self._objects.search(
+                posed, outcome, self._views, may_look=earlier is None or earlier.is_whole
+            )
         announced = () if outcome.view is None else self._add_view(outcome.view, outcome.leans)
         with self._log.stage(Stage.REGISTER):
             taken = self._extension.add(posed, outcome, earlier)
@@ -252,7 +281,9 @@ class CompareRun:
                 f"no frame of {self._setup.source.name} could be compared: {self._counts.commonest_reason}; is it "
                 "another place, another season, or night? `sorvolo inspect` shows what the flight holds"
             )
-        concluding = self._comparing.submit(self._changes.conclude)  # which takes about as long as the map's extension
+        concluding = self._comparing.submit(
+            self._changes.conclude
+        )  # which takes about as long as the map's extension
         shown_as_well = self._extend_map()
         placed = [self._placed[index] for index in sorted(self._placed)]
         with self._log.stage(Stage.DETECT):
@@ -268,19 +299,38 @@ class CompareRun:
                 paint_changes(changes, self._writer.tiles, self._archive.site_grid())
         with self._log.stage(Stage.DETECT):
             changes = self._objects.classified(changes, search)
-            changes, of_heights = with_height_changes(self._archive, self._setup.source.name, changes)
+            changes, of_heights = with_height_changes(
+                self._archive, self._setup.source.name, changes
+            )
         with self._log.stage(Stage.REPORT):
             shown = picture(self._writer.tiles, 800)  # a day without change should cost little
         ground = self._counts.ground.parts([each.outline_m for each in changes])
         report = self._report(
-            changes, suppressed, shown_as_well, placed, shown, [*notices, *of_heights], started_s, ground
+            changes,
+            suppressed,
+            shown_as_well,
+            placed,
+            shown,
+            [*notices, *of_heights],
+            started_s,
+            ground,
         )
         report["objects"] = self._objects.summary(search)
         page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
         site = self._archive.site()
-        documents = {features_name(COVERAGE, is_local=site.is_local): geojson_bytes(coverage_geojson(ground, site))}
+        documents = {
+            features_name(COVERAGE, is_local=site.is_local): geojson_bytes(
+                coverage_geojson(ground, site)
+            )
+        }
         self._writer.commit(
-            placed, self._extension.images, report, page, changes=changes, search=search, documents=documents
+            placed,
+            self._extension.images,
+            report,
+            page,
+            changes=changes,
+            search=search,
+            documents=documents,
         )
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -328,34 +378,66 @@ class CompareRun:
         if self._steps is not None:
             thesis = self._settings.thesis
             steps = thesis_steps(
-                as_bgr(view.reference), as_bgr(view.image), view.valid, thesis.settings, thesis.threads
+                as_bgr(view.reference),
+                as_bgr(view.image),
+                view.valid,
+                thesis.settings,
+                thesis.threads,
             )
             write_pictures(self._steps / view.name, steps.pictures())
 
     def _report(
-        self, changes: Sequence[Change], suppressed: int, shown_as_well: int, placed: Sequence[PlacedFrame],
-        shown: Picture, notices: Sequence[Notice], started_s: float, ground: Sequence[CoveredGround],
+        self,
+        changes: Sequence[Change],
+        suppressed: int,
+        shown_as_well: int,
+        placed: Sequence[PlacedFrame],
+        shown: Picture,
+        notices: Sequence[Notice],
+        started_s: float,
+        ground: Sequence[CoveredGround],
     ) -> dict[str, Any]:
         result = FlightResult(placed, self._setup.source.camera.camera, makes_map=False)
-        notices = [*notices, *self._objects.notices, *flight_notices(self._counts, self._flight_fit)]
+        notices = [
+            *notices,
+            *self._objects.notices,
+            *flight_notices(self._counts, self._flight_fit),
+        ]
         report = build_report(
-            self._setup, self._settings.mapping, self._log, result, self._archive.site(), shown, notices,
+            self._setup,
+            self._settings.mapping,
+            self._log,
+            result,
+            self._archive.site(),
+            shown,
+            notices,
             time.monotonic() - started_s,
         )
-        warnings = comparison_warnings(self._counts, self._views.brightness, self._views.times_coarser)
+        warnings = comparison_warnings(
+            self._counts, self._views.brightness, self._views.times_coarser
+        )
         comparison = comparison_summary(
-            changes, suppressed, self._counts, self._views, self._settings, self._base_version, ground,
+            changes,
+            suppressed,
+            self._counts,
+            self._views,
+            self._settings,
+            self._base_version,
+            ground,
             is_local=self._archive.site().is_local,
         )
         comparison["with_flight"] = flight_summary(self._counts, self._flight_fit)
         comparison["candidates"] = self._changes.candidates()
         comparison["heights_of"] = flight_with_heights(self._archive, but=self._setup.source.name)
         comparison["extension"] = {
-            "frames": len(self._extension.frames), "shown_as_well": shown_as_well,
+            "frames": len(self._extension.frames),
+            "shown_as_well": shown_as_well,
             "area_m2": self._extension.grown_m2(self._base_version),
         }
         return report | {
-            "method": f"compare-{self._settings.method}", "settings": asdict(self._settings), "comparison": comparison,
+            "method": f"compare-{self._settings.method}",
+            "settings": asdict(self._settings),
+            "comparison": comparison,
             "warnings": [*report["warnings"], *warnings],
         }
 
@@ -364,7 +446,11 @@ def _finer(archive: Archive, settings: CompareSettings, sizes: ViewSizes) -> flo
     """How many times as fine as the map its ground is looked at: 1 where things have pixels enough, or by method
     thesis. Over coarser maps learned features are compared as well."""
     m_per_px = archive.site_grid().grid.m_per_px
-    return 1.0 if settings.method == "thesis" else min(max(m_per_px / sizes.fine_m_per_px, 1.0), sizes.finer)
+    return (
+        1.0
+        if settings.method == "thesis"
+        else min(max(m_per_px / sizes.fine_m_per_px, 1.0), sizes.finer)
+    )
 
 
 def _gathering(
@@ -380,7 +466,11 @@ def _gathering(
 
 
 def view_maker(
-    setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int, sizes: ViewSizes = ViewSizes(),
+    setup: FlightSetup,
+    archive: Archive,
+    settings: CompareSettings,
+    base_version: int,
+    sizes: ViewSizes = ViewSizes(),
 ) -> ViewMaker:
     """What compares a flight's frames with a version of the map of a site."""
     source, site_grid = setup.source, archive.site_grid()
@@ -390,24 +480,40 @@ def view_maker(
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
     if settings.method == "thesis":
         return ViewMaker(flight, reference, site_grid, settings.thesis, None)
-    return ViewMaker(flight, reference, site_grid, None, _earlier_pictures(archive, source.name, sizes))
+    return ViewMaker(
+        flight, reference, site_grid, None, _earlier_pictures(archive, source.name, sizes)
+    )
 
 
-def _earlier_pictures(archive: Archive, superseded: str, sizes: ViewSizes = ViewSizes()) -> EarlierPictures:
+def _earlier_pictures(
+    archive: Archive, superseded: str, sizes: ViewSizes = ViewSizes()
+) -> EarlierPictures:
     """The keyframes of earlier flights, rendered over the newest heights; not those of a flight that the map does not
     show any more."""
     keyframes = [
-        each for each in archive.keyframes() if each.flight_id != superseded and each.status is Status.VISION
+        each
+        for each in archive.keyframes()
+        if each.flight_id != superseded and each.status is Status.VISION
     ]
     tall = flight_with_heights(archive, but=superseded)
-    relief = None if tall is None else Relief(
-        *standing(read_field(archive, tall, HeightFile.SURFACE), read_field(archive, tall, HeightFile.GROUND))
+    relief = (
+        None
+        if tall is None
+        else Relief(
+            *standing(
+                read_field(archive, tall, HeightFile.SURFACE),
+                read_field(archive, tall, HeightFile.GROUND),
+            )
+        )
     )
-    images = ImageCache(lambda index: with_known_pixels(archive.image(keyframes[index])), sizes.cache_bytes)
+    images = ImageCache(
+        lambda index: with_known_pixels(archive.image(keyframes[index])), sizes.cache_bytes
+    )
     return EarlierPictures(
         [
             EarlierPicture(each.camera, each.site_from_image, each.site_from_camera, each.time_ns)
             for each in keyframes
         ],
-        images.get, relief,
+        images.get,
+        relief,
     )

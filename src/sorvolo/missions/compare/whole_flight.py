@@ -36,7 +36,12 @@ class WholeFlight:
     """
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, views: ViewMaker, on_map: FlightOnMap, count: int,
+        self,
+        setup: FlightSetup,
+        archive: Archive,
+        views: ViewMaker,
+        on_map: FlightOnMap,
+        count: int,
         settings: WholeFlightSettings = WholeFlightSettings(),
     ) -> None:
         """`count` photos will be added."""
@@ -55,7 +60,10 @@ class WholeFlight:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._spill.close()
 
@@ -74,7 +82,9 @@ class WholeFlight:
         """The photos that are looked for on the map, and where the cameras of all that others of the flight overlap
         are beside each other; by index."""
         self._mapper.settle()
-        tied = [each for each in self._mapper.placed() if self._mapper.ending(each)[0] is Status.VISION]
+        tied = [
+            each for each in self._mapper.placed() if self._mapper.ending(each)[0] is Status.VISION
+        ]
         poses = {each: self._mapper.pose(each) for each in tied}
         return {index: photo for index, photo in self._sought.items() if index in poses}, poses
 
@@ -86,6 +96,9 @@ class WholeFlight:
             return {}
         camera = self._views.undistorted_camera
         return {
-            each: FlightPlace(fit.map_from_flight @ site_from_image(self._mapper, each, camera), fit.residual_m)
-            for each in poses if each not in fit.elsewhere
+            each: FlightPlace(
+                fit.map_from_flight @ site_from_image(self._mapper, each, camera), fit.residual_m
+            )
+            for each in poses
+            if each not in fit.elsewhere
         }

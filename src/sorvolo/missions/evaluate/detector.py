@@ -19,7 +19,13 @@ from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.missions.train.holding_out import hold_out
 from sorvolo.store.atomic import atomic_write_bytes, writing
 from sorvolo.store.datasets import read_datasets
-from sorvolo.store.exports.detector_files import FoundSet, FoundSets, mistake_picture, read_found, write_found
+from sorvolo.store.exports.detector_files import (
+    FoundSet,
+    FoundSets,
+    mistake_picture,
+    read_found,
+    write_found,
+)
 from sorvolo.store.exports.plain import json_bytes
 from sorvolo.store.pages.detector import detector_page
 from sorvolo.survey.flight import Notice
@@ -75,9 +81,17 @@ class DetectorEvaluation:
 
 
 def read_sets(
-    places: Sequence[Path], *, form: str | None = None, classes: Mapping[str, str] | None = None,
-    ignore: Iterable[str] = (), unlabelled: Iterable[str] = (), group_pattern: str | None = None, videos: str = "",
-    held_out: float = 0.0, seed: int = 1, known: Iterable[str] = (),
+    places: Sequence[Path],
+    *,
+    form: str | None = None,
+    classes: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
+    unlabelled: Iterable[str] = (),
+    group_pattern: str | None = None,
+    videos: str = "",
+    held_out: float = 0.0,
+    seed: int = 1,
+    known: Iterable[str] = (),
 ) -> tuple[LabelledSet, ...]:
     """The labelled sets in these files and folders, all read with the same options (those of `read_datasets`).
 
@@ -92,7 +106,12 @@ def read_sets(
         raise SettingsError(f"--videos {videos!r} is no regular expression: {error}") from error
     sets = []
     read = read_datasets(
-        places, form=form, classes=classes, ignore=ignore, unlabelled=unlabelled, group_pattern=group_pattern,
+        places,
+        form=form,
+        classes=classes,
+        ignore=ignore,
+        unlabelled=unlabelled,
+        group_pattern=group_pattern,
         known=known,
     )
     for place, whole in zip(places, read):
@@ -100,7 +119,9 @@ def read_sets(
         chosen = replace(whole.only(fitting), notices=whole.notices)
         if not len(chosen):
             groups = sorted({each.group for each in whole.pictures})
-            raise InputError(f"{place}: no video or flight fits {videos!r}; there are {', '.join(groups[:8])}")
+            raise InputError(
+                f"{place}: no video or flight fits {videos!r}; there are {', '.join(groups[:8])}"
+            )
         sets.append(_held_out(chosen, held_out, seed) if held_out else chosen)
     return tuple(sets)
 
@@ -108,8 +129,11 @@ def read_sets(
 def known_classes(arms: Iterable[Iterable[str]]) -> tuple[str, ...]:
     """All classes that any model of the arms detects. Raises InputError as `evaluate_detector`."""
     found = (
-        read_found(Path(place)).classes if Path(place).suffix == ".json" else read_info(find_model(place)).classes
-        for arm in arms for place in arm
+        read_found(Path(place)).classes
+        if Path(place).suffix == ".json"
+        else read_info(find_model(place)).classes
+        for arm in arms
+        for place in arm
     )
     return tuple(dict.fromkeys(name for classes in found for name in classes))
 
@@ -136,7 +160,10 @@ def evaluate_detector(
     first = seen[0][0]
     scores = tuple(_scores(each, first, settings) for each in labelled)
     comparisons = tuple(_side_by_side(each, seen, settings) for each in labelled if len(seen) > 1)
-    worst = {each.name: tuple(_worst(each, score, first.sets[each.name])) for each, score in zip(labelled, scores)}
+    worst = {
+        each.name: tuple(_worst(each, score, first.sets[each.name]))
+        for each, score in zip(labelled, scores)
+    }
     notices = (*_damage_notices(reader.damaged), *_model_notices(seen))
     return DetectorEvaluation(first, scores, comparisons, worst, notices)
 
@@ -144,13 +171,21 @@ def evaluate_detector(
 def _scores(labelled: LabelledSet, found: FoundSets, settings: EvaluationSettings) -> SetScores:
     mine = found.sets[labelled.name]
     return score_set(
-        labelled, mine.detections, found.classes, mine.thresholds, draws=settings.draws, seed=settings.seed
+        labelled,
+        mine.detections,
+        found.classes,
+        mine.thresholds,
+        draws=settings.draws,
+        seed=settings.seed,
     )
 
 
 def _seen_by_all(
-    arms: Sequence[Sequence[str]], labelled: Sequence[LabelledSet], settings: EvaluationSettings,
-    progress: Callable[[EvaluationProgress], None], reader: "_PictureReader",
+    arms: Sequence[Sequence[str]],
+    labelled: Sequence[LabelledSet],
+    settings: EvaluationSettings,
+    progress: Callable[[EvaluationProgress], None],
+    reader: "_PictureReader",
 ) -> list[list[FoundSets]]:
     """What every model of every arm finds in the pictures that can be read."""
     seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in arms]
@@ -168,7 +203,9 @@ def _model_notices(seen: Sequence[Sequence[FoundSets]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(text for arm in seen for each in arm for text in each.notices))
 
 
-def write_evaluation(evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]) -> None:
+def write_evaluation(
+    evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]
+) -> None:
     """Write detector.html, detector.json and detections.json; `description` is what was measured on what.
 
     Raises StoreError on a full disk.
@@ -178,20 +215,34 @@ def write_evaluation(evaluation: DetectorEvaluation, folder: Path, description: 
     write_found(folder / FOUND, evaluation.found)
     atomic_write_bytes(folder / NUMBERS, json_bytes(evaluation_numbers(evaluation, description)))
     page = detector_page(
-        evaluation.found.name, evaluation.sets, evaluation.comparisons, evaluation.worst, description
+        evaluation.found.name,
+        evaluation.sets,
+        evaluation.comparisons,
+        evaluation.worst,
+        description,
     )
     atomic_write_bytes(folder / PAGE, page.encode())
 
 
-def evaluation_numbers(evaluation: DetectorEvaluation, description: Mapping[str, Any]) -> dict[str, Any]:
+def evaluation_numbers(
+    evaluation: DetectorEvaluation, description: Mapping[str, Any]
+) -> dict[str, Any]:
     """The content of detector.json: all numbers, without the list of every mistake."""
     return {
-        "made_by": "sorvolo evaluate detector", "format": 1, **description, "model": evaluation.found.name,
-        "classes": list(evaluation.found.classes), "seconds_per_picture": evaluation.found.seconds_per_picture,
+        "made_by": "sorvolo evaluate detector",
+        "format": 1,
+        **description,
+        "model": evaluation.found.name,
+        "classes": list(evaluation.found.classes),
+        "seconds_per_picture": evaluation.found.seconds_per_picture,
         "sets": [
             {key: value for key, value in asdict(each).items() if key != "mistakes"}
             | {"thresholds": dict(evaluation.found.sets[each.name].thresholds)}
-            | {"mistakes": {kind: sum(row.kind == kind for row in each.mistakes) for kind in _KINDS}}
+            | {
+                "mistakes": {
+                    kind: sum(row.kind == kind for row in each.mistakes) for kind in _KINDS
+                }
+            }
             for each in evaluation.sets
         ],
         "comparisons": list(evaluation.comparisons),
@@ -207,13 +258,18 @@ def _held_out(labelled: LabelledSet, share: float, seed: int) -> LabelledSet:
 
 
 def _found(
-    place: str, labelled: Sequence[LabelledSet], settings: EvaluationSettings,
-    progress: Callable[[EvaluationProgress], None], reader: "_PictureReader",
+    place: str,
+    labelled: Sequence[LabelledSet],
+    settings: EvaluationSettings,
+    progress: Callable[[EvaluationProgress], None],
+    reader: "_PictureReader",
 ) -> FoundSets:
     """What the model of this name or file finds, or what it found by an earlier file; nothing in damaged pictures."""
     if Path(place).suffix == ".json":
         found = read_found(Path(place))
-        return replace(found, sets={each.name: _same_pictures(place, found, each, reader) for each in labelled})
+        return replace(
+            found, sets={each.name: _same_pictures(place, found, each, reader) for each in labelled}
+        )
     detector = Detector.load(place, stand_in=False)
     for each in labelled:
         judged_classes(each, detector.classes)  # before an hour of looking
@@ -229,10 +285,15 @@ def _found(
                 detections.append(no_detections(detector.classes))
             else:
                 started = time.perf_counter()
-                detections.append(detector.detect(
-                    image, tiles=settings.tiles, m_per_px=picture.m_per_px, least_score=LEAST_SCORE,
-                    from_above=settings.from_above,
-                ))
+                detections.append(
+                    detector.detect(
+                        image,
+                        tiles=settings.tiles,
+                        m_per_px=picture.m_per_px,
+                        least_score=LEAST_SCORE,
+                        from_above=settings.from_above,
+                    )
+                )
                 seconds += time.perf_counter() - started
                 count += 1
                 least = detector.thresholds_for(image, from_above=settings.from_above)
@@ -246,7 +307,10 @@ def _found(
             )
         sets[each.name] = FoundSet(_names(each), tuple(detections), usual)
     return FoundSets(
-        _arm_name(place), detector.classes, sets, seconds / max(count, 1),
+        _arm_name(place),
+        detector.classes,
+        sets,
+        seconds / max(count, 1),
         (*(notice.text for notice in detector.notices), *mixed),
     )
 
@@ -279,14 +343,18 @@ def _readable(labelled: LabelledSet, damaged: Mapping[str, str]) -> LabelledSet:
     return labelled.only(kept)
 
 
-def _without(found: FoundSets, labelled: Sequence[LabelledSet], damaged: Mapping[str, str]) -> FoundSets:
+def _without(
+    found: FoundSets, labelled: Sequence[LabelledSet], damaged: Mapping[str, str]
+) -> FoundSets:
     """What was found, without the pictures that no model could be shown."""
     sets = {}
     for each in labelled:
         one = found.sets[each.name]
         rows = [row for row, picture in enumerate(each.pictures) if picture.path not in damaged]
         sets[each.name] = replace(
-            one, files=tuple(one.files[row] for row in rows), detections=tuple(one.detections[row] for row in rows)
+            one,
+            files=tuple(one.files[row] for row in rows),
+            detections=tuple(one.detections[row] for row in rows),
         )
     return replace(found, sets=sets)
 
@@ -311,7 +379,9 @@ def _same_pictures(
 ) -> FoundSet:
     """The file's detections in the order of the set's pictures; those that it lacks must be damaged ones."""
     if labelled.name not in found.sets:
-        raise InputError(f"{place}: holds detections of {', '.join(found.sets)}, none of {labelled.name}")
+        raise InputError(
+            f"{place}: holds detections of {', '.join(found.sets)}, none of {labelled.name}"
+        )
     one = found.sets[labelled.name]
     wanted = _names(labelled)
     if one.files == wanted:
@@ -325,13 +395,18 @@ def _same_pictures(
             + (f"; {len(missing)} are missing, such as {missing[0]}" if missing else "")
         )
     nothing = no_detections(found.classes)
-    return replace(one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted))
+    return replace(
+        one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted)
+    )
 
 
-def _readable_beside(labelled: LabelledSet, known: Container[str], reader: _PictureReader) -> list[str]:
+def _readable_beside(
+    labelled: LabelledSet, known: Container[str], reader: _PictureReader
+) -> list[str]:
     """The set's pictures that are not known by name, and can be read."""
     return [
-        name for name, picture in zip(_names(labelled), labelled.pictures)
+        name
+        for name, picture in zip(_names(labelled), labelled.pictures)
         if name not in known and reader.read(picture.path) is not None
     ]
 
@@ -343,10 +418,14 @@ def _side_by_side(
     arms = []
     for place, (name, arm) in enumerate(zip(names, seen), start=1):
         seeds = [each.sets[labelled.name] for each in arm]
-        arms.append(Arm(
-            name if names.count(name) == 1 else f"{name} ({place})", arm[0].classes,
-            tuple(each.detections for each in seeds), tuple(each.thresholds for each in seeds),
-        ))
+        arms.append(
+            Arm(
+                name if names.count(name) == 1 else f"{name} ({place})",
+                arm[0].classes,
+                tuple(each.detections for each in seeds),
+                tuple(each.thresholds for each in seeds),
+            )
+        )
     return compare_arms(labelled, arms, draws=settings.draws, seed=settings.seed)
 
 
@@ -367,7 +446,9 @@ def _worst(
             reported = _reported(found.detections[mistake.picture], found.thresholds)
             image = reader.read(picture.path)
             if image is not None:  # of detections.json the pictures were not needed so far
-                crop = mistake_picture(image, mistake.box_px, _judged_boxes(picture, labelled, scores), reported)
+                crop = mistake_picture(
+                    image, mistake.box_px, _judged_boxes(picture, labelled, scores), reported
+                )
                 yield mistake, Path(picture.path).name, crop
 
 
@@ -392,4 +473,6 @@ def _judged_boxes(picture: LabelledPicture, labelled: LabelledSet, scores: SetSc
 
 
 def _reported(found: Detections, thresholds: Mapping[str, float]) -> BoxesPx:
-    return found.boxes_px[[score >= thresholds[name] for score, name in zip(found.scores, found.names)]]
+    return found.boxes_px[
+        [score >= thresholds[name] for score, name in zip(found.scores, found.names)]
+    ]

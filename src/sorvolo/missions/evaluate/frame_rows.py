@@ -38,14 +38,17 @@ def map_frames(site: Path, described: Site) -> dict[str, list[FrameRow]]:
     if not files:
         raise InputError(f"{site}: no flights/*/frames.geojson; map a flight into it first")
     return {
-        path.parent.name: [frame_row(each, described.frame, path) for each in read_features(path)] for path in files
+        path.parent.name: [frame_row(each, described.frame, path) for each in read_features(path)]
+        for path in files
     }
 
 
 def refuse_simulation(site: Path) -> None:
     """Raise InputError for the folder of a simulation: the likely slip is that site and truth are swapped."""
     if not is_site(site) and (site / "truth" / "frames.geojson").is_file():
-        raise InputError(f"{site}: a simulation's folder, no site; give the site first, and --truth {site}")
+        raise InputError(
+            f"{site}: a simulation's folder, no site; give the site first, and --truth {site}"
+        )
 
 
 def truth_file(truth: Path) -> Path:
@@ -53,7 +56,9 @@ def truth_file(truth: Path) -> Path:
     for path in (truth / "truth" / "frames.geojson", truth / "frames.geojson", truth):
         if path.is_file():
             return path
-    raise InputError(f"{truth}: no truth/frames.geojson in it; give the folder that `sorvolo simulate` made")
+    raise InputError(
+        f"{truth}: no truth/frames.geojson in it; give the folder that `sorvolo simulate` made"
+    )
 
 
 def read_features(path: Path) -> list[dict[str, Any]]:
@@ -73,16 +78,25 @@ def frame_row(feature: Mapping[str, Any], frame: LocalFrame, path: Path) -> Fram
         properties, geometry = feature["properties"], feature["geometry"]
         corners = _NO_OUTLINE if geometry is None else geometry["coordinates"][0][:4]
         camera, fix = (
-            [_number(properties, f"{kind}_longitude_deg"), _number(properties, f"{kind}_latitude_deg")]
+            [
+                _number(properties, f"{kind}_longitude_deg"),
+                _number(properties, f"{kind}_latitude_deg"),
+            ]
             for kind in ("camera", "fix")
         )
         return FrameRow(
-            str(properties["frame"]), str(properties.get("status", "")), frame.ground_from_lonlat(corners),
-            frame.ground_from_lonlat([camera])[0], _number(properties, "camera_height_m"),
-            frame.ground_from_lonlat([fix])[0], time_ns_of(str(properties.get("time") or "")),
+            str(properties["frame"]),
+            str(properties.get("status", "")),
+            frame.ground_from_lonlat(corners),
+            frame.ground_from_lonlat([camera])[0],
+            _number(properties, "camera_height_m"),
+            frame.ground_from_lonlat([fix])[0],
+            time_ns_of(str(properties.get("time") or "")),
         )
     except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise InputError(f"{path}: a feature is not as docs/formats.md has it ({error!r})") from error
+        raise InputError(
+            f"{path}: a feature is not as docs/formats.md has it ({error!r})"
+        ) from error
 
 
 def time_ns_of(text: str) -> int:

@@ -37,7 +37,9 @@ def compare_mask_folders(found: Path, truth: Path, least_px: int = 1) -> MaskSco
     pixels, frames, compared = Counts(), Counts(), 0
     for each in compared_masks(found, truth, least_px):
         pixels, frames, compared = pixels + each.pixels, frames + each.frame, compared + 1
-    return MaskScores(pixels, frames, compared, len(mine) - compared, len(true) - compared, least_px)
+    return MaskScores(
+        pixels, frames, compared, len(mine) - compared, len(true) - compared, least_px
+    )
 
 
 def compared_masks(found: Path, truth: Path, least_px: int = 1) -> Iterator[ComparedMask]:
@@ -63,11 +65,16 @@ def compared_masks(found: Path, truth: Path, least_px: int = 1) -> Iterator[Comp
                 f"{mine[name]} and {true[name]} differ in size: {sizes} pixels; give masks of the same pictures"
             )
         yield ComparedMask(
-            name, mine[name], pixel_counts(changed, there, unknown), frame_counts(changed, there, unknown, least_px)
+            name,
+            mine[name],
+            pixel_counts(changed, there, unknown),
+            frame_counts(changed, there, unknown, least_px),
         )
 
 
-def frames_against_times(found: Path, is_changed: Callable[[int], bool | None]) -> Iterator[ComparedMask]:
+def frames_against_times(
+    found: Path, is_changed: Callable[[int], bool | None]
+) -> Iterator[ComparedMask]:
     """Judge masks of a video's frames where it is only known which frames show a change; None: not judged.
 
     Masks are named by the numbers of their frames; others are passed over. Raises InputError as `compared_masks`.

@@ -6,8 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.missions.evaluate.frame_rows import map_frames, refuse_simulation, true_frames, truth_file
-from sorvolo.mosaic.frame_deviation import DeviationSummary, MapDeviation, frames_to_compare, summed_up
+from sorvolo.missions.evaluate.frame_rows import (
+    map_frames,
+    refuse_simulation,
+    true_frames,
+    truth_file,
+)
+from sorvolo.mosaic.frame_deviation import (
+    DeviationSummary,
+    MapDeviation,
+    frames_to_compare,
+    summed_up,
+)
 from sorvolo.mosaic.reference_match import MapPicture, ReferenceMatch, match_reference
 from sorvolo.mosaic.truth_errors import PositionErrors, TruthErrors, table_errors, truth_errors
 from sorvolo.store.rasters.geotiff import Raster, read_raster
@@ -58,7 +68,11 @@ class _TablePlace:
 
 
 def evaluate_mosaic(
-    site: Path, *, truth: Path | None = None, reference: Path | None = None, positions: Path | None = None
+    site: Path,
+    *,
+    truth: Path | None = None,
+    reference: Path | None = None,
+    positions: Path | None = None,
 ) -> MosaicEvaluation:
     """Measure the map in a site folder; the deviation from its own frames always, the rest where given.
 
@@ -80,7 +94,10 @@ def evaluate_mosaic(
         if truth:
             tallies, errors = _against_truth(flights, truth_file(truth), described)
         return MosaicEvaluation(
-            described.name, described.m_per_px, tallies, errors,
+            described.name,
+            described.m_per_px,
+            tallies,
+            errors,
             _deviation(archive),
             _against_reference(archive.mosaic_path, reference) if reference else None,
             _against_positions(flights, positions, described) if positions else None,
@@ -88,16 +105,23 @@ def evaluate_mosaic(
 
 
 def _tally(
-    flights: Mapping[str, Sequence[FrameRow]], known: Mapping[str, Mapping[str, FrameRow]] | None = None
+    flights: Mapping[str, Sequence[FrameRow]],
+    known: Mapping[str, Mapping[str, FrameRow]] | None = None,
 ) -> tuple[FlightTally, ...]:
     tallies = []
     for name, rows in flights.items():
         ended = [row.status for row in rows]
         unmatched = 0 if known is None else sum(row.name not in known.get(name, {}) for row in rows)
-        tallies.append(FlightTally(
-            name, len(rows), ended.count(Status.VISION), ended.count(Status.GPS_ONLY),
-            ended.count(Status.REJECTED), unmatched,
-        ))
+        tallies.append(
+            FlightTally(
+                name,
+                len(rows),
+                ended.count(Status.VISION),
+                ended.count(Status.GPS_ONLY),
+                ended.count(Status.REJECTED),
+                unmatched,
+            )
+        )
     return tuple(tallies)
 
 
@@ -123,9 +147,13 @@ def _against_truth(
 
 
 def _refuse_far(errors: Sequence[TruthErrors], path: Path) -> None:
-    far_m = min((each.corners.absolute.rms_m for each in errors if each.corners.absolute.count), default=0.0)
+    far_m = min(
+        (each.corners.absolute.rms_m for each in errors if each.corners.absolute.count), default=0.0
+    )
     if far_m > _FARTHEST_M:
-        raise InputError(f"{path}: lies {far_m / 1000:.0f} km from the map; give the truth of its own flight")
+        raise InputError(
+            f"{path}: lies {far_m / 1000:.0f} km from the map; give the truth of its own flight"
+        )
 
 
 def _paired(
@@ -144,16 +172,22 @@ def _deviation(archive: Archive) -> DeviationSummary:
     keyframes = archive.keyframes()
     keyframes = [keyframes[i] for i in frames_to_compare(len(keyframes), _DEVIATION_FRAMES)]
     deviation = MapDeviation(archive.tiles(), archive.site_grid())
-    return summed_up([deviation.of(archive.image(each), each.site_from_image) for each in keyframes])
+    return summed_up(
+        [deviation.of(archive.image(each), each.site_from_image) for each in keyframes]
+    )
 
 
 def _against_reference(mosaic_path: Path, reference: Path) -> ReferenceMatch:
     mine, other = read_raster(mosaic_path, _REFERENCE_PX), read_raster(reference, 2 * _REFERENCE_PX)
     if not other.crs:
-        raise InputError(f"{reference}: has no coordinate system; a reference map needs one (a GeoTIFF)")
+        raise InputError(
+            f"{reference}: has no coordinate system; a reference map needs one (a GeoTIFF)"
+        )
     found = match_reference(_map_picture(mine), _map_picture(other))
     if found is None:
-        raise InputError(f"{reference}: shows hardly any ground of this map; give a map of the same place")
+        raise InputError(
+            f"{reference}: shows hardly any ground of this map; give a map of the same place"
+        )
     return found
 
 
@@ -171,11 +205,15 @@ def _against_positions(
     for (flight, name), place in known.items():
         found = _rows_of(cameras, flight, name, path)
         if found and found[0].has_camera:
-            east_m, north_m = described.frame.ground_from_lonlat([[place.longitude_deg, place.latitude_deg]])[0]
+            east_m, north_m = described.frame.ground_from_lonlat(
+                [[place.longitude_deg, place.latitude_deg]]
+            )[0]
             mine.append(found[0])
             places_m.append((float(east_m), float(north_m), place.height_m))
     if not mine:
-        raise InputError(f"{path}: none of its {len(known)} frames has a camera in this map; check the names")
+        raise InputError(
+            f"{path}: none of its {len(known)} frames has a camera in this map; check the names"
+        )
     return table_errors(mine, places_m, len(known) - len(mine), described.m_per_px)
 
 
@@ -198,7 +236,9 @@ def _positions(path: Path) -> dict[tuple[str, str], _TablePlace]:
         _demand_columns(path, table.fieldnames or ())
         return {
             ((row.get("flight") or "").strip(), row["frame"].strip()): _TablePlace(
-                float(row["longitude_deg"]), float(row["latitude_deg"]), float(row.get("height_m") or "nan"),
+                float(row["longitude_deg"]),
+                float(row["latitude_deg"]),
+                float(row.get("height_m") or "nan"),
             )
             for row in rows
         }

@@ -60,7 +60,11 @@ class FlightBase:
         return LocalFrame(self.base.middle)
 
     def tie(
-        self, mapper: PlanarMapper, picture: Callable[[int], ImageRGB], camera: Camera, frame: LocalFrame
+        self,
+        mapper: PlanarMapper,
+        picture: Callable[[int], ImageRGB],
+        camera: Camera,
+        frame: LocalFrame,
     ) -> BaseReport:
         """Find the flight's keyframes on the base map and tie them there.
 
@@ -81,15 +85,21 @@ class FlightBase:
             image = picture(each)
             height_px, width_px = image.shape[:2]
             seen = mapper.refined(camera).resized(width_px, height_px)
-            aligned = aligner.align(image, seen, prior_on_map(mapper, each, sigma_m), number * _APART_NS)
+            aligned = aligner.align(
+                image, seen, prior_on_map(mapper, each, sigma_m), number * _APART_NS
+            )
             if isinstance(aligned, Aligned):
                 misfit_m = aligned.residual_px * native_m * camera.width_px / width_px
-                found.append(FoundFrame(
-                    each, camera.resized(width_px, height_px), aligned.site_from_image, misfit_m
-                ))
+                found.append(
+                    FoundFrame(
+                        each, camera.resized(width_px, height_px), aligned.site_from_image, misfit_m
+                    )
+                )
         least = max(_LEAST_FRAMES, _LEAST_SHARE * len(sought))
         if len(found) < least:
-            together = _found_as_one(mapper, sought, picture, camera, FlightOnMap(MapSearch(reference, site_grid)))
+            together = _found_as_one(
+                mapper, sought, picture, camera, FlightOnMap(MapSearch(reference, site_grid))
+            )
             found = together or found
         if len(found) < least:
             raise InputError(
@@ -98,9 +108,16 @@ class FlightBase:
                 "give another one"
             )
         before = mapper.path_m()
-        left_out, residual_m = tie_to_base(mapper, found, camera, self.base.m_per_px, is_datum=self.is_datum)
+        left_out, residual_m = tie_to_base(
+            mapper, found, camera, self.base.m_per_px, is_datum=self.is_datum
+        )
         return BaseReport(
-            self.base.path.name, self.base.m_per_px, len(sought), len(found), left_out, residual_m,
+            self.base.path.name,
+            self.base.m_per_px,
+            len(sought),
+            len(found),
+            left_out,
+            residual_m,
             float("nan") if self.is_datum else mapper.median_move_m(before),
         )
 
@@ -144,7 +161,11 @@ class FlightBase:
 
 
 def _found_as_one(
-    mapper: PlanarMapper, sought: Sequence[int], picture: Callable[[int], ImageRGB], camera: Camera, on_map: FlightOnMap
+    mapper: PlanarMapper,
+    sought: Sequence[int],
+    picture: Callable[[int], ImageRGB],
+    camera: Camera,
+    on_map: FlightOnMap,
 ) -> list[FoundFrame]:
     """The keyframes where all of them together are found on the base map (0087); none where they are not."""
     refined = mapper.refined(camera)
@@ -157,8 +178,14 @@ def _found_as_one(
     if fit is None:
         return []
     return [
-        FoundFrame(each, camera, fit.map_from_flight @ site_from_image_homography(refined, poses[each]), fit.residual_m)
-        for each in sought if each not in fit.elsewhere
+        FoundFrame(
+            each,
+            camera,
+            fit.map_from_flight @ site_from_image_homography(refined, poses[each]),
+            fit.residual_m,
+        )
+        for each in sought
+        if each not in fit.elsewhere
     ]
 
 

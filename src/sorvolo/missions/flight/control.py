@@ -4,7 +4,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from sorvolo.capture.control_points import LEAST_POINTS, ControlFile, marks_in_frames, read_control_points
+from sorvolo.capture.control_points import (
+    LEAST_POINTS,
+    ControlFile,
+    marks_in_frames,
+    read_control_points,
+)
 from sorvolo.capture.source import Source
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.geodesy import LocalFrame
@@ -37,10 +42,14 @@ class FlightControl:
         """A site frame amid the points, for a flight without GPS."""
         return LocalFrame(self.control.middle)
 
-    def tie(self, mapper: PlanarMapper, keyframe_of: Mapping[str, int], frame: LocalFrame) -> ControlReport:
+    def tie(
+        self, mapper: PlanarMapper, keyframe_of: Mapping[str, int], frame: LocalFrame
+    ) -> ControlReport:
         """Tie the map to them; see `tie_control`. `keyframe_of`: the keyframe that shows each frame, by name."""
         camera = self.source.camera.camera
-        problem = ControlProblem(self.control, keyframe_of, camera, frame, self.is_datum, self._other_readings)
+        problem = ControlProblem(
+            self.control, keyframe_of, camera, frame, self.is_datum, self._other_readings
+        )
         return tie_control(mapper, problem, self.settings)
 
     def check_place(self, distance_m: Callable[[GroundControl], float]) -> None:

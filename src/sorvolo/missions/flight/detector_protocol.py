@@ -33,7 +33,11 @@ class ObjectDetector(Protocol):
         """What a user should know of the pictures seen so far."""
 
     def thresholds_for(
-        self, picture: ImageRGB, *, from_above: bool = False, m_per_px: float | None = None,
+        self,
+        picture: ImageRGB,
+        *,
+        from_above: bool = False,
+        m_per_px: float | None = None,
     ) -> Mapping[str, float]:
         """From which score on each class is reported that is looked for in a picture (H, W, 3) like this."""
 
@@ -41,9 +45,17 @@ class ObjectDetector(Protocol):
         """Give back memory that is kept for the next picture; it may be asked for more pictures later."""
 
     def detect(
-        self, image: ImageRGB, *, tiles: Literal["auto"] | int | None = None, m_per_px: float | None = None,
-        least_score: float | None = None, classes: Sequence[str] | None = None, from_above: bool = False,
-        overlapping: bool = False, early: Early | None = None, is_part: bool = False,
+        self,
+        image: ImageRGB,
+        *,
+        tiles: Literal["auto"] | int | None = None,
+        m_per_px: float | None = None,
+        least_score: float | None = None,
+        classes: Sequence[str] | None = None,
+        from_above: bool = False,
+        overlapping: bool = False,
+        early: Early | None = None,
+        is_part: bool = False,
     ) -> Detections:
         """The objects in one picture, (H, W, 3), best first.
 

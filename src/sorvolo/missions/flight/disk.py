@@ -17,15 +17,23 @@ class DiskSettings:
     """What a flight needs on the disk, measured on simulated flights and photos of meadows and beaches."""
 
     picture_bytes_per_px: float = 0.45  # of a key frame's JPEG
-    map_bytes_per_px: float = 2.0  # of a key frame, for tiles, mosaic.tif, preview and KMZ at 70 % overlap
-    journal_bytes: float = 1.5e6  # of a key frame while the flight is mapped, with what does not stay in memory
+    map_bytes_per_px: float = (
+        2.0  # of a key frame, for tiles, mosaic.tif, preview and KMZ at 70 % overlap
+    )
+    journal_bytes: float = (
+        1.5e6  # of a key frame while the flight is mapped, with what does not stay in memory
+    )
     surely: float = 0.5  # share of the need without which it cannot end well
     enough: float = 1.5  # times the need with which it will
     ahead: int = 60  # frames of a live flight that are still to fit: a few minutes
 
 
 def check_room(
-    setup: FlightSetup, archive: Archive, m_per_px: float | None, *, keeps_pictures: bool = True,
+    setup: FlightSetup,
+    archive: Archive,
+    m_per_px: float | None,
+    *,
+    keeps_pictures: bool = True,
     settings: DiskSettings = DiskSettings(),
 ) -> None:
     """Announce a disk that is too full for a flight's map: pictures no finer than `m_per_px` (None: than their own).
@@ -41,15 +49,21 @@ def check_room(
         need += mosaic.stat().st_size
     free = _free(archive.folder)
     what = "the map of" if keeps_pictures else "the new version of the map after comparing"
-    flown = "" if isinstance(setup.source, LiveSource) or not keeps_pictures else (
-        f" ({counted(count, 'frame')} of {camera.width_px} x {camera.height_px} px)"
+    flown = (
+        ""
+        if isinstance(setup.source, LiveSource) or not keeps_pictures
+        else (f" ({counted(count, 'frame')} of {camera.width_px} x {camera.height_px} px)")
     )
     text = (
         f"the disk of {archive.folder} has {_words(free)} free, and {what} {setup.source.name} needs about "
         f"{_words(need)}{flown}"
     )
     if free < settings.surely * need:
-        coarser = ", or a coarser map (--gsd)" if keeps_pictures else ", or do not update the map (--no-update)"
+        coarser = (
+            ", or a coarser map (--gsd)"
+            if keeps_pictures
+            else ", or do not update the map (--no-update)"
+        )
         raise StoreError(f"{text}: free some space, choose another disk{coarser}")
     if free < settings.enough * need:
         warnings.warn(f"{text}: it may become full", SorvoloWarning, stacklevel=2)
@@ -59,7 +73,11 @@ class LiveRoom:
     """Announces, once, that a disk becomes full while a live flight, whose length nobody knows, goes on."""
 
     def __init__(
-        self, setup: FlightSetup, folder: Path, m_per_px: float | None, settings: DiskSettings = DiskSettings()
+        self,
+        setup: FlightSetup,
+        folder: Path,
+        m_per_px: float | None,
+        settings: DiskSettings = DiskSettings(),
     ) -> None:
         self._name, self._folder, self._ahead = setup.source.name, folder, settings.ahead
         self._kept, self._painted = _frame_bytes(setup, m_per_px, settings)
@@ -80,13 +98,18 @@ class LiveRoom:
             warnings.warn(text, SorvoloWarning, stacklevel=2)
 
 
-def _frame_bytes(setup: FlightSetup, m_per_px: float | None, settings: DiskSettings) -> tuple[float, float]:
+def _frame_bytes(
+    setup: FlightSetup, m_per_px: float | None, settings: DiskSettings
+) -> tuple[float, float]:
     """What a key frame takes while the flight is mapped, and what its ground takes in the map's files."""
     camera, shrink = setup.source.camera.camera, 1.0
     if m_per_px is not None and setup.usual_height_m > 0:
         shrink = min(1.0, setup.usual_height_m / camera.fx_px / m_per_px)
     pixels = camera.width_px * camera.height_px * shrink**2
-    return pixels * settings.picture_bytes_per_px + settings.journal_bytes, pixels * settings.map_bytes_per_px
+    return (
+        pixels * settings.picture_bytes_per_px + settings.journal_bytes,
+        pixels * settings.map_bytes_per_px,
+    )
 
 
 def _free(folder: Path) -> int:

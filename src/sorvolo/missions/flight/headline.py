@@ -35,7 +35,11 @@ class Headline:
 
 
 def map_headline(
-    placed: Sequence[PlacedFrame], figures: FlightFigures, *, is_video: bool, agreement: Consistency = NOTHING_KNOWN,
+    placed: Sequence[PlacedFrame],
+    figures: FlightFigures,
+    *,
+    is_video: bool,
+    agreement: Consistency = NOTHING_KNOWN,
     others: Sequence[str] = (),
 ) -> Headline:
     """The headline of a flight that was mapped; photos were each meant, so that one photo is a map. `others` are
@@ -44,7 +48,10 @@ def map_headline(
     if is_video and (seen == 1 or figures.reach_m < _HOVERING * figures.diagonal_m):
         return Headline(MapQuality.ONE_VIEW, f"no map: {_one_view(figures, seen)}")
     if agreement.faults:
-        return Headline(MapQuality.CONTRADICTORY, f"a map that contradicts itself: {'; '.join(agreement.faults)}")
+        return Headline(
+            MapQuality.CONTRADICTORY,
+            f"a map that contradicts itself: {'; '.join(agreement.faults)}",
+        )
     found = [*agreement.steps, *doubts(placed, figures), *others]
     if found:
         return Headline(MapQuality.DOUBTFUL, f"a map to check before use: {'; '.join(found)}")

@@ -57,7 +57,9 @@ def _found(guess: CameraModel, flight_id: str, reported: Any) -> CameraModel | N
     """This camera by a report's part on the camera; None where it is another or was not estimated."""
     camera = guess.camera
     same = {"origin": guess.origin, "width_px": camera.width_px, "height_px": camera.height_px}
-    if not isinstance(reported, dict) or any(reported.get(key) != value for key, value in same.items()):
+    if not isinstance(reported, dict) or any(
+        reported.get(key) != value for key, value in same.items()
+    ):
         return None
     focal_px, sigma = reported.get("focal_found_px"), reported.get("focal_found_sigma_relative")
     if not focal_px or not sigma:

@@ -42,7 +42,12 @@ class SourceNotes:
             self._is_begun = True
             packer = RecordPacker()
             begun = FlightBegun(
-                source.name, source.fingerprint, source.start_ns, source.start_origin, source.camera, source.gaps_s
+                source.name,
+                source.fingerprint,
+                source.start_ns,
+                source.start_origin,
+                source.camera,
+                source.gaps_s,
             )
             self._journal.append(Entry(BEGUN, {"begun": packer.packed(begun)}, packer.arrays))
         if source.is_reread:
@@ -64,7 +69,10 @@ def flight_so_far(journal: RunJournal) -> FlightSoFar | None:
             elif entry.kind == SAMPLES:
                 parts.append((entry.arrays["times_ns"], entry.arrays["samples"]))
             elif "time_ns" in entry.values:
-                index, last_ns = max(index, int(entry.values["index"])), max(last_ns, int(entry.values["time_ns"]))
+                index, last_ns = (
+                    max(index, int(entry.values["index"])),
+                    max(last_ns, int(entry.values["time_ns"])),
+                )
                 names.add(str(entry.values["name"]))
         times_ns, samples = joined_samples(parts)
     except (KeyError, TypeError, ValueError, IndexError, SorvoloError):
@@ -72,8 +80,17 @@ def flight_so_far(journal: RunJournal) -> FlightSoFar | None:
     if begun is None or index < 0:
         return None
     return FlightSoFar(
-        begun.name, begun.fingerprint, begun.start_ns, begun.start_origin, begun.camera, index + 1, last_ns,
-        frozenset(names), times_ns, samples, begun.gaps_s,
+        begun.name,
+        begun.fingerprint,
+        begun.start_ns,
+        begun.start_origin,
+        begun.camera,
+        index + 1,
+        last_ns,
+        frozenset(names),
+        times_ns,
+        samples,
+        begun.gaps_s,
     )
 
 

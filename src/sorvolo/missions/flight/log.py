@@ -61,7 +61,9 @@ class FlightLog:
 
     def commonest_reason(self) -> str:
         """The reason that most rejected frames share; "" without any."""
-        reasons = Counter(each.reason for each in self.endings.values() if each.status is Status.REJECTED)
+        reasons = Counter(
+            each.reason for each in self.endings.values() if each.status is Status.REJECTED
+        )
         return reasons.most_common(1)[0][0] if reasons else ""
 
     @contextmanager

@@ -34,7 +34,9 @@ from sorvolo.tracking.view_evidence import least_seen
 NO_MODEL, DEFAULT_MODEL = "none", "default"
 """The model that looks for nothing, and the one that comes with the package."""
 
-_AHEAD = 3  # frames of a recorded flight that may wait for the detector before the mapping waits for it
+_AHEAD = (
+    3  # frames of a recorded flight that may wait for the detector before the mapping waits for it
+)
 _CROP_PX = 256  # longer side of a picture on a page
 _MOST_CROPS = 60  # of one frame, the surest
 
@@ -57,7 +59,9 @@ def open_detector(model: str, shared: str = "", *, is_live: bool = False) -> Obj
 def check_classes(detector: ObjectDetector | None, classes: Sequence[str]) -> None:
     """Raise SettingsError for a class that the detector does not know, before anything is searched."""
     if detector is not None and (unknown := sorted(set(classes) - set(detector.classes))):
-        raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
+        raise SettingsError(
+            f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,13 +88,20 @@ class ObjectFinder:
     """
 
     def __init__(
-        self, detector: ObjectDetector, camera: Camera, classes: Sequence[str] = (), *, live_folder: Path | None = None
+        self,
+        detector: ObjectDetector,
+        camera: Camera,
+        classes: Sequence[str] = (),
+        *,
+        live_folder: Path | None = None,
     ) -> None:
         check_classes(detector, classes)
         self._detector, self._camera = detector, camera
         self._live_folder = live_folder
         self._classes = tuple(classes) or detector.info.usual_classes
-        self._thread = ThreadPoolExecutor(1, "detector", lower_priority if live_folder is not None else None)
+        self._thread = ThreadPoolExecutor(
+            1, "detector", lower_priority if live_folder is not None else None
+        )
         self._waiting: deque[Future[FrameDetections]] = deque()
         self._seen: dict[int, FrameDetections] = {}
         self._news: list[FrameDetections] = []
@@ -152,15 +163,23 @@ class ObjectFinder:
         """Whether the frame of this index was searched."""
         return index in self._seen
 
-    def conclude(self, placed: Sequence[PlacedFrame], flight_id: str, *, has_metres: bool) -> ObjectSearch:
+    def conclude(
+        self, placed: Sequence[PlacedFrame], flight_id: str, *, has_metres: bool
+    ) -> ObjectSearch:
         """Lay all detections on the ground by the frames' final places, and report each object once."""
         self._take(0)
-        frames = [each for each in placed if each.index in self._seen and each.status is not Status.REJECTED]
+        frames = [
+            each
+            for each in placed
+            if each.index in self._seen and each.status is not Status.REJECTED
+        ]
         laid: list[LaidSighting] = []
         crops: list[bytes] = []
         for frame in frames:
             seen = self._seen[frame.index]
-            for each, crop in zip(lay_on_ground(seen.found, frame, has_metres=has_metres), seen.crops):
+            for each, crop in zip(
+                lay_on_ground(seen.found, frame, has_metres=has_metres), seen.crops
+            ):
                 if each is not None:
                     laid.append(each)
                     crops.append(crop)
@@ -168,9 +187,16 @@ class ObjectFinder:
         sightings = (each.sighting for each in laid)
         self._sightings = tuple(each for each in sightings if each.score >= least[each.label])
         found = objects_on_map(laid, crops, frames, flight_id, has_metres=has_metres, least=least)
-        searched = SearchedFrames.of(frames, [self._seen[each.index].least.keys() for each in frames], self._classes)
+        searched = SearchedFrames.of(
+            frames, [self._seen[each.index].least.keys() for each in frames], self._classes
+        )
         return ObjectSearch(
-            self._detector.info.name, self._classes, found.objects, searched, len(self._seen), len(self._sightings),
+            self._detector.info.name,
+            self._classes,
+            found.objects,
+            searched,
+            len(self._seen),
+            len(self._sightings),
             found.dropped,
         )
 
@@ -178,7 +204,9 @@ class ObjectFinder:
         """From which score on each class is reported: where frames of two lights differ, the higher; of a class that no
         frame was searched for, from the model's own."""
         of_frames = [self._seen[each.index].least for each in frames]
-        highest = {name: max(each.get(name, 0.0) for each in of_frames) for name in set().union(*of_frames)}
+        highest = {
+            name: max(each.get(name, 0.0) for each in of_frames) for name in set().union(*of_frames)
+        }
         return {**self._detector.info.thresholds, **highest}
 
     def _take(self, left: float) -> None:
@@ -188,31 +216,51 @@ class ObjectFinder:
             self._seen[seen.index] = seen
             self._news.append(seen)
 
-    def _look(self, given: "Frame | FrameOnDisk", m_per_px: float | None, from_above: bool) -> FrameDetections:
+    def _look(
+        self, given: "Frame | FrameOnDisk", m_per_px: float | None, from_above: bool
+    ) -> FrameDetections:
         started_s = time.monotonic()
         frame = given.taken() if isinstance(given, FrameOnDisk) else given
         least = self._detector.thresholds_for(frame.image, from_above=from_above, m_per_px=m_per_px)
         found = self._detector.detect(
-            frame.image, tiles="auto", m_per_px=m_per_px, classes=self._classes, from_above=from_above,
-            overlapping=True, least_score=least_seen(least),
+            frame.image,
+            tiles="auto",
+            m_per_px=m_per_px,
+            classes=self._classes,
+            from_above=from_above,
+            overlapping=True,
+            least_score=least_seen(least),
         )
         surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
-        return FrameDetections(frame.index, surest, crops, time.monotonic() - started_s, dict(least))
+        return FrameDetections(
+            frame.index, surest, crops, time.monotonic() - started_s, dict(least)
+        )
 
 
-def search_summary(search: ObjectSearch | None, seconds: float, why_not: str = "") -> dict[str, Any]:
+def search_summary(
+    search: ObjectSearch | None, seconds: float, why_not: str = ""
+) -> dict[str, Any]:
     """The report's part on objects; specified in docs/formats.md. `why_not`: why nothing was searched."""
     if search is None:
         return {"model": None, "why_not": why_not, "count": 0, "classes": {}, "list": []}
     counts = Counter(each.label for each in search.objects)
-    return dict(plain_json({
-        "model": search.model, "looked_for": search.classes, "frames": search.looked,
-        "sightings": search.sightings, "dropped": search.dropped, "seconds": round(seconds, 3),
-        "count": len(search.objects), "moving": sum(each.moving for each in search.objects),
-        "classes": {name: counts[name] for name in search.classes},
-        "list": [_row(each) for each in search.objects],
-    }))
+    return dict(
+        plain_json(
+            {
+                "model": search.model,
+                "looked_for": search.classes,
+                "frames": search.looked,
+                "sightings": search.sightings,
+                "dropped": search.dropped,
+                "seconds": round(seconds, 3),
+                "count": len(search.objects),
+                "moving": sum(each.moving for each in search.objects),
+                "classes": {name: counts[name] for name in search.classes},
+                "list": [_row(each) for each in search.objects],
+            }
+        )
+    )
 
 
 def why_not_searched(model: str) -> str:
@@ -229,9 +277,17 @@ def crops_of(search: ObjectSearch | None) -> dict[str, bytes]:
 
 def _row(each: MapObject) -> dict[str, Any]:
     return {
-        "id": each.id, "class": each.label, "score": round(each.score, 3), "east_m": each.position_m[0],
-        "north_m": each.position_m[1], "sigma_m": each.sigma_m, "length_m": each.length_m, "width_m": each.width_m,
-        "views": each.views, "possible_views": each.possible_views, "moving": each.moving,
+        "id": each.id,
+        "class": each.label,
+        "score": round(each.score, 3),
+        "east_m": each.position_m[0],
+        "north_m": each.position_m[1],
+        "sigma_m": each.sigma_m,
+        "length_m": each.length_m,
+        "width_m": each.width_m,
+        "views": each.views,
+        "possible_views": each.possible_views,
+        "moving": each.moving,
     }
 
 

@@ -51,8 +51,14 @@ class FlightResult:
 
 
 def build_report(
-    setup: FlightSetup, settings: MapSettings, log: FlightLog, result: FlightResult, site: Site,
-    shown: Picture, notices: Sequence[Notice], seconds: float,
+    setup: FlightSetup,
+    settings: MapSettings,
+    log: FlightLog,
+    result: FlightResult,
+    site: Site,
+    shown: Picture,
+    notices: Sequence[Notice],
+    seconds: float,
 ) -> dict[str, Any]:
     """report.json of one flight; its keys are specified in docs/formats.md. Numbers that are not known are None.
 
@@ -70,7 +76,13 @@ def build_report(
         "inputs": list(source.inputs),
         "georeferenced": not site.is_local,
         "flown": utc_text(setup.flown_ns) if setup.flown_ns else None,
-        **_headline(result, figures, agreement, unlevelled(placed, graph, setup), is_video=source.kind == "video"),
+        **_headline(
+            result,
+            figures,
+            agreement,
+            unlevelled(placed, graph, setup),
+            is_video=source.kind == "video",
+        ),
         "frames": _frames(placed, source.frame_count),
         "reading": asdict(source.reading) if isinstance(source, VideoSource) else None,
         "camera": _camera(source.camera, result.camera, graph),
@@ -101,11 +113,18 @@ def build_report(
 
 
 def _headline(
-    result: FlightResult, figures: FlightFigures, agreement: Consistency, others: Sequence[str], *, is_video: bool
+    result: FlightResult,
+    figures: FlightFigures,
+    agreement: Consistency,
+    others: Sequence[str],
+    *,
+    is_video: bool,
 ) -> dict[str, Any]:
     if not result.makes_map:
         return {}
-    headline = map_headline(result.placed, figures, is_video=is_video, agreement=agreement, others=others)
+    headline = map_headline(
+        result.placed, figures, is_video=is_video, agreement=agreement, others=others
+    )
     return {"headline": asdict(headline)}
 
 
@@ -122,7 +141,11 @@ def _stated(setup: FlightSetup, result: FlightResult) -> Stated:
     source = "the photos' heights" if setup.source.kind == "photos" else "the telemetry's heights"
     if telemetry is None or graph is None:
         return Stated(0.0, float("nan"), source)
-    height_m = stated_height_m(result.placed, graph.altitude_offset_m) if telemetry.knows_ground else float("nan")
+    height_m = (
+        stated_height_m(result.placed, graph.altitude_offset_m)
+        if telemetry.knows_ground
+        else float("nan")
+    )
     return Stated(telemetry.usual_sigma_m, height_m, source)
 
 
@@ -164,17 +187,27 @@ def _figures(figures: FlightFigures) -> dict[str, Any]:
     return {
         "residual_px": {"median": figures.residual_median_px, "p95": figures.residual_p95_px},
         "gps_residual_m": {
-            "median": figures.gps_median_m, "rms": figures.gps_rms_m, "vertical_median": figures.gps_vertical_median_m,
+            "median": figures.gps_median_m,
+            "rms": figures.gps_rms_m,
+            "vertical_median": figures.gps_vertical_median_m,
         },
         "sigma_m": figures.sigma_m,
     }
 
 
 def _effort(log: FlightLog, seconds: float, selected: int) -> dict[str, Any]:
-    registering_s = sum(log.cpu_s.get(stage.value, 0.0) for stage in (Stage.REGISTER, Stage.UNDISTORT))
+    registering_s = sum(
+        log.cpu_s.get(stage.value, 0.0) for stage in (Stage.REGISTER, Stage.UNDISTORT)
+    )
     return {
-        "seconds": {"total": seconds, **{name: round(value, 3) for name, value in log.wall_s.items()}},
-        "cpu_s": {"total": log.total_cpu_s(), **{name: round(value, 3) for name, value in log.cpu_s.items()}},
+        "seconds": {
+            "total": seconds,
+            **{name: round(value, 3) for name, value in log.wall_s.items()},
+        },
+        "cpu_s": {
+            "total": log.total_cpu_s(),
+            **{name: round(value, 3) for name, value in log.cpu_s.items()},
+        },
         "registration_cpu_s_per_keyframe": registering_s / selected,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
     }
@@ -183,8 +216,11 @@ def _effort(log: FlightLog, seconds: float, selected: int) -> dict[str, Any]:
 def _offset(settings: MapSettings, log: FlightLog, offset: OffsetEstimate | None) -> dict[str, Any]:
     result: dict[str, Any] = {
         "applied_s": settings.offset_s if settings.offset_s is not None else log.offset_applied_s,
-        "origin": "given" if settings.offset_s is not None else ("estimated" if log.offset_applied_s else "none"),
-        "estimate_s": None, "sigma_s": None,
+        "origin": "given"
+        if settings.offset_s is not None
+        else ("estimated" if log.offset_applied_s else "none"),
+        "estimate_s": None,
+        "sigma_s": None,
     }
     if offset is not None and offset.is_known:
         result |= {"estimate_s": offset.offset_s, "sigma_s": offset.sigma_s}

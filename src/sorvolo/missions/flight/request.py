@@ -29,7 +29,11 @@ class AlreadyDone:
 
 
 def request_of(
-    setup: FlightSetup, settings: Any, area: Area | None, detector: ObjectDetector | None, *more: Any
+    setup: FlightSetup,
+    settings: Any,
+    area: Area | None,
+    detector: ObjectDetector | None,
+    *more: Any,
 ) -> str:
     """What is asked for: the same command over the same files by the same version of the program gives the same.
 
@@ -40,18 +44,37 @@ def request_of(
         return live_request(setup.source, settings, area, detector, *more)
     files = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in _files(setup)]
     return content_sha256(
-        sorvolo.__version__, software(), setup.source.fingerprint, files, setup.source.camera, setup.source.telemetry,
-        settings, area, None if detector is None else detector.info, more,
+        sorvolo.__version__,
+        software(),
+        setup.source.fingerprint,
+        files,
+        setup.source.camera,
+        setup.source.telemetry,
+        settings,
+        area,
+        None if detector is None else detector.info,
+        more,
     )
 
 
 def live_request(
-    source: LiveSource, settings: Any, area: Area | None, detector: ObjectDetector | None, *more: Any
+    source: LiveSource,
+    settings: Any,
+    area: Area | None,
+    detector: ObjectDetector | None,
+    *more: Any,
 ) -> str:
     """What is asked for of a live flight, which is known before the flight is: the same for the same address."""
     return content_sha256(
-        sorvolo.__version__, software(), source.inputs, source.kind, source.size_px, settings, area,
-        None if detector is None else detector.info, more,
+        sorvolo.__version__,
+        software(),
+        source.inputs,
+        source.kind,
+        source.size_px,
+        settings,
+        area,
+        None if detector is None else detector.info,
+        more,
     )
 
 
@@ -59,10 +82,16 @@ def already_done(archive: Archive, setup: FlightSetup, request: str) -> AlreadyD
     """The flight as the site has it, if that is what is asked for; a live flight is another each time."""
     if isinstance(setup.source, LiveSource):
         return None
-    return next((
-        AlreadyDone(each.id, each.finished_utc) for each in archive.flights()
-        if each.id == setup.source.name and each.status == "complete" and each.settings.get(REQUEST) == request
-    ), None)
+    return next(
+        (
+            AlreadyDone(each.id, each.finished_utc)
+            for each in archive.flights()
+            if each.id == setup.source.name
+            and each.status == "complete"
+            and each.settings.get(REQUEST) == request
+        ),
+        None,
+    )
 
 
 def _files(setup: FlightSetup) -> list[Path]:

@@ -18,14 +18,20 @@ def sample_frames(source: Source) -> list[Frame]:
     if isinstance(source, VideoSource):
         return source.sample_frames(_SAMPLES)
     if isinstance(source, LiveSource):
-        coming = islice(source.frames(every(_LIVE_STEP_S if source.kind == "video" else 0.0)), _SAMPLES)
+        coming = islice(
+            source.frames(every(_LIVE_STEP_S if source.kind == "video" else 0.0)), _SAMPLES
+        )
         return [frame for frame in coming if isinstance(frame, Frame)]
     return list(_spread_photos(source))
 
 
 def _spread_photos(source: Source) -> Iterator[Frame]:
     chosen = set(evenly(source.frame_count, _SAMPLES))
-    return (frame for frame in source.frames(lambda index, _: index in chosen) if isinstance(frame, Frame))
+    return (
+        frame
+        for frame in source.frames(lambda index, _: index in chosen)
+        if isinstance(frame, Frame)
+    )
 
 
 def _spread_frames(source: Source) -> Iterator[Frame]:

@@ -15,7 +15,9 @@ _MOST_OFFSET_S = 86_400 * 365  # a year: a clock that was never set
 def check_offset(offset_s: float | None) -> None:
     """Raise SettingsError for a clock offset, s, that no clock has; None leaves it to the clocks."""
     if offset_s is not None and not abs(offset_s) <= _MOST_OFFSET_S:
-        raise SettingsError(f"the clock offset (--offset) must be a year of seconds at most, got {offset_s}")
+        raise SettingsError(
+            f"the clock offset (--offset) must be a year of seconds at most, got {offset_s}"
+        )
 
 
 @dataclass(frozen=True)
@@ -26,14 +28,20 @@ class MapSettings:
     m_per_px: float | None = None  # of the map; None: the pictures' own, when the site is new
     overlap: float = 0.7  # s of eq. 3.17
     offset_s: float | None = None  # telemetry time = video time + this; None: estimated from motion
-    ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
+    ground_elevation_m: float | None = (
+        None  # of the ground, in the telemetry's own height reference
+    )
     crs: str | None = None  # of mosaic.tif; None: the site's UTM zone
-    compress: Literal["deflate", "jpeg"] | None = None  # of mosaic.tif; None: as before, deflate for a new map
+    compress: Literal["deflate", "jpeg"] | None = (
+        None  # of mosaic.tif; None: as before, deflate for a new map
+    )
     live_s: float = 3.0  # how often the growing map is made visible
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
     thesis: RoiStitchingSettings = field(default_factory=RoiStitchingSettings)  # of method thesis
     control_sigma_m: float = 0.05  # of the control points' places, horizontal
-    checks: tuple[str, ...] = ()  # control points held back to measure the map; "NAME*" for all that begin so
+    checks: tuple[
+        str, ...
+    ] = ()  # control points held back to measure the map; "NAME*" for all that begin so
     memory_mb: float | None = None  # for what can be read again; None: 512 MB
     classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
 
@@ -45,9 +53,13 @@ class MapSettings:
             )
         self._check_method()
         if self.compress not in (None, "deflate", "jpeg"):
-            raise SettingsError(f"the compression (--compress) must be deflate or jpeg, got {self.compress!r}")
+            raise SettingsError(
+                f"the compression (--compress) must be deflate or jpeg, got {self.compress!r}"
+            )
         if self.m_per_px is not None and not 1e-4 <= self.m_per_px <= 100:
-            raise SettingsError(f"the ground sampling distance (--gsd) must lie in 1e-4 to 100 m, got {self.m_per_px}")
+            raise SettingsError(
+                f"the ground sampling distance (--gsd) must lie in 1e-4 to 100 m, got {self.m_per_px}"
+            )
         if not 0 < self.overlap < 1:
             raise SettingsError(f"overlap must lie between 0 and 1, got {self.overlap}")
         if self.crs is not None:
@@ -58,7 +70,9 @@ class MapSettings:
         if self.method not in ("planar", "thesis"):
             raise SettingsError(f"method must be planar or thesis, got {self.method!r}")
         if self.method != "thesis" and self.thesis != RoiStitchingSettings():
-            raise SettingsError("--transform and --thesis belong to the thesis's method: give --method thesis as well")
+            raise SettingsError(
+                "--transform and --thesis belong to the thesis's method: give --method thesis as well"
+            )
 
 
 @dataclass(frozen=True)
@@ -70,22 +84,32 @@ class CompareSettings:
     votes: int = 3  # k: views of a piece of ground that must show a change ...
     voters: int = 5  # n: ... among the last this many that saw it
     offset_s: float | None = None  # telemetry time = video time + this
-    ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
-    side_px: int | None = None  # longest side at which frames are compared; None: photos larger than a video's frames
+    ground_elevation_m: float | None = (
+        None  # of the ground, in the telemetry's own height reference
+    )
+    side_px: int | None = (
+        None  # longest side at which frames are compared; None: photos larger than a video's frames
+    )
     updates_map: bool = True  # make a new version of the map where the ground changed or is new
     writes_masks: bool = False
     trusts_map: bool = False  # also a map that contradicts itself
     model: str = "default"  # that looks for objects: an installed one's name, a file, or "none"
-    thesis: ThesisOptions = field(default_factory=ThesisOptions)  # of method thesis: Table 4.2, threads
+    thesis: ThesisOptions = field(
+        default_factory=ThesisOptions
+    )  # of method thesis: Table 4.2, threads
     classes: tuple[str, ...] = ()  # that are looked for; none: those that the model usually reports
 
     def __post_init__(self) -> None:
         if self.method != "thesis" and self.thesis != ThesisOptions():
-            raise SettingsError("Table 4.2 belongs to the thesis's method: give --method thesis as well")
+            raise SettingsError(
+                "Table 4.2 belongs to the thesis's method: give --method thesis as well"
+            )
         if self.method not in ("robust", "thesis"):
             raise SettingsError(f"method must be robust or thesis, got {self.method!r}")
         if not 0.05 <= self.views_per_second <= 240:
-            raise SettingsError(f"views per second must lie in 0.05 to 240, got {self.views_per_second}")
+            raise SettingsError(
+                f"views per second must lie in 0.05 to 240, got {self.views_per_second}"
+            )
         if not 1 <= self.votes <= self.voters <= 8:
             raise SettingsError(
                 f"a change needs {self.votes} of the last {self.voters} views: the first must not exceed the second, "
@@ -99,5 +123,8 @@ class CompareSettings:
     def mapping(self) -> MapSettings:
         """How frames that show new ground are mapped."""
         return MapSettings(
-            offset_s=self.offset_s, ground_elevation_m=self.ground_elevation_m, model=self.model, classes=self.classes
+            offset_s=self.offset_s,
+            ground_elevation_m=self.ground_elevation_m,
+            model=self.model,
+            classes=self.classes,
         )

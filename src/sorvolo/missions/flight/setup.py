@@ -4,7 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from sorvolo.capture.flight_telemetry import FlightTelemetry, TelemetryWishes, distance_m, duration_s, local_prior
+from sorvolo.capture.flight_telemetry import (
+    FlightTelemetry,
+    TelemetryWishes,
+    distance_m,
+    duration_s,
+    local_prior,
+)
 from sorvolo.capture.source import LiveSource, Source
 from sorvolo.capture.sync import DATED_NS, Clock, Track, site_origin
 from sorvolo.errors import InputError, SettingsError
@@ -98,12 +104,21 @@ class FlightSetup:
         """Whether a frame was taken within the area of interest; frames of unknown place count as inside."""
         if area is None or self.telemetry is None:
             return lambda _: True
-        return lambda posed: not posed.prior.knows_place or area.holds(self.frame, posed.prior.position_m)
+        return lambda posed: (
+            not posed.prior.knows_place or area.holds(self.frame, posed.prior.position_m)
+        )
 
 
 def prepare(
-    source: Source, settings: MapSettings, site: Site | None, *, telemetry_named: bool, finds_itself: bool = False,
-    ground_m: PointsM | None = None, known_ground: KnownGround | None = None, founds_site: bool = False,
+    source: Source,
+    settings: MapSettings,
+    site: Site | None,
+    *,
+    telemetry_named: bool,
+    finds_itself: bool = False,
+    ground_m: PointsM | None = None,
+    known_ground: KnownGround | None = None,
+    founds_site: bool = False,
 ) -> FlightSetup:
     """Tie clocks, lay the flight into the site frame and foresee its keyframes.
 
@@ -131,18 +146,27 @@ def _with_known_ground(setup: FlightSetup, known_ground: KnownGround) -> FlightS
         _check_control(setup, known_ground)
     elif not isinstance(setup.source, LiveSource):
         known_ground.check_place(known_points(setup.track.east_north_m), setup.frame)
-    return replace(setup, known_ground=known_ground, notices=(*setup.notices, *known_ground.notices))
+    return replace(
+        setup, known_ground=known_ground, notices=(*setup.notices, *known_ground.notices)
+    )
 
 
 def _check_control(setup: FlightSetup, control: FlightControl) -> None:
     assert setup.track is not None
     track, frame = setup.track, setup.frame
-    control.check_place(lambda each: distance_m(track, frame.ground_from_lonlat(
-        [(point.longitude_deg, point.latitude_deg) for point in each.points]
-    )))
+    control.check_place(
+        lambda each: distance_m(
+            track,
+            frame.ground_from_lonlat(
+                [(point.longitude_deg, point.latitude_deg) for point in each.points]
+            ),
+        )
+    )
 
 
-def _by_known_ground(source: Source, settings: MapSettings, site: Site | None, known: KnownGround) -> FlightSetup:
+def _by_known_ground(
+    source: Source, settings: MapSettings, site: Site | None, known: KnownGround
+) -> FlightSetup:
     """A first flight that has no GPS and is placed by its control points or its base map."""
     if site is not None:
         raise InputError(
@@ -150,7 +174,9 @@ def _by_known_ground(source: Source, settings: MapSettings, site: Site | None, k
             "into a site folder of its own"
         )
     _refuse_offset(settings)
-    notice = Notice("no_telemetry", 1, f"no GPS: {known.words} alone gives the map its place, scale and north")
+    notice = Notice(
+        "no_telemetry", 1, f"no GPS: {known.words} alone gives the map its place, scale and north"
+    )
     return FlightSetup(
         source, known.frame, _untimed(source), None, (notice, *known.notices), known_ground=known
     )
@@ -164,14 +190,26 @@ def _untimed(source: Source) -> FramePlan:
 
 def _found_by_pictures(source: Source, site: Site) -> FlightSetup:
     """A flight whose frames are matched with the whole map."""
-    lack = "the site has no geo-reference" if site.is_local else "the flight has no telemetry with fixes"
-    notice = Notice("no_telemetry", 1, f"{lack}: the frames are matched with the whole map, by their pictures alone")
+    lack = (
+        "the site has no geo-reference"
+        if site.is_local
+        else "the flight has no telemetry with fixes"
+    )
+    notice = Notice(
+        "no_telemetry",
+        1,
+        f"{lack}: the frames are matched with the whole map, by their pictures alone",
+    )
     plan = untimed_plan(is_video=source.kind == "video", expected=max(2, source.frame_count))
     return FlightSetup(source, site.frame, plan, site, (notice,))
 
 
 def _without_gps(
-    source: Source, settings: MapSettings, site: Site | None, telemetry_named: bool, known_ground: KnownGround | None
+    source: Source,
+    settings: MapSettings,
+    site: Site | None,
+    telemetry_named: bool,
+    known_ground: KnownGround | None,
 ) -> FlightSetup:
     """A first flight in a frame of its own, or in that of known ground."""
     if known_ground is not None:
@@ -191,7 +229,11 @@ def _without_gps(
     lack += " in time" if isinstance(source, LiveSource) and telemetry_named else ""
     text = f"{lack}: the map is in a local frame of its own, without metres and north"
     return FlightSetup(
-        source, LocalFrame(Geodetic(0.0, 0.0)), _untimed(source), site, (Notice("no_telemetry", 1, text),)
+        source,
+        LocalFrame(Geodetic(0.0, 0.0)),
+        _untimed(source),
+        site,
+        (Notice("no_telemetry", 1, text),),
     )
 
 
@@ -216,11 +258,19 @@ def _laid(site: Site | None, source: Source, *, founds_site: bool) -> Geodetic |
         )
     first = site_origin(source.telemetry) if founds_site else None
     place = (site.origin.latitude_deg, site.origin.longitude_deg)
-    return first if first is not None and (first.latitude_deg, first.longitude_deg) == place else site.origin
+    return (
+        first
+        if first is not None and (first.latitude_deg, first.longitude_deg) == place
+        else site.origin
+    )
 
 
 def _with_gps(
-    source: Source, settings: MapSettings, site: Site | None, laid: Geodetic | None, telemetry_named: bool,
+    source: Source,
+    settings: MapSettings,
+    site: Site | None,
+    laid: Geodetic | None,
+    telemetry_named: bool,
     ground_m: PointsM | None,
 ) -> FlightSetup:
     """A flight in the frame around `laid`, the site's; without a site, in one around its first fix."""
@@ -239,7 +289,9 @@ def _with_gps(
             f"the telemetry ({samples.format}) has no fix during the {seconds:.0f} s of {source.name}; give the "
             "telemetry of this flight, or another --offset"
         )
-    return FlightSetup(source, frame, _planned(source, settings, telemetry), site, telemetry.notices, telemetry)
+    return FlightSetup(
+        source, frame, _planned(source, settings, telemetry), site, telemetry.notices, telemetry
+    )
 
 
 def _planned(source: Source, settings: MapSettings, telemetry: FlightTelemetry) -> FramePlan:
@@ -250,7 +302,13 @@ def _planned(source: Source, settings: MapSettings, telemetry: FlightTelemetry) 
     if isinstance(source, LiveSource):
         return live_plan(camera, height_m, speed_m_s, settings.overlap, by_pictures=by_pictures)
     return video_plan(
-        camera, height_m, speed_m_s, settings.overlap, duration_s(source), source.frame_rate_hz, by_pictures=by_pictures
+        camera,
+        height_m,
+        speed_m_s,
+        settings.overlap,
+        duration_s(source),
+        source.frame_rate_hz,
+        by_pictures=by_pictures,
     )
 
 
@@ -269,11 +327,15 @@ def new_site(setup: FlightSetup, name: str, m_per_px: float, ground_up_m: float)
     """
     if setup.is_placed_late:
         place = setup.frame.origin
-        return Site(name, place, f"EPSG:{utm_epsg(place.latitude_deg, place.longitude_deg)}", m_per_px)
+        return Site(
+            name, place, f"EPSG:{utm_epsg(place.latitude_deg, place.longitude_deg)}", m_per_px
+        )
     if setup.telemetry is None:
         return Site(name, Geodetic(0.0, 0.0), "", m_per_px, is_local=True)
     ground_m, reference = setup.telemetry.ground_height(ground_up_m)
-    origin = Geodetic(setup.frame.origin.latitude_deg, setup.frame.origin.longitude_deg, round(ground_m, 3))
+    origin = Geodetic(
+        setup.frame.origin.latitude_deg, setup.frame.origin.longitude_deg, round(ground_m, 3)
+    )
     crs = f"EPSG:{utm_epsg(origin.latitude_deg, origin.longitude_deg)}"
     return Site(name, origin, crs, m_per_px, height_reference=reference)
 
@@ -286,7 +348,8 @@ def repeated(archive: Archive, source: Source, done: str) -> tuple[Notice, ...]:
     versions = {each.flight_id: each.id for each in archive.versions() if each.complete}
     notices = [
         Notice(
-            "same_flight", 1,
+            "same_flight",
+            1,
             f"{source.name} begins with the same bytes as {each.id}, which is in this site already (version "
             f"{versions[each.id]}): it is the same flight under another name, and counts twice",
         )
@@ -294,11 +357,14 @@ def repeated(archive: Archive, source: Source, done: str) -> tuple[Notice, ...]:
         if each.id in versions and each.id != source.name and each.fingerprint == source.fingerprint
     ]
     if (made := versions.get(source.name)) is not None:
-        notices.append(Notice(
-            "repeated", 1,
-            f"{source.name} is in this site already (version {made}): it was {done} again, and the new version "
-            "replaces what it had made",
-        ))
+        notices.append(
+            Notice(
+                "repeated",
+                1,
+                f"{source.name} is in this site already (version {made}): it was {done} again, and the new version "
+                "replaces what it had made",
+            )
+        )
     return tuple(notices)
 
 

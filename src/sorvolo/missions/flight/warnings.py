@@ -18,14 +18,23 @@ _GUESSED = 0.1  # relative: a focal length that is hardly known
 
 
 def flight_warnings(
-    placed: Sequence[PlacedFrame], figures: FlightFigures, setup: FlightSetup, log: FlightLog,
-    agreement: Consistency = NOTHING_KNOWN, graph: GraphReport | None = None,
+    placed: Sequence[PlacedFrame],
+    figures: FlightFigures,
+    setup: FlightSetup,
+    log: FlightLog,
+    agreement: Consistency = NOTHING_KNOWN,
+    graph: GraphReport | None = None,
 ) -> list[str]:
     """The warnings of a flight's report."""
     return [
-        *agreement.faults, *agreement.steps, *_frame_warnings(placed), *doubts(placed, figures), *agreement.remarks,
+        *agreement.faults,
+        *agreement.steps,
+        *_frame_warnings(placed),
+        *doubts(placed, figures),
+        *agreement.remarks,
         *_relief_warnings(figures, graph),
-        *_angle_warnings(placed, graph, has_angles=_has_angles(setup)), *_camera_warnings(figures, setup),
+        *_angle_warnings(placed, graph, has_angles=_has_angles(setup)),
+        *_camera_warnings(figures, setup),
         *_clock_warnings(setup, log),
     ]
 
@@ -34,7 +43,9 @@ def _frame_warnings(placed: Sequence[PlacedFrame]) -> list[str]:
     lost = sum(each.status is Status.REJECTED for each in placed)
     if lost <= _MANY * len(placed):
         return []
-    return [f"{lost} of {counted(len(placed), 'frame')} have no place in the map; `reasons` lists why"]
+    return [
+        f"{lost} of {counted(len(placed), 'frame')} have no place in the map; `reasons` lists why"
+    ]
 
 
 def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
@@ -54,7 +65,9 @@ def doubts(placed: Sequence[PlacedFrame], figures: FlightFigures) -> list[str]:
     return warnings
 
 
-def unlevelled(placed: Sequence[PlacedFrame], graph: GraphReport | None, setup: FlightSetup) -> list[str]:
+def unlevelled(
+    placed: Sequence[PlacedFrame], graph: GraphReport | None, setup: FlightSetup
+) -> list[str]:
     """Why the map may be no view from above: pictures look aside, and neither angles nor positions level them."""
     if setup.track is not None or graph is None or graph.angles_contradicted <= _MANY * len(placed):
         return []
@@ -80,13 +93,16 @@ def _has_angles(setup: FlightSetup) -> bool:
     return setup.track is not None and setup.track.attitude != "none"
 
 
-def _angle_warnings(placed: Sequence[PlacedFrame], graph: GraphReport | None, *, has_angles: bool) -> list[str]:
+def _angle_warnings(
+    placed: Sequence[PlacedFrame], graph: GraphReport | None, *, has_angles: bool
+) -> list[str]:
     """Where the pictures contradict the stated angles of the camera or the aircraft, or the view straight down."""
     warnings = []
     if graph is not None and graph.angles_contradicted > _MANY * len(placed):
         frames = f"{counted(graph.angles_contradicted, 'frame')} of {len(placed)}"
         warnings.append(
-            f"the stated angles of {frames} contradict the pictures by 15 deg or more and were not used" if has_angles
+            f"the stated angles of {frames} contradict the pictures by 15 deg or more and were not used"
+            if has_angles
             else "no angles are stated, so the camera was taken to look straight down; by the pictures it looked 15 "
             f"deg or more to the side in {frames}"
         )
@@ -101,7 +117,9 @@ def _angle_warnings(placed: Sequence[PlacedFrame], graph: GraphReport | None, *,
 
 def _camera_warnings(figures: FlightFigures, setup: FlightSetup) -> list[str]:
     warnings = []
-    if not _has_angles(setup) and figures.tilt_deg > OBLIQUE_DEG:  # measured from the pictures' perspective
+    if (
+        not _has_angles(setup) and figures.tilt_deg > OBLIQUE_DEG
+    ):  # measured from the pictures' perspective
         lack = "there is no telemetry" if setup.track is None else "telemetry has no camera angles"
         warnings.append(
             f"the camera looks {figures.tilt_deg:.0f} deg away from straight down and {lack}: "

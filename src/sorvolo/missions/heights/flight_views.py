@@ -14,7 +14,9 @@ _MOST_BYTES = 256_000_000  # of frames.geojson; 10,000 frames have some ten; by 
 _AXES = ("east", "north", "up")
 
 
-def flight_views(archive: Archive, flight_id: str, keyframes: Sequence[StoredKeyframe]) -> list[View]:
+def flight_views(
+    archive: Archive, flight_id: str, keyframes: Sequence[StoredKeyframe]
+) -> list[View]:
     """The views of a flight. Raises InputError for one that heights cannot be made of."""
     if not keyframes:
         known = ", ".join(each.id for each in archive.flights()) or "none"
@@ -28,10 +30,14 @@ def flight_views(archive: Archive, flight_id: str, keyframes: Sequence[StoredKey
         )
     residuals = _residuals_m(archive, flight_id)
     return [
-        View(each.name, each.camera, each.site_from_camera, fix_from_residual(
-            each.site_from_camera, residuals.get(each.name, (None, None, None))
-        ))
-        for each in keyframes if each.site_from_camera is not None
+        View(
+            each.name,
+            each.camera,
+            each.site_from_camera,
+            fix_from_residual(each.site_from_camera, residuals.get(each.name, (None, None, None))),
+        )
+        for each in keyframes
+        if each.site_from_camera is not None
     ]
 
 
@@ -47,7 +53,8 @@ def _residuals_m(archive: Archive, flight_id: str) -> dict[str, tuple[float | No
         features = json.loads(read_below(path.parent, path.name, _MOST_BYTES))["features"]
         rows = [each["properties"] for each in features]
         return {
-            str(row["frame"]): tuple(row[f"gps_residual_{axis}_m"] for axis in _AXES) for row in rows
+            str(row["frame"]): tuple(row[f"gps_residual_{axis}_m"] for axis in _AXES)
+            for row in rows
         }
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path} is gone or damaged ({error!r}); map the flight again") from error

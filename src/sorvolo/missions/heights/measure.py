@@ -51,7 +51,12 @@ class ProfilePoint:
 
 
 def measure_volume(
-    site: Path, area: Path, *, flight: str = "", since: str = "", settings: VolumeSettings = VolumeSettings()  # noqa: B008
+    site: Path,
+    area: Path,
+    *,
+    flight: str = "",
+    since: str = "",
+    settings: VolumeSettings = VolumeSettings(),
 ) -> MeasuredVolume:
     """What was dug and heaped in an area from the flight `since` to `flight`; without `since`, above the area's rim.
 
@@ -65,19 +70,29 @@ def measure_volume(
         if not since:
             return MeasuredVolume(later_id, "", above_rim(later, polygons, settings), None)
         if since == later_id:
-            raise SettingsError(f"--since {since} is the flight that is measured; name an earlier one")
+            raise SettingsError(
+                f"--since {since} is the flight that is measured; name an earlier one"
+            )
         earlier = read_field(archive, since, HeightFile.SURFACE)
         tied = tie(earlier, later, ~earlier.inside(polygons), settings)
-        return MeasuredVolume(later_id, since, between(earlier, later, polygons, tied, settings), tied)
+        return MeasuredVolume(
+            later_id, since, between(earlier, later, polygons, tied, settings), tied
+        )
 
 
-def measure_profile(site: Path, places: Sequence[str], *, flight: str = "", step_m: float = 0.0) -> list[ProfilePoint]:
+def measure_profile(
+    site: Path, places: Sequence[str], *, flight: str = "", step_m: float = 0.0
+) -> list[ProfilePoint]:
     """Heights along a line through places ("latitude,longitude"), every `step_m` (0: every cell)."""
     if len(places) < 2:
-        raise SettingsError(f"a profile needs at least two places, got {len(places)}: --at LAT,LON --at LAT,LON")
+        raise SettingsError(
+            f"a profile needs at least two places, got {len(places)}: --at LAT,LON --at LAT,LON"
+        )
     with Archive.open(site, write=False) as archive:
         flight_id = flight or newest_flight(archive)
-        surface, ground = (read_field(archive, flight_id, name) for name in (HeightFile.SURFACE, HeightFile.GROUND))
+        surface, ground = (
+            read_field(archive, flight_id, name) for name in (HeightFile.SURFACE, HeightFile.GROUND)
+        )
         described = archive.site()
         corners = described.frame.ground_from_lonlat([lonlat_from_text(each) for each in places])
         points, ways = along(corners, step_m or surface.lattice.cell_m)
@@ -88,16 +103,22 @@ def measure_profile(site: Path, places: Sequence[str], *, flight: str = "", step
         return [ProfilePoint(*(float(each) for each in row)) for row in rows]
 
 
-def write_contours(site: Path, path: Path, interval_m: float, *, flight: str = "", of_surface: bool = False) -> int:
+def write_contours(
+    site: Path, path: Path, interval_m: float, *, flight: str = "", of_surface: bool = False
+) -> int:
     """Write contour lines of the bare ground (or of the surface) as GeoJSON; how many lines there are."""
     if not 0.01 <= interval_m <= 1000:
         raise SettingsError(f"--interval {interval_m}: give metres, 0.01 to 1000")
     with Archive.open(site, write=False) as archive:
         flight_id = flight or newest_flight(archive)
-        field = read_field(archive, flight_id, HeightFile.SURFACE if of_surface else HeightFile.GROUND)
+        field = read_field(
+            archive, flight_id, HeightFile.SURFACE if of_surface else HeightFile.GROUND
+        )
         described = archive.site()
         features = [_line(line, level, described) for level, line in contours(field, interval_m)]
-        atomic_write_bytes(path, geojson_bytes(feature_collection("contours", features, is_local=False)))
+        atomic_write_bytes(
+            path, geojson_bytes(feature_collection("contours", features, is_local=False))
+        )
         return len(features)
 
 
@@ -117,7 +138,9 @@ def _read(archive: Archive, flight_id: str, file: HeightFile, cell_m: float) -> 
     site_grid = height_grid(archive.site(), cell_m)
     read = read_height_cog(archive.height_path(flight_id, file), site_grid.grid)
     rows, columns = read.bands[0].shape
-    return HeightField(Lattice.at(site_grid, read.first, columns, rows), read.bands[0], read.bands[-1])
+    return HeightField(
+        Lattice.at(site_grid, read.first, columns, rows), read.bands[0], read.bands[-1]
+    )
 
 
 def own_surface(archive: Archive, flight_id: str) -> HeightField | None:
@@ -148,7 +171,12 @@ def flight_with_heights(archive: Archive, but: str) -> str | None:
         flight_id = version.flight_id
         keyframes = archive.keyframes(flight_id)
         known = _read_report(archive, flight_id)
-        if flight_id != but and keyframes and known is not None and known["run"] == run_of(keyframes):
+        if (
+            flight_id != but
+            and keyframes
+            and known is not None
+            and known["run"] == run_of(keyframes)
+        ):
             return flight_id
     return None
 
@@ -156,8 +184,10 @@ def flight_with_heights(archive: Archive, but: str) -> str | None:
 def damaged_heights(archive: Archive, but: str) -> list[str]:
     """The flights, `but` one, whose heights are there and cannot be used: their report is damaged."""
     return [
-        each.id for each in archive.flights()
-        if each.id != but and archive.height_path(each.id, HeightFile.REPORT).exists()
+        each.id
+        for each in archive.flights()
+        if each.id != but
+        and archive.height_path(each.id, HeightFile.REPORT).exists()
         and _read_report(archive, each.id) is None
     ]
 
@@ -175,7 +205,11 @@ def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
     report = _read_report(archive, flight_id)
     if report is None:
         is_there = archive.height_path(flight_id, HeightFile.REPORT).exists()
-        found = "has a damaged heights.json; make its heights again" if is_there else "has no heights; make them"
+        found = (
+            "has a damaged heights.json; make its heights again"
+            if is_there
+            else "has no heights; make them"
+        )
         raise InputError(
             f"flight {flight_id} of {archive.folder} {found}: sorvolo heights {archive.folder} --flight {flight_id}"
         )
@@ -184,7 +218,9 @@ def _report(archive: Archive, flight_id: str) -> Mapping[str, Any]:
 
 def _read_report(archive: Archive, flight_id: str) -> Mapping[str, Any] | None:
     try:
-        report = json.loads(read_below(archive.flight_folder(flight_id), HeightFile.REPORT, _MOST_BYTES))
+        report = json.loads(
+            read_below(archive.flight_folder(flight_id), HeightFile.REPORT, _MOST_BYTES)
+        )
         known = {"run": report["run"], "cell_m": float(report["cell_m"])}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return None
@@ -195,6 +231,7 @@ def _line(line: Any, level_m: float, site: Site) -> dict[str, Any]:
     longitudes, latitudes = longitude_latitude(line, site)
     places = [[round(float(x), 8), round(float(y), 8)] for x, y in zip(longitudes, latitudes)]
     return {
-        "type": "Feature", "geometry": {"type": "LineString", "coordinates": places},
+        "type": "Feature",
+        "geometry": {"type": "LineString", "coordinates": places},
         "properties": {"height_m": round(level_m, 3)},
     }

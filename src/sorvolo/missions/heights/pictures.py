@@ -20,18 +20,25 @@ class PictureSettings:
     """How many decoded pictures are kept."""
 
     large_bytes: int = 288 * 1024 * 1024  # as stored, for the orthophoto: ten of 9 megapixels
-    small_bytes: int = 128 * 1024 * 1024  # gray, for the sweep: about a hundred of 4000 pixels at the usual cells
+    small_bytes: int = (
+        128 * 1024 * 1024
+    )  # gray, for the sweep: about a hundred of 4000 pixels at the usual cells
 
 
 class FlightPictures:
     """Loads and corrects pictures, and keeps those last asked for by `colour`; numbers count the keyframes given."""
 
     def __init__(
-        self, archive: Archive, keyframes: Sequence[StoredKeyframe], radial: tuple[float, float] = (0.0, 0.0),
+        self,
+        archive: Archive,
+        keyframes: Sequence[StoredKeyframe],
+        radial: tuple[float, float] = (0.0, 0.0),
         settings: PictureSettings = PictureSettings(),
     ) -> None:
         self._archive, self._keyframes = archive, keyframes
-        self._lens = Undistorter(refined_camera(keyframes[0].camera, 1.0, *radial)) if any(radial) else None
+        self._lens = (
+            Undistorter(refined_camera(keyframes[0].camera, 1.0, *radial)) if any(radial) else None
+        )
         self._large = ImageCache(self._load, settings.large_bytes)
 
     def colour(self, number: int) -> ImageRGB:
@@ -46,7 +53,9 @@ class FlightPictures:
         """A picture in gray, so many pixels wide each; decoded once, and not kept."""
         image, camera = self._load(number), self._keyframes[number].camera
         return {
-            width: gray_from_rgb(at_size(image, width, round(width * camera.height_px / camera.width_px)))
+            width: gray_from_rgb(
+                at_size(image, width, round(width * camera.height_px / camera.width_px))
+            )
             for width in widths
         }
 
@@ -64,7 +73,10 @@ class SmallPictures:
     """
 
     def __init__(
-        self, pictures: FlightPictures, views: Sequence[View], sizes_m: Sequence[float],
+        self,
+        pictures: FlightPictures,
+        views: Sequence[View],
+        sizes_m: Sequence[float],
         settings: PictureSettings = PictureSettings(),
     ) -> None:
         self._pictures, self._views, self._sizes_m = pictures, views, sizes_m

@@ -10,7 +10,12 @@ from typing import Any
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
-from sorvolo.heights.figures import camera_figures, camera_warnings, surface_figures, surface_warnings
+from sorvolo.heights.figures import (
+    camera_figures,
+    camera_warnings,
+    surface_figures,
+    surface_warnings,
+)
 from sorvolo.heights.lattice import CellSettings, Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
 from sorvolo.heights.own_points import OwnPointSettings, judged_by_points
@@ -62,7 +67,10 @@ class HeightsUpdate:
 
 
 def make_heights(
-    site: Path, settings: HeightSettings = HeightSettings(), *, flight: str | None = None,
+    site: Path,
+    settings: HeightSettings = HeightSettings(),
+    *,
+    flight: str | None = None,
     catalogues: Catalogues | None = None,
 ) -> Generator[HeightsUpdate]:
     """Make the heights of one mapped flight (None: the newest) as files in its folder, yielding progress.
@@ -70,10 +78,14 @@ def make_heights(
     `catalogues` has the site's; None: that of the environment. Raises InputError for a flight that has no heights to
     give (no GPS, too few photos that overlap), StoreError for a folder that is no site.
     """
-    Archive.open(site, write=False, catalogues=catalogues).close()  # to write would make a folder that is not there
+    Archive.open(
+        site, write=False, catalogues=catalogues
+    ).close()  # to write would make a folder that is not there
     with Archive.open(site, write=True, catalogues=catalogues) as archive:
         flight_id = flight or newest_flight(archive)
-        keyframes = [each for each in archive.keyframes(flight_id) if each.site_from_camera is not None]
+        keyframes = [
+            each for each in archive.keyframes(flight_id) if each.site_from_camera is not None
+        ]
         started_s = time.monotonic()
         views = flight_views(archive, flight_id, keyframes)
         _lattice(archive.site(), views, settings)  # too many cells end here, before minutes of work
@@ -94,12 +106,23 @@ def make_heights(
         if settings.has_orthophoto:
             yield from _paint(archive, surface, solved, pictures, settings, flight_id)
         report = {
-            "flight": flight_id, "run": run_of(keyframes), "cell_m": surface.lattice.cell_m,
+            "flight": flight_id,
+            "run": run_of(keyframes),
+            "cell_m": surface.lattice.cell_m,
             "height_reference": archive.site().height_reference,
-            "cameras": camera_figures(solved), "surface": surface_figures(surface, shows_ground, judgement),
-            "warnings": [*_map_warnings(mapped), *camera_warnings(solved), *surface_warnings(surface)],
+            "cameras": camera_figures(solved),
+            "surface": surface_figures(surface, shows_ground, judgement),
+            "warnings": [
+                *_map_warnings(mapped),
+                *camera_warnings(solved),
+                *surface_warnings(surface),
+            ],
             "contradicts_itself": contradicts_itself(mapped),
-            "seconds": {"cameras": cameras_s, "heights": heights_s, "total": time.monotonic() - started_s},
+            "seconds": {
+                "cameras": cameras_s,
+                "heights": heights_s,
+                "total": time.monotonic() - started_s,
+            },
             "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
         atomic_write_bytes(archive.height_path(flight_id, HeightFile.REPORT), json_bytes(report))
@@ -110,7 +133,9 @@ def _map_warnings(mapped: Mapping[str, Any]) -> list[str]:
     """What of a flight's report, of its map, spoils its heights too."""
     warnings = []
     if contradicts_itself(mapped):
-        warnings.append(f"the flight has {mapped['headline'].get('text')}; do not build on its heights")
+        warnings.append(
+            f"the flight has {mapped['headline'].get('text')}; do not build on its heights"
+        )
     if any(each.get("code") == "zoom" for each in mapped.get("notices", ())):
         warnings.append(
             "the photos have different focal lengths and were taken as of one lens: heights are wrong by more than "
@@ -123,7 +148,9 @@ def newest_flight(archive: Archive) -> str:
     """The flight that made the newest map. Raises InputError while there is none."""
     complete = [each for each in archive.versions() if each.complete]
     if not complete:
-        raise InputError(f"{archive.folder} has no flight yet; map one: sorvolo map INPUT --site {archive.folder}")
+        raise InputError(
+            f"{archive.folder} has no flight yet; map one: sorvolo map INPUT --site {archive.folder}"
+        )
     return complete[-1].flight_id
 
 
@@ -133,7 +160,11 @@ def height_grid(site: Site, cell_m: float) -> SiteGrid:
 
 
 def _sweep(
-    archive: Archive, solved: Cameras3D, pictures: FlightPictures, settings: HeightSettings, flight_id: str
+    archive: Archive,
+    solved: Cameras3D,
+    pictures: FlightPictures,
+    settings: HeightSettings,
+    flight_id: str,
 ) -> Generator[HeightsUpdate, None, Surface]:
     lattice = _lattice(archive.site(), solved.views, settings)
 
@@ -159,26 +190,39 @@ def _write_models(archive: Archive, flight_id: str, surface: Surface, ground: An
     grid = height_grid(site, surface.lattice.cell_m).grid
     zero_m = site.origin.height_m
     write_height_cog(
-        surface.above(zero_m), (f"height, {site.height_reference}", "one sigma"), surface.lattice.first, grid,
+        surface.above(zero_m),
+        (f"height, {site.height_reference}", "one sigma"),
+        surface.lattice.first,
+        grid,
         archive.height_path(flight_id, HeightFile.SURFACE),
     )
     write_height_cog(
-        [ground + zero_m], (f"bare ground, {site.height_reference}",), surface.lattice.first, grid,
+        [ground + zero_m],
+        (f"bare ground, {site.height_reference}",),
+        surface.lattice.first,
+        grid,
         archive.height_path(flight_id, HeightFile.GROUND),
     )
-    atomic_write_bytes(archive.height_path(flight_id, HeightFile.PICTURE), png_from_rgba(relief_picture(surface)))
+    atomic_write_bytes(
+        archive.height_path(flight_id, HeightFile.PICTURE), png_from_rgba(relief_picture(surface))
+    )
 
 
 def _paint(
-    archive: Archive, surface: Surface, solved: Cameras3D, pictures: FlightPictures, settings: HeightSettings,
+    archive: Archive,
+    surface: Surface,
+    solved: Cameras3D,
+    pictures: FlightPictures,
+    settings: HeightSettings,
     flight_id: str,
 ) -> Generator[HeightsUpdate]:
     folder, site_grid = archive.flight_folder(flight_id), archive.site_grid()
     with scratch_folder(folder) as scratch:
         tiles = TileFolder(scratch)
-        painting = paint_orthophoto(surface, site_grid, solved.views, pictures.colour, settings.orthophoto)
+        painting = paint_orthophoto(
+            surface, site_grid, solved.views, pictures.colour, settings.orthophoto
+        )
         for index, rgba, share in painting:
             tiles.save(index, rgba)
             yield HeightsUpdate(flight_id, "orthophoto", share)
         write_cog(tiles, site_grid, archive.height_path(flight_id, HeightFile.ORTHOPHOTO))
-

@@ -83,7 +83,10 @@ class Division:
 
     def earlier(self) -> Iterator[Step | FrameDetections]:
         """What all blocks noted, steps in the flight's order."""
-        return merge(*(self.journal(each).earlier() for each in range(self.count)), key=lambda each: each.index)
+        return merge(
+            *(self.journal(each).earlier() for each in range(self.count)),
+            key=lambda each: each.index,
+        )
 
     def remove(self) -> None:
         """Remove all files of the blocks."""
@@ -103,7 +106,11 @@ class Division:
 
 
 def map_block(
-    source: Path, camera: Path | str | None, settings: MapSettings, division: Division, number: int,
+    source: Path,
+    camera: Path | str | None,
+    settings: MapSettings,
+    division: Division,
+    number: int,
     alive: Callable[[], None] = lambda: None,
 ) -> int:
     """Register the pictures of one block, noted in the division's folder; how many they are.
@@ -119,7 +126,11 @@ def map_block(
         block = pictures.block(division.count, number)
         division.picture(0).parent.mkdir(parents=True, exist_ok=True)
         detector = open_detector(settings.model)
-        finder = None if detector is None else ObjectFinder(detector, setup.source.camera.camera, settings.classes)
+        finder = (
+            None
+            if detector is None
+            else ObjectFinder(detector, setup.source.camera.camera, settings.classes)
+        )
         spill = SpillFile(division.folder)
         run = _BlockRun(setup, settings, division, number, block, finder, spill)
         try:
@@ -134,7 +145,10 @@ def map_block(
 
 
 def choose_of_video(
-    source: Path, camera: Path | str | None, settings: MapSettings, division: Division,
+    source: Path,
+    camera: Path | str | None,
+    settings: MapSettings,
+    division: Division,
     alive: Callable[[], None] = lambda: None,
 ) -> None:
     """Choose the frames of a video that its map is made of, noted in the division's folder: what its blocks begin with.
@@ -150,7 +164,11 @@ def choose_of_video(
 def prepare_divided(source: Source, settings: MapSettings) -> FlightSetup:
     """A flight that is to be divided, laid as the first of its site. Raises SettingsError where it cannot be."""
     if not source.telemetry.has_fixes:
-        pictures = f"the photos of {source.name} have" if source.kind == "photos" else f"the video {source.name} has"
+        pictures = (
+            f"the photos of {source.name} have"
+            if source.kind == "photos"
+            else f"the video {source.name} has"
+        )
         raise SettingsError(
             f"{pictures} no GPS, by which flights are divided into blocks; leave --blocks out"
         )
@@ -166,10 +184,22 @@ class _BlockRun:
     """One block on its way through its pictures."""
 
     def __init__(
-        self, setup: FlightSetup, settings: MapSettings, division: Division, number: int, block: Block,
-        finder: ObjectFinder | None, spill: SpillFile,
+        self,
+        setup: FlightSetup,
+        settings: MapSettings,
+        division: Division,
+        number: int,
+        block: Block,
+        finder: ObjectFinder | None,
+        spill: SpillFile,
     ) -> None:
-        self._setup, self._division, self._number, self._block, self._finder = setup, division, number, block, finder
+        self._setup, self._division, self._number, self._block, self._finder = (
+            setup,
+            division,
+            number,
+            block,
+            finder,
+        )
         self._journal = division.journal(number)
         self._journal.file.remove()
         self._journal = division.journal(number)
@@ -178,7 +208,8 @@ class _BlockRun:
         offset_sigma_m = None if setup.track is None else setup.track.altitude_offset_sigma_m
         self._mapper = PlanarMapper(
             PoseGraphSettings.of_flight(model.focal_sigma, offset_sigma_m, joins_map=False),
-            shelf=spill, keyframe_bytes=memory_budget_bytes(settings.memory_mb) // 4,
+            shelf=spill,
+            keyframe_bytes=memory_budget_bytes(settings.memory_mb) // 4,
         )
 
     def take(self, each: Selected | LostFrame) -> None:
@@ -194,7 +225,9 @@ class _BlockRun:
             return
         memory = each.memory if isinstance(each, Selected) else None
         is_searched = self._finder is not None and isinstance(each, Selected) and not each.reason
-        self._journal.keep(Step(frame.index, frame.name, frame.time_ns, reason, memory, taken, is_searched))
+        self._journal.keep(
+            Step(frame.index, frame.name, frame.time_ns, reason, memory, taken, is_searched)
+        )
         self._keep_detections(waits=False)
 
     def end(self) -> None:
@@ -243,10 +276,22 @@ class _Pictures:
         """Those of a folder of photos, or those that were chosen of a video."""
         source = setup.source
         if isinstance(source, PhotoSource):
-            return cls(setup, range(source.frame_count), [each.time_ns for each in source.album.photos], None)
+            return cls(
+                setup,
+                range(source.frame_count),
+                [each.time_ns for each in source.album.photos],
+                None,
+            )
         if (chosen := division.chosen()) is None:
-            raise StoreError(f"the frames of {source.name} are not chosen yet; give the same command again")
-        return cls(setup, [each.index for each in chosen.frames], [each.time_ns for each in chosen.frames], chosen)
+            raise StoreError(
+                f"the frames of {source.name} are not chosen yet; give the same command again"
+            )
+        return cls(
+            setup,
+            [each.index for each in chosen.frames],
+            [each.time_ns for each in chosen.frames],
+            chosen,
+        )
 
     def block(self, count: int, number: int) -> Block:
         """One of `count` blocks of them; empty where so few pictures make fewer blocks."""
@@ -254,7 +299,8 @@ class _Pictures:
         if number >= len(blocks):
             return Block(frozenset(), frozenset())
         home, margin = (
-            frozenset(self.numbers[each] for each in part) for part in (blocks[number].home, blocks[number].margin)
+            frozenset(self.numbers[each] for each in part)
+            for part in (blocks[number].home, blocks[number].margin)
         )
         return Block(home, margin)
 
@@ -263,28 +309,40 @@ class _Pictures:
         wanted = block.home | block.margin
         if self.chosen is None:
             return _photos(self.setup, settings, wanted)
-        return frames_again(self.setup, [each for each in self.chosen.frames if each.index in wanted])
+        return frames_again(
+            self.setup, [each for each in self.chosen.frames if each.index in wanted]
+        )
 
     def _outlines(self) -> list[PointsM]:
         """Where telemetry has each picture's outline on the ground, (4, 2) site metres; NaN beyond the horizon."""
         setup = self.setup
         assert setup.track is not None
         priors = [
-            setup.track.prior(setup.seconds(each), smooth_s=setup.plan.smooth_s) for each in self.times_ns
+            setup.track.prior(setup.seconds(each), smooth_s=setup.plan.smooth_s)
+            for each in self.times_ns
         ]
-        return [footprint(setup.source.camera.camera, Pose(each.rotation, each.position_m)) for each in priors]
+        return [
+            footprint(setup.source.camera.camera, Pose(each.rotation, each.position_m))
+            for each in priors
+        ]
 
 
-def _photos(setup: FlightSetup, settings: MapSettings, wanted: Set[int]) -> Iterator[Selected | LostFrame]:
+def _photos(
+    setup: FlightSetup, settings: MapSettings, wanted: Set[int]
+) -> Iterator[Selected | LostFrame]:
     """The photos of these numbers, in the flight's order."""
 
     def posed() -> Iterator[PosedFrame | LostFrame]:
-        with closing(read_ahead(setup.source.frames(lambda index, _: index in wanted), 1)) as frames:
+        with closing(
+            read_ahead(setup.source.frames(lambda index, _: index in wanted), 1)
+        ) as frames:
             for each in frames:
                 if isinstance(each, LostFrame):
                     yield each
                 else:
                     yield PosedFrame(each, setup.prior(each, first=each.index == 0))
 
-    selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
+    selection = SelectionSettings(
+        overlap=settings.overlap, least_overlap=min(0.5, settings.overlap)
+    )
     return select_keyframes(posed(), selection, keep_all=True, inside=setup.inside(None))

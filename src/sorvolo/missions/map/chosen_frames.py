@@ -49,24 +49,31 @@ class ChosenFrames:
         if not isinstance(kept, dict) or kept.get("key") != key:
             return None
         return cls(
-            tuple(ChosenFrame(*each) for each in kept["frames"]), Reading(**kept["reading"]),
+            tuple(ChosenFrame(*each) for each in kept["frames"]),
+            Reading(**kept["reading"]),
             tuple(Notice(**each) for each in kept["notices"]),
         )
 
     def write(self, path: Path, key: str) -> None:
         """Replace the file. Raises StoreError when the disk is full."""
         kept = {
-            "key": key, "frames": [astuple(each) for each in self.frames], "reading": asdict(self.reading),
+            "key": key,
+            "frames": [astuple(each) for each in self.frames],
+            "reading": asdict(self.reading),
             "notices": [asdict(each) for each in self.notices],
         }
         atomic_write_bytes(path, json.dumps(kept).encode())
 
 
-def choose_frames(setup: FlightSetup, settings: MapSettings, alive: Callable[[], None]) -> ChosenFrames:
+def choose_frames(
+    setup: FlightSetup, settings: MapSettings, alive: Callable[[], None]
+) -> ChosenFrames:
     """Read a video as its map is made, and note the frames that are selected."""
     source = setup.source
     assert isinstance(source, VideoSource)
-    selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
+    selection = SelectionSettings(
+        overlap=settings.overlap, least_overlap=min(0.5, settings.overlap)
+    )
     reader = FrameReader(setup, Earlier(), selection)
 
     def posed() -> Iterator[PosedFrame | LostFrame]:
@@ -75,7 +82,9 @@ def choose_frames(setup: FlightSetup, settings: MapSettings, alive: Callable[[],
             yield each
 
     chosen = []
-    for each in select_keyframes(posed(), selection, keep_all=False, inside=setup.inside(None), small=reader.small):
+    for each in select_keyframes(
+        posed(), selection, keep_all=False, inside=setup.inside(None), small=reader.small
+    ):
         frame = each if isinstance(each, LostFrame) else each.posed.frame
         chosen.append(ChosenFrame(frame.index, frame.name, frame.time_ns, each.reason))
     return ChosenFrames(tuple(chosen), source.reading, source.notices())
@@ -88,7 +97,11 @@ def frames_again(
 
     Raises InputError where the video does not give the same frames again.
     """
-    lost = (LostFrame(each.index, each.name, each.time_ns, each.reason) for each in chosen if each.reason)
+    lost = (
+        LostFrame(each.index, each.name, each.time_ns, each.reason)
+        for each in chosen
+        if each.reason
+    )
     usable = [each for each in chosen if not each.reason]
     return merge(lost, _decoded(setup, usable), key=_index)
 
@@ -112,9 +125,14 @@ def _decoded(setup: FlightSetup, chosen: Sequence[ChosenFrame]) -> Iterator[Sele
     waiting = iter(chosen)
     with closing(read_ahead(source.frames(is_wanted, sparse), 1)) as frames:
         for expected, each in zip(waiting, frames, strict=False):
-            if not isinstance(each, Frame) or (each.index, each.time_ns) != (expected.index, expected.time_ns):
+            if not isinstance(each, Frame) or (each.index, each.time_ns) != (
+                expected.index,
+                expected.time_ns,
+            ):
                 break
-            yield Selected(PosedFrame(each, setup.prior(each, first=each.index == 0)), "", SelectionMemory())
+            yield Selected(
+                PosedFrame(each, setup.prior(each, first=each.index == 0)), "", SelectionMemory()
+            )
             if expected is chosen[-1]:
                 return
     raise InputError(

@@ -28,8 +28,14 @@ class FlightCoverage:
     """
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, area: Area | None, refly: Sequence[Path], live_s: float,
-        settings: ReflySettings = ReflySettings(), pace: PaintSettings = PaintSettings(),  # noqa: B008 (frozen)
+        self,
+        setup: FlightSetup,
+        archive: Archive,
+        area: Area | None,
+        refly: Sequence[Path],
+        live_s: float,
+        settings: ReflySettings = ReflySettings(),
+        pace: PaintSettings = PaintSettings(),
     ) -> None:
         self._settings, self._rest = settings, pace.rest
         self._setup, self._archive, self._refly, self._live_s = setup, archive, tuple(refly), live_s
@@ -47,21 +53,30 @@ class FlightCoverage:
         ground = seen_ground(placed, self._area_m)
         atomic_write_bytes(self._archive.live_coverage_path, self._geojson(ground), durable=False)
         self._plan(ground, placed)
-        self._again_s = time.monotonic() + max(self._live_s, self._rest * (time.monotonic() - started_s))
+        self._again_s = time.monotonic() + max(
+            self._live_s, self._rest * (time.monotonic() - started_s)
+        )
 
-    def conclude(self, placed: Sequence[PictureOnGround]) -> tuple[Mapping[str, bytes], dict[str, Any]]:
+    def conclude(
+        self, placed: Sequence[PictureOnGround]
+    ) -> tuple[Mapping[str, bytes], dict[str, Any]]:
         """What all of the flight saw: a file for the flight's folder by its name, and its figures for the report."""
         ground = seen_ground(placed, self._area_m)
         files = self._plan(ground, placed)
         name = features_name(COVERAGE, is_local=self._archive.site().is_local)
-        return {name: self._geojson(ground)}, {**coverage_figures(ground), "refly": [str(each) for each in files]}
+        return {name: self._geojson(ground)}, {
+            **coverage_figures(ground),
+            "refly": [str(each) for each in files],
+        }
 
     def _geojson(self, ground: Sequence[SeenGround]) -> bytes:
         return geojson_bytes(seen_geojson(ground, self._archive.site()))
 
-    def _plan(self, ground: Sequence[SeenGround], placed: Sequence[PictureOnGround]) -> tuple[Path, ...]:
+    def _plan(
+        self, ground: Sequence[SeenGround], placed: Sequence[PictureOnGround]
+    ) -> tuple[Path, ...]:
         """Write the waypoints over the holes; the files, none where there are no holes or no place on Earth."""
-        holes = [each for each in ground if not each.views][:self._settings.most_holes]
+        holes = [each for each in ground if not each.views][: self._settings.most_holes]
         site = self._archive.site()
         if not self._refly or site.is_local:
             return ()

@@ -52,11 +52,21 @@ if TYPE_CHECKING:  # `map` alone has no use for what plants and searches
 
 
 def map_flights(
-    inputs: Sequence[Path | str], site: Path, settings: MapSettings = MapSettings(), *,  # noqa: B008 (frozen)
-    telemetry: Path | str | None = None, camera: Path | str | None = None, area: Path | None = None,
-    detector: ObjectDetector | None = None, live: LiveSettings = LiveSettings(keeps_all=True),  # noqa: B008 (frozen)
-    until: threading.Event | None = None, control: Path | None = None,
-    base: Path | None = None, again: bool = False, refly: Sequence[Path] = (), catalogues: Catalogues | None = None,
+    inputs: Sequence[Path | str],
+    site: Path,
+    settings: MapSettings = MapSettings(),
+    *,
+    telemetry: Path | str | None = None,
+    camera: Path | str | None = None,
+    area: Path | None = None,
+    detector: ObjectDetector | None = None,
+    live: LiveSettings = LiveSettings(keeps_all=True),
+    until: threading.Event | None = None,
+    control: Path | None = None,
+    base: Path | None = None,
+    again: bool = False,
+    refly: Sequence[Path] = (),
+    catalogues: Catalogues | None = None,
     search: "SearchWhileFlying | None" = None,
 ) -> Generator[MosaicUpdate, None, tuple[AlreadyDone, ...]]:
     """Map one or more flights into the site folder, yielding an update for each selected frame.
@@ -80,7 +90,9 @@ def map_flights(
     wanted = None if area is None else read_area(area)
     is_live = any(is_live_address(str(each)) for each in inputs)
     looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
-    opened = opened_sources(inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until)
+    opened = opened_sources(
+        inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until
+    )
     with opened as sources, Archive.open(site, write=True, catalogues=catalogues) as archive:
         ground = _known_ground(control, base, sources, settings)
         known = []
@@ -88,8 +100,13 @@ def map_flights(
         for source in sources:
             samples = go_on_live(source, archive, asked, live.same_flight_s, anew=again)
             setup = prepare(
-                source, settings, archive.site() if archive.has_site else None, telemetry_named=telemetry is not None,
-                ground_m=known_ground_m(archive), known_ground=ground, founds_site=founds_site(archive, source.name),
+                source,
+                settings,
+                archive.site() if archive.has_site else None,
+                telemetry_named=telemetry is not None,
+                ground_m=known_ground_m(archive),
+                known_ground=ground,
+                founds_site=founds_site(archive, source.name),
             )
             request = request_of(setup, *asked)
             mapped = already_done(archive, setup, request)
@@ -98,8 +115,16 @@ def map_flights(
                 continue
             coverage = FlightCoverage(setup, archive, wanted, refly, settings.live_s)
             yield from _map_one(
-                setup, archive, settings, wanted, looks, request, coverage, anew=again and mapped is None,
-                samples=samples, search=search if isinstance(source, LiveSource) else None,
+                setup,
+                archive,
+                settings,
+                wanted,
+                looks,
+                request,
+                coverage,
+                anew=again and mapped is None,
+                samples=samples,
+                search=search if isinstance(source, LiveSource) else None,
             )
         return tuple(known)
 
@@ -108,14 +133,20 @@ def _known_ground(
     control: Path | None, base: Path | None, sources: Sequence[Source], settings: MapSettings
 ) -> KnownGround | None:
     if control is not None and base is not None:
-        raise SettingsError("a map is tied to control points (--gcp) or to a base map (--base), not to both")
+        raise SettingsError(
+            "a map is tied to control points (--gcp) or to a base map (--base), not to both"
+        )
     if settings.checks and control is None:
-        raise SettingsError("check points (--check) are of a control point file: give it with --gcp")
+        raise SettingsError(
+            "check points (--check) are of a control point file: give it with --gcp"
+        )
     if control is None and base is None:
         return None
     _refuse_ties(len(sources), settings)
     if control is not None:
-        return open_control(control, sources[0], ControlSettings(settings.control_sigma_m, checks=settings.checks))
+        return open_control(
+            control, sources[0], ControlSettings(settings.control_sigma_m, checks=settings.checks)
+        )
     assert base is not None
     return open_base(base, sources[0])
 
@@ -125,12 +156,23 @@ def _refuse_ties(flights: int, settings: MapSettings) -> None:
     if settings.method != "planar":
         raise SettingsError("--gcp and --base tie maps of method planar only; leave --method out")
     if flights != 1:
-        raise SettingsError(f"--gcp and --base tie one flight, not {flights}; map the flights one by one")
+        raise SettingsError(
+            f"--gcp and --base tie one flight, not {flights}; map the flights one by one"
+        )
 
 
 def _map_one(
-    setup: FlightSetup, archive: Archive, settings: MapSettings, area: Area | None, detector: ObjectDetector | None,
-    request: str, coverage: FlightCoverage, *, anew: bool, samples: int, search: "SearchWhileFlying | None",
+    setup: FlightSetup,
+    archive: Archive,
+    settings: MapSettings,
+    area: Area | None,
+    detector: ObjectDetector | None,
+    request: str,
+    coverage: FlightCoverage,
+    *,
+    anew: bool,
+    samples: int,
+    search: "SearchWhileFlying | None",
 ) -> Generator[MosaicUpdate]:
     started_s, source = time.monotonic(), setup.source
     refuse_without_texture(source)
@@ -139,19 +181,33 @@ def _map_one(
     room = LiveRoom(setup, archive.folder, m_per_px)
     setup = replace(setup, notices=(*setup.notices, *repeated(archive, source, "mapped")))
     live_folder = archive.folder if isinstance(source, LiveSource) else None
-    finder = None if detector is None else ObjectFinder(
-        detector, source.camera.camera, settings.classes, live_folder=live_folder
+    finder = (
+        None
+        if detector is None
+        else ObjectFinder(detector, source.camera.camera, settings.classes, live_folder=live_folder)
     )
     begun = _begun(setup, archive, settings, finder, request, coverage, anew=anew, samples=samples)
     with begun as run, nullcontext() if search is None else search:
 
-        def update(frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int) -> MosaicUpdate:
+        def update(
+            frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int
+        ) -> MosaicUpdate:
             view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
             if search is not None and ended[0] is not Status.REJECTED:
                 search.take(run, archive, frame.index)
             return MosaicUpdate(
-                source.name, frame.name, ended[0], ended[1], read, source.frame_count, run.selected,
-                max(setup.plan.expected, run.selected), run.by_vision, ended[2], time.monotonic() - started_s, view,
+                source.name,
+                frame.name,
+                ended[0],
+                ended[1],
+                read,
+                source.frame_count,
+                run.selected,
+                max(setup.plan.expected, run.selected),
+                run.by_vision,
+                ended[2],
+                time.monotonic() - started_s,
+                view,
                 isinstance(frame, Step),
             )
 
@@ -160,26 +216,41 @@ def _map_one(
             before.take(step)
             yield update(step, ended, step.index + 1)
         before.search(run.is_unsearched)
-        selection = SelectionSettings(overlap=settings.overlap, least_overlap=min(0.5, settings.overlap))
+        selection = SelectionSettings(
+            overlap=settings.overlap, least_overlap=min(0.5, settings.overlap)
+        )
         reader = FrameReader(setup, before, selection if settings.method == "planar" else None)
         selected = select_keyframes(
-            reader.posed(run.look), selection,
-            keep_all=source.kind == "photos" or (settings.method == "thesis" and setup.track is not None),
-            inside=setup.inside(area), memory=before.memory, small=reader.small,
+            reader.posed(run.look),
+            selection,
+            keep_all=source.kind == "photos"
+            or (settings.method == "thesis" and setup.track is not None),
+            inside=setup.inside(area),
+            memory=before.memory,
+            small=reader.small,
         )
         for each in selected:
             ended = run.take(each)
             room.look(run.selected)
             coverage.show(run.pictures_on_ground)
-            yield update(each if isinstance(each, LostFrame) else each.posed.frame, ended, reader.read)
+            yield update(
+                each if isinstance(each, LostFrame) else each.posed.frame, ended, reader.read
+            )
         if search is not None:
             search.land()
         run.finish(source.notices(), started_s)
 
 
 def _begun(
-    setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None, request: str,
-    coverage: FlightCoverage, *, anew: bool, samples: int,
+    setup: FlightSetup,
+    archive: Archive,
+    settings: MapSettings,
+    finder: ObjectFinder | None,
+    request: str,
+    coverage: FlightCoverage,
+    *,
+    anew: bool,
+    samples: int,
 ) -> FlightRun:
     """The run of one flight, which notes how far it is, and goes on where a killed one was.
 
@@ -192,5 +263,9 @@ def _begun(
             warnings.warn(text, SorvoloWarning, stacklevel=2)
             file = begun_journal(setup, archive, request, anew=True)
         return ThesisRun(setup, archive, settings, finder, MapJournal(file), request)
-    journal = MapJournal(file, SourceNotes(file, source, samples) if isinstance(source, LiveSource) else None)
-    return PlanarRun(setup, archive, settings, finder=finder, journal=journal, request=request, coverage=coverage)
+    journal = MapJournal(
+        file, SourceNotes(file, source, samples) if isinstance(source, LiveSource) else None
+    )
+    return PlanarRun(
+        setup, archive, settings, finder=finder, journal=journal, request=request, coverage=coverage
+    )

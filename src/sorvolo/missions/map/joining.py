@@ -25,7 +25,12 @@ from sorvolo.survey.mosaic import MosaicUpdate, Status
 
 
 def plan_blocks(
-    source: Path, site: Path, settings: MapSettings, camera: Path | str | None, count: int, folder: Path
+    source: Path,
+    site: Path,
+    settings: MapSettings,
+    camera: Path | str | None,
+    count: int,
+    folder: Path,
 ) -> Division | AlreadyDone:
     """How to divide a flight into `count` blocks, fewer where it is small; or what the site has of it already.
 
@@ -41,11 +46,17 @@ def plan_blocks(
             if (mapped := already_done(archive, setup, request)) is not None:
                 return mapped
             check_room(setup, archive, settings.m_per_px)
-        return Division(folder, request, min(count, most_blocks(setup)), isinstance(sources[0], VideoSource))
+        return Division(
+            folder, request, min(count, most_blocks(setup)), isinstance(sources[0], VideoSource)
+        )
 
 
 def join_blocks(
-    source: Path, site: Path, settings: MapSettings, camera: Path | str | None, division: Division,
+    source: Path,
+    site: Path,
+    settings: MapSettings,
+    camera: Path | str | None,
+    division: Division,
     elsewhere: PaintsElsewhere,
 ) -> Generator[MosaicUpdate, None, str]:
     """Make one map of a flight's blocks, an update for each picture; the flight's name in the site.
@@ -62,11 +73,21 @@ def join_blocks(
         _demand_new(archive, setup)
         chosen = division.chosen()
         count = setup.source.frame_count if chosen is None else len(chosen.frames)
-        finder = None if looks is None else ObjectFinder(looks, setup.source.camera.camera, settings.classes)
+        finder = (
+            None
+            if looks is None
+            else ObjectFinder(looks, setup.source.camera.camera, settings.classes)
+        )
         journal = MapJournal(begun_journal(setup, archive, division.key, anew=True))
         coverage = FlightCoverage(setup, archive, None, (), settings.live_s)
         with PlanarRun(
-            setup, archive, settings, finder=finder, journal=journal, request=division.key, coverage=coverage,
+            setup,
+            archive,
+            settings,
+            finder=finder,
+            journal=journal,
+            request=division.key,
+            coverage=coverage,
             elsewhere=elsewhere,
         ) as run:
             lost = set()
@@ -113,9 +134,23 @@ def _joined(run: PlanarRun, step: Step, division: Division) -> tuple[Status, str
 
 
 def _update(
-    run: PlanarRun, step: Step, ended: tuple[Status, str], setup: FlightSetup, count: int, started_s: float
+    run: PlanarRun,
+    step: Step,
+    ended: tuple[Status, str],
+    setup: FlightSetup,
+    count: int,
+    started_s: float,
 ) -> MosaicUpdate:
     return MosaicUpdate(
-        setup.source.name, step.name, *ended, step.index + 1, setup.source.frame_count, run.selected, count,
-        run.by_vision, 0, time.monotonic() - started_s, run.view(step.index, step.time_ns),
+        setup.source.name,
+        step.name,
+        *ended,
+        step.index + 1,
+        setup.source.frame_count,
+        run.selected,
+        count,
+        run.by_vision,
+        0,
+        time.monotonic() - started_s,
+        run.view(step.index, step.time_ns),
     )

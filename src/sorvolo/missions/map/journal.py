@@ -102,7 +102,10 @@ class MapJournal:
         """Note a frame. Raises StoreError when the disk is full."""
         self.keep_source()
         values: dict[str, Any] = {
-            "index": step.index, "name": step.name, "time_ns": step.time_ns, "reason": step.reason,
+            "index": step.index,
+            "name": step.name,
+            "time_ns": step.time_ns,
+            "reason": step.reason,
             "searched": step.is_searched,
         }
         arrays: dict[str, Any] = {}
@@ -116,13 +119,24 @@ class MapJournal:
 
     def keep_detections(self, seen: FrameDetections) -> None:
         """Note what was detected in a frame."""
-        self.file.append(Entry("seen", {
-            "index": seen.index, "classes": seen.found.classes, "seconds": seen.seconds,
-            "crops": [len(each) for each in seen.crops], "least": dict(seen.least),
-        }, {
-            "boxes_px": seen.found.boxes_px, "scores": seen.found.scores, "labels": seen.found.labels,
-            "jpegs": array_from_bytes(b"".join(seen.crops)),
-        }))
+        self.file.append(
+            Entry(
+                "seen",
+                {
+                    "index": seen.index,
+                    "classes": seen.found.classes,
+                    "seconds": seen.seconds,
+                    "crops": [len(each) for each in seen.crops],
+                    "least": dict(seen.least),
+                },
+                {
+                    "boxes_px": seen.found.boxes_px,
+                    "scores": seen.found.scores,
+                    "labels": seen.found.labels,
+                    "jpegs": array_from_bytes(b"".join(seen.crops)),
+                },
+            )
+        )
 
     def earlier(self) -> Iterator[Step | FrameDetections]:
         """What a killed run did, in order; it ends where an entry is not as one was written."""
@@ -148,13 +162,17 @@ def run_key(setup: FlightSetup, archive: Archive, request: str) -> str:
     if isinstance(setup.source, LiveSource):
         return live_key(archive, request)
     site = archive.site() if archive.has_site else None
-    versions = [(each.id, each.run_id, each.flight_id) for each in archive.versions() if each.complete]
+    versions = [
+        (each.id, each.run_id, each.flight_id) for each in archive.versions() if each.complete
+    ]
     return content_sha256(request, setup.plan, setup.frame.origin, site, versions)
 
 
 def live_key(archive: Archive, request: str) -> str:
     """The same of a live flight, before anything is known of it."""
-    return content_sha256(request, [(each.id, each.run_id) for each in archive.versions() if each.complete])
+    return content_sha256(
+        request, [(each.id, each.run_id) for each in archive.versions() if each.complete]
+    )
 
 
 def go_on_live(
@@ -175,15 +193,27 @@ def put_taken(taken: Taken, values: dict[str, Any], arrays: dict[str, Any]) -> N
     new = taken.registered
     keyframe, features = new.keyframe, new.keyframe.features
     values["keyframe"] = {
-        "id": keyframe.id, "camera": _camera_values(keyframe.camera), "features": features.kind, "met": new.met,
-        "source": keyframe.prior.source, "reason": new.reason, "placed": new.guess is not None,
+        "id": keyframe.id,
+        "camera": _camera_values(keyframe.camera),
+        "features": features.kind,
+        "met": new.met,
+        "source": keyframe.prior.source,
+        "reason": new.reason,
+        "placed": new.guess is not None,
         "links": [{"old_id": each.old_id, "sigma_px": each.sigma_px} for each in new.links],
     }
     arrays |= {
-        "gray": keyframe.gray, "points_px": features.points_px, "descriptors": features.descriptors,
-        "thumbnail": new.thumbnail, "distortion": keyframe.camera.distortion,
+        "gray": keyframe.gray,
+        "points_px": features.points_px,
+        "descriptors": features.descriptors,
+        "thumbnail": new.thumbnail,
+        "distortion": keyframe.camera.distortion,
         **{name: getattr(keyframe.prior, name) for name in _PRIOR},
-        **{f"{name}_{number}": getattr(each, name) for number, each in enumerate(new.links) for name in _LINK},
+        **{
+            f"{name}_{number}": getattr(each, name)
+            for number, each in enumerate(new.links)
+            for name in _LINK
+        },
     }
     if new.guess is not None:
         arrays |= {"guess_rotation": new.guess.rotation, "guess_m": new.guess.translation_m}
@@ -196,7 +226,11 @@ def put_taken(taken: Taken, values: dict[str, Any], arrays: dict[str, Any]) -> N
 
 
 def _camera_values(camera: Camera) -> dict[str, Any]:
-    return {each.name: getattr(camera, each.name) for each in fields(camera) if each.name != "distortion"}
+    return {
+        each.name: getattr(camera, each.name)
+        for each in fields(camera)
+        if each.name != "distortion"
+    }
 
 
 def _step(entry: Entry) -> Step:
@@ -204,10 +238,17 @@ def _step(entry: Entry) -> Step:
     memory = None
     if "selection" in values:
         kept = values["selection"]
-        memory = SelectionMemory(arrays.get("last"), tuple(float(each) for each in kept["usual"]), int(kept["count"]))
+        memory = SelectionMemory(
+            arrays.get("last"), tuple(float(each) for each in kept["usual"]), int(kept["count"])
+        )
     return Step(
-        int(values["index"]), str(values["name"]), int(values["time_ns"]), str(values["reason"]), memory,
-        taken_in(entry), bool(values["searched"]),
+        int(values["index"]),
+        str(values["name"]),
+        int(values["time_ns"]),
+        str(values["reason"]),
+        memory,
+        taken_in(entry),
+        bool(values["searched"]),
     )
 
 
@@ -223,15 +264,21 @@ def taken_in(entry: Entry) -> Taken | None:
     _check_picture(arrays["gray"], (camera.height_px, camera.width_px))
     links = tuple(
         Link(
-            keyframe_id, int(each["old_id"]), **{name: arrays[f"{name}_{number}"] for name in _LINK},
+            keyframe_id,
+            int(each["old_id"]),
+            **{name: arrays[f"{name}_{number}"] for name in _LINK},
             sigma_px=float(each["sigma_px"]),
         )
         for number, each in enumerate(kept["links"])
     )
     guess = Pose(arrays["guess_rotation"], arrays["guess_m"]) if kept["placed"] else None
     registered = Registered(
-        Keyframe(keyframe_id, camera, arrays["gray"], features, prior), arrays["thumbnail"], links, guess,
-        str(kept["reason"]), tuple(int(each) for each in kept["met"]),
+        Keyframe(keyframe_id, camera, arrays["gray"], features, prior),
+        arrays["thumbnail"],
+        links,
+        guess,
+        str(kept["reason"]),
+        tuple(int(each) for each in kept["met"]),
     )
     return Taken(registered, _picture(entry))
 
@@ -250,14 +297,19 @@ def detections_in(entry: Entry) -> FrameDetections:
     """A frame's detections that an entry holds. Raises what a damaged one leads to."""
     arrays, values = entry.arrays, entry.values
     found = Detections(
-        arrays["boxes_px"], arrays["scores"], arrays["labels"], tuple(str(each) for each in values["classes"])
+        arrays["boxes_px"],
+        arrays["scores"],
+        arrays["labels"],
+        tuple(str(each) for each in values["classes"]),
     )
     jpegs, crops, at = bytes(arrays["jpegs"]), [], 0
     for length in values["crops"]:
         crops.append(jpegs[at : at + int(length)])
         at += int(length)
     least = {str(name): float(score) for name, score in values["least"].items()}
-    return FrameDetections(int(values["index"]), found, tuple(crops), float(values["seconds"]), least)
+    return FrameDetections(
+        int(values["index"]), found, tuple(crops), float(values["seconds"]), least
+    )
 
 
 def _check_picture(gray: Any, size: tuple[int, int]) -> None:

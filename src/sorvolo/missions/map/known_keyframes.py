@@ -39,10 +39,14 @@ class KnownKeyframes:
         ranks: Mapping[str, int] = {each.id: each.rank for each in archive.flights()}
         newest = next((v for v in reversed(archive.versions()) if v.complete), None)
         is_newest = newest is not None and newest.flight_id == flight
-        return cls(archive, [
-            _Known(each, ranks[each.flight_id], each.flight_id == flight)
-            for each in archive.keyframes() if not (is_newest and each.flight_id == flight)
-        ])
+        return cls(
+            archive,
+            [
+                _Known(each, ranks[each.flight_id], each.flight_id == flight)
+                for each in archive.keyframes()
+                if not (is_newest and each.flight_id == flight)
+            ],
+        )
 
     def __getitem__(self, keyframe_id: int) -> _Known:
         return self._known[keyframe_id]
@@ -70,8 +74,14 @@ class KnownKeyframes:
         """All of them as they were painted."""
         frames = [
             canvas_frame(
-                number, each.rank, each.stored.camera, each.stored.site_from_image, site_grid, each.stored.gains,
-                each.stored.vignette, None,
+                number,
+                each.rank,
+                each.stored.camera,
+                each.stored.site_from_image,
+                site_grid,
+                each.stored.gains,
+                each.stored.vignette,
+                None,
             )
             for number, each in enumerate(self._known)
         ]
@@ -79,6 +89,10 @@ class KnownKeyframes:
 
     def _for_graph(self, number: int, stored: StoredKeyframe) -> KnownKeyframe:
         # the thesis's method knows a similarity only: that of a camera looking straight down
-        pose = stored.site_from_camera or pose_from_homography(stored.site_from_image, stored.camera)
+        pose = stored.site_from_camera or pose_from_homography(
+            stored.site_from_image, stored.camera
+        )
         assert pose is not None
-        return KnownKeyframe(number, stored.camera, pose, stored.sigma_m, lambda: self._archive.image(stored))
+        return KnownKeyframe(
+            number, stored.camera, pose, stored.sigma_m, lambda: self._archive.image(stored)
+        )

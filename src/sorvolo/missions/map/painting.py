@@ -36,8 +36,12 @@ class PaintSettings:
     at_once: int = 24  # at most, the newest first: a solve may move a hundred
     live: int = 3  # of those moved, beside the newest, while somebody waits for that
     rest: float = 4.0  # times as long as a painting took: showing a map that still moves must not hold up the flight
-    coarse_map: float = 0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
-    cache_bytes: int = 128 * 1024 * 1024  # of earlier flights' pictures; an eighth of it of the flight's own, small
+    coarse_map: float = (
+        0.77  # times the pictures' own pixels: a coarser map does not need every pixel of them
+    )
+    cache_bytes: int = (
+        128 * 1024 * 1024
+    )  # of earlier flights' pictures; an eighth of it of the flight's own, small
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +87,28 @@ class FlightPainter:
     """
 
     def __init__(
-        self, writer: FlightWriter, archive: Archive, mapper: PlanarMapper, lens: Undistorter, known: KnownKeyframes,
-        native_m_per_px: float, log: FlightLog, live_s: float,
-        *, is_live: bool, elsewhere: PaintsElsewhere | None = None, settings: PaintSettings = PaintSettings(),
+        self,
+        writer: FlightWriter,
+        archive: Archive,
+        mapper: PlanarMapper,
+        lens: Undistorter,
+        known: KnownKeyframes,
+        native_m_per_px: float,
+        log: FlightLog,
+        live_s: float,
+        *,
+        is_live: bool,
+        elsewhere: PaintsElsewhere | None = None,
+        settings: PaintSettings = PaintSettings(),
     ) -> None:
         self._settings = settings
-        self._writer, self._archive, self._mapper, self._known, self._log = writer, archive, mapper, known, log
+        self._writer, self._archive, self._mapper, self._known, self._log = (
+            writer,
+            archive,
+            mapper,
+            known,
+            log,
+        )
         self._live_s, self._paint_every = live_s, settings.every if live_s >= 1 else 1
         self._is_live, self._elsewhere = is_live, elsewhere
         self.shown_s = 0.0
@@ -96,26 +116,39 @@ class FlightPainter:
         self.images: dict[int, str] = {}
         """Where each frame's picture is stored, by frame index: what `FlightWriter.commit` wants."""
         self.exposure = Exposure({}, {}, 0.0)
-        self._known_images = ImageCache(lambda each: archive.image(known[each].stored), settings.cache_bytes)
+        self._known_images = ImageCache(
+            lambda each: archive.image(known[each].stored), settings.cache_bytes
+        )
         self._stored: Camera = lens.camera
         shrink = native_m_per_px / archive.site_grid().grid.m_per_px
         if shrink < settings.coarse_map:
             full = lens.camera
-            self._stored = full.resized(max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink)))
+            self._stored = full.resized(
+                max(16, round(full.width_px * shrink)), max(16, round(full.height_px * shrink))
+            )
         self._valid: Mask | None = lens.valid(self._stored.width_px, self._stored.height_px)
         step = coarseness(max(self._stored.width_px, self._stored.height_px))
         self._live = _Fineness(
-            step, coarse_grid(archive.site_grid(), step),
-            self._stored.resized(-(-self._stored.width_px // step), -(-self._stored.height_px // step)),
+            step,
+            coarse_grid(archive.site_grid(), step),
+            self._stored.resized(
+                -(-self._stored.width_px // step), -(-self._stored.height_px // step)
+            ),
         )
         self._live_images = ImageCache(
             lambda each: writer.small_image(each - known.count, step), settings.cache_bytes // 8
         )
         self._live_tiles = CoarseTiles(writer.tiles, archive.site_grid().grid, step)
         self._live_canvas = Canvas(
-            self._live.site_grid.grid, self._live_tiles, self._live_images.get, keeps_known_ground=True
+            self._live.site_grid.grid,
+            self._live_tiles,
+            self._live_images.get,
+            keeps_known_ground=True,
         )
-        self._preview, self._unshown = LivePreview(self._live.site_grid.grid.tile_px), set[TileIndex]()
+        self._preview, self._unshown = (
+            LivePreview(self._live.site_grid.grid.tile_px),
+            set[TileIndex](),
+        )
         self._frames: set[int] = set()
         self._dirty: set[int] = set()
         self._painted_at = 0
@@ -153,13 +186,18 @@ class FlightPainter:
         """
         started_s = time.monotonic()
         painted = self._show_now(newest) if self._is_live else 0
-        if len(self._frames) - self._painted_at < self._paint_every or started_s < self._paint_again_s:
+        if (
+            len(self._frames) - self._painted_at < self._paint_every
+            or started_s < self._paint_again_s
+        ):
             return painted
         self._painted_at = len(self._frames)
         self._adapt()
         most = self._settings.live if self._is_live else self._settings.at_once
         painted += self._paint_small(sorted(self._dirty)[-most:])
-        self._paint_again_s = time.monotonic() + self._settings.rest * (time.monotonic() - started_s)
+        self._paint_again_s = time.monotonic() + self._settings.rest * (
+            time.monotonic() - started_s
+        )
         self._flush()
         return painted
 
@@ -217,12 +255,17 @@ class FlightPainter:
             self._writer.flush()
             self._preview.write(self._live_tiles, self._unshown, self._archive.live_preview_path)
             self._unshown.clear()
-        self._show_again_s = time.monotonic() + max(self._live_s, self._settings.rest * (time.monotonic() - started_s))
+        self._show_again_s = time.monotonic() + max(
+            self._live_s, self._settings.rest * (time.monotonic() - started_s)
+        )
 
     def _new_canvas(self) -> Canvas:
         site_grid = self._archive.site_grid()
         canvas = Canvas(
-            site_grid.grid, self._writer.tiles, self._image, painted=self._known.canvas_frames(site_grid),
+            site_grid.grid,
+            self._writer.tiles,
+            self._image,
+            painted=self._known.canvas_frames(site_grid),
             keeps_known_ground=True,
         )
         if self._known.count:
@@ -242,10 +285,14 @@ class FlightPainter:
         for keyframe_id in sorted(self._frames):
             index = keyframe_id - self._known.count
             self._writer.keep_original(index)
-            self.images[index] = self._writer.save_image(index, lens.undistort(self._writer.image(index)))
+            self.images[index] = self._writer.save_image(
+                index, lens.undistort(self._writer.image(index))
+            )
         self._valid = lens.valid(self._stored.width_px, self._stored.height_px)
 
-    def _paint(self, canvas: Canvas, keyframe_ids: Collection[int], at: "_Fineness") -> frozenset[TileIndex]:
+    def _paint(
+        self, canvas: Canvas, keyframe_ids: Collection[int], at: "_Fineness"
+    ) -> frozenset[TileIndex]:
         """Paint keyframes where they stand; the tiles that this changed."""
         painted = {each: self._canvas_frame(each, at) for each in sorted(keyframe_ids)}
         return canvas.paint(
@@ -254,17 +301,28 @@ class FlightPainter:
         )
 
     def _plan(self, at: "_Fineness") -> PaintPlan:
-        frames = [frame for each in sorted(self._frames) if (frame := self._canvas_frame(each, at)) is not None]
+        frames = [
+            frame
+            for each in sorted(self._frames)
+            if (frame := self._canvas_frame(each, at)) is not None
+        ]
         paths = [self._archive.folder / self.images[each.id - self._known.count] for each in frames]
         return PaintPlan(
-            at.site_grid.grid, tuple(replace(each, valid=None) for each in frames),
-            tuple(str(each.resolve()) for each in paths), self._valid,
+            at.site_grid.grid,
+            tuple(replace(each, valid=None) for each in frames),
+            tuple(str(each.resolve()) for each in paths),
+            self._valid,
         )
 
     def _canvas_frame(self, keyframe_id: int, at: "_Fineness") -> CanvasFrame | None:
         return canvas_frame(
-            keyframe_id, self._known.next_rank, at.camera, site_from_image(self._mapper, keyframe_id, at.camera),
-            at.site_grid, self.exposure.gains_of(keyframe_id), self.exposure.vignette_of(0),
+            keyframe_id,
+            self._known.next_rank,
+            at.camera,
+            site_from_image(self._mapper, keyframe_id, at.camera),
+            at.site_grid,
+            self.exposure.gains_of(keyframe_id),
+            self.exposure.vignette_of(0),
             self._valid if at.step == 1 else None,
         )
 
@@ -273,4 +331,3 @@ def site_from_image(mapper: PlanarMapper, keyframe_id: int, camera: Camera) -> M
     """(3, 3) of an undistorted image of the size that `camera` has: the stored one's or the frame's own."""
     refined = camera.with_focal_px(camera.fx_px * mapper.focal_scale)
     return site_from_image_homography(refined, mapper.pose(keyframe_id))
-

@@ -55,9 +55,16 @@ class PlanarRun(FlightRun):
     """A flight placed keyframe by keyframe and painted as it goes; ground that the map shows already stays as it is."""
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
-        finder: ObjectFinder | None = None, journal: MapJournal | None = None, request: str = "",
-        coverage: FlightCoverage | None = None, elsewhere: PaintsElsewhere | None = None,
+        self,
+        setup: FlightSetup,
+        archive: Archive,
+        settings: MapSettings,
+        writer: FlightWriter | None = None,
+        finder: ObjectFinder | None = None,
+        journal: MapJournal | None = None,
+        request: str = "",
+        coverage: FlightCoverage | None = None,
+        elsewhere: PaintsElsewhere | None = None,
     ) -> None:
         super().__init__(setup, archive, settings, writer, finder, journal, request)
         self._coverage, self._elsewhere = coverage, elsewhere
@@ -68,21 +75,31 @@ class PlanarRun(FlightRun):
         self._spill = SpillFile(archive.folder)
         self._mapper = PlanarMapper(
             PoseGraphSettings.of_flight(
-                model.focal_sigma, offset_sigma_m, joins_map=self._known.count > 0 or setup.known_ground is not None
+                model.focal_sigma,
+                offset_sigma_m,
+                joins_map=self._known.count > 0 or setup.known_ground is not None,
             ),
             known=self._known.for_graph(),
-            shelf=self._spill, keyframe_bytes=memory_budget_bytes(settings.memory_mb) // 8,
+            shelf=self._spill,
+            keyframe_bytes=memory_budget_bytes(settings.memory_mb) // 8,
         )
         self._times_ns: dict[int, int] = {}  # of the flight's keyframes that have a place
-        self._held: dict[int, ImageRGB | bytes | KeptPicture] = {}  # JPEG where all of the flight waits for its place
+        self._held: dict[
+            int, ImageRGB | bytes | KeptPicture
+        ] = {}  # JPEG where all of the flight waits for its place
         self._painter: FlightPainter | None = None
         self._offset: OffsetEstimate | None = None
         self._control: ControlReport | None = None
         self._base: BaseReport | None = None
-        self._found: dict[int, FoundFrame] = {}  # by keyframe, where the site's own map shows its ground
+        self._found: dict[
+            int, FoundFrame
+        ] = {}  # by keyframe, where the site's own map shows its ground
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._spill.close()
         super().__exit__(kind, error, trace)
@@ -100,7 +117,9 @@ class PlanarRun(FlightRun):
         if not self._archive.has_site:
             if not self._times_ns:
                 raise self._nothing_placed()
-            self._make_site(self._settings.m_per_px or self._native_m_per_px(), self._mapper.altitude_offset_m)
+            self._make_site(
+                self._settings.m_per_px or self._native_m_per_px(), self._mapper.altitude_offset_m
+            )
         return self._begin_flight()
 
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
@@ -132,7 +151,9 @@ class PlanarRun(FlightRun):
         if step.taken is None:
             return super().again(step)
         registered, picture = step.taken.registered, step.taken.picture
-        if registered.keyframe.id != self._known.count + step.index or not self._mapper.can_place(registered):
+        if registered.keyframe.id != self._known.count + step.index or not self._mapper.can_place(
+            registered
+        ):
             return None
         if not isinstance(picture, StoredPicture):
             return *self._take(step, registered, picture), 0
@@ -161,14 +182,17 @@ class PlanarRun(FlightRun):
         outlines_m = [(pose, footprint(camera, pose)) for pose in poses]
         return [
             PictureOnGround(outline_m, float(pose.translation_m[2]) / camera.fx_px)
-            for pose, outline_m in outlines_m if is_on_ground(outline_m)
+            for pose, outline_m in outlines_m
+            if is_on_ground(outline_m)
         ]
 
     def stored_frame(self, index: int) -> StoredKeyframe | None:
         """See `FlightRun.stored_frame`."""
         if self._known.count + index not in self._times_ns or index not in self.images:
             return None
-        frame = self._on_ground(self._log.endings[index], self._refined(self._setup.source.camera.camera))
+        frame = self._on_ground(
+            self._log.endings[index], self._refined(self._setup.source.camera.camera)
+        )
         return None if frame is None else self.begin().keyframe(frame, self.images[index])
 
     def note_found(self, index: int, site_from_image: Matrix3, residual_px: float) -> None:
@@ -178,7 +202,9 @@ class PlanarRun(FlightRun):
         """
         keyframe_id, camera = self._known.count + index, self._lens.camera
         if keyframe_id in self._times_ns:
-            self._found[keyframe_id] = FoundFrame.of(keyframe_id, camera, site_from_image, residual_px)
+            self._found[keyframe_id] = FoundFrame.of(
+                keyframe_id, camera, site_from_image, residual_px
+            )
 
     def complete(self) -> list[PlacedFrame]:
         """Solve once more, find the clock offset, paint what moved: every selected frame as it ends, in their order.
@@ -207,13 +233,24 @@ class PlanarRun(FlightRun):
         with self._log.stage(Stage.REPORT):
             shown = picture(writer.tiles, 1600)
         result = FlightResult(
-            placed, self._refined(self._setup.source.camera.camera), self._offset, self._mapper.report(),
-            self._exposure.spread, control=self._control, base=self._base,
+            placed,
+            self._refined(self._setup.source.camera.camera),
+            self._offset,
+            self._mapper.report(),
+            self._exposure.spread,
+            control=self._control,
+            base=self._base,
             pieces=[[each - self._known.count for each in ids] for ids in self._mapper.pieces()],
         )
         report = build_report(
-            self._setup, self._settings, self._log, result, self._archive.site(), shown,
-            [*notices, *self._detector_notices], time.monotonic() - started_s,
+            self._setup,
+            self._settings,
+            self._log,
+            result,
+            self._archive.site(),
+            shown,
+            [*notices, *self._detector_notices],
+            time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
         page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
@@ -222,7 +259,13 @@ class PlanarRun(FlightRun):
             files, report["seen"] = self._coverage.conclude(self.pictures_on_ground())
             documents.update(files)
         writer.commit(
-            placed, self.images, report, page, crs=self._settings.crs, search=search, documents=documents
+            placed,
+            self.images,
+            report,
+            page,
+            crs=self._settings.crs,
+            search=search,
+            documents=documents,
         )
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -235,7 +278,10 @@ class PlanarRun(FlightRun):
         return Exposure({}, {}, 0.0) if self._painter is None else self._painter.exposure
 
     def _take(
-        self, frame: Frame | Step, registered: Registered, picture: ImageRGB | bytes | KeptPicture | None
+        self,
+        frame: Frame | Step,
+        registered: Registered,
+        picture: ImageRGB | bytes | KeptPicture | None,
     ) -> tuple[Status, str]:
         """Place a registered frame and keep its picture, if it has not been kept before; what became of it."""
         with self._log.stage(Stage.REGISTER):
@@ -254,14 +300,20 @@ class PlanarRun(FlightRun):
 
     def _keep(self, keyframe_id: int, picture: ImageRGB | bytes | KeptPicture) -> None:
         if self._painter is not None:
-            self._painter.save(keyframe_id, image_from_jpeg(picture, "") if isinstance(picture, bytes) else picture)
+            self._painter.save(
+                keyframe_id, image_from_jpeg(picture, "") if isinstance(picture, bytes) else picture
+            )
             return
         self._held[keyframe_id] = picture
         if self._setup.is_placed_late:
             return
         telemetry = self._setup.telemetry
         known = telemetry is None or telemetry.knows_ground
-        if self._archive.has_site or (known and len(self._held) >= 2) or len(self._held) >= _WAIT_FOR_HEIGHT:
+        if (
+            self._archive.has_site
+            or (known and len(self._held) >= 2)
+            or len(self._held) >= _WAIT_FOR_HEIGHT
+        ):
             self._started_painter()
 
     def _started_painter(self) -> FlightPainter:
@@ -269,8 +321,16 @@ class PlanarRun(FlightRun):
         if self._painter is None:
             writer = self.begin()
             self._painter = FlightPainter(
-                writer, self._archive, self._mapper, self._lens, self._known, self._native_m_per_px(), self._log,
-                self._settings.live_s, is_live=isinstance(self._setup.source, LiveSource), elsewhere=self._elsewhere,
+                writer,
+                self._archive,
+                self._mapper,
+                self._lens,
+                self._known,
+                self._native_m_per_px(),
+                self._log,
+                self._settings.live_s,
+                is_live=isinstance(self._setup.source, LiveSource),
+                elsewhere=self._elsewhere,
             )
             for keyframe_id, held in self._held.items():
                 image = image_from_jpeg(held, "") if isinstance(held, bytes) else held
@@ -282,7 +342,9 @@ class PlanarRun(FlightRun):
     def _native_m_per_px(self) -> float:
         if self._setup.track is None and not self._setup.is_placed_late:
             return _LOCAL_M_PER_PX
-        heights = [float(self._mapper.pose(each).translation_m[2]) for each in self._mapper.placed()]
+        heights = [
+            float(self._mapper.pose(each).translation_m[2]) for each in self._mapper.placed()
+        ]
         telemetry = self._setup.telemetry
         seconds = [self._setup.seconds(time_ns) for time_ns in self._times_ns.values()]
         climb_m = 0.0 if telemetry is None else telemetry.track.climb_after_m(seconds)
@@ -296,13 +358,23 @@ class PlanarRun(FlightRun):
         ground = self._setup.known_ground
         if isinstance(ground, FlightControl):
             endings = self._log.endings
-            keyframe_of = {endings[each - self._known.count].name: each for each in self._mapper.placed()}
+            keyframe_of = {
+                endings[each - self._known.count].name: each for each in self._mapper.placed()
+            }
             self._control = ground.tie(self._mapper, keyframe_of, self._setup.frame)
         elif ground is None and self._found:
             m_per_px = self._archive.site_grid().grid.m_per_px
-            tie_to_base(self._mapper, list(self._found.values()), self._lens.camera, m_per_px, is_datum=False)
+            tie_to_base(
+                self._mapper,
+                list(self._found.values()),
+                self._lens.camera,
+                m_per_px,
+                is_datum=False,
+            )
         elif ground is not None:
-            self._base = ground.tie(self._mapper, self._picture, self._lens.camera, self._setup.frame)
+            self._base = ground.tie(
+                self._mapper, self._picture, self._lens.camera, self._setup.frame
+            )
 
     def _picture(self, keyframe_id: int) -> ImageRGB:
         """A keyframe's undistorted picture, from wherever it is kept."""
@@ -353,10 +425,14 @@ class PlanarRun(FlightRun):
                 result.append(self._rejected(ending, HORIZON, camera))
                 continue
             self._log.end(ending.index, ending.name, ending.time_ns, status, reason)
-            result.append(replace(
-                frame, residual_px=residuals.get(keyframe_id, frame.residual_px), sigma_m=sigmas[keyframe_id],
-                gps_residual_m=gps[keyframe_id],
-            ))
+            result.append(
+                replace(
+                    frame,
+                    residual_px=residuals.get(keyframe_id, frame.residual_px),
+                    sigma_m=sigmas[keyframe_id],
+                    gps_residual_m=gps[keyframe_id],
+                )
+            )
         return result
 
     def _on_ground(self, ending: Ending, camera: Camera) -> PlacedFrame | None:
@@ -367,9 +443,19 @@ class PlanarRun(FlightRun):
         if not is_on_ground(outline_m):
             return None
         return PlacedFrame(
-            ending.name, ending.index, self._setup.utc_ns(ending.time_ns), ending.status, ending.reason, camera, pose,
-            site_from_image(self._mapper, keyframe_id, self._lens.camera), outline_m, unknown, unknown,
-            self._exposure.gains_of(keyframe_id), vignette=self._exposure.vignette_of(0),
+            ending.name,
+            ending.index,
+            self._setup.utc_ns(ending.time_ns),
+            ending.status,
+            ending.reason,
+            camera,
+            pose,
+            site_from_image(self._mapper, keyframe_id, self._lens.camera),
+            outline_m,
+            unknown,
+            unknown,
+            self._exposure.gains_of(keyframe_id),
+            vignette=self._exposure.vignette_of(0),
         )
 
     def _rejected(self, ending: Ending, reason: str, camera: Camera) -> PlacedFrame:

@@ -22,7 +22,9 @@ class FrameReader:
     `selection`; None: every frame.
     """
 
-    def __init__(self, setup: FlightSetup, before: Earlier, selection: SelectionSettings | None) -> None:
+    def __init__(
+        self, setup: FlightSetup, before: Earlier, selection: SelectionSettings | None
+    ) -> None:
         self._setup, self._before, self._selection = setup, before, selection
         self._is_candidate = every(setup.plan.step_s)
         self.small = SmallCopies()
@@ -52,7 +54,8 @@ class FrameReader:
             return
         if isinstance(source, VideoSource) and self._selection is not None:
             frames = source.frames(
-                self._is_wanted, SparseReading(self._setup.plan.step_s, self._is_needed, self._is_enough)
+                self._is_wanted,
+                SparseReading(self._setup.plan.step_s, self._is_needed, self._is_enough),
             )
         else:
             frames = source.frames(self._is_wanted)

@@ -6,7 +6,12 @@ from types import TracebackType
 from typing import Any, Self
 
 from sorvolo.missions.flight.log import FlightLog, Stage
-from sorvolo.missions.flight.map_objects import FrameDetections, ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.map_objects import (
+    FrameDetections,
+    ObjectFinder,
+    search_summary,
+    why_not_searched,
+)
 from sorvolo.missions.flight.memory import MemorySettings, memory_budget_bytes
 from sorvolo.missions.flight.request import REQUEST
 from sorvolo.missions.flight.settings import MapSettings
@@ -30,8 +35,14 @@ class FlightRun(ABC):
     """
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: MapSettings, writer: FlightWriter | None = None,
-        finder: ObjectFinder | None = None, journal: MapJournal | None = None, request: str = "",
+        self,
+        setup: FlightSetup,
+        archive: Archive,
+        settings: MapSettings,
+        writer: FlightWriter | None = None,
+        finder: ObjectFinder | None = None,
+        journal: MapJournal | None = None,
+        request: str = "",
     ) -> None:
         self._request = request
         self._setup, self._archive, self._settings, self._finder = setup, archive, settings, finder
@@ -45,7 +56,10 @@ class FlightRun(ABC):
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if self._finder is not None:
             self._finder.close()
@@ -94,7 +108,9 @@ class FlightRun(ABC):
             memory = each.memory if isinstance(each, Selected) else None
             reason = ended[1] if self._taken is None else ""
             is_searched = not each.reason and self._finder is not None
-            self._journal.keep(Step(lost.index, lost.name, lost.time_ns, reason, memory, self._taken, is_searched))
+            self._journal.keep(
+                Step(lost.index, lost.name, lost.time_ns, reason, memory, self._taken, is_searched)
+            )
             self._keep_detections()
         return ended
 
@@ -198,8 +214,12 @@ class FlightRun(ABC):
             memory_mb = int(memory_budget_bytes(self._settings.memory_mb) / 1e6)
             journal = None if self._journal is None else self._journal.file
             self._writer = self._archive.begin_flight(
-                source.name, source.fingerprint, settings, tiles_mb=min(MemorySettings().tiles_mb, memory_mb // 8),
-                images_mb=min(self._images_mb(), memory_mb // 2), journal=journal,
+                source.name,
+                source.fingerprint,
+                settings,
+                tiles_mb=min(MemorySettings().tiles_mb, memory_mb // 8),
+                images_mb=min(self._images_mb(), memory_mb // 2),
+                journal=journal,
             )
             self._began_writer = True
         return self._writer

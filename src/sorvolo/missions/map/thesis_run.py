@@ -14,7 +14,13 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.journal import MapJournal
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.roi_stitching import RoiStitcher, Stitched
-from sorvolo.mosaic.stitched_map import MIRROR_Y, StitchedPlaces, mosaic_m_per_px, paint_mosaic, site_from_mosaic
+from sorvolo.mosaic.stitched_map import (
+    MIRROR_Y,
+    StitchedPlaces,
+    mosaic_m_per_px,
+    paint_mosaic,
+    site_from_mosaic,
+)
 from sorvolo.registration.lens import Undistorter
 from sorvolo.registration.sizes import at_size
 from sorvolo.store.exports.map_pictures import picture
@@ -28,14 +34,21 @@ class ThesisRun(FlightRun):
     """A flight mapped as the thesis does: all of it stitched first, then anchored to its fixes."""
 
     def __init__(
-        self, setup: FlightSetup, archive: Archive, settings: MapSettings, finder: ObjectFinder | None = None,
-        journal: MapJournal | None = None, request: str = "",
+        self,
+        setup: FlightSetup,
+        archive: Archive,
+        settings: MapSettings,
+        finder: ObjectFinder | None = None,
+        journal: MapJournal | None = None,
+        request: str = "",
     ) -> None:
         super().__init__(setup, archive, settings, finder=finder, journal=journal, request=request)
         self._lens = Undistorter(setup.source.camera.camera)
         full = self._lens.camera
         scale = min(1.0, settings.thesis.side_px / max(full.width_px, full.height_px))
-        self._camera: Camera = full.resized(round(full.width_px * scale), round(full.height_px * scale))
+        self._camera: Camera = full.resized(
+            round(full.width_px * scale), round(full.height_px * scale)
+        )
         self._stitcher = RoiStitcher(settings.thesis)
         self._frames: dict[int, PosedFrame] = {}
         self._stitched: dict[int, Stitched] = {}
@@ -72,7 +85,9 @@ class ThesisRun(FlightRun):
         self._make_site(self._settings.m_per_px or mosaic_m_per_px(anchored), 0.0)
         site, writer = self._archive.site(), self._begin_flight()
         with self._log.stage(Stage.STORE):
-            paths = {index: writer.save_image(index, image) for index, image in self._pictures.items()}
+            paths = {
+                index: writer.save_image(index, image) for index, image in self._pictures.items()
+            }
         with self._log.stage(Stage.PAINT):
             rgba, corner_px = self._stitcher.mosaic()
             paint_mosaic(rgba, corner_px, anchored, self._archive.site_grid(), writer.tiles)
@@ -81,8 +96,14 @@ class ThesisRun(FlightRun):
             shown = picture(writer.tiles, 1600)
         search = self._search(placed)
         report = build_report(
-            self._setup, self._settings, self._log, FlightResult(placed, self._setup.source.camera.camera), site,
-            shown, [*notices, *self._detector_notices], time.monotonic() - started_s,
+            self._setup,
+            self._settings,
+            self._log,
+            FlightResult(placed, self._setup.source.camera.camera),
+            site,
+            shown,
+            [*notices, *self._detector_notices],
+            time.monotonic() - started_s,
         )
         report["objects"] = self._search_summary(search)
         page = report_page(report, shown.rgba, crops_of(search), self._archive.site())
@@ -95,7 +116,8 @@ class ThesisRun(FlightRun):
         if self._setup.track is None:
             return MIRROR_Y
         anchored = [
-            (stitched, self._frames[each]) for each, stitched in self._stitched.items()
+            (stitched, self._frames[each])
+            for each, stitched in self._stitched.items()
             if self._frames[each].prior.knows_place
         ]
         try:
@@ -108,7 +130,9 @@ class ThesisRun(FlightRun):
 
     def _placed(self, anchored: Matrix3) -> list[PlacedFrame]:
         camera = self._setup.source.camera.camera
-        places = StitchedPlaces(camera, self._camera, anchored, has_fixes=self._setup.track is not None)
+        places = StitchedPlaces(
+            camera, self._camera, anchored, has_fixes=self._setup.track is not None
+        )
         result = []
         for ending in self._log.endings.values():
             time_ns = self._setup.utc_ns(ending.time_ns)
@@ -116,5 +140,7 @@ class ThesisRun(FlightRun):
                 posed, stitched = self._frames[ending.index], self._stitched.get(ending.index)
                 result.append(places.place(posed, stitched, time_ns, ending.status, ending.reason))
             else:
-                result.append(PlacedFrame.rejected(ending.index, ending.name, time_ns, ending.reason, camera))
+                result.append(
+                    PlacedFrame.rejected(ending.index, ending.name, time_ns, ending.reason, camera)
+                )
         return result

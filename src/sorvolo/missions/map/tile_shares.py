@@ -38,7 +38,9 @@ class PaintPlan:
 
     def shares(self, count: int) -> list[frozenset[TileIndex]]:
         """The tiles in `count` parts, or fewer, of neighbours: rows of the map from north to south."""
-        touched = set[TileIndex]().union(*(self.grid.tiles_touched(each.outline_px) for each in self.frames))
+        touched = set[TileIndex]().union(
+            *(self.grid.tiles_touched(each.outline_px) for each in self.frames)
+        )
         tiles = sorted(touched, key=lambda tile: (tile[1], tile[0]))
         size = max(1, -(-len(tiles) // count))
         return [frozenset(tiles[at : at + size]) for at in range(0, len(tiles), size)]
@@ -54,7 +56,11 @@ def write_plan(plan: PaintPlan, folder: Path) -> None:
 
 
 def paint_share(
-    folder: Path, number: int, count: int, memory_bytes: int, alive: Callable[[], None] = lambda: None
+    folder: Path,
+    number: int,
+    count: int,
+    memory_bytes: int,
+    alive: Callable[[], None] = lambda: None,
 ) -> None:
     """Paint one of `count` shares of the tiles of a folder's plan; they lie in the folder then.
 
@@ -63,16 +69,26 @@ def paint_share(
     """
     plan = _read_plan(folder)
     tiles = plan.shares(count)[number]
-    around = {(column + x, row + y) for column, row in tiles for x in (-1, 0, 1) for y in (-1, 0, 1)}
-    near = [at for at, each in enumerate(plan.frames) if plan.grid.tiles_touched(each.outline_px) & around]
+    around = {
+        (column + x, row + y) for column, row in tiles for x in (-1, 0, 1) for y in (-1, 0, 1)
+    }
+    near = [
+        at
+        for at, each in enumerate(plan.frames)
+        if plan.grid.tiles_touched(each.outline_px) & around
+    ]
     files = {plan.frames[at].id: Path(plan.pictures[at]) for at in near}
 
     def picture(frame_id: int) -> ImageRGB:
         alive()
         return image_from_jpeg(files[frame_id].read_bytes(), str(files[frame_id]))
 
-    with closing(GrowingTiles(tile_blobs(folder), {}, plan.grid.tile_px, memory_bytes // 4)) as painted:
-        canvas = Canvas(plan.grid, painted, ImageCache(picture, memory_bytes // 2).get, within=tiles)
+    with closing(
+        GrowingTiles(tile_blobs(folder), {}, plan.grid.tile_px, memory_bytes // 4)
+    ) as painted:
+        canvas = Canvas(
+            plan.grid, painted, ImageCache(picture, memory_bytes // 2).get, within=tiles
+        )
         canvas.paint([plan.frames[at] for at in near])
         saved = painted.save()
     rows = [[*tile, sha256] for tile, sha256 in sorted(saved.items()) if sha256 is not None]
@@ -81,7 +97,10 @@ def paint_share(
 
 def tiles_painted(folder: Path, number: int) -> dict[TileIndex, str]:
     """The tiles of a share that was painted, by their SHA-256."""
-    return {(column, row): sha256 for column, row, sha256 in json.loads(_share_path(folder, number).read_bytes())}
+    return {
+        (column, row): sha256
+        for column, row, sha256 in json.loads(_share_path(folder, number).read_bytes())
+    }
 
 
 def tile_blobs(folder: Path) -> TileBlobs:

@@ -17,7 +17,11 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.evaluate.frame_rows import map_frames
-from sorvolo.missions.evaluate.mask_folders import ComparedMask, compared_masks, frames_against_times
+from sorvolo.missions.evaluate.mask_folders import (
+    ComparedMask,
+    compared_masks,
+    frames_against_times,
+)
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.reproduce.settings import COMPARISONS, FIGURE_PX
 from sorvolo.missions.reproduce.video_input import VideoInput
@@ -36,7 +40,12 @@ MASKS, TIMES = "change masks", "times of appearance"
 
 
 def compare_video(
-    later: VideoInput, site: Path, scratch: Path, title: str, truth: UmcdVideo, views_per_second: float
+    later: VideoInput,
+    site: Path,
+    scratch: Path,
+    title: str,
+    truth: UmcdVideo,
+    views_per_second: float,
 ) -> tuple[dict[str, Any], dict[str, tuple[bytes, bytes]]]:
     """A row of Tables 4.3 to 4.5, and pictures of Figures 4.4 and 4.5: the map beside the frame, as JPEGs.
 
@@ -49,7 +58,11 @@ def compare_video(
         shutil.rmtree(scratch, ignore_errors=True)
         shutil.copytree(site, scratch)
     settings = CompareSettings(
-        method=method, model="none", writes_masks=True, updates_map=False, thesis=thesis_options(written),
+        method=method,
+        model="none",
+        writes_masks=True,
+        updates_map=False,
+        thesis=thesis_options(written),
         views_per_second=views_per_second,
     )
     started_cpu_s = time.process_time()
@@ -58,7 +71,9 @@ def compare_video(
     (masks,) = (scratch / "flights").glob("*/masks")
     judged_by, judged = _judged(masks, truth, later.fps)
     values = {
-        "judged_by": judged_by, "views": updates[-1].views, "compared": updates[-1].compared,
+        "judged_by": judged_by,
+        "views": updates[-1].views,
+        "compared": updates[-1].compared,
         "cpu_seconds_per_view": cpu_s / max(1, updates[-1].views),
         "frames": _plain(_sum(each.frame for each in judged)),
         "pixels": _plain(_sum(each.pixels for each in judged)) if judged_by == MASKS else None,
@@ -76,7 +91,9 @@ def time_comparison(first: VideoInput, later: VideoInput, repeats: int) -> dict[
     """
     before, after = (_middle(each) for each in (first, later))
     if before.shape != after.shape:
-        raise InputError(f"{first.video} and {later.video} differ in size; give videos of one camera")
+        raise InputError(
+            f"{first.video} and {later.video} differ in size; give videos of one camera"
+        )
     cores = os.cpu_count() or 1
     seconds = {}
     for threads in (1, cores):
@@ -88,15 +105,22 @@ def time_comparison(first: VideoInput, later: VideoInput, repeats: int) -> dict[
         seconds[threads] = median(times)
     height, width = before.shape[:2]
     return {
-        "single_thread_s": seconds[1], "multithread_s": seconds[cores], "threads": cores, "repeats": repeats,
-        "width_px": width, "height_px": height,
+        "single_thread_s": seconds[1],
+        "multithread_s": seconds[cores],
+        "threads": cores,
+        "repeats": repeats,
+        "width_px": width,
+        "height_px": height,
     }
 
 
 def rates(counts: Counts) -> dict[str, float | None]:
     """The rates of section 4.2.1, None where nothing was to divide by."""
     named = {
-        "precision": counts.precision, "recall": counts.recall, "accuracy": counts.accuracy, "f1": counts.f1,
+        "precision": counts.precision,
+        "recall": counts.recall,
+        "accuracy": counts.accuracy,
+        "f1": counts.f1,
     }
     return {name: None if math.isnan(rate) else round(rate, 4) for name, rate in named.items()}
 
@@ -129,7 +153,13 @@ def _sum(counts: Iterable[Counts]) -> Counts:
 
 
 def _plain(counts: Counts) -> dict[str, int]:
-    return {"tp": counts.tp, "fp": counts.fp, "fn": counts.fn, "tn": counts.tn, "unknown": counts.unknown}
+    return {
+        "tp": counts.tp,
+        "fp": counts.fp,
+        "fn": counts.fn,
+        "tn": counts.tn,
+        "unknown": counts.unknown,
+    }
 
 
 def _examples(
@@ -141,10 +171,15 @@ def _examples(
     with Archive.open(site, write=False) as archive:
         rows = {row.name: row for row in map_frames(site, archive.site())[flight]}
         under = MapDeviation(archive.tiles(), archive.site_grid())
-        shown = {name: each for name, each in wanted.items() if each.name in rows and int(each.name) in frames}
+        shown = {
+            name: each
+            for name, each in wanted.items()
+            if each.name in rows and int(each.name) in frames
+        }
         return {
             name: _side_by_side(frames[int(each.name)], each.path, rows[each.name].outline_m, under)
-            for name, each in shown.items() if rows[each.name].has_outline
+            for name, each in shown.items()
+            if rows[each.name].has_outline
         }
 
 
@@ -160,7 +195,9 @@ def _extremes(judged: Sequence[ComparedMask]) -> dict[str, ComparedMask]:
     return wanted
 
 
-def _side_by_side(image: ImageRGB, mask: Path, outline_m: Floats, under: MapDeviation) -> tuple[bytes, bytes]:
+def _side_by_side(
+    image: ImageRGB, mask: Path, outline_m: Floats, under: MapDeviation
+) -> tuple[bytes, bytes]:
     changed, _ = read_mask(mask, may_be_unknown=True)
     height, width = image.shape[:2]
     shown = under.under(outline_m, width, height), with_outlines(image, changed)

@@ -58,7 +58,9 @@ def extract_frames(videos: Sequence[UmcdVideo], folder: Path, views_per_second: 
     return sum(_extract(each, stated, folder, views_per_second) for each, stated in boxed)
 
 
-def train_network(labels: Labels, out: Path, rpn: str, settings: DetectorSettings, seed: int) -> str:
+def train_network(
+    labels: Labels, out: Path, rpn: str, settings: DetectorSettings, seed: int
+) -> str:
     """Train one network of Table 4.6 on what is not held out; the file of the model, which is left in `out`.
 
     Raises InputError as `train_detector`, and where torch is not installed; SettingsError for a device.
@@ -71,8 +73,13 @@ def train_network(labels: Labels, out: Path, rpn: str, settings: DetectorSetting
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"
         ) from error
     wanted = TrainSettings(
-        settings.preset, "extended" if rpn == "extended" else "standard", weights=settings.weights,
-        steps=settings.steps, side_px=settings.side_px, seed=seed, patience=0,
+        settings.preset,
+        "extended" if rpn == "extended" else "standard",
+        weights=settings.weights,
+        steps=settings.steps,
+        side_px=settings.side_px,
+        seed=seed,
+        patience=0,
     )
     with writing(out):
         shutil.rmtree(out, ignore_errors=True)
@@ -90,11 +97,18 @@ def held_out(labels: Labels, seed: int) -> LabelledSet:
 
 def measure_model(model: str, labelled: LabelledSet) -> dict[str, Any]:
     """The thesis's mAP (eqs 4.3, 4.4) and COCO's AP of a model on labelled pictures, and of each class."""
-    measured = evaluate_detector([[model]], [labelled], EvaluationSettings(tiles=None, draws=_DRAWS))
+    measured = evaluate_detector(
+        [[model]], [labelled], EvaluationSettings(tiles=None, draws=_DRAWS)
+    )
     (scores,) = measured.sets
     return {
-        "set": labelled.name, "pictures": scores.pictures, "videos": scores.groups, "thesis_map": scores.thesis_map,
-        "ap50": scores.coco.ap50, "ap": scores.coco.ap, "labels": {row.label: row.labels for row in scores.classes},
+        "set": labelled.name,
+        "pictures": scores.pictures,
+        "videos": scores.groups,
+        "thesis_map": scores.thesis_map,
+        "ap50": scores.coco.ap50,
+        "ap": scores.coco.ap,
+        "labels": {row.label: row.labels for row in scores.classes},
         "recall": {row.label: row.reported.recall for row in scores.classes},
         "remarks": [*scores.remarks, *measured.notices],
     }
@@ -110,9 +124,18 @@ def example_pictures(model: str, labelled: LabelledSet) -> list[bytes]:
     for picture in list(shown.values())[:_EXAMPLES]:
         image = read_picture(Path(picture.path))
         detections = detector.detect(image, m_per_px=picture.m_per_px)
-        found.append(jpeg_from_image(annotated(
-            image, detections.boxes_px, detections.labels.tolist(), _words(detections), [True] * len(detections),
-        ), FIGURE_PX))
+        found.append(
+            jpeg_from_image(
+                annotated(
+                    image,
+                    detections.boxes_px,
+                    detections.labels.tolist(),
+                    _words(detections),
+                    [True] * len(detections),
+                ),
+                FIGURE_PX,
+            )
+        )
     return found
 
 
@@ -121,7 +144,9 @@ def _words(found: Detections) -> list[str]:
 
 
 def _stated(videos: Sequence[UmcdVideo]) -> list[tuple[UmcdVideo, UmcdMetadata]]:
-    return [(each, read_umcd_metadata(each.metadata)) for each in videos if each.metadata is not None]
+    return [
+        (each, read_umcd_metadata(each.metadata)) for each in videos if each.metadata is not None
+    ]
 
 
 def _extract(video: UmcdVideo, stated: UmcdMetadata, folder: Path, views_per_second: float) -> int:
@@ -135,8 +160,10 @@ def _extract(video: UmcdVideo, stated: UmcdMetadata, folder: Path, views_per_sec
     (source,) = open_sources([video.video])
     count = 0
     for each in source.frames(
-        lambda index, time_ns: index in stated.boxed
-        or (steady(index, time_ns) and stated.shows_object(index / rate_hz) is False)
+        lambda index, time_ns: (
+            index in stated.boxed
+            or (steady(index, time_ns) and stated.shows_object(index / rate_hz) is False)
+        )
     ):
         if isinstance(each, Frame):
             path = folder / name / f"{each.index:06d}.jpg"

@@ -22,7 +22,9 @@ from sorvolo.store.site.archive import Archive
 Transform = Literal["similarity", "homography"]
 
 
-def map_video(flight: VideoInput, site: Path, method: str, transform: Transform = "similarity") -> dict[str, Any]:
+def map_video(
+    flight: VideoInput, site: Path, method: str, transform: Transform = "similarity"
+) -> dict[str, Any]:
     """A row of Table 4.1: one video mapped into a new site folder, and the deviation of section 4.1.1.
 
     Raises InputError and StoreError as `map_flights`.
@@ -31,19 +33,29 @@ def map_video(flight: VideoInput, site: Path, method: str, transform: Transform 
         shutil.rmtree(site, ignore_errors=True)
         site.parent.mkdir(parents=True, exist_ok=True)
     settings = MapSettings(
-        method="thesis" if method == "thesis" else "planar", model="none",
+        method="thesis" if method == "thesis" else "planar",
+        model="none",
         thesis=RoiStitchingSettings(transform=transform),
     )
     started_s, started_cpu_s = time.monotonic(), time.process_time()
     updates = list(map_flights([flight.video], site, settings, **flight.options))
-    minutes, cpu_minutes = (time.monotonic() - started_s) / 60, (time.process_time() - started_cpu_s) / 60
+    minutes, cpu_minutes = (
+        (time.monotonic() - started_s) / 60,
+        (time.process_time() - started_cpu_s) / 60,
+    )
     deviation = evaluate_mosaic(site).deviation
     with Archive.open(site, write=False) as archive:
         headline = archive.report(archive.flights()[0].id).get("headline", {})
     return {
-        "frames": updates[-1].frames_read, "keyframes": len(updates), "matched": updates[-1].by_vision,
-        "minutes": minutes, "cpu_minutes": cpu_minutes, "seconds_per_keyframe": 60 * cpu_minutes / len(updates),
-        "deviation": deviation.mean, "histogram": deviation.histogram, "quality": headline.get("quality"),
+        "frames": updates[-1].frames_read,
+        "keyframes": len(updates),
+        "matched": updates[-1].by_vision,
+        "minutes": minutes,
+        "cpu_minutes": cpu_minutes,
+        "seconds_per_keyframe": 60 * cpu_minutes / len(updates),
+        "deviation": deviation.mean,
+        "histogram": deviation.histogram,
+        "quality": headline.get("quality"),
         "camera": "calibrated" if flight.camera else "guessed",
     }
 
@@ -59,7 +71,9 @@ def example_jpegs(site: Path) -> dict[str, bytes]:
     with Archive.open(site, write=False) as archive:
         keyframes = archive.keyframes()
         middle = keyframes[len(keyframes) // 2]
-        shown = MapDeviation(archive.tiles(), archive.site_grid()).shown(archive.image(middle), middle.site_from_image)
+        shown = MapDeviation(archive.tiles(), archive.site_grid()).shown(
+            archive.image(middle), middle.site_from_image
+        )
     return {
         "mosaic": jpeg_from_image(shown.mosaic, FIGURE_PX),
         "frame": jpeg_from_image(shown.frame, FIGURE_PX),
@@ -75,8 +89,12 @@ def distortion_of(site: Path) -> dict[str, Any]:
     outlines = [row.outline_m for row in rows if row.has_outline]
     measured = outline_distortion(outlines)
     return {
-        "sides": measured.sides, "areas": measured.areas, "bend": measured.bend, "frames": measured.frames,
-        "selected": len(rows), "outlines_m": [each.round(3) for each in outlines],
+        "sides": measured.sides,
+        "areas": measured.areas,
+        "bend": measured.bend,
+        "frames": measured.frames,
+        "selected": len(rows),
+        "outlines_m": [each.round(3) for each in outlines],
     }
 
 
@@ -88,6 +106,8 @@ def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
     reference = evaluate_mosaic(site, reference=mosaic).reference
     assert reference is not None
     return {
-        "correlation": reference.correlation, "correlation_after_shift": reference.correlation_after_shift,
-        "m_per_px": reference.m_per_px, "area_m2": reference.area_m2,
+        "correlation": reference.correlation,
+        "correlation_after_shift": reference.correlation_after_shift,
+        "m_per_px": reference.m_per_px,
+        "area_m2": reference.area_m2,
     }

@@ -10,11 +10,13 @@ VIDEOS: dict[str, dict[str, tuple[str, ...]]] = {
         "Countryside": tuple(f"path{number:02d}" for number in range(1, 11)),
     },
     f"{WITH}/{MOSAICKING}": {
-        "Urban": ("path1", "path2", "path3", "path4"), "Dirt": ("path1", "path2", "path3", "path4"),
+        "Urban": ("path1", "path2", "path3", "path4"),
+        "Dirt": ("path1", "path2", "path3", "path4"),
         "Countryside": ("path1", "path2"),
     },
     f"{WITH}/{CHANGES}": {
-        "Urban": ("path1", "path2", "path3", "path4_1", "path4_2"), "Dirt": ("path1", "path2", "path3", "path4"),
+        "Urban": ("path1", "path2", "path3", "path4_1", "path4_2"),
+        "Dirt": ("path1", "path2", "path3", "path4"),
         "Countryside": ("path1", "path2"),
     },
 }
@@ -22,8 +24,13 @@ VIDEOS: dict[str, dict[str, tuple[str, ...]]] = {
 
 TABLE_4_1: tuple[dict[str, Any], ...] = tuple(
     {
-        "sequence": name, "frames": frames, "keyframes": keyframes, "proposed": proposed, "bu_et_al": bu,
-        "pix4d": pix4d, "photoscan": photoscan,
+        "sequence": name,
+        "frames": frames,
+        "keyframes": keyframes,
+        "proposed": proposed,
+        "bu_et_al": bu,
+        "pix4d": pix4d,
+        "photoscan": photoscan,
     }
     for name, frames, keyframes, proposed, bu, pix4d, photoscan in (
         ("phantom3-npu", 19983, 457, 7.2, 9.32, 140.08, 538.38),
@@ -38,8 +45,20 @@ SECTION_4_1_1 = {"deviation": 0.15, "correlation": 0.80, "videos": 40}
 TABLE_4_3 = {"tp": 3167, "fp": 884, "fn": 41, "tn": 9779}
 TABLE_4_4 = {"precision": 0.7818, "recall": 0.9872, "accuracy": 0.9333, "f1": 0.8726}
 TABLE_4_5: tuple[dict[str, Any], ...] = (
-    {"method": "B. Wang et al. [100]", "precision": 0.48, "recall": 0.76, "accuracy": 0.9127, "f1": None},
-    {"method": "Q. Wang et al. [103]", "precision": 0.8366, "recall": None, "accuracy": None, "f1": None},
+    {
+        "method": "B. Wang et al. [100]",
+        "precision": 0.48,
+        "recall": 0.76,
+        "accuracy": 0.9127,
+        "f1": None,
+    },
+    {
+        "method": "Q. Wang et al. [103]",
+        "precision": 0.8366,
+        "recall": None,
+        "accuracy": None,
+        "f1": None,
+    },
     {"method": "thesis", "precision": 0.6715, "recall": 0.9588, "accuracy": 0.9954, "f1": 0.7898},
 )
 SECTION_4_2_2 = {"single_thread_s": 2.883, "multithread_s": 0.47}
@@ -50,10 +69,10 @@ TABLE_4_6: dict[str, dict[str, float]] = {
 
 FIGURES = {
     "3.12": "Two mosaics of one flight along a road: (a) by homographies, which widens and bends away in an arc; "
-            "(b) by rigid transforms of four degrees of freedom, which stays a straight band.",
+    "(b) by rigid transforms of four degrees of freedom, which stays a straight band.",
     "4.1": "(a) A mosaic at low altitude with three miniatures: a part of the mosaic, the frame it was made of, and "
-           "their difference, almost black. (b) A mosaic at high altitude by the thesis's method, and one by Bu et al. "
-           "[17], which look alike.",
+    "their difference, almost black. (b) A mosaic at high altitude by the thesis's method, and one by Bu et al. "
+    "[17], which look alike.",
     "4.2": "Mosaics of dirt and countryside at very low altitudes: clean bands without steps.",
     "4.3": "Three mosaics of urban ground at very low altitudes, with artifacts by parallax and low height.",
     "4.4": "A false positive: a small thing on the ground, seen from another side on the second flight.",

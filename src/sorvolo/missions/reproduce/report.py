@@ -23,7 +23,11 @@ NUMBERS, PAGE, MARKDOWN = "reproduction.json", "reproduction.html", "reproductio
 
 
 def write_reproduction(
-    out: Path, rows: Sequence[Row], place: Path, settings: ReproductionSettings, size: SimulatedSize | None
+    out: Path,
+    rows: Sequence[Row],
+    place: Path,
+    settings: ReproductionSettings,
+    size: SimulatedSize | None,
 ) -> dict[str, Any]:
     """Write reproduction.json, .html and .md and the tables' CSVs; what reproduction.json holds.
 
@@ -49,22 +53,31 @@ def reproduction_document(
 ) -> dict[str, Any]:
     """The content of reproduction.json: tables, rows, and what is missing."""
     made = [each for each in rows if not each.missing]
-    return plain_json({
-        "made_by": "sorvolo reproduce", "format": 1,
-        "dataset": f"{place}" if size is None else "a simulated dataset in UMCD's layout",
-        "size": _size_words(made, size), "made": _made(settings), "settings": asdict(settings),
-        "simulated": None if size is None else asdict(size), "tables": tables_of(rows), "figures": FIGURES,
-        "rows": [asdict(each) for each in made],
-        "missing": [{"id": each.id, "reason": each.missing} for each in rows if each.missing],
-    })
+    return plain_json(
+        {
+            "made_by": "sorvolo reproduce",
+            "format": 1,
+            "dataset": f"{place}" if size is None else "a simulated dataset in UMCD's layout",
+            "size": _size_words(made, size),
+            "made": _made(settings),
+            "settings": asdict(settings),
+            "simulated": None if size is None else asdict(size),
+            "tables": tables_of(rows),
+            "figures": FIGURES,
+            "rows": [asdict(each) for each in made],
+            "missing": [{"id": each.id, "reason": each.missing} for each in rows if each.missing],
+        }
+    )
 
 
 def _made(settings: ReproductionSettings) -> dict[str, str]:
     """How the tables were made, for people."""
     return {
-        "program": f"sorvolo {__version__}", "made at": datetime.now(UTC).isoformat(timespec="seconds"),
+        "program": f"sorvolo {__version__}",
+        "made at": datetime.now(UTC).isoformat(timespec="seconds"),
         "computer": f"{platform.machine()}, {os.cpu_count() or 1} cores, {platform.system()}",
-        "views compared": f"{settings.views_per_second:g} a second", "seed": str(settings.seed),
+        "views compared": f"{settings.views_per_second:g} a second",
+        "seed": str(settings.seed),
     }
 
 

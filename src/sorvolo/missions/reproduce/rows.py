@@ -40,7 +40,11 @@ class RowStore:
                 return None
         except (OSError, ValueError, KeyError, TypeError):
             return None
-        return row if all((self.picture_path(each)).is_file() for each in row.pictures.values()) else None
+        return (
+            row
+            if all((self.picture_path(each)).is_file() for each in row.pictures.values())
+            else None
+        )
 
     def put(self, row: Row, stamp: str) -> Row:
         """Keep a row; its values come back as JSON holds them. Raises StoreError on a full disk."""

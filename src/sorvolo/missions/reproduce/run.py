@@ -13,7 +13,12 @@ from sorvolo.errors import GeometryError, InputError, StoreError
 from sorvolo.missions.reproduce import comparisons, detectors, mosaics
 from sorvolo.missions.reproduce.published import VIDEOS
 from sorvolo.missions.reproduce.rows import Row, RowStore
-from sorvolo.missions.reproduce.settings import COMPARISONS, MAP_METHODS, PUBLISHED, ReproductionSettings
+from sorvolo.missions.reproduce.settings import (
+    COMPARISONS,
+    MAP_METHODS,
+    PUBLISHED,
+    ReproductionSettings,
+)
 from sorvolo.missions.reproduce.video_input import VideoInput, video_input
 from sorvolo.store.datasets.npu_folder import ENVIRONMENT, read_npu_folder
 from sorvolo.store.datasets.umcd_folder import UmcdFolder, UmcdVideo, read_umcd_folder
@@ -46,7 +51,12 @@ class _Task:
 
 
 def reproduce(
-    place: Path, out: Path, settings: ReproductionSettings, *, okutama: Path | None = None, npu: Path | None = None,
+    place: Path,
+    out: Path,
+    settings: ReproductionSettings,
+    *,
+    okutama: Path | None = None,
+    npu: Path | None = None,
     is_whole: bool = True,
 ) -> Iterator[ReproductionUpdate]:
     """Do the experiments of chapter 4 on the dataset in `place`, yielding each row of the tables as it is there.
@@ -60,7 +70,10 @@ def reproduce(
     started_s = time.monotonic()
     work = _Work(read_umcd_folder(place), out, settings)
     tasks = [
-        *(work.absent() if is_whole else ()), *work.mosaic_tasks(), *work.npu_tasks(npu), *work.change_tasks(),
+        *(work.absent() if is_whole else ()),
+        *work.mosaic_tasks(),
+        *work.npu_tasks(npu),
+        *work.change_tasks(),
         *work.detector_tasks(okutama),
     ]
     for number, task in enumerate(tasks, start=1):
@@ -87,21 +100,32 @@ class _Work:
             if (known := self._rows.find(task.id, stamp)) is not None:
                 return known, True
             values, pictures = task.make()
-            named = {name: self._rows.add_picture(f"{task.id}-{name}", jpeg) for name, jpeg in pictures.items()}
+            named = {
+                name: self._rows.add_picture(f"{task.id}-{name}", jpeg)
+                for name, jpeg in pictures.items()
+            }
         except (InputError, GeometryError, StoreError) as error:
             return Row(task.id, task.kind, missing=str(error)), False
         return self._rows.put(Row(task.id, task.kind, values, named), stamp), False
 
     def absent(self) -> Iterator[_Task]:
         """The videos of the thesis's tables that the folder lacks."""
-        lists = (self._dataset.without_telemetry, self._dataset.mosaicking, self._dataset.change_detection)
+        lists = (
+            self._dataset.without_telemetry,
+            self._dataset.mosaicking,
+            self._dataset.change_detection,
+        )
         for (part, wanted), found in zip(VIDEOS.items(), lists):
             there = {_plain(each.key) for each in found}
             for environment, names in wanted.items():
-                for name in names[:self._settings.videos]:
+                for name in names[: self._settings.videos]:
                     if _plain(f"{environment}/{name}") not in there:
                         where = f"{part}/{environment}/{name}.mp4"
-                        yield _Task(f"video/{where}", "video", missing=f"{where} is not in {self._dataset.place}")
+                        yield _Task(
+                            f"video/{where}",
+                            "video",
+                            missing=f"{where} is not in {self._dataset.place}",
+                        )
 
     def mosaic_tasks(self) -> Iterator[_Task]:
         """Section 4.1: Table 4.1 and its text, Figures 3.12 and 4.1 to 4.3."""
@@ -113,7 +137,10 @@ class _Work:
         if first is not None:
             for transform in ("similarity", "homography"):
                 yield self._task(
-                    "transform", f"{first.key}/{transform}", (first,), partial(self._transform, first, transform)
+                    "transform",
+                    f"{first.key}/{transform}",
+                    (first,),
+                    partial(self._transform, first, transform),
                 )
             yield self._task("example", first.key, (first,), partial(self._example, first))
         for each in self._chosen(self._dataset.without_telemetry):
@@ -121,14 +148,20 @@ class _Work:
 
     def npu_tasks(self, place: Path | None) -> Iterator[_Task]:
         """Table 4.1 on its own dataset, and the correlation with the mosaics of Bu et al."""
-        sequences = {each.video.key: each for each in read_npu_folder(place)} if place is not None else {}
+        sequences = (
+            {each.video.key: each for each in read_npu_folder(place)} if place is not None else {}
+        )
         for video in self._chosen([each.video for each in sequences.values()]):
             yield from self._tasks_of_map(video)
             mosaic = sequences[video.key].mosaic
             for method in MAP_METHODS:
                 row_id = f"{PUBLISHED}/{video.key}/{method}"
                 if mosaic is None:
-                    yield _Task(row_id, PUBLISHED, missing=f"{video.video}: no mosaic (.tif) of Bu et al. beside it")
+                    yield _Task(
+                        row_id,
+                        PUBLISHED,
+                        missing=f"{video.video}: no mosaic (.tif) of Bu et al. beside it",
+                    )
                     continue
                 make = partial(self._correlate_published, video, mosaic, method)
                 yield _Task(row_id, PUBLISHED, (*_files_of(video), mosaic), make)
@@ -144,19 +177,28 @@ class _Work:
                     reason = f"{later.video}: no mosaicking video of its path, so there is no map to compare it with"
                     yield _Task(f"comparison/{row_id}", "comparison", missing=reason)
                 else:
-                    yield self._task("comparison", row_id, (first, later), partial(self._compare, first, later, title))
+                    yield self._task(
+                        "comparison",
+                        row_id,
+                        (first, later),
+                        partial(self._compare, first, later, title),
+                    )
             if first is not None:
                 pairs.append((first, later))
         if pairs:
             first, later = pairs[0]
-            yield self._task("seconds", later.key, (first, later), partial(self._time, first, later))
+            yield self._task(
+                "seconds", later.key, (first, later), partial(self._time, first, later)
+            )
 
     def detector_tasks(self, okutama: Path | None) -> Iterator[_Task]:
         """Section 4.3: Table 4.6 and Figure 4.6."""
         videos = self._chosen(self._dataset.change_detection)
         models = ("standard", "extended") if self._settings.detector.steps else ()
         for model in (*models, "packaged"):
-            yield self._task("detector", f"UMCD/{model}", tuple(videos), partial(self._detect, videos, model))
+            yield self._task(
+                "detector", f"UMCD/{model}", tuple(videos), partial(self._detect, videos, model)
+            )
         if okutama is not None:
             for model in (*models, "packaged"):
                 make = partial(self._detect_okutama, okutama, model)
@@ -167,26 +209,36 @@ class _Work:
         chosen: dict[str, list[UmcdVideo]] = {}
         for each in videos:
             chosen.setdefault(each.environment.lower(), []).append(each)
-        return [each for group in chosen.values() for each in group[:self._settings.videos]]
+        return [each for group in chosen.values() for each in group[: self._settings.videos]]
 
     def _tasks_of_map(self, each: UmcdVideo) -> Iterator[_Task]:
         for method in MAP_METHODS:
             row_id = f"{'with' if each.has_telemetry else 'without'}/{each.key}/{method}"
             yield self._task("mosaic", row_id, (each,), partial(self._map, each, method))
 
-    def _task(self, kind: str, row_id: str, videos: Sequence[UmcdVideo], make: Callable[[], _Made]) -> _Task:
+    def _task(
+        self, kind: str, row_id: str, videos: Sequence[UmcdVideo], make: Callable[[], _Made]
+    ) -> _Task:
         files = tuple(path for each in videos for path in _files_of(each))
         camera = (self._dataset.camera,) if self._dataset.camera else ()
         return _Task(f"{kind}/{row_id}", kind, (*files, *camera), make)
 
     def _stamp(self, task: _Task) -> str:
         try:
-            files = [(self._name(path), path.stat().st_size, path.stat().st_mtime_ns) for path in task.files]
+            files = [
+                (self._name(path), path.stat().st_size, path.stat().st_mtime_ns)
+                for path in task.files
+            ]
         except OSError as error:
             raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from error
         of_kind = {
-            "comparison": (self._settings.views_per_second,), "seconds": (self._settings.repeats,),
-            "detector": (self._settings.detector, self._settings.views_per_second, self._settings.seed),
+            "comparison": (self._settings.views_per_second,),
+            "seconds": (self._settings.repeats,),
+            "detector": (
+                self._settings.detector,
+                self._settings.views_per_second,
+                self._settings.seed,
+            ),
         }
         return content_sha256(__version__, task.id, files, of_kind.get(task.kind, ()))
 
@@ -196,7 +248,9 @@ class _Work:
         return str(path.relative_to(place) if path.is_relative_to(place) else path)
 
     def _look_into(self, each: UmcdVideo) -> VideoInput:
-        camera = None if each.environment == ENVIRONMENT else self._dataset.camera  # another drone flew those
+        camera = (
+            None if each.environment == ENVIRONMENT else self._dataset.camera
+        )  # another drone flew those
         return video_input(each, camera)
 
     def _site(self, each: UmcdVideo, name: str) -> Path:
@@ -224,7 +278,11 @@ class _Work:
     def _map(self, each: UmcdVideo, method: str) -> _Made:
         site = self._map_site(each, method)
         values = self._map_into(site, each, method)
-        named = {"sequence": each.key, "environment": each.environment, "has_telemetry": each.has_telemetry}
+        named = {
+            "sequence": each.key,
+            "environment": each.environment,
+            "has_telemetry": each.has_telemetry,
+        }
         return {**named, "method": method, **values}, {"map": mosaics.map_jpeg(site)}
 
     def _correlate(self, each: UmcdVideo) -> _Made:
@@ -249,17 +307,33 @@ class _Work:
 
     def _compare(self, first: UmcdVideo, later: UmcdVideo, title: str) -> _Made:
         values, shown = comparisons.compare_video(
-            self._input(later), self._mapped(first, "planar"), self._out / "sites" / "compared", title, later,
+            self._input(later),
+            self._mapped(first, "planar"),
+            self._out / "sites" / "compared",
+            title,
+            later,
             self._settings.views_per_second,
         )
         pictures = {
-            f"{name}-{side}": jpeg for name, both in shown.items() for side, jpeg in zip(("map", "frame"), both)
+            f"{name}-{side}": jpeg
+            for name, both in shown.items()
+            for side, jpeg in zip(("map", "frame"), both)
         }
-        return {"sequence": later.key, "environment": later.environment, "method": title, **values}, pictures
+        return {
+            "sequence": later.key,
+            "environment": later.environment,
+            "method": title,
+            **values,
+        }, pictures
 
     def _time(self, first: UmcdVideo, later: UmcdVideo) -> _Made:
-        before, after = (self._input(replace(each, has_telemetry=False)) for each in (first, later))  # it needs none
-        return {"sequence": later.key, **comparisons.time_comparison(before, after, self._settings.repeats)}, {}
+        before, after = (
+            self._input(replace(each, has_telemetry=False)) for each in (first, later)
+        )  # it needs none
+        return {
+            "sequence": later.key,
+            **comparisons.time_comparison(before, after, self._settings.repeats),
+        }, {}
 
     def _detect(self, videos: Sequence[UmcdVideo], model: str) -> _Made:
         frames = self._out / "frames"
@@ -280,8 +354,17 @@ class _Work:
             out = self._out / "models" / f"{labels.form}-{model}"
             file = detectors.train_network(labels, out, model, wanted, seed)
             trained = {"preset": wanted.preset, "steps": wanted.steps}
-        values = {"dataset": labels.name, "model": model, **trained, **detectors.measure_model(file, tested)}
-        shown = detectors.example_pictures(file, tested) if model == "extended" or not wanted.steps else []
+        values = {
+            "dataset": labels.name,
+            "model": model,
+            **trained,
+            **detectors.measure_model(file, tested),
+        }
+        shown = (
+            detectors.example_pictures(file, tested)
+            if model == "extended" or not wanted.steps
+            else []
+        )
         return values, {str(number): jpeg for number, jpeg in enumerate(shown, start=1)}
 
 

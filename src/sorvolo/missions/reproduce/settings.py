@@ -64,11 +64,17 @@ class ReproductionSettings:
         if self.videos is not None and self.videos < 1:
             raise SettingsError(f"--videos must be 1 or more, got {self.videos}")
         if not 0.05 <= self.views_per_second <= 240:
-            raise SettingsError(f"--views-per-second must lie in 0.05 to 240, got {self.views_per_second:g}")
+            raise SettingsError(
+                f"--views-per-second must lie in 0.05 to 240, got {self.views_per_second:g}"
+            )
 
 
-def quick(settings: ReproductionSettings, size: SimulatedSize) -> tuple[ReproductionSettings, SimulatedSize]:
+def quick(
+    settings: ReproductionSettings, size: SimulatedSize
+) -> tuple[ReproductionSettings, SimulatedSize]:
     """The same at the size of a try: one short path of small pictures, and a training that only shows that it runs."""
-    detector = replace(settings.detector, steps=min(4, settings.detector.steps), side_px=128, weights="none")
+    detector = replace(
+        settings.detector, steps=min(4, settings.detector.steps), side_px=128, weights="none"
+    )
     small = replace(size, length_m=10.0, size_px=(480, 270), environments=("Countryside",))
     return replace(settings, videos=1, repeats=1, detector=detector), small

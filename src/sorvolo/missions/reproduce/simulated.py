@@ -13,7 +13,14 @@ from sorvolo.missions.simulate.site import SimulationProgress, simulate_site
 from sorvolo.simulation.presets import preset, preset_names
 from sorvolo.simulation.settings import SimulationSettings
 from sorvolo.store.atomic import atomic_write_bytes, writing
-from sorvolo.store.datasets.umcd_folder import CALIBRATION, CHANGES, MASKS_ENDING, MOSAICKING, WITH, WITHOUT
+from sorvolo.store.datasets.umcd_folder import (
+    CALIBRATION,
+    CHANGES,
+    MASKS_ENDING,
+    MOSAICKING,
+    WITH,
+    WITHOUT,
+)
 from sorvolo.store.datasets.umcd_writing import umcd_metadata
 from sorvolo.store.exports.plain import json_bytes
 
@@ -47,34 +54,53 @@ def chosen_presets(size: SimulatedSize, videos: int | None) -> list[str]:
     chosen: list[str] = []
     for environment in size.environments:
         for start, most in ((_WITH, videos), (_WITHOUT, size.bare_videos)):
-            chosen += [name for name in preset_names() if name.startswith(f"{start}{environment.lower()}-")][:most]
+            chosen += [
+                name for name in preset_names() if name.startswith(f"{start}{environment.lower()}-")
+            ][:most]
     return chosen
 
 
-def simulation_of(name: str, size: SimulatedSize, settings: ReproductionSettings) -> SimulationSettings:
+def simulation_of(
+    name: str, size: SimulatedSize, settings: ReproductionSettings
+) -> SimulationSettings:
     """A preset at this size: every video by one camera, as the dataset has one calibration."""
     wanted = preset(name)
     imaging = replace(wanted.imaging, width_px=size.size_px[0], height_px=size.size_px[1])
-    length_m = wanted.path.length_m if size.length_m is None else min(size.length_m, wanted.path.length_m)
+    length_m = (
+        wanted.path.length_m if size.length_m is None else min(size.length_m, wanted.path.length_m)
+    )
     step = max(1, round(imaging.fps / settings.views_per_second))
     return replace(
-        wanted, seed=settings.seed, imaging=imaging, path=replace(wanted.path, length_m=length_m),
+        wanted,
+        seed=settings.seed,
+        imaging=imaging,
+        path=replace(wanted.path, length_m=length_m),
         output=replace(wanted.output, truth_step=step),
     )
 
 
 def _claim(place: Path, size: SimulatedSize, settings: ReproductionSettings) -> None:
-    wanted = json.loads(json_bytes({
-        "made_by": "sorvolo reproduce --simulated", "seed": settings.seed,
-        "views_per_second": settings.views_per_second, **asdict(size),
-    }))
+    wanted = json.loads(
+        json_bytes(
+            {
+                "made_by": "sorvolo reproduce --simulated",
+                "seed": settings.seed,
+                "views_per_second": settings.views_per_second,
+                **asdict(size),
+            }
+        )
+    )
     mark = place / MARK
     if mark.is_file():
         if json.loads(mark.read_text(encoding="utf-8")) != wanted:
-            raise SettingsError(f"{place}: holds a simulated dataset of another size or seed; choose another --out")
+            raise SettingsError(
+                f"{place}: holds a simulated dataset of another size or seed; choose another --out"
+            )
         return
     if place.exists() and any(place.iterdir()):
-        raise SettingsError(f"{place}: is not empty and holds no simulated dataset; choose another --out")
+        raise SettingsError(
+            f"{place}: is not empty and holds no simulated dataset; choose another --out"
+        )
     with writing(place):
         place.mkdir(parents=True, exist_ok=True)
     atomic_write_bytes(mark, json_bytes(wanted))
@@ -99,7 +125,9 @@ class _Path:
 def _path_of(preset_name: str) -> _Path:
     """Urban, path1, with telemetry: of "umcd-telemetry-urban-path1"."""
     has_telemetry = preset_name.startswith(_WITH)
-    environment, _, name = preset_name.removeprefix(_WITH if has_telemetry else _WITHOUT).partition("-")
+    environment, _, name = preset_name.removeprefix(_WITH if has_telemetry else _WITHOUT).partition(
+        "-"
+    )
     return _Path(environment.capitalize(), name, has_telemetry)
 
 
@@ -115,7 +143,10 @@ def _arrange(made: Path, place: Path, path: _Path) -> None:
             ending = _NMEA_ENDING.get(file.suffix, file.suffix)
             if file.is_file() and ending != ".xml":
                 _move(file, place / WITH / part / environment / f"{path.name}{ending}")
-    objects, boxes = _read(made / "truth" / "objects.geojson"), _read(made / "truth" / "flight2" / "boxes.json")
+    objects, boxes = (
+        _read(made / "truth" / "objects.geojson"),
+        _read(made / "truth" / "flight2" / "boxes.json"),
+    )
     fps = preset(f"{_WITH}{environment.lower()}-{path.name}").imaging.fps
     text = umcd_metadata(fps, objects["features"], boxes, flight=2)
     atomic_write_bytes(place / WITH / CHANGES / environment / f"{path.name}.txt", text.encode())

@@ -33,10 +33,14 @@ def tables_of(rows: Sequence[Row]) -> dict[str, Any]:
     tables: dict[str, Any] = {
         "table_4_1": _both(TABLE_4_1, _mosaics(made)),
         "section_4_1_1": _both(SECTION_4_1_1, _deviations(made)),
-        "figure_3_12": _both(FIGURES["3.12"], [dict(row.values) for row in made if row.kind == "transform"]),
+        "figure_3_12": _both(
+            FIGURES["3.12"], [dict(row.values) for row in made if row.kind == "transform"]
+        ),
         "tables_4_3_and_4_4": _both({"method": "thesis", **TABLE_4_3, **TABLE_4_4}, frames),
         "table_4_5": _both(TABLE_4_5, _pooled(made, "pixels")),
-        "section_4_2_2": _both(SECTION_4_2_2, [dict(row.values) for row in made if row.kind == "seconds"]),
+        "section_4_2_2": _both(
+            SECTION_4_2_2, [dict(row.values) for row in made if row.kind == "seconds"]
+        ),
         "table_4_6": _both(TABLE_4_6, [dict(row.values) for row in made if row.kind == "detector"]),
     }
     for name, texts in DIFFERENCES.items():
@@ -50,8 +54,18 @@ def _both(published: Any, ours: Any) -> dict[str, Any]:
 
 def _mosaics(rows: Iterable[Row]) -> list[dict[str, Any]]:
     keys = (
-        "sequence", "has_telemetry", "method", "frames", "keyframes", "matched", "minutes", "cpu_minutes",
-        "seconds_per_keyframe", "deviation", "quality", "camera",
+        "sequence",
+        "has_telemetry",
+        "method",
+        "frames",
+        "keyframes",
+        "matched",
+        "minutes",
+        "cpu_minutes",
+        "seconds_per_keyframe",
+        "deviation",
+        "quality",
+        "camera",
     )
     return [{key: row.values[key] for key in keys} for row in rows if row.kind == "mosaic"]
 
@@ -63,13 +77,24 @@ def _deviations(rows: Sequence[Row]) -> list[dict[str, Any]]:
     found = []
     for method in MAP_METHODS:
         own = [row for row in rows if row.values.get("method") == method]
-        shares = _values([row for row in own if row.values.get("environment") != ENVIRONMENT], "mosaic", "deviation")
+        shares = _values(
+            [row for row in own if row.values.get("environment") != ENVIRONMENT],
+            "mosaic",
+            "deviation",
+        )
         published = _values(own, PUBLISHED, "correlation")
         if shares or published:
-            found.append({
-                "method": method, "videos": len(shares), "deviation": _mean(shares), "correlation": _mean(alike),
-                "correlated": len(alike), "published_correlation": _mean(published), "published": len(published),
-            })
+            found.append(
+                {
+                    "method": method,
+                    "videos": len(shares),
+                    "deviation": _mean(shares),
+                    "correlation": _mean(alike),
+                    "correlated": len(alike),
+                    "published_correlation": _mean(published),
+                    "published": len(published),
+                }
+            )
     return found
 
 
@@ -84,21 +109,33 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def _pooled(rows: Iterable[Row], kind: str) -> list[dict[str, Any]]:
     """Counts of all videos together and the rates of section 4.2.1, by method and by what they were judged by."""
-    compared = [row.values for row in rows if row.kind == "comparison" and row.values[kind] is not None]
+    compared = [
+        row.values for row in rows if row.kind == "comparison" and row.values[kind] is not None
+    ]
     result = []
     for title in COMPARISONS:
         for judged_by in (MASKS, TIMES):
-            parts = [each for each in compared if each["method"] == title and each["judged_by"] == judged_by]
+            parts = [
+                each
+                for each in compared
+                if each["method"] == title and each["judged_by"] == judged_by
+            ]
             if parts:
                 result.append(_summed(title, judged_by, parts, kind))
     return result
 
 
-def _summed(title: str, judged_by: str, parts: Sequence[Mapping[str, Any]], kind: str) -> dict[str, Any]:
+def _summed(
+    title: str, judged_by: str, parts: Sequence[Mapping[str, Any]], kind: str
+) -> dict[str, Any]:
     whole = sum((Counts(**each[kind]) for each in parts), Counts())
     return {
-        "method": title, "judged_by": judged_by, "videos": len(parts),
-        "views": sum(each["views"] for each in parts), "compared": sum(each["compared"] for each in parts),
-        **{name: getattr(whole, name) for name in _COUNTS}, **rates(whole),
+        "method": title,
+        "judged_by": judged_by,
+        "videos": len(parts),
+        "views": sum(each["views"] for each in parts),
+        "compared": sum(each["compared"] for each in parts),
+        **{name: getattr(whole, name) for name in _COUNTS},
+        **rates(whole),
         "cpu_seconds_per_view": sum(each["cpu_seconds_per_view"] for each in parts) / len(parts),
     }

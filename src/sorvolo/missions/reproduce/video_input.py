@@ -40,7 +40,10 @@ def video_input(each: UmcdVideo, camera: Path | None) -> VideoInput:
             f"{each.video}: no telemetry beside it (found: {beside}); add the table or the NMEA log under its name"
         )
     return VideoInput(
-        each.video, telemetry, _fitting(camera, info.width_px, info.height_px), info.frame_rate_hz,
+        each.video,
+        telemetry,
+        _fitting(camera, info.width_px, info.height_px),
+        info.frame_rate_hz,
         (info.width_px, info.height_px),
     )
 

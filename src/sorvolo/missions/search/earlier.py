@@ -36,7 +36,12 @@ class EarlierFlights:
     """
 
     def __init__(
-        self, archive: Archive, but: str, prepared: PreparedSearch, settings: SearchSettings, outputs: SearchOutputs
+        self,
+        archive: Archive,
+        but: str,
+        prepared: PreparedSearch,
+        settings: SearchSettings,
+        outputs: SearchOutputs,
     ) -> None:
         site, before = archive.site(), read_plants(outputs.folder)
         self._left: deque[_Flight] = deque()
@@ -53,12 +58,19 @@ class EarlierFlights:
             basis = Basis.of(frames, prepared, settings, heights=mark)
             known, searched = before.get(name, (None, None))
             if known is not None and searched is not None and known.serves(basis):
-                self._left.append(_Flight(name, frames, site, basis.classes, searched, above, settings))
+                self._left.append(
+                    _Flight(name, frames, site, basis.classes, searched, above, settings)
+                )
 
     @property
     def uncounted_m(self) -> list[PointsM]:
         """The ground of each frame of the flights that do not count yet, or never will, (4, 2) site metres."""
-        return [each for name, own in self._outlines_m.items() if name not in self.frames for each in own]
+        return [
+            each
+            for name, own in self._outlines_m.items()
+            if name not in self.frames
+            for each in own
+        ]
 
     def look(self) -> bool:
         """Look at one more frame; whether there was one."""
@@ -78,7 +90,10 @@ class EarlierFlights:
         moved = []
         for own, flight in self._measured:
             rows = own.rows_at(cells.centres_m)
-            classes = [replace(each, seen=each.seen.at(rows), chances=each.chances.at(rows)) for each in flight.classes]
+            classes = [
+                replace(each, seen=each.seen.at(rows), chances=each.chances.at(rows))
+                for each in flight.classes
+            ]
             moved.append(replace(flight, classes=tuple(classes)))
         return moved
 
@@ -87,15 +102,26 @@ class _Flight:
     """One flight while its frames are looked at."""
 
     def __init__(
-        self, name: str, frames: Sequence[SearchFrame], site: Site, labels: Sequence[str], searched: SearchedPlants,
-        above: AboveGround | None, settings: SearchSettings,
+        self,
+        name: str,
+        frames: Sequence[SearchFrame],
+        site: Site,
+        labels: Sequence[str],
+        searched: SearchedPlants,
+        above: AboveGround | None,
+        settings: SearchSettings,
     ) -> None:
         self.name, self.frames, self._settings, self._searched = name, frames, settings, searched
         self.cells = cells_of([each.placed.outline_m for each in frames], site, None)
-        self._sun, self._has_heights = sun_at(frames[len(frames) // 2], site, settings), above is not None
+        self._sun, self._has_heights = (
+            sun_at(frames[len(frames) // 2], site, settings),
+            above is not None,
+        )
         on = partial(Gathering, above=above)
         self._cells = {label: on(self.cells.centres_m, reach_m(label)) for label in labels}
-        self._plants = {label: on(plants_of(label, searched.plants)[0], reach_m(label)) for label in labels}
+        self._plants = {
+            label: on(plants_of(label, searched.plants)[0], reach_m(label)) for label in labels
+        }
         self._looked, self._is_thermal, self._blur_px = 0, False, 0.0
 
     @property
@@ -115,13 +141,22 @@ class _Flight:
     def measured(self) -> MeasuredFlight:
         """What its plants state of its own cells."""
         return MeasuredFlight(
-            self.name, len(self.frames), self._searched, self._sun is not None, self._has_heights, self._is_thermal,
-            self._blur_px, tuple(map(self._class, self._cells)), is_earlier=True,
+            self.name,
+            len(self.frames),
+            self._searched,
+            self._sun is not None,
+            self._has_heights,
+            self._is_thermal,
+            self._blur_px,
+            tuple(map(self._class, self._cells)),
+            is_earlier=True,
         )
 
     def _class(self, label: str) -> MeasuredClass:
         seen, plants_seen = self._cells[label].conditions(), self._plants[label].conditions()
-        return measured_class(label, seen, self._searched.plants, lambda _, __: plants_seen, self._settings)
+        return measured_class(
+            label, seen, self._searched.plants, lambda _, __: plants_seen, self._settings
+        )
 
 
 def _frames_of(archive: Archive, name: str) -> list[SearchFrame]:

@@ -9,7 +9,14 @@ from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.plan_flight import ReflySettings
 from sorvolo.missions.search.refly import write_refly
-from sorvolo.missions.search.report import Searched, SoFar, State, build_search_report, hole_numbers, total_of
+from sorvolo.missions.search.report import (
+    Searched,
+    SoFar,
+    State,
+    build_search_report,
+    hole_numbers,
+    total_of,
+)
 from sorvolo.missions.search.settings import FIGURES, SearchOutputs, SearchSettings
 from sorvolo.search.holes import POD_EDGES, REASONS, flyable, pod_classes, without_seen
 from sorvolo.store.atomic import atomic_write_bytes, writing
@@ -28,8 +35,13 @@ from sorvolo.store.pages.search import search_page
 
 
 def write_search(
-    searched: Searched, tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, settings: SearchSettings,
-    outputs: SearchOutputs, detector: ObjectDetector, so_far: SoFar | None = None,
+    searched: Searched,
+    tiles: Mapping[TileIndex, ImageRGBA],
+    site_grid: SiteGrid,
+    settings: SearchSettings,
+    outputs: SearchOutputs,
+    detector: ObjectDetector,
+    so_far: SoFar | None = None,
     seen_before_m: Sequence[PointsM] = (),
 ) -> dict[str, Any]:
     """Write all files of a measured search over the map of these `tiles`, and return its report.
@@ -45,7 +57,10 @@ def write_search(
     bands, features, pictures = {}, [], {}
     shown = picture(tiles, PICTURE_PX)
     for label in searched.labels:
-        total, holes = total_of(searched, label), hole_numbers(searched, label, settings, detector.info)
+        total, holes = (
+            total_of(searched, label),
+            hole_numbers(searched, label, settings, detector.info),
+        )
         classes = cells.as_grid(pod_classes(total, cells.wanted))
         hole_grid = cells.as_grid(holes)
         for name, values in (("pod", total.mean), ("low", total.low), ("high", total.high)):
@@ -53,16 +68,37 @@ def write_search(
         features += _features(label, regions_of(classes, grid), regions_of(hole_grid, grid))
         pictures[label] = pod_picture(shown, site_grid, classes, hole_grid > 0, grid)
         if label == searched.labels[0]:
-            again = regions_of(cells.as_grid(flyable(without_seen(holes, cells, seen_before_m))), grid)
-    write_pod_tif(outputs.folder / "pod.tif", bands, grid, {"sorvolo": "probability of detection; docs/search.md"})
+            again = regions_of(
+                cells.as_grid(flyable(without_seen(holes, cells, seen_before_m))), grid
+            )
+    write_pod_tif(
+        outputs.folder / "pod.tif",
+        bands,
+        grid,
+        {"sorvolo": "probability of detection; docs/search.md"},
+    )
     collection = feature_collection("pod", features, is_local=False)
     atomic_write_bytes(outputs.folder / "pod.geojson", geojson_bytes(collection))
     was_stopped = so_far is not None and so_far.state is State.STOPPED
-    refly = None if was_stopped else write_refly(
-        again, grid, searched, settings, detector.info, outputs.refly, dji_drone=outputs.dji_drone
+    refly = (
+        None
+        if was_stopped
+        else write_refly(
+            again,
+            grid,
+            searched,
+            settings,
+            detector.info,
+            outputs.refly,
+            dji_drone=outputs.dji_drone,
+        )
     )
-    warnings = [] if refly is not None else _without_waypoints(
-        outputs.refly, was_stopped=was_stopped, leaves_earlier=len(seen_before_m) > 0
+    warnings = (
+        []
+        if refly is not None
+        else _without_waypoints(
+            outputs.refly, was_stopped=was_stopped, leaves_earlier=len(seen_before_m) > 0
+        )
     )
     report = build_search_report(searched, settings, detector, refly, so_far, warnings)
     atomic_write_bytes(outputs.folder / "search.json", json_bytes(report))
@@ -87,14 +123,20 @@ def _removed(files: Sequence[Path]) -> list[str]:
     return there
 
 
-def _without_waypoints(files: Sequence[Path], *, was_stopped: bool, leaves_earlier: bool) -> list[str]:
+def _without_waypoints(
+    files: Sequence[Path], *, was_stopped: bool, leaves_earlier: bool
+) -> list[str]:
     """Take away earlier waypoints at these files, and what a person who asked for some has to know; `leaves_earlier`:
     what earlier flights show was not to be flown."""
     old = _removed(files)
     if not files:
         return []
     if was_stopped:
-        return [f"the flight was stopped, and its waypoints were taken away: {', '.join(old)}"] if old else []
+        return (
+            [f"the flight was stopped, and its waypoints were taken away: {', '.join(old)}"]
+            if old
+            else []
+        )
     removed = f"; earlier ones were taken away: {', '.join(old)}" if old else ""
     beside = " and that flights before it do not show" if leaves_earlier else ""
     return [
@@ -103,10 +145,14 @@ def _without_waypoints(files: Sequence[Path], *, was_stopped: bool, leaves_earli
     ]
 
 
-def _features(label: str, classes: Sequence[Region], holes: Sequence[Region]) -> list[dict[str, Any]]:
+def _features(
+    label: str, classes: Sequence[Region], holes: Sequence[Region]
+) -> list[dict[str, Any]]:
     """Polygons of equal classes of probability, then the holes with their reasons."""
     ranges = [(POD_EDGES[each.number - 1], POD_EDGES[each.number]) for each in classes]
-    properties = [{"kind": "pod", "class": label, "pod_from": low, "pod_to": high} for low, high in ranges]
+    properties = [
+        {"kind": "pod", "class": label, "pod_from": low, "pod_to": high} for low, high in ranges
+    ]
     reasons = [
         {"kind": "hole", "class": label, "reason": REASONS[each.number].value} for each in holes
     ]

@@ -8,9 +8,20 @@ from sorvolo.errors import InputError
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.search.files import write_search
 from sorvolo.missions.search.frames import flights_to_search, marked_heights, search_frames
-from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, SearchProgress, measure_flight
+from sorvolo.missions.search.measure import (
+    MeasuredFlight,
+    SearchFrame,
+    SearchProgress,
+    measure_flight,
+)
 from sorvolo.missions.search.measured_before import Basis, read_plants, write_plants
-from sorvolo.missions.search.prepare import PreparedSearch, check_area, known_places, prepare_search, site_with_metres
+from sorvolo.missions.search.prepare import (
+    PreparedSearch,
+    check_area,
+    known_places,
+    prepare_search,
+    site_with_metres,
+)
 from sorvolo.missions.search.report import Searched
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.search.cells import Cells, cells_of
@@ -19,7 +30,10 @@ from sorvolo.store.site.archive import Archive
 
 
 def search_site(
-    site_folder: Path, settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector | None = None
+    site_folder: Path,
+    settings: SearchSettings,
+    outputs: SearchOutputs,
+    detector: ObjectDetector | None = None,
 ) -> Generator[SearchProgress | dict[str, Any]]:
     """Measure the flights of a site, yielding progress and, at last, the report; files appear in `outputs.folder`.
 
@@ -35,19 +49,31 @@ def search_site(
         names = flights_to_search(archive, outputs.flights)
         frames = {name: search_frames(archive, name) for name in names}
         if not frames:
-            raise InputError(f"{site_folder} has no mapped flight: sorvolo map INPUT --site {site_folder} makes one")
+            raise InputError(
+                f"{site_folder} has no mapped flight: sorvolo map INPUT --site {site_folder} makes one"
+            )
         outlines_m = [each.placed.outline_m for own in frames.values() for each in own]
         cells = cells_of(outlines_m, site, None if area is None else area.polygons_m(site.frame))
         measured = yield from _measured(frames, cells, archive, prepared, settings, outputs.folder)
         searched = Searched(
-            site, cells, tuple(measured), {name: tuple(own) for name, own in frames.items()}, prepared.segments
+            site,
+            cells,
+            tuple(measured),
+            {name: tuple(own) for name, own in frames.items()},
+            prepared.segments,
         )
-        yield write_search(searched, archive.tiles(), archive.site_grid(), settings, outputs, prepared.detector)
+        yield write_search(
+            searched, archive.tiles(), archive.site_grid(), settings, outputs, prepared.detector
+        )
 
 
 def _measured(
-    frames: Mapping[str, Sequence[SearchFrame]], cells: Cells, archive: Archive, prepared: PreparedSearch,
-    settings: SearchSettings, folder: Path,
+    frames: Mapping[str, Sequence[SearchFrame]],
+    cells: Cells,
+    archive: Archive,
+    prepared: PreparedSearch,
+    settings: SearchSettings,
+    folder: Path,
 ) -> Generator[SearchProgress, None, list[MeasuredFlight]]:
     """Each flight measured, one after the other; what an earlier search of the same measured is taken from it."""
     site, known_m, measured = archive.site(), known_places(archive), []

@@ -21,7 +21,9 @@ def flights_to_search(archive: Archive, wanted: Sequence[str]) -> list[str]:
     """The names of the site's mapped flights, or of those wanted. Raises InputError for one that the site has not."""
     known = _mapped(archive)
     if unknown := [name for name in wanted if name not in known]:
-        raise InputError(f"the site {archive.folder} has no flight {unknown[0]!r}; it has {', '.join(known) or 'none'}")
+        raise InputError(
+            f"the site {archive.folder} has no flight {unknown[0]!r}; it has {', '.join(known) or 'none'}"
+        )
     return [name for name in known if not wanted or name in wanted]
 
 
@@ -33,10 +35,14 @@ def _mapped(archive: Archive) -> list[str]:
 def search_frames(archive: Archive, flight_id: str) -> list[SearchFrame]:
     """The frames of a flight that have a place. Raises InputError where none has."""
     frames = [
-        frame for stored in archive.keyframes(flight_id) if (frame := search_frame(archive, stored)) is not None
+        frame
+        for stored in archive.keyframes(flight_id)
+        if (frame := search_frame(archive, stored)) is not None
     ]
     if not frames:
-        raise InputError(f"no frame of the flight {flight_id} has a place on the ground; map it again")
+        raise InputError(
+            f"no frame of the flight {flight_id} has a place on the ground; map it again"
+        )
     return frames
 
 
@@ -59,8 +65,14 @@ def marked_heights(archive: Archive, flight_id: str) -> tuple[AboveGround | None
     none."""
     for each in (flight_id, flight_with_heights(archive, "")):
         try:
-            if each is not None and (report := archive.height_path(each, HeightFile.REPORT)).exists():
-                surface, ground = (read_field(archive, each, file) for file in (HeightFile.SURFACE, HeightFile.GROUND))
+            if (
+                each is not None
+                and (report := archive.height_path(each, HeightFile.REPORT)).exists()
+            ):
+                surface, ground = (
+                    read_field(archive, each, file)
+                    for file in (HeightFile.SURFACE, HeightFile.GROUND)
+                )
                 return partial(above_ground, surface, ground), content_sha256(report.read_text())
         except InputError:
             continue  # of an earlier map, or damaged: a search can do without
@@ -74,6 +86,16 @@ def _placed(stored: StoredKeyframe) -> PlacedFrame | None:
     if pose is None or not is_on_ground(outline_m := footprint(stored.camera, pose)):
         return None
     return PlacedFrame(
-        stored.name, stored.index, stored.time_ns, stored.status, "", stored.camera, pose, stored.site_from_image,
-        outline_m, stored.residual_px, stored.sigma_m, stored.gains,
+        stored.name,
+        stored.index,
+        stored.time_ns,
+        stored.status,
+        "",
+        stored.camera,
+        pose,
+        stored.site_from_image,
+        outline_m,
+        stored.residual_px,
+        stored.sigma_m,
+        stored.gains,
     )

@@ -48,8 +48,15 @@ class GrowingMeasure:
     """
 
     def __init__(
-        self, name: str, site: Site, detector: ObjectDetector, settings: SearchSettings, *,
-        area_m: Sequence[Sequence[PointsM]] | None, keep_off_m: Sequence[Floats], above: AboveGround | None,
+        self,
+        name: str,
+        site: Site,
+        detector: ObjectDetector,
+        settings: SearchSettings,
+        *,
+        area_m: Sequence[Sequence[PointsM]] | None,
+        keep_off_m: Sequence[Floats],
+        above: AboveGround | None,
     ) -> None:
         self._name, self._site, self._detector, self._settings = name, site, detector, settings
         self._area_m, self._keep_off_m, self._above = area_m, keep_off_m, above
@@ -58,7 +65,9 @@ class GrowingMeasure:
         self._things: list[Thing] = []
         self._looks: list[FrameLook] = []
         self._pictures: dict[int, tuple[PlacedFrame, Sequence[int], SearchedPicture]] = {}
-        self._fresh: set[int] = set()  # plants that were shown since it was last asked which are reported
+        self._fresh: set[int] = (
+            set()
+        )  # plants that were shown since it was last asked which are reported
         self._reported: set[int] = set()
         self._least: dict[str, float] = {}
         self._has_shadows = self._is_thermal = False
@@ -72,7 +81,11 @@ class GrowingMeasure:
         if self._field is None or not self._field.fits(outline_m):
             self._forget()
             self._field = PlantField(
-                self._wanted, outline_m, keep_off_m=self._keep_off_m, free_m=KEEP_OFF_M, seed=self._settings.seed
+                self._wanted,
+                outline_m,
+                keep_off_m=self._keep_off_m,
+                free_m=KEEP_OFF_M,
+                seed=self._settings.seed,
             )
         pose, image = pose_of(frame.placed), frame.image()
         assert pose is not None  # frames without a place are none of these
@@ -81,10 +94,17 @@ class GrowingMeasure:
         numbers = self._field.near(outline_m, _REACH_M)
         self._grow(self._field)
         things = [self._things[each] for each in numbers]
-        under = gather([look], [each.place_m(0)[:2] for each in things], 0.5, self._above).under_trees
-        shown = [self._settings.through_crowns if hidden and self._settings.through_crowns else 1.0 for hidden in under]
+        under = gather(
+            [look], [each.place_m(0)[:2] for each in things], 0.5, self._above
+        ).under_trees
+        shown = [
+            self._settings.through_crowns if hidden and self._settings.through_crowns else 1.0
+            for hidden in under
+        ]
         seed = self._settings.seed + frame.placed.index
-        seen = search_planted(frame, image, light, things, sun, shown, seed, self._detector, self._wanted)
+        seen = search_planted(
+            frame, image, light, things, sun, shown, seed, self._detector, self._wanted
+        )
         if seen is not None:
             self._pictures[frame.placed.index] = frame.placed, numbers, seen
             self._fresh.update(numbers)
@@ -109,17 +129,30 @@ class GrowingMeasure:
         at = conditions_at([each.place_m for each in places], 0.5)
         hides = at.roofs if self._settings.through_crowns > 0 else at.roofs | at.beside_trees
         gathered = [
-            (place, number in self._reported) for number, (place, hidden) in enumerate(zip(places, hides)) if not hidden
+            (place, number in self._reported)
+            for number, (place, hidden) in enumerate(zip(places, hides))
+            if not hidden
         ]
         classes = tuple(
             measured_class(
-                label, conditions_at(cells.centres_m, reach_m(label)), gathered, conditions_at, self._settings
-            ) for label in self._wanted
+                label,
+                conditions_at(cells.centres_m, reach_m(label)),
+                gathered,
+                conditions_at,
+                self._settings,
+            )
+            for label in self._wanted
         )
         searched = SearchedPlants(len(self._pictures), 1, self._seconds, tuple(gathered))
         return cells, MeasuredFlight(
-            self._name, len(self.frames), searched, self._has_shadows, self._above is not None, self._is_thermal,
-            self._blur_px, classes,
+            self._name,
+            len(self.frames),
+            searched,
+            self._has_shadows,
+            self._above is not None,
+            self._is_thermal,
+            self._blur_px,
+            classes,
         )
 
     def _judge_fresh(self, places: Sequence[PlantPlace]) -> None:
@@ -130,12 +163,17 @@ class GrowingMeasure:
         known = near_any([each.place_m for each in places], fresh_m, 2 * _AROUND_M)
         wanted = set(known)
         pictures = [each for each in self._pictures.values() if not wanted.isdisjoint(each[1])]
-        boxes = {placed.index: rows_of(seen.boxes_px, numbers, known) for placed, numbers, seen in pictures}
+        boxes = {
+            placed.index: rows_of(seen.boxes_px, numbers, known)
+            for placed, numbers, seen in pictures
+        }
         laid = [each for _, _, seen in pictures for each in seen.laid]
         near = near_any([each.sighting.position_m for each in laid], fresh_m, _AROUND_M)
         labels = [places[each].label for each in known]
         frames = [placed for placed, _, _ in pictures]
-        reported = reported_plants([laid[each] for each in near], frames, boxes, labels, self._least)
+        reported = reported_plants(
+            [laid[each] for each in near], frames, boxes, labels, self._least
+        )
         self._reported -= self._fresh
         self._reported |= {known[row] for row in reported} & self._fresh
         self._fresh.clear()

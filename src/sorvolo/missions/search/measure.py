@@ -95,8 +95,14 @@ class SearchProgress:
 
 
 def measure_flight(
-    name: str, frames: Sequence[SearchFrame], cells: Cells, site: Site, detector: ObjectDetector,
-    settings: SearchSettings, keep_off_m: Sequence[Floats], above: AboveGround | None = None,
+    name: str,
+    frames: Sequence[SearchFrame],
+    cells: Cells,
+    site: Site,
+    detector: ObjectDetector,
+    settings: SearchSettings,
+    keep_off_m: Sequence[Floats],
+    above: AboveGround | None = None,
     before: SearchedPlants | None = None,
 ) -> Iterator[SearchProgress | MeasuredFlight]:
     """Measure one flight over a site with metres; yields progress and, at last, what was measured.
@@ -112,22 +118,46 @@ def measure_flight(
     seen = {label: conditions_at(cells.centres_m, reach_m(label)) for label in wanted}
     if before is None:
         places = plant_places(
-            cells, seen[wanted[0]], wanted, settings.plants, keep_off_m=keep_off_m, free_m=KEEP_OFF_M,
-            rng=seeded(settings.seed), usable=_usable(seen[wanted[0]], cells, settings),
+            cells,
+            seen[wanted[0]],
+            wanted,
+            settings.plants,
+            keep_off_m=keep_off_m,
+            free_m=KEEP_OFF_M,
+            rng=seeded(settings.seed),
+            usable=_usable(seen[wanted[0]], cells, settings),
         )
-        searched = yield from _searched(name, frames, lights, conditions_at, places, sun, detector, wanted, settings)
+        searched = yield from _searched(
+            name, frames, lights, conditions_at, places, sun, detector, wanted, settings
+        )
     else:
         searched = before
-    classes = tuple(measured_class(label, seen[label], searched.plants, conditions_at, settings) for label in wanted)
+    classes = tuple(
+        measured_class(label, seen[label], searched.plants, conditions_at, settings)
+        for label in wanted
+    )
     yield MeasuredFlight(
-        name, len(frames), searched, sun is not None, above is not None, any(each.is_thermal for each in lights),
-        max((each.blur_px for each in lights), default=0.0), classes, is_earlier=before is not None,
+        name,
+        len(frames),
+        searched,
+        sun is not None,
+        above is not None,
+        any(each.is_thermal for each in lights),
+        max((each.blur_px for each in lights), default=0.0),
+        classes,
+        is_earlier=before is not None,
     )
 
 
 def _searched(
-    name: str, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], conditions_at: ConditionsAt,
-    rounds: Sequence[Sequence[PlantPlace]], sun: Vector3 | None, detector: ObjectDetector, wanted: Sequence[str],
+    name: str,
+    frames: Sequence[SearchFrame],
+    lights: Sequence[FrameLight],
+    conditions_at: ConditionsAt,
+    rounds: Sequence[Sequence[PlantPlace]],
+    sun: Vector3 | None,
+    detector: ObjectDetector,
+    wanted: Sequence[str],
     settings: SearchSettings,
 ) -> Generator[SearchProgress, None, SearchedPlants]:
     """Plant one round after the other and search the frames."""
@@ -135,7 +165,10 @@ def _searched(
     gathered: list[Planted] = []
     number = looked = 0
     for place_round in rounds:
-        things = [new_plant(number + k, each.label, each.place_m, settings.seed) for k, each in enumerate(place_round)]
+        things = [
+            new_plant(number + k, each.label, each.place_m, settings.seed)
+            for k, each in enumerate(place_round)
+        ]
         number += len(things)
         run = _Round(frames, lights, conditions_at, things, sun, settings)
         yield from run.search(name, detector, wanted, looked, len(rounds) * len(frames), gathered)
@@ -155,7 +188,9 @@ def planted_classes(detector: ObjectDetector, settings: SearchSettings) -> tuple
     usual = detector.info.usual_classes
     wanted = tuple(dict.fromkeys(settings.classes)) or every_label(usual)
     if undrawn := sorted(set(wanted) - set(CLASSES)):
-        raise SettingsError(f"no {undrawn[0]!r} can be drawn into pictures; a search measures {', '.join(CLASSES)}")
+        raise SettingsError(
+            f"no {undrawn[0]!r} can be drawn into pictures; a search measures {', '.join(CLASSES)}"
+        )
     if not wanted:
         raise SettingsError(
             f"a search measures {', '.join(CLASSES)}, and the model {detector.info.name} reports "
@@ -180,8 +215,17 @@ class SearchedPicture:
 
 
 def search_planted(
-    frame: SearchFrame, image: ImageRGB, light: FrameLight, things: Sequence[Thing], sun: Vector3 | None,
-    shown: Sequence[float], seed: int, detector: ObjectDetector, wanted: Sequence[str], *, is_again: bool = False,
+    frame: SearchFrame,
+    image: ImageRGB,
+    light: FrameLight,
+    things: Sequence[Thing],
+    sun: Vector3 | None,
+    shown: Sequence[float],
+    seed: int,
+    detector: ObjectDetector,
+    wanted: Sequence[str],
+    *,
+    is_again: bool = False,
 ) -> SearchedPicture | None:
     """Plant things into a frame's picture and have it searched as a map's is; None where it shows none of them.
 
@@ -197,8 +241,13 @@ def search_planted(
     from_above = is_from_above(pose.rotation)
     least = detector.thresholds_for(planted.image, from_above=from_above)
     found = detector.detect(
-        planted.image, tiles="auto", m_per_px=float(pose.translation_m[2]) / camera.fx_px, classes=wanted,
-        from_above=from_above, least_score=least_seen(least), is_part=is_again,
+        planted.image,
+        tiles="auto",
+        m_per_px=float(pose.translation_m[2]) / camera.fx_px,
+        classes=wanted,
+        from_above=from_above,
+        least_score=least_seen(least),
+        is_part=is_again,
     ).surest(_MOST_DETECTIONS + len(things))
     laid = [each for each in lay_on_ground(found, frame.placed) if each is not None]
     return SearchedPicture(planted.boxes_px, laid, least)
@@ -213,10 +262,21 @@ class _Round:
     """Plants that stand at once, in all frames that show them."""
 
     def __init__(
-        self, frames: Sequence[SearchFrame], lights: Sequence[FrameLight], conditions_at: ConditionsAt,
-        things: Sequence[Thing], sun: Vector3 | None, settings: SearchSettings,
+        self,
+        frames: Sequence[SearchFrame],
+        lights: Sequence[FrameLight],
+        conditions_at: ConditionsAt,
+        things: Sequence[Thing],
+        sun: Vector3 | None,
+        settings: SearchSettings,
     ) -> None:
-        self._frames, self._lights, self._things, self._sun, self._settings = frames, lights, things, sun, settings
+        self._frames, self._lights, self._things, self._sun, self._settings = (
+            frames,
+            lights,
+            things,
+            sun,
+            settings,
+        )
         under = conditions_at([each.place_m(0)[:2] for each in things], 0.5).under_trees
         self._shown = [settings.through_crowns if hidden else 1.0 for hidden in under]
         self._laid: list[LaidSighting] = []
@@ -225,14 +285,27 @@ class _Round:
         self.looked = 0
 
     def search(
-        self, name: str, detector: ObjectDetector, wanted: Sequence[str], before: int, total: int,
+        self,
+        name: str,
+        detector: ObjectDetector,
+        wanted: Sequence[str],
+        before: int,
+        total: int,
         gathered: Sequence[Planted],
     ) -> Iterator[SearchProgress]:
         """Plant into one frame after the other and search it; those that show no plant are left out."""
         for number, (each, light) in enumerate(zip(self._frames, self._lights)):
             seen = search_planted(
-                each, each.image(), light, self._things, self._sun, self._shown, self._settings.seed + number, detector,
-                wanted, is_again=before > 0,
+                each,
+                each.image(),
+                light,
+                self._things,
+                self._sun,
+                self._shown,
+                self._settings.seed + number,
+                detector,
+                wanted,
+                is_again=before > 0,
             )
             if seen is not None:
                 self._least = strictest(self._least, seen.least)
@@ -249,7 +322,9 @@ class _Round:
         return reported_plants(self._laid, placed, self._boxes_px, labels, self._least)
 
 
-def _looks(frames: Sequence[SearchFrame], sun: Vector3 | None) -> tuple[list[FrameLight], list[FrameLook]]:
+def _looks(
+    frames: Sequence[SearchFrame], sun: Vector3 | None
+) -> tuple[list[FrameLight], list[FrameLook]]:
     lights, looks = [], []
     for each in frames:
         light, look = look_of(each, sun)
@@ -280,7 +355,11 @@ def sun_at(frame: SearchFrame, site: Site, settings: SearchSettings) -> Vector3 
 
 
 def measured_class(
-    label: str, seen: Conditions, planted: Sequence[Planted], conditions_at: ConditionsAt, settings: SearchSettings
+    label: str,
+    seen: Conditions,
+    planted: Sequence[Planted],
+    conditions_at: ConditionsAt,
+    settings: SearchSettings,
 ) -> MeasuredClass:
     """What plants of a class state of all cells, which were `seen` under their conditions; others are left out.
 

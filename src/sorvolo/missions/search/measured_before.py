@@ -43,28 +43,46 @@ class Basis:
 
     @classmethod
     def of(
-        cls, frames: Sequence[SearchFrame], prepared: PreparedSearch, settings: SearchSettings, *, heights: str
+        cls,
+        frames: Sequence[SearchFrame],
+        prepared: PreparedSearch,
+        settings: SearchSettings,
+        *,
+        heights: str,
     ) -> Self:
         """The basis of a search of these frames."""
         area = "" if prepared.area is None else content_sha256(prepared.area.polygons_lonlat)
         places = [(each.placed.camera, pose_of(each.placed)) for each in frames]
         return cls(
-            content_sha256(__version__, software()), content_sha256(prepared.detector.info), content_sha256(places),
-            heights, settings.through_crowns, settings.sun_deg, planted_classes(prepared.detector, settings),
-            settings.plants, settings.seed, area,
+            content_sha256(__version__, software()),
+            content_sha256(prepared.detector.info),
+            content_sha256(places),
+            heights,
+            settings.through_crowns,
+            settings.sun_deg,
+            planted_classes(prepared.detector, settings),
+            settings.plants,
+            settings.seed,
+            area,
         )
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> Self:
         """The basis that `asdict` made plain. Raises KeyError, TypeError or ValueError for anything else."""
         values = {name: row[name] for name in cls.__dataclass_fields__}
-        sun_deg = None if values["sun_deg"] is None else (float(values["sun_deg"][0]), float(values["sun_deg"][1]))
+        sun_deg = (
+            None
+            if values["sun_deg"] is None
+            else (float(values["sun_deg"][0]), float(values["sun_deg"][1]))
+        )
         return cls(**{**values, "sun_deg": sun_deg, "classes": tuple(values["classes"])})
 
     def serves(self, other: "Basis") -> bool:
         """Whether plants on this basis state as much for another search: of the same frames by the same model, under
         the same assumptions and of all its classes, however many there are and wherever in the frames they stand."""
-        alike = replace(self, classes=other.classes, plants=other.plants, seed=other.seed, area=other.area)
+        alike = replace(
+            self, classes=other.classes, plants=other.plants, seed=other.seed, area=other.area
+        )
         return alike == other and set(other.classes) <= set(self.classes)
 
 
@@ -74,10 +92,14 @@ def read_plants(folder: Path) -> dict[str, tuple[Basis, SearchedPlants]]:
         content = json.loads((folder / PLANTS).read_bytes())
         if content["format"] != _FORMAT:
             return {}
-        planted: dict[str, list[tuple[PlantPlace, bool]]] = {name: [] for name in content["flights"]}
+        planted: dict[str, list[tuple[PlantPlace, bool]]] = {
+            name: [] for name in content["flights"]
+        }
         for each in content["features"]:
             row = each["properties"]
-            planted[row["flight"]].append((PlantPlace.at(row["class"], *row["site_m"]), bool(row["found"])))
+            planted[row["flight"]].append(
+                (PlantPlace.at(row["class"], *row["site_m"]), bool(row["found"]))
+            )
         return {
             name: (
                 Basis.from_json(row["basis"]),
@@ -89,7 +111,9 @@ def read_plants(folder: Path) -> dict[str, tuple[Basis, SearchedPlants]]:
         return {}
 
 
-def write_plants(folder: Path, site: Site, flights: Mapping[str, tuple[Basis, SearchedPlants]]) -> None:
+def write_plants(
+    folder: Path, site: Site, flights: Mapping[str, tuple[Basis, SearchedPlants]]
+) -> None:
     """Write what `read_plants` reads: a point for each plant, with its flight, class and whether it was found."""
     rows = [(name, place, hit) for name, (_, own) in flights.items() for place, hit in own.plants]
     properties = [
@@ -98,8 +122,16 @@ def write_plants(folder: Path, site: Site, flights: Mapping[str, tuple[Basis, Se
     ]
     features = point_features([place.place_m for _, place, _ in rows], site, properties)
     collection = feature_collection("plants", features, is_local=False)
-    collection |= {"format": _FORMAT, "flights": {
-        name: {"looked": own.looked, "rounds": own.rounds, "seconds": round(own.seconds, 1), "basis": asdict(basis)}
-        for name, (basis, own) in flights.items()
-    }}
+    collection |= {
+        "format": _FORMAT,
+        "flights": {
+            name: {
+                "looked": own.looked,
+                "rounds": own.rounds,
+                "seconds": round(own.seconds, 1),
+                "basis": asdict(basis),
+            }
+            for name, (basis, own) in flights.items()
+        },
+    }
     atomic_write_bytes(folder / PLANTS, geojson_bytes(collection))

@@ -35,7 +35,9 @@ def check_area(area: Area | None, site: Site) -> None:
     """Raise InputError for an area with a polygon farther from the site than any small drone flies."""
     far_m = [] if area is None else area.distances_m(site.origin)
     if far_m and max(far_m) > _FARTHEST_M:
-        which = "the area" if len(far_m) == 1 else f"polygon {far_m.index(max(far_m)) + 1} of the area"
+        which = (
+            "the area" if len(far_m) == 1 else f"polygon {far_m.index(max(far_m)) + 1} of the area"
+        )
         raise InputError(
             f"--area: {which} begins {max(far_m) / 1000:,.0f} km from the site, out of reach; is it "
             "the right file, and does it have longitude before latitude?"
@@ -51,7 +53,11 @@ def check_area_of(site_folder: Path, area: Area | None) -> None:
 
 
 def prepare_search(
-    settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector | None = None, *, is_live: bool = False
+    settings: SearchSettings,
+    outputs: SearchOutputs,
+    detector: ObjectDetector | None = None,
+    *,
+    is_live: bool = False,
 ) -> PreparedSearch:
     """Read and check all that a search needs beside a site, before it takes any time.
 
@@ -84,11 +90,17 @@ def _check_writable(folder: Path) -> None:
 
 def _check_apart(outputs: SearchOutputs) -> None:
     """Raise SettingsError for waypoints that would take the place of an input, or of another file of the search."""
-    taken = {path.resolve(): name for name, path in (("--area", outputs.area), ("--poa", outputs.poa)) if path}
+    taken = {
+        path.resolve(): name
+        for name, path in (("--area", outputs.area), ("--poa", outputs.poa))
+        if path
+    }
     taken |= {(outputs.folder / name).resolve(): f"a result, {name}" for name in RESULTS}
     for path in outputs.refly:
         if (name := taken.get(path.resolve())) is not None:
-            raise SettingsError(f"--refly {path} is the file of {name}; give the waypoints another name")
+            raise SettingsError(
+                f"--refly {path} is the file of {name}; give the waypoints another name"
+            )
 
 
 def site_with_metres(archive: Archive) -> Site:

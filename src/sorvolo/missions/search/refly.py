@@ -25,15 +25,21 @@ class Refly:
 
 
 def write_refly(
-    again: Sequence[Region], grid: CellGrid, searched: Searched, settings: SearchSettings, info: ModelInfo,
-    files: Sequence[Path], *, dji_drone: str,
+    again: Sequence[Region],
+    grid: CellGrid,
+    searched: Searched,
+    settings: SearchSettings,
+    info: ModelInfo,
+    files: Sequence[Path],
+    *,
+    dji_drone: str,
 ) -> Refly | None:
     """Plan passes over the holes and write them; None where no hole is worth a flight.
 
     It is flown as high as the first flights, lower where their pictures were too coarse for the detector.
     """
     pace = ReflySettings()
-    large = [each for each in again if each.area_m2 >= pace.least_m2][:pace.most_holes]
+    large = [each for each in again if each.area_m2 >= pace.least_m2][: pace.most_holes]
     if not large:
         return None
     area = Area(tuple(_rings(large, grid)), "holes of the search")
@@ -43,7 +49,11 @@ def write_refly(
         height_m = max(pace.lowest_m, min(height_m, 0.9 * needed * camera.fx_px))
     plan = fly_again(area, camera, height_m, files, dji_drone=dji_drone, settings=pace)
     return Refly(
-        len(large), sum(each.area_m2 for each in large), plan.height_m, plan.duration_s, tuple(map(str, files))
+        len(large),
+        sum(each.area_m2 for each in large),
+        plan.height_m,
+        plan.duration_s,
+        tuple(map(str, files)),
     )
 
 

@@ -83,7 +83,9 @@ class Searched:
     def path_m(self) -> float:
         """How far the cameras flew, all flights together, by straight ways between their frames."""
         return sum(
-            path_length_m([pose.translation_m for each in own if (pose := pose_of(each.placed)) is not None])
+            path_length_m(
+                [pose.translation_m for each in own if (pose := pose_of(each.placed)) is not None]
+            )
             for own in self.frames.values()
         )
 
@@ -91,9 +93,18 @@ class Searched:
     def unseen_from_m(self) -> float | None:
         """How far the area is from the ground that was seen, where none of the area was seen; else None."""
         cells = self.cells
-        if any((each.seen.seen & cells.wanted).any() for flight in self.flights for each in flight.classes):
+        if any(
+            (each.seen.seen & cells.wanted).any()
+            for flight in self.flights
+            for each in flight.classes
+        ):
             return None
-        places_m = [corner_m for own in self.frames.values() for each in own for corner_m in each.placed.outline_m]
+        places_m = [
+            corner_m
+            for own in self.frames.values()
+            for each in own
+            for corner_m in each.placed.outline_m
+        ]
         return cells.wanted_from_m(places_m)
 
     def of_class(self, label: str) -> list[MeasuredClass]:
@@ -110,18 +121,29 @@ def total_of(searched: Searched, label: str) -> Chances:
     return together([each.chances for each in searched.of_class(label)])
 
 
-def hole_numbers(searched: Searched, label: str, settings: SearchSettings, info: ModelInfo) -> Holes:
+def hole_numbers(
+    searched: Searched, label: str, settings: SearchSettings, info: ModelInfo
+) -> Holes:
     """(N,) why each wanted cell has less than enough of a chance, as numbers of REASONS."""
     own = searched.of_class(label)
     reasons = [
         hole_reasons(
-            searched.cells, each.seen, each.chances, each.recall, enough=settings.enough,
-            needed_m_per_px=needed_m_per_px(label, info), length_m=_length_m(label),
+            searched.cells,
+            each.seen,
+            each.chances,
+            each.recall,
+            enough=settings.enough,
+            needed_m_per_px=needed_m_per_px(label, info),
+            length_m=_length_m(label),
         )
         for each in own
     ]
     return reasons_together(
-        reasons, [each.chances for each in own], total_of(searched, label), searched.cells, settings.enough
+        reasons,
+        [each.chances for each in own],
+        total_of(searched, label),
+        searched.cells,
+        settings.enough,
     )
 
 
@@ -138,25 +160,38 @@ def is_coarse(searched: Searched, settings: SearchSettings, info: ModelInfo) -> 
 
 
 def build_search_report(
-    searched: Searched, settings: SearchSettings, detector: ObjectDetector, refly: "Refly | None",
-    so_far: SoFar | None = None, warnings: Sequence[str] = (),
+    searched: Searched,
+    settings: SearchSettings,
+    detector: ObjectDetector,
+    refly: "Refly | None",
+    so_far: SoFar | None = None,
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """search.json (docs/formats.md), these warnings first; `so_far` is given while the flight goes on."""
-    rows = {label: _class_row(searched, label, settings, detector.info) for label in searched.labels}
+    rows = {
+        label: _class_row(searched, label, settings, detector.info) for label in searched.labels
+    }
     first = searched.labels[0]
     report = {
-        "site": searched.site.name, "model": detector.info.name, "settings": asdict(settings),
-        "cell_m": searched.cells.cell_m, "headline": _headline(first, rows[first], settings, so_far),
+        "site": searched.site.name,
+        "model": detector.info.name,
+        "settings": asdict(settings),
+        "cell_m": searched.cells.cell_m,
+        "headline": _headline(first, rows[first], settings, so_far),
         "so_far": None if so_far is None else asdict(so_far),
-        "classes": rows, "flights": [_flight_row(each) for each in searched.flights],
-        "segments": _segment_rows(searched, first), "refly": None if refly is None else asdict(refly),
+        "classes": rows,
+        "flights": [_flight_row(each) for each in searched.flights],
+        "segments": _segment_rows(searched, first),
+        "refly": None if refly is None else asdict(refly),
         "notices": [asdict(each) for each in detector.notices],
         "warnings": [*warnings, *_warnings(searched, settings, is_over=so_far is None)],
     }
     return dict(plain_json(report))
 
 
-def _class_row(searched: Searched, label: str, settings: SearchSettings, info: ModelInfo) -> dict[str, Any]:
+def _class_row(
+    searched: Searched, label: str, settings: SearchSettings, info: ModelInfo
+) -> dict[str, Any]:
     cells = searched.cells
     chances = [each.chances for each in searched.of_class(label)]
     found = figures(chances, cells.wanted, cells.cell_m, searched.path_m)
@@ -170,14 +205,22 @@ def _flight_row(flight: MeasuredFlight) -> dict[str, Any]:
         own, hits = each.outcomes, int(each.outcomes.found.sum())
         held_out = held_out_chances(own.columns, own.found)
         classes[each.label] = {
-            "planted": len(own), "found": hits, "interval": wilson(hits, len(own)),
+            "planted": len(own),
+            "found": hits,
+            "interval": wilson(hits, len(own)),
             "calibration": [asdict(row) for row in calibration_bins(held_out, own.found)],
         }
     return {
-        "name": flight.name, "frames": flight.frames, "searched_pictures": flight.searched.looked,
-        "rounds": flight.searched.rounds, "seconds": round(flight.searched.seconds, 1),
-        "measured_before": flight.is_earlier, "shadows": flight.has_shadows,
-        "heights": flight.has_heights, "thermal": flight.is_thermal, "blur_px": round(flight.blur_px, 2),
+        "name": flight.name,
+        "frames": flight.frames,
+        "searched_pictures": flight.searched.looked,
+        "rounds": flight.searched.rounds,
+        "seconds": round(flight.searched.seconds, 1),
+        "measured_before": flight.is_earlier,
+        "shadows": flight.has_shadows,
+        "heights": flight.has_heights,
+        "thermal": flight.is_thermal,
+        "blur_px": round(flight.blur_px, 2),
         "classes": classes,
     }
 
@@ -185,9 +228,16 @@ def _flight_row(flight: MeasuredFlight) -> dict[str, Any]:
 def _segment_rows(searched: Searched, label: str) -> list[dict[str, Any]]:
     cells, total, site = searched.cells, total_of(searched, label), searched.site
     return [
-        asdict(segment(
-            name, poa, total, inside_any(area.polygons_m(site.frame), cells.centres_m), cells.cell_m, area.area_m2
-        ))
+        asdict(
+            segment(
+                name,
+                poa,
+                total,
+                inside_any(area.polygons_m(site.frame), cells.centres_m),
+                cells.cell_m,
+                area.area_m2,
+            )
+        )
         for name, area, poa in searched.segments
     ]
 
@@ -197,18 +247,30 @@ def _headline(
 ) -> dict[str, Any]:
     """The search in one line, and whether all of the area was searched well enough."""
     area_m2 = row["area_m2"]
-    shares = {reason: holes_m2 / area_m2 for reason, holes_m2 in row["holes_m2"].items()} if area_m2 else {}
+    shares = (
+        {reason: holes_m2 / area_m2 for reason, holes_m2 in row["holes_m2"].items()}
+        if area_m2
+        else {}
+    )
     holes = ", ".join(f"{share:.0%} {reason}" for reason, share in shares.items() if share >= 0.005)
     chance = f"{row['pod']:.2f} (90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f})"
-    by = "" if so_far is None else (
-        f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')} of the flight {so_far.flight} "
-        f"{'and ' + counted(len(so_far.earlier), 'flight') + ' before it' if so_far.earlier else 'alone'}: "
+    by = (
+        ""
+        if so_far is None
+        else (
+            f"so far, by {so_far.measured} of {counted(so_far.placed, 'picture')} of the flight {so_far.flight} "
+            f"{'and ' + counted(len(so_far.earlier), 'flight') + ' before it' if so_far.earlier else 'alone'}: "
+        )
     )
     text = f"{by}probability of detection of a {label} anywhere in the area: {chance}"
     total = sum(shares.values())
     is_complete = total <= _MOST_HOLES
-    text += "; no holes" if is_complete else (
-        f"; {total:.0%} of the area is below {settings.enough:g}: {holes or 'in small pieces'}"
+    text += (
+        "; no holes"
+        if is_complete
+        else (
+            f"; {total:.0%} of the area is below {settings.enough:g}: {holes or 'in small pieces'}"
+        )
     )
     return {"text": text, "complete": is_complete, "hole_share": total}
 
@@ -229,7 +291,8 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
         few = [each for each in flight.classes if len(each.outcomes) < _FEW_PLANTS]
         warnings += [
             f"{flight.name}: {'only ' * bool(len(each.outcomes))}{counted(len(each.outcomes), 'plant')} of the class "
-            f"{each.label}{how}; its probability is a guess, as its interval shows" for each in few
+            f"{each.label}{how}; its probability is a guess, as its interval shows"
+            for each in few
         ]
         if not flight.has_shadows and not flight.is_thermal:
             warnings.append(
@@ -241,7 +304,9 @@ def _warnings(searched: Searched, settings: SearchSettings, *, is_over: bool) ->
             "`sorvolo heights` measures both, for the next search"
         )
     if settings.through_crowns == 0:
-        warnings.append("ground under trees counts as not found at all; --through-crowns assumes gaps in crowns")
+        warnings.append(
+            "ground under trees counts as not found at all; --through-crowns assumes gaps in crowns"
+        )
     if "person" in searched.labels:
         warnings.append(
             "plants are drawn people, and the detector finds drawn and real people differently well: compare the "

@@ -18,7 +18,13 @@ from sorvolo.missions.search.earlier import EarlierFlights
 from sorvolo.missions.search.files import remove_figures, write_search
 from sorvolo.missions.search.frames import heights_for, search_frame
 from sorvolo.missions.search.growing import GrowingMeasure
-from sorvolo.missions.search.prepare import PreparedSearch, check_area, known_places, prepare_search, site_with_metres
+from sorvolo.missions.search.prepare import (
+    PreparedSearch,
+    check_area,
+    known_places,
+    prepare_search,
+    site_with_metres,
+)
 from sorvolo.missions.search.report import Searched, SoFar, State
 from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
 from sorvolo.store.atomic import atomic_write_bytes, writing
@@ -35,8 +41,12 @@ class Pace:
     again_s: float = 15.0
     rest: float = 4.0  # times as long as the last writing took: most of the time is the measure's
     look_s: float = 0.2  # until it is asked again whether there is a frame
-    most_behind: int = 8  # frames that wait: of more every second is put off, so that new ground is measured soon
-    earlier: float = 1.0  # times as long as a picture is searched, those of earlier flights are looked at
+    most_behind: int = (
+        8  # frames that wait: of more every second is put off, so that new ground is measured soon
+    )
+    earlier: float = (
+        1.0  # times as long as a picture is searched, those of earlier flights are looked at
+    )
     land_s: float = 20.0  # for the frame that is being searched as the flight lands; a report that takes longer is lost
 
 
@@ -51,19 +61,26 @@ class SearchWhileFlying:
     """
 
     def __init__(
-        self, settings: SearchSettings, outputs: SearchOutputs, detector: ObjectDetector | None = None,
+        self,
+        settings: SearchSettings,
+        outputs: SearchOutputs,
+        detector: ObjectDetector | None = None,
         pace: Pace = Pace(),
     ) -> None:
         self._prepared: PreparedSearch = prepare_search(settings, outputs, detector, is_live=True)
         self._settings, self._outputs, self._pace = settings, outputs, pace
-        self._unplaced: list[int] = []  # frames that the map took, whose pictures it has not stored yet
+        self._unplaced: list[
+            int
+        ] = []  # frames that the map took, whose pictures it has not stored yet
         self._waiting: deque[StoredKeyframe] = deque()
         self._put_off: deque[StoredKeyframe] = deque()
         self._landed = threading.Event()
         # Python 3.11's join takes a thread for ended where Ctrl-C meets it: the process's end would abort it
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
-        self._shown: Callable[[SoFar], None] | None = None  # writes the last report again, in another state
+        self._shown: Callable[[SoFar], None] | None = (
+            None  # writes the last report again, in another state
+        )
         self._last: SoFar | None = None
         self._has_warned = False
         self.written = 0
@@ -80,7 +97,10 @@ class SearchWhileFlying:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.land(State.LANDED if kind is None else State.STOPPED)
 
@@ -113,7 +133,9 @@ class SearchWhileFlying:
         if self._thread is not None:
             self._ended.wait(self._pace.land_s)
         if self._shown is None or self._last is None:
-            if state is State.STOPPED and (self.placed or self._unplaced):  # else an earlier search's page stands
+            if state is State.STOPPED and (
+                self.placed or self._unplaced
+            ):  # else an earlier search's page stands
                 self._write_waiting(is_over=True)
         elif self._last.state is not state:
             self._last = replace(self._last, state=state)
@@ -137,7 +159,11 @@ class SearchWhileFlying:
             yield
         except Exception as error:
             if not self._has_warned and not self._landed.is_set():
-                words = str(error) if isinstance(error, SorvoloError) else f"{type(error).__name__}: {error}"
+                words = (
+                    str(error)
+                    if isinstance(error, SorvoloError)
+                    else f"{type(error).__name__}: {error}"
+                )
                 text = f"the search is not measured whole while the flight goes on: {words}"
                 warnings.warn(text, SorvoloWarning, stacklevel=3)
                 self._has_warned = True
@@ -155,8 +181,12 @@ class SearchWhileFlying:
         area, flight_id = self._prepared.area, self._waiting[0].flight_id
         check_area(area, site)
         measure = GrowingMeasure(
-            flight_id, site, self._prepared.detector, self._settings,
-            area_m=None if area is None else area.polygons_m(site.frame), keep_off_m=known_places(archive),
+            flight_id,
+            site,
+            self._prepared.detector,
+            self._settings,
+            area_m=None if area is None else area.polygons_m(site.frame),
+            keep_off_m=known_places(archive),
             above=heights_for(archive, flight_id),
         )
         earlier = EarlierFlights(archive, flight_id, self._prepared, self._settings, self._outputs)
@@ -209,15 +239,26 @@ class SearchWhileFlying:
         tiles, placed = archive.live_tiles(), self.placed
         if not tiles:
             return False
-        cells, flight = measure.measured([each.placed.outline_m for own in earlier.frames.values() for each in own])
+        cells, flight = measure.measured(
+            [each.placed.outline_m for own in earlier.frames.values() for each in own]
+        )
         searched = Searched(
-            archive.site(), cells, (*earlier.on(cells), flight), {**earlier.frames, flight.name: tuple(measure.frames)},
+            archive.site(),
+            cells,
+            (*earlier.on(cells), flight),
+            {**earlier.frames, flight.name: tuple(measure.frames)},
             self._prepared.segments,
         )
 
         def show(so_far: SoFar) -> None:
             write_search(
-                searched, tiles, archive.site_grid(), self._settings, self._outputs, self._prepared.detector, so_far,
+                searched,
+                tiles,
+                archive.site_grid(),
+                self._settings,
+                self._outputs,
+                self._prepared.detector,
+                so_far,
                 earlier.uncounted_m,
             )
 

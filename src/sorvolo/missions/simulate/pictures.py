@@ -6,7 +6,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sorvolo.missions.simulate.simulation_folder import PICTURES_MARK, simulation_description, simulation_folder
+from sorvolo.missions.simulate.simulation_folder import (
+    PICTURES_MARK,
+    simulation_description,
+    simulation_folder,
+)
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.pictures import PictureSettings, SimulatedPicture, simulate_picture
 from sorvolo.simulation.truth import coco_categories
@@ -41,7 +45,11 @@ def simulate_pictures(
     simulation, InputError for an unreadable orthophoto and StoreError for a full disk.
     """
     started = time.monotonic()
-    ground = None if ground_file is None else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
+    ground = (
+        None
+        if ground_file is None
+        else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
+    )
     info = simulation_description(asdict(settings))
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -50,27 +58,43 @@ def simulate_pictures(
         with writing(folder):
             (partial / "images").mkdir()
         pictures = in_order(
-            lambda index: simulate_picture(settings, index, ground), range(settings.pictures),
+            lambda index: simulate_picture(settings, index, ground),
+            range(settings.pictures),
             most_threads=_MOST_THREADS,
         )
         for picture in pictures:
             row = _image_row(picture, settings.seed)
-            atomic_write_bytes(partial / row["file_name"], jpeg_from_image(picture.image), durable=False)
+            atomic_write_bytes(
+                partial / row["file_name"], jpeg_from_image(picture.image), durable=False
+            )
             images.append(row)
             annotations += [box | {"id": len(annotations) + box["id"]} for box in picture.boxes]
             counted += sum(1 - box["iscrowd"] for box in picture.boxes)
-            yield PicturesProgress(len(images), settings.pictures, counted, time.monotonic() - started)
-        write_json(partial / PICTURES_MARK, {
-            "info": info, "categories": coco_categories(), "images": images, "annotations": annotations,
-        })
+            yield PicturesProgress(
+                len(images), settings.pictures, counted, time.monotonic() - started
+            )
+        write_json(
+            partial / PICTURES_MARK,
+            {
+                "info": info,
+                "categories": coco_categories(),
+                "images": images,
+                "annotations": annotations,
+            },
+        )
 
 
 def _image_row(picture: SimulatedPicture, seed: int) -> dict[str, Any]:
     height_px, width_px = picture.image.shape[:2]
     name = f"site{seed}-{picture.index + 1:06d}"
     return {
-        "id": picture.index + 1, "file_name": f"images/{name}.jpg", "width": width_px, "height": height_px,
-        "flight": name, "m_per_px": round(picture.m_per_px, 5),
+        "id": picture.index + 1,
+        "file_name": f"images/{name}.jpg",
+        "width": width_px,
+        "height": height_px,
+        "flight": name,
+        "m_per_px": round(picture.m_per_px, 5),
         "height_above_ground_m": round(float(picture.site_from_camera.translation_m[2]), 2),
-        "ground": picture.ground, "thermal": picture.is_thermal,
+        "ground": picture.ground,
+        "thermal": picture.is_thermal,
     }

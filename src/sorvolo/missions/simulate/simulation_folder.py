@@ -45,15 +45,20 @@ def simulation_description(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {
         "made_by": _MADE_BY,
         "versions": {
-            "sorvolo": __version__, "python": platform.python_version(), "numpy": version("numpy"),
-            "opencv": version("opencv-contrib-python-headless"), "av": version("av"),
+            "sorvolo": __version__,
+            "python": platform.python_version(),
+            "numpy": version("numpy"),
+            "opencv": version("opencv-contrib-python-headless"),
+            "av": version("av"),
         },
         "settings": settings,
     }
 
 
 def _is_ours(folder: Path) -> bool:
-    return any(f'"made_by":"{_MADE_BY}"' in _start_of(folder / mark) for mark in (MARK, PICTURES_MARK))
+    return any(
+        f'"made_by":"{_MADE_BY}"' in _start_of(folder / mark) for mark in (MARK, PICTURES_MARK)
+    )
 
 
 def _start_of(path: Path) -> str:

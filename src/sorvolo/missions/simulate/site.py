@@ -8,7 +8,11 @@ from typing import Any
 
 from sorvolo.geometry.geodesy import utm_epsg
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.missions.simulate.simulation_folder import MARK, simulation_description, simulation_folder
+from sorvolo.missions.simulate.simulation_folder import (
+    MARK,
+    simulation_description,
+    simulation_folder,
+)
 from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
 from sorvolo.simulation.ground import orthophoto_ground
 from sorvolo.simulation.settings import GEOID_HEIGHT_M, SimulationSettings
@@ -64,15 +68,21 @@ def simulate_site(
     """
     started = time.monotonic()
     ground = (
-        None if ground_file is None else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
+        None
+        if ground_file is None
+        else orthophoto_ground(*read_orthophoto(ground_file, ground_m_per_px))
     )
     features: list[dict[str, Any]] = []
     with simulation_folder(folder, MARK, simulation_description(asdict(settings))) as partial:
         yield SimulationProgress("site", "", 0, 0, time.monotonic() - started)
         for flight in simulate_flights(settings, ground):
             for done in _write_flight(flight, partial / flight.name):
-                yield SimulationProgress("frames", flight.name, done, len(flight), time.monotonic() - started)
-            yield SimulationProgress("truth", flight.name, len(flight), len(flight), time.monotonic() - started)
+                yield SimulationProgress(
+                    "frames", flight.name, done, len(flight), time.monotonic() - started
+                )
+            yield SimulationProgress(
+                "truth", flight.name, len(flight), len(flight), time.monotonic() - started
+            )
             features += frame_features(flight)
             _write_truth(flight, partial / "truth")
             if flight.settings.imaging != settings.imaging:
@@ -80,7 +90,9 @@ def simulate_site(
             if flight.number == 1:
                 write_camera(partial / "camera.xml", flight.camera)
                 _write_ground(flight, partial / "truth" / "ground.tif")
-            write_json(partial / "truth" / "frames.geojson", feature_collection(features, flight.site))
+            write_json(
+                partial / "truth" / "frames.geojson", feature_collection(features, flight.site)
+            )
             write_json(
                 partial / "truth" / "objects.geojson",
                 feature_collection(object_features(flight.world, flight.site), flight.site),
@@ -103,7 +115,9 @@ def _write_flight(flight: SimulatedFlight, folder: Path) -> Iterator[int]:
         return
     size_px = flight.camera.width_px, flight.camera.height_px
     imaging, crf = flight.settings.imaging, flight.settings.output.crf
-    with video_writer(folder / f"{flight.name}.mp4", size_px, imaging.fps, flight.started_ns, crf) as write:
+    with video_writer(
+        folder / f"{flight.name}.mp4", size_px, imaging.fps, flight.started_ns, crf
+    ) as write:
         for frame in in_order(flight.frame, range(len(flight)), most_threads=_MOST_THREADS):
             write(frame.image)
             yield frame.index + 1
@@ -124,7 +138,9 @@ def _write_telemetry(flight: SimulatedFlight, folder: Path) -> None:
         path = place / f"{flight.name}{_SUFFIXES[format_name]}"
         write_telemetry(path, telemetry, observation.corrupt, GEOID_HEIGHT_M)
         if format_name == "srt" and len(formats) > 1:
-            write_telemetry(place / f"{flight.name}_old_dialect.srt", replace(telemetry, format="srt-gps"))
+            write_telemetry(
+                place / f"{flight.name}_old_dialect.srt", replace(telemetry, format="srt-gps")
+            )
 
 
 def _photo_rows(flight: SimulatedFlight) -> list[dict[str, float]]:
@@ -132,11 +148,16 @@ def _photo_rows(flight: SimulatedFlight) -> list[dict[str, float]]:
     if observation is None:
         return [{} for _ in range(len(flight))]
     columns = observation.telemetry.columns
-    return [{name: float(values[index]) for name, values in columns.items()} for index in range(len(flight))]
+    return [
+        {name: float(values[index]) for name, values in columns.items()}
+        for index in range(len(flight))
+    ]
 
 
 def _write_truth(flight: SimulatedFlight, folder: Path) -> None:
-    sampled = range(0, len(flight), 1 if flight.settings.output.photos else flight.settings.output.truth_step)
+    sampled = range(
+        0, len(flight), 1 if flight.settings.output.photos else flight.settings.output.truth_step
+    )
     with writing(folder):
         (folder / flight.name).mkdir(parents=True)
     write_json(folder / flight.name / "boxes.json", coco_boxes(flight, sampled))

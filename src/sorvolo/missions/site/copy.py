@@ -17,7 +17,9 @@ from sorvolo.store.site.catalogue_place import Catalogues, chosen_catalogues
 _MAY_BE_SHORT = 1.05  # times the need: other programs write to the disk as well
 
 
-def copy_site(source: str, target: str, catalogue: str = "") -> Generator[CopyUpdate, None, CopyOutcome]:
+def copy_site(
+    source: str, target: str, catalogue: str = ""
+) -> Generator[CopyUpdate, None, CopyOutcome]:
     """Copy the site at one address to another, yielding progress; an interrupted copy continues.
 
     The catalogue of a new copy in a folder lies there, whatever the site's does, or at the address `catalogue`.
@@ -29,7 +31,11 @@ def copy_site(source: str, target: str, catalogue: str = "") -> Generator[CopyUp
     """
     ends = _ends(source, target, catalogue)
     with tempfile.TemporaryDirectory(prefix="sorvolo-") as scratch:
-        return (yield from copy(*ends, Path(scratch), room=lambda need, free: _check_room(target, need, free)))
+        return (
+            yield from copy(
+                *ends, Path(scratch), room=lambda need, free: _check_room(target, need, free)
+            )
+        )
 
 
 def verify_copy(source: str, target: str) -> Generator[CopyUpdate, None, CopyOutcome]:
@@ -55,7 +61,9 @@ def _ends(source: str, target: str, catalogue: str = "") -> tuple[SiteEnd, SiteE
     if isinstance(ends[0], FolderEnd) and isinstance(ends[1], FolderEnd):
         one, other = ends[0].folder.resolve(), ends[1].folder.resolve()
         if one.is_relative_to(other) or other.is_relative_to(one):
-            raise SettingsError(f"{target} and {source} are the same folder, or lie in each other; choose another one")
+            raise SettingsError(
+                f"{target} and {source} are the same folder, or lie in each other; choose another one"
+            )
     return ends
 
 
@@ -63,7 +71,9 @@ def _catalogues(target: str, catalogue: str) -> Catalogues:
     """Those with the catalogue of a new copy at an address."""
     folder = folder_of(target)
     if folder is None:
-        raise SettingsError(f"{target} keeps its catalogue with its tiles; --catalogue is for folders")
+        raise SettingsError(
+            f"{target} keeps its catalogue with its tiles; --catalogue is for folders"
+        )
     return chosen_catalogues(folder, catalogue)
 
 
@@ -82,7 +92,9 @@ def folder_of(address: str) -> Path | None:
         return Path(unquote(parts.path))
     if parts.scheme == "s3":
         return None
-    raise SettingsError(f"{parts.scheme}:// is no place of sites; give a folder, file:///FOLDER or s3://BUCKET/NAME")
+    raise SettingsError(
+        f"{parts.scheme}:// is no place of sites; give a folder, file:///FOLDER or s3://BUCKET/NAME"
+    )
 
 
 def _check_room(target: str, need: int, free: int | None) -> None:

@@ -13,7 +13,11 @@ from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.survey.findings import Verdict
 
-_STEPS = {2: timedelta(hours=1), 4: timedelta(minutes=1), 6: timedelta(seconds=1)}  # by digits of a time of day
+_STEPS = {
+    2: timedelta(hours=1),
+    4: timedelta(minutes=1),
+    6: timedelta(seconds=1),
+}  # by digits of a time of day
 _ENDINGS = (".tif", ".tiff", ".png", ".kmz")
 
 
@@ -51,24 +55,39 @@ def site_history(site: Path) -> list[HistoryEntry]:
         comparisons = archive.comparisons()
         verdicts = [(each.flight_id, each.verdict) for each in archive.changes()]
         return [
-            _entry(archive, each, comparisons.get(each.id), verdicts if last_of[each.flight_id] == each.id else None)
+            _entry(
+                archive,
+                each,
+                comparisons.get(each.id),
+                verdicts if last_of[each.flight_id] == each.id else None,
+            )
             for each in versions
         ]
 
 
 def _entry(
-    archive: Archive, version: VersionEntry, changes: Mapping[str, int] | None,
+    archive: Archive,
+    version: VersionEntry,
+    changes: Mapping[str, int] | None,
     verdicts: Sequence[tuple[str, Verdict | None]] | None,
 ) -> HistoryEntry:
     """A version; `changes` is None for one that mapping made, `verdicts` for one that was replaced since."""
     difference = archive.tile_difference(version)
     given = verdicts or ()
     return HistoryEntry(
-        version.id, version.created_utc, version.flown_utc, version.flight_id,
+        version.id,
+        version.created_utc,
+        version.flown_utc,
+        version.flight_id,
         "map" if changes is None else "compare",
-        version.parent_id, version.tiles, difference.changed, difference.removed, difference.changed_bytes,
+        version.parent_id,
+        version.tiles,
+        difference.changed,
+        difference.removed,
+        difference.changed_bytes,
         {kind: count for kind, count in (changes or {}).items() if count},
-        given.count((version.flight_id, Verdict.CONFIRMED)), given.count((version.flight_id, Verdict.REJECTED)),
+        given.count((version.flight_id, Verdict.CONFIRMED)),
+        given.count((version.flight_id, Verdict.REJECTED)),
         verdicts is None,
     )
 
@@ -80,15 +99,21 @@ def find_version(archive: Archive, at: str) -> VersionEntry:
     Raises InputError when there is none, SettingsError when `at` is neither.
     """
     if at.isdecimal() and len(at) < 8:  # eight digits are an ISO date without dashes
-        found = [version for version in archive.versions() if version.complete and version.id == int(at)]
+        found = [
+            version for version in archive.versions() if version.complete and version.id == int(at)
+        ]
         if not found:
             numbers = [str(version.id) for version in archive.versions() if version.complete]
-            raise InputError(f"{archive.folder} has no version {at} of its map; it has {', '.join(numbers) or 'none'}")
+            raise InputError(
+                f"{archive.folder} has no version {at} of its map; it has {', '.join(numbers) or 'none'}"
+            )
         return found[0]
     return archive.version_at(_moment(at))
 
 
-def export_version(site: Path, at: str | None, path: Path, *, compress: str = "deflate") -> VersionEntry:
+def export_version(
+    site: Path, at: str | None, path: Path, *, compress: str = "deflate"
+) -> VersionEntry:
     """Write the map as it was at a version or date (see `find_version`; None: now) to a .tif, .png or .kmz file.
 
     Returns the version. Raises SettingsError for another ending, InputError when there was no map or the file's
@@ -107,9 +132,13 @@ def export_version(site: Path, at: str | None, path: Path, *, compress: str = "d
 def _check_target(path: Path) -> None:
     """Raises SettingsError or InputError where no map can be written to the path."""
     if path.suffix.lower() not in _ENDINGS:
-        raise SettingsError(f"{path.name}: the map is written as .tif, .png or .kmz; give a name with such an ending")
+        raise SettingsError(
+            f"{path.name}: the map is written as .tif, .png or .kmz; give a name with such an ending"
+        )
     if not path.resolve().parent.is_dir():
-        raise InputError(f"no folder {path.resolve().parent} to write {path.name} to; make it first")
+        raise InputError(
+            f"no folder {path.resolve().parent} to write {path.name} to; make it first"
+        )
     if path.is_dir():
         raise InputError(f"{path} is a folder, a file was needed; choose another name")
 
@@ -117,16 +146,22 @@ def _check_target(path: Path) -> None:
 def _write_map(archive: Archive, version: VersionEntry, path: Path, compress: str) -> None:
     tiles, site = archive.tiles(version.id), archive.site()
     if not tiles:
-        raise StoreError(f"version {version.id} of the map of {archive.folder} is empty; there is nothing to write")
+        raise StoreError(
+            f"version {version.id} of the map of {archive.folder} is empty; there is nothing to write"
+        )
     ending = path.suffix.lower()
     if ending == ".kmz" and site.is_local:
-        raise SettingsError(f"{archive.folder} has no place on Earth, so its map cannot be a KMZ; write .tif or .png")
+        raise SettingsError(
+            f"{archive.folder} has no place on Earth, so its map cannot be a KMZ; write .tif or .png"
+        )
     if ending == ".png":
         write_preview(tiles, path)
     elif ending == ".kmz":
         write_kmz(tiles, archive.site_grid(), site.name, path)
     else:
-        write_cog(tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress)
+        write_cog(
+            tiles, archive.site_grid(), path, crs=version.export_crs or None, compress=compress
+        )
 
 
 def _moment(text: str) -> datetime:

@@ -29,13 +29,19 @@ def review_changes(
     """
     if not ids:
         raise InputError("no change was named; give the ids that `sorvolo review SITE` lists")
-    with Archive.open(site, write=False):  # without a site there is nothing to review: do not make one
+    with Archive.open(
+        site, write=False
+    ):  # without a site there is nothing to review: do not make one
         pass
     with Archive.open(site, write=True) as archive:
         _require_flight(archive, flight)
         if flight is None:
             _demand_whole_ids(archive, ids)
-        by_number = {str(each.number): each.id for each in archive.changes(flight)} if flight is not None else {}
+        by_number = (
+            {str(each.number): each.id for each in archive.changes(flight)}
+            if flight is not None
+            else {}
+        )
         wanted = {by_number.get(each, each) for each in ids}
         archive.review(wanted, verdict, note)
         return [each for each in archive.changes() if each.id in wanted]
@@ -46,7 +52,9 @@ def withdraw_reviews(site: Path, ids: Sequence[str]) -> None:
 
     Raises InputError for an unknown id, StoreError when the folder is no site or another process is writing.
     """
-    with Archive.open(site, write=False):  # without a site there is nothing to withdraw: do not make one
+    with Archive.open(
+        site, write=False
+    ):  # without a site there is nothing to withdraw: do not make one
         pass
     with Archive.open(site, write=True) as archive:
         archive.withdraw_review(ids)
@@ -55,7 +63,9 @@ def withdraw_reviews(site: Path, ids: Sequence[str]) -> None:
 def _require_flight(archive: Archive, flight: str | None) -> None:
     known = [entry.id for entry in archive.flights()]
     if flight is not None and flight not in known:
-        raise InputError(f"{archive.folder} has no flight {flight}; it has {', '.join(known) or 'none'}")
+        raise InputError(
+            f"{archive.folder} has no flight {flight}; it has {', '.join(known) or 'none'}"
+        )
 
 
 def _demand_whole_ids(archive: Archive, ids: Sequence[str]) -> None:

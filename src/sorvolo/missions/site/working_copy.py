@@ -44,7 +44,9 @@ def _fetched(working: WorkingCopy, scratch: Path) -> Generator[CopyUpdate, None,
     except OvertakenError:
         warnings.warn(
             f"another writer has changed {working.address}; what this machine had added and not sent is kept in "
-            f"{working.set_aside()}", SorvoloWarning, stacklevel=2,
+            f"{working.set_aside()}",
+            SorvoloWarning,
+            stacklevel=2,
         )
         return (yield from working.fetch(scratch))
 

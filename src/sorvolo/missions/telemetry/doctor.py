@@ -86,8 +86,14 @@ class _Compared:
 
 
 def correct_telemetry(
-    site_folder: Path, folder: Path, *, flight: str = "", source: Path | None = None, telemetry: str | None = None,
-    camera: str | None = None, cot: CotReceiver | None = None,
+    site_folder: Path,
+    folder: Path,
+    *,
+    flight: str = "",
+    source: Path | None = None,
+    telemetry: str | None = None,
+    camera: str | None = None,
+    cot: CotReceiver | None = None,
 ) -> dict[str, Any]:
     """Write a flight's corrected telemetry into `folder`; the report, which telemetry.json holds as well, and
     `cot_sent`, how many events were sent.
@@ -112,7 +118,9 @@ def correct_telemetry(
             _check_folder(folder, name, site)
             if (earlier := _diagnosis(folder)) is not None:
                 return _sent_again(earlier, folder, cot)
-            return _written(site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot)
+            return _written(
+                site, name, folder, _solved(archive, name, 0), None, archive.report(name), cot
+            )
         with opened_sources([source], telemetry, camera) as sources:
             opened = sources[0]
             name = _flight(archive, flight or opened.name)
@@ -146,13 +154,17 @@ def _mapped(archive: Archive) -> dict[str, str]:
 def _flight(archive: Archive, wanted: str) -> str:
     known = [*_mapped(archive)]
     if not known:
-        raise InputError(f"{archive.folder} has no mapped flight: map one first, or give its video with --site")
+        raise InputError(
+            f"{archive.folder} has no mapped flight: map one first, or give its video with --site"
+        )
     if wanted and wanted not in known:
         raise InputError(
             f"{archive.folder} has no flight {wanted!r}, only {', '.join(known)}: choose one of these, or map it first"
         )
     if not wanted and len(known) != 1:
-        raise InputError(f"{archive.folder} has the flights {', '.join(known)}; choose one with --flight")
+        raise InputError(
+            f"{archive.folder} has the flights {', '.join(known)}; choose one with --flight"
+        )
     return wanted or known[0]
 
 
@@ -220,8 +232,15 @@ def _solved(archive: Archive, name: str, first_ns: int) -> list[_Solved]:
     stored = [each for each in archive.keyframes(name) if each.status is not Status.REJECTED]
     begin_ns = first_ns or min((each.time_ns for each in stored), default=0)
     solved = [
-        _Solved(each, each.site_from_camera, (each.time_ns - begin_ns) / 1e9, each.sigma_m, each.status.value)
-        for each in stored if each.site_from_camera is not None
+        _Solved(
+            each,
+            each.site_from_camera,
+            (each.time_ns - begin_ns) / 1e9,
+            each.sigma_m,
+            each.status.value,
+        )
+        for each in stored
+        if each.site_from_camera is not None
     ]
     if not solved:
         raise InputError(f"no frame of {name} has a camera in space; map it with --method planar")
@@ -242,7 +261,9 @@ def _compared(
         )
     first = setup.source.inputs[0]
     if track is None:
-        raise InputError(f"{first}: no telemetry with positions was found in it or beside it; give it as --telemetry")
+        raise InputError(
+            f"{first}: no telemetry with positions was found in it or beside it; give it as --telemetry"
+        )
     clock, applied_s = _clock(report)
     priors = track.priors([solved[k].seconds for k in seen], applied_s, setup.plan.smooth_s)
     if not any(each.knows_place for each in priors):
@@ -251,17 +272,27 @@ def _compared(
             "position: check that the log is of this flight, or give another one with --telemetry"
         )
     sigma_s = clock.sigma if isfinite(clock.sigma) else track.clock.sigma_s
-    path = AS_THE_MAP if _is_tied(report) else path_fit(priors, [solved[k].pose for k in seen], sigma_s)
+    path = (
+        AS_THE_MAP
+        if _is_tied(report)
+        else path_fit(priors, [solved[k].pose for k in seen], sigma_s)
+    )
     poses = fitted([each.pose for each in solved], path)
-    faults = telemetry_faults(priors, [poses[k] for k in seen], clock, path, knows_height=track.knows_ground)
+    faults = telemetry_faults(
+        priors, [poses[k] for k in seen], clock, path, knows_height=track.knows_ground
+    )
     compared = _Compared(setup, track, applied_s, faults, [solved[k].stored.name for k in seen])
     moved = [replace(each, pose=pose) for each, pose in zip(solved, poses)]
     for row, apart_m in zip(faults.apart, faults.apart_m):
-        moved[seen[row]] = replace(moved[seen[row]], sigma_m=max(apart_m, solved[seen[row]].sigma_m))
+        moved[seen[row]] = replace(
+            moved[seen[row]], sigma_m=max(apart_m, solved[seen[row]].sigma_m)
+        )
     return _without_misplaced(moved, [seen[row] for row in faults.misplaced], compared), compared
 
 
-def _without_misplaced(solved: Sequence[_Solved], misplaced: Sequence[int], compared: _Compared) -> list[_Solved]:
+def _without_misplaced(
+    solved: Sequence[_Solved], misplaced: Sequence[int], compared: _Compared
+) -> list[_Solved]:
     """The frames, those where the map is doubtful placed by telemetry between the others, as KLV is."""
     if not misplaced:
         return list(solved)
@@ -276,37 +307,54 @@ def _without_misplaced(solved: Sequence[_Solved], misplaced: Sequence[int], comp
     return sorted([*kept, *laid], key=lambda each: each.seconds)
 
 
-def _between(times_s: Sequence[float], solved: Sequence[_Solved], compared: _Compared) -> list[Pose]:
+def _between(
+    times_s: Sequence[float], solved: Sequence[_Solved], compared: _Compared
+) -> list[Pose]:
     """The cameras at any moments, by telemetry as the solved frames correct it."""
     smooth_s, key_s = compared.setup.plan.smooth_s, [each.seconds for each in solved]
-    priors, key_priors = (compared.track.priors(each, compared.applied_s, smooth_s) for each in (times_s, key_s))
+    priors, key_priors = (
+        compared.track.priors(each, compared.applied_s, smooth_s) for each in (times_s, key_s)
+    )
     return corrected_poses(times_s, priors, key_s, key_priors, [each.pose for each in solved])
 
 
 def _is_tied(report: Mapping[str, Any]) -> bool:
     """Whether a base map or control points hold the map's scale and direction."""
     points = (report.get("control") or {}).get("points", [])
-    return bool(report.get("base")) or sum(each["role"] == ControlRole.CONTROL for each in points) >= _HOLDING
+    return (
+        bool(report.get("base"))
+        or sum(each["role"] == ControlRole.CONTROL for each in points) >= _HOLDING
+    )
 
 
 def _clock(report: Mapping[str, Any]) -> tuple[Bias, float]:
     """The clock offset that the map found, and the one that it applied, s."""
     offset = report.get("time_offset") or {}
-    value, sigma = (nan if offset.get(key) is None else float(offset[key]) for key in ("estimate_s", "sigma_s"))
+    value, sigma = (
+        nan if offset.get(key) is None else float(offset[key]) for key in ("estimate_s", "sigma_s")
+    )
     return Bias(value, sigma), float(offset.get("applied_s") or 0.0)
 
 
 def _written(
-    site: Site, name: str, folder: Path, solved: Sequence[_Solved], compared: _Compared | None,
-    mapped: Mapping[str, Any], cot: CotReceiver | None,
+    site: Site,
+    name: str,
+    folder: Path,
+    solved: Sequence[_Solved],
+    compared: _Compared | None,
+    mapped: Mapping[str, Any],
+    cot: CotReceiver | None,
 ) -> dict[str, Any]:
     frames = [_frame(each, site) for each in solved]
     texts = {
-        "geo.txt": geo_txt(frames).encode(), "track.csv": track_csv(frames, site.height_reference).encode(),
+        "geo.txt": geo_txt(frames).encode(),
+        "track.csv": track_csv(frames, site.height_reference).encode(),
         "track.gpx": track_gpx(frames, name),
     }
     if is_dated(frames):
-        texts["cot.xml"] = cot_track(frames, name, is_ellipsoidal=site.height_reference == "ellipsoidal")
+        texts["cot.xml"] = cot_track(
+            frames, name, is_ellipsoidal=site.height_reference == "ellipsoidal"
+        )
     elif cot is not None:
         raise InputError(
             f"the date of {name} is not known, and Cursor on Target events need one: map the flight with a log that "
@@ -324,13 +372,22 @@ def _written(
         with atomic_path(folder / f"{name}.ts") as temporary:
             mux_klv(video, temporary, *_samples(compared, solved, site), site.height_reference)
         files.append(f"{name}.ts")
-    report = dict(plain_json({
-        "flight": name, "site": site.name, "frames": len(frames), "height_reference": site.height_reference,
-        "faults": None if compared is None else asdict(compared.faults),
-        "sentences": [_UNDIAGNOSED] if compared is None else fault_sentences(compared.faults, compared.names),
-        "files": files,
-        "warnings": _warnings(site, mapped, frames),
-    }))
+    report = dict(
+        plain_json(
+            {
+                "flight": name,
+                "site": site.name,
+                "frames": len(frames),
+                "height_reference": site.height_reference,
+                "faults": None if compared is None else asdict(compared.faults),
+                "sentences": [_UNDIAGNOSED]
+                if compared is None
+                else fault_sentences(compared.faults, compared.names),
+                "files": files,
+                "warnings": _warnings(site, mapped, frames),
+            }
+        )
+    )
     atomic_write_bytes(folder / _REPORT, json_bytes(report))
     sent = None if cot is None else send_all(texts["cot.xml"].splitlines(), cot.place, cot.tls)
     return {**report, "cot_sent": sent, "diagnosed_before": False}
@@ -351,7 +408,17 @@ def _samples(
     stored, first_ns = solved[0].stored, _first_ns(compared.setup)
     stated_deg = compared.track.body_headings_deg(times_s, compared.applied_s)
     rows = [
-        _row("", number, first_ns + round(time_s * 1e9), time_s, pose, stored.camera, nan, _INTERPOLATED, site)
+        _row(
+            "",
+            number,
+            first_ns + round(time_s * 1e9),
+            time_s,
+            pose,
+            stored.camera,
+            nan,
+            _INTERPOLATED,
+            site,
+        )
         for number, (time_s, pose) in enumerate(zip(times_s, poses))
     ]
     return rows, headings_deg(stated_deg, compared.faults.heading_deg, times_s, poses)
@@ -360,13 +427,27 @@ def _samples(
 def _frame(each: _Solved, site: Site) -> CorrectedFrame:
     stored = each.stored
     return _row(
-        stored.name, stored.index, stored.time_ns, each.seconds, each.pose, stored.camera, each.sigma_m, each.status,
+        stored.name,
+        stored.index,
+        stored.time_ns,
+        each.seconds,
+        each.pose,
+        stored.camera,
+        each.sigma_m,
+        each.status,
         site,
     )
 
 
 def _row(
-    name: str, index: int, time_ns: int, seconds: float, pose: Pose, camera: Camera, sigma_m: float, status: str,
+    name: str,
+    index: int,
+    time_ns: int,
+    seconds: float,
+    pose: Pose,
+    camera: Camera,
+    sigma_m: float,
+    status: str,
     site: Site,
 ) -> CorrectedFrame:
     longitudes, latitudes = longitude_latitude(pose.translation_m[None], site)
@@ -374,8 +455,21 @@ def _row(
     up_m = float(pose.translation_m[2])
     across_deg, along_deg = camera.angle_of_view_deg
     return CorrectedFrame(
-        name, index, time_ns, seconds, float(latitudes[0]), float(longitudes[0]), site.origin.height_m + up_m, up_m,
-        yaw_deg, pitch_deg, roll_deg, sigma_m if isfinite(sigma_m) else nan, across_deg, along_deg, status,
+        name,
+        index,
+        time_ns,
+        seconds,
+        float(latitudes[0]),
+        float(longitudes[0]),
+        site.origin.height_m + up_m,
+        up_m,
+        yaw_deg,
+        pitch_deg,
+        roll_deg,
+        sigma_m if isfinite(sigma_m) else nan,
+        across_deg,
+        along_deg,
+        status,
     )
 
 
@@ -383,7 +477,9 @@ def _warnings(site: Site, mapped: Mapping[str, Any], frames: Sequence[CorrectedF
     """The warnings about the map that all is measured by, and what the files leave out."""
     doubt = doubt_about(mapped)
     warnings = [doubt] if doubt else []
-    warnings += [f"of the map: {each}" for each in mapped.get("warnings") or () if each not in doubt]
+    warnings += [
+        f"of the map: {each}" for each in mapped.get("warnings") or () if each not in doubt
+    ]
     if site.height_reference not in ("ellipsoidal", "orthometric"):
         warnings.append(
             f"heights are {site.height_reference}: geo.txt, GPX and CSV hold them as such, and KLV and Cursor on "

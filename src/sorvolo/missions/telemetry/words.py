@@ -7,7 +7,12 @@ from statistics import median
 from sorvolo.survey.corrected import Bias, PathFit, TelemetryFaults
 from sorvolo.survey.wording import counted
 
-_LEAST = {"clock": 0.04, "heading": 0.5, "tilt": 0.5, "height": 0.3}  # s, deg, deg, m: smaller ones matter to nobody
+_LEAST = {
+    "clock": 0.04,
+    "heading": 0.5,
+    "tilt": 0.5,
+    "height": 0.3,
+}  # s, deg, deg, m: smaller ones matter to nobody
 _NOT_KNOWN = {"clock": 1.0, "heading": 10.0, "height": 10.0}
 """s (10 m of flight, or less), deg, m: right within more than this is no knowledge; by choice."""
 _TOO_FEW = "too few frames have a fix"
@@ -17,9 +22,13 @@ _MOST_NAMED = 6  # frames in a sentence
 def fault_sentences(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
     """One sentence for each quantity that telemetry states; `names` are those of the compared frames."""
     return [
-        *_clock(faults.clock_s), *_heading(faults.heading_deg, faults.path), *_outlying(faults, names),
+        *_clock(faults.clock_s),
+        *_heading(faults.heading_deg, faults.path),
+        *_outlying(faults, names),
         *_misplaced(faults, names),
-        *_tilt(faults.tilt_deg), *_height(faults.height_m, faults.path), *_map(faults.path),
+        *_tilt(faults.tilt_deg),
+        *_height(faults.height_m, faults.path),
+        *_map(faults.path),
         f"fixes scatter by {faults.position_m.scatter:.2f} m about the path in the pictures (1 sigma per axis)",
     ]
 
@@ -28,11 +37,15 @@ def _clock(found: Bias) -> list[str]:
     if not isfinite(found.value):
         return ["the clocks cannot be compared: the motion does not show an offset"]
     if _is_unknown(found, "clock"):
-        return ["whether the clocks agree cannot be known: the flight turns too little to show an offset"]
+        return [
+            "whether the clocks agree cannot be known: the flight turns too little to show an offset"
+        ]
     if abs(found.value) < _LEAST["clock"] or not found.is_significant:
         return [f"the clocks agree within {_within(found, 0.01):.2f} s"]
     side = "ahead of" if found.value > 0 else "behind"
-    return [f"the telemetry's clock was {abs(found.value):.2f} s {side} the pictures (1 sigma {found.sigma:.2f} s)"]
+    return [
+        f"the telemetry's clock was {abs(found.value):.2f} s {side} the pictures (1 sigma {found.sigma:.2f} s)"
+    ]
 
 
 def _heading(found: Bias, path: PathFit) -> list[str]:
@@ -68,7 +81,11 @@ def _map(path: PathFit) -> list[str]:
             f"turned by {abs(path.sure_turn_deg):.1f} deg {side} against {'it' if found else 'its GPS track'} (1 sigma "
             f"{path.turn_deg.sigma:.1f} deg)"
         )
-    return [f"the map is {' and '.join(found)}: the corrected cameras follow the track"] if found else []
+    return (
+        [f"the map is {' and '.join(found)}: the corrected cameras follow the track"]
+        if found
+        else []
+    )
 
 
 def _outlying(faults: TelemetryFaults, names: Sequence[str]) -> list[str]:
@@ -108,24 +125,32 @@ def _named(rows: Sequence[int], names: Sequence[str]) -> str:
 def _tilt(found: Bias) -> list[str]:
     if not isfinite(found.value) or found.value < _LEAST["tilt"] or not found.is_significant:
         return []
-    return [f"the camera looked {found.value:.1f} deg beside where telemetry puts it (1 sigma {found.sigma:.1f} deg)"]
+    return [
+        f"the camera looked {found.value:.1f} deg beside where telemetry puts it (1 sigma {found.sigma:.1f} deg)"
+    ]
 
 
 def _height(found: Bias, path: PathFit) -> list[str]:
     if not isfinite(found.value):
         return ["telemetry has no height above the ground to compare"]
     if _is_unknown(found, "height"):
-        why = "the GPS track is too short for its scatter" if isfinite(path.scale.value) else _TOO_FEW
+        why = (
+            "the GPS track is too short for its scatter" if isfinite(path.scale.value) else _TOO_FEW
+        )
         return [f"whether heights above the ground were right cannot be known: {why}"]
     if abs(found.value) < _LEAST["height"] or not found.is_significant:
         return [f"heights above the ground were right within {_within(found, 0.1):.1f} m"]
     side = "too high" if found.value > 0 else "too low"
-    return [f"heights above the ground were {abs(found.value):.1f} m {side} (1 sigma {found.sigma:.1f} m)"]
+    return [
+        f"heights above the ground were {abs(found.value):.1f} m {side} (1 sigma {found.sigma:.1f} m)"
+    ]
 
 
 def _is_unknown(found: Bias, what: str) -> bool:
     """Whether an error could be so large that "right within" would mislead; one that surely is an error is known."""
-    return not 2 * found.sigma <= _NOT_KNOWN[what] and not (isfinite(found.sigma) and found.is_significant)
+    return not 2 * found.sigma <= _NOT_KNOWN[what] and not (
+        isfinite(found.sigma) and found.is_significant
+    )
 
 
 def _within(found: Bias, least: float) -> float:

@@ -15,12 +15,19 @@ from sorvolo.training.seeing import see
 
 def check_of(checked: Checked, step: int) -> Check:
     """The figures of a check: AP50 and AP over all classes, the plain mean, and AP50 of each class."""
-    return Check(step, mean_known(checked.ap50.values()), mean_known(checked.ap.values()), checked.ap50)
+    return Check(
+        step, mean_known(checked.ap50.values()), mean_known(checked.ap.values()), checked.ap50
+    )
 
 
 def check_model(
-    model: FasterRCNN, classes: Sequence[str], held_out: Sequence[LabelledSet], read: Callable[[str], ImageRGB], *,
-    device: str, most: int,
+    model: FasterRCNN,
+    classes: Sequence[str],
+    held_out: Sequence[LabelledSet],
+    read: Callable[[str], ImageRGB],
+    *,
+    device: str,
+    most: int,
 ) -> Checked:
     """Run the network over at most `most` held-out pictures, spread evenly over each set; damaged ones are left out."""
     total = sum(len(each) for each in held_out)

@@ -19,7 +19,13 @@ from sorvolo.detection.held_out import Checked, best_sizes_px, found_sizes_px
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.train.checks import check_model, check_of
-from sorvolo.missions.train.sets import DataOptions, TrainingSets, read_labels, simulate_samples, training_sets
+from sorvolo.missions.train.sets import (
+    DataOptions,
+    TrainingSets,
+    read_labels,
+    simulate_samples,
+    training_sets,
+)
 from sorvolo.missions.train.settings import TrainSettings
 from sorvolo.missions.train.start import (
     class_notices,
@@ -58,11 +64,16 @@ MODEL, REPORT, PAGE = "model.onnx", "training.json", "training.html"
 CHECKPOINT, BEST, SIMULATED = "checkpoint.pt", "best.safetensors", "simulated"
 """What a run leaves in its folder; the last only where simulated pictures were asked for."""
 
-_CHECKS, _CHECK_STEPS = 20, 50  # a run is checked so often, evenly over its steps, but not after fewer of them
+_CHECKS, _CHECK_STEPS = (
+    20,
+    50,
+)  # a run is checked so often, evenly over its steps, but not after fewer of them
 _MOST_CHECKED, _MOST_CHECKED_LAST = 150, 1000  # held-out pictures
 _ROWS = 200  # of losses in the report
 _SAVE_S = 60.0  # a kill costs no more than this and the time between two checks
-_KEPT_PICTURES_BYTES = 2 << 30  # decoded pictures in memory: two gigabytes of a small computer's eight; by choice
+_KEPT_PICTURES_BYTES = (
+    2 << 30
+)  # decoded pictures in memory: two gigabytes of a small computer's eight; by choice
 _FINDS_NOTHING_AP50 = 0.05  # below which a model is of no use yet
 _EXPORT_PICTURES, _EXPORT_PX = 4, 1280  # by which the model file is compared with torch
 
@@ -102,12 +113,26 @@ class _Run:
         if isinstance(self.start, ExportedModel):
             begun = f"model with SHA-256 {self.start.sha256[:16]}"
         else:
-            begun = "none" if self.start is None else f"ImageNet{', original strides' if self.start.original else ''}"
-        return {**settings, "weights": begun, "classes": list(self.sets.classes), "data": self.sets.fingerprint}
+            begun = (
+                "none"
+                if self.start is None
+                else f"ImageNet{', original strides' if self.start.original else ''}"
+            )
+        return {
+            **settings,
+            "weights": begun,
+            "classes": list(self.sets.classes),
+            "data": self.sets.fingerprint,
+        }
 
 
 def train_detector(
-    places: Sequence[Path], out: Path, settings: TrainSettings, options: DataOptions, *, device: str = "auto",
+    places: Sequence[Path],
+    out: Path,
+    settings: TrainSettings,
+    options: DataOptions,
+    *,
+    device: str = "auto",
     resume: bool = False,
 ) -> Iterator[TrainingUpdate]:
     """Train on the sets at `places` and leave model.onnx, training.html, training.json and checkpoints in `out`.
@@ -122,7 +147,12 @@ def train_detector(
 
 
 def _train(
-    places: Sequence[Path], out: Path, settings: TrainSettings, options: DataOptions, device: str, resume: bool
+    places: Sequence[Path],
+    out: Path,
+    settings: TrainSettings,
+    options: DataOptions,
+    device: str,
+    resume: bool,
 ) -> Iterator[TrainingUpdate]:
     start = load_start(settings.weights, settings.preset)
     steps = settings.steps
@@ -141,8 +171,16 @@ def _train(
     with without_denormals():
         with closing(_batches(sets, reader, settings)) as first:
             learner = start_learner(
-                settings.preset, sets.classes, settings.rpn, settings.schedule, start, first, steps=steps,
-                batch=settings.batch, seed=settings.seed, device=device,
+                settings.preset,
+                sets.classes,
+                settings.rpn,
+                settings.schedule,
+                start,
+                first,
+                steps=steps,
+                batch=settings.batch,
+                seed=settings.seed,
+                device=device,
             )
         run = _Run(out, settings, sets, learner, reader, device, start, notices)
         if resume:
@@ -152,7 +190,9 @@ def _train(
         yield from _learn(run)
         yield TrainingUpdate(run.learner.step, steps, "measuring and writing the model")
         check, closing_notices = _finish(run)
-    yield TrainingUpdate(run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=closing_notices)
+    yield TrainingUpdate(
+        run.learner.step, steps, f"{out / MODEL} is ready", check=check, notices=closing_notices
+    )
 
 
 @contextmanager
@@ -163,9 +203,13 @@ def _claimed(out: Path, resume: bool) -> Iterator[None]:
     """
     held = (out / CHECKPOINT).is_file()
     if resume and not held:
-        raise SettingsError(f"{out} holds no {CHECKPOINT} to go on from; leave --resume out to start there")
+        raise SettingsError(
+            f"{out} holds no {CHECKPOINT} to go on from; leave --resume out to start there"
+        )
     if held and not resume:
-        raise SettingsError(f"{out} already holds a run; --resume continues it, another --out starts a new one")
+        raise SettingsError(
+            f"{out} already holds a run; --resume continues it, another --out starts a new one"
+        )
     made = [each for each in (out, *out.parents) if not each.exists()]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
@@ -204,8 +248,14 @@ def _batches(
 ) -> Generator[list[Sample], None, None]:
     """What is learnt from, batch by batch, from number `start` on."""
     return batches_from(
-        sets.shares, sets.classes, reader, Augmentation(side_px=settings.side_px), seed=settings.seed,
-        batch=settings.batch, start=start, threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
+        sets.shares,
+        sets.classes,
+        reader,
+        Augmentation(side_px=settings.side_px),
+        seed=settings.seed,
+        batch=settings.batch,
+        start=start,
+        threads=max(1, min(8, (os.cpu_count() or 1) - 1)),
     )
 
 
@@ -224,14 +274,21 @@ def _learn(run: _Run) -> Iterator[TrainingUpdate]:
                     f"--weights auto or another --seed; {run.out / CHECKPOINT} is from before"
                 )
             here_s = time.monotonic() - started_s
-            run.history = run.history.after(progress, before_s + here_s, every=max(1, settings.steps // _ROWS))
+            run.history = run.history.after(
+                progress, before_s + here_s, every=max(1, settings.steps // _ROWS)
+            )
             check = _check(run) if _is_check_due(run) else None
             if check is not None or time.monotonic() - saved_s > _SAVE_S:
                 _save(run)
                 saved_s = time.monotonic()
             yield TrainingUpdate(
-                learner.step, settings.steps, _stage(learner), progress, (learner.step - first) / here_s,
-                seconds_left(learner.step, settings.steps, learner.step - first, here_s), check,
+                learner.step,
+                settings.steps,
+                _stage(learner),
+                progress,
+                (learner.step - first) / here_s,
+                seconds_left(learner.step, settings.steps, learner.step - first, here_s),
+                check,
             )
     except GeneratorExit:
         _save(run)
@@ -244,7 +301,9 @@ def _learn(run: _Run) -> Iterator[TrainingUpdate]:
 def _is_check_due(run: _Run) -> bool:
     """At even distances and in the end; of the four steps only in the last: before, the parts do not fit together."""
     step, steps = run.learner.step, run.settings.steps
-    if not run.sets.held_out or (isinstance(run.learner, FourStepTraining) and run.learner.stage < 3):
+    if not run.sets.held_out or (
+        isinstance(run.learner, FourStepTraining) and run.learner.stage < 3
+    ):
         return False
     return step % max(_CHECK_STEPS, steps // _CHECKS) == 0 or step == steps
 
@@ -263,11 +322,15 @@ def _stage(learner: Learner) -> str:
 
 
 def _save(run: _Run) -> None:
-    atomic_write_bytes(run.out / CHECKPOINT, checkpoint_bytes(run.learner, run.identity, run.history))
+    atomic_write_bytes(
+        run.out / CHECKPOINT, checkpoint_bytes(run.learner, run.identity, run.history)
+    )
 
 
 def _look(run: _Run, model: FasterRCNN, most: int) -> Checked:
-    return check_model(model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most)
+    return check_model(
+        model, run.sets.classes, run.sets.held_out, run.reader, device=run.device, most=most
+    )
 
 
 def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
@@ -281,23 +344,32 @@ def _finish(run: _Run) -> tuple[Check | None, tuple[str, ...]]:
     thresholds = checked.thresholds(classes, before)
     scores = {name: each.score for name, each in thresholds.items()}
     known = run.start.calibration if isinstance(run.start, ExportedModel) else {}
-    calibration = checked.calibration(classes, {name: Calibration(**each) for name, each in known.items()})
+    calibration = checked.calibration(
+        classes, {name: Calibration(**each) for name, each in known.items()}
+    )
     scaled = scaled_thresholds(scores, calibration)
     info = _info(run, checked, scores) | {
-        "format": FORMAT if calibration else 1, "thresholds": scaled,
+        "format": FORMAT if calibration else 1,
+        "thresholds": scaled,
         "calibration": {name: asdict(each) for name, each in calibration.items()},
     }
     exported = export_onnx(model, info)
     agreement = check_export(model.cpu(), exported, _some_pictures(run))
     atomic_write_bytes(run.out / MODEL, exported)
-    check = check_of(checked, run.learner.step if best is None else best.step) if run.sets.held_out else None
+    check = (
+        check_of(checked, run.learner.step if best is None else best.step)
+        if run.sets.held_out
+        else None
+    )
     notices = _closing_notices(run, agreement, check)
     if isinstance(run.start, ExportedModel):
         notices += tuple(threshold_notices(run.start, checked.too_few(classes)))
         notices += tuple(size_notices(run.start, checked.too_few(classes)))
         notices += tuple(request_notices(run.start, info["on_request"]))
     report = _report(run, info, agreement, len(exported), check, notices) | {
-        "reported": {name: asdict(replace(each, score=scaled[name])) for name, each in thresholds.items()},
+        "reported": {
+            name: asdict(replace(each, score=scaled[name])) for name, each in thresholds.items()
+        },
         "found_px": found_sizes_px(checked, scores, classes),
     }
     atomic_write_bytes(run.out / REPORT, json_bytes(report))
@@ -311,11 +383,16 @@ def _info(run: _Run, checked: Checked, thresholds: dict[str, float]) -> dict[str
     classes, (thermal, by_day) = run.sets.classes, run.sets.lights
     before = run.start.best_px if isinstance(run.start, ExportedModel) else {}
     return {
-        "name": run.out.resolve().name or "model", "preset": run.settings.preset, "version": __version__,
-        "classes": list(classes), "thresholds": thresholds,
+        "name": run.out.resolve().name or "model",
+        "preset": run.settings.preset,
+        "version": __version__,
+        "classes": list(classes),
+        "thresholds": thresholds,
         "best_px": best_sizes_px(checked, thresholds, learnt, classes, before),
         **_descent(run, ", ".join(each.name for each in learnt)),
-        "thermal": thermal, "daylight": by_day, **_kept(run, checked, thermal=thermal),
+        "thermal": thermal,
+        "daylight": by_day,
+        **_kept(run, checked, thermal=thermal),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
     }
 
@@ -351,7 +428,11 @@ def _some_pictures(run: _Run) -> list[ImageRGB]:
         if len(found) == _EXPORT_PICTURES:
             break
         try:
-            found.append(padded_to(run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride))
+            found.append(
+                padded_to(
+                    run.reader(picture.path)[:_EXPORT_PX, :_EXPORT_PX], run.learner.model.stride
+                )
+            )
         except InputError:
             continue
     return found
@@ -367,9 +448,13 @@ def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> 
         )
     if run.reader.damaged:
         count, (path, reason) = len(run.reader.damaged), next(iter(run.reader.damaged.items()))
-        notices.append(f"{counted(count, 'picture')} left out that cannot be read (first: {path}: {reason})")
+        notices.append(
+            f"{counted(count, 'picture')} left out that cannot be read (first: {path}: {reason})"
+        )
     if not run.sets.held_out:
-        notices.append("nothing was held out: how good the model is, and from which score to report, is not known")
+        notices.append(
+            "nothing was held out: how good the model is, and from which score to report, is not known"
+        )
     if not agreement.is_good:
         notices.append(
             f"the exported model differs from torch by {agreement.box_px:.2f} px, {agreement.score:.4f} in score, "
@@ -379,18 +464,31 @@ def _closing_notices(run: _Run, agreement: ExportCheck, check: Check | None) -> 
 
 
 def _report(
-    run: _Run, info: Mapping[str, Any], agreement: ExportCheck, size_bytes: int, check: Check | None,
+    run: _Run,
+    info: Mapping[str, Any],
+    agreement: ExportCheck,
+    size_bytes: int,
+    check: Check | None,
     closing_notices: Sequence[str],
 ) -> dict[str, Any]:
     """The content of training.json."""
     step, steps, history = run.learner.step, run.settings.steps, run.history
     return {
-        "made_by": "sorvolo train", "format": 1, "model": dict(info), "settings": asdict(run.settings),
-        "device": run.device, "weights": "none" if run.start is None else run.start.origin,
+        "made_by": "sorvolo train",
+        "format": 1,
+        "model": dict(info),
+        "settings": asdict(run.settings),
+        "device": run.device,
+        "weights": "none" if run.start is None else run.start.origin,
         "not_carried_on": list(run.start.left) if isinstance(run.start, ExportedModel) else [],
-        "sets": run.sets.described(), "notices": [*run.notices, *closing_notices],
-        "step": step, "steps": steps, "stopped_early": step < steps, "seconds": history.seconds,
-        "losses": [asdict(row) for row in history.rows], "checks": [asdict(each) for each in history.checks],
+        "sets": run.sets.described(),
+        "notices": [*run.notices, *closing_notices],
+        "step": step,
+        "steps": steps,
+        "stopped_early": step < steps,
+        "seconds": history.seconds,
+        "losses": [asdict(row) for row in history.rows],
+        "checks": [asdict(each) for each in history.checks],
         "best_step": None if history.best is None else history.best.step,
         "held_out": None if check is None else asdict(check),
         "export": {**asdict(agreement), "good": agreement.is_good, "bytes": size_bytes},

@@ -4,10 +4,15 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.splits import split_by_blocks, split_by_group
 
-_BLOCKS, _GAP = 10, 10  # into which a set of too few videos is cut; frames left out between them, at most
+_BLOCKS, _GAP = (
+    10,
+    10,
+)  # into which a set of too few videos is cut; frames left out between them, at most
 
 
-def hold_out(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSet, LabelledSet, list[str]]:
+def hold_out(
+    labelled: LabelledSet, share: float, seed: int
+) -> tuple[LabelledSet, LabelledSet, list[str]]:
     """What is learnt from, what is held out, and notices about that; whole videos wherever there are enough.
 
     Both `sorvolo train --val SHARE` and `sorvolo evaluate detector --held-out SHARE` take it from here. Raises
@@ -34,5 +39,7 @@ def hold_out(labelled: LabelledSet, share: float, seed: int) -> tuple[LabelledSe
         f"{labelled.name} has too few videos to hold whole ones out: blocks of about {block} neighbouring frames were "
         "instead; frames of one video look alike, so the score will be too good"
     )
-    remarks = [f"{labelled.name}: {notice.text}" for each in parts.values() for notice in each.notices]
+    remarks = [
+        f"{labelled.name}: {notice.text}" for each in parts.values() for notice in each.notices
+    ]
     return parts["learnt"], parts["held out"], [text, *remarks]

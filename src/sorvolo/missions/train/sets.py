@@ -87,8 +87,11 @@ class TrainingSets:
         parts += [(each, "checked on", None) for each in self.held_out]
         return [
             {
-                "name": each.name, "part": part, "pictures": len(each),
-                "videos": len({picture.group for picture in each.pictures}), "thermal": thermal,
+                "name": each.name,
+                "part": part,
+                "pictures": len(each),
+                "videos": len({picture.group for picture in each.pictures}),
+                "thermal": thermal,
                 "boxes": {
                     name: int(sum((picture.labels == label).sum() for picture in each.pictures))
                     for label, name in enumerate(each.classes)
@@ -99,7 +102,9 @@ class TrainingSets:
         ]
 
 
-def read_labels(places: Sequence[Path], options: DataOptions, *, synthetic: float, seed: int) -> ReadLabels:
+def read_labels(
+    places: Sequence[Path], options: DataOptions, *, synthetic: float, seed: int
+) -> ReadLabels:
     """Read and split all sets.
 
     Raises InputError where there is nothing to learn from or a set cannot be read, SettingsError where `val` is neither
@@ -107,10 +112,12 @@ def read_labels(places: Sequence[Path], options: DataOptions, *, synthetic: floa
     """
     share = _share_of(options.val)
     if not places and synthetic < 1:
-        raise InputError("no data to learn from; give folders of labelled pictures, or --synthetic 1")
+        raise InputError(
+            "no data to learn from; give folders of labelled pictures, or --synthetic 1"
+        )
     checked = [Path(options.val)] if share is None else []
     read = _read([*places, *checked], options)
-    whole, apart = list(read[:len(places)]), list(read[len(places):])
+    whole, apart = list(read[: len(places)]), list(read[len(places) :])
     notices = [f"{each.name}: {notice.text}" for each in read for notice in each.notices]
     if share is not None:
         return _divided(whole, share, seed, notices)
@@ -118,11 +125,14 @@ def read_labels(places: Sequence[Path], options: DataOptions, *, synthetic: floa
     return ReadLabels(tuple(whole), tuple(apart), tuple(notices))
 
 
-def _divided(whole: Sequence[LabelledSet], share: float, seed: int, notices: Sequence[str]) -> ReadLabels:
+def _divided(
+    whole: Sequence[LabelledSet], share: float, seed: int, notices: Sequence[str]
+) -> ReadLabels:
     """The sets with a share of each held out; `notices` and what is to be known of that."""
     parts = [hold_out(each, share, seed) for each in whole]
     return ReadLabels(
-        tuple(learnt for learnt, _, _ in parts), tuple(held_out for _, held_out, _ in parts if len(held_out)),
+        tuple(learnt for learnt, _, _ in parts),
+        tuple(held_out for _, held_out, _ in parts if len(held_out)),
         (*notices, *(text for _, _, texts in parts for text in texts)),
     )
 
@@ -145,7 +155,10 @@ def training_sets(read: ReadLabels, *, synthetic: float, simulated: Path) -> Tra
     _demand_objects(shares, notices)
     notices += _short_classes(shares, classes)
     return TrainingSets(
-        tuple(shares), tuple(_honest(each, classes) for each in read.held_out), classes, tuple(notices)
+        tuple(shares),
+        tuple(_honest(each, classes) for each in read.held_out),
+        classes,
+        tuple(notices),
     )
 
 
@@ -158,8 +171,10 @@ def _demand_objects(shares: Sequence[Share], notices: Sequence[str]) -> None:
     """Raise InputError where no picture has an object to learn, with what was remarked of the sets."""
     if not any(len(picture.labels) for each in shares for picture in each.labelled.pictures):
         remarks = "; ".join(notices) or "all their label files are empty"
-        raise InputError(f"none of the pictures to learn from has a labelled object that can be used ({remarks}); "
-                         "check the labels, their class names and what is held out with --val")
+        raise InputError(
+            f"none of the pictures to learn from has a labelled object that can be used ({remarks}); "
+            "check the labels, their class names and what is held out with --val"
+        )
 
 
 def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
@@ -175,7 +190,11 @@ def simulate_samples(folder: Path, samples: int, seed: int) -> Iterator[str]:
 
 def _read(places: Sequence[Path], options: DataOptions) -> tuple[LabelledSet, ...]:
     return read_datasets(
-        places, form=options.form, classes=options.classes, ignore=options.ignore, unlabelled=options.unlabelled,
+        places,
+        form=options.form,
+        classes=options.classes,
+        ignore=options.ignore,
+        unlabelled=options.unlabelled,
         group_pattern=options.group_pattern,
     )
 
@@ -187,7 +206,9 @@ def _share_of(val: str) -> float | None:
     try:
         share = float(val)
     except ValueError as error:
-        raise SettingsError(f"--val {val} is neither an existing data set nor a share such as 0.15") from error
+        raise SettingsError(
+            f"--val {val} is neither an existing data set nor a share such as 0.15"
+        ) from error
     if not 0 <= share < 1:
         raise SettingsError(f"the share to check on (--val) must lie in 0 to below 1, got {val}")
     return share
@@ -213,8 +234,12 @@ def _by_light(labelled: LabelledSet) -> list[Share]:
 def _parted(labelled: LabelledSet) -> tuple[LabelledSet, LabelledSet]:
     """The set's pictures by day, damaged ones among them, and its thermal ones."""
     are_thermal = [_is_thermal(picture) for picture in labelled.pictures]
-    by_day = labelled.only([picture for picture, dark in zip(labelled.pictures, are_thermal) if not dark])
-    thermal = labelled.only([picture for picture, dark in zip(labelled.pictures, are_thermal) if dark])
+    by_day = labelled.only(
+        [picture for picture, dark in zip(labelled.pictures, are_thermal) if not dark]
+    )
+    thermal = labelled.only(
+        [picture for picture, dark in zip(labelled.pictures, are_thermal) if dark]
+    )
     return by_day, replace(thermal, name=f"{labelled.name}, thermal")
 
 
@@ -232,7 +257,9 @@ def _mixed(shares: Sequence[Share], made: Sequence[LabelledSet], ratio: float) -
     pictures = sum(len(each) for each in made)
     scaled = [replace(share, weight=share.weight / real * (1 - ratio)) for share in shares]
     return [share for share in scaled if share.weight > 0] + [
-        Share(each, ratio * len(each) / pictures, thermal=index == 1) for index, each in enumerate(made) if len(each)
+        Share(each, ratio * len(each) / pictures, thermal=index == 1)
+        for index, each in enumerate(made)
+        if len(each)
     ]
 
 
@@ -248,4 +275,8 @@ def _short_classes(shares: Sequence[Share], classes: Sequence[str]) -> list[str]
         for picture in share.labelled.pictures:
             for label in picture.labels:
                 counts[share.labelled.classes[label]] += 1
-    return [f"only {count} boxes of class {name} to learn from" for name, count in counts.items() if count < 50]
+    return [
+        f"only {count} boxes of class {name} to learn from"
+        for name, count in counts.items()
+        if count < 50
+    ]

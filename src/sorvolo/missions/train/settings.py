@@ -31,12 +31,17 @@ class TrainSettings:
             if value not in known:
                 raise SettingsError(f"{name} must be one of {', '.join(known)}, got {value!r}")
         for name, number, low, high in (
-            ("steps", self.steps, 1, 10**8), ("batch", self.batch, 1, 1024), ("side_px", self.side_px, 64, 4096),
-            ("seed", self.seed, 0, 2**62), ("patience", self.patience, 0, 10**6),
+            ("steps", self.steps, 1, 10**8),
+            ("batch", self.batch, 1, 1024),
+            ("side_px", self.side_px, 64, 4096),
+            ("seed", self.seed, 0, 2**62),
+            ("patience", self.patience, 0, 10**6),
         ):
             if not low <= number <= high:
                 raise SettingsError(f"{name} must lie in {low} to {high}, got {number}")
         if self.side_px % 32:
             raise SettingsError(f"side_px must be a multiple of 32, got {self.side_px}")
         if not 0 <= self.synthetic <= 1:
-            raise SettingsError(f"the share of synthetic samples must lie in 0 to 1, got {self.synthetic}")
+            raise SettingsError(
+                f"the share of synthetic samples must lie in 0 to 1, got {self.synthetic}"
+            )

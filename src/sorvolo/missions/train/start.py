@@ -53,7 +53,9 @@ def load_weights(choice: str, net: Net) -> ImageNetWeights:
     if choice == "auto":
         weights = replace(weights, origin=f"{SOURCES[net].name} ({SOURCES[net].licence})")
     if weights.net != net:
-        raise InputError(f"{choice} holds weights of {weights.net}, but this preset is built on {net}; {WAYS}")
+        raise InputError(
+            f"{choice} holds weights of {weights.net}, but this preset is built on {net}; {WAYS}"
+        )
     return weights
 
 
@@ -118,7 +120,9 @@ def size_notices(start: ExportedModel, too_few: Sequence[str]) -> list[str]:
     ]
 
 
-def kept_on_request(start: ExportedModel, classes: Sequence[str], too_few: Sequence[str]) -> tuple[str, ...]:
+def kept_on_request(
+    start: ExportedModel, classes: Sequence[str], too_few: Sequence[str]
+) -> tuple[str, ...]:
     """Which of the new model's classes are reported on request alone: those of the model before that are `too_few`
     among the held-out objects, since nothing shows that they became surer. None where no other class would be left."""
     kept = tuple(name for name in classes if name in start.on_request and name in too_few)
@@ -152,7 +156,9 @@ def class_notices(start: ExportedModel, classes: Sequence[str]) -> list[str]:
     if new:
         notices.append(f"{start.origin} does not know {', '.join(new)}: learnt from the beginning")
     if left:
-        notices.append(f"{start.origin} knows {', '.join(left)}, which nothing here labels: the new model will not")
+        notices.append(
+            f"{start.origin} knows {', '.join(left)}, which nothing here labels: the new model will not"
+        )
     return notices
 
 
@@ -165,14 +171,26 @@ def _model(choice: str, preset: Preset) -> ExportedModel:
         )
     demand_searching(info)
     if info.preset and info.preset not in NETS:
-        raise InputError(f"{path} is of the preset {info.preset}, which cannot be trained; there are {', '.join(NETS)}")
+        raise InputError(
+            f"{path} is of the preset {info.preset}, which cannot be trained; there are {', '.join(NETS)}"
+        )
     if info.preset and info.preset != preset:
-        raise InputError(f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}")
+        raise InputError(
+            f"{path} is of the preset {info.preset}, not {preset}: train with --preset {info.preset}"
+        )
     sha256 = file_sha256(path)
     start = ExportedModel(
-        content, info.classes, f"the model {info.name}", sha256, info.licence, info.trained_on, in_own_scale(info),
-        {name: asdict(each) for name, each in info.calibration.items()}, on_request=info.on_request,
-        thermal_by=info.thermal_by, best_px=info.best_px,
+        content,
+        info.classes,
+        f"the model {info.name}",
+        sha256,
+        info.licence,
+        info.trained_on,
+        in_own_scale(info),
+        {name: asdict(each) for name, each in info.calibration.items()},
+        on_request=info.on_request,
+        thermal_by=info.thermal_by,
+        best_px=info.best_px,
     )
     return _aerial(start, info, path) if other_networks(content) else start
 
@@ -183,10 +201,14 @@ def _aerial(start: ExportedModel, info: ModelInfo, path: Path) -> ExportedModel:
     is_of_file = str(card.get(HASH_KEY, "")).lower() == start.sha256
     alone = card.get("aerial_alone", {}) if is_of_file else {}
     left = [*other_networks(start.content)]
-    left += [f"the second look at reports ({', '.join(info.second_look)})"] if info.second_look else []
+    left += (
+        [f"the second look at reports ({', '.join(info.second_look)})"] if info.second_look else []
+    )
     left += ["the search in several sizes"] if info.pyramid else []
     cost = tuple(_lost(alone.get("measured") or {}, card.get("measured") or {})) if alone else ()
-    return replace(start, thresholds=alone.get("thresholds", {}), calibration={}, left=tuple(left), cost=cost)
+    return replace(
+        start, thresholds=alone.get("thresholds", {}), calibration={}, left=tuple(left), cost=cost
+    )
 
 
 def _lost(alone: Mapping[str, Any], whole: Mapping[str, Any]) -> Iterator[str]:

@@ -97,12 +97,16 @@ class Outbox(Generic[_Item]):
                 item = self._waiting.popleft()
             try:
                 self._send(item)
-            except Exception as error:  # counted and reported: one bad answer must not end all later alerts
+            except (
+                Exception
+            ) as error:  # counted and reported: one bad answer must not end all later alerts
                 self._failed += 1
                 self._last_words = " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def alert_command(template: str, *, limit_s: float = _COMMAND_LIMIT_S) -> Callable[[Mapping[str, Any]], None]:
+def alert_command(
+    template: str, *, limit_s: float = _COMMAND_LIMIT_S
+) -> Callable[[Mapping[str, Any]], None]:
     """A function that runs the command for one alert, its placeholders filled in, the alert as JSON on its stdin.
 
     The template is split into words as a shell does, but no shell runs. The function raises StoreError when the command
@@ -115,13 +119,21 @@ def alert_command(template: str, *, limit_s: float = _COMMAND_LIMIT_S) -> Callab
         raise SettingsError("--alert-command is empty; give a program and its arguments")
     if unknown := sorted(named - set(PLACEHOLDERS)):
         known = " ".join(f"{{{name}}}" for name in PLACEHOLDERS)
-        raise SettingsError(f"--alert-command: there is no placeholder {{{unknown[0]}}}; use {known}")
+        raise SettingsError(
+            f"--alert-command: there is no placeholder {{{unknown[0]}}}; use {known}"
+        )
     if shutil.which(words[0]) is None:
-        raise SettingsError(f"--alert-command: no program {words[0]!r} was found; give its full path")
+        raise SettingsError(
+            f"--alert-command: no program {words[0]!r} was found; give its full path"
+        )
 
     def run(alert: Mapping[str, Any]) -> None:
-        values = {name: "" if alert.get(name) is None else str(alert[name]) for name in PLACEHOLDERS}
-        _run_command([word.format_map(values) for word in words], json.dumps(alert).encode(), limit_s)
+        values = {
+            name: "" if alert.get(name) is None else str(alert[name]) for name in PLACEHOLDERS
+        }
+        _run_command(
+            [word.format_map(values) for word in words], json.dumps(alert).encode(), limit_s
+        )
 
     return run
 
@@ -137,7 +149,7 @@ def interpreted_placeholder(template: str) -> str:
         option = _CODE_OPTIONS.get(re.split(r"[/\\]", word)[-1])
         if option is None:
             continue
-        for before, code in zip(words[place + 1:], words[place + 2:]):
+        for before, code in zip(words[place + 1 :], words[place + 2 :]):
             if option.fullmatch(before):
                 return next(_placeholders(code), "")
     return ""
@@ -159,18 +171,24 @@ def alert_url(url: str) -> Callable[[Mapping[str, Any]], None]:
     """
     parts = urlsplit(url)
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise SettingsError(f"--alert-url {url} is not a web address; give one with http:// or https://")
+        raise SettingsError(
+            f"--alert-url {url} is not a web address; give one with http:// or https://"
+        )
     opener = urllib.request.build_opener(_NoRedirect)
 
     def post(alert: Mapping[str, Any]) -> None:
         request = urllib.request.Request(
-            url, json.dumps(alert).encode(), {"Content-Type": "application/json", "User-Agent": "sorvolo"}
+            url,
+            json.dumps(alert).encode(),
+            {"Content-Type": "application/json", "User-Agent": "sorvolo"},
         )
         try:
             opener.open(request, timeout=_URL_LIMIT_S).close()
         except http.client.HTTPException as error:
             reason = " ".join(str(error).split()) or type(error).__name__
-            raise StoreError(f"{parts.hostname} does not answer as a web server does: {reason}") from error
+            raise StoreError(
+                f"{parts.hostname} does not answer as a web server does: {reason}"
+            ) from error
 
     return post
 
@@ -178,9 +196,13 @@ def alert_url(url: str) -> Callable[[Mapping[str, Any]], None]:
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
     """A redirected POST would become a GET without the alert, perhaps to another protocol: it is an error instead."""
 
-    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> None:
+    def redirect_request(
+        self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
+    ) -> None:
         """Refuse. Raises StoreError with the address to give."""
-        raise StoreError(f"the server redirects alerts to {newurl}; give that address with --alert-url")
+        raise StoreError(
+            f"the server redirects alerts to {newurl}; give that address with --alert-url"
+        )
 
 
 class Pace:
@@ -218,7 +240,11 @@ def _placeholders(word: str) -> Iterator[str]:
 def _run_command(words: list[str], alert_json: bytes, limit_s: float) -> None:
     # a session of its own: Ctrl-C is meant for the watch, and whatever the command started can be ended with it
     with subprocess.Popen(
-        words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, start_new_session=True
+        words,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
     ) as running:
         try:
             _, complaint = running.communicate(alert_json, timeout=limit_s)
@@ -226,5 +252,7 @@ def _run_command(words: list[str], alert_json: bytes, limit_s: float) -> None:
             os.killpg(running.pid, signal.SIGKILL)
             raise StoreError(f"{words[0]} ran longer than {limit_s:g} s and was ended") from None
     if running.returncode != 0:
-        last = complaint.decode("utf-8", "replace").strip().splitlines()[-1:] or ["without a message"]
+        last = complaint.decode("utf-8", "replace").strip().splitlines()[-1:] or [
+            "without a message"
+        ]
         raise StoreError(f"{words[0]} ended with code {running.returncode}: {last[0]}")

@@ -18,7 +18,9 @@ Transport = Literal["udp", "tcp", "tls"]
 
 _DEFAULT_PORTS: dict[Transport, int] = {"udp": 6969, "tcp": 8087, "tls": 8089}
 _TIMEOUT_S = 3.0  # for a connection and a message, which wait meanwhile; by choice
-_VERDICT_S = 1.0  # for a server's answer to one's certificate: a satellite's way and back; by choice
+_VERDICT_S = (
+    1.0  # for a server's answer to one's certificate: a satellite's way and back; by choice
+)
 _END_S = 1.0  # for the other side to end its half of a stream; by choice
 
 
@@ -49,7 +51,9 @@ class CotTls:
             if self.certificate is not None:
                 made.load_cert_chain(str(self.certificate), password=lambda: "")
         except (OSError, ssl.SSLError, ValueError) as error:
-            named = " and ".join(str(each) for each in (self.ca, self.certificate) if each is not None)
+            named = " and ".join(
+                str(each) for each in (self.ca, self.certificate) if each is not None
+            )
             raise InputError(
                 f"{named}: no usable certificate ({error}); give PEM files, --cot-cert with the certificate and its "
                 "key, the key without a password (openssl pkcs12 -in FILE.p12 -out FILE.pem -nodes)"
@@ -63,7 +67,9 @@ def cot_place(url: str) -> CotPlace:
     A multicast group (udp://239.2.3.1:6969 is the one that ATAK listens to) is a host as any other. Raises
     SettingsError for anything else.
     """
-    wanted = "give udp://host:port, tcp://host:port or tls://host:port, such as udp://239.2.3.1:6969"
+    wanted = (
+        "give udp://host:port, tcp://host:port or tls://host:port, such as udp://239.2.3.1:6969"
+    )
     try:
         parts = urlsplit(url)
         port = parts.port
@@ -133,7 +139,8 @@ class CotSender:
         self._place = place
         self._tls = tls.context() if place.transport == "tls" else None
         self._advice = (
-            "it may ask clients for a certificate: give --cot-cert" if tls.certificate is None
+            "it may ask clients for a certificate: give --cot-cert"
+            if tls.certificate is None
             else "check that it knows the certificate of --cot-cert"
         )
         self._socket: socket.socket | None = None
@@ -145,7 +152,11 @@ class CotSender:
         ConnectionRefusedError where a TLS server refuses this client.
         """
         try:
-            if self._socket is not None and self._place.transport != "udp" and not _is_open(self._socket):
+            if (
+                self._socket is not None
+                and self._place.transport != "udp"
+                and not _is_open(self._socket)
+            ):
                 self.close()
             if self._socket is None:
                 self._socket = _connected(self._place, self._tls)
@@ -183,15 +194,22 @@ class CotSender:
         """Raise ConnectionRefusedError, which names --cot-cert, for an error by which a TLS server refuses a client,
         and ssl.SSLCertVerificationError, which names --cot-ca, for a server that is not trusted."""
         if isinstance(error, ssl.SSLCertVerificationError):
-            raise ssl.SSLCertVerificationError(error.errno, (
-                f"the server's certificate is not trusted ({error.verify_message.rstrip('.')}): give the certificate "
-                "of the authority that signed it as --cot-ca, and the server by the name that is in it"
-            )) from error
+            raise ssl.SSLCertVerificationError(
+                error.errno,
+                (
+                    f"the server's certificate is not trusted ({error.verify_message.rstrip('.')}): give the certificate "
+                    "of the authority that signed it as --cot-ca, and the server by the name that is in it"
+                ),
+            ) from error
         if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
             words = (error.reason or "").lower().replace("_", " ")
-            raise ConnectionRefusedError(f"the server refuses this client ({words}); {self._advice}") from error
+            raise ConnectionRefusedError(
+                f"the server refuses this client ({words}); {self._advice}"
+            ) from error
         if isinstance(error, _ClosedAtOnceError):
-            raise ConnectionRefusedError(f"the server closed the connection at once; {self._advice}") from error
+            raise ConnectionRefusedError(
+                f"the server closed the connection at once; {self._advice}"
+            ) from error
 
 
 class _ClosedAtOnceError(ConnectionError):
@@ -250,11 +268,15 @@ def _connected(place: CotPlace, tls: ssl.SSLContext | None = None) -> socket.soc
             stream.close()
             raise
         return stream
-    family, kind, protocol, _, address = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_DGRAM)[0]
+    family, kind, protocol, _, address = socket.getaddrinfo(
+        place.host, place.port, type=socket.SOCK_DGRAM
+    )[0]
     made = socket.socket(family, kind, protocol)
     try:
         if ip_address(address[0]).is_multicast and family == socket.AF_INET:
-            made.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 4)  # a few routers of one's own network
+            made.setsockopt(
+                socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 4
+            )  # a few routers of one's own network
         made.settimeout(_TIMEOUT_S)
         made.connect(address)
     except OSError:

@@ -79,7 +79,9 @@ class WatchFiles:
         self._stack = ExitStack()
         self._lines = self._stack.enter_context(DetectionLines(folder))
         self._video = (
-            self._stack.enter_context(AnnotatedVideo(folder / ANNOTATED_VIDEO)) if outputs.save == "video" else None
+            self._stack.enter_context(AnnotatedVideo(folder / ANNOTATED_VIDEO))
+            if outputs.save == "video"
+            else None
         )
         self.seconds = 0.0
         self._thread = threading.Thread(target=self._run, name="watch files", daemon=True)
@@ -89,7 +91,10 @@ class WatchFiles:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -137,7 +142,9 @@ class WatchFiles:
 
     def forget(self, track_ids: Iterable[int]) -> None:
         """The crops of tracks that turned out to be others belong to nothing any more; `clear` removes them."""
-        self._forgotten += [name for each in track_ids if (name := self.crop_names.pop(each, None)) is not None]
+        self._forgotten += [
+            name for each in track_ids if (name := self.crop_names.pop(each, None)) is not None
+        ]
 
     def clear(self) -> None:
         """Remove the crops that were forgotten; not earlier: who received an alert may still be looking at them."""
@@ -165,8 +172,12 @@ class WatchFiles:
         atomic_write_bytes(self.folder / name, geojson_bytes(collection), durable=False)
         if not self._site.is_local:
             placemarks = track_placemarks(tracks, self._site)
-            atomic_write_bytes(self.folder / TRACKS_KML, kml_bytes("tracks", placemarks), durable=False)
-            atomic_write_bytes(self.folder / TRACKS_GPX, gpx_bytes("tracks", placemarks), durable=False)
+            atomic_write_bytes(
+                self.folder / TRACKS_KML, kml_bytes("tracks", placemarks), durable=False
+            )
+            atomic_write_bytes(
+                self.folder / TRACKS_GPX, gpx_bytes("tracks", placemarks), durable=False
+            )
         return rows
 
     def close(self) -> None:
@@ -214,17 +225,25 @@ class WatchFiles:
     def _label_name(self, seen: SeenFrame) -> str:
         return f"{self._site.name}_{_file_name(seen.frame)}.jpg"
 
-    def _label_of(self, seen: SeenFrame, name: str, size_px: tuple[int, int]) -> tuple[LabelledPicture, Floats]:
+    def _label_of(
+        self, seen: SeenFrame, name: str, size_px: tuple[int, int]
+    ) -> tuple[LabelledPicture, Floats]:
         height, width = size_px
-        picture = picture_of_detections(f"images/{name}", width, height, self._site.name, seen.detections)
+        picture = picture_of_detections(
+            f"images/{name}", width, height, self._site.name, seen.detections
+        )
         return picture, seen.detections.scores
 
     def _write_labels(self) -> None:
         if not self._labelled:
             return
-        found = LabelledSet(self._site.name, self._classes, tuple(picture for picture, _ in self._labelled))
+        found = LabelledSet(
+            self._site.name, self._classes, tuple(picture for picture, _ in self._labelled)
+        )
         if "coco" in self._outputs.labels:
-            write_coco(self.folder / LABELS / "coco.json", found, [scores for _, scores in self._labelled])
+            write_coco(
+                self.folder / LABELS / "coco.json", found, [scores for _, scores in self._labelled]
+            )
         if "yolo" in self._outputs.labels:
             write_yolo(self.folder / LABELS, found)
         self._labelled = []
@@ -259,9 +278,16 @@ def _rows(seen: SeenFrame, site: Site) -> list[dict[str, Any]]:
     segment = {"segment": seen.segment} if site.is_local else {}
     return [
         detection_row(
-            seen.frame, seen.time_ns, found.names[row], float(found.scores[row]), found.boxes_px[row].tolist(),
-            seen.sightings[row], seen.track_ids[row] or None, site,
-        ) | segment
+            seen.frame,
+            seen.time_ns,
+            found.names[row],
+            float(found.scores[row]),
+            found.boxes_px[row].tolist(),
+            seen.sightings[row],
+            seen.track_ids[row] or None,
+            site,
+        )
+        | segment
         for row in range(len(found))
     ]
 
@@ -275,4 +301,6 @@ def _drawn(seen: SeenFrame) -> ImageRGB:
         f"{name} {track_id} {score:.2f}" if is_counted else ""
         for name, track_id, score, is_counted in zip(found.names, track_ids, found.scores, counted)
     ]
-    return annotated(seen.frame.image, found.boxes_px, found.labels.tolist(), words, counted, seen.headline)
+    return annotated(
+        seen.frame.image, found.boxes_px, found.labels.tolist(), words, counted, seen.headline
+    )

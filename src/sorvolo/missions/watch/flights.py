@@ -43,10 +43,17 @@ class _Heard:
 
 
 def watch(
-    source: Path | str, settings: WatchSettings = WatchSettings(), outputs: WatchOutputs = WatchOutputs(), *,  # noqa: B008 (frozen)
-    telemetry: Path | str | None = None, camera: Path | str | None = None, detector: ObjectDetector | None = None,
-    live: LiveSettings = LiveSettings(), until: threading.Event | None = None,  # noqa: B008 (frozen)
-    moved: Callable[[PictureStep], None] | None = None, early: Callable[[EarlyFound], None] | None = None,
+    source: Path | str,
+    settings: WatchSettings = WatchSettings(),
+    outputs: WatchOutputs = WatchOutputs(),
+    *,
+    telemetry: Path | str | None = None,
+    camera: Path | str | None = None,
+    detector: ObjectDetector | None = None,
+    live: LiveSettings = LiveSettings(),
+    until: threading.Event | None = None,
+    moved: Callable[[PictureStep], None] | None = None,
+    early: Callable[[EarlyFound], None] | None = None,
 ) -> Generator[WatchUpdate]:
     """Search a flight, yielding an update for each frame searched.
 
@@ -78,11 +85,22 @@ def watch(
             if until.is_set():
                 return
             order = WatchOrder(settings, outputs, finder)
-            goes_on = order.go_on_live(each, live.same_flight_s) if isinstance(each, LiveSource) else None
-            folder = _folder_of(each, outputs, is_only=len(sources) == 1) if goes_on is None else goes_on.folder
+            goes_on = (
+                order.go_on_live(each, live.same_flight_s) if isinstance(each, LiveSource) else None
+            )
+            folder = (
+                _folder_of(each, outputs, is_only=len(sources) == 1)
+                if goes_on is None
+                else goes_on.folder
+            )
             heard = _Heard(moved, early) if isinstance(each, LiveSource) else _Heard()
             yield from _watch_one(
-                each, WatchOrder(settings, replace(outputs, folder=folder), finder), folder, goes_on, until, heard,
+                each,
+                WatchOrder(settings, replace(outputs, folder=folder), finder),
+                folder,
+                goes_on,
+                until,
+                heard,
                 telemetry_named=telemetry is not None,
             )
 
@@ -115,16 +133,28 @@ def _checked_detector(
     return finder
 
 
-def _demand_known_classes(detector: ObjectDetector, settings: WatchSettings, outputs: WatchOutputs) -> None:
+def _demand_known_classes(
+    detector: ObjectDetector, settings: WatchSettings, outputs: WatchOutputs
+) -> None:
     if unknown := sorted(set(settings.classes) - set(detector.classes)):
-        raise SettingsError(f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}")
+        raise SettingsError(
+            f"the model knows no {unknown[0]!r}; it knows {', '.join(detector.classes)}"
+        )
     if unknown := sorted(set(outputs.cot_types) - {*detector.classes, *COT_TYPES}):
-        raise SettingsError(f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(detector.classes)}")
+        raise SettingsError(
+            f"--cot-type {unknown[0]}: no such class; the model knows {', '.join(detector.classes)}"
+        )
 
 
 def _watch_one(
-    source: Source, order: WatchOrder, folder: Path, goes_on: StoppedWatch | None, until: threading.Event,
-    heard: _Heard, *, telemetry_named: bool,
+    source: Source,
+    order: WatchOrder,
+    folder: Path,
+    goes_on: StoppedWatch | None,
+    until: threading.Event,
+    heard: _Heard,
+    *,
+    telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
     settings, outputs, detector = order.settings, order.outputs, order.detector
     setup, places = _prepared(source, order, telemetry_named=telemetry_named)
@@ -147,12 +177,16 @@ def _watch_one(
             raise
         finally:
             if run.log.detected or ended == _STOPPED:
-                run.finish(ended=ended, skipped=source.skipped if isinstance(source, LiveSource) else 0)
+                run.finish(
+                    ended=ended, skipped=source.skipped if isinstance(source, LiveSource) else 0
+                )
         if ended != _STOPPED:
             _demand_searched(run, source)
 
 
-def _give_steps(source: LiveStream, setup: FlightSetup, moved: Callable[[PictureStep], None]) -> None:
+def _give_steps(
+    source: LiveStream, setup: FlightSetup, moved: Callable[[PictureStep], None]
+) -> None:
     """Have a live video compared with itself a tenth of a second before, while its frames are searched."""
     steps = PictureSteps()
 
@@ -167,13 +201,19 @@ def _give_steps(source: LiveStream, setup: FlightSetup, moved: Callable[[Picture
 def _demand_searched(run: WatchRun, source: Source) -> None:
     if not run.log.detected:
         reason = next(iter(run.log.lost), "the source holds none")
-        raise InputError(f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`")
+        raise InputError(
+            f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`"
+        )
 
 
-def _prepared(source: Source, order: WatchOrder, *, telemetry_named: bool) -> tuple[FlightSetup, Places]:
+def _prepared(
+    source: Source, order: WatchOrder, *, telemetry_named: bool
+) -> tuple[FlightSetup, Places]:
     """The flight as it is set up, and where what is found in it will lie."""
     settings = order.settings
-    mapping = MapSettings(offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m)
+    mapping = MapSettings(
+        offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m
+    )
 
     def prepared(mapping: MapSettings) -> FlightSetup:
         return prepare(source, mapping, None, telemetry_named=telemetry_named)
@@ -183,22 +223,33 @@ def _prepared(source: Source, order: WatchOrder, *, telemetry_named: bool) -> tu
     else:
         setup, ground = prepared(mapping), None
     thresholds = order.detector.info.thresholds
-    least = thresholds if settings.least_score is None else dict.fromkeys(thresholds, settings.least_score)
+    least = (
+        thresholds
+        if settings.least_score is None
+        else dict.fromkeys(thresholds, settings.least_score)
+    )
     return setup, places_of(setup, least, ground)
 
 
 @contextmanager
 def _begun(
-    source: Source, order: WatchOrder, setup: FlightSetup, folder: Path, goes_on: StoppedWatch | None
+    source: Source,
+    order: WatchOrder,
+    setup: FlightSetup,
+    folder: Path,
+    goes_on: StoppedWatch | None,
 ) -> Iterator[WatchJournal]:
     """The journal of a watch, whose folder is claimed: as a killed watch left it where that goes on, else empty."""
     file, is_live = order.journal(setup, folder), isinstance(source, LiveSource)
     goes = goes_on is not None if is_live else file.is_begun
     with (
-        claimed_folder(folder, source.name, source.fingerprint, replaces=not is_live, goes_on=goes), closing(file)
+        claimed_folder(folder, source.name, source.fingerprint, replaces=not is_live, goes_on=goes),
+        closing(file),
     ):
         if isinstance(source, LiveSource):
-            yield WatchJournal(file, SourceNotes(file, source, 0 if goes_on is None else goes_on.samples))
+            yield WatchJournal(
+                file, SourceNotes(file, source, 0 if goes_on is None else goes_on.samples)
+            )
         else:
             yield WatchJournal(file)
 

@@ -27,9 +27,13 @@ def over_heights(
     """
     setup = prepare(mapping)
     if setup.track is None:
-        raise InputError(f"{setup.source.name} has no GPS fixes, so {model} cannot be used: leave out --height-model")
+        raise InputError(
+            f"{setup.source.name} has no GPS fixes, so {model} cannot be used: leave out --height-model"
+        )
     fixes_m = known_points(setup.track.east_north_m)
-    (south, north), (west, east), _ = setup.frame.wgs84_from_site(corners_around(fixes_m, _AROUND_M))
+    (south, north), (west, east), _ = setup.frame.wgs84_from_site(
+        corners_around(fixes_m, _AROUND_M)
+    )
     heights = read_height_model(model, (float(west), float(south), float(east), float(north)))
     latitudes, longitudes, _ = setup.frame.wgs84_from_site(fixes_m[:1])
     zero_m = float(heights.at(longitudes, latitudes)[0])

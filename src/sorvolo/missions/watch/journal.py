@@ -84,7 +84,10 @@ class WatchJournal:
             self._notes.keep()
         packer = RecordPacker()
         values = {
-            "index": frame.index, "name": frame.name, "time_ns": frame.time_ns, "frame": packer.packed(frame),
+            "index": frame.index,
+            "name": frame.name,
+            "time_ns": frame.time_ns,
+            "frame": packer.packed(frame),
         }
         self.file.append(Entry(_FRAME, values, packer.arrays))
 
@@ -135,7 +138,9 @@ class WatchOrder:
 
         Warns where there is one of another watch, which is of no use.
         """
-        journal = self._at(folder, request_of(setup, self.settings, None, self.detector, *self._more))
+        journal = self._at(
+            folder, request_of(setup, self.settings, None, self.detector, *self._more)
+        )
         if why_not := journal.why_not:
             text = f"{folder}: a watch that was stopped cannot continue: {why_not}"
             warnings.warn(text, SorvoloWarning, stacklevel=2)
@@ -158,7 +163,11 @@ class WatchOrder:
     @property
     def _more(self) -> tuple[Any, ...]:
         heights = Path(self.settings.height_model)
-        stamp = (heights.stat().st_size, heights.stat().st_mtime_ns) if self.settings.height_model else ()
+        stamp = (
+            (heights.stat().st_size, heights.stat().st_mtime_ns)
+            if self.settings.height_model
+            else ()
+        )
         return replace(self.outputs, folder=None, below=None), stamp
 
     def _at(self, folder: Path, request: str) -> RunJournal:

@@ -24,7 +24,13 @@ class Notifier:
     """
 
     def __init__(
-        self, flight: str, fingerprint: str, site: Site, outputs: WatchOutputs, folder: Path, journal: WatchJournal
+        self,
+        flight: str,
+        fingerprint: str,
+        site: Site,
+        outputs: WatchOutputs,
+        folder: Path,
+        journal: WatchJournal,
     ) -> None:
         self._journal = journal
         self._flight, self._uid = flight, f"sorvolo.{flight}.{fingerprint[:8]}"
@@ -42,10 +48,17 @@ class Notifier:
         if outputs.alert_command:
             self._add_receiver(_COMMAND, alert_command(outputs.alert_command), "the alert command")
         if outputs.alert_url:
-            self._add_receiver(_URL, alert_url(outputs.alert_url), f"the alert to {outputs.alert_url}")
+            self._add_receiver(
+                _URL, alert_url(outputs.alert_url), f"the alert to {outputs.alert_url}"
+            )
 
     def report(
-        self, new: Sequence[Track], seen: Sequence[Track], crops: Mapping[int, str], segments: Mapping[int, int], *,
+        self,
+        new: Sequence[Track],
+        seen: Sequence[Track],
+        crops: Mapping[int, str],
+        segments: Mapping[int, int],
+        *,
         is_resumed: bool = False,
     ) -> None:
         """Send one alert for each new track, and the TAK server all tracks that are seen, each at its pace.
@@ -114,7 +127,9 @@ class Notifier:
         """Send the alert of a track to those who have not got it."""
         of_segment = {"segment": segment} if self._site.is_local else {}
         alert = {
-            "flight": self._flight, **track_properties(track, self._site), **of_segment,
+            "flight": self._flight,
+            **track_properties(track, self._site),
+            **of_segment,
             "crop": None if crop is None else str((self._folder / crop).resolve()),
         }
         alert["time"] = alert["last_seen"]
@@ -122,8 +137,11 @@ class Notifier:
             if Sent(receiver, track.id) not in self._journal.sent:
                 outbox.put(alert)
 
-    def _add_receiver(self, code: str, send: Callable[[Mapping[str, Any]], None], what: str) -> None:
+    def _add_receiver(
+        self, code: str, send: Callable[[Mapping[str, Any]], None], what: str
+    ) -> None:
         """A receiver of alerts; what it has got is noted at once."""
+
         def noted(alert: Mapping[str, Any]) -> None:
             send(alert)
             self._journal.keep_sent(code, alert["id"])
@@ -132,6 +150,10 @@ class Notifier:
 
     def _event(self, track: Track) -> bytes:
         return cot_event(
-            track, self._site, uid=f"{self._uid}.{track.id}", now_ns=time.time_ns(),
-            stale_s=self._outputs.cot_stale_s, types=self._outputs.cot_types,
+            track,
+            self._site,
+            uid=f"{self._uid}.{track.id}",
+            now_ns=time.time_ns(),
+            stale_s=self._outputs.cot_stale_s,
+            types=self._outputs.cot_types,
         )

@@ -15,13 +15,23 @@ from sorvolo.survey.flight import CameraPrior, Frame, Notice, Site
 from sorvolo.survey.mosaic import FrameView
 from sorvolo.survey.objects import Detections, Track
 from sorvolo.survey.wording import counted
-from sorvolo.tracking.following import GroundFollower, Located, PictureFollower, Taken, watched_prior
+from sorvolo.tracking.following import (
+    GroundFollower,
+    Located,
+    PictureFollower,
+    Taken,
+    watched_prior,
+)
 from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, GroundHeight
 from sorvolo.tracking.photo_headings import PhotoHeadings
 from sorvolo.tracking.tracker import TrackerSettings
 
 _COMPASS_REPORTED_DEG = 2.0  # by which a compass is off: less is not worth a notice; by choice
-_OF_MAPS = ("no_telemetry", "ground_unknown", "height_unknown")  # notices about what a mapping does about it
+_OF_MAPS = (
+    "no_telemetry",
+    "ground_unknown",
+    "height_unknown",
+)  # notices about what a mapping does about it
 
 
 class Places(Protocol):
@@ -63,7 +73,9 @@ class Places(Protocol):
         """(N, 2) where the camera was, in site metres; none where it is not known."""
 
 
-def places_of(setup: FlightSetup, least: Mapping[str, float], ground: GroundHeight | None = None) -> Places:
+def places_of(
+    setup: FlightSetup, least: Mapping[str, float], ground: GroundHeight | None = None
+) -> Places:
     """The way to place a flight's detections that its telemetry allows; those of a class score `least` or more.
 
     What one photo alone shows is reported from there on; a video shows a place in many frames.
@@ -71,16 +83,24 @@ def places_of(setup: FlightSetup, least: Mapping[str, float], ground: GroundHeig
     """
     why_not = _why_not_on_ground(setup)
     settings = TrackerSettings(
-        sure_score=min(TrackerSettings.sure_score, *least.values()),  # lower ones would never begin a track
+        sure_score=min(
+            TrackerSettings.sure_score, *least.values()
+        ),  # lower ones would never begin a track
         alone=least if setup.source.kind == "photos" else {},
     )
-    return GroundPlaces(setup, settings, ground) if why_not is None else ImagePlaces(setup, settings, why_not)
+    return (
+        GroundPlaces(setup, settings, ground)
+        if why_not is None
+        else ImagePlaces(setup, settings, why_not)
+    )
 
 
 class GroundPlaces:
     """Detections on the ground of a flight with telemetry, tracked in metres."""
 
-    def __init__(self, setup: FlightSetup, settings: TrackerSettings, ground: GroundHeight | None) -> None:
+    def __init__(
+        self, setup: FlightSetup, settings: TrackerSettings, ground: GroundHeight | None
+    ) -> None:
         self._setup, self._over_model = setup, ground is not None
         is_video = setup.source.kind != "photos"
         self._headings = None if is_video else PhotoHeadings(setup.source.camera.camera)
@@ -143,7 +163,10 @@ class GroundPlaces:
     def notices(self) -> tuple[Notice, ...]:
         """How frames were placed, and what could not be."""
         track = self._setup.track
-        words = {"gimbal": "the gimbal's angles", "body": "the aircraft's angles, the camera taken as fixed downwards"}
+        words = {
+            "gimbal": "the gimbal's angles",
+            "body": "the aircraft's angles, the camera taken as fixed downwards",
+        }
         nadir = "no angles: the camera is taken to look straight down, its heading estimated from the pictures' motion"
         how = words.get(track.attitude, nadir) if track else ""
         height = track.height_words if track else ""
@@ -151,9 +174,19 @@ class GroundPlaces:
             height = f"{height.split(',')[0]}, over the height model's ground"
         text = f"places come from the telemetry's position, height ({height}) and {how}"
         return (
-            *self._setup.notices, Notice("placed_by", 1, text), *self._heading_notices(), *self._compass_notices(),
-            *(Notice("not_placed", count, f"{counted(count, 'detection')} without a place on the ground: {reason}")
-              for reason, count in self._follower.unlocated.most_common() if reason != IMPOSSIBLE_SIZE),
+            *self._setup.notices,
+            Notice("placed_by", 1, text),
+            *self._heading_notices(),
+            *self._compass_notices(),
+            *(
+                Notice(
+                    "not_placed",
+                    count,
+                    f"{counted(count, 'detection')} without a place on the ground: {reason}",
+                )
+                for reason, count in self._follower.unlocated.most_common()
+                if reason != IMPOSSIBLE_SIZE
+            ),
             *self._size_notices(),
         )
 
@@ -172,7 +205,9 @@ class GroundPlaces:
         turns_deg = self._follower.turns_deg if self._headings is None else self._headings.turns_deg
         if not turns_deg:
             return ()
-        shown_by = "their motion shows" if self._headings is None else "the ground shows that photos share"
+        shown_by = (
+            "their motion shows" if self._headings is None else "the ground shows that photos share"
+        )
         what = counted(len(turns_deg), "frame" if self._headings is None else "photo")
         text = f"headings about {median(map(abs, turns_deg)):.0f} degrees off, as {shown_by}: corrected in {what}"
         return (Notice("headings_wrong", len(turns_deg), text),)
@@ -195,7 +230,9 @@ class GroundPlaces:
         prior, track = self._setup.prior(frame, first=False), self._setup.track
         if track is None:
             return prior
-        return watched_prior(prior, track.altitude_offset_sigma_m, has_gimbal=track.attitude == "gimbal")
+        return watched_prior(
+            prior, track.altitude_offset_sigma_m, has_gimbal=track.attitude == "gimbal"
+        )
 
 
 class ImagePlaces:

@@ -24,7 +24,13 @@ from sorvolo.survey.objects import Detections, Track
 from sorvolo.survey.wording import counted, most_first
 
 # notices of sources about frames that cannot be used: left out where the reasons are reported
-_OF_LOST_FRAMES = ("unreadable_photo", "corrupt_photo", "duplicate_photo", "other_size", "other_shape")
+_OF_LOST_FRAMES = (
+    "unreadable_photo",
+    "corrupt_photo",
+    "duplicate_photo",
+    "other_size",
+    "other_shape",
+)
 
 
 @dataclass
@@ -67,9 +73,14 @@ class WatchLog:
         return time.monotonic() - self.started_s
 
 
-def found_words(track: Track, site: Site, form: Coordinates = Coordinates.LATLON) -> tuple[str, str]:
+def found_words(
+    track: Track, site: Site, form: Coordinates = Coordinates.LATLON
+) -> tuple[str, str]:
     """A new object's name, and where it is (none of a local site) and how sure that is."""
-    name, seen = f"{track.label} {track.id}", f"score {track.score:.2f}, {counted(track.views, 'view')}"
+    name, seen = (
+        f"{track.label} {track.id}",
+        f"score {track.score:.2f}, {counted(track.views, 'view')}",
+    )
     if site.is_local:
         return name, seen
     latitude, longitude, _ = site.frame.wgs84_from_site(track.position_m[None])
@@ -85,16 +96,35 @@ def count_by_class(tracks: Sequence[Track]) -> dict[str, int]:
 def model_facts(model: ModelInfo) -> dict[str, Any]:
     """What the report states of a model that looked at pictures."""
     return {
-        "name": model.name, "version": model.version, "preset": model.preset, "precision": model.precision,
-        "classes": list(model.classes), "thresholds": dict(model.thresholds), "calibrated": list(model.calibration),
-        "licence": model.licence, "trained_on": model.trained_on, "created": model.created,
+        "name": model.name,
+        "version": model.version,
+        "preset": model.preset,
+        "precision": model.precision,
+        "classes": list(model.classes),
+        "thresholds": dict(model.thresholds),
+        "calibrated": list(model.calibration),
+        "licence": model.licence,
+        "trained_on": model.trained_on,
+        "created": model.created,
     }
 
 
 def build_watch_report(
-    setup: FlightSetup, settings: WatchSettings, outputs: WatchOutputs, detector: ObjectDetector, log: WatchLog,
-    tracks: Sequence[Track], notices: Sequence[Notice], warnings: Sequence[str], *, looked_for: Sequence[str],
-    others: Sequence[Mapping[str, Any]], ended: str, skipped: int, set_aside: int, on_ground: bool,
+    setup: FlightSetup,
+    settings: WatchSettings,
+    outputs: WatchOutputs,
+    detector: ObjectDetector,
+    log: WatchLog,
+    tracks: Sequence[Track],
+    notices: Sequence[Notice],
+    warnings: Sequence[str],
+    *,
+    looked_for: Sequence[str],
+    others: Sequence[Mapping[str, Any]],
+    ended: str,
+    skipped: int,
+    set_aside: int,
+    on_ground: bool,
 ) -> dict[str, Any]:
     """report.json of one watch; its keys are specified in docs/formats.md. Numbers that are not known are None.
 
@@ -114,19 +144,28 @@ def build_watch_report(
         "looked_for": list(looked_for),
         "objects": {"total": len(tracks), "by_class": count_by_class(tracks)},
         "frames": {
-            "read": log.read, "detected": log.detected, "with_detections": log.with_detections, "skipped": skipped,
-            "lost": sum(log.lost.values()), "reasons": dict(log.lost.most_common()),
+            "read": log.read,
+            "detected": log.detected,
+            "with_detections": log.with_detections,
+            "skipped": skipped,
+            "lost": sum(log.lost.values()),
+            "reasons": dict(log.lost.most_common()),
         },
         "detections": {
-            "total": total, "placed": log.placed, "not_placed": total - log.placed - set_aside,
+            "total": total,
+            "placed": log.placed,
+            "not_placed": total - log.placed - set_aside,
             "set_aside": set_aside,
             "by_class": dict(log.found.most_common()),
         },
         "model": {**model_facts(detector.info), "runs_on": detector.provider},
         "other_models": list(others),
         "camera": {
-            "origin": camera.origin, "width_px": camera.camera.width_px, "height_px": camera.camera.height_px,
-            "focal_px": camera.camera.fx_px, "focal_sigma_relative": camera.focal_sigma,
+            "origin": camera.origin,
+            "width_px": camera.camera.width_px,
+            "height_px": camera.camera.height_px,
+            "focal_px": camera.camera.fx_px,
+            "focal_sigma_relative": camera.focal_sigma,
         },
         "telemetry": _telemetry(setup, on_ground),
         "latency_s": {
@@ -134,14 +173,25 @@ def build_watch_report(
             "max": max(log.latency_s, default=None),
         },
         "frames_per_second": log.detected / seconds if seconds > 0 else None,
-        "seconds": {"total": round(seconds, 3), **{name: round(value, 3) for name, value in log.wall_s.items()}},
+        "seconds": {
+            "total": round(seconds, 3),
+            **{name: round(value, 3) for name, value in log.wall_s.items()},
+        },
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "notices": [asdict(each) for each in notices],
         "warnings": list(warnings),
-        "settings": {**asdict(settings), "save": outputs.save, "labels": list(outputs.labels), "cot": outputs.cot},
+        "settings": {
+            **asdict(settings),
+            "save": outputs.save,
+            "labels": list(outputs.labels),
+            "cot": outputs.cot,
+        },
         "versions": {
             "python": platform.python_version(),
-            **{name: version(name) for name in ("numpy", "opencv-contrib-python-headless", "av", "onnxruntime")},
+            **{
+                name: version(name)
+                for name in ("numpy", "opencv-contrib-python-headless", "av", "onnxruntime")
+            },
         },
     }
 
@@ -150,7 +200,9 @@ def _telemetry(setup: FlightSetup, on_ground: bool) -> dict[str, Any]:
     telemetry = setup.source.telemetry
     height = setup.track.height_words if setup.track else "none"
     return {
-        "format": telemetry.format, "samples": len(telemetry), "tie": setup.clock.tie if setup.clock else "none",
+        "format": telemetry.format,
+        "samples": len(telemetry),
+        "tie": setup.clock.tie if setup.clock else "none",
         "height": height if on_ground else height.split(",")[0],  # the rest is how a map finds it
         "attitude": setup.track.attitude if setup.track else "none",
     }
@@ -160,6 +212,10 @@ def source_notices(source: Source, log: WatchLog) -> tuple[Notice, ...]:
     """The notices of the source and its telemetry, and one about unusable frames."""
     lost = sum(log.lost.values())
     reasons = "; ".join(f"{count} x {reason}" for reason, count in log.lost.most_common(5))
-    unusable = (Notice("lost_frames", lost, f"{counted(lost, 'frame')} could not be used: {reasons}"),) if lost else ()
+    unusable = (
+        (Notice("lost_frames", lost, f"{counted(lost, 'frame')} could not be used: {reasons}"),)
+        if lost
+        else ()
+    )
     others = [each for each in source.notices() if not (lost and each.code in _OF_LOST_FRAMES)]
     return (*source.telemetry.notices, *others, *unusable)

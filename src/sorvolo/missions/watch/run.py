@@ -116,27 +116,43 @@ class WatchRun:
     """
 
     def __init__(
-        self, setup: FlightSetup, places: Places, detector: ObjectDetector, settings: WatchSettings,
-        outputs: WatchOutputs, folder: Path, journal: WatchJournal, early: Callable[[EarlyFound], None] | None = None,
+        self,
+        setup: FlightSetup,
+        places: Places,
+        detector: ObjectDetector,
+        settings: WatchSettings,
+        outputs: WatchOutputs,
+        folder: Path,
+        journal: WatchJournal,
+        early: Callable[[EarlyFound], None] | None = None,
     ) -> None:
         self._journal, self._early = journal, early
         self._setup, self._places, self._detector = setup, places, detector
         self._settings, self._outputs, self._folder = settings, outputs, folder
         self._classes = settings.classes or detector.info.usual_classes
         self._magnifier = SceneMagnifier(detector.info, self._classes)
-        self._others = list(journal.models)  # that looked besides it, in the order of their first looks
-        self._looks_before = {info.name: count for info, count in detector.others}  # at another flight's pictures
+        self._others = list(
+            journal.models
+        )  # that looked besides it, in the order of their first looks
+        self._looks_before = {
+            info.name: count for info, count in detector.others
+        }  # at another flight's pictures
         self.log = WatchLog()
         self._stack = ExitStack()
         self._files = self._stack.enter_context(WatchFiles(folder, outputs, places.site))
-        self._notifier = Notifier(setup.source.name, setup.source.fingerprint, places.site, outputs, folder, journal)
+        self._notifier = Notifier(
+            setup.source.name, setup.source.fingerprint, places.site, outputs, folder, journal
+        )
         self._stack.callback(self._notifier.close, 0.0, 0.0)
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._stack.close()
 
@@ -146,42 +162,68 @@ class WatchRun:
         with self.log.stage("detect"):
             return self._searched(frame, earlier, arrived_s), earlier is not None
 
-    def _searched(self, frame: Frame, earlier: SearchedFrame | None, arrived_s: float) -> SearchedFrame:
+    def _searched(
+        self, frame: Frame, earlier: SearchedFrame | None, arrived_s: float
+    ) -> SearchedFrame:
         """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows.
 
         `earlier` is what it found in a watch that was killed, which is taken in its place.
         """
         settings, classes = self._settings, self._classes
-        magnifier = self._magnifier if settings.tiles == "auto" and self._places.site.is_local else None
+        magnifier = (
+            self._magnifier if settings.tiles == "auto" and self._places.site.is_local else None
+        )
         m_per_px = self._places.m_per_px(frame)
         looks: list[Detections] = []
 
         def look(part: ImageRGB) -> Detections:
             known = None if earlier is None else earlier.looks[len(looks)]
-            looks.append(self._detector.detect(part, classes=classes, is_part=True) if known is None else known)
+            looks.append(
+                self._detector.detect(part, classes=classes, is_part=True)
+                if known is None
+                else known
+            )
             return looks[-1]
 
         def known(names: tuple[str, ...], found: Detections) -> None:
             if self._early is not None:
-                self._early(EarlyFound(
-                    frame.name, utc_ns(self._setup, frame.time_ns), names, found, time.monotonic() - arrived_s,
-                    frame.image.shape[1::-1], frame.time_ns - self._setup.source.start_ns,
-                ))
+                self._early(
+                    EarlyFound(
+                        frame.name,
+                        utc_ns(self._setup, frame.time_ns),
+                        names,
+                        found,
+                        time.monotonic() - arrived_s,
+                        frame.image.shape[1::-1],
+                        frame.time_ns - self._setup.source.start_ns,
+                    )
+                )
 
         if magnifier is not None:
             m_per_px = magnifier.m_per_px(frame.image, look)
         overlapping = self._setup.source.kind != "photos"
         if m_per_px is not None and overlapping:
             m_per_px = whole_m_per_px(self._detector.info, classes, m_per_px, frame.image.shape[:2])
-        found = self._detector.detect(
-            frame.image, tiles=settings.tiles, m_per_px=m_per_px, least_score=settings.least_score, classes=classes,
-            from_above=self._places.is_from_above(frame), overlapping=overlapping,
-            early=None if self._early is None else known,
-        ) if earlier is None else earlier.found
+        found = (
+            self._detector.detect(
+                frame.image,
+                tiles=settings.tiles,
+                m_per_px=m_per_px,
+                least_score=settings.least_score,
+                classes=classes,
+                from_above=self._places.is_from_above(frame),
+                overlapping=overlapping,
+                early=None if self._early is None else known,
+            )
+            if earlier is None
+            else earlier.found
+        )
         if magnifier is not None:
             magnifier.see(found, frame.image)
         size_px = frame.image.shape[0], frame.image.shape[1]
-        return SearchedFrame(frame.index, frame.name, frame.time_ns, found, tuple(looks), None, size_px)
+        return SearchedFrame(
+            frame.index, frame.name, frame.time_ns, found, tuple(looks), None, size_px
+        )
 
     def lose(self, lost: LostFrame) -> None:
         """A frame that cannot be used."""
@@ -197,7 +239,9 @@ class WatchRun:
             taken = self._places.take(frame, time_ns, searched.found)
         if not is_resumed:
             self._note_others()
-            self._journal.keep_frame(replace(searched, located=taken.located if self._journal.is_live else None))
+            self._journal.keep_frame(
+                replace(searched, located=taken.located if self._journal.is_live else None)
+            )
         return self._update(frame, time_ns, searched, taken, arrived_s, is_resumed=is_resumed)
 
     def _note_others(self) -> None:
@@ -216,10 +260,19 @@ class WatchRun:
         self.log.read = searched.index + 1
         taken = self._places.recall(searched.located, searched.found, searched.size_px)
         frame = Frame.unseen(searched.index, searched.name, searched.time_ns)
-        return self._update(frame, searched.located.time_ns, searched, taken, time.monotonic(), is_resumed=True)
+        return self._update(
+            frame, searched.located.time_ns, searched, taken, time.monotonic(), is_resumed=True
+        )
 
     def _update(
-        self, frame: Frame, time_ns: int, searched: SearchedFrame, taken: Taken, arrived_s: float, *, is_resumed: bool
+        self,
+        frame: Frame,
+        time_ns: int,
+        searched: SearchedFrame,
+        taken: Taken,
+        arrived_s: float,
+        *,
+        is_resumed: bool,
     ) -> WatchUpdate:
         """Hand over what a frame brought."""
         log, found, size_px = self.log, searched.found, searched.size_px
@@ -227,28 +280,54 @@ class WatchRun:
         tracks = self._tracks_after(taken)
         log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
         with log.stage("hand over"):
-            self._write(SeenFrame(
-                frame, time_ns, found, taken.sightings, taken.track_ids,
-                frozenset(each.id for each in tracks.confirmed),
-                f"frame {frame.name}, counted so far: {counted_list(tracks.counts)}", taken.segment,
-            ), size_px, [*tracks.seen, *tracks.new])
+            self._write(
+                SeenFrame(
+                    frame,
+                    time_ns,
+                    found,
+                    taken.sightings,
+                    taken.track_ids,
+                    frozenset(each.id for each in tracks.confirmed),
+                    f"frame {frame.name}, counted so far: {counted_list(tracks.counts)}",
+                    taken.segment,
+                ),
+                size_px,
+                [*tracks.seen, *tracks.new],
+            )
             self._hand_over(taken, tracks, is_resumed=is_resumed)
         latency_s = time.monotonic() - arrived_s
         if not is_resumed:
             log.latency_s.append(latency_s)
         source = self._setup.source
         return WatchUpdate(
-            frame.name, time_ns, found, sighted, tracks.new, tracks.seen, tracks.counts,
-            latency_s, log.read, log.detected, source.frame_count, log.seconds, self._folder,
-            self._places.site, taken.segment, size_px[::-1],
-            frame.time_ns - source.start_ns, self._places.view(frame), is_resumed,
+            frame.name,
+            time_ns,
+            found,
+            sighted,
+            tracks.new,
+            tracks.seen,
+            tracks.counts,
+            latency_s,
+            log.read,
+            log.detected,
+            source.frame_count,
+            log.seconds,
+            self._folder,
+            self._places.site,
+            taken.segment,
+            size_px[::-1],
+            frame.time_ns - source.start_ns,
+            self._places.view(frame),
+            is_resumed,
         )
 
     def _tracks_after(self, taken: Taken) -> "_Tracks":
         known = self._places.tracks()
         confirmed = [track for track in known if track.confirmed]
         seen = [track for track in confirmed if track.id in set(taken.track_ids)]
-        return _Tracks(known, confirmed, seen, [each for each in confirmed if each.id in taken.new_ids])
+        return _Tracks(
+            known, confirmed, seen, [each for each in confirmed if each.id in taken.new_ids]
+        )
 
     def _write(self, written: SeenFrame, size_px: tuple[int, int], shown: Sequence[Track]) -> None:
         """Write a frame's part of the files; of one whose picture is not there any more, what does without it."""
@@ -265,7 +344,11 @@ class WatchRun:
         self._files.forget(taken.merged)
         self._files.keep_crops_of(tracks.known)
         self._notifier.report(
-            tracks.new, tracks.seen, self._files.crop_names, self._files.segments, is_resumed=is_resumed
+            tracks.new,
+            tracks.seen,
+            self._files.crop_names,
+            self._files.segments,
+            is_resumed=is_resumed,
         )
         self._notifier.withdraw(taken.merged)
         self._files.show(tracks.confirmed)
@@ -287,16 +370,31 @@ class WatchRun:
             write_detections(self._folder, site)
             rows = self._files.write_tracks(tracks)
         notices = (
-            *self._places.notices(), *self._detector.notices, *source_notices(self._setup.source, self.log),
+            *self._places.notices(),
+            *self._detector.notices,
+            *source_notices(self._setup.source, self.log),
             *self._notifier.notices(),
         )
         self.log.wall_s["write, beside the rest"] = self._files.seconds
         report = build_watch_report(
-            self._setup, self._settings, self._outputs, self._detector, self.log, tracks, notices,
-            self._warnings(tracks), looked_for=self._classes, others=[each.facts for each in self._others],
-            ended=ended, skipped=skipped, set_aside=self._places.set_aside, on_ground=not site.is_local,
+            self._setup,
+            self._settings,
+            self._outputs,
+            self._detector,
+            self.log,
+            tracks,
+            notices,
+            self._warnings(tracks),
+            looked_for=self._classes,
+            others=[each.facts for each in self._others],
+            ended=ended,
+            skipped=skipped,
+            set_aside=self._places.set_aside,
+            on_ground=not site.is_local,
         )
-        crops = {track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()}
+        crops = {
+            track_id: (self._folder / name).read_bytes() for track_id, name in crop_names.items()
+        }
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
         page = watch_page(report, rows, crops, self._places.path_m())
         atomic_write_bytes(self._folder / "report.html", page.encode())
@@ -318,7 +416,9 @@ class WatchRun:
                 "the notices state why"
             )
         if self._setup.source.camera.focal_sigma > 0.1:
-            warnings.append(f"camera: {self._setup.source.camera.origin}; until then places are some percent off")
+            warnings.append(
+                f"camera: {self._setup.source.camera.origin}; until then places are some percent off"
+            )
         far = [track for track in tracks if track.sigma_m > 10]
         if far:
             warnings.append(

@@ -24,12 +24,20 @@ class WatchSettings:
     model: str = "default"  # a name or a file
     classes: tuple[str, ...] = ()  # empty: all that the model knows
     least_score: float | None = None  # of a detection; None: each class's own, as its model has it
-    tiles: Literal["auto"] | int | None = "auto"  # large pictures cut: by the ground's sampling distance, px, not
+    tiles: Literal["auto"] | int | None = (
+        "auto"  # large pictures cut: by the ground's sampling distance, px, not
+    )
     every: int | None = None  # search every N-th frame; None: by time
-    frames_per_second: float | None = None  # of flight; None: 10, and of a live stream as many as there is time for
+    frames_per_second: float | None = (
+        None  # of flight; None: 10, and of a live stream as many as there is time for
+    )
     offset_s: float | None = None  # telemetry time = video time + this; None: by their clocks
-    ground_elevation_m: float | None = None  # of the ground, in the telemetry's own height reference
-    height_model: str = ""  # a GeoTIFF of the ground's heights, in the same reference; empty: the ground is level
+    ground_elevation_m: float | None = (
+        None  # of the ground, in the telemetry's own height reference
+    )
+    height_model: str = (
+        ""  # a GeoTIFF of the ground's heights, in the same reference; empty: the ground is level
+    )
 
     def __post_init__(self) -> None:
         if self.least_score is not None and not 0 <= self.least_score <= 1:
@@ -43,11 +51,15 @@ class WatchSettings:
 
     def _check_frames(self) -> None:
         if self.every is not None and self.frames_per_second is not None:
-            raise SettingsError("give every N-th frame (--every) or this many frames a second (--fps), not both")
+            raise SettingsError(
+                "give every N-th frame (--every) or this many frames a second (--fps), not both"
+            )
         if self.every is not None and self.every < 1:
             raise SettingsError(f"every N-th frame: N must be 1 or more, got {self.every}")
         if self.frames_per_second is not None and not 0.001 <= self.frames_per_second <= 1000:
-            raise SettingsError(f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}")
+            raise SettingsError(
+                f"frames a second must lie in 0.001 to 1000, got {self.frames_per_second}"
+            )
 
 
 @dataclass(frozen=True)
@@ -56,15 +68,21 @@ class WatchOutputs:
 
     folder: Path | None = None  # None: `<source>-watch` where the command runs
     save: Literal["none", "video", "pictures"] = "none"  # frames with what was found drawn in
-    labels: tuple[str, ...] = ()  # of "coco", "yolo": what was found, as labels to correct and train with
+    labels: tuple[
+        str, ...
+    ] = ()  # of "coco", "yolo": what was found, as labels to correct and train with
     cot: str = ""  # udp://host:port, tcp://host:port or tls://host:port
-    cot_types: Mapping[str, str] = field(default_factory=lambda: COT_TYPES)  # Cursor on Target's type of each class
+    cot_types: Mapping[str, str] = field(
+        default_factory=lambda: COT_TYPES
+    )  # Cursor on Target's type of each class
     cot_every_s: float = 3.0  # of one track, once it was reported
     cot_stale_s: float = 300.0
     alert_command: str = ""
     alert_url: str = ""
     cot_tls: CotTls = field(default_factory=CotTls)  # certificates for tls://
-    below: Path | None = None  # where `folder` is not given: each watch has a folder of its source's name in this one
+    below: Path | None = (
+        None  # where `folder` is not given: each watch has a folder of its source's name in this one
+    )
 
     def __post_init__(self) -> None:
         self._check_files()
@@ -74,11 +92,15 @@ class WatchOutputs:
         if self.save not in ("none", "video", "pictures"):
             raise SettingsError(f"save must be none, video or pictures, got {self.save!r}")
         if unknown := sorted(set(self.labels) - set(_LABEL_FORMATS)):
-            raise SettingsError(f"labels are written as {' and '.join(_LABEL_FORMATS)}, not as {unknown[0]!r}")
+            raise SettingsError(
+                f"labels are written as {' and '.join(_LABEL_FORMATS)}, not as {unknown[0]!r}"
+            )
 
     def _check_receivers(self) -> None:
         if not (self.cot_every_s >= 0 and self.cot_stale_s > 0):
-            raise SettingsError("events are sent every 0 s or more, and are stale after more than 0 s")
+            raise SettingsError(
+                "events are sent every 0 s or more, and are stale after more than 0 s"
+            )
         if self.cot:
             cot_place(self.cot)
         if self.cot_tls != CotTls() and not self.cot.startswith("tls://"):

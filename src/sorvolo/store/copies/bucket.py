@@ -85,14 +85,25 @@ class Manifest:
     def data(self) -> bytes:
         """As JSON."""
         held = self.held
-        return json.dumps({
-            "format": "sorvolo site", "format_version": _FORMAT, "id": self.id, "generation": self.generation,
-            "written_utc": self.written_utc,
-            "site": {"identity": held.identity, "name": held.name}, "digest": held.digest,
-            "versions": sorted(map(list, held.versions)), "reviews": dict(held.reviews),
-            "catalogue": list(self.catalogue), "tidying": self.tidying, "tidied": self.tidied,
-            "files": {path: [each.size, each.sha256] for path, each in sorted(self.files.items())},
-        }).encode()
+        return json.dumps(
+            {
+                "format": "sorvolo site",
+                "format_version": _FORMAT,
+                "id": self.id,
+                "generation": self.generation,
+                "written_utc": self.written_utc,
+                "site": {"identity": held.identity, "name": held.name},
+                "digest": held.digest,
+                "versions": sorted(map(list, held.versions)),
+                "reviews": dict(held.reviews),
+                "catalogue": list(self.catalogue),
+                "tidying": self.tidying,
+                "tidied": self.tidied,
+                "files": {
+                    path: [each.size, each.sha256] for path, each in sorted(self.files.items())
+                },
+            }
+        ).encode()
 
     @classmethod
     def parsed(cls, data: bytes, where: str) -> Self:
@@ -111,15 +122,25 @@ class Manifest:
                 for path, (size, sha256) in row["files"].items()
             }
             held = CatalogueState(
-                str(row["site"]["identity"]), str(row["site"]["name"]), str(row["digest"]),
-                frozenset((int(version), int(run), str(utc)) for version, run, utc in row["versions"]),
+                str(row["site"]["identity"]),
+                str(row["site"]["name"]),
+                str(row["digest"]),
+                frozenset(
+                    (int(version), int(run), str(utc)) for version, run, utc in row["versions"]
+                ),
                 {str(change): str(utc) for change, utc in row["reviews"].items()},
             )
             size, sha256 = row["catalogue"]
             catalogue = _size(size), checked_sha256(sha256)
             return cls(
-                str(row["id"]), int(row["generation"]), str(row["written_utc"]), held, catalogue, files,
-                str(row["tidying"]), str(row["tidied"]),
+                str(row["id"]),
+                int(row["generation"]),
+                str(row["written_utc"]),
+                held,
+                catalogue,
+                files,
+                str(row["tidying"]),
+                str(row["tidied"]),
             )
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise StoreError(
@@ -143,7 +164,9 @@ class BucketEnd:
         self._round = _Round()
         self.written: Manifest | None = None  # by `conclude`
         self.shown: Manifest | None = None  # what `state` last gave
-        self.tile_bytes: Mapping[str, int] = {}  # of the site's tiles, by SHA-256, after `state` or `conclude`
+        self.tile_bytes: Mapping[
+            str, int
+        ] = {}  # of the site's tiles, by SHA-256, after `state` or `conclude`
 
     @property
     def name(self) -> str:
@@ -167,7 +190,9 @@ class BucketEnd:
         """The manifest. Raises StoreError where there is no site."""
         found, _ = self.find_manifest()
         if found is None:
-            raise StoreError(f"no site at {self.name}; put one there: sorvolo site copy FOLDER {self.name}")
+            raise StoreError(
+                f"no site at {self.name}; put one there: sorvolo site copy FOLDER {self.name}"
+            )
         return found
 
     def state(self, scratch: Path) -> SiteState:
@@ -183,12 +208,20 @@ class BucketEnd:
             held = find_state(catalogue)
             tiles, keyframes, _ = named_files(catalogue)
         if held is None or held.identity != manifest.held.identity:
-            raise StoreError(f"{self.name}: the catalogue is not the one of this site; restore it from a copy")
+            raise StoreError(
+                f"{self.name}: the catalogue is not the one of this site; restore it from a copy"
+            )
         sizes = self._objects.sizes("tiles")
         files = dict(manifest.files)
-        files |= {tile_path(each): SiteFile(tile_path(each), sizes.get(tile_path(each), 0), each) for each in tiles}
+        files |= {
+            tile_path(each): SiteFile(tile_path(each), sizes.get(tile_path(each), 0), each)
+            for each in tiles
+        }
         files |= {path: SiteFile(path, 0) for path in keyframes - files.keys()}
-        self.shown, self.tile_bytes = manifest, {each: sizes.get(tile_path(each), 0) for each in tiles}
+        self.shown, self.tile_bytes = (
+            manifest,
+            {each: sizes.get(tile_path(each), 0) for each in tiles},
+        )
         return SiteState(held, path, files)
 
     def is_still(self, state: SiteState, scratch: Path) -> bool:
@@ -209,12 +242,17 @@ class BucketEnd:
         """Write an object to a path. Raises StoreError when it is gone, or its hash does not match its name."""
         digest = hashlib.sha256()
         try:
-            with closing(self._objects.opened(key, file.size)) as stream, open(path, "wb") as target:
+            with (
+                closing(self._objects.opened(key, file.size)) as stream,
+                open(path, "wb") as target,
+            ):
                 for chunk in chunks_of(stream):
                     digest.update(chunk)
                     target.write(chunk)
         except FileNotFoundError as error:
-            raise StoreError(f"{self.name}/{key} is gone; restore it from a copy of the site") from error
+            raise StoreError(
+                f"{self.name}/{key} is gone; restore it from a copy of the site"
+            ) from error
         if digest.hexdigest() != file.sha256:
             raise StoreError(f"{self.name}/{key} is damaged; restore it from a copy of the site")
 
@@ -229,7 +267,9 @@ class BucketEnd:
         self._round.manifest = manifest
         if manifest is None:
             if self._base:
-                raise StoreError(f"the site at {self.name} is gone; copy it there again: sorvolo site copy")
+                raise StoreError(
+                    f"the site at {self.name} is gone; copy it there again: sorvolo site copy"
+                )
             self._refuse_foreign()
         else:
             if self._base not in (None, manifest.id):
@@ -252,7 +292,10 @@ class BucketEnd:
             former = known.get(file.path)
             same = former if former and _is_same_picture(file, former) else file
             stored = self._round.stored.get(key_of(same)) if same.sha256 else None
-            if stored is not None and same.size in (stored, 0):  # 0: not fetched into a working copy
+            if stored is not None and same.size in (
+                stored,
+                0,
+            ):  # 0: not fetched into a working copy
                 self._round.files[file.path] = same
             else:
                 lacking.append(file)
@@ -280,8 +323,16 @@ class BucketEnd:
     def conclude(self, state: SiteState) -> None:
         """Make everything that was put the site. Raises StoreError where another writer was faster."""
         former, stored = self._round.manifest, self._round.stored
-        here = {path: replace(each, stamp=0) for path, each in self._round.files.items() if path in state.files}
-        self.tile_bytes = {tile_of(path): stored.get(path, each.size) for path, each in here.items() if tile_of(path)}
+        here = {
+            path: replace(each, stamp=0)
+            for path, each in self._round.files.items()
+            if path in state.files
+        }
+        self.tile_bytes = {
+            tile_of(path): stored.get(path, each.size)
+            for path, each in here.items()
+            if tile_of(path)
+        }
         files = {path: each for path, each in here.items() if not tile_of(path)}
         if former and former.held == state.held and dict(former.files) == files:
             self.written = former  # nothing is new
@@ -331,7 +382,8 @@ class BucketEnd:
         except StoreError as error:
             warnings.warn(
                 f"the site is at {self.name}, but not its map under the plain names {', '.join(SHOWN)}: {error}",
-                SorvoloWarning, stacklevel=2,
+                SorvoloWarning,
+                stacklevel=2,
             )
 
     def _show_as(self, name: str, file: SiteFile | None) -> None:
@@ -381,7 +433,10 @@ class _Round:
 
 
 def _next_manifest(
-    former: Manifest | None, held: CatalogueState, catalogue: tuple[int, str], files: Mapping[str, SiteFile]
+    former: Manifest | None,
+    held: CatalogueState,
+    catalogue: tuple[int, str],
+    files: Mapping[str, SiteFile],
 ) -> Manifest:
     generation = 1 if former is None else former.generation + 1
     now_utc = datetime.now(UTC).isoformat(timespec="seconds")
@@ -397,7 +452,9 @@ def key_of(file: SiteFile) -> str:
     if tile_of(file.path):
         return file.path
     suffix = Path(file.path).suffix.lower()
-    ending = suffix if suffix[1:].isalnum() and suffix.isascii() and len(suffix) <= _MOST_SUFFIX else ""
+    ending = (
+        suffix if suffix[1:].isalnum() and suffix.isascii() and len(suffix) <= _MOST_SUFFIX else ""
+    )
     return f"files/{file.sha256[:2]}/{file.sha256}{ending}"
 
 

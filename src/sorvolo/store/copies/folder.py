@@ -38,7 +38,13 @@ from sorvolo.store.copies.site_state import (
 from sorvolo.store.nofollow import open_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue
-from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, Catalogues, create_database, is_site
+from sorvolo.store.site.catalogue_place import (
+    CATALOGUE,
+    POINTER,
+    Catalogues,
+    create_database,
+    is_site,
+)
 from sorvolo.store.site.files import (
     COPYING,
     JOURNAL,
@@ -53,9 +59,19 @@ from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT
 from sorvolo.store.site.row_copies import copy_rows
 from sorvolo.store.site.sqlite_database import SqliteDatabase
 
-_OF_THE_FOLDER = frozenset({
-    CATALOGUE, f"{CATALOGUE}-wal", f"{CATALOGUE}-shm", POINTER, LOCK, COPYING, ORIGIN, TILE_SIZES, UNSENT,
-})
+_OF_THE_FOLDER = frozenset(
+    {
+        CATALOGUE,
+        f"{CATALOGUE}-wal",
+        f"{CATALOGUE}-shm",
+        POINTER,
+        LOCK,
+        COPYING,
+        ORIGIN,
+        TILE_SIZES,
+        UNSENT,
+    }
+)
 
 
 class FolderEnd:
@@ -93,7 +109,9 @@ class FolderEnd:
             held = find_state(copied)
             named = named_files(copied)
         if held is None:
-            raise StoreError(f"{self.folder} has no map yet: there is nothing to copy; map a flight into it first")
+            raise StoreError(
+                f"{self.folder} has no map yet: there is nothing to copy; map a flight into it first"
+            )
         listed, left_out = _listed(self.folder, *named)
         return SiteState(held, path, listed, left_out)
 
@@ -116,7 +134,9 @@ class FolderEnd:
             try:
                 self.folder.mkdir(parents=True, exist_ok=True)
             except FileExistsError as error:
-                raise StoreError(f"{self.folder} is a file, a folder was needed; choose another name") from error
+                raise StoreError(
+                    f"{self.folder} is a file, a folder was needed; choose another name"
+                ) from error
         refuse_links(self.folder)
         if not self.has_site and (foreign := sorted(_foreign(self.folder))):
             raise StoreError(
@@ -146,7 +166,9 @@ class FolderEnd:
         atomic_write_bytes(self.folder / COPYING, json.dumps(note).encode())
         remove_leftovers([self.folder, *(each for each in self.folder.rglob("*") if each.is_dir())])
 
-    def _refuse_loss(self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState) -> None:
+    def _refuse_loss(
+        self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState
+    ) -> None:
         refuse_loss(self.name, missing_from(held, files, new))
 
     def find_held(self) -> CatalogueState | None:
@@ -164,7 +186,9 @@ class FolderEnd:
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_path(path) as temporary:
-            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+            descriptor = os.open(
+                temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666
+            )
             digest = hashlib.sha256()
             with os.fdopen(descriptor, "wb") as target:
                 for chunk in chunks_of(stream):
@@ -196,13 +220,19 @@ class FolderEnd:
 
     def free_bytes(self) -> int | None:
         """Free disk space, bytes."""
-        there = next(each for each in (self.folder.absolute(), *self.folder.absolute().parents) if each.exists())
+        there = next(
+            each
+            for each in (self.folder.absolute(), *self.folder.absolute().parents)
+            if each.exists()
+        )
         return shutil.disk_usage(there).free
 
     def _held(self, scratch: Path) -> tuple[CatalogueState | None, Mapping[str, SiteFile]]:
         """What the folder's catalogue holds (None: no map), unfinished runs apart, and its files."""
         path = scratch / f"held-{CATALOGUE}"
-        with closing(Catalogue.open(self.folder, write=False, catalogues=self._catalogues)) as catalogue:
+        with closing(
+            Catalogue.open(self.folder, write=False, catalogues=self._catalogues)
+        ) as catalogue:
             _copy_catalogue(catalogue, path)
         with closing(Catalogue.at(path, write=True)) as copied:
             with copied.changing() as connection:
@@ -218,7 +248,11 @@ class FolderEnd:
             return False
         if file.is_lasting or (file.stamp and about.st_mtime_ns == file.stamp):
             return True
-        return not file.stamp and bool(file.sha256) and file_sha256(self.folder, file.path) == file.sha256
+        return (
+            not file.stamp
+            and bool(file.sha256)
+            and file_sha256(self.folder, file.path) == file.sha256
+        )
 
 
 def file_sha256(folder: Path, path: str) -> str:
@@ -268,24 +302,33 @@ def _copy_catalogue(catalogue: Catalogue, path: Path) -> None:
             with closing(sqlite3.connect(path)) as copied:
                 driver.backup(copied)
         except sqlite3.Error as error:
-            raise StoreError(f"cannot write {path} ({error}); free some space and run it again") from error
+            raise StoreError(
+                f"cannot write {path} ({error}); free some space and run it again"
+            ) from error
 
 
 def _overwrite_catalogue(path: Path, new: Path) -> None:
     """Replace what a catalogue holds, in one transaction: readers see the old state or the new one."""
     try:
-        with closing(sqlite3.connect(new)) as source, closing(sqlite3.connect(path, timeout=30)) as target:
+        with (
+            closing(sqlite3.connect(new)) as source,
+            closing(sqlite3.connect(path, timeout=30)) as target,
+        ):
             source.backup(target)
             target.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     except sqlite3.Error as error:
-        raise StoreError(f"cannot write {path} ({error}); free some space and run the copy again") from error
+        raise StoreError(
+            f"cannot write {path} ({error}); free some space and run the copy again"
+        ) from error
 
 
 def _overwrite_rows(folder: Path, new: Path, catalogues: Catalogues | None) -> None:
     """The same for a catalogue in a PostgreSQL database."""
     with (
-        closing(Catalogue.open(folder, write=True, catalogues=catalogues)) as target, target.changing() as written,
-        closing(Catalogue.at(new, write=False)) as source, source.reading() as read,
+        closing(Catalogue.open(folder, write=True, catalogues=catalogues)) as target,
+        target.changing() as written,
+        closing(Catalogue.at(new, write=False)) as source,
+        source.reading() as read,
     ):
         copy_rows(read, written)
 
@@ -336,7 +379,9 @@ def _is_passing(path: str) -> bool:
 
 def _foreign(folder: Path) -> Iterator[str]:
     for path in folder.iterdir():
-        if path.name not in (LOCK, ORIGIN, TILE_SIZES, UNSENT) and not path.name.startswith(TEMPORARY_PREFIX):
+        if path.name not in (LOCK, ORIGIN, TILE_SIZES, UNSENT) and not path.name.startswith(
+            TEMPORARY_PREFIX
+        ):
             yield path.name
 
 

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
 _BUCKET = re.compile(r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]")
-_PREFIX = re.compile(r"[A-Za-z0-9!_.*'()-]+(/[A-Za-z0-9!_.*'()-]+)*")  # names that no store or program writes otherwise
+_PREFIX = re.compile(
+    r"[A-Za-z0-9!_.*'()-]+(/[A-Za-z0-9!_.*'()-]+)*"
+)  # names that no store or program writes otherwise
 _CODE = re.compile(r"<Code>([A-Za-z]{1,60})</Code>")
 _PATH = re.compile(r"(https?://[^/\s]*)\S*")  # which may hold any words
 _STATUS = re.compile(r"status code: (\d{3})")
@@ -36,24 +38,37 @@ _WORDS = {
     "NoSuchBucket": "there is no such bucket: check its name, and AWS_ENDPOINT_URL where it is not Amazon's",
     "AccessDenied": "the keys have no right to do this in the bucket: ask its owner for reading, writing and listing",
     "AllAccessDisabled": "the bucket is closed: ask its owner",
-    "InvalidAccessKeyId": _KEYS, "SignatureDoesNotMatch": _KEYS,
-    "RequestTimeTooSkewed": _CLOCK, "RequestExpired": _CLOCK,
-    "ExpiredToken": _TOKEN, "InvalidToken": _TOKEN,
-    "PermanentRedirect": _REGION, "AuthorizationHeaderMalformed": _REGION,
+    "InvalidAccessKeyId": _KEYS,
+    "SignatureDoesNotMatch": _KEYS,
+    "RequestTimeTooSkewed": _CLOCK,
+    "RequestExpired": _CLOCK,
+    "ExpiredToken": _TOKEN,
+    "InvalidToken": _TOKEN,
+    "PermanentRedirect": _REGION,
+    "AuthorizationHeaderMalformed": _REGION,
     "IllegalLocationConstraintException": _REGION,
     "SlowDown": "the store is busy: run the same command again later",
     "EntityTooLarge": "the store takes no file of this size",
-    "QuotaExceeded": _FULL, "XMinioStorageFull": _FULL,
+    "QuotaExceeded": _FULL,
+    "XMinioStorageFull": _FULL,
 }  # S3's codes of errors
 
 _BY_STATUS = {"403": _WORDS["AccessDenied"], "401": _KEYS, "301": _REGION}
 _UNASKED = (  # by the library's message: what keeps it from asking the store at all, which no later try mends
-    ("http://169.254.", _NO_KEYS), ("credential", _NO_KEYS),  # where only Amazon's machines give keys
-    ("certificate", "the store's certificate is not trusted: set AWS_CA_BUNDLE to its authority's PEM file"),
+    ("http://169.254.", _NO_KEYS),
+    ("credential", _NO_KEYS),  # where only Amazon's machines give keys
+    (
+        "certificate",
+        "the store's certificate is not trusted: set AWS_CA_BUNDLE to its authority's PEM file",
+    ),
 )
 _WITHOUT_ANSWER = (  # likewise, the first that is in it
-    ("timed out", _SLOW), ("timedout", _SLOW),
-    ("", "no connection, or it was cut: check the network and AWS_ENDPOINT_URL, then run the same command again"),
+    ("timed out", _SLOW),
+    ("timedout", _SLOW),
+    (
+        "",
+        "no connection, or it was cut: check the network and AWS_ENDPOINT_URL, then run the same command again",
+    ),
 )
 
 T = TypeVar("T")
@@ -81,7 +96,9 @@ class Objects:
     Every method raises StoreError where the store refuses or cannot be reached; no message holds a key of access.
     """
 
-    def __init__(self, store: "ObjectStore", name: str, settings: ObjectSettings = ObjectSettings()) -> None:
+    def __init__(
+        self, store: "ObjectStore", name: str, settings: ObjectSettings = ObjectSettings()
+    ) -> None:
         self._store, self.name, self._settings = store, name, settings
 
     def read(self, key: str, most_bytes: int) -> tuple[bytes, str]:
@@ -91,7 +108,9 @@ class Objects:
         def get() -> tuple[bytes, str]:
             found = obstore.get(self._store, key)
             if found.meta["size"] > most_bytes:
-                raise StoreError(f"{self.name}/{key} has {found.meta['size'] / 1e6:.0f} MB: no Sorvolo wrote it")
+                raise StoreError(
+                    f"{self.name}/{key} has {found.meta['size'] / 1e6:.0f} MB: no Sorvolo wrote it"
+                )
             return bytes(found.bytes()), str(found.meta["e_tag"])
 
         return self._tried(get, "read")
@@ -104,7 +123,9 @@ class Objects:
         """Some bytes of an object. Raises FileNotFoundError where there is none."""
         import obstore
 
-        return self._tried(lambda: bytes(obstore.get_range(self._store, key, start=start, length=length)), "read")
+        return self._tried(
+            lambda: bytes(obstore.get_range(self._store, key, start=start, length=length)), "read"
+        )
 
     def write(self, key: str, stream: BinaryIO) -> None:
         """Put all of a stream, from its beginning, whole or not at all."""
@@ -112,7 +133,9 @@ class Objects:
 
         def put() -> None:
             stream.seek(0)
-            obstore.put(self._store, key, stream, chunk_size=self._settings.part_bytes, max_concurrency=2)
+            obstore.put(
+                self._store, key, stream, chunk_size=self._settings.part_bytes, max_concurrency=2
+            )
 
         self._tried(put, "write")
 
@@ -144,7 +167,10 @@ class Objects:
             newest = max((each["last_modified"] for each in found), default=None)
             now = max(newest, datetime.now(UTC)) if newest else None
             return {
-                each["path"]: (each["size"], (now - each["last_modified"]).total_seconds() if now else 0.0)
+                each["path"]: (
+                    each["size"],
+                    (now - each["last_modified"]).total_seconds() if now else 0.0,
+                )
                 for each in found
             }
 
@@ -241,7 +267,7 @@ class _Parts(io.RawIOBase):
         if length <= 0:
             return 0
         data = self._objects.part(self._key, self._at, length)
-        buffer[:len(data)] = data
+        buffer[: len(data)] = data
         self._at += len(data)
         return len(data)
 
@@ -255,28 +281,45 @@ def open_objects(address: str, settings: ObjectSettings = ObjectSettings()) -> O
     """
     bucket, prefix = _parsed(address)
     if importlib.util.find_spec("obstore") is None:
-        raise SettingsError("object stores need one more package; install it: pip install 'sorvolo[s3]'")
+        raise SettingsError(
+            "object stores need one more package; install it: pip install 'sorvolo[s3]'"
+        )
     from obstore.exceptions import BaseError
     from obstore.store import S3Store
 
     options: Any = {
-        "connect_timeout": timedelta(seconds=settings.connect_s), "timeout": timedelta(seconds=settings.request_s),
+        "connect_timeout": timedelta(seconds=settings.connect_s),
+        "timeout": timedelta(seconds=settings.request_s),
     }
     endpoint = _endpoint()
     if endpoint.startswith("http://"):
         options["allow_http"] = True  # it was asked for in so many letters
     if bundle := os.environ.get("AWS_CA_BUNDLE"):
         options["root_certificate"] = Path(bundle).read_bytes()
-    retries: Any = {"max_retries": settings.retries, "retry_timeout": timedelta(seconds=settings.retry_s)}
-    config: Any = {"checksum_algorithm": "sha256"} | ({"endpoint": endpoint} if endpoint else {}) | _profile(os.environ)
-    region = os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or config.get("region")
+    retries: Any = {
+        "max_retries": settings.retries,
+        "retry_timeout": timedelta(seconds=settings.retry_s),
+    }
+    config: Any = (
+        {"checksum_algorithm": "sha256"}
+        | ({"endpoint": endpoint} if endpoint else {})
+        | _profile(os.environ)
+    )
+    region = (
+        os.environ.get("AWS_REGION") or os.environ.get("AWS_DEFAULT_REGION") or config.get("region")
+    )
     try:
         store = S3Store(
-            bucket, prefix=prefix or None, client_options=options, retry_config=retries,
+            bucket,
+            prefix=prefix or None,
+            client_options=options,
+            retry_config=retries,
             config=config | {"region": region or "us-east-1"},
         )
     except BaseError:
-        raise SettingsError("the AWS_ variables of the environment hold what no store takes; check them") from None
+        raise SettingsError(
+            "the AWS_ variables of the environment hold what no store takes; check them"
+        ) from None
     return Objects(store, f"s3://{bucket}/{prefix}".rstrip("/"), settings)
 
 
@@ -284,10 +327,18 @@ def _parsed(address: str) -> tuple[str, str]:
     """Bucket and prefix of an address. Raises SettingsError, without the address where it may hold a key."""
     parts = urlsplit(address)
     if "@" in address:
-        raise SettingsError("an address of a store holds no keys; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")
+        raise SettingsError(
+            "an address of a store holds no keys; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+        )
     prefix = parts.path.strip("/")
     plain = not prefix or (_PREFIX.fullmatch(prefix) and not {".", ".."} & set(prefix.split("/")))
-    if parts.scheme != "s3" or parts.query or parts.fragment or not _BUCKET.fullmatch(parts.netloc) or not plain:
+    if (
+        parts.scheme != "s3"
+        or parts.query
+        or parts.fragment
+        or not _BUCKET.fullmatch(parts.netloc)
+        or not plain
+    ):
         raise SettingsError(
             f"{address[:200]!r} names no place in a store; give s3://BUCKET/NAME, NAME of letters, digits, '-', '_'"
         )
@@ -299,7 +350,9 @@ def _endpoint() -> str:
         if value := os.environ.get(name, ""):
             parts = urlsplit(value)
             if parts.scheme not in ("http", "https") or not parts.hostname or "@" in parts.netloc:
-                raise SettingsError(f"{name} holds no address; give https://HOST or https://HOST:PORT")
+                raise SettingsError(
+                    f"{name} holds no address; give https://HOST or https://HOST:PORT"
+                )
             return value.rstrip("/")
     return ""
 
@@ -311,14 +364,22 @@ def _profile(environment: Mapping[str, str]) -> dict[str, str]:
     home = Path(environment.get("HOME", "~")).expanduser() / ".aws"
     profile = environment.get("AWS_PROFILE", "default")
     found = {
-        **_section(Path(environment.get("AWS_CONFIG_FILE", home / "config")), f"profile {profile}", profile),
-        **_section(Path(environment.get("AWS_SHARED_CREDENTIALS_FILE", home / "credentials")), profile),
+        **_section(
+            Path(environment.get("AWS_CONFIG_FILE", home / "config")), f"profile {profile}", profile
+        ),
+        **_section(
+            Path(environment.get("AWS_SHARED_CREDENTIALS_FILE", home / "credentials")), profile
+        ),
     }
     if "AWS_PROFILE" in environment and "aws_access_key_id" not in found:
-        raise SettingsError(f"the profile {profile!r} (AWS_PROFILE) has no keys in {home}; check its name")
+        raise SettingsError(
+            f"the profile {profile!r} (AWS_PROFILE) has no keys in {home}; check its name"
+        )
     names = {
-        "aws_access_key_id": "access_key_id", "aws_secret_access_key": "secret_access_key",
-        "aws_session_token": "session_token", "region": "region",
+        "aws_access_key_id": "access_key_id",
+        "aws_secret_access_key": "secret_access_key",
+        "aws_session_token": "session_token",
+        "region": "region",
     }
     return {ours: found[theirs] for theirs, ours in names.items() if theirs in found}
 
@@ -328,7 +389,9 @@ def _section(path: Path, *names: str) -> dict[str, str]:
     try:
         parser.read(path, encoding="utf-8")
     except (OSError, ConfigError, UnicodeDecodeError):
-        raise SettingsError(f"{path} cannot be read; mend it, or set AWS_ACCESS_KEY_ID instead") from None
+        raise SettingsError(
+            f"{path} cannot be read; mend it, or set AWS_ACCESS_KEY_ID instead"
+        ) from None
     return next((dict(parser[name]) for name in names if parser.has_section(name)), {})
 
 
@@ -339,7 +402,9 @@ def _kind_of(text: str) -> type[StoreError]:
         return StoreError
     if status is None and code is None:
         return _CutError
-    is_busy = (status is not None and status[1].startswith("5")) or (code is not None and code[1] == "SlowDown")
+    is_busy = (status is not None and status[1].startswith("5")) or (
+        code is not None and code[1] == "SlowDown"
+    )
     return UnavailableError if is_busy else StoreError
 
 

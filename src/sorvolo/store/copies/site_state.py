@@ -18,12 +18,24 @@ from sorvolo.store.site.catalogue import Catalogue
 from sorvolo.store.site.files import JOURNAL, STAGED, HeightFile
 from sorvolo.store.site.names import checked_image_path, is_plain_name, is_sha256
 
-_MAP_FILES = frozenset({
-    "mosaic.tif", "preview.png", "mosaic.kmz", "objects.geojson", "objects.json", "objects.kml", "objects.gpx",
-})
+_MAP_FILES = frozenset(
+    {
+        "mosaic.tif",
+        "preview.png",
+        "mosaic.kmz",
+        "objects.geojson",
+        "objects.json",
+        "objects.kml",
+        "objects.gpx",
+    }
+)
 _CHUNK_BYTES = 1 << 20
 _MOST_PARTS = 6  # of a file's path: flights/<flight>/staged/<run>/changes/<file>
-_HOW_FAR_WRITTEN = {"site": {"derived_version"}, "runs": {"files_written"}, "documents": {"content"}}
+_HOW_FAR_WRITTEN = {
+    "site": {"derived_version"},
+    "runs": {"files_written"},
+    "documents": {"content"},
+}
 _LASTING = frozenset(HeightFile)  # files of a flight that nothing in the catalogue could make again
 _TILE = re.compile(r"tiles/[0-9a-f]{2}/([0-9a-f]{64})\.png")
 _KEYFRAME = re.compile(r"flights/[^/]+/keyframes/[0-9]{1,18}/[0-9]{6,18}\.jpg")
@@ -90,11 +102,18 @@ def find_state(catalogue: Catalogue) -> CatalogueState | None:
         row = connection.execute(select(schema.site)).mappings().one_or_none()
         if row is None or records.newest_version(connection) == 0:
             return None
-        versions = connection.execute(select(schema.versions).where(schema.versions.c.complete.is_(True)))
+        versions = connection.execute(
+            select(schema.versions).where(schema.versions.c.complete.is_(True))
+        )
         reviews = connection.execute(select(schema.reviews.c.change_id, schema.reviews.c.at_utc))
-        fixed = [row[name] for name in ("created_utc", "latitude_deg", "longitude_deg", "crs", "m_per_px")]
+        fixed = [
+            row[name]
+            for name in ("created_utc", "latitude_deg", "longitude_deg", "crs", "m_per_px")
+        ]
         return CatalogueState(
-            hashlib.sha256(json.dumps(fixed).encode()).hexdigest()[:32], row["name"], _digest(connection),
+            hashlib.sha256(json.dumps(fixed).encode()).hexdigest()[:32],
+            row["name"],
+            _digest(connection),
             frozenset((each.id, each.run_id, each.created_utc) for each in versions),
             {each.change_id: each.at_utc for each in reviews},
         )
@@ -105,7 +124,8 @@ def named_files(catalogue: Catalogue) -> tuple[set[str], set[str], set[tuple[str
     with catalogue.reading() as connection:
         tiles = records.used_hashes(connection)
         keyframes = {
-            checked_image_path(each.image_path, each.flight_id) for each in records.load_keyframes(connection, None)
+            checked_image_path(each.image_path, each.flight_id)
+            for each in records.load_keyframes(connection, None)
         }
         owed = {(each.flight_id, str(each.run_id)) for each in records.owed_files(connection)}
     return tiles, keyframes, owed
@@ -115,10 +135,14 @@ def missing_from(held: CatalogueState, files: Mapping[str, SiteFile], other: Sit
     """What a site holds and another state of it has not, in words; "" where the other could replace it without loss."""
     if versions := sorted(each[0] for each in held.versions - other.held.versions):
         return f"version {', '.join(map(str, versions))} of the map"
-    later = sorted(each for each, at_utc in held.reviews.items() if at_utc > other.held.reviews.get(each, ""))
+    later = sorted(
+        each for each, at_utc in held.reviews.items() if at_utc > other.held.reviews.get(each, "")
+    )
     if later:
         return f"the review of change {', '.join(later[:5])}"
-    lasting = sorted(path for path in files if path.rpartition("/")[2] in _LASTING and path not in other.files)
+    lasting = sorted(
+        path for path in files if path.rpartition("/")[2] in _LASTING and path not in other.files
+    )
     return ", ".join(lasting[:5])
 
 
@@ -129,7 +153,9 @@ def is_site_path(path: str) -> bool:
         return path in _MAP_FILES
     if not 3 <= len(parts) <= _MOST_PARTS or parts[0] != "flights" or parts[2] == JOURNAL:
         return False
-    return all(is_plain_name(part) for part in parts[1:]) and not parts[-1].startswith(TEMPORARY_PREFIX)
+    return all(is_plain_name(part) for part in parts[1:]) and not parts[-1].startswith(
+        TEMPORARY_PREFIX
+    )
 
 
 def checked_path(path: object) -> str:

@@ -42,7 +42,9 @@ def prune(objects: Objects, older_than_s: float, *, only_count: bool = False) ->
         _swap(objects, manifest, etag)
     stored = {key: about for key, about in objects.listing("").items() if key.startswith(_FOLDERS)}
     unused = {
-        key: size for key, (size, age_s) in stored.items() if key not in used and age_s > older_than_s
+        key: size
+        for key, (size, age_s) in stored.items()
+        if key not in used and age_s > older_than_s
     }
     if not only_count:
         _remove(objects, sorted(unused))
@@ -54,7 +56,7 @@ def prune(objects: Objects, older_than_s: float, *, only_count: bool = False) ->
 
 def _remove(objects: Objects, keys: Sequence[str]) -> None:
     for start in range(0, len(keys), _AT_ONCE):
-        objects.remove(keys[start:start + _AT_ONCE])
+        objects.remove(keys[start : start + _AT_ONCE])
 
 
 def _used(end: BucketEnd, manifest: Manifest) -> set[str]:
@@ -69,4 +71,6 @@ def _swap(objects: Objects, manifest: Manifest, etag: str) -> None:
     try:
         objects.swap(MANIFEST, manifest.data(), etag)
     except ConflictError:
-        raise StoreError(f"another writer has changed the site at {objects.name}; run the same command again") from None
+        raise StoreError(
+            f"another writer has changed the site at {objects.name}; run the same command again"
+        ) from None

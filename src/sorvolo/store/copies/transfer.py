@@ -104,7 +104,12 @@ class _Counts:
 
 
 def copy(
-    source: SiteEnd, target: SiteEnd, scratch: Path, *, threads: int = 4, most_rounds: int = 20,
+    source: SiteEnd,
+    target: SiteEnd,
+    scratch: Path,
+    *,
+    threads: int = 4,
+    most_rounds: int = 20,
     room: Callable[[int, int | None], None] = lambda needed, free: None,
 ) -> Generator[CopyUpdate, None, CopyOutcome]:
     """Make `target` a copy of `source` as of one moment, even if the source changes meanwhile.
@@ -122,16 +127,25 @@ def copy(
             lacking = [each for each in target.lacks(state) if each.path not in counts.faults]
             room(sum(each.size for each in lacking), target.free_bytes())
             gone = yield from _move(source, target, lacking, counts, threads)
-            for path in gone & counts.gone:  # gone in two rounds: another process is not just replacing it
+            for path in (
+                gone & counts.gone
+            ):  # gone in two rounds: another process is not just replacing it
                 counts.faults[path] = "missing"
             counts.gone = gone
             if not gone - counts.faults.keys() and source.is_still(state, scratch):
                 target.conclude(state)
                 return CopyOutcome(
-                    len(state.files), sum(each.size for each in state.files.values()), counts.copied,
-                    counts.copied_bytes, state.held.newest, counts.faults, state.left_out,
+                    len(state.files),
+                    sum(each.size for each in state.files.values()),
+                    counts.copied,
+                    counts.copied_bytes,
+                    state.held.newest,
+                    counts.faults,
+                    state.left_out,
                 )
-    raise StoreError(f"{source.name} changes faster than it can be copied; run the same command again later")
+    raise StoreError(
+        f"{source.name} changes faster than it can be copied; run the same command again later"
+    )
 
 
 def _move(
@@ -194,14 +208,18 @@ def verify(
         yield CopyUpdate(done, len(both), done_bytes, total)
     if faults and not source.is_still(state, scratch):
         raise StoreError(f"{source.name} changed while it was compared; run the same command again")
-    return CopyOutcome(len(state.files), total, len(both), total, state.held.newest, faults, state.left_out)
+    return CopyOutcome(
+        len(state.files), total, len(both), total, state.held.newest, faults, state.left_out
+    )
 
 
 def _differences(state: SiteState, theirs: SiteState) -> dict[str, str]:
     """How a copy differs by its catalogue and the names of its files."""
     faults = {}
     if state.held.digest != theirs.held.digest:
-        faults["site.db"] = f"differs: version {theirs.held.newest} of the map, the site has {state.held.newest}"
+        faults["site.db"] = (
+            f"differs: version {theirs.held.newest} of the map, the site has {state.held.newest}"
+        )
     faults |= {path: "not in the site" for path in theirs.files.keys() - state.files.keys()}
     return faults | {path: "missing" for path in state.files.keys() - theirs.files.keys()}
 

@@ -15,7 +15,13 @@ from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.copies.bucket import SHOWN, BucketEnd, Manifest, key_of
 from sorvolo.store.copies.folder import FolderEnd
 from sorvolo.store.copies.object_store import Objects, open_objects
-from sorvolo.store.copies.site_state import CatalogueState, DamagedError, SiteFile, SiteState, tile_of
+from sorvolo.store.copies.site_state import (
+    CatalogueState,
+    DamagedError,
+    SiteFile,
+    SiteState,
+    tile_of,
+)
 from sorvolo.store.copies.transfer import CopyUpdate, copy
 from sorvolo.store.site.catalogue_place import is_site
 from sorvolo.store.site.files import lock_folder
@@ -99,7 +105,9 @@ class WorkingCopy:
         outcome = yield from copy(folder, end, scratch, threads=8)
         if outcome.faults:
             lost = ", ".join(outcome.faults)
-            raise StoreError(f"{self.folder} lacks files that {self.address} has not either: {lost}")
+            raise StoreError(
+                f"{self.folder} lacks files that {self.address} has not either: {lost}"
+            )
         self._note(end)
         (self.folder / UNSENT).unlink(missing_ok=True)
         return end.written is not None and end.written.id != before
@@ -165,7 +173,9 @@ class StoreOrigin:
         try:
             FolderEnd(self._folder).put(file, stream)
         except DamagedError as error:
-            raise StoreError(f"{file.path} is damaged in the store, at {end.name}; restore it from a copy") from error
+            raise StoreError(
+                f"{file.path} is damaged in the store, at {end.name}; restore it from a copy"
+            ) from error
 
     def _opened(self) -> tuple[BucketEnd, Mapping[str, SiteFile]]:
         """The store, and the files that it has as of now: the working copy may have been brought up to date."""
@@ -192,7 +202,9 @@ class _WorkingFolder(FolderEnd):
         """Nothing that comes when it is asked for."""
         return [each for each in super().lacks(state) if not each.is_lasting]
 
-    def _refuse_loss(self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState) -> None:
+    def _refuse_loss(
+        self, held: CatalogueState, files: Mapping[str, SiteFile], new: SiteState
+    ) -> None:
         """All that was added here was sent before."""
 
 
@@ -202,7 +214,11 @@ def known_manifest(folder: Path) -> Manifest | None:
         note = json.loads((folder / ORIGIN).read_bytes())
     except (FileNotFoundError, ValueError):
         return None
-    return Manifest.parsed(json.dumps(note.get("manifest")).encode(), str(folder)) if isinstance(note, dict) else None
+    return (
+        Manifest.parsed(json.dumps(note.get("manifest")).encode(), str(folder))
+        if isinstance(note, dict)
+        else None
+    )
 
 
 def store_address(folder: Path, path: str) -> str:
@@ -223,5 +239,3 @@ def _read_sizes(path: Path) -> Mapping[str, int]:
     except (FileNotFoundError, ValueError):
         return {}
     return sizes if isinstance(sizes, dict) else {}
-
-

@@ -19,15 +19,24 @@ from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 
 READERS: Mapping[str, Reader] = {
-    "coco": read_coco, "yolo": read_yolo, "voc": read_voc, "visdrone": read_visdrone, "okutama": read_okutama,
+    "coco": read_coco,
+    "yolo": read_yolo,
+    "voc": read_voc,
+    "visdrone": read_visdrone,
+    "okutama": read_okutama,
     "umcd": read_umcd,
 }
 """Every form by the name that a user gives it."""
 
 
 def read_dataset(
-    place: Path | str, *, form: str | None = None, classes: Mapping[str, str] | None = None,
-    ignore: Iterable[str] = (), unlabelled: Iterable[str] = (), group_pattern: str | None = None,
+    place: Path | str,
+    *,
+    form: str | None = None,
+    classes: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
+    unlabelled: Iterable[str] = (),
+    group_pattern: str | None = None,
 ) -> LabelledSet:
     """Labelled pictures from a file or folder, in our classes (docs/datasets.md).
 
@@ -44,8 +53,13 @@ def read_dataset(
 
 
 def read_datasets(
-    places: Sequence[Path | str], *, form: str | None = None, classes: Mapping[str, str] | None = None,
-    ignore: Iterable[str] = (), unlabelled: Iterable[str] = (), group_pattern: str | None = None,
+    places: Sequence[Path | str],
+    *,
+    form: str | None = None,
+    classes: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
+    unlabelled: Iterable[str] = (),
+    group_pattern: str | None = None,
     known: Iterable[str] = (),
 ) -> tuple[LabelledSet, ...]:
     """Several sets, read alike, each as `read_dataset` reads it; a slip in a name is no silent one here.
@@ -54,7 +68,9 @@ def read_datasets(
     or one in `unlabelled` no class: of ours, of `classes`, of a set, or of those that are `known` besides.
     """
     ignore, unlabelled = tuple(ignore), tuple(unlabelled)
-    read = [_read(Path(place), form, classes, ignore, unlabelled, group_pattern) for place in places]
+    read = [
+        _read(Path(place), form, classes, ignore, unlabelled, group_pattern) for place in places
+    ]
     if read:
         names = dict.fromkeys(name for _, own in read for name in own)
         _refuse_unknown("ignore", ignore, names, "name in the labels")
@@ -71,19 +87,27 @@ def _refuse_unknown(
     unknown = [name for name in asked if (name if exact else plain(name)) not in compared]
     if unknown:
         there = ", ".join(known) or "none"
-        raise SettingsError(f"{option}: {', '.join(map(repr, unknown))} is no {kind}; there are: {there}")
+        raise SettingsError(
+            f"{option}: {', '.join(map(repr, unknown))} is no {kind}; there are: {there}"
+        )
 
 
 def _read(
-    place: Path, form: str | None, classes: Mapping[str, str] | None, ignore: Iterable[str],
-    unlabelled: Iterable[str], group_pattern: str | None,
+    place: Path,
+    form: str | None,
+    classes: Mapping[str, str] | None,
+    ignore: Iterable[str],
+    unlabelled: Iterable[str],
+    group_pattern: str | None,
 ) -> tuple[LabelledSet, tuple[str, ...]]:
     """The set, and all names that its own labels have."""
     if form is not None and form not in READERS:
         raise SettingsError(f"unknown form {form!r} of labels; choose one of {', '.join(READERS)}")
     pattern = None if group_pattern is None else compiled(group_pattern)
     if not place.exists():
-        raise InputError(f"{place} does not exist; give a folder of labelled pictures, or its label file")
+        raise InputError(
+            f"{place} does not exist; give a folder of labelled pictures, or its label file"
+        )
     parsed = _parsed(place, form)
     labelled = labelled_set(parsed, place, naming(classes, ignore), unlabelled, pattern)
     return labelled, parsed.names
@@ -99,7 +123,9 @@ def _parsed(place: Path, form: str | None) -> ParsedSet:
         recognised = form_of(place)
         if recognised in (None, form):
             raise
-        raise InputError(f"{error}; it looks like {recognised}: read it as that, or leave the form out") from error
+        raise InputError(
+            f"{error}; it looks like {recognised}: read it as that, or leave the form out"
+        ) from error
 
 
 def _parsed_as_recognised(place: Path) -> ParsedSet:
@@ -108,7 +134,9 @@ def _parsed_as_recognised(place: Path) -> ParsedSet:
     if recognised is not None:
         return READERS[recognised](place)
     if place.is_file():
-        raise InputError(f"{place} is no label file of a known form ({known}); give the folder, or its labels")
+        raise InputError(
+            f"{place} is no label file of a known form ({known}); give the folder, or its labels"
+        )
     try:
         return read_yolo(place)  # the one form in which every label file may be empty
     except InputError as error:

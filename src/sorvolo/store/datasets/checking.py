@@ -26,14 +26,22 @@ from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _SAME_SHAPE = 0.01  # of the aspect: thumbnails and halved frames are rounded to whole pixels
 _CLIPPED_PX = 1.5  # less is rounding, or counting from 1
-_LEAST_LEFT = 0.1  # share of a box's area within the picture below which it shows nothing of the object
+_LEAST_LEFT = (
+    0.1  # share of a box's area within the picture below which it shows nothing of the object
+)
 
 
 def labelled_set(
-    parsed: ParsedSet, place: Path, names: Naming, unlabelled: Iterable[str], pattern: re.Pattern[str] | None
+    parsed: ParsedSet,
+    place: Path,
+    names: Naming,
+    unlabelled: Iterable[str],
+    pattern: re.Pattern[str] | None,
 ) -> LabelledSet:
     """The set in our classes. Raises InputError when no name maps, or no picture can be opened."""
-    counts = Counter(box.name for picture in parsed.pictures for box in picture.boxes if not box.is_ignored)
+    counts = Counter(
+        box.name for picture in parsed.pictures for box in picture.boxes if not box.is_ignored
+    )
     names, classes = _mapped(parsed, place, names, counts)
     made = [_labelled(picture, place, names, classes, pattern) for picture in parsed.pictures]
     pictures = tuple(picture for picture, _ in made if picture is not None)
@@ -44,7 +52,13 @@ def labelled_set(
             + "; ".join(each.text for each in found)
         )
     notices = (*found, *_left_out(counts, names), *_look_alikes(counts, names))
-    return LabelledSet(place.stem if place.is_file() else place.name, classes, pictures, frozenset(unlabelled), notices)
+    return LabelledSet(
+        place.stem if place.is_file() else place.name,
+        classes,
+        pictures,
+        frozenset(unlabelled),
+        notices,
+    )
 
 
 def _mapped(
@@ -61,7 +75,11 @@ def _mapped(
 
 
 def _labelled(
-    parsed: ParsedPicture, place: Path, names: Naming, classes: tuple[str, ...], pattern: re.Pattern[str] | None
+    parsed: ParsedPicture,
+    place: Path,
+    names: Naming,
+    classes: tuple[str, ...],
+    pattern: re.Pattern[str] | None,
 ) -> tuple[LabelledPicture | None, list[Finding]]:
     """The picture in our classes, None where it cannot be used; what was wrong with it or its boxes."""
     name = parsed.path.name
@@ -70,7 +88,9 @@ def _labelled(
     except InputError:
         return None, [Finding("unreadable_pictures", name)]
     edges = np.array([box[1:5] for box in parsed.boxes], np.float64).reshape(-1, 4)
-    fitted, scaling = _in_picture_px(edges, parsed.labelled_size, (width_px, height_px), orientation, name)
+    fitted, scaling = _in_picture_px(
+        edges, parsed.labelled_size, (width_px, height_px), orientation, name
+    )
     if fitted is None:
         return None, scaling
     inside, keep, clipping = _clipped(fitted, width_px, height_px, name)
@@ -80,8 +100,14 @@ def _labelled(
         ignored = [(0.0, 0.0, float(width_px), float(height_px)), *ignored]
     group = group_of(parsed.path, place, pattern) if pattern or not parsed.group else parsed.group
     return LabelledPicture(
-        str(parsed.path), width_px, height_px, group, np.array(boxes, np.float32), np.array(labels, np.int64),
-        np.array(list(dict.fromkeys(ignored)), np.float32), parsed.m_per_px,
+        str(parsed.path),
+        width_px,
+        height_px,
+        group,
+        np.array(boxes, np.float32),
+        np.array(labels, np.int64),
+        np.array(list(dict.fromkeys(ignored)), np.float32),
+        parsed.m_per_px,
     ), scaling + clipping
 
 
@@ -100,7 +126,11 @@ def _targets_and_ignored(
 
 
 def _in_picture_px(
-    edges: Floats, labelled: tuple[float, float] | None, shown_px: tuple[int, int], orientation: int, name: str
+    edges: Floats,
+    labelled: tuple[float, float] | None,
+    shown_px: tuple[int, int],
+    orientation: int,
+    name: str,
 ) -> tuple[Floats | None, list[Finding]]:
     """Edges, (N, 4), in pixels of the picture as it is shown; None when the labels are of another shape.
 
@@ -111,7 +141,9 @@ def _in_picture_px(
     is_scaled = labelled != SHARES
     if is_scaled and not _same_shape(labelled, shown_px):
         if orientation >= 5 and _same_shape(labelled, shown_px[::-1]):
-            return _in_picture_px(turned(edges, labelled, orientation), labelled[::-1], shown_px, 1, name)
+            return _in_picture_px(
+                turned(edges, labelled, orientation), labelled[::-1], shown_px, 1, name
+            )
         return None, [Finding("other_size", name)]
     fitted = edges * np.tile(np.divide(shown_px, labelled), 2)
     return fitted, [Finding("scaled_labels", name)] if is_scaled else []
@@ -148,15 +180,23 @@ def _clipped(
         shows_it = (left > 0).all(axis=1) & ((left / sides).prod(axis=1) >= _LEAST_LEFT)
     outside = ~empty & ~shows_it
     moved = np.abs(inside - edges_px).max(axis=1, initial=0) > _CLIPPED_PX
-    return inside, list(~empty & ~outside), [
-        Finding("empty_boxes", name, int(empty.sum())),
-        Finding("outside_boxes", name, int(outside.sum())),
-        Finding("clipped_boxes", name, int((moved & ~empty & ~outside).sum())),
-    ]
+    return (
+        inside,
+        list(~empty & ~outside),
+        [
+            Finding("empty_boxes", name, int(empty.sum())),
+            Finding("outside_boxes", name, int(outside.sum())),
+            Finding("clipped_boxes", name, int((moved & ~empty & ~outside).sum())),
+        ],
+    )
 
 
 def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
-    rest = {name: count for name, count in counts.items() if not names.is_target(name) and not names.is_ignored(name)}
+    rest = {
+        name: count
+        for name, count in counts.items()
+        if not names.is_target(name) and not names.is_ignored(name)
+    }
     if not rest:
         return ()
     total = sum(rest.values())
@@ -165,7 +205,11 @@ def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
 
 
 def _look_alikes(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
-    alike = {name: count for name, count in counts.items() if names.is_ignored(name) and plain(name) in LOOK_ALIKES}
+    alike = {
+        name: count
+        for name, count in counts.items()
+        if names.is_ignored(name) and plain(name) in LOOK_ALIKES
+    }
     if not alike:
         return ()
     total = sum(alike.values())

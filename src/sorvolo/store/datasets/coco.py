@@ -27,18 +27,25 @@ def read_coco(place: Path) -> ParsedSet:
     """
     path = coco_file(place)
     whole = _loaded(path)
-    categories = {row.get("id"): str(row.get("name", row.get("id"))) for row in _rows(whole, "categories", path)}
+    categories = {
+        row.get("id"): str(row.get("name", row.get("id")))
+        for row in _rows(whole, "categories", path)
+    }
     images = {}
     for row in _rows(whole, "images", path):
         if row.get("id") is None or row["id"] in images:
-            raise InputError(f"{path}: an image has no id, or that of another ({row.get('id')}); each needs its own")
+            raise InputError(
+                f"{path}: an image has no id, or that of another ({row.get('id')}); each needs its own"
+            )
         images[row["id"]] = row
     boxes, wrong = _boxes(_rows(whole, "annotations", path), categories, images)
     pictures, missing = _pictures(path, images, boxes)
     if not pictures:
         raise _no_picture(path, images)
     each_once, twice = joined(pictures)
-    return ParsedSet(FORM, each_once, tuple(dict.fromkeys(categories.values())), (*wrong, *missing, *twice))
+    return ParsedSet(
+        FORM, each_once, tuple(dict.fromkeys(categories.values())), (*wrong, *missing, *twice)
+    )
 
 
 def coco_file(place: Path) -> Path:
@@ -47,7 +54,9 @@ def coco_file(place: Path) -> Path:
         return place
     found = coco_files(place)
     if not found:
-        raise InputError(f"{place} holds no COCO file (JSON with images, annotations and categories)")
+        raise InputError(
+            f"{place} holds no COCO file (JSON with images, annotations and categories)"
+        )
     if len(found) > 1:
         names = ", ".join(str(path.relative_to(place)) for path in found[:5])
         raise InputError(f"{place} holds {len(found)} COCO files ({names}); name the one to read")
@@ -57,7 +66,11 @@ def coco_file(place: Path) -> Path:
 def coco_files(folder: Path) -> list[Path]:
     """COCO files in the folder, else in its `annotations/`, else one folder below, else a simulation's truth."""
     for pattern in ("*.json", "annotations/*.json", "*/*.json", "truth/*/boxes.json"):
-        found = [path for path in sorted(folder.glob(pattern)) if path.is_file() and _looks_like_coco(path)]
+        found = [
+            path
+            for path in sorted(folder.glob(pattern))
+            if path.is_file() and _looks_like_coco(path)
+        ]
         if found:
             return found
     return []
@@ -86,9 +99,11 @@ def _loaded(path: Path) -> dict[str, Any]:
         ) from error
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is no JSON ({error}); COCO labels are one JSON file") from error
-    missing = [key for key in ("images", "annotations", "categories") if key not in whole] if isinstance(
-        whole, dict
-    ) else ["images", "annotations", "categories"]
+    missing = (
+        [key for key in ("images", "annotations", "categories") if key not in whole]
+        if isinstance(whole, dict)
+        else ["images", "annotations", "categories"]
+    )
     if missing:
         raise InputError(f"{path} is no COCO file: it has no {', '.join(missing)}")
     return whole
@@ -98,8 +113,14 @@ def _rows(whole: Mapping[str, Any], key: str, path: Path) -> list[dict[str, Any]
     rows = whole[key]
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise InputError(f"{path}: COCO's {key} must be a list of objects")
-    if any(isinstance(row.get(field), (list, dict)) for row in rows for field in ("id", "image_id", "category_id")):
-        raise InputError(f"{path}: an id in COCO's {key} is a list or an object; ids are numbers or texts")
+    if any(
+        isinstance(row.get(field), (list, dict))
+        for row in rows
+        for field in ("id", "image_id", "category_id")
+    ):
+        raise InputError(
+            f"{path}: an id in COCO's {key} is a list or an object; ids are numbers or texts"
+        )
     return rows
 
 
@@ -159,17 +180,26 @@ def _pictures(
     """The images whose picture is there, and those that have none."""
     pictures, findings = [], []
     folders = _folders(path)
-    by_name = cache(partial(_by_name, path.parent))  # for pictures that are not where the file has them
+    by_name = cache(
+        partial(_by_name, path.parent)
+    )  # for pictures that are not where the file has them
     for image_id, row in images.items():
         name = _inside(path, str(row.get("file_name", "")).replace("\\", "/"))
         found = _found(name, folders, by_name) if name else None
         if found is None:
-            findings.append(Finding("labels_without_picture", name or f"image {image_id} without file_name"))
+            findings.append(
+                Finding("labels_without_picture", name or f"image {image_id} without file_name")
+            )
             continue
-        pictures.append(ParsedPicture(
-            found, tuple(boxes.get(image_id, ())), _labelled_size(row), _video(row),
-            next(iter(_finite([row.get("m_per_px")])), float("nan")),
-        ))
+        pictures.append(
+            ParsedPicture(
+                found,
+                tuple(boxes.get(image_id, ())),
+                _labelled_size(row),
+                _video(row),
+                next(iter(_finite([row.get("m_per_px")])), float("nan")),
+            )
+        )
     return pictures, findings
 
 
@@ -191,7 +221,9 @@ def _labelled_size(row: Mapping[str, Any]) -> tuple[float, float] | None:
 
 def _video(row: Mapping[str, Any]) -> str:
     """The name of the video that the picture is of; empty where the file names none."""
-    return next((str(row[field]) for field in _VIDEO_FIELDS if row.get(field) not in (None, "")), "")
+    return next(
+        (str(row[field]) for field in _VIDEO_FIELDS if row.get(field) not in (None, "")), ""
+    )
 
 
 def _inside(path: Path, name: str) -> str:
@@ -199,7 +231,11 @@ def _inside(path: Path, name: str) -> str:
     place = Path(os.path.normpath(path.parent / name))
     folders = [path.parent, *(each for each in _folders(path) if each != path.parent.parent)]
     is_below = any(place.is_relative_to(os.path.normpath(each)) for each in folders)
-    if name.startswith("/") or PureWindowsPath(name).drive or (".." in name.split("/") and not is_below):
+    if (
+        name.startswith("/")
+        or PureWindowsPath(name).drive
+        or (".." in name.split("/") and not is_below)
+    ):
         raise InputError(
             f"{path}: its file_name {name!r} leads out of the set; needed are names below the label file's folder or "
             "in images/ beside it: put the label file beside its pictures and give their names alone"
@@ -226,7 +262,9 @@ def _by_name(folder: Path) -> dict[str, list[Path]]:
 def _no_picture(path: Path, images: Mapping[Any, Mapping[str, Any]]) -> InputError:
     names = [str(row.get("file_name", "")) for row in images.values()]
     for folder in _folders(path):
-        videos = [each for each in sorted(folder.iterdir()) if each.suffix.lower() in _VIDEO_ENDINGS]
+        videos = [
+            each for each in sorted(folder.iterdir()) if each.suffix.lower() in _VIDEO_ENDINGS
+        ]
         if videos:
             return InputError(
                 f"{path} labels frames of a video ({videos[0].name}), not pictures; extract its frames first, as "

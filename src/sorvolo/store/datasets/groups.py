@@ -7,12 +7,33 @@ from sorvolo.errors import SettingsError
 from sorvolo.survey.splits import stem_of
 
 _NUMBERED = re.compile(
-    r"(?P<video>.*?)[ _.\-]*(?:(?<![a-z])(?:frames?|img|image|picture|[if]))?[ _.\-]*\(?\d+\)?[ _.\-]*", re.IGNORECASE
+    r"(?P<video>.*?)[ _.\-]*(?:(?<![a-z])(?:frames?|img|image|picture|[if]))?[ _.\-]*\(?\d+\)?[ _.\-]*",
+    re.IGNORECASE,
 )
-_PLAIN_FOLDERS = frozenset({
-    "images", "image", "imgs", "img", "jpegimages", "pictures", "photos", "frames", "labels", "annotations", "data",
-    "obj_train_data", "sequences", "train", "training", "val", "valid", "validation", "test", "testing",
-})
+_PLAIN_FOLDERS = frozenset(
+    {
+        "images",
+        "image",
+        "imgs",
+        "img",
+        "jpegimages",
+        "pictures",
+        "photos",
+        "frames",
+        "labels",
+        "annotations",
+        "data",
+        "obj_train_data",
+        "sequences",
+        "train",
+        "training",
+        "val",
+        "valid",
+        "validation",
+        "test",
+        "testing",
+    }
+)
 
 
 def compiled(pattern: str) -> re.Pattern[str]:
@@ -20,7 +41,9 @@ def compiled(pattern: str) -> re.Pattern[str]:
     try:
         found = re.compile(pattern)
     except re.error as error:
-        raise SettingsError(f"group pattern {pattern!r} is no regular expression: {error}") from error
+        raise SettingsError(
+            f"group pattern {pattern!r} is no regular expression: {error}"
+        ) from error
     if found.groups != 1:
         raise SettingsError(
             f"group pattern {pattern!r} has {found.groups} groups; mark the video's name with exactly one (...)"
@@ -40,7 +63,9 @@ def group_of(path: Path, place: Path, pattern: re.Pattern[str] | None = None) ->
         return match.group(1)
     stem = stem_of(below.name)
     numbered = _NUMBERED.fullmatch(stem)
-    folders = [part for part in below.parts[:-1] if part.lower() not in _PLAIN_FOLDERS and part != ".."]
+    folders = [
+        part for part in below.parts[:-1] if part.lower() not in _PLAIN_FOLDERS and part != ".."
+    ]
     video = numbered["video"] if numbered else stem
     return "/".join([*folders, video] if video else folders) or place.name
 

@@ -10,28 +10,97 @@ PERSON, CAR, SMALL = CLASSES
 
 DEFAULT_CLASSES: Mapping[str, str] = {
     **dict.fromkeys(
-        ("person", "persons", "people", "pedestrian", "pedestrians", "human", "humans", "man", "woman", "child",
-         "swimmer", "victim", "mannequin"), PERSON,
+        (
+            "person",
+            "persons",
+            "people",
+            "pedestrian",
+            "pedestrians",
+            "human",
+            "humans",
+            "man",
+            "woman",
+            "child",
+            "swimmer",
+            "victim",
+            "mannequin",
+        ),
+        PERSON,
     ),
     **dict.fromkeys(
-        ("car", "cars", "vehicle", "vehicles", "van", "minivan", "minibus", "suv", "taxi", "pickup", "automobile"), CAR,
+        (
+            "car",
+            "cars",
+            "vehicle",
+            "vehicles",
+            "van",
+            "minivan",
+            "minibus",
+            "suv",
+            "taxi",
+            "pickup",
+            "automobile",
+        ),
+        CAR,
     ),
     **dict.fromkeys(
-        ("small object", "small objects", "box", "small box", "big box", "suitcase", "metal suitcase", "bag",
-         "backpack", "handbag", "luggage", "tire", "tyre", "gas bottle"), SMALL,
+        (
+            "small object",
+            "small objects",
+            "box",
+            "small box",
+            "big box",
+            "suitcase",
+            "metal suitcase",
+            "bag",
+            "backpack",
+            "handbag",
+            "luggage",
+            "tire",
+            "tyre",
+            "gas bottle",
+        ),
+        SMALL,
     ),
 }
 """Common names and the class they stand for unless the user maps them; compared as `plain` writes them."""
 
-LOOK_ALIKES = frozenset({
-    "truck", "lorry", "bus", "othervehicle", "other vehicle",
-    "biker", "bicyclist", "cyclist", "rider", "motorcyclist", "skater", "bicycle", "bike", "motor", "motorcycle",
-    "motorbike", "scooter", "tricycle", "awning tricycle", "cart",
-})
+LOOK_ALIKES = frozenset(
+    {
+        "truck",
+        "lorry",
+        "bus",
+        "othervehicle",
+        "other vehicle",
+        "biker",
+        "bicyclist",
+        "cyclist",
+        "rider",
+        "motorcyclist",
+        "skater",
+        "bicycle",
+        "bike",
+        "motor",
+        "motorcycle",
+        "motorbike",
+        "scooter",
+        "tricycle",
+        "awning tricycle",
+        "cart",
+    }
+)
 """Names of what looks like a class of ours but is none: calling a truck a car, or a cyclist a person, is neither right
 nor wrong."""
 
-DEFAULT_IGNORED = LOOK_ALIKES | {"ignored regions", "ignored", "ignore", "dontcare", "dont care", "others", "crowd"}
+DEFAULT_IGNORED = LOOK_ALIKES | {
+    "ignored regions",
+    "ignored",
+    "ignore",
+    "dontcare",
+    "dont care",
+    "others",
+    "crowd",
+}
 """Names that become regions where nothing counts: look-alikes, and what a set ignores itself."""
 
 
@@ -69,7 +138,9 @@ class Naming:
 def of_one_unnamed(names: Naming) -> Naming:
     """The naming of a set whose one class has the number 0 and no name, where the user looks for one class only."""
     targets = set(names.targets.values())
-    return Naming({**names.targets, "0": targets.pop()}, names.ignored) if len(targets) == 1 else names
+    return (
+        Naming({**names.targets, "0": targets.pop()}, names.ignored) if len(targets) == 1 else names
+    )
 
 
 def naming(classes: Mapping[str, str] | None, ignore: Iterable[str]) -> Naming:

@@ -31,7 +31,9 @@ def read_npu_folder(place: Path) -> tuple[NpuSequence, ...]:
         raise InputError(f"{place}: no such folder; give the folder of the NPU Drone-Map dataset")
     videos = videos_in(place)
     if not videos:
-        raise InputError(f"{place}: no videos; give the folder of the NPU Drone-Map dataset, a video of each sequence")
+        raise InputError(
+            f"{place}: no videos; give the folder of the NPU Drone-Map dataset, a video of each sequence"
+        )
     in_folder = Counter(each.video.parent for each in videos)
     found = []
     for each in videos:
@@ -44,5 +46,9 @@ def read_npu_folder(place: Path) -> tuple[NpuSequence, ...]:
 
 
 def _mosaic(folder: Path, start: str) -> Path | None:
-    files = (path for path in sorted(folder.iterdir()) if path.suffix.lower() in _MOSAIC_ENDINGS and path.is_file())
+    files = (
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in _MOSAIC_ENDINGS and path.is_file()
+    )
     return next((path for path in files if path.stem.lower().startswith(start.lower())), None)

@@ -27,13 +27,19 @@ def read_okutama(place: Path) -> ParsedSet:
     and with multiple actions, the boxes are the same: the first file counts. Raises InputError when no line is of this
     form, or no frame is there.
     """
-    files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_okutama_file(path)]
+    files = (
+        [place]
+        if place.is_file()
+        else [path for path in files_below(place, ".txt") if is_okutama_file(path)]
+    )
     files_of = {path.stem: path for path in reversed(files)}
     read = {video: _boxes(path) for video, path in sorted(files_of.items())}
     labelled = {video: by_frame for video, (by_frame, _) in read.items()}
     findings = findings_in(read.values())
     if not any(labelled.values()):
-        raise InputError(f"{place}: no line is an {FORM} label (track, four edges, frame, three flags, \"Person\")")
+        raise InputError(
+            f'{place}: no line is an {FORM} label (track, four edges, frame, three flags, "Person")'
+        )
     frames = frames_by_video(pictures_around(place, FORM), labelled)
     if not any(frames.values()):
         raise no_frames(place, FORM, labelled)
@@ -41,7 +47,9 @@ def read_okutama(place: Path) -> ParsedSet:
     for video, by_frame in labelled.items():
         lonely = set(by_frame) - set(frames[video])
         findings.append(
-            Finding("labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely))
+            Finding(
+                "labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely)
+            )
         )
         size = _labelled_size(files_of[video])
         result += [
@@ -58,7 +66,9 @@ def looks_like_okutama(line: str) -> bool:
 
 def is_okutama_file(path: Path) -> bool:
     """Whether the file's first line is of this form."""
-    return looks_like_okutama(next((line for line in read_text(path).splitlines() if line.strip()), ""))
+    return looks_like_okutama(
+        next((line for line in read_text(path).splitlines() if line.strip()), "")
+    )
 
 
 def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[Finding]]:
@@ -73,7 +83,9 @@ def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[Finding]]:
             continue
         of_frame = found.setdefault(int(match["frame"]), [])
         if match["lost"] == "0":
-            left, top, right, bottom = (float(match[edge]) for edge in ("left", "top", "right", "bottom"))
+            left, top, right, bottom = (
+                float(match[edge]) for edge in ("left", "top", "right", "bottom")
+            )
             of_frame.append(ParsedBox(match["name"], left, top, right, bottom))
     return found, findings
 

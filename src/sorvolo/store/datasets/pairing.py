@@ -21,11 +21,17 @@ def pictures_around(place: Path, form: str) -> list[Path]:
     folder = place if place.is_dir() else place.parent
     found = pictures_below(folder)
     if not found:
-        beside = [each for each in sorted(folder.parent.iterdir()) if each.name.lower() in _PICTURE_FOLDERS]
+        beside = [
+            each
+            for each in sorted(folder.parent.iterdir())
+            if each.name.lower() in _PICTURE_FOLDERS
+        ]
         found = [path for each in beside for path in pictures_below(each)]
     if not found:
         endings = ", ".join(sorted(PICTURE_ENDINGS))
-        raise InputError(f"{place}: no pictures ({endings}) in it nor beside it; {form} labels need theirs")
+        raise InputError(
+            f"{place}: no pictures ({endings}) in it nor beside it; {form} labels need theirs"
+        )
     return found
 
 
@@ -39,15 +45,23 @@ def paired(
     """
     label_of = _labels_of_pictures(pictures, labels)
     if not label_of:
-        raise InputError(f"{place}: none of its {len(labels)} {form} files has a picture of the same name")
+        raise InputError(
+            f"{place}: none of its {len(labels)} {form} files has a picture of the same name"
+        )
     lonely = sorted(set(labels) - set(label_of.values()))
     return label_of, [
         *(Finding("labels_without_picture", path.name) for path in lonely),
-        *(Finding("pictures_without_labels", path.name) for path in pictures if path not in label_of),
+        *(
+            Finding("pictures_without_labels", path.name)
+            for path in pictures
+            if path not in label_of
+        ),
     ]
 
 
-def frames_by_video(pictures: Iterable[Path], videos: Iterable[str]) -> Mapping[str, Mapping[int, Path]]:
+def frames_by_video(
+    pictures: Iterable[Path], videos: Iterable[str]
+) -> Mapping[str, Mapping[int, Path]]:
     """The pictures of each video by frame number: in a folder of its name, or with its name before the number."""
     frames: dict[str, dict[int, Path]] = {video: {} for video in videos}
     for path in pictures:
@@ -76,7 +90,8 @@ def _labels_of_pictures(pictures: Iterable[Path], labels: Iterable[Path]) -> dic
         by_stem.setdefault(path.stem, []).append(path)
     return {
         picture: max(by_stem[picture.stem], key=lambda path: _folders_in_common(path, picture))
-        for picture in pictures if picture.stem in by_stem
+        for picture in pictures
+        if picture.stem in by_stem
     }
 
 

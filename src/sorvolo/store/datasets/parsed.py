@@ -76,7 +76,8 @@ def notices_of(findings: Iterable[Finding]) -> tuple[Notice, ...]:
             counts[code] += times
             first.setdefault(code, place)
     return tuple(
-        Notice(code, count, f"{count} {FINDINGS[code]}, the first: {first[code]}") for code, count in counts.items()
+        Notice(code, count, f"{count} {FINDINGS[code]}, the first: {first[code]}")
+        for code, count in counts.items()
     )
 
 
@@ -94,7 +95,11 @@ class ParsedSet:
     @property
     def names(self) -> tuple[str, ...]:
         """Every class name: those of its list, then those that only boxes have."""
-        return tuple(dict.fromkeys([*self.declared, *(box.name for each in self.pictures for box in each.boxes)]))
+        return tuple(
+            dict.fromkeys(
+                [*self.declared, *(box.name for each in self.pictures for box in each.boxes)]
+            )
+        )
 
 
 Reader: TypeAlias = Callable[[Path], ParsedSet]

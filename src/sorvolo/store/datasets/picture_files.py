@@ -11,7 +11,14 @@ from sorvolo.errors import InputError
 PICTURE_ENDINGS = frozenset({".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"})
 
 _BROKEN = (
-    OSError, SyntaxError, ValueError, TypeError, KeyError, IndexError, OverflowError, Image.DecompressionBombError,
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    KeyError,
+    IndexError,
+    OverflowError,
+    Image.DecompressionBombError,
 )
 
 
@@ -35,7 +42,11 @@ def files_below(folder: Path, *endings: str) -> list[Path]:
         seen.add(real)
         folders[:] = sorted(name for name in folders if not _is_hidden(name))
         names = (name for name in files if not _is_hidden(name))
-        found += [Path(parent, name) for name in names if not endings or Path(name).suffix.lower() in endings]
+        found += [
+            Path(parent, name)
+            for name in names
+            if not endings or Path(name).suffix.lower() in endings
+        ]
     return sorted(found)
 
 
@@ -46,7 +57,9 @@ def shown_size_px(path: Path) -> tuple[int, int, int]:
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a survey's orthophoto is large, not an attack: pixels are not read here
+            warnings.simplefilter(
+                "ignore"
+            )  # a survey's orthophoto is large, not an attack: pixels are not read here
             with Image.open(path) as picture:
                 width, height = picture.size
                 orientation = _orientation(picture)

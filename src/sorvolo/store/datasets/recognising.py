@@ -44,7 +44,9 @@ def _label_texts(folder: Path) -> list[Path]:
 def _form_of_text(path: Path) -> str | None:
     line = next((line for line in read_text(path).splitlines() if line.strip()), "")
     for form, looks_like in (
-        ("visdrone", looks_like_visdrone), ("okutama", looks_like_okutama), ("yolo", looks_like_yolo)
+        ("visdrone", looks_like_visdrone),
+        ("okutama", looks_like_okutama),
+        ("yolo", looks_like_yolo),
     ):
         if looks_like(line):
             return form

@@ -4,10 +4,21 @@ from pathlib import Path
 
 from sorvolo.errors import InputError
 
-_NOT_LABELS = frozenset({
-    "classes.txt", "predefined_classes.txt", "train.txt", "val.txt", "valid.txt", "test.txt", "readme.txt",
-    "license.txt", "requirements.txt", "readme.dataset.txt", "readme.roboflow.txt",
-})
+_NOT_LABELS = frozenset(
+    {
+        "classes.txt",
+        "predefined_classes.txt",
+        "train.txt",
+        "val.txt",
+        "valid.txt",
+        "test.txt",
+        "readme.txt",
+        "license.txt",
+        "requirements.txt",
+        "readme.dataset.txt",
+        "readme.roboflow.txt",
+    }
+)
 _MOST_BYTES = 2_000_000_000  # COCO's own train2017 is half a gigabyte
 
 
@@ -18,7 +29,9 @@ def read_text(path: Path) -> str:
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path} has {path.stat().st_size / 1e9:.1f} GB; no label file is that large")
+            raise InputError(
+                f"{path} has {path.stat().st_size / 1e9:.1f} GB; no label file is that large"
+            )
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} cannot be read ({error.strerror})") from error

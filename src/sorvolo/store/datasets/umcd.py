@@ -14,7 +14,19 @@ from sorvolo.store.datasets.text_files import read_text
 
 FORM = "UMCD"
 _OBJECT = re.compile(r"object\b\s*#?\s*\d*\s*[:.=]?\s*", re.IGNORECASE)
-_KNOWN = frozenset({"type", "shape", "dimension", "dimensions", "size", "color", "colour", "movement", "appearance"})
+_KNOWN = frozenset(
+    {
+        "type",
+        "shape",
+        "dimension",
+        "dimensions",
+        "size",
+        "color",
+        "colour",
+        "movement",
+        "appearance",
+    }
+)
 _NUMBER = re.compile(r"\d{1,9}(?:\.\d{1,9})?")
 _ROUNDED_S = 1.0  # times of appearance are whole seconds, rounded one way or the other
 
@@ -76,7 +88,9 @@ class UmcdMetadata:
 
     def shows_object(self, time_s: float) -> bool | None:
         """Whether an object is in view at a time; None within a second of where one comes or goes, or unknown."""
-        inside_s = [min(time_s - start, end - time_s) for start, end in self.in_view_s]  # negative: out of view
+        inside_s = [
+            min(time_s - start, end - time_s) for start, end in self.in_view_s
+        ]  # negative: out of view
         if not inside_s or not all(map(isfinite, inside_s)):
             return None
         if max(inside_s) > _ROUNDED_S:
@@ -88,9 +102,12 @@ def read_umcd_metadata(path: Path) -> UmcdMetadata:
     """One video's metadata file; raises InputError for one that describes no object."""
     video = _parsed(path)
     if not video.objects:
-        raise InputError(f"{path}: describes no object as {FORM}'s metadata does (Type:, Shape:, Dimension:, ...)")
+        raise InputError(
+            f"{path}: describes no object as {FORM}'s metadata does (Type:, Shape:, Dimension:, ...)"
+        )
     return UmcdMetadata(
-        video.fps, tuple((each.from_s, each.until_s) for each in video.objects),
+        video.fps,
+        tuple((each.from_s, each.until_s) for each in video.objects),
         frozenset(frame for each in video.objects for frame in each.boxes),
     )
 
@@ -99,16 +116,24 @@ def looks_like_umcd(path: Path) -> bool:
     """Whether a text file names an object's type and has at least two of the fields of this form."""
     fields = [_field(line) for line in read_text(path).splitlines()]
     keys = {key for key, value in fields if value} & _KNOWN
-    return len(keys) >= 2 and ("type" in keys or any(key == "object" and value for key, value in fields))
+    return len(keys) >= 2 and (
+        "type" in keys or any(key == "object" and value for key, value in fields)
+    )
 
 
 def _videos(place: Path) -> dict[Path, _Video]:
     """The videos of all metadata files that describe objects. Raises InputError when none does."""
-    files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
+    files = (
+        [place]
+        if place.is_file()
+        else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
+    )
     videos = {path: _parsed(path) for path in files}
     videos = {path: video for path, video in videos.items() if video.objects}
     if not videos:
-        raise InputError(f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)")
+        raise InputError(
+            f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)"
+        )
     return videos
 
 
@@ -121,10 +146,16 @@ def _findings(videos: Iterable[_Video], pictures: Iterable[ParsedPicture]) -> It
             yield Finding("no_boxes_for_frame", each.path.name)
 
 
-def _labelled_frames(name: str, video: _Video, frames: Mapping[int, Path]) -> Iterator[ParsedPicture]:
+def _labelled_frames(
+    name: str, video: _Video, frames: Mapping[int, Path]
+) -> Iterator[ParsedPicture]:
     for number, picture in sorted(frames.items()):
         boxes = [_box(each, number) for each in video.objects if number in each.boxes]
-        unplaced = any(_is_in_view(each, number, video.fps) for each in video.objects if number not in each.boxes)
+        unplaced = any(
+            _is_in_view(each, number, video.fps)
+            for each in video.objects
+            if number not in each.boxes
+        )
         yield ParsedPicture(picture, tuple(boxes), None, name, is_ignored=unplaced)
 
 
@@ -135,8 +166,10 @@ def _field(line: str) -> tuple[str, str]:
     """
     bare = line.strip().strip("-*; ")
     if begun := _OBJECT.match(bare):
-        return "object", bare[begun.end():]
-    key, mark, value = bare.replace("=", ":", 1).partition(":") if ":" not in bare else bare.partition(":")
+        return "object", bare[begun.end() :]
+    key, mark, value = (
+        bare.replace("=", ":", 1).partition(":") if ":" not in bare else bare.partition(":")
+    )
     return (key.strip().lower(), value.strip()) if mark else ("", bare)
 
 
@@ -160,7 +193,9 @@ def _add_field(video: _Video, key: str, value: str, numbers: list[float]) -> boo
     if key == "type" and (not video.objects or "type" in video.objects[-1].keys):
         video.objects.append(_Object())
     if not video.objects:
-        return key not in _KNOWN and key != "box"  # what comes before the first object is about the video
+        return (
+            key not in _KNOWN and key != "box"
+        )  # what comes before the first object is about the video
     last = video.objects[-1]
     last.keys.add(key)
     return _set_field(last, key, value, numbers)

@@ -86,7 +86,9 @@ def videos_in(part: Path | None) -> tuple[UmcdVideo, ...]:
     """All videos in a folder and below it, with the files that belong to each; none of None."""
     if part is None:
         return ()
-    found = sorted(path for path in part.rglob("*") if path.suffix.lower() in _VIDEO_ENDINGS and path.is_file())
+    found = sorted(
+        path for path in part.rglob("*") if path.suffix.lower() in _VIDEO_ENDINGS and path.is_file()
+    )
     return tuple(_video(path, part) for path in found)
 
 
@@ -95,7 +97,14 @@ def _folder(place: Path | None, name: str) -> Path | None:
     if place is None:
         return None
     wanted = _letters(name)
-    return next((each for each in sorted(place.iterdir()) if each.is_dir() and _letters(each.name) == wanted), None)
+    return next(
+        (
+            each
+            for each in sorted(place.iterdir())
+            if each.is_dir() and _letters(each.name) == wanted
+        ),
+        None,
+    )
 
 
 def _letters(name: str) -> str:
@@ -108,7 +117,12 @@ def _video(path: Path, part: Path) -> UmcdVideo:
     metadata = next((each for each in texts if _is_metadata(each)), None)
     others = tuple(each for each in texts if each != metadata)
     return UmcdVideo(
-        path.parent.name if path.parent != part else "", path.stem, path, others, metadata, _masks(beside)
+        path.parent.name if path.parent != part else "",
+        path.stem,
+        path,
+        others,
+        metadata,
+        _masks(beside),
     )
 
 
@@ -123,11 +137,15 @@ def _is_metadata(path: Path) -> bool:
 def _belongs(other: Path, video: Path) -> bool:
     """Whether a file or folder has the video's name, alone or with more behind it: path1.csv, path1_masks."""
     stem, name = video.stem.lower(), other.stem.lower() if other.is_file() else other.name.lower()
-    return other != video and name.startswith(stem) and _REST.fullmatch(name[len(stem):]) is not None
+    return (
+        other != video and name.startswith(stem) and _REST.fullmatch(name[len(stem) :]) is not None
+    )
 
 
 def _masks(beside: Sequence[Path]) -> Path | None:
-    folders = (each for each in beside if each.is_dir() and each.name.lower().endswith(MASKS_ENDING))
+    folders = (
+        each for each in beside if each.is_dir() and each.name.lower().endswith(MASKS_ENDING)
+    )
     return next((each for each in folders if _holds(each, MASK_ENDINGS)), None)
 
 
@@ -138,4 +156,11 @@ def _holds(folder: Path, endings: Iterable[str]) -> bool:
 def _camera(folder: Path | None) -> Path | None:
     if folder is None:
         return None
-    return next((each for each in sorted(folder.iterdir()) if each.suffix.lower() in (".xml", ".yml", ".yaml")), None)
+    return next(
+        (
+            each
+            for each in sorted(folder.iterdir())
+            if each.suffix.lower() in (".xml", ".yml", ".yaml")
+        ),
+        None,
+    )

@@ -9,14 +9,18 @@ from sorvolo.store.datasets.naming import DEFAULT_CLASSES, plain
 _FIRST_AS_BEFORE = 1  # a simulation counts flights from 1
 
 
-def umcd_metadata(fps: float, objects: Iterable[Mapping[str, Any]], boxes: Mapping[str, Any], flight: int) -> str:
+def umcd_metadata(
+    fps: float, objects: Iterable[Mapping[str, Any]], boxes: Mapping[str, Any], flight: int
+) -> str:
     """The text: each object that came with a later flight, when it is in view, and its boxes (ours, `Box:` lines).
 
     `objects` are the features of a simulation's objects.geojson, `boxes` the COCO content of the flight's boxes.json,
     `flight` its number. Objects that no picture shows are left out. Sizes are in centimetres, times in whole seconds.
     """
     came = {
-        each["properties"]["id"]: each["properties"] for each in objects if _came(each["properties"], flight)
+        each["properties"]["id"]: each["properties"]
+        for each in objects
+        if _came(each["properties"], flight)
     }
     seen: dict[int, list[tuple[int, list[float]]]] = {}
     for row in boxes["annotations"]:
@@ -35,12 +39,19 @@ def _came(properties: Mapping[str, Any], flight: int) -> bool:
 def _block(
     number: int, properties: Mapping[str, Any], views: list[tuple[int, list[float]]], fps: float
 ) -> list[str]:
-    name = properties["subtype"] if plain(properties["subtype"]) in DEFAULT_CLASSES else properties["class"]
+    name = (
+        properties["subtype"]
+        if plain(properties["subtype"]) in DEFAULT_CLASSES
+        else properties["class"]
+    )
     sizes_cm = (round(100 * properties[f"{side}_m"]) for side in ("length", "width", "height"))
     frames = [frame for frame, _ in views]
     return [
-        f"Object {number}", f"Type: {name}", f"Shape: {_shape(properties)}",
-        f"Dimension: {' x '.join(map(str, sizes_cm))}", "Color: not stated",
+        f"Object {number}",
+        f"Type: {name}",
+        f"Shape: {_shape(properties)}",
+        f"Dimension: {' x '.join(map(str, sizes_cm))}",
+        "Color: not stated",
         f"Movement: {'moving' if properties['moving'] else 'static'}",
         f"Appearance: {floor(min(frames) / fps):02d} to {ceil(max(frames) / fps):02d}",
         *(f"Box: {frame} {' '.join(f'{edge:g}' for edge in box)}" for frame, box in views),

@@ -12,8 +12,18 @@ from sorvolo.store.datasets.text_files import is_label_file, read_text
 
 FORM = "VisDrone"
 NAMES = (
-    "ignored regions", "pedestrian", "people", "bicycle", "car", "van", "truck", "tricycle", "awning-tricycle", "bus",
-    "motor", "others",
+    "ignored regions",
+    "pedestrian",
+    "people",
+    "bicycle",
+    "car",
+    "van",
+    "truck",
+    "tricycle",
+    "awning-tricycle",
+    "bus",
+    "motor",
+    "others",
 )
 """Categories 0 to 11 of the VisDrone toolkits; 0 and 11 are ignored."""
 
@@ -31,10 +41,16 @@ def read_visdrone(place: Path) -> ParsedSet:
     target come first. Score 0 and the categories "ignored regions" and "others" are ignored; truncated and occluded
     objects count. Raises InputError when no line is of either form.
     """
-    files = [place] if place.is_file() else [path for path in files_below(place, ".txt") if is_label_file(path)]
+    files = (
+        [place]
+        if place.is_file()
+        else [path for path in files_below(place, ".txt") if is_label_file(path)]
+    )
     parsed = {path: _rows(path) for path in files}
     malformed = findings_in(parsed.values())
-    rows = {path: found for path, (found, _) in parsed.items() if found or not read_text(path).strip()}
+    rows = {
+        path: found for path, (found, _) in parsed.items() if found or not read_text(path).strip()
+    }
     length = _numbers_a_line(place, rows)
     pictures = pictures_around(place, FORM)
     read = _video_frames if length == _VID else _separate_pictures
@@ -62,16 +78,22 @@ def _numbers_a_line(place: Path, rows: _RowsByFile) -> int:
     """8 (DET) or 10 (VID). Raises InputError for no line, and for lines of both lengths."""
     lengths = {len(row) for found in rows.values() for row in found}
     if not lengths:
-        raise InputError(f"{place}: no line is a VisDrone label (8 or 10 whole numbers with commas)")
+        raise InputError(
+            f"{place}: no line is a VisDrone label (8 or 10 whole numbers with commas)"
+        )
     if len(lengths) > 1:
-        raise InputError(f"{place}: lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one")
+        raise InputError(
+            f"{place}: lines of 8 and of 10 numbers; read pictures (DET) and videos (VID) one by one"
+        )
     return lengths.pop()
 
 
 def _box(row: list[int]) -> ParsedBox:
     left, top, width, height, score, category = row[-_DET:-2]
     name = NAMES[category] if 0 <= category < len(NAMES) else str(category)
-    return ParsedBox(name, left, top, left + width, top + height, score == 0 or category in _IGNORED)
+    return ParsedBox(
+        name, left, top, left + width, top + height, score == 0 or category in _IGNORED
+    )
 
 
 def _separate_pictures(
@@ -81,8 +103,12 @@ def _separate_pictures(
     result = []
     for path in pictures:
         found = rows[label_of[path]] if path in label_of else []
-        sequence = re.fullmatch(r"(\d{7})_\d+_d_\d+", path.stem)  # the video it was taken from comes first
-        result.append(ParsedPicture(path, tuple(map(_box, found)), None, sequence[1] if sequence else ""))
+        sequence = re.fullmatch(
+            r"(\d{7})_\d+_d_\d+", path.stem
+        )  # the video it was taken from comes first
+        result.append(
+            ParsedPicture(path, tuple(map(_box, found)), None, sequence[1] if sequence else "")
+        )
     return tuple(result), lonely
 
 
@@ -103,9 +129,14 @@ def _video_frames(
             else:
                 lonely.add(row[0])
         findings.append(
-            Finding("labels_without_picture", f"{path.stem}, frame {min(lonely, default=0)}", len(lonely))
+            Finding(
+                "labels_without_picture",
+                f"{path.stem}, frame {min(lonely, default=0)}",
+                len(lonely),
+            )
         )
         result += [
-            ParsedPicture(frames[path.stem][number], tuple(each), None, path.stem) for number, each in boxes.items()
+            ParsedPicture(frames[path.stem][number], tuple(each), None, path.stem)
+            for number, each in boxes.items()
         ]
     return tuple(result), findings

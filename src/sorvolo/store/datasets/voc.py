@@ -84,7 +84,9 @@ def _parsed(path: Path) -> tuple[ParsedPicture | None, int]:
 
 def _box(element: Any) -> ParsedBox | None:
     """The box of an `object` element; None without a name or with an edge that is no number."""
-    left, top, right, bottom = (_number(element, f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax"))
+    left, top, right, bottom = (
+        _number(element, f"bndbox/{name}") for name in ("xmin", "ymin", "xmax", "ymax")
+    )
     name = (element.findtext("name") or "").strip()
     if not name or not all(isfinite(edge) for edge in (left, top, right, bottom)):
         return None

@@ -6,12 +6,26 @@ from math import isfinite
 from pathlib import Path
 
 from sorvolo.errors import InputError
-from sorvolo.store.datasets.parsed import SHARES, Finding, ParsedBox, ParsedPicture, ParsedSet, findings_in
+from sorvolo.store.datasets.parsed import (
+    SHARES,
+    Finding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    findings_in,
+)
 from sorvolo.store.datasets.picture_files import PICTURE_ENDINGS, files_below, pictures_below
 from sorvolo.store.datasets.text_files import is_label_file, read_text
 
 FORM = "YOLO"
-_NAME_FILES = ("data.yaml", "dataset.yaml", "data.yml", "classes.txt", "obj.names", "_darknet.labels")
+_NAME_FILES = (
+    "data.yaml",
+    "dataset.yaml",
+    "data.yml",
+    "classes.txt",
+    "obj.names",
+    "_darknet.labels",
+)
 _PARTS = frozenset({"images", "labels", "train", "training", "val", "valid", "validation", "test"})
 _FARTHEST_SHARE = 2.0  # an edge farther out is no slip of a labelling tool: the file holds pixels
 
@@ -38,7 +52,11 @@ def read_yolo(place: Path) -> ParsedSet:
 def looks_like_yolo(line: str) -> bool:
     """Whether a line is a class number and at least four numbers with spaces between, none of them far beyond 1."""
     numbers = _numbers(line)
-    return len(numbers) >= 5 and numbers[0] == int(numbers[0]) >= 0 and max(map(abs, numbers[1:5])) <= _FARTHEST_SHARE
+    return (
+        len(numbers) >= 5
+        and numbers[0] == int(numbers[0]) >= 0
+        and max(map(abs, numbers[1:5])) <= _FARTHEST_SHARE
+    )
 
 
 def names_in_yaml(text: str) -> list[str]:
@@ -82,13 +100,21 @@ def _name_files(folder: Path) -> Iterator[Path]:
         above.append(above[-1].parent)
     for each in above:
         candidates = [each / name for name in _NAME_FILES]
-        candidates += sorted(each.glob("*.names")) + sorted(each.glob("*.yaml")) + [each / "labels" / "classes.txt"]
+        candidates += (
+            sorted(each.glob("*.names"))
+            + sorted(each.glob("*.yaml"))
+            + [each / "labels" / "classes.txt"]
+        )
         yield from (path for path in candidates if path.is_file())
 
 
 def _names_in(path: Path) -> list[str]:
     text = read_text(path)
-    return names_in_yaml(text) if _is_yaml(path) else [line.strip() for line in text.splitlines() if line.strip()]
+    return (
+        names_in_yaml(text)
+        if _is_yaml(path)
+        else [line.strip() for line in text.splitlines() if line.strip()]
+    )
 
 
 def _is_yaml(path: Path) -> bool:
@@ -101,7 +127,7 @@ def _label_file(picture: Path) -> Path | None:
     parts = list(picture.parts)
     for index in reversed(range(len(parts) - 1)):
         if parts[index].lower() in ("images", "jpegimages"):
-            mirrored = Path(*parts[:index], "labels", *parts[index + 1:]).with_suffix(".txt")
+            mirrored = Path(*parts[:index], "labels", *parts[index + 1 :]).with_suffix(".txt")
             if mirrored.is_file():
                 return mirrored
             break
@@ -169,7 +195,9 @@ def _boxes(path: Path, names: list[str]) -> tuple[list[ParsedBox], list[Finding]
             boxes.append(ParsedBox(name, min(xs), min(ys), max(xs), max(ys)))
         else:  # a sixth number is a score or a track
             x, y, width, height = numbers[1:5]
-            boxes.append(ParsedBox(name, x - width / 2, y - height / 2, x + width / 2, y + height / 2))
+            boxes.append(
+                ParsedBox(name, x - width / 2, y - height / 2, x + width / 2, y + height / 2)
+            )
     return boxes, findings
 
 

@@ -14,7 +14,14 @@ from sorvolo.geometry.arrays import BoxesPx, ImageRGB, Mask
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
 from sorvolo.store.images import jpeg_from_image
 
-_COLOURS = ((255, 196, 0), (0, 200, 255), (255, 90, 160), (120, 230, 80), (190, 140, 255), (255, 140, 60))
+_COLOURS = (
+    (255, 196, 0),
+    (0, 200, 255),
+    (255, 90, 160),
+    (120, 230, 80),
+    (190, 140, 255),
+    (255, 140, 60),
+)
 _VIDEO_SIDE_PX = 1920  # of the longer side: larger videos help no one on a screen and take long
 _TICKS_PER_S = 90_000  # MPEG's clock
 
@@ -22,7 +29,11 @@ _Bar = tuple[int, int, int, int]  # left, top, right, bottom edge of a bar with 
 
 
 def annotated(
-    image: ImageRGB, boxes_px: BoxesPx, labels: Sequence[int], words: Sequence[str], counted: Sequence[bool],
+    image: ImageRGB,
+    boxes_px: BoxesPx,
+    labels: Sequence[int],
+    words: Sequence[str],
+    counted: Sequence[bool],
     headline: str = "",
 ) -> ImageRGB:
     """A copy of the picture (H, W, 3) with boxes (N, 4), each in its class's colour with its words above or below.
@@ -87,7 +98,10 @@ class AnnotatedVideo:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -99,9 +113,13 @@ class AnnotatedVideo:
             assert self._container is not None and self._stream is not None
             size = (self._stream.width, self._stream.height)
             if picture.shape[1::-1] != size:
-                picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+                picture = np.asarray(
+                    cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8
+                )
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-            tick = max((time_ns - self._first_ns) * _TICKS_PER_S // 1_000_000_000, self._last_tick + 1)
+            tick = max(
+                (time_ns - self._first_ns) * _TICKS_PER_S // 1_000_000_000, self._last_tick + 1
+            )
             frame.pts, frame.time_base = tick, Fraction(1, _TICKS_PER_S)
             self._last_tick = tick
             self._container.mux(self._stream.encode(frame))
@@ -121,11 +139,15 @@ class AnnotatedVideo:
         height, width = picture.shape[:2]
         scale = min(1.0, _VIDEO_SIDE_PX / max(height, width))
         self._container = av.open(
-            str(self._temporary), "w", format="mp4",
+            str(self._temporary),
+            "w",
+            format="mp4",
             container_options={"movflags": "+frag_keyframe+empty_moov+default_base_moof"},
         )
         stream = self._container.add_stream("libx264", rate=30)
-        stream.width, stream.height = (max(2, round(side * scale) // 2 * 2) for side in (width, height))
+        stream.width, stream.height = (
+            max(2, round(side * scale) // 2 * 2) for side in (width, height)
+        )
         stream.pix_fmt = "yuv420p"
         stream.codec_context.time_base = Fraction(1, _TICKS_PER_S)
         stream.options = {"crf": "23", "preset": "veryfast", "g": "60", "bf": "0"}
@@ -133,7 +155,11 @@ class AnnotatedVideo:
 
 
 def _write(
-    picture: ImageRGB, words: str, corners: Sequence[tuple[int, int]], size: float, colour: tuple[int, int, int],
+    picture: ImageRGB,
+    words: str,
+    corners: Sequence[tuple[int, int]],
+    size: float,
+    colour: tuple[int, int, int],
     written: Sequence[_Bar],
 ) -> _Bar:
     """Words on a dark bar within the picture, at the first of the lower left corners where they hide none written.

@@ -31,17 +31,23 @@ def changes_geojson(changes: Iterable[StoredChange], site: Site) -> dict[str, An
     Rings turn counter-clockwise, ten decimals. Longitudes run on beyond 180 degrees where a site meets the
     antimeridian. For a local site it is plain JSON with coordinates in pixels of the site.
     """
-    return feature_collection("changes", [_feature(change, site) for change in changes], is_local=site.is_local)
+    return feature_collection(
+        "changes", [_feature(change, site) for change in changes], is_local=site.is_local
+    )
 
 
 def change_placemarks(changes: Iterable[StoredChange], site: Site) -> list[Placemark]:
     """The changes of a site with a place on Earth as placemarks, rejected ones left out."""
     return [
         Placemark(
-            f"{each.id} {each.kind.value}", _description(each), *_point(each.centre_m, site), each.first_seen_ns,
+            f"{each.id} {each.kind.value}",
+            _description(each),
+            *_point(each.centre_m, site),
+            each.first_seen_ns,
             tuple((x, y) for x, y in _ring(each.outline_m, site)[:-1]),
         )
-        for each in changes if each.verdict is not Verdict.REJECTED
+        for each in changes
+        if each.verdict is not Verdict.REJECTED
     ]
 
 
@@ -64,7 +70,9 @@ def write_view_masks(folder: Path, name: str, changed: ImageGray, valid: Mask) -
 
     `changed` and `valid` are (H, W), as in `survey.findings.ComparedView`. Raises StoreError on a full disk.
     """
-    mask: ImageGray = np.where(valid, np.where(changed > 0, CHANGED, UNCHANGED), UNKNOWN).astype(np.uint8)
+    mask: ImageGray = np.where(valid, np.where(changed > 0, CHANGED, UNCHANGED), UNKNOWN).astype(
+        np.uint8
+    )
     path = folder / f"{name}.png"
     _, data = cv2.imencode(".png", mask)
     atomic_write_bytes(path, data.tobytes(), durable=False)
@@ -109,8 +117,12 @@ def _feature(change: StoredChange, site: Site) -> dict[str, Any]:
         "length_m": rounded(change.length_m, 4),
         "sigma_m": rounded(change.sigma_m, 4),
         "sigma_in_map_m": rounded(change.sigma_in_map_m, 4),
-        "height_change_m": None if change.height_change is None else rounded(change.height_change.rise_m, 3),
-        "height_change_sigma_m": None if change.height_change is None else rounded(change.height_change.sigma_m, 3),
+        "height_change_m": None
+        if change.height_change is None
+        else rounded(change.height_change.rise_m, 3),
+        "height_change_sigma_m": None
+        if change.height_change is None
+        else rounded(change.height_change.sigma_m, 3),
         "class_before": change.class_before or None,
         "class_after": change.class_after or None,
         "east_m": rounded(east_m, 4),
@@ -138,9 +150,13 @@ def _description(change: StoredChange) -> str:
     ]
     if change.height_change is not None:
         risen = change.height_change
-        lines.append(f"height change {risen.rise_m:+.2f} m, accuracy {risen.sigma_m:.2f} m (1 sigma)")
+        lines.append(
+            f"height change {risen.rise_m:+.2f} m, accuracy {risen.sigma_m:.2f} m (1 sigma)"
+        )
     lines += [
-        f"{words}: {name}" for words, name in (("before", change.class_before), ("now", change.class_after)) if name
+        f"{words}: {name}"
+        for words, name in (("before", change.class_before), ("now", change.class_after))
+        if name
     ]
     if change.verdict is not None:
         lines.append(change.verdict.value + (f": {change.note}" if change.note else ""))

@@ -28,9 +28,13 @@ def control_documents(report: ControlReport) -> dict[str, bytes]:
     features = [
         {
             "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [
-                round(each.point.longitude_deg, 9), round(each.point.latitude_deg, 9),
-            ]},
+            "geometry": {
+                "type": "Point",
+                "coordinates": [
+                    round(each.point.longitude_deg, 9),
+                    round(each.point.latitude_deg, 9),
+                ],
+            },
             "properties": _properties(each),
         }
         for each in report.residuals

@@ -21,30 +21,41 @@ def coverage_geojson(ground: Sequence[CoveredGround], site: Site) -> dict[str, A
 
     Outlines turn counter-clockwise, holes clockwise. For a local site it is plain JSON with coordinates in pixels.
     """
-    return feature_collection(COVERAGE, [_feature(each, site) for each in ground], is_local=site.is_local)
+    return feature_collection(
+        COVERAGE, [_feature(each, site) for each in ground], is_local=site.is_local
+    )
 
 
 def seen_geojson(ground: Sequence[SeenGround], site: Site) -> dict[str, Any]:
     """The ground that a flight's pictures show as `coverage_geojson` has it, and the holes (docs/formats.md)."""
-    return feature_collection(COVERAGE, [_seen(each, site) for each in ground], is_local=site.is_local)
+    return feature_collection(
+        COVERAGE, [_seen(each, site) for each in ground], is_local=site.is_local
+    )
 
 
-def holes_lonlat(ground: Sequence[SeenGround], site: Site, reach_m: float) -> tuple[tuple[Floats, ...], ...]:
+def holes_lonlat(
+    ground: Sequence[SeenGround], site: Site, reach_m: float
+) -> tuple[tuple[Floats, ...], ...]:
     """Parts of the ground as polygons of longitude and latitude, widened by so many metres; those that then touch are
     one."""
     polygons = [rings for each in ground for rings in each.polygons]
     return tuple(
-        tuple(np.column_stack(longitude_latitude(ring, site)) for ring in rings) for rings in swollen(polygons, reach_m)
+        tuple(np.column_stack(longitude_latitude(ring, site)) for ring in rings)
+        for rings in swollen(polygons, reach_m)
     )
 
 
 def _seen(ground: SeenGround, site: Site) -> dict[str, Any]:
-    return _multipolygon(ground.polygons, site, {
-        "status": "seen" if ground.views else "hole",
-        "views": ground.views,
-        "m_per_px": rounded(ground.m_per_px, 4),
-        "area_m2": rounded(ground.area_m2, 1),
-    })
+    return _multipolygon(
+        ground.polygons,
+        site,
+        {
+            "status": "seen" if ground.views else "hole",
+            "views": ground.views,
+            "m_per_px": rounded(ground.m_per_px, 4),
+            "area_m2": rounded(ground.area_m2, 1),
+        },
+    )
 
 
 def _feature(ground: CoveredGround, site: Site) -> dict[str, Any]:
@@ -62,7 +73,10 @@ def _feature(ground: CoveredGround, site: Site) -> dict[str, Any]:
 def _multipolygon(
     polygons_m: Sequence[Sequence[PointsM]], site: Site, properties: dict[str, Any]
 ) -> dict[str, Any]:
-    polygons = [[_ring(ring, site, is_hole=place > 0) for place, ring in enumerate(rings)] for rings in polygons_m]
+    polygons = [
+        [_ring(ring, site, is_hole=place > 0) for place, ring in enumerate(rings)]
+        for rings in polygons_m
+    ]
     geometry = {"type": "MultiPolygon", "coordinates": polygons}
     rings_m = [[np.round(ring, 3).tolist() for ring in rings] for rings in polygons_m]
     return {"type": "Feature", "geometry": geometry, "properties": properties, "rings_m": rings_m}

@@ -13,9 +13,15 @@ from sorvolo.store.exports.plain import utc_text
 from sorvolo.survey.flight import Site
 from sorvolo.survey.objects import Track
 
-COT_TYPES: Mapping[str, str] = MappingProxyType({
-    "person": "a-u-G", "car": "a-u-G-E-V-C", "truck": "a-u-G-E-V-C", "bus": "a-u-G-E-V-C", "small object": "b-m-p-s-m",
-})
+COT_TYPES: Mapping[str, str] = MappingProxyType(
+    {
+        "person": "a-u-G",
+        "car": "a-u-G-E-V-C",
+        "truck": "a-u-G-E-V-C",
+        "bus": "a-u-G-E-V-C",
+        "small object": "b-m-p-s-m",
+    }
+)
 """The event type of each class: unknown on the ground, unknown civilian vehicle, a spot on the map."""
 
 DRONE_TYPE = "a-f-A-M-H-Q"
@@ -31,7 +37,13 @@ def cot_type(label: str, types: Mapping[str, str] = COT_TYPES) -> str:
 
 
 def cot_event(
-    track: Track, site: Site, *, uid: str, now_ns: int, stale_s: float, types: Mapping[str, str] = COT_TYPES
+    track: Track,
+    site: Site,
+    *,
+    uid: str,
+    now_ns: int,
+    stale_s: float,
+    types: Mapping[str, str] = COT_TYPES,
 ) -> bytes:
     """One track as one event: an XML element without a declaration, as streams of events want it.
 
@@ -40,23 +52,39 @@ def cot_event(
     ground's height above the ellipsoid where the site knows it. Speed and course are sent of what moves. The site must
     be geo-referenced.
     """
-    longitude, latitude = (float(each[0]) for each in longitude_latitude(track.position_m[None], site))
+    longitude, latitude = (
+        float(each[0]) for each in longitude_latitude(track.position_m[None], site)
+    )
     event = _event(uid, cot_type(track.label, types), now_ns, stale_s)
     error_m = float(np.sqrt(np.linalg.eigvalsh(track.covariance_m2)[-1]))
-    SubElement(event, "point", {
-        "lat": f"{latitude:.7f}", "lon": f"{(longitude + 180) % 360 - 180:.7f}",
-        "hae": f"{site.origin.height_m:.1f}" if site.height_reference == "ellipsoidal" else _UNKNOWN_M,
-        "ce": f"{error_m:.1f}", "le": _UNKNOWN_M,
-    })
+    SubElement(
+        event,
+        "point",
+        {
+            "lat": f"{latitude:.7f}",
+            "lon": f"{(longitude + 180) % 360 - 180:.7f}",
+            "hae": f"{site.origin.height_m:.1f}"
+            if site.height_reference == "ellipsoidal"
+            else _UNKNOWN_M,
+            "ce": f"{error_m:.1f}",
+            "le": _UNKNOWN_M,
+        },
+    )
     detail = SubElement(event, "detail")
     label = _printable(track.label)
     SubElement(detail, "contact", {"callsign": f"{label} {track.id}"})
     east, north = track.velocity_m_s
     if track.moving:
         course_deg = float(np.degrees(np.arctan2(east, north))) % 360
-        SubElement(detail, "track", {"course": f"{course_deg:.0f}", "speed": f"{float(np.hypot(east, north)):.1f}"})
+        SubElement(
+            detail,
+            "track",
+            {"course": f"{course_deg:.0f}", "speed": f"{float(np.hypot(east, north)):.1f}"},
+        )
     seen = utc_text(track.last_seen_ns)[:19] + "Z"
-    SubElement(detail, "remarks").text = (
+    SubElement(
+        detail, "remarks"
+    ).text = (
         f"{label}, score {track.score:.2f}, {track.views} views, last seen {seen}, found by Sorvolo"
     )
     return bytes(tostring(event, encoding="utf-8"))
@@ -87,10 +115,17 @@ def cot_drone(view: DroneView, *, uid: str, callsign: str, now_ns: int, stale_s:
     """A drone as one event, with its camera's field of view in `<sensor>` where azimuth and angle are known: ATAK and
     WinTAK draw it on the ground."""
     event = _event(uid, DRONE_TYPE, now_ns, stale_s)
-    SubElement(event, "point", {
-        "lat": f"{view.latitude_deg:.7f}", "lon": f"{(view.longitude_deg + 180) % 360 - 180:.7f}",
-        "hae": _known(view.height_m, ".1f"), "ce": _known(view.error_m, ".1f"), "le": _UNKNOWN_M,
-    })
+    SubElement(
+        event,
+        "point",
+        {
+            "lat": f"{view.latitude_deg:.7f}",
+            "lon": f"{(view.longitude_deg + 180) % 360 - 180:.7f}",
+            "hae": _known(view.height_m, ".1f"),
+            "ce": _known(view.error_m, ".1f"),
+            "le": _UNKNOWN_M,
+        },
+    )
     detail = SubElement(event, "detail")
     SubElement(detail, "contact", {"callsign": _printable(callsign)})
     if isfinite(view.course_deg):
@@ -98,26 +133,54 @@ def cot_drone(view: DroneView, *, uid: str, callsign: str, now_ns: int, stale_s:
         SubElement(detail, "track", {"course": f"{view.course_deg % 360:.0f}", "speed": speed})
     if isfinite(view.azimuth_deg) and isfinite(view.across_deg):
         down_deg = view.down_deg if isfinite(view.down_deg) else view.across_deg
-        SubElement(detail, "sensor", {
-            "version": "0.6", "type": "r-e", "model": "Sorvolo", "azimuth": f"{view.azimuth_deg % 360:.1f}",
-            "elevation": f"{view.elevation_deg if isfinite(view.elevation_deg) else -90.0:.1f}", "roll": "0.0",
-            "fov": f"{view.across_deg:.1f}", "vfov": f"{down_deg:.1f}",
-            "range": f"{view.range_m if isfinite(view.range_m) else 100.0:.0f}", "north": "0",
-            "fovRed": "1.0", "fovGreen": "1.0", "fovBlue": "0.0", "fovAlpha": "0.3",
-        })
+        SubElement(
+            detail,
+            "sensor",
+            {
+                "version": "0.6",
+                "type": "r-e",
+                "model": "Sorvolo",
+                "azimuth": f"{view.azimuth_deg % 360:.1f}",
+                "elevation": f"{view.elevation_deg if isfinite(view.elevation_deg) else -90.0:.1f}",
+                "roll": "0.0",
+                "fov": f"{view.across_deg:.1f}",
+                "vfov": f"{down_deg:.1f}",
+                "range": f"{view.range_m if isfinite(view.range_m) else 100.0:.0f}",
+                "north": "0",
+                "fovRed": "1.0",
+                "fovGreen": "1.0",
+                "fovBlue": "0.0",
+                "fovAlpha": "0.3",
+            },
+        )
     return bytes(tostring(event, encoding="utf-8"))
 
 
 def cot_spot(
-    longitude_deg: float, latitude_deg: float, *, uid: str, kind: str, callsign: str, words: str, error_m: float,
-    now_ns: int, stale_s: float,
+    longitude_deg: float,
+    latitude_deg: float,
+    *,
+    uid: str,
+    kind: str,
+    callsign: str,
+    words: str,
+    error_m: float,
+    now_ns: int,
+    stale_s: float,
 ) -> bytes:
     """Something at a place as one event of the type `kind`; `words` are its remarks."""
     event = _event(uid, kind, now_ns, stale_s)
-    SubElement(event, "point", {
-        "lat": f"{latitude_deg:.7f}", "lon": f"{(longitude_deg + 180) % 360 - 180:.7f}", "hae": _UNKNOWN_M,
-        "ce": _known(error_m, ".1f"), "le": _UNKNOWN_M,
-    })
+    SubElement(
+        event,
+        "point",
+        {
+            "lat": f"{latitude_deg:.7f}",
+            "lon": f"{(longitude_deg + 180) % 360 - 180:.7f}",
+            "hae": _UNKNOWN_M,
+            "ce": _known(error_m, ".1f"),
+            "le": _UNKNOWN_M,
+        },
+    )
     detail = SubElement(event, "detail")
     SubElement(detail, "contact", {"callsign": _printable(callsign)})
     SubElement(detail, "remarks").text = _printable(words)
@@ -126,10 +189,18 @@ def cot_spot(
 
 def _event(uid: str, kind: str, now_ns: int, stale_s: float) -> Element:
     now = _milliseconds(now_ns)
-    return Element("event", {
-        "version": "2.0", "uid": uid, "type": kind, "how": "m-g", "time": now, "start": now,
-        "stale": _milliseconds(now_ns + round(stale_s * 1e9)),
-    })
+    return Element(
+        "event",
+        {
+            "version": "2.0",
+            "uid": uid,
+            "type": kind,
+            "how": "m-g",
+            "time": now,
+            "start": now,
+            "stale": _milliseconds(now_ns + round(stale_s * 1e9)),
+        },
+    )
 
 
 def _known(value: float, form: str) -> str:
@@ -137,13 +208,19 @@ def _known(value: float, form: str) -> str:
 
 
 def _printable(text: str) -> str:
-    return "".join(letter for letter in text if letter.isprintable())  # another's model may name anything
+    return "".join(
+        letter for letter in text if letter.isprintable()
+    )  # another's model may name anything
 
 
 def cot_removal(uid: str, *, type_: str, now_ns: int) -> bytes:
     """The event that takes another one, of this `uid` and type, off everyone's map: it turned out to be none."""
     event = _event(f"{uid}.removed", "t-x-d-d", now_ns, 60.0)
-    SubElement(event, "point", {"lat": "0", "lon": "0", "hae": _UNKNOWN_M, "ce": _UNKNOWN_M, "le": _UNKNOWN_M})
+    SubElement(
+        event,
+        "point",
+        {"lat": "0", "lon": "0", "hae": _UNKNOWN_M, "ce": _UNKNOWN_M, "le": _UNKNOWN_M},
+    )
     detail = SubElement(event, "detail")
     SubElement(detail, "link", {"uid": uid, "relation": "p-p", "type": type_})
     SubElement(detail, "__forcedelete")

@@ -13,7 +13,13 @@ import numpy as np
 
 from sorvolo.errors import StoreError, UnavailableError
 from sorvolo.geometry.arrays import Floats, ImageRGB, TimesNs
-from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_path, atomic_write_bytes, remove_leftovers, writing
+from sorvolo.store.atomic import (
+    TEMPORARY_PREFIX,
+    atomic_path,
+    atomic_write_bytes,
+    remove_leftovers,
+    writing,
+)
 from sorvolo.store.exports.placemarks import Placemark
 from sorvolo.store.exports.places import longitude_latitude
 from sorvolo.store.exports.plain import (
@@ -47,10 +53,21 @@ _LOCK = "watch.lock"
 """Held by the one process that writes into the folder, while it does."""
 
 _OURS = (
-    JOURNAL, LINES,
-    *(features_name(name, is_local=is_local) for name in (DETECTIONS, TRACKS) for is_local in (False, True)),
-    TRACKS_KML, TRACKS_GPX, CROPS, ANNOTATED_VIDEO, ANNOTATED_PICTURES, LABELS,
-    REPORT, "report.html",
+    JOURNAL,
+    LINES,
+    *(
+        features_name(name, is_local=is_local)
+        for name in (DETECTIONS, TRACKS)
+        for is_local in (False, True)
+    ),
+    TRACKS_KML,
+    TRACKS_GPX,
+    CROPS,
+    ANNOTATED_VIDEO,
+    ANNOTATED_PICTURES,
+    LABELS,
+    REPORT,
+    "report.html",
 )
 _MADE_BY = "sorvolo watch"
 _OF_FIRST_PICTURE = (
@@ -106,13 +123,18 @@ class DetectionLines:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._file.close()
 
     def append(self, rows: Iterable[Mapping[str, Any]]) -> None:
         """Write rows and hand them to the operating system. Raises StoreError on a full disk."""
-        lines = [json.dumps(plain_json(row), ensure_ascii=False, allow_nan=False) + "\n" for row in rows]
+        lines = [
+            json.dumps(plain_json(row), ensure_ascii=False, allow_nan=False) + "\n" for row in rows
+        ]
         if lines:
             with writing(self._path):
                 self._file.write("".join(lines).encode())
@@ -120,17 +142,30 @@ class DetectionLines:
 
 
 def detection_row(
-    frame: Frame, time_ns: int, name: str, score: float, box_px: Sequence[float], sighting: Sighting | None,
-    track_id: int | None, site: Site,
+    frame: Frame,
+    time_ns: int,
+    name: str,
+    score: float,
+    box_px: Sequence[float],
+    sighting: Sighting | None,
+    track_id: int | None,
+    site: Site,
 ) -> dict[str, Any]:
     """One detection for `detections.jsonl` (docs/formats.md); without a sighting it has no place on the ground."""
     row: dict[str, Any] = {
-        "frame": frame.name, "time": utc_text(time_ns), "class": name, "score": rounded(score, 4),
-        "box_px": [rounded(edge, 1) for edge in box_px], "track": track_id,
+        "frame": frame.name,
+        "time": utc_text(time_ns),
+        "class": name,
+        "score": rounded(score, 4),
+        "box_px": [rounded(edge, 1) for edge in box_px],
+        "track": track_id,
     }
     if sighting is not None:
         row |= _place(sighting.position_m, site)
-        row |= {"sigma_m": rounded(sighting.sigma_m, 3), "size_m": [rounded(side, 3) for side in sighting.size_m]}
+        row |= {
+            "sigma_m": rounded(sighting.sigma_m, 3),
+            "size_m": [rounded(side, 3) for side in sighting.size_m],
+        }
     return row
 
 
@@ -163,18 +198,27 @@ def track_properties(track: Track, site: Site) -> dict[str, Any]:
     """What is reported of a track: its properties in the list of tracks, the body of an alert."""
     east, north = track.velocity_m_s
     return {
-        "id": track.id, "class": track.label, "score": rounded(track.score, 4),
+        "id": track.id,
+        "class": track.label,
+        "score": rounded(track.score, 4),
         **_place(track.position_m, site),
-        "sigma_m": rounded(track.sigma_m, 3), "size_m": [rounded(side, 3) for side in track.size_m],
-        "first_seen": utc_text(track.first_seen_ns), "last_seen": utc_text(track.last_seen_ns),
-        "views": track.views, "passes": track.passes, "moving": track.moving,
+        "sigma_m": rounded(track.sigma_m, 3),
+        "size_m": [rounded(side, 3) for side in track.size_m],
+        "first_seen": utc_text(track.first_seen_ns),
+        "last_seen": utc_text(track.last_seen_ns),
+        "views": track.views,
+        "passes": track.passes,
+        "moving": track.moving,
         "velocity_m_s": [rounded(east, 3), rounded(north, 3)] if track.moving else None,
         "class_scores": {name: rounded(share, 4) for name, share in track.class_scores.items()},
-        "best_frame": track.best.frame_name, "best_box_px": [rounded(float(edge), 1) for edge in track.best.box_px],
+        "best_frame": track.best.frame_name,
+        "best_box_px": [rounded(float(edge), 1) for edge in track.best.box_px],
     }
 
 
-def tracks_collection(tracks: Iterable[Track], site: Site, crops: Mapping[int, str]) -> dict[str, Any]:
+def tracks_collection(
+    tracks: Iterable[Track], site: Site, crops: Mapping[int, str]
+) -> dict[str, Any]:
     """Confirmed tracks as a GeoJSON FeatureCollection: a point each, its path as a property (docs/formats.md).
 
     `crops` are the crops' file names by track. For a local site it is plain JSON: coordinates are pixels of the first
@@ -183,10 +227,18 @@ def tracks_collection(tracks: Iterable[Track], site: Site, crops: Mapping[int, s
     features = []
     for track in tracks:
         properties = track_properties(track, site)
-        features.append({
-            "type": "Feature", "id": track.id, "geometry": _point(properties),
-            "properties": {**properties, "crop": crops.get(track.id), "path": _path(track.path_m, track.path_ns, site)},
-        })
+        features.append(
+            {
+                "type": "Feature",
+                "id": track.id,
+                "geometry": _point(properties),
+                "properties": {
+                    **properties,
+                    "crop": crops.get(track.id),
+                    "path": _path(track.path_m, track.path_ns, site),
+                },
+            }
+        )
     return _collection(TRACKS, features, site)
 
 
@@ -197,11 +249,18 @@ def track_placemarks(tracks: Iterable[Track], site: Site) -> list[Placemark]:
         longitude, latitude = longitude_latitude(each.position_m[None], site)
         words = (
             f"score {each.score:.2f} (0 to 1), {each.views} views, last seen {time_words(each.last_seen_ns)}\n"
-            f"position accuracy {each.sigma_m:.1f} m (1 sigma)" + ("\nmoving" if each.moving else "")
+            f"position accuracy {each.sigma_m:.1f} m (1 sigma)"
+            + ("\nmoving" if each.moving else "")
         )
-        placemarks.append(Placemark(
-            f"{each.label} {each.id}", words, float(longitude[0]), float(latitude[0]), each.last_seen_ns
-        ))
+        placemarks.append(
+            Placemark(
+                f"{each.label} {each.id}",
+                words,
+                float(longitude[0]),
+                float(latitude[0]),
+                each.last_seen_ns,
+            )
+        )
     return placemarks
 
 
@@ -239,8 +298,13 @@ def _refuse_others(folder: Path, source: str, fingerprint: str, *, may_be_there:
         return
     earlier = _mark_of(folder)
     if earlier is None:
-        raise StoreError(f"{folder} is not empty and holds no earlier watch; give another folder with --out")
-    if not may_be_there or (earlier.get("source"), earlier.get("fingerprint")) != (source, fingerprint):
+        raise StoreError(
+            f"{folder} is not empty and holds no earlier watch; give another folder with --out"
+        )
+    if not may_be_there or (earlier.get("source"), earlier.get("fingerprint")) != (
+        source,
+        fingerprint,
+    ):
         raise StoreError(
             f"{folder} holds a watch of {earlier.get('source')}, which stays; give another folder with --out"
         )
@@ -294,8 +358,10 @@ def _place(position_m: Floats, site: Site) -> dict[str, Any]:
         return {"x_px": rounded(position_m[0], 2), "y_px": rounded(position_m[1], 2)}
     longitude, latitude = longitude_latitude(position_m[None], site)
     return {
-        "latitude": rounded(latitude[0], 8), "longitude": rounded(longitude[0], 8),
-        "east_m": rounded(position_m[0], 3), "north_m": rounded(position_m[1], 3),
+        "latitude": rounded(latitude[0], 8),
+        "longitude": rounded(longitude[0], 8),
+        "east_m": rounded(position_m[0], 3),
+        "north_m": rounded(position_m[1], 3),
     }
 
 

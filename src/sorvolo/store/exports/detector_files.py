@@ -47,14 +47,19 @@ class FoundSets:
 def write_found(path: Path, found: FoundSets) -> None:
     """Write detections.json (docs/formats.md): boxes to 0.01 px, scores to 1e-5. Raises StoreError on a full disk."""
     content = {
-        "made_by": _MADE_BY, "format": _FORMAT, "model": found.name, "classes": list(found.classes),
+        "made_by": _MADE_BY,
+        "format": _FORMAT,
+        "model": found.name,
+        "classes": list(found.classes),
         "sets": {
             name: {
                 "thresholds": dict(one.thresholds),
                 "pictures": [
                     {
-                        "file": file, "boxes_px": np.round(each.boxes_px.astype(float), 2).tolist(),
-                        "scores": np.round(each.scores, 5).tolist(), "labels": each.labels.tolist(),
+                        "file": file,
+                        "boxes_px": np.round(each.boxes_px.astype(float), 2).tolist(),
+                        "scores": np.round(each.scores, 5).tolist(),
+                        "labels": each.labels.tolist(),
                     }
                     for file, each in zip(one.files, one.detections)
                 ],
@@ -97,15 +102,23 @@ def mistake_picture(
     side = max(3.0 * max(right - left, bottom - top), 48.0)
     x0, y0 = (left + right - side) / 2, (top + bottom - side) / 2
     scale = _CROP_PX / side
-    matrix = np.array([[scale, 0, -scale * x0 + (scale - 1) / 2], [0, scale, -scale * y0 + (scale - 1) / 2]])
-    crop = cv2.warpAffine(image, matrix, (_CROP_PX, _CROP_PX), flags=cv2.INTER_LINEAR, borderValue=(60, 60, 60))
+    matrix = np.array(
+        [[scale, 0, -scale * x0 + (scale - 1) / 2], [0, scale, -scale * y0 + (scale - 1) / 2]]
+    )
+    crop = cv2.warpAffine(
+        image, matrix, (_CROP_PX, _CROP_PX), flags=cv2.INTER_LINEAR, borderValue=(60, 60, 60)
+    )
     for boxes, colour in ((labels_px, _LABEL_COLOUR), (found_px, _FOUND_COLOUR)):
         for edges in boxes:
-            low, high = (np.round((edges[k:k + 2] - [x0, y0]) * scale).astype(int).tolist() for k in (0, 2))
+            low, high = (
+                np.round((edges[k : k + 2] - [x0, y0]) * scale).astype(int).tolist() for k in (0, 2)
+            )
             cv2.rectangle(crop, low, high, colour, 2, cv2.LINE_AA)
     return np.asarray(crop, np.uint8)
 
 
 def _detections(row: Mapping[str, Any], classes: tuple[str, ...]) -> Detections:
     boxes = np.array(row["boxes_px"], np.float32).reshape(-1, 4)
-    return Detections(boxes, np.array(row["scores"], float), np.array(row["labels"], np.int64), classes)
+    return Detections(
+        boxes, np.array(row["scores"], float), np.array(row["labels"], np.int64), classes
+    )

@@ -90,8 +90,18 @@ UMCD_COLUMNS = (
 )
 """The sixty columns of the thesis's Table 2.2, spelled as there."""
 
-_UMCD_IDLE_INSTRUMENTS = ("0.0", "0.0", "-9.81", *["0.0"] * 3, *["0"] * 4)  # acceleration, rotation, magnetometer
-_UMCD_IDLE_ERRORS = (*["0.0"] * 4, "9.81", "0.0")  # errors, size of the acceleration and of the rotation
+_UMCD_IDLE_INSTRUMENTS = (
+    "0.0",
+    "0.0",
+    "-9.81",
+    *["0.0"] * 3,
+    *["0"] * 4,
+)  # acceleration, rotation, magnetometer
+_UMCD_IDLE_ERRORS = (
+    *["0.0"] * 4,
+    "9.81",
+    "0.0",
+)  # errors, size of the acceleration and of the rotation
 _UMCD_MOTORS = (*["5200"] * 4, *["38"] * 4)  # speed and load of the four motors
 _MOST_GROUND_PX = 500_000_000  # of an orthophoto to simulate over: its colours take 1.5 GB then
 _GPX = "http://www.topografix.com/GPX/1/1"
@@ -110,16 +120,26 @@ def video_writer(
     StoreError when the disk is full or the folder cannot be written.
     """
     rate = Fraction(fps).limit_denominator(1001)
-    with atomic_path(path, durable=False) as temporary, av.open(
-        str(temporary), "w", format="mp4", container_options={"fflags": "+bitexact", "movflags": "+faststart"}
-    ) as container:
+    with (
+        atomic_path(path, durable=False) as temporary,
+        av.open(
+            str(temporary),
+            "w",
+            format="mp4",
+            container_options={"fflags": "+bitexact", "movflags": "+faststart"},
+        ) as container,
+    ):
         container.metadata["creation_time"] = _moment(started_ns).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         stream = container.add_stream("libx264", rate=rate)
         stream.width, stream.height, stream.pix_fmt = *size_px, "yuv420p"
         stream.codec_context.thread_count = 1
         stream.codec_context.time_base = 1 / rate
         stream.options = {
-            "crf": str(crf), "preset": "veryfast", "threads": "1", "weightp": "none", "mbtree": "0",
+            "crf": str(crf),
+            "preset": "veryfast",
+            "threads": "1",
+            "weightp": "none",
+            "mbtree": "0",
             "flags": "+bitexact",
         }
         count = 0
@@ -183,7 +203,9 @@ def write_camera(path: Path, camera: Camera) -> None:
     """Write the camera as OpenCV's XML, the distortion in OpenCV's order, which is named beside it."""
     k = " ".join(repr(float(number)) for number in camera.distortion)
     matrix = " ".join(repr(float(number)) for number in camera.matrix.ravel())
-    atomic_write_bytes(path, f"""<?xml version="1.0"?>
+    atomic_write_bytes(
+        path,
+        f"""<?xml version="1.0"?>
 <opencv_storage>
 <image_width>{camera.width_px}</image_width>
 <image_height>{camera.height_px}</image_height>
@@ -201,12 +223,16 @@ def write_camera(path: Path, camera: Camera) -> None:
 </distortion_coefficients>
 <distortion_order>"k1 k2 p1 p2 k3"</distortion_order>
 </opencv_storage>
-""".encode(), durable=False)
+""".encode(),
+        durable=False,
+    )
 
 
 def write_json(path: Path, value: Any) -> None:
     """Write JSON, or GeoJSON, compactly and in a fixed order."""
-    atomic_write_bytes(path, (json.dumps(value, separators=(",", ":")) + "\n").encode(), durable=False)
+    atomic_write_bytes(
+        path, (json.dumps(value, separators=(",", ":")) + "\n").encode(), durable=False
+    )
 
 
 def write_mask(path: Path, mask: ImageGray) -> None:
@@ -227,7 +253,11 @@ def read_orthophoto(path: Path, m_per_px: float | None = None) -> tuple[ImageRGB
                     f"{path}: {source.count} band(s) of {source.dtypes[0]}; an orthophoto needs red, green"
                     " and blue in 8 bits each"
                 )
-            own = abs(source.transform.a) if source.crs is not None and source.crs.is_projected else None
+            own = (
+                abs(source.transform.a)
+                if source.crs is not None and source.crs.is_projected
+                else None
+            )
             size_m = m_per_px or own
             if not size_m:
                 raise InputError(
@@ -261,15 +291,26 @@ def _umcd(telemetry: Telemetry) -> str:
     times_s = _since_first_s(telemetry)
     speed = telemetry["speed_m_s"]
     travelled_m = (
-        np.concatenate([[0.0], np.cumsum(speed[1:] * np.diff(times_s))]) if len(times_s) else times_s
+        np.concatenate([[0.0], np.cumsum(speed[1:] * np.diff(times_s))])
+        if len(times_s)
+        else times_s
     )
     for i, time_s in enumerate(times_s):
         row = {name: float(column[i]) for name, column in telemetry.columns.items()}
-        writer.writerow([
-            *_umcd_place(time_s, row), *_UMCD_IDLE_INSTRUMENTS, *_umcd_velocity(row), *_umcd_attitude(row),
-            *_UMCD_IDLE_ERRORS, *[f"{travelled_m[i]:.2f}"] * 2, f"{row['course_deg']:.2f}", *_umcd_battery(time_s),
-            *[f"{row[f'camera_{axis}_deg']:.4f}" for axis in ("roll", "pitch", "yaw")] * 2, *_UMCD_MOTORS,
-        ])
+        writer.writerow(
+            [
+                *_umcd_place(time_s, row),
+                *_UMCD_IDLE_INSTRUMENTS,
+                *_umcd_velocity(row),
+                *_umcd_attitude(row),
+                *_UMCD_IDLE_ERRORS,
+                *[f"{travelled_m[i]:.2f}"] * 2,
+                f"{row['course_deg']:.2f}",
+                *_umcd_battery(time_s),
+                *[f"{row[f'camera_{axis}_deg']:.4f}" for axis in ("roll", "pitch", "yaw")] * 2,
+                *_UMCD_MOTORS,
+            ]
+        )
     return text.getvalue()
 
 
@@ -277,8 +318,16 @@ def _umcd_place(time_s: float, row: Mapping[str, float]) -> list[Any]:
     """Columns `Tick#` to `relativeHeight`: time since the first row, place, satellites, heights."""
     height = f"{row['orthometric_height_m']:.3f}"
     return [
-        round(time_s * 600), f"{time_s:.3f}", round(time_s * 1000), f"{row['longitude_deg']:.10f}",
-        f"{row['latitude_deg']:.10f}", 14, height, height, "0.0", f"{row['height_above_takeoff_m']:.3f}",
+        round(time_s * 600),
+        f"{time_s:.3f}",
+        round(time_s * 1000),
+        f"{row['longitude_deg']:.10f}",
+        f"{row['latitude_deg']:.10f}",
+        14,
+        height,
+        height,
+        "0.0",
+        f"{row['height_above_takeoff_m']:.3f}",
     ]
 
 
@@ -292,27 +341,45 @@ def _umcd_velocity(row: Mapping[str, float]) -> list[str]:
 def _umcd_attitude(row: Mapping[str, float]) -> list[str]:
     """Columns `quatW` to `Yaw`."""
     yaw, pitch, roll = (row[f"body_{axis}_deg"] for axis in ("yaw", "pitch", "roll"))
-    return [*(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)), *(f"{angle:.3f}" for angle in (roll, pitch, yaw))]
+    return [
+        *(f"{q:.6f}" for q in _quaternion(yaw, pitch, roll)),
+        *(f"{angle:.3f}" for angle in (roll, pitch, yaw)),
+    ]
 
 
 def _umcd_battery(time_s: float) -> list[str]:
     """Columns `IMUTemp(C)` to `batteryLifePercentage`: the charge falls with the flight's time."""
-    return ["42.0", "31.0", "4480", f"{4480 - time_s:.0f}", "12", f"{max(5.0, 98 - time_s / 12):.0f}"]
+    return [
+        "42.0",
+        "31.0",
+        "4480",
+        f"{4480 - time_s:.0f}",
+        "12",
+        f"{max(5.0, 98 - time_s / 12):.0f}",
+    ]
 
 
-def _quaternion(yaw_deg: float, pitch_deg: float, roll_deg: float) -> tuple[float, float, float, float]:
+def _quaternion(
+    yaw_deg: float, pitch_deg: float, roll_deg: float
+) -> tuple[float, float, float, float]:
     """w, x, y, z of the body's attitude (z-y-x)."""
-    (cy, cp, cr), (sy, sp, sr) = (f(np.radians([yaw_deg, pitch_deg, roll_deg]) / 2) for f in (np.cos, np.sin))
+    (cy, cp, cr), (sy, sp, sr) = (
+        f(np.radians([yaw_deg, pitch_deg, roll_deg]) / 2) for f in (np.cos, np.sin)
+    )
     return (
-        float(cr * cp * cy + sr * sp * sy), float(sr * cp * cy - cr * sp * sy),
-        float(cr * sp * cy + sr * cp * sy), float(cr * cp * sy - sr * sp * cy),
+        float(cr * cp * cy + sr * sp * sy),
+        float(sr * cp * cy - cr * sp * sy),
+        float(cr * sp * cy + sr * cp * sy),
+        float(cr * cp * sy - sr * sp * cy),
     )
 
 
 def _srt_times(telemetry: Telemetry) -> list[tuple[str, str]]:
     starts_ms = np.round(telemetry.video_time_ns / 1e6).astype(int)
     step_ms = int(np.median(np.diff(starts_ms))) if len(starts_ms) > 1 else 1000
-    ends_ms = np.append(np.minimum(starts_ms[1:], starts_ms[:-1] + step_ms), starts_ms[-1:] + step_ms)
+    ends_ms = np.append(
+        np.minimum(starts_ms[1:], starts_ms[:-1] + step_ms), starts_ms[-1:] + step_ms
+    )
     return [(_srt_time(int(start)), _srt_time(int(end))) for start, end in zip(starts_ms, ends_ms)]
 
 
@@ -412,7 +479,8 @@ def _gps_tags(row: Mapping[str, float], moment: datetime) -> dict[int, Any]:
         GPS.GPSAltitude: IFDRational(round(abs(row["orthometric_height_m"]) * 1000), 1000),
         GPS.GPSDateStamp: moment.strftime("%Y:%m:%d"),
         GPS.GPSTimeStamp: (
-            IFDRational(moment.hour, 1), IFDRational(moment.minute, 1),
+            IFDRational(moment.hour, 1),
+            IFDRational(moment.minute, 1),
             IFDRational(moment.second * 1000 + moment.microsecond // 1000, 1000),
         ),
     }

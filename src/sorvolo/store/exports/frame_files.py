@@ -18,7 +18,9 @@ def frames_geojson(placed: Sequence[PlacedFrame], site: Site) -> dict[str, Any]:
     Longitudes run on beyond 180 degrees where a flight crosses the antimeridian. For a local site it is plain JSON with
     coordinates in pixels of the site.
     """
-    return feature_collection("frames", [_feature(frame, site) for frame in placed], is_local=site.is_local)
+    return feature_collection(
+        "frames", [_feature(frame, site) for frame in placed], is_local=site.is_local
+    )
 
 
 def _feature(frame: PlacedFrame, site: Site) -> dict[str, Any]:
@@ -59,7 +61,9 @@ def _camera_place(frame: PlacedFrame, site: Site) -> dict[str, Any]:
         if site.is_local:
             local = {"camera_east": rounded(east_m, 6), "camera_north": rounded(north_m, 6)}
         else:
-            longitudes, latitudes = longitude_latitude(frame.site_from_camera.translation_m[None], site)
+            longitudes, latitudes = longitude_latitude(
+                frame.site_from_camera.translation_m[None], site
+            )
             longitude_deg, latitude_deg = longitudes[0], latitudes[0]
     return {
         "camera_longitude_deg": rounded(longitude_deg, 10),

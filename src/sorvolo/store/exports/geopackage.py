@@ -43,21 +43,30 @@ CREATE TABLE gpkg_geometry_columns (table_name TEXT NOT NULL PRIMARY KEY REFEREN
 
 
 def write_geopackage(
-    path: Path, layers: Mapping[str, Sequence[Feature]], styles: Mapping[str, str] = MappingProxyType({})
+    path: Path,
+    layers: Mapping[str, Sequence[Feature]],
+    styles: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Write a layer for each name that has features; GeoJSON features in WGS84.
 
     `styles` are QML documents by layer, which QGIS takes as the layers' own. Raises StoreError on a full disk.
     """
-    with atomic_path(path) as temporary, closing(sqlite3.connect(temporary, isolation_level=None)) as file:
+    with (
+        atomic_path(path) as temporary,
+        closing(sqlite3.connect(temporary, isolation_level=None)) as file,
+    ):
         file.execute(f"PRAGMA application_id = {_APPLICATION}")
         file.execute(f"PRAGMA user_version = {_VERSION}")
         file.executescript(_TABLES)
         file.execute("BEGIN")
-        file.executemany("INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')", [
-            ("Undefined cartesian", -1, "NONE", -1, "undefined"), ("Undefined geographic", 0, "NONE", 0, "undefined"),
-            ("WGS 84", _WGS84, "EPSG", _WGS84, _WGS84_WKT),
-        ])
+        file.executemany(
+            "INSERT INTO gpkg_spatial_ref_sys VALUES (?, ?, ?, ?, ?, '')",
+            [
+                ("Undefined cartesian", -1, "NONE", -1, "undefined"),
+                ("Undefined geographic", 0, "NONE", 0, "undefined"),
+                ("WGS 84", _WGS84, "EPSG", _WGS84, _WGS84_WKT),
+            ],
+        )
         for name, features in layers.items():
             if features:
                 _write_layer(file, name, features)
@@ -67,23 +76,32 @@ def write_geopackage(
 
 def _write_layer(file: sqlite3.Connection, name: str, features: Sequence[Feature]) -> None:
     shapes = _alike([shapely.force_2d(shape(each["geometry"])) for each in features])
-    kind = shapes[0].geom_type.upper() if len({each.geom_type for each in shapes}) == 1 else "GEOMETRY"
+    kind = (
+        shapes[0].geom_type.upper() if len({each.geom_type for each in shapes}) == 1 else "GEOMETRY"
+    )
     columns = _columns(features)
     declared = "".join(f", {_quoted(column)} {sql}" for column, sql in columns.items())
-    file.execute(f"CREATE TABLE {_quoted(name)} (fid INTEGER PRIMARY KEY AUTOINCREMENT, geom {kind}{declared})")
+    file.execute(
+        f"CREATE TABLE {_quoted(name)} (fid INTEGER PRIMARY KEY AUTOINCREMENT, geom {kind}{declared})"
+    )
     marks = ", ".join("?" * (len(columns) + 1))
     names = ", ".join(["geom", *(_quoted(each) for each in columns)])
-    file.executemany(f"INSERT INTO {_quoted(name)} ({names}) VALUES ({marks})", [
-        (_blob(geometry), *(_plain(each["properties"].get(column)) for column in columns))
-        for geometry, each in zip(shapes, features, strict=True)
-    ])
+    file.executemany(
+        f"INSERT INTO {_quoted(name)} ({names}) VALUES ({marks})",
+        [
+            (_blob(geometry), *(_plain(each["properties"].get(column)) for column in columns))
+            for geometry, each in zip(shapes, features, strict=True)
+        ],
+    )
     bounds = shapely.total_bounds(shapes)
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.000Z")
     file.execute(
         "INSERT INTO gpkg_contents VALUES (?, 'features', ?, '', ?, ?, ?, ?, ?, ?)",
         (name, name, now, *(float(each) for each in bounds), _WGS84),
     )
-    file.execute("INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (name, kind, _WGS84))
+    file.execute(
+        "INSERT INTO gpkg_geometry_columns VALUES (?, 'geom', ?, ?, 0, 0)", (name, kind, _WGS84)
+    )
 
 
 def _write_styles(file: sqlite3.Connection, styles: Mapping[str, str]) -> None:
@@ -105,7 +123,9 @@ def _write_styles(file: sqlite3.Connection, styles: Mapping[str, str]) -> None:
 def _alike(shapes: Sequence[BaseGeometry]) -> list[BaseGeometry]:
     """Polygons beside multipolygons become multipolygons: a layer of one kind opens in every program."""
     if {each.geom_type for each in shapes} == {"Polygon", "MultiPolygon"}:
-        return [shapely.MultiPolygon([each]) if each.geom_type == "Polygon" else each for each in shapes]
+        return [
+            shapely.MultiPolygon([each]) if each.geom_type == "Polygon" else each for each in shapes
+        ]
     return list(shapes)
 
 
@@ -140,7 +160,9 @@ def _plain(value: object) -> object:
 
 def _blob(geometry: BaseGeometry) -> bytes:
     """A geometry as GeoPackages hold it: magic, version, flags (little-endian, no envelope), EPSG code, ISO WKB."""
-    return struct.pack("<2sBBi", b"GP", 0, 1, _WGS84) + bytes(shapely.to_wkb(geometry, byte_order=1, flavor="iso"))
+    return struct.pack("<2sBBi", b"GP", 0, 1, _WGS84) + bytes(
+        shapely.to_wkb(geometry, byte_order=1, flavor="iso")
+    )
 
 
 def _quoted(name: str) -> str:

@@ -17,17 +17,30 @@ from sorvolo.survey.objects import Detections
 
 
 def picture_of_detections(
-    path: str, width_px: int, height_px: int, group: str, detections: Detections, m_per_px: float = float("nan")
+    path: str,
+    width_px: int,
+    height_px: int,
+    group: str,
+    detections: Detections,
+    m_per_px: float = float("nan"),
 ) -> LabelledPicture:
     """What a detector saw in a picture, as labels to correct and to learn from; scores are not kept."""
     no_regions = np.zeros((0, 4), np.float32)
     return LabelledPicture(
-        path, width_px, height_px, group, detections.boxes_px, np.asarray(detections.labels, np.int64), no_regions,
+        path,
+        width_px,
+        height_px,
+        group,
+        detections.boxes_px,
+        np.asarray(detections.labels, np.int64),
+        no_regions,
         m_per_px,
     )
 
 
-def coco_document(labelled: LabelledSet, folder: Path, scores: Sequence[Floats] | None = None) -> dict[str, Any]:
+def coco_document(
+    labelled: LabelledSet, folder: Path, scores: Sequence[Floats] | None = None
+) -> dict[str, Any]:
     """The set as a COCO document for a file in `folder`, to which file names are relative.
 
     Ids count from 1, categories in the order of the classes. A picture's group is its `flight`, `m_per_px` is added
@@ -47,7 +60,9 @@ def coco_document(labelled: LabelledSet, folder: Path, scores: Sequence[Floats] 
             annotations += [_annotation(box, label, index + 1, 1) for box in picture.ignored_px]
     return {
         "info": {"description": labelled.name},
-        "categories": [{"id": number, "name": name} for number, name in enumerate(labelled.classes, start=1)],
+        "categories": [
+            {"id": number, "name": name} for number, name in enumerate(labelled.classes, start=1)
+        ],
         "images": images,
         "annotations": [{"id": number, **row} for number, row in enumerate(annotations, start=1)],
     }
@@ -75,7 +90,9 @@ def write_yolo(folder: Path, labelled: LabelledSet) -> int:
             raise InputError(
                 f"two pictures are named {place.stem}, as YOLO's label files cannot be; rename one: {picture.path}"
             )
-        texts[place] = yolo_text(picture.boxes_px, picture.labels, picture.width_px, picture.height_px)
+        texts[place] = yolo_text(
+            picture.boxes_px, picture.labels, picture.width_px, picture.height_px
+        )
     for place, text in texts.items():
         write_yolo_text(folder / "labels" / place, text)
     write_yolo_names(folder, labelled.classes)
@@ -104,7 +121,9 @@ def write_yolo_names(folder: Path, classes: Iterable[str]) -> None:
     names = list(classes)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    atomic_write_bytes(folder / "classes.txt", "".join(f"{name}\n" for name in names).encode(), durable=False)
+    atomic_write_bytes(
+        folder / "classes.txt", "".join(f"{name}\n" for name in names).encode(), durable=False
+    )
     numbered = [f"  {number}: {_quoted(name)}" for number, name in enumerate(names)]
     lines = ["path: .", "train: images", "val: images", "names:", *numbered]
     atomic_write_bytes(folder / "data.yaml", ("\n".join(lines) + "\n").encode(), durable=False)
@@ -112,17 +131,25 @@ def write_yolo_names(folder: Path, classes: Iterable[str]) -> None:
 
 def _image_row(picture: LabelledPicture, image_id: int, folder: Path) -> dict[str, Any]:
     row: dict[str, Any] = {
-        "id": image_id, "file_name": _relative(picture.path, folder), "width": picture.width_px,
-        "height": picture.height_px, "flight": picture.group,
+        "id": image_id,
+        "file_name": _relative(picture.path, folder),
+        "width": picture.width_px,
+        "height": picture.height_px,
+        "flight": picture.group,
     }
     return row | ({"m_per_px": round(picture.m_per_px, 6)} if isfinite(picture.m_per_px) else {})
 
 
-def _annotation(box_px: Iterable[float], label: int, image_id: int, is_crowd: int) -> dict[str, Any]:
+def _annotation(
+    box_px: Iterable[float], label: int, image_id: int, is_crowd: int
+) -> dict[str, Any]:
     left, top, right, bottom = (float(edge) for edge in box_px)
     width, height = right - left, bottom - top
     return {
-        "image_id": image_id, "category_id": label + 1, "area": round(width * height, 2), "iscrowd": is_crowd,
+        "image_id": image_id,
+        "category_id": label + 1,
+        "area": round(width * height, 2),
+        "iscrowd": is_crowd,
         "bbox": [round(left, 3), round(top, 3), round(width, 3), round(height, 3)],
     }
 

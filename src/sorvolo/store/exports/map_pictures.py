@@ -84,7 +84,9 @@ class SmallMap:
     def picture(self, *beside: "SmallMap") -> Picture:
         """What was drawn, cropped to what is seen in it or in any of the maps `beside` it, of the same tiles."""
         seen = np.any([each._canvas[..., 3] > 0 for each in (self, *beside)], axis=0)
-        (y0, y1), (x0, x1) = (np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0))
+        (y0, y1), (x0, x1) = (
+            np.flatnonzero(seen.any(axis=axis))[[0, -1]] + [0, 1] for axis in (1, 0)
+        )
         corner_px = tuple(
             float(tile * self._tile_px + int(first) * self._step - 0.5)
             for tile, first in ((self._left, x0), (self._top, y0))
@@ -94,7 +96,7 @@ class SmallMap:
 
     def _part(self, index: TileIndex) -> ImageRGBA:
         x, y = (index[0] - self._left) * self._side, (index[1] - self._top) * self._side
-        return self._canvas[y:y + self._side, x:x + self._side]
+        return self._canvas[y : y + self._side, x : x + self._side]
 
 
 class LivePreview:
@@ -105,7 +107,9 @@ class LivePreview:
         self._shrunk: dict[TileIndex, ImageRGBA] = {}
         self._side = tile_px
 
-    def write(self, tiles: Mapping[TileIndex, ImageRGBA], changed: Collection[TileIndex], path: Path) -> None:
+    def write(
+        self, tiles: Mapping[TileIndex, ImageRGBA], changed: Collection[TileIndex], path: Path
+    ) -> None:
         """Write the map, of whose tiles `changed` are others than when it was written last; nothing without tiles."""
         if not tiles:
             return
@@ -113,7 +117,9 @@ class LivePreview:
         if small.side_px != self._side:
             kept = {} if small.side_px > self._side else self._shrunk
             self._side = small.side_px
-            self._shrunk = {index: shrink(each, self._side, self._side) for index, each in kept.items()}
+            self._shrunk = {
+                index: shrink(each, self._side, self._side) for index, each in kept.items()
+            }
         for index in tiles:
             if index not in self._shrunk or index in changed:
                 self._shrunk[index] = shrink(tiles[index], self._side, self._side)
@@ -135,13 +141,17 @@ def with_room(shown: Picture, corners_px: PointsPx, max_px: int) -> Picture:
     height, width = shown.rgba.shape[:2]
     low = np.minimum(corner_px, np.floor(corners_px.min(axis=0)))
     high = np.maximum(corner_px + step * np.array([width, height]), corners_px.max(axis=0))
-    times = max(1, int(np.ceil((high - low).max() / (step * (max_px - 2)))))  # room at both ends is rounded up
+    times = max(
+        1, int(np.ceil((high - low).max() / (step * (max_px - 2))))
+    )  # room at both ends is rounded up
     wider = step * times
     before = np.ceil((corner_px - low) / wider).astype(int)  # pixels of the wider picture
     own = -(-np.array([width, height]) // times)
     after = np.maximum(np.ceil((high - corner_px) / wider).astype(int) - own, 0)
     padded = np.pad(shown.rgba, [(0, own[1] * times - height), (0, own[0] * times - width), (0, 0)])
-    rgba = np.pad(shrink(padded, own[0], own[1]), [(before[1], after[1]), (before[0], after[0]), (0, 0)])
+    rgba = np.pad(
+        shrink(padded, own[0], own[1]), [(before[1], after[1]), (before[0], after[0]), (0, 0)]
+    )
     corner = corner_px - before * wider
     return Picture(rgba, (float(corner[0]), float(corner[1])), wider, shown.shown_px)
 
@@ -154,7 +164,9 @@ def pictures(
     Tiles at the places `alike` are the same in all maps and are read once.
     """
     indexes = sorted(set().union(*maps))
-    tile_px = next(tiles[index].shape[0] for index in indexes[:1] for tiles in maps if index in tiles)
+    tile_px = next(
+        tiles[index].shape[0] for index in indexes[:1] for tiles in maps if index in tiles
+    )
     small = [SmallMap(indexes, tile_px, max_px) for _ in maps]
     for each, tiles in zip(small, maps):
         known = alike if each is not small[0] else ()
@@ -174,7 +186,9 @@ def _thinning(tiles: int, tile_px: int, max_px: int) -> int:
     return step
 
 
-def write_preview(tiles: Mapping[TileIndex, ImageRGBA], path: Path, max_px: int = PREVIEW_PX) -> None:
+def write_preview(
+    tiles: Mapping[TileIndex, ImageRGBA], path: Path, max_px: int = PREVIEW_PX
+) -> None:
     """Write the map as one PNG with a transparent background."""
     atomic_write_bytes(path, png_from_rgba(picture(tiles, max_px).rgba))
 
@@ -184,7 +198,9 @@ def small_map_of(tiles: Collection[TileIndex], tile_px: int) -> SmallMap:
     return SmallMap(tiles, tile_px, _KMZ_PX)
 
 
-def write_small_maps(small: SmallMap, site_grid: SiteGrid, name: str, preview: Path, kmz: Path | None) -> None:
+def write_small_maps(
+    small: SmallMap, site_grid: SiteGrid, name: str, preview: Path, kmz: Path | None
+) -> None:
     """Write what `write_preview` and, unless that is None, `write_kmz` do, of a `small_map_of` all tiles."""
     shown = small.picture()
     rgba = shown.rgba
@@ -197,7 +213,9 @@ def write_small_maps(small: SmallMap, site_grid: SiteGrid, name: str, preview: P
         _write_kmz(shown, site_grid, name, kmz)
 
 
-def write_kmz(tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: str, path: Path) -> None:
+def write_kmz(
+    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, name: str, path: Path
+) -> None:
     """Write the map as a KMZ of north-up ground overlays in WGS84, at most 4096 px a side.
 
     The site must have a CRS. Raises StoreError on a full disk.
@@ -211,7 +229,9 @@ def _write_kmz(small: Picture, site_grid: SiteGrid, name: str, path: Path) -> No
     counts = -(-size // _KMZ_PIECE_PX)
     longitudes = np.linspace(west, east, counts[0] + 1)
     latitudes = np.linspace(north, south, counts[1] + 1)
-    pieces: list[tuple[str, str, tuple[float, float, float, float], bytes]] = []  # title, file, box, picture
+    pieces: list[
+        tuple[str, str, tuple[float, float, float, float], bytes]
+    ] = []  # title, file, box, picture
     for row in range(counts[1]):
         for column in range(counts[0]):
             box = (longitudes[column], latitudes[row + 1], longitudes[column + 1], latitudes[row])
@@ -242,12 +262,19 @@ def _bounds_deg(small: Picture, site_grid: SiteGrid) -> tuple[float, float, floa
     latitudes, longitudes = Projection(site_grid.grid.crs).wgs84_from_projected(points_m)
     longitudes = near_longitudes(longitudes, site_grid.frame.origin.longitude_deg)
     return (
-        float(longitudes.min()), float(latitudes.min()), float(longitudes.max()), float(latitudes.max())
+        float(longitudes.min()),
+        float(latitudes.min()),
+        float(longitudes.max()),
+        float(latitudes.max()),
     )
 
 
 def _north_up(
-    small: Picture, site_grid: SiteGrid, box_deg: tuple[float, float, float, float], width: int, height: int
+    small: Picture,
+    site_grid: SiteGrid,
+    box_deg: tuple[float, float, float, float],
+    width: int,
+    height: int,
 ) -> ImageRGBA:
     """The part of the picture in the box (west, south, east, north), with pixels along meridian and parallel.
 
@@ -266,6 +293,8 @@ def _north_up(
     if x0 == x1 or y0 == y1:
         return np.zeros((height, width, 4), np.uint8)
     target = np.array([[0, 0], [width, 0], [width, height], [0, height]]) - 0.5
-    matrix = cv2.getPerspectiveTransform((source - [x0, y0]).astype(np.float32), target.astype(np.float32))
+    matrix = cv2.getPerspectiveTransform(
+        (source - [x0, y0]).astype(np.float32), target.astype(np.float32)
+    )
     part = weighted(small.rgba[y0:y1, x0:x1])
     return unweighted(cv2.warpPerspective(part, matrix, (width, height), flags=cv2.INTER_LINEAR))

@@ -19,7 +19,9 @@ CROPS = "objects"
 """The folder of a flight's crops."""
 
 
-def objects_geojson(objects: Iterable[StoredObject], site: Site, *, crops_from_site: bool) -> dict[str, Any]:
+def objects_geojson(
+    objects: Iterable[StoredObject], site: Site, *, crops_from_site: bool
+) -> dict[str, Any]:
     """Objects as a GeoJSON FeatureCollection, a point each (docs/formats.md).
 
     `crop` is relative to the site folder or to the flight's. For a local site it is plain JSON with coordinates in
@@ -39,9 +41,15 @@ def object_placemarks(objects: Iterable[StoredObject], site: Site) -> list[Place
             f"{time_words(each.first_seen_ns)}\nposition accuracy {each.sigma_m:.2f} m (1 sigma)"
             + ("\nmoving" if each.moving else "")
         )
-        placemarks.append(Placemark(
-            f"{each.id} {each.label}", words, float(longitudes[0]), float(latitudes[0]), each.first_seen_ns
-        ))
+        placemarks.append(
+            Placemark(
+                f"{each.id} {each.label}",
+                words,
+                float(longitudes[0]),
+                float(latitudes[0]),
+                each.first_seen_ns,
+            )
+        )
     return placemarks
 
 
@@ -60,7 +68,10 @@ def _feature(stored: StoredObject, site: Site, crops_from_site: bool) -> dict[st
     folder = f"flights/{stored.flight_id}/" if crops_from_site else ""
     east_m, north_m = each.position_m
     properties: dict[str, Any] = {
-        "id": each.id, "flight": stored.flight_id, "class": each.label, "score": rounded(each.score, 4),
+        "id": each.id,
+        "flight": stored.flight_id,
+        "class": each.label,
+        "score": rounded(each.score, 4),
     }
     if site.is_local:
         coordinates = [rounded(east_m, 4), rounded(north_m, 4)]
@@ -69,16 +80,25 @@ def _feature(stored: StoredObject, site: Site, crops_from_site: bool) -> dict[st
         coordinates = [rounded(longitudes[0], 8), rounded(latitudes[0], 8)]
         properties |= {"latitude": coordinates[1], "longitude": coordinates[0]}
     properties |= {
-        "east_m": rounded(east_m, 3), "north_m": rounded(north_m, 3), "sigma_m": rounded(each.sigma_m, 3),
-        "length_m": rounded(each.length_m, 2), "width_m": rounded(each.width_m, 2),
-        "views": each.views, "possible_views": each.possible_views,
-        "first_seen": utc_text(each.first_seen_ns), "last_seen": utc_text(each.last_seen_ns),
-        "flights": list(stored.flights), "moving": each.moving,
+        "east_m": rounded(east_m, 3),
+        "north_m": rounded(north_m, 3),
+        "sigma_m": rounded(each.sigma_m, 3),
+        "length_m": rounded(each.length_m, 2),
+        "width_m": rounded(each.width_m, 2),
+        "views": each.views,
+        "possible_views": each.possible_views,
+        "first_seen": utc_text(each.first_seen_ns),
+        "last_seen": utc_text(each.last_seen_ns),
+        "flights": list(stored.flights),
+        "moving": each.moving,
         "velocity_m_s": [rounded(speed, 3) for speed in each.velocity_m_s] if each.moving else None,
         "class_scores": {name: rounded(share, 4) for name, share in each.class_scores.items()},
-        "best_frame": each.best_frame, "crop": f"{folder}{CROPS}/{crop_name(each.id)}",
+        "best_frame": each.best_frame,
+        "crop": f"{folder}{CROPS}/{crop_name(each.id)}",
     }
     return {
-        "type": "Feature", "id": each.id, "geometry": {"type": "Point", "coordinates": coordinates},
+        "type": "Feature",
+        "id": each.id,
+        "geometry": {"type": "Point", "coordinates": coordinates},
         "properties": properties,
     }

@@ -40,7 +40,9 @@ def kml_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
     """The places as KML: a point each, and its outline where it has one."""
     with kml_from_one(_printable(title)) as document:
         for each in placemarks:
-            folder = document.newmultigeometry(name=_printable(each.name), description=_printable(each.description))
+            folder = document.newmultigeometry(
+                name=_printable(each.name), description=_printable(each.description)
+            )
             folder.newpoint(coords=[(each.longitude_deg, each.latitude_deg)])
             if each.outline_deg:
                 folder.newpolygon(outerboundaryis=[*each.outline_deg, each.outline_deg[0]])
@@ -57,11 +59,15 @@ def gpx_bytes(title: str, placemarks: Sequence[Placemark]) -> bytes:
     document = gpxpy.gpx.GPX()
     document.creator, document.name = "Sorvolo", _printable(title)
     for each in placemarks:
-        document.waypoints.append(gpxpy.gpx.GPXWaypoint(
-            latitude=round(each.latitude_deg, 8), longitude=round((each.longitude_deg + 180) % 360 - 180, 8),
-            name=_printable(each.name), description=_printable(each.description),
-            time=_moment(each.seen_ns) if each.seen_ns >= DAY_NS else None,
-        ))
+        document.waypoints.append(
+            gpxpy.gpx.GPXWaypoint(
+                latitude=round(each.latitude_deg, 8),
+                longitude=round((each.longitude_deg + 180) % 360 - 180, 8),
+                name=_printable(each.name),
+                description=_printable(each.description),
+                time=_moment(each.seen_ns) if each.seen_ns >= DAY_NS else None,
+            )
+        )
     return document.to_xml(version="1.1").encode()
 
 

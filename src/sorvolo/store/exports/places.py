@@ -18,7 +18,9 @@ def longitude_latitude(points_m: Floats, site: Site) -> tuple[Floats, Floats]:
 
 def near_longitudes(longitudes_deg: Floats, reference_deg: float) -> Floats:
     """The same longitudes within half a turn of the reference, so that none jumps at the antimeridian."""
-    return np.asarray(longitudes_deg) + 360 * np.round((reference_deg - np.asarray(longitudes_deg)) / 360)
+    return np.asarray(longitudes_deg) + 360 * np.round(
+        (reference_deg - np.asarray(longitudes_deg)) / 360
+    )
 
 
 def wrapped_deg(longitude_deg: float) -> float:
@@ -39,6 +41,12 @@ def place_words(point_m: Floats, site: Site) -> dict[str, str]:
 
 def degrees_words(latitude_deg: float, longitude_deg: float) -> dict[str, str]:
     """A place of WGS84 in each notation of SYSTEMS that it has."""
-    words = {system.value: place_text(latitude_deg, longitude_deg, system) for system in Coordinates}
+    words = {
+        system.value: place_text(latitude_deg, longitude_deg, system) for system in Coordinates
+    }
     degrees = words[Coordinates.LATLON.value]
-    return {name: text for name, text in words.items() if name == Coordinates.LATLON.value or text != degrees}
+    return {
+        name: text
+        for name, text in words.items()
+        if name == Coordinates.LATLON.value or text != degrees
+    }

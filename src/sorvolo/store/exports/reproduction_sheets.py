@@ -6,7 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-_METHODS_4_1 = {"proposed": "thesis", "bu_et_al": "Bu et al.", "pix4d": "Pix4D", "photoscan": "Photoscan"}
+_METHODS_4_1 = {
+    "proposed": "thesis",
+    "bu_et_al": "Bu et al.",
+    "pix4d": "Pix4D",
+    "photoscan": "Photoscan",
+}
 _COUNTS = ("tp", "fp", "fn", "tn")
 _RATES = ("precision", "recall", "accuracy", "f1")
 _RATE_NAMES = ("TP", "FP", "FN", "TN", "precision, %", "recall, %", "accuracy, %", "F1, %")
@@ -34,7 +39,12 @@ class Sheet:
     @property
     def markdown(self) -> str:
         """The table in Markdown, under its title."""
-        lines = [f"### {self.title}", "", _markdown_row(self.columns), _markdown_row(["---"] * len(self.columns))]
+        lines = [
+            f"### {self.title}",
+            "",
+            _markdown_row(self.columns),
+            _markdown_row(["---"] * len(self.columns)),
+        ]
         lines += [_markdown_row(row) for row in self.rows]
         return "\n".join([*lines, "", *(f"- {note}" for note in self.notes)]).rstrip() + "\n"
 
@@ -42,10 +52,13 @@ class Sheet:
 def reproduction_sheets(tables: Mapping[str, Any]) -> list[Sheet]:
     """The sheets of what `missions.reproduce.thesis_tables.tables_of` gives, in the order of the thesis's chapter."""
     return [
-        _distortions(tables["figure_3_12"]), *_times(tables["table_4_1"]), _deviations(tables["section_4_1_1"]),
+        _distortions(tables["figure_3_12"]),
+        *_times(tables["table_4_1"]),
+        _deviations(tables["section_4_1_1"]),
         _counted(tables["tables_4_3_and_4_4"], "tables_4_3_and_4_4", "Tables 4.3 and 4.4: frames"),
         _counted(tables["table_4_5"], "table_4_5", "Table 4.5: pixels"),
-        _seconds(tables["section_4_2_2"]), _precisions(tables["table_4_6"]),
+        _seconds(tables["section_4_2_2"]),
+        _precisions(tables["table_4_6"]),
     ]
 
 
@@ -57,49 +70,82 @@ def percent(share: float | None) -> str:
 def _distortions(table: Mapping[str, Any]) -> Sheet:
     rows = [
         (
-            each["sequence"], "rigid, 4 degrees of freedom" if each["transform"] == "similarity" else "homography",
-            f"{each['frames']} of {each['selected']}", _number(each["sides"], 3), _number(each["areas"], 3),
+            each["sequence"],
+            "rigid, 4 degrees of freedom" if each["transform"] == "similarity" else "homography",
+            f"{each['frames']} of {each['selected']}",
+            _number(each["sides"], 3),
+            _number(each["areas"], 3),
             percent(each["bend"]),
         )
         for each in table["ours"]
     ]
     columns = (
-        "sequence", "transform", "frames placed", "opposite sides, largest ratio", "areas, largest ratio",
+        "sequence",
+        "transform",
+        "frames placed",
+        "opposite sides, largest ratio",
+        "areas, largest ratio",
         "bend of the path, %",
     )
     notes = (
         "Ratios are of the frames' outlines on the map: 1 is an undistorted frame. The bend is the path's largest "
         "distance from the chord between its ends, over the chord; wind and drift bend it, too.",
     )
-    return Sheet("figure_3_12", "Figure 3.12: homography and rigid transform", columns, tuple(rows), notes)
+    return Sheet(
+        "figure_3_12", "Figure 3.12: homography and rigid transform", columns, tuple(rows), notes
+    )
 
 
 def _times(table: Mapping[str, Any]) -> list[Sheet]:
     printed = [
         (
-            each["sequence"], f"{each['frames']}", f"{each['keyframes']}",
-            *(f"{each[key]:g}" for key in _METHODS_4_1), f"{60 * each['proposed'] / each['keyframes']:.2f}",
+            each["sequence"],
+            f"{each['frames']}",
+            f"{each['keyframes']}",
+            *(f"{each[key]:g}" for key in _METHODS_4_1),
+            f"{60 * each['proposed'] / each['keyframes']:.2f}",
         )
         for each in table["published"]
     ]
     ours = [
         (
-            _sequence(each), each["method"], f"{each['frames']}", f"{each['keyframes']}", f"{each['matched']}",
-            _number(each["minutes"], 2), _number(each["cpu_minutes"], 2), _number(each["seconds_per_keyframe"], 2),
-            percent(each["deviation"]), str(each["quality"] or "-"),
+            _sequence(each),
+            each["method"],
+            f"{each['frames']}",
+            f"{each['keyframes']}",
+            f"{each['matched']}",
+            _number(each["minutes"], 2),
+            _number(each["cpu_minutes"], 2),
+            _number(each["seconds_per_keyframe"], 2),
+            percent(each["deviation"]),
+            str(each["quality"] or "-"),
         )
         for each in table["ours"]
     ]
     return [
         Sheet(
-            "table_4_1_printed", "Table 4.1 as printed: minutes",
-            ("sequence", "frames", "KFs", *_METHODS_4_1.values(), "thesis: s a KF"), tuple(printed),
+            "table_4_1_printed",
+            "Table 4.1 as printed: minutes",
+            ("sequence", "frames", "KFs", *_METHODS_4_1.values(), "thesis: s a KF"),
+            tuple(printed),
         ),
         Sheet(
-            "table_4_1", "Table 4.1 here",
-            ("sequence", "method", "frames", "KFs", "matched", "minutes", "processor minutes", "processor s a KF",
-             "deviation, %", "quality"),
-            tuple(ours), tuple(table["differences"]),
+            "table_4_1",
+            "Table 4.1 here",
+            (
+                "sequence",
+                "method",
+                "frames",
+                "KFs",
+                "matched",
+                "minutes",
+                "processor minutes",
+                "processor s a KF",
+                "deviation, %",
+                "quality",
+            ),
+            tuple(ours),
+            tuple(table["differences"]),
         ),
     ]
 
@@ -110,23 +156,39 @@ def _sequence(each: Mapping[str, Any]) -> str:
 
 def _deviations(table: Mapping[str, Any]) -> Sheet:
     printed = table["published"]
-    rows = [("thesis, printed", f"{printed['videos']}", f"about {percent(printed['deviation'])}",
-             f"about {percent(printed['correlation'])} (4 videos)")]
+    rows = [
+        (
+            "thesis, printed",
+            f"{printed['videos']}",
+            f"about {percent(printed['deviation'])}",
+            f"about {percent(printed['correlation'])} (4 videos)",
+        )
+    ]
     rows += [
         (
-            f"{each['method']} here", f"{each['videos']}", percent(each["deviation"]),
+            f"{each['method']} here",
+            f"{each['videos']}",
+            percent(each["deviation"]),
             f"{percent(each['correlation'])} ({counted_videos(each['correlated'])})",
         )
         for each in table["ours"]
     ]
     rows += [
         (
-            f"{each['method']} here, with the mosaics of [17]", f"{each['published']}", "-",
+            f"{each['method']} here, with the mosaics of [17]",
+            f"{each['published']}",
+            "-",
             f"{percent(each['published_correlation'])} ({counted_videos(each['published'])})",
         )
-        for each in table["ours"] if each["published"]
+        for each in table["ours"]
+        if each["published"]
     ]
-    columns = ("method", "videos", "deviation from the frames, %", "correlation with another map (eq. 4.1), %")
+    columns = (
+        "method",
+        "videos",
+        "deviation from the frames, %",
+        "correlation with another map (eq. 4.1), %",
+    )
     title = "Section 4.1.1: how good the mosaics are"
     return Sheet("section_4_1_1", title, columns, tuple(rows), tuple(table["differences"]))
 
@@ -135,20 +197,30 @@ def _counted(table: Mapping[str, Any], name: str, title: str) -> Sheet:
     published = table["published"]
     printed = [
         (
-            f"{each['method']}, printed", "13871 frames" if each["method"] == "thesis" else "-", "-",
-            *(str(each.get(key, "-")) for key in _COUNTS), *(percent(each[key]) for key in _RATES),
+            f"{each['method']}, printed",
+            "13871 frames" if each["method"] == "thesis" else "-",
+            "-",
+            *(str(each.get(key, "-")) for key in _COUNTS),
+            *(percent(each[key]) for key in _RATES),
         )
         for each in ([published] if isinstance(published, Mapping) else published)
     ]
     ours = [
         (
-            f"{each['method']}, here", f"{each['compared']} views of {counted_videos(each['videos'])}",
-            each["judged_by"], *(str(each[key]) for key in _COUNTS), *(percent(each[key]) for key in _RATES),
+            f"{each['method']}, here",
+            f"{each['compared']} views of {counted_videos(each['videos'])}",
+            each["judged_by"],
+            *(str(each[key]) for key in _COUNTS),
+            *(percent(each[key]) for key in _RATES),
         )
         for each in table["ours"]
     ]
     return Sheet(
-        name, title, ("method", "compared", "judged by", *_RATE_NAMES), (*printed, *ours), tuple(table["differences"])
+        name,
+        title,
+        ("method", "compared", "judged by", *_RATE_NAMES),
+        (*printed, *ours),
+        tuple(table["differences"]),
     )
 
 
@@ -159,12 +231,22 @@ def counted_videos(videos: int) -> str:
 
 def _seconds(table: Mapping[str, Any]) -> Sheet:
     printed = table["published"]
-    rows = [("thesis, printed", "not stated", _number(printed["single_thread_s"], 3), "-",
-             _number(printed["multithread_s"], 3))]
+    rows = [
+        (
+            "thesis, printed",
+            "not stated",
+            _number(printed["single_thread_s"], 3),
+            "-",
+            _number(printed["multithread_s"], 3),
+        )
+    ]
     rows += [
         (
-            f"{each['sequence']}, here", f"{each['width_px']} x {each['height_px']}",
-            _number(each["single_thread_s"], 3), f"{each['threads']}", _number(each["multithread_s"], 3),
+            f"{each['sequence']}, here",
+            f"{each['width_px']} x {each['height_px']}",
+            _number(each["single_thread_s"], 3),
+            f"{each['threads']}",
+            _number(each["multithread_s"], 3),
         )
         for each in table["ours"]
     ]
@@ -176,19 +258,26 @@ def _seconds(table: Mapping[str, Any]) -> Sheet:
 def _precisions(table: Mapping[str, Any]) -> Sheet:
     printed = [
         (f"{model} Faster R-CNN, printed", dataset, "2000 epochs", "-", percent(score), "-")
-        for model, scores in table["published"].items() for dataset, score in scores.items()
+        for model, scores in table["published"].items()
+        for dataset, score in scores.items()
     ]
     ours = [
         (
-            f"{each['model']}, here", each["dataset"],
-            f"{each['steps']} steps of preset {each['preset']}" if "steps" in each else "as packaged",
-            f"{each['pictures']} of {counted_videos(each['videos'])}", percent(each["thesis_map"]),
+            f"{each['model']}, here",
+            each["dataset"],
+            f"{each['steps']} steps of preset {each['preset']}"
+            if "steps" in each
+            else "as packaged",
+            f"{each['pictures']} of {counted_videos(each['videos'])}",
+            percent(each["thesis_map"]),
             percent(each["ap50"]),
         )
         for each in table["ours"]
     ]
     columns = ("network", "dataset", "training", "test frames", "mAP (eq. 4.4), %", "AP50, %")
-    return Sheet("table_4_6", "Table 4.6: detectors", columns, (*printed, *ours), tuple(table["differences"]))
+    return Sheet(
+        "table_4_6", "Table 4.6: detectors", columns, (*printed, *ours), tuple(table["differences"])
+    )
 
 
 def _number(value: float | None, decimals: int) -> str:

@@ -67,7 +67,12 @@ class _Extent:
     def add(self, place: BaseGeometry) -> None:
         west, south, east, north = place.bounds
         known = self.bounds
-        self.bounds = min(known[0], west), min(known[1], south), max(known[2], east), max(known[3], north)
+        self.bounds = (
+            min(known[0], west),
+            min(known[1], south),
+            max(known[2], east),
+            max(known[3], north),
+        )
         self.types.add(place.geom_type)
         self.rows += 1
 
@@ -100,10 +105,14 @@ class ItemTable:
     def finish(self) -> None:
         """Write what waits, and what the whole file holds."""
         self._write()
-        self._file.add_key_value_metadata({
-            "geo": json.dumps(_geo(self._extent)),
-            "stac-geoparquet": json.dumps({"version": _VERSION, "collections": self._collections}),
-        })
+        self._file.add_key_value_metadata(
+            {
+                "geo": json.dumps(_geo(self._extent)),
+                "stac-geoparquet": json.dumps(
+                    {"version": _VERSION, "collections": self._collections}
+                ),
+            }
+        )
 
     def _write(self) -> None:
         import pyarrow
@@ -127,7 +136,9 @@ def item_table(path: Path, own: Mapping[str, str]) -> Iterator[ItemTable]:
     with (
         atomic_path(path) as temporary,
         # with Arrow's own schema in the file, readers would look for the metadata there, which is written first
-        pyarrow.parquet.ParquetWriter(temporary, schema, compression="zstd", store_schema=False) as file,
+        pyarrow.parquet.ParquetWriter(
+            temporary, schema, compression="zstd", store_schema=False
+        ) as file,
     ):
         table = ItemTable(file, schema, own)
         yield table
@@ -137,7 +148,9 @@ def item_table(path: Path, own: Mapping[str, str]) -> Iterator[ItemTable]:
 def demand_pyarrow() -> None:
     """Raises SettingsError where the library that writes Parquet is not installed."""
     if importlib.util.find_spec("pyarrow") is None:
-        raise SettingsError("Parquet needs one more package; install it: pip install 'sorvolo[archive]'")
+        raise SettingsError(
+            "Parquet needs one more package; install it: pip install 'sorvolo[archive]'"
+        )
 
 
 def _collection(items: Sequence[StacItem], title: str) -> dict[str, Any]:
@@ -148,8 +161,12 @@ def _collection(items: Sequence[StacItem], title: str) -> dict[str, Any]:
     first = min(each.moment_ns if each.first_ns is None else each.first_ns for each in items)
     last = max(each.moment_ns if each.last_ns is None else each.last_ns for each in items)
     return {
-        "type": "Collection", "stac_version": STAC_VERSION, "id": items[0].collection, "title": title,
-        "license": "other", "description": "A map made of drone flights: its versions, flights, changes and objects.",
+        "type": "Collection",
+        "stac_version": STAC_VERSION,
+        "id": items[0].collection,
+        "title": title,
+        "license": "other",
+        "description": "A map made of drone flights: its versions, flights, changes and objects.",
         "extent": {
             "spatial": {"bbox": [list(extent.bounds)]},
             "temporal": {"interval": [[utc_text(first), utc_text(last)]]},
@@ -161,16 +178,25 @@ def _collection(items: Sequence[StacItem], title: str) -> dict[str, Any]:
 def _row(item: StacItem, own: Mapping[str, str]) -> dict[str, Any]:
     west, south, east, north = item.place.bounds
     return {
-        "type": "Feature", "stac_version": STAC_VERSION, "stac_extensions": [], "id": item.id,
-        "collection": item.collection, "geometry": shapely.to_wkb(item.place),
-        "bbox": {"xmin": west, "ymin": south, "xmax": east, "ymax": north}, "links": [],
+        "type": "Feature",
+        "stac_version": STAC_VERSION,
+        "stac_extensions": [],
+        "id": item.id,
+        "collection": item.collection,
+        "geometry": shapely.to_wkb(item.place),
+        "bbox": {"xmin": west, "ymin": south, "xmax": east, "ymax": north},
+        "links": [],
         "assets": {
             name: {"href": each.href, "type": each.type, "title": each.title, "roles": [each.role]}
             for name, each in item.assets.items()
         },
-        "datetime": _time(item.moment_ns), "start_datetime": _time(item.first_ns), "end_datetime": _time(item.last_ns),
+        "datetime": _time(item.moment_ns),
+        "start_datetime": _time(item.first_ns),
+        "end_datetime": _time(item.last_ns),
         "created": datetime.fromisoformat(item.created_utc) if item.created_utc else None,
-        "title": item.title, "gsd": item.gsd_m, **{name: item.properties.get(name) for name in own},
+        "title": item.title,
+        "gsd": item.gsd_m,
+        **{name: item.properties.get(name) for name in own},
     }
 
 
@@ -188,24 +214,38 @@ def _schema(own: Mapping[str, str]) -> "pyarrow.Schema":
     asset = pa.struct([("href", text), ("type", text), ("title", text), ("roles", pa.list_(text))])
     link = pa.struct([("href", text), ("rel", text), ("type", text), ("title", text)])
     types = {"string": text, "int32": pa.int32(), "double": pa.float64()}
-    return pa.schema([
-        ("type", text), ("stac_version", text), ("stac_extensions", pa.list_(text)), ("id", text), ("collection", text),
-        pa.field("geometry", pa.binary(), nullable=False),
-        pa.field("bbox", pa.struct([(each, pa.float64()) for each in ("xmin", "ymin", "xmax", "ymax")])),
-        ("links", pa.list_(link)), ("assets", pa.struct([(each, asset) for each in ASSETS])),
-        ("datetime", moment), ("start_datetime", moment), ("end_datetime", moment), ("created", moment),
-        ("title", text), ("gsd", pa.float64()), *((name, types[kind]) for name, kind in own.items()),
-    ])
+    return pa.schema(
+        [
+            ("type", text),
+            ("stac_version", text),
+            ("stac_extensions", pa.list_(text)),
+            ("id", text),
+            ("collection", text),
+            pa.field("geometry", pa.binary(), nullable=False),
+            pa.field(
+                "bbox",
+                pa.struct([(each, pa.float64()) for each in ("xmin", "ymin", "xmax", "ymax")]),
+            ),
+            ("links", pa.list_(link)),
+            ("assets", pa.struct([(each, asset) for each in ASSETS])),
+            ("datetime", moment),
+            ("start_datetime", moment),
+            ("end_datetime", moment),
+            ("created", moment),
+            ("title", text),
+            ("gsd", pa.float64()),
+            *((name, types[kind]) for name, kind in own.items()),
+        ]
+    )
 
 
 def _geo(extent: _Extent) -> dict[str, Any]:
     """The metadata of GeoParquet: longitude and latitude in WGS84 (its default), with boxes for skipping."""
     column: dict[str, Any] = {
-        "encoding": "WKB", "geometry_types": sorted(extent.types),
+        "encoding": "WKB",
+        "geometry_types": sorted(extent.types),
         "covering": {"bbox": {each: ["bbox", each] for each in ("xmin", "ymin", "xmax", "ymax")}},
     }
     if extent.rows:
         column["bbox"] = list(extent.bounds)
     return {"version": _VERSION, "primary_column": "geometry", "columns": {"geometry": column}}
-
-

@@ -55,26 +55,36 @@ def track_csv(frames: Sequence[CorrectedFrame], height_reference: str) -> str:
     writer.writerow([*(name for name in names if name != "time_ns"), "utc", "height_reference"])
     for each in frames:
         row = {name: value for name, value in asdict(each).items() if name != "time_ns"}
-        plain = ["" if isinstance(value, float) and math.isnan(value) else value for value in row.values()]
+        plain = [
+            "" if isinstance(value, float) and math.isnan(value) else value
+            for value in row.values()
+        ]
         writer.writerow([*plain, utc_text(each.time_ns) if has_dates else "", height_reference])
     return text.getvalue()
 
 
 def track_gpx(frames: Sequence[CorrectedFrame], name: str) -> bytes:
     """A GPX 1.1 track; each point's description has its sigma. Without a date no point has a time."""
-    gpx = Element("gpx", {"version": "1.1", "creator": "sorvolo", "xmlns": "http://www.topografix.com/GPX/1/1"})
+    gpx = Element(
+        "gpx",
+        {"version": "1.1", "creator": "sorvolo", "xmlns": "http://www.topografix.com/GPX/1/1"},
+    )
     track = SubElement(gpx, "trk")
     SubElement(track, "name").text = name
     segment, has_dates = SubElement(track, "trkseg"), is_dated(frames)
     for each in frames:
-        point = SubElement(segment, "trkpt", {"lat": f"{each.latitude_deg:.9f}", "lon": f"{_wrapped(each):.9f}"})
+        point = SubElement(
+            segment, "trkpt", {"lat": f"{each.latitude_deg:.9f}", "lon": f"{_wrapped(each):.9f}"}
+        )
         SubElement(point, "ele").text = f"{each.height_m:.3f}"
         if has_dates:
             SubElement(point, "time").text = utc_text(each.time_ns)
         SubElement(point, "name").text = each.name
         if not math.isnan(each.sigma_m):
             SubElement(point, "desc").text = f"position accuracy {each.sigma_m:.2f} m (1 sigma)"
-    return b'<?xml version="1.0" encoding="UTF-8"?>\n' + bytes(tostring(gpx, encoding="utf-8")) + b"\n"
+    return (
+        b'<?xml version="1.0" encoding="UTF-8"?>\n' + bytes(tostring(gpx, encoding="utf-8")) + b"\n"
+    )
 
 
 def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bool) -> bytes:
@@ -87,15 +97,29 @@ def cot_track(frames: Sequence[CorrectedFrame], name: str, *, is_ellipsoidal: bo
     """
     lines = []
     for number, each in enumerate(frames):
-        event = Element("event", {
-            "version": "2.0", "uid": f"sorvolo.{name}", "type": _DRONE, "how": "m-g", "time": _moment(each.time_ns),
-            "start": _moment(each.time_ns), "stale": _moment(each.time_ns + _STALE_NS),
-        })
-        SubElement(event, "point", {
-            "lat": f"{each.latitude_deg:.7f}", "lon": f"{_wrapped(each):.7f}",
-            "hae": f"{each.height_m:.1f}" if is_ellipsoidal else _UNKNOWN_M,
-            "ce": _UNKNOWN_M if math.isnan(each.sigma_m) else f"{each.sigma_m:.1f}", "le": _UNKNOWN_M,
-        })
+        event = Element(
+            "event",
+            {
+                "version": "2.0",
+                "uid": f"sorvolo.{name}",
+                "type": _DRONE,
+                "how": "m-g",
+                "time": _moment(each.time_ns),
+                "start": _moment(each.time_ns),
+                "stale": _moment(each.time_ns + _STALE_NS),
+            },
+        )
+        SubElement(
+            event,
+            "point",
+            {
+                "lat": f"{each.latitude_deg:.7f}",
+                "lon": f"{_wrapped(each):.7f}",
+                "hae": f"{each.height_m:.1f}" if is_ellipsoidal else _UNKNOWN_M,
+                "ce": _UNKNOWN_M if math.isnan(each.sigma_m) else f"{each.sigma_m:.1f}",
+                "le": _UNKNOWN_M,
+            },
+        )
         detail = SubElement(event, "detail")
         SubElement(detail, "contact", {"callsign": name})
         SubElement(detail, "sensor", _sensor(each))
@@ -112,16 +136,23 @@ def _sensor(each: CorrectedFrame) -> dict[str, str]:
     if each.pitch_deg < _NADIR_DEG:
         azimuth_deg, roll_deg = _body_angles_deg(each)[0], 0.0
     return {
-        "azimuth": f"{azimuth_deg % 360:.1f}", "elevation": f"{each.pitch_deg:.1f}", "roll": f"{roll_deg:.1f}",
-        "fov": f"{each.horizontal_fov_deg:.1f}", "vfov": f"{each.vertical_fov_deg:.1f}",
-        "range": f"{each.above_ground_m / down:.0f}" if down > 0.05 else "0", "model": "camera", "type": "r-e",
+        "azimuth": f"{azimuth_deg % 360:.1f}",
+        "elevation": f"{each.pitch_deg:.1f}",
+        "roll": f"{roll_deg:.1f}",
+        "fov": f"{each.horizontal_fov_deg:.1f}",
+        "vfov": f"{each.vertical_fov_deg:.1f}",
+        "range": f"{each.above_ground_m / down:.0f}" if down > 0.05 else "0",
+        "model": "camera",
+        "type": "r-e",
         "version": "0.6",
     }
 
 
 def _body_angles_deg(each: CorrectedFrame) -> tuple[float, float, float]:
     """Yaw, pitch and roll of a body that the camera looks straight down from, x to the top of the picture."""
-    return body_nadir_angles_from_rotation(site_from_gimbal_rotation(each.yaw_deg, each.pitch_deg, each.roll_deg))
+    return body_nadir_angles_from_rotation(
+        site_from_gimbal_rotation(each.yaw_deg, each.pitch_deg, each.roll_deg)
+    )
 
 
 def _course(before: CorrectedFrame, now: CorrectedFrame) -> dict[str, str]:
@@ -130,7 +161,10 @@ def _course(before: CorrectedFrame, now: CorrectedFrame) -> dict[str, str]:
     north_m = (latitude - math.radians(before.latitude_deg)) * _EARTH_M
     passed_s = (now.time_ns - before.time_ns) / 1e9
     speed = math.hypot(east_m, north_m) / passed_s if passed_s > 0 else 0.0
-    return {"course": f"{math.degrees(math.atan2(east_m, north_m)) % 360:.1f}", "speed": f"{speed:.2f}"}
+    return {
+        "course": f"{math.degrees(math.atan2(east_m, north_m)) % 360:.1f}",
+        "speed": f"{speed:.2f}",
+    }
 
 
 def _wrapped(each: CorrectedFrame) -> float:

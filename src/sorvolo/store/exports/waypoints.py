@@ -18,7 +18,14 @@ from sorvolo.store.atomic import atomic_write_bytes
 from sorvolo.store.exports.placemarks import kml_from_one
 from sorvolo.store.exports.wpml import check_drone, wpml_kmz
 
-_TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _MOUNT_CONTROL, _TRIGGER_DISTANCE = 22, 16, 20, 178, 205, 206  # MAV_CMD
+_TAKEOFF, _WAYPOINT, _RETURN, _CHANGE_SPEED, _MOUNT_CONTROL, _TRIGGER_DISTANCE = (
+    22,
+    16,
+    20,
+    178,
+    205,
+    206,
+)  # MAV_CMD
 _MOUNT_BY_MAVLINK = 2  # MAV_MOUNT_MODE: to the angles given
 _FRAME_RELATIVE_HEIGHT, _FRAME_MISSION = 3, 2  # MAV_FRAME
 _HEIGHT_RELATIVE = 1  # QGroundControl's AltitudeMode
@@ -40,12 +47,18 @@ def write_waypoints(
     """
     check_waypoint_file(path, dji_drone)
     writers: Mapping[str, Callable[[FlightPlan, _LonLat, str], str | bytes]] = {
-        ".plan": _qgroundcontrol, ".kmz": lambda plan, lonlat, _: wpml_kmz(plan, lonlat, dji_drone),
-        ".geojson": _geojson, ".json": _geojson, ".kml": _kml,
+        ".plan": _qgroundcontrol,
+        ".kmz": lambda plan, lonlat, _: wpml_kmz(plan, lonlat, dji_drone),
+        ".geojson": _geojson,
+        ".json": _geojson,
+        ".kml": _kml,
     }
     writer = writers[path.suffix.lower()]
     latitude_deg, longitude_deg, _ = frame.wgs84_from_site(plan.waypoints_m)
-    lonlat = [[round(float(lon), 9), round(float(lat), 9)] for lon, lat in zip(longitude_deg, latitude_deg)]
+    lonlat = [
+        [round(float(lon), 9), round(float(lat), 9)]
+        for lon, lat in zip(longitude_deg, latitude_deg)
+    ]
     content = writer(plan, lonlat, name)
     atomic_write_bytes(path, content.encode() if isinstance(content, str) else content)
 
@@ -53,7 +66,9 @@ def write_waypoints(
 def check_waypoint_file(path: Path, dji_drone: str = "fly") -> None:
     """Raise SettingsError for an ending other than .plan, .kmz, .geojson, .json or .kml, and for an unknown drone."""
     if path.suffix.lower() not in _ENDINGS:
-        raise SettingsError(f"{path}: flight plans are written as {', '.join(_ENDINGS)}, not as {path.suffix!r}")
+        raise SettingsError(
+            f"{path}: flight plans are written as {', '.join(_ENDINGS)}, not as {path.suffix!r}"
+        )
     if path.suffix.lower() == ".kmz":
         check_drone(dji_drone)
 
@@ -79,7 +94,9 @@ def _geojson(plan: FlightPlan, lonlat: _LonLat, name: str) -> str:
 
 def _feature(kind: str, coordinates: Any, properties: _Item) -> _Item:
     return {
-        "type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties,
+        "type": "Feature",
+        "geometry": {"type": kind, "coordinates": coordinates},
+        "properties": properties,
     }
 
 
@@ -112,13 +129,19 @@ def _qgroundcontrol(plan: FlightPlan, lonlat: _LonLat, _name: str) -> str:
     commands: list[tuple[int, int, list[float | None]]] = [
         (_TAKEOFF, _FRAME_RELATIVE_HEIGHT, [0, 0, 0, None, *_place(plan, lonlat[0])]),
         (_CHANGE_SPEED, _FRAME_MISSION, [1, plan.speed_m_s, -1, 0, 0, 0, 0]),
-        (_MOUNT_CONTROL, _FRAME_MISSION, [-90, 0, 0, 0, 0, 0, _MOUNT_BY_MAVLINK]),  # pitch, roll, yaw
+        (
+            _MOUNT_CONTROL,
+            _FRAME_MISSION,
+            [-90, 0, 0, 0, 0, 0, _MOUNT_BY_MAVLINK],
+        ),  # pitch, roll, yaw
     ]
     for index, place in enumerate(lonlat):
         starts_pass = index % 2 == 0
         commands.append((_WAYPOINT, _FRAME_RELATIVE_HEIGHT, [0, 0, 0, None, *_place(plan, place)]))
         spacing_m = round(plan.photo_spacing_m, 2) if starts_pass else 0
-        commands.append((_TRIGGER_DISTANCE, _FRAME_MISSION, [spacing_m, 0, int(starts_pass), 0, 0, 0, 0]))
+        commands.append(
+            (_TRIGGER_DISTANCE, _FRAME_MISSION, [spacing_m, 0, int(starts_pass), 0, 0, 0, 0])
+        )
     commands.append((_RETURN, _FRAME_MISSION, [0, 0, 0, 0, 0, 0, 0]))
     mission = {
         "version": 2,
@@ -130,23 +153,32 @@ def _qgroundcontrol(plan: FlightPlan, lonlat: _LonLat, _name: str) -> str:
         "plannedHomePosition": [lonlat[0][1], lonlat[0][0], 0],
         "items": [_item(plan, index, *command) for index, command in enumerate(commands, start=1)],
     }
-    return json.dumps({
-        "fileType": "Plan",
-        "version": 1,
-        "groundStation": "QGroundControl",
-        "geoFence": {"circles": [], "polygons": [], "version": 2},
-        "rallyPoints": {"points": [], "version": 2},
-        "mission": mission,
-    }, indent=1)
+    return json.dumps(
+        {
+            "fileType": "Plan",
+            "version": 1,
+            "groundStation": "QGroundControl",
+            "geoFence": {"circles": [], "polygons": [], "version": 2},
+            "rallyPoints": {"points": [], "version": 2},
+            "mission": mission,
+        },
+        indent=1,
+    )
 
 
 def _place(plan: FlightPlan, lonlat: list[float]) -> list[float]:
     return [lonlat[1], lonlat[0], round(plan.height_m, 2)]
 
 
-def _item(plan: FlightPlan, jump_id: int, command: int, frame: int, params: list[float | None]) -> _Item:
+def _item(
+    plan: FlightPlan, jump_id: int, command: int, frame: int, params: list[float | None]
+) -> _Item:
     item: _Item = {
-        "type": "SimpleItem", "autoContinue": True, "command": command, "doJumpId": jump_id, "frame": frame,
+        "type": "SimpleItem",
+        "autoContinue": True,
+        "command": command,
+        "doJumpId": jump_id,
+        "frame": frame,
         "params": params,
     }
     if frame == _FRAME_RELATIVE_HEIGHT:

@@ -26,7 +26,12 @@ from sorvolo.errors import SettingsError, StoreError
 from sorvolo.store.index import tables
 from sorvolo.store.index.finding import FoundFlight, Place, find
 from sorvolo.store.index.site_rows import FlightRows, SiteState
-from sorvolo.store.site.catalogue_place import Catalogues, create_pointed, parsed_url, pointed_database
+from sorvolo.store.site.catalogue_place import (
+    Catalogues,
+    create_pointed,
+    parsed_url,
+    pointed_database,
+)
 from sorvolo.store.site.database import Database
 from sorvolo.store.site.sqlite_database import SqliteDatabase
 
@@ -76,7 +81,9 @@ class ArchiveIndex:
         """
         if not has_index(root):
             if not write:
-                raise StoreError(f"{root} has no index; make one with: sorvolo archive index {root}")
+                raise StoreError(
+                    f"{root} has no index; make one with: sorvolo archive index {root}"
+                )
             _create(root, address)
         is_file = (root / INDEX).is_file()
         if address and is_file != (parsed_url(address) is None):
@@ -87,7 +94,11 @@ class ArchiveIndex:
             )
         if is_file:
             return cls(SqliteDatabase(root / INDEX, write=write, layout=tables.LAYOUT))
-        return cls(pointed_database(root, POINTER, write=write, layout=tables.LAYOUT, catalogues=catalogues))
+        return cls(
+            pointed_database(
+                root, POINTER, write=write, layout=tables.LAYOUT, catalogues=catalogues
+            )
+        )
 
     def close(self) -> None:
         """Let go of the database."""
@@ -106,22 +117,32 @@ class ArchiveIndex:
             kept = tables.flights.c
             for row in connection.execute(select(kept.site_id, kept.flight, kept.state)):
                 flights.setdefault(row.site_id, {})[row.flight] = row.state
-            known = connection.execute(select(tables.sites.c.id, tables.sites.c.path, tables.sites.c.state))
-            return {row.path: IndexedSite(row.id, row.state, flights.get(row.id, {})) for row in known}
+            known = connection.execute(
+                select(tables.sites.c.id, tables.sites.c.path, tables.sites.c.state)
+            )
+            return {
+                row.path: IndexedSite(row.id, row.state, flights.get(row.id, {})) for row in known
+            }
 
-    def put_site(self, path: str, state: SiteState, gone: Collection[str], new: Iterable[FlightRows]) -> None:
+    def put_site(
+        self, path: str, state: SiteState, gone: Collection[str], new: Iterable[FlightRows]
+    ) -> None:
         """Update a site in one transaction: remove the flights in `gone`, then add `new` ones.
 
         A flight in both is replaced. Verdicts are updated.
         """
         with self._database.changing() as connection:
-            site_id = connection.execute(select(tables.sites.c.id).where(tables.sites.c.path == path)).scalar()
+            site_id = connection.execute(
+                select(tables.sites.c.id).where(tables.sites.c.path == path)
+            ).scalar()
             values = {"name": state.name, "is_local": state.is_local, "state": state.state}
             if site_id is None:
                 site_id = _next_id(connection, tables.sites)
                 connection.execute(insert(tables.sites).values(id=site_id, path=path, **values))
             else:
-                connection.execute(update(tables.sites).where(tables.sites.c.id == site_id).values(**values))
+                connection.execute(
+                    update(tables.sites).where(tables.sites.c.id == site_id).values(**values)
+                )
             own = tables.flights.c.site_id == site_id
             for flight in gone:
                 _drop_flights(connection, own & (tables.flights.c.flight == flight))
@@ -133,7 +154,9 @@ class ArchiveIndex:
         """Remove sites that no longer exist."""
         with self._database.changing() as connection:
             for path in paths:
-                site = select(tables.sites.c.id).where(tables.sites.c.path == path).scalar_subquery()
+                site = (
+                    select(tables.sites.c.id).where(tables.sites.c.path == path).scalar_subquery()
+                )
                 _drop_flights(connection, tables.flights.c.site_id == site)
                 connection.execute(delete(tables.sites).where(tables.sites.c.path == path))
 
@@ -180,35 +203,65 @@ def _create(root: Path, address: str) -> None:
 def _add_flight(connection: Connection, site_id: int, rows: FlightRows) -> None:
     frames = rows.frames
     outlines = shapely.GeometryCollection(list(shapely.polygons(frames.outlines)))
-    flight_id = _insert(connection, tables.flights, [frames.place], [{
-        "site_id": site_id, "flight": rows.flight, "state": rows.state, "kind": rows.kind,
-        "first_ns": rows.first_ns, "last_ns": rows.last_ns,
-        "frames": len(frames.names), "outlines": shapely.to_wkb(outlines, byte_order=1),
-        "frame_names": "\n".join(each.replace("\n", " ") for each in frames.names),
-        "frame_times": frames.times_ns.astype("<i8").tobytes(),
-        "frame_kept": frames.is_kept.tobytes(),
-    }])
+    flight_id = _insert(
+        connection,
+        tables.flights,
+        [frames.place],
+        [
+            {
+                "site_id": site_id,
+                "flight": rows.flight,
+                "state": rows.state,
+                "kind": rows.kind,
+                "first_ns": rows.first_ns,
+                "last_ns": rows.last_ns,
+                "frames": len(frames.names),
+                "outlines": shapely.to_wkb(outlines, byte_order=1),
+                "frame_names": "\n".join(each.replace("\n", " ") for each in frames.names),
+                "frame_times": frames.times_ns.astype("<i8").tobytes(),
+                "frame_kept": frames.is_kept.tobytes(),
+            }
+        ],
+    )
     for kept, each in ((tables.objects, rows.objects), (tables.changes, rows.changes)):
-        _insert(connection, kept, each.places, [{**columns, "flight_id": flight_id} for columns in each.columns])
+        _insert(
+            connection,
+            kept,
+            each.places,
+            [{**columns, "flight_id": flight_id} for columns in each.columns],
+        )
 
 
 def _insert(
-    connection: Connection, kept: Table, places: Sequence[BaseGeometry | None], columns: Sequence[Mapping[str, Any]]
+    connection: Connection,
+    kept: Table,
+    places: Sequence[BaseGeometry | None],
+    columns: Sequence[Mapping[str, Any]],
 ) -> int:
     """Add rows, with their boxes where the database has an R-tree of its own; the first one's number."""
     first = _next_id(connection, kept)
     blobs = [None if each is None else shapely.to_wkb(each) for each in places]
-    rows = [{**row, "id": first + k, "place": blob} for k, (row, blob) in enumerate(zip(columns, blobs, strict=True))]
+    rows = [
+        {**row, "id": first + k, "place": blob}
+        for k, (row, blob) in enumerate(zip(columns, blobs, strict=True))
+    ]
     for start in range(0, len(rows), _AT_ONCE):
-        connection.execute(insert(kept), rows[start:start + _AT_ONCE])
+        connection.execute(insert(kept), rows[start : start + _AT_ONCE])
     if connection.dialect.name == "sqlite":
-        _add_boxes(connection, kept, {first + k: place for k, place in enumerate(places) if place is not None})
+        _add_boxes(
+            connection,
+            kept,
+            {first + k: place for k, place in enumerate(places) if place is not None},
+        )
     return first
 
 
 def _add_boxes(connection: Connection, kept: Table, places: Mapping[int, BaseGeometry]) -> None:
-    boxes = [(number, west, east, south, north) for number, place in places.items()
-             for west, south, east, north in [place.bounds]]
+    boxes = [
+        (number, west, east, south, north)
+        for number, place in places.items()
+        for west, south, east, north in [place.bounds]
+    ]
     if boxes:
         connection.exec_driver_sql(f"INSERT INTO {kept.name}_places VALUES (?, ?, ?, ?, ?)", boxes)
 
@@ -220,7 +273,9 @@ def _drop_flights(connection: Connection, which: ColumnElement[bool]) -> None:
         for each in tables.PLACED:
             own = each.c.id if each is tables.flights else each.c.flight_id
             boxes = table(f"{each.name}_places", column("id"))
-            connection.execute(delete(boxes).where(boxes.c.id.in_(select(each.c.id).where(own.in_(flights)))))
+            connection.execute(
+                delete(boxes).where(boxes.c.id.in_(select(each.c.id).where(own.in_(flights))))
+            )
     connection.execute(delete(tables.flights).where(which))
 
 

@@ -19,7 +19,9 @@ EARLIEST_NS, LATEST_NS = -(2**62), 2**62
 
 _MOST_VALUES = 10_000  # in a query: SQLite bounds their number
 _HEAD_BYTES = 9  # of a collection: byte order, type, number of members
-_POLYGON = np.dtype([("head", "u1", 13), ("corners", "<f8", (5, 2))])  # ... of which each is a ring of five points
+_POLYGON = np.dtype(
+    [("head", "u1", 13), ("corners", "<f8", (5, 2))]
+)  # ... of which each is a ring of five points
 _ABOUT = (tables.flights.c.flight, tables.flights.c.kind, tables.sites.c.path, tables.sites.c.name)
 
 
@@ -45,9 +47,13 @@ class Place:
                 "-180 to 180 degrees were needed"
             )
         if not 0 < self.within_m <= 10_000:
-            raise SettingsError(f"within {self.within_m} m: more than 0 and at most 10,000 m was needed")
+            raise SettingsError(
+                f"within {self.within_m} m: more than 0 and at most 10,000 m was needed"
+            )
         if self.first_ns > self.last_ns:
-            raise SettingsError("the first moment asked for is after the last one; give them in order")
+            raise SettingsError(
+                "the first moment asked for is after the last one; give them in order"
+            )
 
 
 @dataclass(frozen=True)
@@ -99,21 +105,31 @@ def find(connection: Connection, place: Place) -> list[FoundFlight]:
 
 
 def _seen(
-    connection: Connection, place: Place, longitude_deg: float, things: Mapping[int, Sequence[FoundThing]]
+    connection: Connection,
+    place: Place,
+    longitude_deg: float,
+    things: Mapping[int, Sequence[FoundThing]],
 ) -> list[tuple[int, FoundFlight]]:
     """The flights with a frame that shows the place, by their numbers in the index."""
     c = tables.flights.c
     columns = (c.id, *_ABOUT, c.frames, c.frame_names, c.frame_times, c.frame_kept, c.outlines)
-    query = _near(connection, tables.flights, columns, longitude_deg, place.latitude_deg, np.zeros(2))
+    query = _near(
+        connection, tables.flights, columns, longitude_deg, place.latitude_deg, np.zeros(2)
+    )
     if place.classes and len(things) <= _MOST_VALUES:  # what others saw is not asked for
         query = query.where(c.id.in_(things))
     rows = connection.execute(_then(query, place, c.first_ns, c.last_ns).join(tables.sites)).all()
     if not rows:
         return []
-    numbers, flights, kinds, paths, names, counts, frame_names, times, kept, outlines = zip(*rows, strict=True)
+    numbers, flights, kinds, paths, names, counts, frame_names, times, kept, outlines = zip(
+        *rows, strict=True
+    )
     owner = np.repeat(np.arange(len(rows)), counts)
     start = np.cumsum([0, *counts])
-    times_ns, is_kept = np.frombuffer(b"".join(times), "<i8"), np.frombuffer(b"".join(kept), np.bool_)
+    times_ns, is_kept = (
+        np.frombuffer(b"".join(times), "<i8"),
+        np.frombuffer(b"".join(kept), np.bool_),
+    )
     origin, scale = [longitude_deg, place.latitude_deg], _metres_per_degree(place.latitude_deg)
     corners_m = (_corners(outlines) - origin) * scale
     inside = _contain_origin(corners_m) & (times_ns >= place.first_ns) & (times_ns <= place.last_ns)
@@ -121,20 +137,39 @@ def _seen(
     if not len(frames):
         return []
     # the best frame of a flight comes last: kept ones after others, and then by how far inside the place lies
-    frames = frames[np.lexsort((_distance_to_edge_m(corners_m[frames]), is_kept[frames], owner[frames]))]
+    frames = frames[
+        np.lexsort((_distance_to_edge_m(corners_m[frames]), is_kept[frames], owner[frames]))
+    ]
     begins = np.flatnonzero(np.diff(owner[frames], prepend=-1))
     ends = np.append(begins[1:], len(frames))
     best, which = frames[ends - 1], owner[frames[begins]]
     columns_of_found = (
-        which, ends - begins, np.minimum.reduceat(times_ns[frames], begins),
-        np.maximum.reduceat(times_ns[frames], begins), best - start[which], is_kept[best],
+        which,
+        ends - begins,
+        np.minimum.reduceat(times_ns[frames], begins),
+        np.maximum.reduceat(times_ns[frames], begins),
+        best - start[which],
+        is_kept[best],
     )
     return [
-        (numbers[k], FoundFlight(
-            paths[k], names[k], flights[k], kinds[k], count, first_ns, last_ns, frame_names[k].split("\n")[frame],
-            is_best_kept, tuple(things.get(numbers[k], ())),
-        ))
-        for k, count, first_ns, last_ns, frame, is_best_kept in zip(*(each.tolist() for each in columns_of_found))
+        (
+            numbers[k],
+            FoundFlight(
+                paths[k],
+                names[k],
+                flights[k],
+                kinds[k],
+                count,
+                first_ns,
+                last_ns,
+                frame_names[k].split("\n")[frame],
+                is_best_kept,
+                tuple(things.get(numbers[k], ())),
+            ),
+        )
+        for k, count, first_ns, last_ns, frame, is_best_kept in zip(
+            *(each.tolist() for each in columns_of_found)
+        )
     ]
 
 
@@ -170,20 +205,42 @@ def _things(connection: Connection, place: Place) -> dict[int, list[FoundThing]]
     reach_deg = place.within_m / _metres_per_degree(place.latitude_deg)
     o, h = tables.objects.c, tables.changes.c
     asked: tuple[tuple[Table, tuple[Any, ...]], ...] = (
-        (tables.objects, (o.object_id.label("name"), literal("").label("kind"), literal("").label("verdict"))),
+        (
+            tables.objects,
+            (o.object_id.label("name"), literal("").label("kind"), literal("").label("verdict")),
+        ),
         (tables.changes, (h.change_id.label("name"), h.kind, h.verdict)),
     )
     for kept, own in asked:
         c = kept.c
-        columns = (c.flight_id, *own, c.label.label("what"), c.score, c.first_ns, c.last_ns, c.place)
+        columns = (
+            c.flight_id,
+            *own,
+            c.label.label("what"),
+            c.score,
+            c.first_ns,
+            c.last_ns,
+            c.place,
+        )
         rows, distances_m = _meeting(connection, kept, columns, place, reach_deg)
         for row, distance_m in zip(rows, distances_m.tolist(), strict=True):
             if distance_m <= place.within_m and (not place.classes or row.what in place.classes):
-                found.setdefault(row.flight_id, []).append(FoundThing(
-                    "object" if kept is tables.objects else "change", row.name, row.what, row.kind, row.score,
-                    row.first_ns, row.last_ns, distance_m, row.verdict,
-                ))
-    return {flight: sorted(each, key=lambda thing: thing.distance_m) for flight, each in found.items()}
+                found.setdefault(row.flight_id, []).append(
+                    FoundThing(
+                        "object" if kept is tables.objects else "change",
+                        row.name,
+                        row.what,
+                        row.kind,
+                        row.score,
+                        row.first_ns,
+                        row.last_ns,
+                        distance_m,
+                        row.verdict,
+                    )
+                )
+    return {
+        flight: sorted(each, key=lambda thing: thing.distance_m) for flight, each in found.items()
+    }
 
 
 def _meeting(
@@ -196,12 +253,18 @@ def _meeting(
         query = _near(connection, kept, columns, longitude, place.latitude_deg, reach_deg)
         found = connection.execute(_then(query, place, kept.c.first_ns, kept.c.last_ns)).all()
         rows += found
-        distances_m.append(_distances_m([row.place for row in found], longitude, place.latitude_deg))
+        distances_m.append(
+            _distances_m([row.place for row in found], longitude, place.latitude_deg)
+        )
     return rows, np.concatenate(distances_m)
 
 
 def _near(
-    connection: Connection, kept: Table, columns: Sequence[Any], longitude_deg: float, latitude_deg: float,
+    connection: Connection,
+    kept: Table,
+    columns: Sequence[Any],
+    longitude_deg: float,
+    latitude_deg: float,
     reach_deg: Floats,
 ) -> Select[Any]:
     """Rows whose box comes so near (2,) to a place, by the spatial index."""
@@ -212,7 +275,12 @@ def _near(
         box = func.ST_MakeEnvelope(west, south, east, north, 4326)
         return query.where(kept.c.place.op("&&", is_comparison=True)(box))
     tree = table(f"{kept.name}_places", *map(column, ("id", "west", "east", "south", "north")))
-    inside = (tree.c.west <= east, tree.c.east >= west, tree.c.south <= north, tree.c.north >= south)
+    inside = (
+        tree.c.west <= east,
+        tree.c.east >= west,
+        tree.c.south <= north,
+        tree.c.north >= south,
+    )
     return query.where(kept.c.id.in_(select(tree.c.id).where(*inside)))
 
 
@@ -226,13 +294,17 @@ def _distances_m(places: Sequence[bytes], longitude_deg: float, latitude_deg: fl
     if not places:
         return np.zeros(0)
     scale, origin = _metres_per_degree(latitude_deg), np.array([longitude_deg, latitude_deg])
-    shapes = shapely.transform(shapely.from_wkb([bytes(each) for each in places]), lambda each: (each - origin) * scale)
+    shapes = shapely.transform(
+        shapely.from_wkb([bytes(each) for each in places]), lambda each: (each - origin) * scale
+    )
     return np.asarray(shapely.distance(shapes, shapely.Point(0.0, 0.0)), np.float64)
 
 
 def _metres_per_degree(latitude_deg: float) -> Floats:
     """(2,) of longitude and of latitude."""
-    return np.array([M_PER_DEG_LATITUDE * max(1e-6, np.cos(np.radians(latitude_deg))), M_PER_DEG_LATITUDE])
+    return np.array(
+        [M_PER_DEG_LATITUDE * max(1e-6, np.cos(np.radians(latitude_deg))), M_PER_DEG_LATITUDE]
+    )
 
 
 def _turns(longitude_deg: float, reach_deg: float) -> list[float]:
@@ -245,10 +317,14 @@ def _flights(connection: Connection, ids: Sequence[int]) -> list[Any]:
     found: list[Any] = []
     for start in range(0, len(ids), _MOST_VALUES):
         query = select(tables.flights.c.id, *_ABOUT).select_from(tables.flights).join(tables.sites)
-        found += connection.execute(query.where(tables.flights.c.id.in_(ids[start:start + _MOST_VALUES]))).all()
+        found += connection.execute(
+            query.where(tables.flights.c.id.in_(ids[start : start + _MOST_VALUES]))
+        ).all()
     return found
 
 
 def _unseen(row: Any, things: Sequence[FoundThing]) -> FoundFlight:
     times = min(each.first_ns for each in things), max(each.last_ns for each in things)
-    return FoundFlight(row.path, row.name, row.flight, row.kind, 0, *times, "", False, tuple(things))
+    return FoundFlight(
+        row.path, row.name, row.flight, row.kind, 0, *times, "", False, tuple(things)
+    )

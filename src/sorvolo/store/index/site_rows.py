@@ -41,7 +41,11 @@ class FrameRows:
     @property
     def place(self) -> BaseGeometry | None:
         """All ground that they show; None without frames."""
-        return shapely.union_all(shapely.make_valid(shapely.polygons(self.outlines))) if len(self.names) else None
+        return (
+            shapely.union_all(shapely.make_valid(shapely.polygons(self.outlines)))
+            if len(self.names)
+            else None
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,9 +90,13 @@ def site_state(archive: Archive) -> SiteState:
         return SiteState(archive.folder.name, False, "", {}, {})
     site = archive.site()
     flights = {} if site.is_local else {each.id: _state_of(each) for each in _complete(archive)}
-    verdicts = {} if site.is_local else {each.change_id: each.verdict.value for each in archive.reviews()}
+    verdicts = (
+        {} if site.is_local else {each.change_id: each.verdict.value for each in archive.reviews()}
+    )
     content = json.dumps([site.name, site.is_local, flights, verdicts], sort_keys=True)
-    return SiteState(site.name, site.is_local, hashlib.sha256(content.encode()).hexdigest(), flights, verdicts)
+    return SiteState(
+        site.name, site.is_local, hashlib.sha256(content.encode()).hexdigest(), flights, verdicts
+    )
 
 
 def flight_rows(archive: Archive, wanted: Collection[str]) -> Iterator[FlightRows]:
@@ -99,8 +107,12 @@ def flight_rows(archive: Archive, wanted: Collection[str]) -> Iterator[FlightRow
         if each.id not in wanted:
             continue
         yield FlightRows(
-            each.id, _state_of(each), "compare" if versions[each.id].id in compared else "map",
-            _frames(archive, each.id, site), _objects(archive, each.id, site), _changes(archive, each.id, site),
+            each.id,
+            _state_of(each),
+            "compare" if versions[each.id].id in compared else "map",
+            _frames(archive, each.id, site),
+            _objects(archive, each.id, site),
+            _changes(archive, each.id, site),
         )
 
 
@@ -121,17 +133,24 @@ def _frames(archive: Archive, flight: str, site: Site) -> FrameRows:
     if not rows:
         return FrameRows()
     names, outlines, times_ns, is_kept = zip(*rows, strict=True)
-    return FrameRows(names, np.array(outlines), np.array(times_ns, np.int64), np.array(is_kept, np.bool_))
+    return FrameRows(
+        names, np.array(outlines), np.array(times_ns, np.int64), np.array(is_kept, np.bool_)
+    )
 
 
-_Row = tuple[str, Floats, int, bool]  # a frame's name, outline (4, 2) in degrees, time in ns, whether it was kept
+_Row = tuple[
+    str, Floats, int, bool
+]  # a frame's name, outline (4, 2) in degrees, time in ns, whether it was kept
 
 
 def _written(feature: Any, kept: Collection[str]) -> _Row | None:
     """A frame as the file has it; None for one that was not placed or is damaged."""
     try:
         outline = np.array(feature["geometry"]["coordinates"][0], np.float64)[:4, :2]
-        name, time_ns = str(feature["properties"]["frame"]), _nanoseconds(feature["properties"]["time"])
+        name, time_ns = (
+            str(feature["properties"]["frame"]),
+            _nanoseconds(feature["properties"]["time"]),
+        )
     except (TypeError, ValueError, KeyError, IndexError):
         return None
     return (name, outline, time_ns, name in kept) if _is_usable(outline) else None
@@ -153,8 +172,11 @@ def _objects(archive: Archive, flight: str, site: Site) -> PlacedRows:
         list(shapely.points(longitudes, latitudes)),
         [
             {
-                "object_id": each.id, "label": each.label, "score": float(each.score),
-                "sigma_m": number_or_null(each.sigma_m), "first_ns": int(each.first_seen_ns),
+                "object_id": each.id,
+                "label": each.label,
+                "score": float(each.score),
+                "sigma_m": number_or_null(each.sigma_m),
+                "first_ns": int(each.first_seen_ns),
                 "last_ns": int(each.last_seen_ns),
             }
             for each in things
@@ -168,9 +190,12 @@ def _changes(archive: Archive, flight: str, site: Site) -> PlacedRows:
         [_polygon(each.outline_m, site) for each in found],
         [
             {
-                "change_id": each.id, "kind": each.kind.value, "score": float(each.score),
+                "change_id": each.id,
+                "kind": each.kind.value,
+                "score": float(each.score),
                 "label": each.class_after or each.class_before or each.kind.value,
-                "first_ns": int(each.first_seen_ns), "last_ns": int(each.last_seen_ns),
+                "first_ns": int(each.first_seen_ns),
+                "last_ns": int(each.last_seen_ns),
                 "verdict": "" if each.verdict is None else each.verdict.value,
             }
             for each in found
@@ -181,12 +206,18 @@ def _changes(archive: Archive, flight: str, site: Site) -> PlacedRows:
 def _polygon(outline_m: Floats, site: Site) -> BaseGeometry:
     """An outline (N, 2) in degrees; of one or two points, their box grown to a millimetre or so."""
     corners = np.column_stack(longitude_latitude(np.asarray(outline_m)[:, :2], site))
-    return shapely.Polygon(corners) if len(corners) > 2 else shapely.MultiPoint(corners).envelope.buffer(1e-8)
+    return (
+        shapely.Polygon(corners)
+        if len(corners) > 2
+        else shapely.MultiPoint(corners).envelope.buffer(1e-8)
+    )
 
 
 def _is_usable(outline: Floats) -> bool:
     """Four corners, none of them as far away as the horizon, to which a frame that looks ahead may reach."""
-    return outline.shape == (4, 2) and bool(np.isfinite(outline).all() and (np.ptp(outline, axis=0) < 1).all())
+    return outline.shape == (4, 2) and bool(
+        np.isfinite(outline).all() and (np.ptp(outline, axis=0) < 1).all()
+    )
 
 
 def _nanoseconds(text: str) -> int:

@@ -20,19 +20,34 @@ from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.flight import Site
 
 PROPERTIES = {
-    "sorvolo:kind": "string", "sorvolo:site": "string", "sorvolo:flight": "string", "sorvolo:version": "int32",
-    "sorvolo:mission": "string", "sorvolo:frames": "int32", "sorvolo:class": "string", "sorvolo:change": "string",
-    "sorvolo:score": "double", "sorvolo:sigma_m": "double", "sorvolo:review": "string",
+    "sorvolo:kind": "string",
+    "sorvolo:site": "string",
+    "sorvolo:flight": "string",
+    "sorvolo:version": "int32",
+    "sorvolo:mission": "string",
+    "sorvolo:frames": "int32",
+    "sorvolo:class": "string",
+    "sorvolo:change": "string",
+    "sorvolo:score": "double",
+    "sorvolo:sigma_m": "double",
+    "sorvolo:review": "string",
 }
 """The items' own properties (docs/archive-search.md) and their types."""
 
 _TYPES = {
-    ".tif": "image/tiff; application=geotiff; profile=cloud-optimized", ".png": "image/png", ".jpg": "image/jpeg",
-    ".html": "text/html", ".geojson": "application/geo+json",
+    ".tif": "image/tiff; application=geotiff; profile=cloud-optimized",
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".html": "text/html",
+    ".geojson": "application/geo+json",
 }
-_MAP_FILES = (("map", "mosaic.tif", "The newest map", "data"), ("preview", "preview.png", "Preview", "thumbnail"))
+_MAP_FILES = (
+    ("map", "mosaic.tif", "The newest map", "data"),
+    ("preview", "preview.png", "Preview", "thumbnail"),
+)
 _FLIGHT_FILES = (
-    ("report", "report.html", "Report", "metadata"), ("frames", "frames.geojson", "What each frame shows", "metadata"),
+    ("report", "report.html", "Report", "metadata"),
+    ("frames", "frames.geojson", "What each frame shows", "metadata"),
     ("heights", HeightFile.SURFACE, "Height model", "data"),
     ("orthophoto", HeightFile.ORTHOPHOTO, "True orthophoto", "data"),
 )
@@ -58,35 +73,62 @@ def _map_items(
 ) -> Iterator[StacItem]:
     """The site and the versions of its map that have tiles."""
     site = archive.site()
-    places = {each.id: place for each in versions if (place := _ground(archive, each.id)) is not None}
+    places = {
+        each.id: place for each in versions if (place := _ground(archive, each.id)) is not None
+    }
     shown = [each for each in versions if each.id in places]
     if shown:
         yield _site_item(name, site, shown, places, address_of)
     for version in shown:
-        yield _version_item(name, site, version, places[version.id], address_of, is_newest=version is shown[-1])
+        yield _version_item(
+            name, site, version, places[version.id], address_of, is_newest=version is shown[-1]
+        )
 
 
 def _site_item(
-    name: str, site: Site, versions: list[VersionEntry], places: Mapping[int, BaseGeometry],
+    name: str,
+    site: Site,
+    versions: list[VersionEntry],
+    places: Mapping[int, BaseGeometry],
     address_of: Callable[[str], str],
 ) -> StacItem:
     moments = [_moment_ns(each) for each in versions]
     return StacItem(
-        name, name, site.name, shapely.union_all([places[each.id] for each in versions]), max(moments), min(moments),
-        max(moments), versions[0].created_utc, site.m_per_px,
+        name,
+        name,
+        site.name,
+        shapely.union_all([places[each.id] for each in versions]),
+        max(moments),
+        min(moments),
+        max(moments),
+        versions[0].created_utc,
+        site.m_per_px,
         {"sorvolo:kind": "site", "sorvolo:site": name, "sorvolo:version": versions[-1].id},
         _assets(_MAP_FILES, "", address_of),
     )
 
 
 def _version_item(
-    name: str, site: Site, version: VersionEntry, place: BaseGeometry, address_of: Callable[[str], str], *,
+    name: str,
+    site: Site,
+    version: VersionEntry,
+    place: BaseGeometry,
+    address_of: Callable[[str], str],
+    *,
     is_newest: bool,
 ) -> StacItem:
     return StacItem(
-        f"{name}/version-{version.id}", name, f"{site.name}, version {version.id}", place, _moment_ns(version),
-        created_utc=version.created_utc, gsd_m=site.m_per_px, properties={
-            "sorvolo:kind": "version", "sorvolo:site": name, "sorvolo:flight": version.flight_id,
+        f"{name}/version-{version.id}",
+        name,
+        f"{site.name}, version {version.id}",
+        place,
+        _moment_ns(version),
+        created_utc=version.created_utc,
+        gsd_m=site.m_per_px,
+        properties={
+            "sorvolo:kind": "version",
+            "sorvolo:site": name,
+            "sorvolo:flight": version.flight_id,
             "sorvolo:version": version.id,
         },
         assets=_assets(_MAP_FILES, "", address_of) if is_newest else {},
@@ -103,39 +145,89 @@ def _flight_items(
     place = rows.frames.place
     if place is not None:
         yield StacItem(
-            f"{name}/{rows.flight}", name, rows.flight, place,
-            rows.first_ns if is_dated else _moment_ns(version), rows.first_ns if is_dated else None,
-            rows.last_ns if is_dated else None, version.created_utc, None,
+            f"{name}/{rows.flight}",
+            name,
+            rows.flight,
+            place,
+            rows.first_ns if is_dated else _moment_ns(version),
+            rows.first_ns if is_dated else None,
+            rows.last_ns if is_dated else None,
+            version.created_utc,
+            None,
             {
-                **common, "sorvolo:kind": "flight", "sorvolo:mission": rows.kind,
+                **common,
+                "sorvolo:kind": "flight",
+                "sorvolo:mission": rows.kind,
                 "sorvolo:frames": len(rows.frames.names),
             },
             _assets(_FLIGHT_FILES, folder, address_of),
         )
     for place, row in zip(rows.changes.places, rows.changes.columns, strict=True):
         before, after = crop_names(row["change_id"])
-        yield _thing(name, row["change_id"], place, row, version, {
-            **common, "sorvolo:kind": "change", "sorvolo:change": row["kind"], "sorvolo:review": row["verdict"] or None,
-        }, _assets((
-            ("before", f"changes/{before}", "Before", "visual"), ("after", f"changes/{after}", "After", "visual"),
-        ), folder, address_of))
+        yield _thing(
+            name,
+            row["change_id"],
+            place,
+            row,
+            version,
+            {
+                **common,
+                "sorvolo:kind": "change",
+                "sorvolo:change": row["kind"],
+                "sorvolo:review": row["verdict"] or None,
+            },
+            _assets(
+                (
+                    ("before", f"changes/{before}", "Before", "visual"),
+                    ("after", f"changes/{after}", "After", "visual"),
+                ),
+                folder,
+                address_of,
+            ),
+        )
     for place, row in zip(rows.objects.places, rows.objects.columns, strict=True):
-        yield _thing(name, row["object_id"], place, row, version, {
-            **common, "sorvolo:kind": "object", "sorvolo:sigma_m": row["sigma_m"],
-        }, _assets((("crop", f"objects/{crop_name(row['object_id'])}", "Best view", "visual"),), folder, address_of))
+        yield _thing(
+            name,
+            row["object_id"],
+            place,
+            row,
+            version,
+            {
+                **common,
+                "sorvolo:kind": "object",
+                "sorvolo:sigma_m": row["sigma_m"],
+            },
+            _assets(
+                (("crop", f"objects/{crop_name(row['object_id'])}", "Best view", "visual"),),
+                folder,
+                address_of,
+            ),
+        )
 
 
 def _thing(
-    name: str, id: str, place: BaseGeometry, row: Mapping[str, Any], version: VersionEntry,
-    properties: Mapping[str, Any], assets: Mapping[str, StacAsset],
+    name: str,
+    id: str,
+    place: BaseGeometry,
+    row: Mapping[str, Any],
+    version: VersionEntry,
+    properties: Mapping[str, Any],
+    assets: Mapping[str, StacAsset],
 ) -> StacItem:
     """A change or an object, with when it was seen."""
     is_dated = row["first_ns"] >= DAY_NS
     return StacItem(
-        f"{name}/{id}", name, f"{row['label']} ({id})", place,
-        row["first_ns"] if is_dated else _moment_ns(version), row["first_ns"] if is_dated else None,
-        row["last_ns"] if is_dated else None, version.created_utc, None,
-        {**properties, "sorvolo:class": row["label"], "sorvolo:score": row["score"]}, assets,
+        f"{name}/{id}",
+        name,
+        f"{row['label']} ({id})",
+        place,
+        row["first_ns"] if is_dated else _moment_ns(version),
+        row["first_ns"] if is_dated else None,
+        row["last_ns"] if is_dated else None,
+        version.created_utc,
+        None,
+        {**properties, "sorvolo:class": row["label"], "sorvolo:score": row["score"]},
+        assets,
     )
 
 
@@ -150,7 +242,9 @@ def _ground(archive: Archive, version: int) -> BaseGeometry | None:
     site_from_grid = np.linalg.inv(grid.grid_from_site_affine(np.zeros(2), 50.0))
 
     def degrees(points_px: Any) -> Any:
-        return np.column_stack(longitude_latitude(points_px @ site_from_grid[:2, :2].T + site_from_grid[:2, 2], site))
+        return np.column_stack(
+            longitude_latitude(points_px @ site_from_grid[:2, :2].T + site_from_grid[:2, 2], site)
+        )
 
     return shapely.transform(shapely.union_all(squares).simplify(0), degrees)
 
@@ -163,8 +257,11 @@ def _assets(
     files: tuple[tuple[str, str, str, str], ...], folder: str, address_of: Callable[[str], str]
 ) -> dict[str, StacAsset]:
     """The files that are there, by the asset's name."""
-    found = {name: (address_of(folder + file), file, title, role) for name, file, title, role in files}
+    found = {
+        name: (address_of(folder + file), file, title, role) for name, file, title, role in files
+    }
     return {
         name: StacAsset(address, _TYPES[Path(file).suffix], title, role)
-        for name, (address, file, title, role) in found.items() if address
+        for name, (address, file, title, role) in found.items()
+        if address
     }

@@ -50,7 +50,8 @@ Geometry = LargeBinary().with_variant(_PostgisGeometry(), "postgresql")
 
 metadata = MetaData()
 sites = Table(
-    "sites", metadata,
+    "sites",
+    metadata,
     Column("id", Integer, primary_key=True, autoincrement=False),
     Column("path", String, nullable=False, unique=True),  # of its folder, below the archive's
     Column("name", String, nullable=False),
@@ -58,7 +59,8 @@ sites = Table(
     Column("state", String, nullable=False),  # a hash of what the site held when it was read
 )
 flights = Table(
-    "flights", metadata,
+    "flights",
+    metadata,
     Column("id", Integer, primary_key=True, autoincrement=False),
     Column("site_id", ForeignKey("sites.id", ondelete="CASCADE"), nullable=False),
     Column("flight", String, nullable=False),
@@ -66,15 +68,24 @@ flights = Table(
     Column("kind", String, nullable=False),  # map | compare
     Column("first_ns", Nanoseconds, nullable=False),  # UTC; from 1970 on where no clock has a date
     Column("last_ns", Nanoseconds, nullable=False),
-    Column("frames", Integer, nullable=False),  # that were placed; one row each would be slow to ask
-    Column("frame_names", String, nullable=False),  # a line each, in the order of their outlines, as below
+    Column(
+        "frames", Integer, nullable=False
+    ),  # that were placed; one row each would be slow to ask
+    Column(
+        "frame_names", String, nullable=False
+    ),  # a line each, in the order of their outlines, as below
     Column("frame_times", LargeBinary, nullable=False),  # ns as little-endian integers of 64 bits
-    Column("frame_kept", LargeBinary, nullable=False),  # a byte each: 1 where the site has its picture
-    Column("outlines", Geometry, nullable=False),  # a collection of what each shows, polygons of four corners
+    Column(
+        "frame_kept", LargeBinary, nullable=False
+    ),  # a byte each: 1 where the site has its picture
+    Column(
+        "outlines", Geometry, nullable=False
+    ),  # a collection of what each shows, polygons of four corners
     Column("place", Geometry),  # all that they show; NULL without any
 )
 objects = Table(
-    "objects", metadata,
+    "objects",
+    metadata,
     Column("id", Integer, primary_key=True, autoincrement=False),
     Column("flight_id", ForeignKey("flights.id", ondelete="CASCADE"), nullable=False),
     Column("object_id", String, nullable=False),
@@ -86,7 +97,8 @@ objects = Table(
     Column("place", Geometry, nullable=False),
 )
 changes = Table(
-    "changes", metadata,
+    "changes",
+    metadata,
     Column("id", Integer, primary_key=True, autoincrement=False),
     Column("flight_id", ForeignKey("flights.id", ondelete="CASCADE"), nullable=False),
     Column("change_id", String, nullable=False),
@@ -113,14 +125,20 @@ def make_index(connection: Connection) -> None:
         make_numbers(connection, ["format"])
         connection.execute(numbers.update().where(numbers.c.name == "format").values(last=FORMAT))
     metadata.create_all(connection)
-    if connection.dialect.name != "sqlite":  # as they are: unpacking them would take longer than to read them
+    if (
+        connection.dialect.name != "sqlite"
+    ):  # as they are: unpacking them would take longer than to read them
         connection.execute(text("ALTER TABLE flights ALTER COLUMN outlines SET STORAGE EXTERNAL"))
     for table in PLACED:
         if connection.dialect.name != "sqlite":
-            connection.execute(text(f"CREATE INDEX {table.name}_by_place ON {table.name} USING gist (place)"))
+            connection.execute(
+                text(f"CREATE INDEX {table.name}_by_place ON {table.name} USING gist (place)")
+            )
             continue
         connection.execute(
-            text(f"CREATE VIRTUAL TABLE {table.name}_places USING rtree(id, west, east, south, north)")
+            text(
+                f"CREATE VIRTUAL TABLE {table.name}_places USING rtree(id, west, east, south, north)"
+            )
         )
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql(f"PRAGMA user_version = {FORMAT:d}")
@@ -137,10 +155,12 @@ LAYOUT = Layout(_APPLICATION_ID, make_index, beside="public", page_bytes=16_384)
 
 
 def _demand_postgis(connection: Connection) -> None:
-    place = connection.execute(text(
-        "SELECT nspname FROM pg_extension JOIN pg_namespace ON pg_namespace.oid = extnamespace "
-        "WHERE extname = 'postgis'"
-    )).scalar()
+    place = connection.execute(
+        text(
+            "SELECT nspname FROM pg_extension JOIN pg_namespace ON pg_namespace.oid = extnamespace "
+            "WHERE extname = 'postgis'"
+        )
+    ).scalar()
     if place != "public":
         found = "no PostGIS" if place is None else f"PostGIS in the schema {place}"
         raise StoreError(

@@ -19,7 +19,16 @@ from sorvolo.store.exports.plain import time_words
 from sorvolo.store.images import shrink
 from sorvolo.store.pages.coverage_layer import coverage_shapes, coverage_words, gap_rows, size_rows
 from sorvolo.store.pages.render import render
-from sorvolo.store.pages.words import area_words, at, known, length_words, number_at, picture_uri, plural, with_unit
+from sorvolo.store.pages.words import (
+    area_words,
+    at,
+    known,
+    length_words,
+    number_at,
+    picture_uri,
+    plural,
+    with_unit,
+)
 from sorvolo.store.site.change_records import StoredChange
 from sorvolo.survey.findings import ChangeKind, Verdict, ViewStatus
 from sorvolo.survey.flight import Site
@@ -66,36 +75,61 @@ def changes_page(
     of coverage.geojson. What the report does not hold is left out. All text is escaped.
     """
     most_bytes = int(_CROPS_BYTES / max(2 * len(changes), 1))
-    shown = (before, after) if before is not None and after is not None and after.rgba.size > 0 else None
+    shown = (
+        (before, after)
+        if before is not None and after is not None and after.rgba.size > 0
+        else None
+    )
     listed = [
-        _listed(each, site, crops.get(each.id, (None, None)), most_bytes, shown[1] if shown else None)
+        _listed(
+            each, site, crops.get(each.id, (None, None)), most_bytes, shown[1] if shown else None
+        )
         for each in changes
     ]
     is_reviewed = any(each.verdict is not None for each in changes)
     page = render(
-        "changes.html", title=f"{report.get('flight')} - changes", flight=known(report.get("flight")),
-        site=known(report.get("site")), against=at(report, "comparison", "against_version"),
-        headline=_headline(report, changes), summary=" ".join(_summary(report, changes)),
-        warning_lines=_warnings(report), is_many=len(changes) > _MANY, legend=_legend(changes),
-        before_words=before_words, after_words=after_words,
-        **_compared_ground(report, coverage, site, shown), changes=listed, is_reviewed=is_reviewed,
-        has_metres=not site.is_local, systems=() if site.is_local else tuple(SYSTEMS.items()),
-        columns=_columns(listed, is_reviewed), files=_files(site),
-        view_rows=_view_rows(report), not_announced=_not_announced(report),
-        reasons=_reasons(report), how=_how(report),
+        "changes.html",
+        title=f"{report.get('flight')} - changes",
+        flight=known(report.get("flight")),
+        site=known(report.get("site")),
+        against=at(report, "comparison", "against_version"),
+        headline=_headline(report, changes),
+        summary=" ".join(_summary(report, changes)),
+        warning_lines=_warnings(report),
+        is_many=len(changes) > _MANY,
+        legend=_legend(changes),
+        before_words=before_words,
+        after_words=after_words,
+        **_compared_ground(report, coverage, site, shown),
+        changes=listed,
+        is_reviewed=is_reviewed,
+        has_metres=not site.is_local,
+        systems=() if site.is_local else tuple(SYSTEMS.items()),
+        columns=_columns(listed, is_reviewed),
+        files=_files(site),
+        view_rows=_view_rows(report),
+        not_announced=_not_announced(report),
+        reasons=_reasons(report),
+        how=_how(report),
     )
     return str(page)
 
 
 def _compared_ground(
-    report: Mapping[str, Any], coverage: Sequence[Any], site: Site, shown: tuple[Picture, Picture] | None
+    report: Mapping[str, Any],
+    coverage: Sequence[Any],
+    site: Site,
+    shown: tuple[Picture, Picture] | None,
 ) -> dict[str, Any]:
     """The map on both dates with the ground that was not compared, for the template; sizes only of sites in metres."""
     unknown = number_at(report, "comparison", "unknown_share")
     return {
         "map": _map(*shown) if shown else None,
-        "coverage": coverage_shapes(coverage, site, shown[1]) if shown and not site.is_local else (),
-        "gap_rows": gap_rows(coverage), "size_rows": () if site.is_local else size_rows(coverage),
+        "coverage": coverage_shapes(coverage, site, shown[1])
+        if shown and not site.is_local
+        else (),
+        "gap_rows": gap_rows(coverage),
+        "size_rows": () if site.is_local else size_rows(coverage),
         "unknown_share": None if unknown is None else f"{unknown:.1%}",
     }
 
@@ -141,16 +175,24 @@ class _Listed:
     crops: tuple[_Crop, ...]
 
 
-def _listed(change: StoredChange, site: Site, crops: _Crops, most_bytes: int, shown: Picture | None) -> _Listed:
+def _listed(
+    change: StoredChange, site: Site, crops: _Crops, most_bytes: int, shown: Picture | None
+) -> _Listed:
     outline_px = None if shown is None else _outline_px(change, site, shown)
     return _Listed(
-        change.number, change.id, change.kind.value, "" if change.verdict is None else change.verdict.value,
+        change.number,
+        change.id,
+        change.kind.value,
+        "" if change.verdict is None else change.verdict.value,
         change.kind.value + (" is-rejected" if change.verdict is Verdict.REJECTED else ""),
         "" if outline_px is None else _points(outline_px),
         None if outline_px is None or shown is None else _pin(outline_px, shown),
         tuple(place_words(change.centre_m, site).items()),
-        _cells(change, site), _details(change, site),
-        tuple(_crop(rgba, change, when, most_bytes) for when, rgba in zip(("before", "after"), crops)),
+        _cells(change, site),
+        _details(change, site),
+        tuple(
+            _crop(rgba, change, when, most_bytes) for when, rgba in zip(("before", "after"), crops)
+        ),
     )
 
 
@@ -163,7 +205,9 @@ def _headline(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> str
     if area_m2 is not None and report.get("georeferenced", True):
         covered = coverage_words(at(report, "comparison") or {})
         ground, missing = covered or (f" on {area_words(area_m2)} of ground", "")
-    kinds: Counter[ChangeKind] = Counter(each.kind for each in changes if each.kind is not ChangeKind.MOVING)
+    kinds: Counter[ChangeKind] = Counter(
+        each.kind for each in changes if each.kind is not ChangeKind.MOVING
+    )
     moving = sum(each.kind is ChangeKind.MOVING for each in changes)
     also = (f"; also {plural(moving, 'moving object')}" if moving else "") + missing
     is_dark = at(report, "comparison", "most_missed") is True
@@ -191,21 +235,31 @@ def _summary(report: Mapping[str, Any], changes: Sequence[StoredChange]) -> list
     unknown = number_at(report, "comparison", "unknown_share")
     sentences = []
     if views:
-        sentences.append(f"{views.get(ViewStatus.COMPARED.value, 0)} of {sum(views.values())} views were compared.")
+        sentences.append(
+            f"{views.get(ViewStatus.COMPARED.value, 0)} of {sum(views.values())} views were compared."
+        )
     if votes is not None and voters is not None:
         sentences.append(f"A change counts when {votes} of {voters} views of its ground show it.")
     if unknown is not None:
-        sentences.append(f"{unknown:.1%} of the ground under these views was unknown on one of the dates.")
-    grown_m2, extending = (number_at(report, "comparison", "extension", key) for key in ("area_m2", "frames"))
+        sentences.append(
+            f"{unknown:.1%} of the ground under these views was unknown on one of the dates."
+        )
+    grown_m2, extending = (
+        number_at(report, "comparison", "extension", key) for key in ("area_m2", "frames")
+    )
     if grown_m2 and extending:
-        sentences.append(f"The map grew by {area_words(grown_m2)}, shown by {plural(extending, 'frame')}.")
+        sentences.append(
+            f"The map grew by {area_words(grown_m2)}, shown by {plural(extending, 'frame')}."
+        )
     return sentences + _reviewed_words(changes)
 
 
 def _reviewed_words(changes: Sequence[StoredChange]) -> list[str]:
     """One sentence, or none where nothing was reviewed."""
     reviewed = Counter(each.verdict for each in changes if each.verdict is not None)
-    counts = " and ".join(f"{reviewed[verdict]} {verdict.value}" for verdict in Verdict if reviewed[verdict])
+    counts = " and ".join(
+        f"{reviewed[verdict]} {verdict.value}" for verdict in Verdict if reviewed[verdict]
+    )
     return [f"Reviewed by a person: {counts}."] if reviewed else []
 
 
@@ -213,10 +267,14 @@ def _warnings(report: Mapping[str, Any]) -> list[str]:
     warnings = [str(each) for each in at(report, "warnings") or []] + _view_warnings(report)
     unknown = number_at(report, "comparison", "unknown_share")
     if unknown is not None and unknown > _UNKNOWN_SHARE:
-        warnings.append(f"{unknown:.0%} of the ground under the views was unknown: its changes are not in the list.")
+        warnings.append(
+            f"{unknown:.0%} of the ground under the views was unknown: its changes are not in the list."
+        )
     suppressed = number_at(report, "comparison", "suppressed")
     if suppressed:
-        warnings.append(f"{plural(suppressed, 'change')} left out: a person rejected the same after an earlier flight.")
+        warnings.append(
+            f"{plural(suppressed, 'change')} left out: a person rejected the same after an earlier flight."
+        )
     if at(report, "comparison", "map_updated") is False:
         warnings.append("The map was not updated: both halves of the picture show the map before.")
     return warnings
@@ -226,24 +284,33 @@ def _view_warnings(report: Mapping[str, Any]) -> list[str]:
     """Reasons for which more than a tenth of the views could not be compared."""
     views = at(report, "comparison", "views") or {}
     total = sum(views.values())
-    counts = {status: views.get(status.value, 0) for status in (ViewStatus.NOT_ALIGNED, ViewStatus.ALL_CHANGED)}
+    counts = {
+        status: views.get(status.value, 0)
+        for status in (ViewStatus.NOT_ALIGNED, ViewStatus.ALL_CHANGED)
+    }
     return [
         f"{count} of {total} views: {status.value}; each {_VIEW_WORDS[status]}."
-        for status, count in counts.items() if total and count > 0.1 * total
+        for status, count in counts.items()
+        if total and count > 0.1 * total
     ]
 
 
 def _map(before: Picture, after: Picture) -> dict[str, Any]:
     height_px, width_px = after.rgba.shape[:2]
     return {
-        "before": picture_uri(before.rgba), "after": picture_uri(after.rgba), "width": width_px, "height": height_px,
+        "before": picture_uri(before.rgba),
+        "after": picture_uri(after.rgba),
+        "width": width_px,
+        "height": height_px,
     }
 
 
 def _legend(changes: Sequence[StoredChange]) -> list[dict[str, Any]]:
     kinds = Counter(each.kind for each in changes)
     entries = [
-        {"name": kind.value, "meaning": _KIND_WORDS[kind], "count": kinds[kind]} for kind in ChangeKind if kinds[kind]
+        {"name": kind.value, "meaning": _KIND_WORDS[kind], "count": kinds[kind]}
+        for kind in ChangeKind
+        if kinds[kind]
     ]
     rejected = sum(each.verdict is Verdict.REJECTED for each in changes)
     return entries + ([{"name": "rejected", "meaning": "", "count": rejected}] if rejected else [])
@@ -256,12 +323,18 @@ def _columns(listed: Sequence[_Listed], is_reviewed: bool) -> list[str]:
 
 def _cells(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
     """The columns of the list; without GPS lengths have no unit and are left out."""
-    measured = () if site.is_local else (
-        ("size", _length(change.length_m)), ("area", _area(change.area_m2)),
-        ("position accuracy", _length(change.sigma_m)),
+    measured = (
+        ()
+        if site.is_local
+        else (
+            ("size", _length(change.length_m)),
+            ("area", _area(change.area_m2)),
+            ("position accuracy", _length(change.sigma_m)),
+        )
     )
     return (
-        *measured, ("views", "1 alone" if change.is_single_view else str(change.views)),
+        *measured,
+        ("views", "1 alone" if change.is_single_view else str(change.views)),
         ("first seen", time_words(change.first_seen_ns)),
         ("score", f"{change.score:.2f}"),
     )
@@ -269,17 +342,22 @@ def _cells(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
 
 def _details(change: StoredChange, site: Site) -> tuple[tuple[str, str], ...]:
     details = [
-        (f"{name} (1 sigma)" if name == "position accuracy" else name, value) for name, value in _cells(change, site)
+        (f"{name} (1 sigma)" if name == "position accuracy" else name, value)
+        for name, value in _cells(change, site)
     ]
     details.append(("last seen", time_words(change.last_seen_ns)))
     details += [
-        (name, label) for name, label in (("was", change.class_before), ("is now", change.class_after)) if label
+        (name, label)
+        for name, label in (("was", change.class_before), ("is now", change.class_after))
+        if label
     ]
     if not site.is_local and np.isfinite(change.sigma_in_map_m):
         details.append(("position on this map (1 sigma)", _length(change.sigma_in_map_m)))
     if change.height_change is not None:
         risen = change.height_change
-        details.append(("height change", f"{risen.rise_m:+.2f} m (accuracy {risen.sigma_m:.2f} m, 1 sigma)"))
+        details.append(
+            ("height change", f"{risen.rise_m:+.2f} m (accuracy {risen.sigma_m:.2f} m, 1 sigma)")
+        )
     if change.kind is ChangeKind.MOVING:
         details.append(("moves", _velocity(change.velocity_m_s, site)))
     if change.note:
@@ -303,7 +381,9 @@ def _crop(rgba: ImageRGBA | None, change: StoredChange, when: str, most_bytes: i
 def _view_rows(report: Mapping[str, Any]) -> list[tuple[str, int, str]]:
     views = at(report, "comparison", "views") or {}
     return [
-        (status.value, views[status.value], _VIEW_WORDS[status]) for status in ViewStatus if views.get(status.value)
+        (status.value, views[status.value], _VIEW_WORDS[status])
+        for status in ViewStatus
+        if views.get(status.value)
     ]
 
 
@@ -311,7 +391,10 @@ def _not_announced(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Candidates for changes that the views did not confirm, by reason: number, what became of them, reason."""
     return [
         (known(count), words, str(reason))
-        for name, words in (("withdrawn", "withdrawn after being announced"), ("never_announced", "never announced"))
+        for name, words in (
+            ("withdrawn", "withdrawn after being announced"),
+            ("never_announced", "never announced"),
+        )
         for reason, count in (at(report, "comparison", "candidates", name) or {}).items()
     ]
 
@@ -321,8 +404,10 @@ def _how(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("method", at(report, "comparison", "method")),
         ("misalignment of views and map", with_unit("{:.2f} px median", residual_px)),
-        *((str(name).replace("_", " "), _plain(value))
-          for name, value in (at(report, "comparison", "chosen") or {}).items()),
+        *(
+            (str(name).replace("_", " "), _plain(value))
+            for name, value in (at(report, "comparison", "chosen") or {}).items()
+        ),
     ]
     return [(name, str(value)) for name, value in rows if value is not None]
 
@@ -338,7 +423,10 @@ def _pin(outline_px: PointsPx, shown: Picture) -> _Pin | None:
     """Where the change's number stands: beside the outline and within the map; None for one beside the map."""
     height_px, width_px = shown.rgba.shape[:2]
     low, high = outline_px.min(axis=0), outline_px.max(axis=0)
-    is_right, is_above = high[0] < _RIM * width_px, low[1] > (1 - _RIM) * height_px  # else the rim would cut it
+    is_right, is_above = (
+        high[0] < _RIM * width_px,
+        low[1] > (1 - _RIM) * height_px,
+    )  # else the rim would cut it
     x, y = high[0] if is_right else low[0], low[1] if is_above else high[1]
     if not (0 <= x <= width_px and 0 <= y <= height_px):
         return None
@@ -371,9 +459,16 @@ def _plain(value: Any) -> str:
 def _velocity(velocity_m_s: Floats, site: Site) -> str:
     if site.is_local:
         return "yes"
-    towards = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")[
-        round(float(np.arctan2(*velocity_m_s)) / (np.pi / 4)) % 8
-    ]
+    towards = (
+        "north",
+        "north-east",
+        "east",
+        "south-east",
+        "south",
+        "south-west",
+        "west",
+        "north-west",
+    )[round(float(np.arctan2(*velocity_m_s)) / (np.pi / 4)) % 8]
     return f"{float(np.hypot(*velocity_m_s)):.1f} m/s to the {towards}"
 
 

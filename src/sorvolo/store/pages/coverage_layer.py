@@ -12,7 +12,11 @@ from sorvolo.store.pages.words import area_words, at, finite_or_none, length_wor
 from sorvolo.survey.coverage import GAP_WORDS, Gap
 from sorvolo.survey.flight import Site
 
-_PALEST, _DARKEST, _RANGE = 0.05, 0.6, 8.0  # how dark a size is drawn, over so many times the smallest size
+_PALEST, _DARKEST, _RANGE = (
+    0.05,
+    0.6,
+    8.0,
+)  # how dark a size is drawn, over so many times the smallest size
 
 
 @dataclass(frozen=True)
@@ -27,19 +31,25 @@ class CoverageShape:
 def coverage_shapes(coverage: Sequence[Any], site: Site, shown: Picture) -> list[CoverageShape]:
     """The features of coverage.geojson on the page's picture; features that somebody broke are left out."""
     grid = SiteGrid.at(site.origin, site.m_per_px, site.crs)
-    sizes_m = [size for each in coverage if (size := finite_or_none(at(each, "properties", "smallest_m")))]
+    sizes_m = [
+        size for each in coverage if (size := finite_or_none(at(each, "properties", "smallest_m")))
+    ]
     finest_m = min(sizes_m, default=1.0)
     shapes = []
     for feature in coverage:
         rings = [
-            (grid.grid_from_site(np.array(ring, float).reshape(-1, 2)) - shown.corner_px) / shown.step_px
-            for polygon in at(feature, "rings_m") or () for ring in polygon
+            (grid.grid_from_site(np.array(ring, float).reshape(-1, 2)) - shown.corner_px)
+            / shown.step_px
+            for polygon in at(feature, "rings_m") or ()
+            for ring in polygon
         ]
         path = "".join("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in ring) + "Z" for ring in rings)
         size_m = finite_or_none(at(feature, "properties", "smallest_m")) or _RANGE * finest_m
         share = min(float(np.log(size_m / finest_m) / np.log(_RANGE)), 1.0)
         is_compared = at(feature, "properties", "status") == "compared"
-        shapes.append(CoverageShape(path, is_compared, f"{_PALEST + (_DARKEST - _PALEST) * share:.2f}"))
+        shapes.append(
+            CoverageShape(path, is_compared, f"{_PALEST + (_DARKEST - _PALEST) * share:.2f}")
+        )
     return shapes
 
 
@@ -52,7 +62,8 @@ def gap_rows(coverage: Sequence[Any]) -> list[tuple[str, str]]:
             areas[gap, why] = areas.get((gap, why), 0.0) + _area_m2(feature)
     largest_first = sorted(areas.items(), key=lambda item: -item[1])
     return [
-        (GAP_WORDS[Gap(gap)] + (f": {why}" if why else ""), area_words(area)) for (gap, why), area in largest_first
+        (GAP_WORDS[Gap(gap)] + (f": {why}" if why else ""), area_words(area))
+        for (gap, why), area in largest_first
     ]
 
 
@@ -61,11 +72,15 @@ def size_rows(coverage: Sequence[Any]) -> list[tuple[str, str, str]]:
     areas: dict[tuple[float, float], float] = {}
     for feature in coverage:
         if at(feature, "properties", "status") == "compared":
-            found = (finite_or_none(at(feature, "properties", name)) for name in ("smallest_m", "faint_m"))
+            found = (
+                finite_or_none(at(feature, "properties", name))
+                for name in ("smallest_m", "faint_m")
+            )
             plain, faint = (float("inf") if each is None else each for each in found)
             areas[plain, faint] = areas.get((plain, faint), 0.0) + _area_m2(feature)
     return [
-        (_size_words(plain), _size_words(faint), area_words(area)) for (plain, faint), area in sorted(areas.items())
+        (_size_words(plain), _size_words(faint), area_words(area))
+        for (plain, faint), area in sorted(areas.items())
     ]
 
 

@@ -8,17 +8,46 @@ import numpy as np
 from markupsafe import Markup
 
 from sorvolo.geometry.arrays import ImageRGB, ImageRGBA
-from sorvolo.store.pages.plots import SIDE_PX, Line, colour_class, line_plot, stated_and_found, unit_axes
+from sorvolo.store.pages.plots import (
+    SIDE_PX,
+    Line,
+    colour_class,
+    line_plot,
+    stated_and_found,
+    unit_axes,
+)
 from sorvolo.store.pages.render import cell, render
 from sorvolo.store.pages.words import known, picture_uri
 
 _KIND_WORDS = {
-    "false alarm": "The most certain false alarms", "miss": "The largest misses",
+    "false alarm": "The most certain false alarms",
+    "miss": "The largest misses",
     "confusion": "The most certain confusions",
 }
-_SET_NAMES = ("set", "pictures", "videos", "AP", "AP50", "AP75", "AP small", "medium", "large", "thesis mAP")
+_SET_NAMES = (
+    "set",
+    "pictures",
+    "videos",
+    "AP",
+    "AP50",
+    "AP75",
+    "AP small",
+    "medium",
+    "large",
+    "thesis mAP",
+)
 _CLASS_NAMES = (
-    "class", "labels", "AP", "AP50", "AP75", "reported from", "precision", "recall", "F1", "thesis AP", "best F1",
+    "class",
+    "labels",
+    "AP",
+    "AP50",
+    "AP75",
+    "reported from",
+    "precision",
+    "recall",
+    "F1",
+    "thesis AP",
+    "best F1",
     "from",
 )
 _SCORE_NAMES = ("class", "score", "candidates", "right", "90 % interval")
@@ -39,11 +68,17 @@ def detector_page(
     """
     pictures = sum(each.pictures for each in sets)
     page = render(
-        "detector.html", title=f"{model} - detector", model=known(model),
+        "detector.html",
+        title=f"{model} - detector",
+        model=known(model),
         headline="; ".join(f"{each.name}: AP50 {_class_words(each.classes)}" for each in sets),
         summary=f"Measured on {pictures} labelled pictures of {_videos(sets)}. All shares are in per cent.",
-        overview_names=_SET_NAMES, overview=[_overview_row(each) for each in sets], remarks=_remarks(sets),
-        comparisons=[_comparison(each) for each in comparisons], class_names=_CLASS_NAMES, size_names=_SIZE_NAMES,
+        overview_names=_SET_NAMES,
+        overview=[_overview_row(each) for each in sets],
+        remarks=_remarks(sets),
+        comparisons=[_comparison(each) for each in comparisons],
+        class_names=_CLASS_NAMES,
+        size_names=_SIZE_NAMES,
         score_names=_SCORE_NAMES,
         sets=[_set(each, worst.get(each.name, ())) for each in sets],
         description=[(str(key), known(value)) for key, value in description.items()],
@@ -54,10 +89,14 @@ def detector_page(
 def _set(scores: Any, worst: Sequence[tuple[Any, str, ImageRGB]]) -> dict[str, Any]:
     labels = [row.label for row in scores.classes]
     return {
-        "name": scores.name, "classes": _class_rows(scores), "curves": _curves(scores),
-        "by_score": _by_score(scores), "sizes": _sizes(scores),
+        "name": scores.name,
+        "classes": _class_rows(scores),
+        "curves": _curves(scores),
+        "by_score": _by_score(scores),
+        "sizes": _sizes(scores),
         "confusion_names": ["label", *(f"reported as {name}" for name in labels), "missed"],
-        "confusion": _confusion(scores, labels), "mistakes": _mistakes(scores, worst),
+        "confusion": _confusion(scores, labels),
+        "mistakes": _mistakes(scores, worst),
     }
 
 
@@ -67,12 +106,17 @@ def _videos(sets: Sequence[Any]) -> str:
 
 
 def _class_words(classes: Sequence[Any]) -> str:
-    return ", ".join(f"{row.label} {_share(row.coco.ap50)}" for row in classes if row.labels) or "unknown"
+    return (
+        ", ".join(f"{row.label} {_share(row.coco.ap50)}" for row in classes if row.labels)
+        or "unknown"
+    )
 
 
 def _overview_row(each: Any) -> list[Any]:
     return [
-        each.name, each.pictures, each.groups,
+        each.name,
+        each.pictures,
+        each.groups,
         *(_with_interval(each.intervals[name]) for name in ("AP", "AP50", "AP75")),
         *(_share(value) for value in (each.coco.ap_small, each.coco.ap_medium, each.coco.ap_large)),
         _with_interval(each.intervals["thesis_map"]),
@@ -82,7 +126,9 @@ def _overview_row(each: Any) -> list[Any]:
 def _remarks(sets: Sequence[Any]) -> list[str]:
     remarks = [f"{each.name}: {text}" for each in sets for text in each.remarks]
     return remarks + [
-        f"{each.name}: {', '.join(each.left_out)} not labelled there, so not judged" for each in sets if each.left_out
+        f"{each.name}: {', '.join(each.left_out)} not labelled there, so not judged"
+        for each in sets
+        if each.left_out
     ]
 
 
@@ -91,9 +137,13 @@ def _comparison(each: Any) -> dict[str, Any]:
     names = [name for name, value in first.mean.items() if math.isfinite(value)]
     labels = ", ".join(f"{count} {name}" for name, count in each.labels.items())
     return {
-        "name": each.name, "basis": f"{each.pictures} pictures of {each.groups} videos, labels: {labels}.",
-        "head": ["measure", *(arm.name for arm in each.arms),
-                 *(f"{arm.name} less {first.name}" for arm in each.arms[1:])],
+        "name": each.name,
+        "basis": f"{each.pictures} pictures of {each.groups} videos, labels: {labels}.",
+        "head": [
+            "measure",
+            *(arm.name for arm in each.arms),
+            *(f"{arm.name} less {first.name}" for arm in each.arms[1:]),
+        ],
         "rows": [_comparison_row(each, name) for name in names],
     }
 
@@ -113,10 +163,19 @@ def _comparison_row(each: Any, name: str) -> list[Any]:
 def _class_rows(scores: Any) -> list[list[Any]]:
     return [
         [
-            row.label, row.labels, _with_interval(scores.intervals[f"AP {row.label}"]),
-            _with_interval(scores.intervals[f"AP50 {row.label}"]), _share(row.coco.ap75), _number(row.reported.score),
-            *(_share(value) for value in (row.reported.precision, row.reported.recall, row.reported.f1)),
-            _share(row.thesis_ap), _share(row.best.f1), _number(row.best.score),
+            row.label,
+            row.labels,
+            _with_interval(scores.intervals[f"AP {row.label}"]),
+            _with_interval(scores.intervals[f"AP50 {row.label}"]),
+            _share(row.coco.ap75),
+            _number(row.reported.score),
+            *(
+                _share(value)
+                for value in (row.reported.precision, row.reported.recall, row.reported.f1)
+            ),
+            _share(row.thesis_ap),
+            _share(row.best.f1),
+            _number(row.best.score),
         ]
         for row in scores.classes
     ]
@@ -134,7 +193,10 @@ def _curves(scores: Any) -> dict[str, Any] | None:
         points = [(x(recall), y(precision)) for _, precision, recall in row.curve]
         lines.append(Line(colour_class(place), points, dots, "reported", 4.5))
     keys = [(colour_class(place), row.label) for place, row in enumerate(shown)]
-    return {"drawing": line_plot("Precision over recall", lines, frame, SIDE_PX, SIDE_PX), "legend": keys}
+    return {
+        "drawing": line_plot("Precision over recall", lines, frame, SIDE_PX, SIDE_PX),
+        "legend": keys,
+    }
 
 
 def _by_score(scores: Any) -> dict[str, Any] | None:
@@ -142,14 +204,23 @@ def _by_score(scores: Any) -> dict[str, Any] | None:
     shown = [(row, each) for row in scores.classes if row.labels for each in row.by_score]
     if not shown:
         return None
-    rows = [(row.label, each.stated, each.found, each.found_low, each.found_high, each.count) for row, each in shown]
+    rows = [
+        (row.label, each.stated, each.found, each.found_low, each.found_high, each.count)
+        for row, each in shown
+    ]
     names = list(dict.fromkeys(row.label for row, _ in shown))
     return {
         "drawing": stated_and_found(rows, across="score", upwards="right"),
         "legend": [(colour_class(place), name) for place, name in enumerate(names)],
         "rows": [
-            [row.label, f"{each.low:.1f} to {each.high:.1f}", each.count, _share(each.found),
-             f"{_share(each.found_low)} to {_share(each.found_high)}"] for row, each in shown
+            [
+                row.label,
+                f"{each.low:.1f} to {each.high:.1f}",
+                each.count,
+                _share(each.found),
+                f"{_share(each.found_low)} to {_share(each.found_high)}",
+            ]
+            for row, each in shown
         ],
     }
 
@@ -157,14 +228,19 @@ def _by_score(scores: Any) -> dict[str, Any] | None:
 def _sizes(scores: Any) -> list[tuple[str, list[list[Any]]]]:
     tables = []
     for found_by_label, unit, words in (
-        (scores.by_size_px, "px", "in the picture"), (scores.by_size_m, "m", "on the ground"),
+        (scores.by_size_px, "px", "in the picture"),
+        (scores.by_size_m, "m", "on the ground"),
     ):
         rows = [
             [
-                label, _range(row.low, row.high, unit), row.count, cell("share", _share(row.recall), row.recall),
+                label,
+                _range(row.low, row.high, unit),
+                row.count,
+                cell("share", _share(row.recall), row.recall),
                 _share(row.candidates / row.count),
             ]
-            for label, found in found_by_label.items() for row in found
+            for label, found in found_by_label.items()
+            for row in found
         ]
         if rows:
             tables.append((f"Size {words}", rows))
@@ -175,7 +251,9 @@ def _confusion(scores: Any, labels: Sequence[str]) -> list[list[Any]]:
     rows = []
     for k, name in enumerate([*labels, "nothing there"]):
         counts = [int(value) for value in scores.confusion[k]]
-        cells: list[Any] = [cell("hit", count) if k == c else count for c, count in enumerate(counts)]
+        cells: list[Any] = [
+            cell("hit", count) if k == c else count for c, count in enumerate(counts)
+        ]
         rows.append([name, *cells[:-1], cells[-1] if k < len(labels) else ""])
     return rows
 
@@ -186,8 +264,13 @@ def _mistakes(
     blocks = []
     for kind, words in _KIND_WORDS.items():
         figures = [
-            {"words": _mistake_words(mistake), "picture": name, "address": picture_uri(_opaque(crop), 24_000)}
-            for mistake, name, crop in worst if mistake.kind == kind
+            {
+                "words": _mistake_words(mistake),
+                "picture": name,
+                "address": picture_uri(_opaque(crop), 24_000),
+            }
+            for mistake, name, crop in worst
+            if mistake.kind == kind
         ]
         if figures:
             total = sum(each.kind == kind for each in scores.mistakes)
@@ -197,7 +280,9 @@ def _mistakes(
 
 def _mistake_words(mistake: Any) -> str:
     if mistake.kind == "miss":
-        return f"{mistake.true_label} missed" + (f", best candidate {mistake.score:.2f}" if mistake.score else "")
+        return f"{mistake.true_label} missed" + (
+            f", best candidate {mistake.score:.2f}" if mistake.score else ""
+        )
     if mistake.kind == "confusion":
         return f"{mistake.true_label} reported as {mistake.label}, {mistake.score:.2f}"
     beside = f", overlaps a label by {mistake.overlap:.2f}" if mistake.overlap >= 0.1 else ""
@@ -232,4 +317,6 @@ def _with_interval(measured: Any) -> Markup:
 
 def _interval(value: float, low: float, high: float, words: Callable[[float], str]) -> Markup:
     """The value, and its bounds on a line of their own where they are known."""
-    return cell("interval", words(value), *((words(low), words(high)) if math.isfinite(low) else ("", "")))
+    return cell(
+        "interval", words(value), *((words(low), words(high)) if math.isfinite(low) else ("", ""))
+    )

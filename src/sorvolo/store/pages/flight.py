@@ -9,7 +9,14 @@ import numpy as np
 
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.pages.objects import objects_section
-from sorvolo.store.pages.plots import TrackColumns, gps_along, gps_scatter, residuals_along, round_length, track_plan
+from sorvolo.store.pages.plots import (
+    TrackColumns,
+    gps_along,
+    gps_scatter,
+    residuals_along,
+    round_length,
+    track_plan,
+)
 from sorvolo.store.pages.render import render
 from sorvolo.store.pages.words import (
     area_words,
@@ -28,15 +35,27 @@ from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import Status
 
 _TRACK_NUMBERS = (
-    "east_m", "north_m", "up_m", "residual_px", "sigma_m", "gps_east_m", "gps_north_m", "gps_up_m",
+    "east_m",
+    "north_m",
+    "up_m",
+    "residual_px",
+    "sigma_m",
+    "gps_east_m",
+    "gps_north_m",
+    "gps_up_m",
 )
 _STATUS_WORDS = {
     Status.VISION: ("matched", "its picture matches its neighbours"),
-    Status.GPS_ONLY: ("GPS only", "matches no neighbour; placed by telemetry alone, so its edges may be metres off"),
+    Status.GPS_ONLY: (
+        "GPS only",
+        "matches no neighbour; placed by telemetry alone, so its edges may be metres off",
+    ),
     Status.REJECTED: ("not placed", "has no place in the map; see the reasons"),
 }
 _ROLE_WORDS = {
-    "control": "ties the map", "check": "check point", "excluded": "left out: contradicts the others",
+    "control": "ties the map",
+    "check": "check point",
+    "excluded": "left out: contradicts the others",
     "unseen": "in no frame that has a place",
 }
 _STAGE_WORDS = {
@@ -52,7 +71,9 @@ _STAGE_WORDS = {
 
 
 def report_page(
-    report: Mapping[str, Any], picture: ImageRGBA, object_crops: Mapping[str, bytes] = MappingProxyType({}),
+    report: Mapping[str, Any],
+    picture: ImageRGBA,
+    object_crops: Mapping[str, bytes] = MappingProxyType({}),
     site: Site | None = None,
 ) -> str:
     """report.html of one flight: `report` as in report.json (docs/formats.md), `picture` the map, (H, W, 4).
@@ -61,18 +82,37 @@ def report_page(
     or missing in the report is shown as unknown or left out. All text is escaped.
     """
     page = render(
-        "flight.html", title=f"{report.get('flight')} - flight report", flight=known(report.get("flight")),
-        site=known(report.get("site")), inputs=_inputs(report), headline=_headline(report), summary=_summary(report),
-        is_comparison=bool(report.get("comparison")), warning_lines=at(report, "warnings") or [],
-        picture=_picture(report, picture), figures=_key_figures(report),
-        control=_control(report), objects=objects_section(report, object_crops, site), statuses=_statuses(report),
-        reasons=[(count, reason) for reason, count in (at(report, "frames", "reasons") or {}).items()],
-        plots=_plots(report), camera_rows=_camera_and_telemetry(report),
-        notices=[(known(each.get("count")), known(each.get("text")), known(each.get("code")))
-                 for each in at(report, "notices") or []],
-        stages=_stages(report), effort=_effort(report),
-        settings=[(name, _setting_words(value)) for name, value in (at(report, "settings") or {}).items()],
-        versions=list({"sorvolo": known(report.get("sorvolo")), **(at(report, "versions") or {})}.items()),
+        "flight.html",
+        title=f"{report.get('flight')} - flight report",
+        flight=known(report.get("flight")),
+        site=known(report.get("site")),
+        inputs=_inputs(report),
+        headline=_headline(report),
+        summary=_summary(report),
+        is_comparison=bool(report.get("comparison")),
+        warning_lines=at(report, "warnings") or [],
+        picture=_picture(report, picture),
+        figures=_key_figures(report),
+        control=_control(report),
+        objects=objects_section(report, object_crops, site),
+        statuses=_statuses(report),
+        reasons=[
+            (count, reason) for reason, count in (at(report, "frames", "reasons") or {}).items()
+        ],
+        plots=_plots(report),
+        camera_rows=_camera_and_telemetry(report),
+        notices=[
+            (known(each.get("count")), known(each.get("text")), known(each.get("code")))
+            for each in at(report, "notices") or []
+        ],
+        stages=_stages(report),
+        effort=_effort(report),
+        settings=[
+            (name, _setting_words(value)) for name, value in (at(report, "settings") or {}).items()
+        ],
+        versions=list(
+            {"sorvolo": known(report.get("sorvolo")), **(at(report, "versions") or {})}.items()
+        ),
     )
     return str(page)
 
@@ -115,7 +155,9 @@ def _ground(report: Mapping[str, Any]) -> str:
     if not report.get("georeferenced"):
         return ""
     gsd_m = number_at(report, "ground_sampling_distance_m")
-    resolution = f" at a ground resolution of {length_words(gsd_m)} per pixel" if gsd_m is not None else ""
+    resolution = (
+        f" at a ground resolution of {length_words(gsd_m)} per pixel" if gsd_m is not None else ""
+    )
     return f" of {area_words(number_at(report, 'area_m2'))}{resolution}"
 
 
@@ -143,7 +185,11 @@ def _picture(report: Mapping[str, Any], picture: ImageRGBA) -> dict[str, Any] | 
         return None
     height_px, width_px = picture.shape[:2]
     shown = {
-        "address": picture_uri(picture), "width": width_px, "height": height_px, "bar_share": 0.0, "bar_words": "",
+        "address": picture_uri(picture),
+        "width": width_px,
+        "height": height_px,
+        "bar_share": 0.0,
+        "bar_words": "",
         "caption": "The map. Grey ground was never photographed.",
     }
     area_m2 = number_at(report, "area_m2")
@@ -152,7 +198,8 @@ def _picture(report: Mapping[str, Any], picture: ImageRGBA) -> dict[str, Any] | 
         width_m = math.sqrt(area_m2 / np.count_nonzero(picture[..., 3])) * width_px
         length_m = round_length(width_m / 4)
         shown |= {
-            "bar_share": length_m / width_m, "bar_words": f"{length_m:g} m",
+            "bar_share": length_m / width_m,
+            "bar_words": f"{length_m:g} m",
             "caption": "The map, north up. Grey ground was never photographed.",
         }
     return shown
@@ -164,13 +211,24 @@ def _key_figures(report: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     other = "the map" if report.get("comparison") else "its neighbours"
     total = at(report, "frames", "total")
     figures = [
-        ("frames matched", f"{_count(report, Status.VISION)} of {at(report, 'frames', 'selected') or 0}",
-         f"selected from {'an unknown number' if total is None else plural(total, 'frame')}"),
+        (
+            "frames matched",
+            f"{_count(report, Status.VISION)} of {at(report, 'frames', 'selected') or 0}",
+            f"selected from {'an unknown number' if total is None else plural(total, 'frame')}",
+        ),
         *(_metric_figures(report) if report.get("georeferenced") else []),
-        ("misalignment", with_unit("{:.2f} px", number_at(report, "residual_px", "median")),
-         f"median distance between a frame and {other}; 95 % are below {p95}"),
-        ("time taken", seconds_words(number_at(report, "seconds", "total")),
-         f"{1000 * cpu_s:.0f} ms of processor time to match a frame" if cpu_s is not None else "in all"),
+        (
+            "misalignment",
+            with_unit("{:.2f} px", number_at(report, "residual_px", "median")),
+            f"median distance between a frame and {other}; 95 % are below {p95}",
+        ),
+        (
+            "time taken",
+            seconds_words(number_at(report, "seconds", "total")),
+            f"{1000 * cpu_s:.0f} ms of processor time to match a frame"
+            if cpu_s is not None
+            else "in all",
+        ),
     ]
     return [(name, value, words) for name, value, words in figures if value]
 
@@ -181,14 +239,26 @@ def _metric_figures(report: Mapping[str, Any]) -> list[tuple[str, str | None, st
     rms = length_words(number_at(report, "gps_residual_m", "rms")) or "unknown"
     return [
         ("area", area_words(number_at(report, "area_m2")), "seen by at least one frame"),
-        ("ground resolution", length_words(number_at(report, "ground_sampling_distance_m")),
-         f"per pixel of the map; of the frames {native}"),
-        ("position accuracy", length_words(number_at(report, "sigma_m")),
-         "1 sigma: two of three such maps lie closer to their true position; includes the error shared by all fixes"),
-        ("distance to GPS", length_words(number_at(report, "gps_residual_m", "median")),
-         f"median, horizontal, of cameras and their fixes; root mean square {rms}"),
-        ("flight height", with_unit("{:.1f} m", number_at(report, "height_above_ground_m")),
-         "above the ground, median"),
+        (
+            "ground resolution",
+            length_words(number_at(report, "ground_sampling_distance_m")),
+            f"per pixel of the map; of the frames {native}",
+        ),
+        (
+            "position accuracy",
+            length_words(number_at(report, "sigma_m")),
+            "1 sigma: two of three such maps lie closer to their true position; includes the error shared by all fixes",
+        ),
+        (
+            "distance to GPS",
+            length_words(number_at(report, "gps_residual_m", "median")),
+            f"median, horizontal, of cameras and their fixes; root mean square {rms}",
+        ),
+        (
+            "flight height",
+            with_unit("{:.1f} m", number_at(report, "height_above_ground_m")),
+            "above the ground, median",
+        ),
     ]
 
 
@@ -203,9 +273,13 @@ def _control(report: Mapping[str, Any]) -> dict[str, Any] | None:
         if (number := number_at(report, "control", key)) is not None
     ]
     rows = [
-        (known(each.get("label")), _ROLE_WORDS.get(str(each.get("role")), known(each.get("role"))),
-         each.get("marks"), *(_signed_m(each.get(name)) for name in ("east_m", "north_m")),
-         with_unit("{:.3f}", finite_or_none(each.get("distance_m"))) or "")
+        (
+            known(each.get("label")),
+            _ROLE_WORDS.get(str(each.get("role")), known(each.get("role"))),
+            each.get("marks"),
+            *(_signed_m(each.get(name)) for name in ("east_m", "north_m")),
+            with_unit("{:.3f}", finite_or_none(each.get("distance_m"))) or "",
+        )
         for each in control.get("points") or []
     ]
     source = f"From {known(control.get('file'))}, {known(control.get('crs'))}"
@@ -219,8 +293,13 @@ def _signed_m(value: Any) -> str:
 def _statuses(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     selected = max(1, int(at(report, "frames", "selected") or 0))
     return [
-        {"name": status.value, "words": words, "meaning": meaning, "count": _count(report, status),
-         "share": _count(report, status) / selected}
+        {
+            "name": status.value,
+            "words": words,
+            "meaning": meaning,
+            "count": _count(report, status),
+            "share": _count(report, status) / selected,
+        }
         for status, (words, meaning) in _STATUS_WORDS.items()
     ]
 
@@ -231,8 +310,10 @@ def _plots(report: Mapping[str, Any]) -> dict[str, str]:
         return {"plan": "", "residuals": "", "scatter": "", "along": ""}
     unit = "m" if report.get("georeferenced") else ""
     return {
-        "plan": track_plan(track, unit=unit), "residuals": residuals_along(track),
-        "scatter": gps_scatter(track, unit=unit), "along": gps_along(track, unit=unit),
+        "plan": track_plan(track, unit=unit),
+        "residuals": residuals_along(track),
+        "scatter": gps_scatter(track, unit=unit),
+        "along": gps_along(track, unit=unit),
     }
 
 
@@ -241,19 +322,38 @@ def _camera_and_telemetry(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     distortion = at(report, "camera", "distortion_k1_k2_p1_p2_k3") or []
     rows = [
         ("camera", camera.get("origin")),
-        ("picture", f"{camera['width_px']} x {camera['height_px']} px" if camera.get("width_px") else None),
-        ("focal length", join_words(
-            with_unit("{:.1f} px", number_at(report, "camera", "focal_px")),
-            _within(number_at(report, "camera", "focal_sigma_relative")),
-        )),
-        ("focal length estimated", join_words(
-            with_unit("{:.1f} px", number_at(report, "camera", "focal_found_px")),
-            _within(number_at(report, "camera", "focal_found_sigma_relative")),
-        )),
-        ("distortion k1 k2 p1 p2 k3", "  ".join(f"{each:.4g}" for each in distortion if each is not None)),
-        ("further distortion estimated", with_unit("{:+.4f} (radial)", number_at(report, "camera", "radial_found"))),
-        ("telemetry",
-         join_words(telemetry.get("format"), with_unit("with {:.0f} samples", telemetry.get("samples")))),
+        (
+            "picture",
+            f"{camera['width_px']} x {camera['height_px']} px" if camera.get("width_px") else None,
+        ),
+        (
+            "focal length",
+            join_words(
+                with_unit("{:.1f} px", number_at(report, "camera", "focal_px")),
+                _within(number_at(report, "camera", "focal_sigma_relative")),
+            ),
+        ),
+        (
+            "focal length estimated",
+            join_words(
+                with_unit("{:.1f} px", number_at(report, "camera", "focal_found_px")),
+                _within(number_at(report, "camera", "focal_found_sigma_relative")),
+            ),
+        ),
+        (
+            "distortion k1 k2 p1 p2 k3",
+            "  ".join(f"{each:.4g}" for each in distortion if each is not None),
+        ),
+        (
+            "further distortion estimated",
+            with_unit("{:+.4f} (radial)", number_at(report, "camera", "radial_found")),
+        ),
+        (
+            "telemetry",
+            join_words(
+                telemetry.get("format"), with_unit("with {:.0f} samples", telemetry.get("samples"))
+            ),
+        ),
         ("tied to the frames by", telemetry.get("tie")),
         ("height from", telemetry.get("height")),
         ("attitude from", telemetry.get("attitude")),
@@ -265,11 +365,17 @@ def _camera_and_telemetry(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def _estimates(report: Mapping[str, Any]) -> list[tuple[str, str | None]]:
     """What the map's adjustment found besides the frames' positions."""
-    kept, dropped = number_at(report, "links", "kept"), number_at(report, "links", "dropped_as_false")
+    kept, dropped = (
+        number_at(report, "links", "kept"),
+        number_at(report, "links", "dropped_as_false"),
+    )
     false = "" if dropped is None else f", {dropped:.0f} dropped as false"
     pairs = None if kept is None else f"{kept:.0f} kept{false}"
     metric = [
-        ("altitude offset estimated", with_unit("{:+.2f} m", number_at(report, "altitude_offset_m"))),
+        (
+            "altitude offset estimated",
+            with_unit("{:+.2f} m", number_at(report, "altitude_offset_m")),
+        ),
         ("relief of the ground", with_unit("{:.2f} m", number_at(report, "relief_m"))),
     ]
     return [
@@ -280,15 +386,28 @@ def _estimates(report: Mapping[str, Any]) -> list[tuple[str, str | None]]:
 
 
 def _clock_offset(report: Mapping[str, Any]) -> str:
-    origin, applied = at(report, "time_offset", "origin"), number_at(report, "time_offset", "applied_s")
-    estimate, sigma = number_at(report, "time_offset", "estimate_s"), number_at(report, "time_offset", "sigma_s")
+    origin, applied = (
+        at(report, "time_offset", "origin"),
+        number_at(report, "time_offset", "applied_s"),
+    )
+    estimate, sigma = (
+        number_at(report, "time_offset", "estimate_s"),
+        number_at(report, "time_offset", "sigma_s"),
+    )
     nothing = origin in (None, "none") or applied is None
     words = "none applied" if nothing else f"{applied:+.3f} s applied, {origin}"
     if estimate is not None:
-        words += f"; estimated from motion: {estimate:+.3f} s" + (f" \u00b1 {sigma:.3f} s" if sigma is not None else "")
-    before, after = number_at(report, "time_offset", "rms_at_zero_m"), number_at(report, "time_offset", "rms_m")
+        words += f"; estimated from motion: {estimate:+.3f} s" + (
+            f" \u00b1 {sigma:.3f} s" if sigma is not None else ""
+        )
+    before, after = (
+        number_at(report, "time_offset", "rms_at_zero_m"),
+        number_at(report, "time_offset", "rms_m"),
+    )
     if before is not None and after is not None:
-        words += f" (path against GPS: {before:.2f} m rms without the offset, {after:.2f} m with it)"
+        words += (
+            f" (path against GPS: {before:.2f} m rms without the offset, {after:.2f} m with it)"
+        )
     return words
 
 
@@ -297,8 +416,12 @@ def _stages(report: Mapping[str, Any]) -> list[dict[str, Any]]:
     rows = _stage_rows(report)
     longest = max([value for _, value, _ in rows] + [1e-9])
     return [
-        {"name": name, "share": value / longest, "time": seconds_words(value),
-         "cpu": "" if cpu_s is None else seconds_words(cpu_s)}
+        {
+            "name": name,
+            "share": value / longest,
+            "time": seconds_words(value),
+            "cpu": "" if cpu_s is None else seconds_words(cpu_s),
+        }
         for name, value, cpu_s in rows
     ]
 
@@ -308,7 +431,10 @@ def _stage_rows(report: Mapping[str, Any]) -> list[tuple[str, float, float | Non
     wall, cpu = at(report, "seconds") or {}, at(report, "cpu_s") or {}
     stages = {name: finite_or_none(value) or 0.0 for name, value in wall.items() if name != "total"}
     rest = (finite_or_none(wall.get("total")) or 0.0) - sum(stages.values())
-    rows = [(_STAGE_WORDS.get(name, name), value, finite_or_none(cpu.get(name))) for name, value in stages.items()]
+    rows = [
+        (_STAGE_WORDS.get(name, name), value, finite_or_none(cpu.get(name)))
+        for name, value in stages.items()
+    ]
     if rest > 0:
         rows.append(("reading frames, and the rest", rest, None))
     return rows
@@ -327,7 +453,10 @@ def _effort(report: Mapping[str, Any]) -> str:
 
 def _reading(report: Mapping[str, Any]) -> str | None:
     """How much of a video was decoded."""
-    decoded, skipped = number_at(report, "reading", "decoded"), number_at(report, "reading", "skipped")
+    decoded, skipped = (
+        number_at(report, "reading", "decoded"),
+        number_at(report, "reading", "skipped"),
+    )
     if decoded is None or skipped is None:
         return None
     if why := at(report, "reading", "whole_because"):
@@ -341,13 +470,20 @@ def _track(report: Mapping[str, Any]) -> TrackColumns:
     unknown = float("nan")
     has_gps = bool(report.get("georeferenced"))
     columns = {
-        name: np.array([
-            unknown if (number := finite_or_none(row.get(name))) is None else number for row in rows
-        ]) if has_gps or not name.startswith("gps_") else np.full(len(rows), unknown)
+        name: np.array(
+            [
+                unknown if (number := finite_or_none(row.get(name))) is None else number
+                for row in rows
+            ]
+        )
+        if has_gps or not name.startswith("gps_")
+        else np.full(len(rows), unknown)
         for name in _TRACK_NUMBERS
     }
     return TrackColumns(
-        tuple(str(row.get("frame")) for row in rows), tuple(str(row.get("status")) for row in rows), columns
+        tuple(str(row.get("frame")) for row in rows),
+        tuple(str(row.get("status")) for row in rows),
+        columns,
     )
 
 

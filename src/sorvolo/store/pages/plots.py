@@ -11,7 +11,9 @@ from markupsafe import Markup
 from sorvolo.geometry.arrays import Floats
 from sorvolo.store.pages.render import render
 
-_WIDE_PX = 720  # of all drawings: a phone's screen and a page's column take it; the rest by choice too
+_WIDE_PX = (
+    720  # of all drawings: a phone's screen and a page's column take it; the rest by choice too
+)
 _LOW_PX = 250
 _MARGIN_PX = 46.0
 _PLAN_HIGHEST_PX = 620.0
@@ -63,7 +65,9 @@ class Scale:
 def round_length(about: float) -> float:
     """The largest of ... 0.2, 0.5, 1, 2, 5, 10, 20 ... that is no more than `about`, a positive number."""
     power = 10.0 ** math.floor(math.log10(about))
-    return power * max(each for each in (1, 2, 5) if each <= about / power * (1 + 1e-9) or each == 1)
+    return power * max(
+        each for each in (1, 2, 5) if each <= about / power * (1 + 1e-9) or each == 1
+    )
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,9 @@ class Bar:
     words: str
 
 
-def bar_plot(title: str, groups: Sequence[tuple[str, Sequence[Bar]]], width: float, height: float) -> Markup:
+def bar_plot(
+    title: str, groups: Sequence[tuple[str, Sequence[Bar]]], width: float, height: float
+) -> Markup:
     """Groups of bars beside each other, shares in per cent upwards, each group with its name below."""
     y = Scale(0, 1, height - 34, 18)
     wide = (width - 2 * _MARGIN_PX) / max(1, len(groups))
@@ -128,14 +134,33 @@ def bar_plot(title: str, groups: Sequence[tuple[str, Sequence[Bar]]], width: flo
         left, step = _MARGIN_PX + (place + 0.1) * wide, 0.8 * wide / max(1, len(bars))
         labels.append(Label(_MARGIN_PX + (place + 0.5) * wide, height - 14, name))
         for k, bar in enumerate(bars):
-            drawn.append((bar.style, left + k * step, y(bar.share), 0.85 * step, y(0) - y(bar.share), bar.words))
-            labels.append(Label(left + (k + 0.42) * step, y(bar.share) - 4, f"{100 * bar.share:.0f}"))
+            drawn.append(
+                (
+                    bar.style,
+                    left + k * step,
+                    y(bar.share),
+                    0.85 * step,
+                    y(0) - y(bar.share),
+                    bar.words,
+                )
+            )
+            labels.append(
+                Label(left + (k + 0.42) * step, y(bar.share) - 4, f"{100 * bar.share:.0f}")
+            )
     ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
     labels += [Label(_MARGIN_PX - 6, y(tick) + 4, f"{100 * tick:g}", "end") for tick in ticks]
     frame = Axes(
-        _MARGIN_PX, width - 8, 18, y(0), tuple((_line_style(tick), y(tick)) for tick in ticks), (), tuple(labels)
+        _MARGIN_PX,
+        width - 8,
+        18,
+        y(0),
+        tuple((_line_style(tick), y(tick)) for tick in ticks),
+        (),
+        tuple(labels),
     )
-    return render("plots/bars.svg", title=title, bars=drawn, frame=frame, width=width, height=height)
+    return render(
+        "plots/bars.svg", title=title, bars=drawn, frame=frame, width=width, height=height
+    )
 
 
 def colour_class(place: int) -> str:
@@ -143,9 +168,13 @@ def colour_class(place: int) -> str:
     return f"c{place % _COLOURS}"
 
 
-def line_plot(title: str, lines: Sequence[Line], frame: Axes, width: float, height: float) -> Markup:
+def line_plot(
+    title: str, lines: Sequence[Line], frame: Axes, width: float, height: float
+) -> Markup:
     """Lines over their axes."""
-    return render("plots/lines.svg", title=title, lines=lines, frame=frame, width=width, height=height)
+    return render(
+        "plots/lines.svg", title=title, lines=lines, frame=frame, width=width, height=height
+    )
 
 
 def unit_axes(across: str, upwards: str) -> tuple[Scale, Scale, Axes]:
@@ -154,10 +183,22 @@ def unit_axes(across: str, upwards: str) -> tuple[Scale, Scale, Axes]:
     ticks = (0.0, 0.25, 0.5, 0.75, 1.0)
     labels = [Label(x(tick), y(0) + 16, f"{tick:g}") for tick in ticks]
     labels += [Label(x(0) - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
-    labels += [Label(x(1), SIDE_PX - 8, across, "end"), Label(6, SIDE_PX - 8, f"{upwards} upwards", "start")]
-    return x, y, Axes(
-        x(0), x(1), 12, y(0), tuple(("grid", y(tick)) for tick in ticks), tuple(("grid", x(tick)) for tick in ticks),
-        tuple(labels),
+    labels += [
+        Label(x(1), SIDE_PX - 8, across, "end"),
+        Label(6, SIDE_PX - 8, f"{upwards} upwards", "start"),
+    ]
+    return (
+        x,
+        y,
+        Axes(
+            x(0),
+            x(1),
+            12,
+            y(0),
+            tuple(("grid", y(tick)) for tick in ticks),
+            tuple(("grid", x(tick)) for tick in ticks),
+            tuple(labels),
+        ),
     )
 
 
@@ -173,17 +214,29 @@ def track_plan(track: TrackColumns, *, unit: str) -> str:
         return ""
     fixed = shown & np.isfinite(fix_east) & np.isfinite(fix_north)
     x, y, height, px = _plan_scales(
-        np.concatenate([east[shown], fix_east[fixed]]), np.concatenate([north[shown], fix_north[fixed]])
+        np.concatenate([east[shown], fix_east[fixed]]),
+        np.concatenate([north[shown], fix_north[fixed]]),
     )
     length = round_length((x.high - x.low + y.high - y.low) / 6)
     return render(
-        "plots/track.svg", width=_WIDE_PX, height=height,
+        "plots/track.svg",
+        width=_WIDE_PX,
+        height=height,
         path=[(x(east[k]), y(north[k])) for k in np.flatnonzero(shown)],
-        fixes=[(x(east[k]), y(north[k]), x(fix_east[k]), y(fix_north[k])) for k in np.flatnonzero(fixed)],
+        fixes=[
+            (x(east[k]), y(north[k]), x(fix_east[k]), y(fix_north[k]))
+            for k in np.flatnonzero(fixed)
+        ],
         marks=[_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(shown)],
-        start=_start_label(x(east[shown]), y(north[shown]), x(fix_east) if fixed[np.flatnonzero(shown)[0]] else None,
-                           int(np.flatnonzero(shown)[0])),
-        bar=length * px, bar_words=f"{length:g} {unit}".strip(), has_north=unit == "m",
+        start=_start_label(
+            x(east[shown]),
+            y(north[shown]),
+            x(fix_east) if fixed[np.flatnonzero(shown)[0]] else None,
+            int(np.flatnonzero(shown)[0]),
+        ),
+        bar=length * px,
+        bar_words=f"{length:g} {unit}".strip(),
+        has_north=unit == "m",
     )
 
 
@@ -193,11 +246,17 @@ def residuals_along(track: TrackColumns) -> str:
     highest = float(np.nanmax(values)) if np.isfinite(values).any() else 1.0
     x, y, frame = _frame_axes(len(track), 0.0, max(highest, 1e-3) * 1.08, "px")
     marks = [
-        _mark(x(k + 1), y(value if math.isfinite(value) else 0.0), track, k) for k, value in enumerate(values)
+        _mark(x(k + 1), y(value if math.isfinite(value) else 0.0), track, k)
+        for k, value in enumerate(values)
     ]
     return render(
-        "plots/marks.svg", title="Misalignment of each frame along the flight", frame=frame, marks=marks, circle=None,
-        width=_WIDE_PX, height=_LOW_PX,
+        "plots/marks.svg",
+        title="Misalignment of each frame along the flight",
+        frame=frame,
+        marks=marks,
+        circle=None,
+        width=_WIDE_PX,
+        height=_LOW_PX,
     )
 
 
@@ -215,7 +274,9 @@ def gps_along(track: TrackColumns, *, unit: str) -> str:
         for run in _runs(np.isfinite(values)):
             points = [(x(k + 1), y(values[k])) for k in run]
             lines.append(Line(name, points, points if len(run) == 1 else ()))
-    return line_plot("Camera position less GPS fix, along the flight", lines, frame, _WIDE_PX, _LOW_PX)
+    return line_plot(
+        "Camera position less GPS fix, along the flight", lines, frame, _WIDE_PX, _LOW_PX
+    )
 
 
 def gps_scatter(track: TrackColumns, *, unit: str) -> str:
@@ -230,21 +291,40 @@ def gps_scatter(track: TrackColumns, *, unit: str) -> str:
     ticks = list(x.ticks(6))
     labels = [Label(x(tick), low + 16, f"{tick:g}") for tick in ticks]
     labels += [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
-    labels += [Label(size - 12, size - 10, f"east, {unit}", "end"), Label(8, 22, f"north, {unit}", "start")]
+    labels += [
+        Label(size - 12, size - 10, f"east, {unit}", "end"),
+        Label(8, 22, f"north, {unit}", "start"),
+    ]
     frame = Axes(
-        _MARGIN_PX, size - 12, 12, low, tuple((_line_style(tick), y(tick)) for tick in ticks),
-        tuple((_line_style(tick), x(tick)) for tick in ticks), tuple(labels),
+        _MARGIN_PX,
+        size - 12,
+        12,
+        low,
+        tuple((_line_style(tick), y(tick)) for tick in ticks),
+        tuple((_line_style(tick), x(tick)) for tick in ticks),
+        tuple(labels),
     )
-    half_px = float(np.median(np.hypot(east[known], north[known]))) / (2 * reach) * (size - 12 - _MARGIN_PX)
+    half_px = (
+        float(np.median(np.hypot(east[known], north[known])))
+        / (2 * reach)
+        * (size - 12 - _MARGIN_PX)
+    )
     return render(
-        "plots/marks.svg", title="Camera position less GPS fix, east and north", frame=frame,
+        "plots/marks.svg",
+        title="Camera position less GPS fix, east and north",
+        frame=frame,
         marks=[_mark(x(east[k]), y(north[k]), track, int(k)) for k in np.flatnonzero(known)],
-        circle=(x(0), y(0), half_px), width=size, height=size,
+        circle=(x(0), y(0), half_px),
+        width=size,
+        height=size,
     )
 
 
 def stated_and_found(
-    rows: Sequence[tuple[str, float, float, float, float, int]], *, across: str = "stated", upwards: str = "found",
+    rows: Sequence[tuple[str, float, float, float, float, int]],
+    *,
+    across: str = "stated",
+    upwards: str = "found",
 ) -> Markup:
     """What came true over what was stated, both 0 to 1; on the rising line both agree.
 
@@ -256,10 +336,15 @@ def stated_and_found(
     lines = [Line("median", [(x(0), y(0)), (x(1), y(1))])]
     for name, stated, found, found_low, found_high, count in rows:
         words = f"{name}: {stated:.2f} {across}, {found:.2f} {upwards} of {count}"
-        lines.append(Line(
-            colour_class(names.index(name)), [(x(stated), y(found_low)), (x(stated), y(found_high))],
-            [(x(stated), y(found))], words, 4.0,
-        ))
+        lines.append(
+            Line(
+                colour_class(names.index(name)),
+                [(x(stated), y(found_low)), (x(stated), y(found_high))],
+                [(x(stated), y(found))],
+                words,
+                4.0,
+            )
+        )
     return line_plot(f"{upwards.capitalize()} over {across}", lines, frame, SIDE_PX, SIDE_PX)
 
 
@@ -289,8 +374,13 @@ def _frame_axes(count: int, low: float, high: float, unit: str) -> tuple[Scale, 
     y = Scale(low, high, _LOW_PX - 34, 18)
     ticks = list(y.ticks(5))
     labels = [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in ticks]
-    labels += [Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)]
-    labels += [Label(8, 12, unit, "start"), Label(_WIDE_PX - 8, _LOW_PX - 2, "selected frame, in order", "end")]
+    labels += [
+        Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)
+    ]
+    labels += [
+        Label(8, 12, unit, "start"),
+        Label(_WIDE_PX - 8, _LOW_PX - 2, "selected frame, in order", "end"),
+    ]
     across = tuple((_line_style(tick), y(tick)) for tick in ticks)
     return x, y, Axes(_MARGIN_PX, _WIDE_PX - 8, 18, _LOW_PX - 34, across, (), tuple(labels))
 
@@ -303,7 +393,9 @@ def _mark(x: float, y: float, track: TrackColumns, k: int) -> Mark:
     """A frame's mark, whose words name it."""
     status, residual = track.statuses[k], track["residual_px"][k]
     tail = f", misalignment {residual:.2f} px" if math.isfinite(residual) else ""
-    return Mark(float(x), float(y), status, f"{track.names[k]}: {_STATUS_WORDS.get(status, status)}{tail}")
+    return Mark(
+        float(x), float(y), status, f"{track.names[k]}: {_STATUS_WORDS.get(status, status)}{tail}"
+    )
 
 
 def _extent(values: Floats) -> tuple[float, float]:

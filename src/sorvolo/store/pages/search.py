@@ -6,28 +6,46 @@ from typing import Any
 from sorvolo.geometry.arrays import ImageRGBA
 from sorvolo.store.pages.plots import colour_class, stated_and_found
 from sorvolo.store.pages.render import render
-from sorvolo.store.pages.words import area_words, at, known, number_at, picture_uri, seconds_words, with_unit
+from sorvolo.store.pages.words import (
+    area_words,
+    at,
+    known,
+    number_at,
+    picture_uri,
+    seconds_words,
+    with_unit,
+)
 
 
 def search_page(report: Mapping[str, Any], pictures: Mapping[str, ImageRGBA]) -> str:
     """search.html of search.json's content; `pictures` are the maps of the classes' probabilities. Text is escaped."""
     first = next(iter(report["classes"]))
     page = render(
-        "search.html", title=f"{known(report['site'])} - what the search would have found", site=known(report["site"]),
-        headline=_sentence(known(at(report, "headline", "text"))), model=known(report["model"]),
+        "search.html",
+        title=f"{known(report['site'])} - what the search would have found",
+        site=known(report["site"]),
+        headline=_sentence(known(at(report, "headline", "text"))),
+        model=known(report["model"]),
         notices=[*report["warnings"], *(known(at(each, "text")) for each in report["notices"])],
         maps=[(label, picture_uri(picture)) for label, picture in pictures.items()],
-        figures=_figures(report["classes"][first]), holes=_holes(report["classes"]), segments=_segments(report),
-        refly=_refly(report.get("refly")), plants=_plants(report), calibration=_calibration(report),
+        figures=_figures(report["classes"][first]),
+        holes=_holes(report["classes"]),
+        segments=_segments(report),
+        refly=_refly(report.get("refly")),
+        plants=_plants(report),
+        calibration=_calibration(report),
         calibration_plot=_calibration_plot(report),
-        cell=with_unit("{:g} m", report["cell_m"]), so_far=report["so_far"],
+        cell=with_unit("{:g} m", report["cell_m"]),
+        so_far=report["so_far"],
     )
     return str(page)
 
 
 def waiting_page(*, is_over: bool) -> str:
     """search.html of a flight of which nothing was measured yet: it loads itself anew, until the flight is over."""
-    return str(render("search_waiting.html", title="What a search would have found", is_over=is_over))
+    return str(
+        render("search_waiting.html", title="What a search would have found", is_over=is_over)
+    )
 
 
 def _sentence(text: str) -> str:
@@ -35,27 +53,38 @@ def _sentence(text: str) -> str:
 
 
 def _figures(row: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    interval = f"90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f}; unseen ground counts as 0"
+    interval = (
+        f"90 % interval {row['pod_low']:.2f} to {row['pod_high']:.2f}; unseen ground counts as 0"
+    )
     return [
         ("probability of detection (POD)", f"{row['pod']:.2f}", interval),
         ("area", area_words(row["area_m2"]), f"of it seen: {area_words(row['seen_m2'])}"),
-        ("effective sweep width", with_unit("{:.1f} m", row["sweep_width_m"]) or "unknown",
-         "ground times its probability, within the area or not, over the path of all flights"),
-        ("coverage", f"{row['coverage']:.2f}", f"a random search of that effort has POD {row['random_pod']:.2f}"),
+        (
+            "effective sweep width",
+            with_unit("{:.1f} m", row["sweep_width_m"]) or "unknown",
+            "ground times its probability, within the area or not, over the path of all flights",
+        ),
+        (
+            "coverage",
+            f"{row['coverage']:.2f}",
+            f"a random search of that effort has POD {row['random_pod']:.2f}",
+        ),
     ]
 
 
 def _holes(classes: Mapping[str, Any]) -> list[list[str]]:
     return [
         [label, reason, area_words(area_m2), f"{area_m2 / row['area_m2']:.0%}"]
-        for label, row in classes.items() for reason, area_m2 in row["holes_m2"].items()
+        for label, row in classes.items()
+        for reason, area_m2 in row["holes_m2"].items()
     ]
 
 
 def _segments(report: Mapping[str, Any]) -> list[list[str]]:
     return [
         [
-            known(each["name"]), *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
+            known(each["name"]),
+            *(f"{each[key]:.2f}" for key in ("poa", "pod", "pos", "left")),
             area_words(each["area_m2"]),
         ]
         for each in report["segments"]
@@ -75,28 +104,50 @@ def _refly(refly: Mapping[str, Any] | None) -> str:
 
 def _plants(report: Mapping[str, Any]) -> list[list[str]]:
     return [
-        [known(flight["name"]), label, str(row["planted"]), str(row["found"]),
-         "{:.2f} to {:.2f}".format(*row["interval"]), str(flight["frames"]), seconds_words(flight["seconds"])]
-        for flight in report["flights"] for label, row in flight["classes"].items()
+        [
+            known(flight["name"]),
+            label,
+            str(row["planted"]),
+            str(row["found"]),
+            "{:.2f} to {:.2f}".format(*row["interval"]),
+            str(flight["frames"]),
+            seconds_words(flight["seconds"]),
+        ]
+        for flight in report["flights"]
+        for label, row in flight["classes"].items()
     ]
 
 
 def _calibration_plot(report: Mapping[str, Any]) -> dict[str, Any]:
     """The drawing of `_calibration`, and what its colours are."""
     rows = [
-        (f"{name}, {label}", float(each["stated"]), float(each["found"]), float(each["found_low"]),
-         float(each["found_high"]), int(each["count"])) for name, label, each in _calibrated(report)
+        (
+            f"{name}, {label}",
+            float(each["stated"]),
+            float(each["found"]),
+            float(each["found_low"]),
+            float(each["found_high"]),
+            int(each["count"]),
+        )
+        for name, label, each in _calibrated(report)
     ]
     names = list(dict.fromkeys(name for name, *_ in rows))
     return {
-        "drawing": stated_and_found(rows), "legend": [(colour_class(k), name) for k, name in enumerate(names)],
+        "drawing": stated_and_found(rows),
+        "legend": [(colour_class(k), name) for k, name in enumerate(names)],
     }
 
 
 def _calibration(report: Mapping[str, Any]) -> list[list[str]]:
     return [
-        [name, label, f"{each['stated']:.2f}", f"{each['found']:.2f}",
-         f"{each['found_low']:.2f} to {each['found_high']:.2f}", str(each["count"])]
+        [
+            name,
+            label,
+            f"{each['stated']:.2f}",
+            f"{each['found']:.2f}",
+            f"{each['found_low']:.2f} to {each['found_high']:.2f}",
+            str(each["count"]),
+        ]
         for name, label, each in _calibrated(report)
     ]
 

@@ -10,8 +10,10 @@ from sorvolo.store.pages.words import at, known, seconds_words
 
 _WIDE_PX, _LOW_PX, _MARGIN_PX = 720.0, 250.0, 46.0
 _LOSSES = {
-    "proposal_score": "proposals: score", "proposal_box": "proposals: box",
-    "region_score": "classifier: score", "region_box": "classifier: box",
+    "proposal_score": "proposals: score",
+    "proposal_box": "proposals: box",
+    "region_score": "classifier: score",
+    "region_box": "classifier: box",
 }
 _Lines = Mapping[str, Sequence[tuple[float, float]]]
 
@@ -21,11 +23,20 @@ def training_page(report: Mapping[str, Any]) -> str:
     ap50 = at(report, "held_out", "ap50")
     best = report["best_step"]
     page = render(
-        "training.html", title=f"{at(report, 'model', 'name')} - training", name=known(at(report, "model", "name")),
-        headline="Accuracy not measured: no pictures were held out" if ap50 is None else f"AP50 {_number(ap50)}",
-        summary=_summary(report), notices=report["notices"], losses=_losses(report), checks=_checks(report),
-        kept=f"The weights of step {best} were kept." if best is not None else "", classes=_classes(report),
-        sets=_sets(report), settings=_settings(report),
+        "training.html",
+        title=f"{at(report, 'model', 'name')} - training",
+        name=known(at(report, "model", "name")),
+        headline="Accuracy not measured: no pictures were held out"
+        if ap50 is None
+        else f"AP50 {_number(ap50)}",
+        summary=_summary(report),
+        notices=report["notices"],
+        losses=_losses(report),
+        checks=_checks(report),
+        kept=f"The weights of step {best} were kept." if best is not None else "",
+        classes=_classes(report),
+        sets=_sets(report),
+        settings=_settings(report),
     )
     return str(page)
 
@@ -46,11 +57,15 @@ def _losses(report: Mapping[str, Any]) -> dict[str, Any] | None:
 
 def _checks(report: Mapping[str, Any]) -> dict[str, Any] | None:
     checks = report["checks"]
-    lines: dict[str, list[tuple[float, float]]] = {"all classes": [(row["step"], row["ap50"]) for row in checks]}
+    lines: dict[str, list[tuple[float, float]]] = {
+        "all classes": [(row["step"], row["ap50"]) for row in checks]
+    }
     for row in checks:
         for name, value in row["classes"].items():
             lines.setdefault(name, []).append((row["step"], value))
-    if list(lines.values()).count(lines["all classes"]) == len(lines) == 2:  # the mean over one class is that class
+    if (
+        list(lines.values()).count(lines["all classes"]) == len(lines) == 2
+    ):  # the mean over one class is that class
         del lines["all classes"]
     return _plot("AP50 over steps", lines, high=1.0)
 
@@ -59,18 +74,25 @@ def _classes(report: Mapping[str, Any]) -> list[list[str]]:
     rows = []
     for name, ap50 in (at(report, "held_out", "classes") or {}).items():
         reported, found_px = report["reported"][name], report["found_px"].get(name)
-        rows.append([
-            name, *map(_number, (ap50, reported["score"], reported["precision"], reported["recall"])),
-            f"{found_px[0]:g} to {found_px[1]:g} px" if found_px else "too few found",
-        ])
+        rows.append(
+            [
+                name,
+                *map(_number, (ap50, reported["score"], reported["precision"], reported["recall"])),
+                f"{found_px[0]:g} to {found_px[1]:g} px" if found_px else "too few found",
+            ]
+        )
     return rows
 
 
 def _sets(report: Mapping[str, Any]) -> list[list[str]]:
     return [
         [
-            each["name"], each["part"], str(each["pictures"]), str(each["videos"]),
-            ", ".join(f"{count} {name}" for name, count in each["boxes"].items()), ", ".join(each["unlabelled"]) or "-",
+            each["name"],
+            each["part"],
+            str(each["pictures"]),
+            str(each["videos"]),
+            ", ".join(f"{count} {name}" for name, count in each["boxes"].items()),
+            ", ".join(each["unlabelled"]) or "-",
         ]
         for each in report["sets"]
     ]
@@ -81,10 +103,12 @@ def _settings(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     undecided = f"; {export['undecided']} more depend on rounding" if export["undecided"] else ""
     rows = [(str(key), known(value)) for key, value in report["settings"].items()]
     rows.append(("began with", known(report["weights"])))
-    rows.append((
-        "exported model against torch",
-        f"{export['box_px']:.3f} px, {export['score']:.5f} in score, over {export['detections']} detections{undecided}",
-    ))
+    rows.append(
+        (
+            "exported model against torch",
+            f"{export['box_px']:.3f} px, {export['score']:.5f} in score, over {export['detections']} detections{undecided}",
+        )
+    )
     return rows
 
 
@@ -113,7 +137,9 @@ def _certain(lines: _Lines) -> dict[str, list[tuple[float, float]]]:
 
 def _axes(x: Scale, y: Scale) -> Axes:
     labels = [Label(_MARGIN_PX - 6, y(tick) + 4, f"{tick:g}", "end") for tick in y.ticks(5)]
-    labels += [Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)]
+    labels += [
+        Label(x(tick), _LOW_PX - 16, f"{tick:g}") for tick in x.ticks(8) if tick == round(tick)
+    ]
     labels.append(Label(_WIDE_PX - 8, _LOW_PX - 2, "step", "end"))
     across = tuple(("grid", y(tick)) for tick in y.ticks(5))
     return Axes(_MARGIN_PX, _WIDE_PX - 8, 14, _LOW_PX - 34, across, (), tuple(labels))

@@ -34,7 +34,11 @@ _CROPS_BYTES = 8_000_000  # of all crops in the page together
 _COLOURS = 6  # that the styles of pages have, c0 to c5
 _FILES = "tracks.geojson, tracks.kml (Google Earth), tracks.gpx (GPS receivers)"
 _LOCAL_FILES = "tracks.json, coordinates in pixels of the first picture. " + NO_PLACE_FILES
-_FACTS = {"thresholds": "reported from a score of", "calibrated": "half are right at 0.5", "trained_on": "trained on"}
+_FACTS = {
+    "thresholds": "reported from a score of",
+    "calibrated": "half are right at 0.5",
+    "trained_on": "trained on",
+}
 _Box = tuple[float, float, float, float]  # left, top, right, bottom
 _Track = Mapping[str, Any]
 
@@ -50,16 +54,22 @@ def watch_page(
     shown = _crops(tracks, crops)
     is_local = not report.get("georeferenced")
     page = render(
-        "watch.html", title=f"{report.get('flight')} - watch", flight=known(report.get("flight")),
-        first=_when(report.get("first_frame")), last=_when(report.get("last_frame")),
+        "watch.html",
+        title=f"{report.get('flight')} - watch",
+        flight=known(report.get("flight")),
+        first=_when(report.get("first_frame")),
+        last=_when(report.get("last_frame")),
         counts=counted_list(most_first(str(each["class"]) for each in tracks)),
         frames=known(at(report, "frames", "detected")),
         looked_for=", ".join(map(str, report.get("looked_for") or ["objects"])),
         warning_lines=report.get("warnings") or [],
-        maps=_maps(report, tracks, drone_m), rows=_rows(tracks, is_local=is_local),
+        maps=_maps(report, tracks, drone_m),
+        rows=_rows(tracks, is_local=is_local),
         systems=() if is_local else tuple(SYSTEMS.items()),
         files=_LOCAL_FILES if is_local else _FILES,
-        crops=shown, without_crop=len(tracks) - len(shown), course=_course(report),
+        crops=shown,
+        without_crop=len(tracks) - len(shown),
+        course=_course(report),
         notices=[str(each["text"]) for each in report.get("notices") or []],
         model=_model_rows(report.get("model") or {}),
         others=[_model_rows(each) for each in report.get("other_models") or []],
@@ -69,7 +79,9 @@ def watch_page(
 
 
 def _model_rows(facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    return [(_FACTS.get(str(name), str(name)), known(_plain(value))) for name, value in facts.items()]
+    return [
+        (_FACTS.get(str(name), str(name)), known(_plain(value))) for name, value in facts.items()
+    ]
 
 
 def _versions(report: Mapping[str, Any]) -> str:
@@ -90,14 +102,16 @@ class _Spot:
     label_y: float
 
 
-def _maps(report: Mapping[str, Any], tracks: Sequence[_Track], drone_m: Floats) -> list[dict[str, Any]]:
+def _maps(
+    report: Mapping[str, Any], tracks: Sequence[_Track], drone_m: Floats
+) -> list[dict[str, Any]]:
     """One map, or one for each segment of a flight that was followed in the picture: their pixels are not the same."""
     is_local = not report.get("georeferenced")
     note = (
         "Pixels of the first frame, or the first after a cut, with the camera's own motion removed: nothing places "
         "this flight on the ground."
-        if is_local else
-        "North is up. The dashed line is the path of the camera. The pale discs show the position accuracy (1 sigma)."
+        if is_local
+        else "North is up. The dashed line is the path of the camera. The pale discs show the position accuracy (1 sigma)."
     )
     maps = []
     for title, of_one in _by_segment(tracks):
@@ -114,14 +128,17 @@ def _by_segment(tracks: Sequence[_Track]) -> list[tuple[str, list[_Track]]]:
     if len(segments) < 2:
         return [("Where", list(tracks))]
     return [
-        (f"Where, segment {name}", [each for each in tracks if each.get("segment", 0) == name]) for name in segments
+        (f"Where, segment {name}", [each for each in tracks if each.get("segment", 0) == name])
+        for name in segments
     ]
 
 
 def _drawing(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> Markup:
     """Objects and the camera's path seen from above; north is up, in a local frame the first frame's top."""
     x_key, y_key = ("x_px", "y_px") if is_local else ("east_m", "north_m")
-    places = np.array([[each[x_key], each[y_key]] for each in tracks], dtype=np.float64).reshape(-1, 2)
+    places = np.array([[each[x_key], each[y_key]] for each in tracks], dtype=np.float64).reshape(
+        -1, 2
+    )
     path = drone_m[np.isfinite(drone_m).all(axis=1)] if len(drone_m) else np.zeros((0, 2))
     everything = np.vstack([places, path])
     if not len(everything):
@@ -130,7 +147,9 @@ def _drawing(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> Ma
     span = np.maximum(high - low, 50.0 if is_local else 1.0)
     scale = float(min((_WIDE_PX - 2 * _RIM_PX) / span[0], (_HIGH_PX - 2 * _RIM_PX) / span[1]))
     height_px = float(span[1] * scale) + 2 * _RIM_PX
-    signs = np.array([1.0, 1.0 if is_local else -1.0])  # pixels count downwards, metres north upwards
+    signs = np.array(
+        [1.0, 1.0 if is_local else -1.0]
+    )  # pixels count downwards, metres north upwards
     middle_px = np.array([_WIDE_PX, height_px]) / 2
 
     def on_drawing(points: Floats) -> Floats:
@@ -138,9 +157,14 @@ def _drawing(tracks: Sequence[_Track], drone_m: Floats, *, is_local: bool) -> Ma
 
     bar = round_length(0.25 * (_WIDE_PX - 2 * _RIM_PX) / scale)
     return render(
-        "plots/places.svg", width=_WIDE_PX, height=height_px, rim=_RIM_PX,
-        path=on_drawing(path[:: max(1, len(path) // 1000)]).tolist(), spots=_spots(tracks, on_drawing(places), scale),
-        bar=bar * scale, bar_words=f"{bar:g} {'px' if is_local else 'm'}",
+        "plots/places.svg",
+        width=_WIDE_PX,
+        height=height_px,
+        rim=_RIM_PX,
+        path=on_drawing(path[:: max(1, len(path) // 1000)]).tolist(),
+        spots=_spots(tracks, on_drawing(places), scale),
+        bar=bar * scale,
+        bar_words=f"{bar:g} {'px' if is_local else 'm'}",
     )
 
 
@@ -148,7 +172,9 @@ def _spots(tracks: Sequence[_Track], places_px: Floats, scale: float) -> list[_S
     classes = _classes(tracks)
     names = [str(each["id"]) for each in tracks]
     spots = []
-    for each, (x, y), name, (label_x, label_y) in zip(tracks, places_px, names, _label_places(places_px, names)):
+    for each, (x, y), name, (label_x, label_y) in zip(
+        tracks, places_px, names, _label_places(places_px, names)
+    ):
         radius = max(4.0, float(each.get("sigma_m") or 0.0) * scale)
         style = f"c{classes.index(str(each['class'])) % _COLOURS}"
         words = f"{each['class']} {each['id']}"
@@ -164,12 +190,17 @@ def _label_places(dots_px: Floats, names: Sequence[str]) -> list[tuple[float, fl
         wide = _LETTER_PX * len(name)
         sides = [
             (x + dx, y + dy, x + dx + wide, y + dy + _LINE_PX)
-            for row in range(_ROWS) for dx, dy in (
-                (7.0, row * _LINE_PX - 6), (-7 - wide, row * _LINE_PX - 6),
-                (-wide / 2, -(row + 1) * _LINE_PX - 6), (-wide / 2, row * _LINE_PX + 6),
+            for row in range(_ROWS)
+            for dx, dy in (
+                (7.0, row * _LINE_PX - 6),
+                (-7 - wide, row * _LINE_PX - 6),
+                (-wide / 2, -(row + 1) * _LINE_PX - 6),
+                (-wide / 2, row * _LINE_PX + 6),
             )
         ]
-        place = next((each for each in sides if not any(_meet(each, other) for other in taken)), sides[0])
+        place = next(
+            (each for each in sides if not any(_meet(each, other) for other in taken)), sides[0]
+        )
         taken.append(place)
         places.append((float(place[0]), float(place[3] - 2)))
     return places
@@ -186,14 +217,20 @@ def _rows(tracks: Sequence[_Track], *, is_local: bool) -> list[dict[str, Any]]:
     for each in tracks:
         speed = each.get("velocity_m_s")
         first, last = _when(each["first_seen"]), _when(each["last_seen"])
-        rows.append({
-            "id": each["id"], "name": each["class"], "score": f"{each['score']:.2f}",
-            "place": _place(each, is_local, has_cuts),
-            "accuracy": with_unit("{:.1f} " + unit, finite_or_none(each.get("sigma_m"))) or "",
-            "motion": f"{np.hypot(*speed):.1f} {unit}/s" if speed else "still",
-            "views": each["views"], "passes": each["passes"], "first": first,
-            "last": last if first[:10] != last[:10] else last[-8:],
-        })
+        rows.append(
+            {
+                "id": each["id"],
+                "name": each["class"],
+                "score": f"{each['score']:.2f}",
+                "place": _place(each, is_local, has_cuts),
+                "accuracy": with_unit("{:.1f} " + unit, finite_or_none(each.get("sigma_m"))) or "",
+                "motion": f"{np.hypot(*speed):.1f} {unit}/s" if speed else "still",
+                "views": each["views"],
+                "passes": each["passes"],
+                "first": first,
+                "last": last if first[:10] != last[:10] else last[-8:],
+            }
+        )
     return rows
 
 
@@ -217,28 +254,48 @@ def _crops(tracks: Sequence[_Track], crops: Mapping[int, bytes]) -> list[dict[st
         if data is None or len(data) > left:
             continue
         left -= len(data)
-        shown.append({
-            "address": jpeg_uri(data), "name": f"{each['class']} {each['id']}", "score": f"{each['score']:.2f}",
-            "frame": known(each["best_frame"]),
-        })
+        shown.append(
+            {
+                "address": jpeg_uri(data),
+                "name": f"{each['class']} {each['id']}",
+                "score": f"{each['score']:.2f}",
+                "frame": known(each["best_frame"]),
+            }
+        )
     return shown
 
 
 def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
     """How the watch went: frames, detections, times, and what the places rest on."""
     frames, latency = report.get("frames") or {}, report.get("latency_s") or {}
-    seconds = {name: value for name, value in (report.get("seconds") or {}).items() if name != "total"}
+    seconds = {
+        name: value for name, value in (report.get("seconds") or {}).items() if name != "total"
+    }
     rows = [
-        ("frames", f"{known(frames.get('detected'))} searched of {known(frames.get('read'))} read, "
-                   f"{known(frames.get('skipped'))} skipped to keep up, {known(frames.get('lost'))} unusable"),
+        (
+            "frames",
+            f"{known(frames.get('detected'))} searched of {known(frames.get('read'))} read, "
+            f"{known(frames.get('skipped'))} skipped to keep up, {known(frames.get('lost'))} unusable",
+        ),
         ("detections", _detections(report)),
-        ("time taken", join_words(
-            seconds_words(number_at(report, "seconds", "total")),
-            with_unit("({:.1f} frames per second)", number_at(report, "frames_per_second")),
-        )),
-        ("of that", ", ".join(f"{name} {seconds_words(finite_or_none(value))}" for name, value in seconds.items())),
-        ("delay from frame to result", f"{seconds_words(finite_or_none(latency.get('median')))} (median), "
-                                       f"{seconds_words(finite_or_none(latency.get('max')))} at most"),
+        (
+            "time taken",
+            join_words(
+                seconds_words(number_at(report, "seconds", "total")),
+                with_unit("({:.1f} frames per second)", number_at(report, "frames_per_second")),
+            ),
+        ),
+        (
+            "of that",
+            ", ".join(
+                f"{name} {seconds_words(finite_or_none(value))}" for name, value in seconds.items()
+            ),
+        ),
+        (
+            "delay from frame to result",
+            f"{seconds_words(finite_or_none(latency.get('median')))} (median), "
+            f"{seconds_words(finite_or_none(latency.get('max')))} at most",
+        ),
         ("height", known(at(report, "telemetry", "height"))),
         ("attitude", known(at(report, "telemetry", "attitude"))),
         ("camera", known(at(report, "camera", "origin"))),
@@ -248,7 +305,11 @@ def _course(report: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _detections(report: Mapping[str, Any]) -> str:
-    missing = f"{known(at(report, 'detections', 'not_placed'))} without" if report.get("georeferenced") else "none with"
+    missing = (
+        f"{known(at(report, 'detections', 'not_placed'))} without"
+        if report.get("georeferenced")
+        else "none with"
+    )
     short = at(report, "detections", "set_aside")
     aside = f"; {short} dropped, of a size that their class cannot have" if short else ""
     return f"{known(at(report, 'detections', 'total'))}, of which {missing} a place on the ground{aside}"

@@ -77,7 +77,13 @@ def seconds_words(value: float | None) -> str:
     """A duration in seconds or minutes."""
     if value is None:
         return "unknown"
-    return f"{value:.2g} s" if value < 10 else f"{value:.0f} s" if value < 180 else f"{value / 60:.1f} min"
+    return (
+        f"{value:.2g} s"
+        if value < 10
+        else f"{value:.0f} s"
+        if value < 180
+        else f"{value / 60:.1f} min"
+    )
 
 
 def picture_uri(picture: ImageRGBA, most_bytes: int = _MOST_PICTURE_BYTES) -> str:
@@ -85,7 +91,9 @@ def picture_uri(picture: ImageRGBA, most_bytes: int = _MOST_PICTURE_BYTES) -> st
     small = picture
     while True:
         alpha = small[..., 3:].astype(np.float32) / 255
-        flat: ImageBGR = np.round(small[..., 2::-1] * alpha + _BACKGROUND * (1 - alpha)).astype(np.uint8)
+        flat: ImageBGR = np.round(small[..., 2::-1] * alpha + _BACKGROUND * (1 - alpha)).astype(
+            np.uint8
+        )
         for quality in (88, 75):
             _, data = cv2.imencode(".jpg", flat, [cv2.IMWRITE_JPEG_QUALITY, quality])
             if len(data) <= most_bytes or max(small.shape[:2]) <= 32:

@@ -40,7 +40,9 @@ class BaseMap:
         try:
             with open_raster(path, "a GeoTIFF, or a site folder with a map,") as source:
                 if why := why_no_place(source.crs):
-                    raise InputError(f"{path} has no place on Earth ({why}); give a map with one as --base")
+                    raise InputError(
+                        f"{path} has no place on Earth ({why}); give a map with one as --base"
+                    )
                 if source.count == 2 or set(source.dtypes) != {"uint8"}:
                     raise InputError(
                         f"{path} has {source.count} bands of {'/'.join(sorted(set(source.dtypes)))}; a base map has "
@@ -48,9 +50,13 @@ class BaseMap:
                     )
                 west, south, east, north = transform_bounds(source.crs, _WGS84, *source.bounds)
                 middle = Geodetic(round((south + north) / 2, 7), round((west + east) / 2, 7))
-                return cls(path, middle, _metres_a_pixel(source, middle), (west, south, east, north))
+                return cls(
+                    path, middle, _metres_a_pixel(source, middle), (west, south, east, north)
+                )
         except (RasterioError, CRSError) as error:
-            raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
+            raise InputError(
+                f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again"
+            ) from error
 
     @property
     def extent_m(self) -> float:
@@ -62,8 +68,12 @@ class BaseMap:
     def beside_m(self, places_m: PointsM, frame: LocalFrame) -> float:
         """How far the nearest of places, (N, 2) metres of a site, lies beside the map's bounds; 0 within."""
         west, south, east, north = self.bounds_deg
-        corners_m = frame.ground_from_lonlat([(west, south), (east, south), (east, north), (west, north)])
-        beside_m = np.maximum(np.maximum(corners_m.min(axis=0) - places_m, places_m - corners_m.max(axis=0)), 0.0)
+        corners_m = frame.ground_from_lonlat(
+            [(west, south), (east, south), (east, north), (west, north)]
+        )
+        beside_m = np.maximum(
+            np.maximum(corners_m.min(axis=0) - places_m, places_m - corners_m.max(axis=0)), 0.0
+        )
         return float(np.linalg.norm(beside_m, axis=1).min())
 
     def overview(self, site_grid: SiteGrid) -> tuple[ImageRGBA, PointsM]:
@@ -75,7 +85,10 @@ class BaseMap:
         """The map around places of the site, (N, 2) site metres, as tiles of the grid; none where it shows nothing."""
         places = site_grid.projected_from_site(outline_m)
         own_low, own_high = self._bounds_in(site_grid.grid.crs)
-        low, high = np.maximum(places.min(axis=0), own_low), np.minimum(places.max(axis=0), own_high)
+        low, high = (
+            np.maximum(places.min(axis=0), own_low),
+            np.minimum(places.max(axis=0), own_high),
+        )
         if (low >= high).any():
             return {}
         rgba, first_m = self._resampled(site_grid, low, high)
@@ -83,11 +96,16 @@ class BaseMap:
         x, y = np.rint(grid.grid_from_projected(first_m[None])[0]).astype(int)
         left, top = x % side, y % side
         height, width = rgba.shape[:2]
-        padded = np.zeros((-(-(height + top) // side) * side, -(-(width + left) // side) * side, 4), np.uint8)
-        padded[top:top + height, left:left + width] = rgba
+        padded = np.zeros(
+            (-(-(height + top) // side) * side, -(-(width + left) // side) * side, 4), np.uint8
+        )
+        padded[top : top + height, left : left + width] = rgba
         cut = {
-            ((x - left + column) // side, (y - top + row) // side): padded[row:row + side, column:column + side]
-            for row in range(0, padded.shape[0], side) for column in range(0, padded.shape[1], side)
+            ((x - left + column) // side, (y - top + row) // side): padded[
+                row : row + side, column : column + side
+            ]
+            for row in range(0, padded.shape[0], side)
+            for column in range(0, padded.shape[1], side)
         }
         return {index: tile for index, tile in cut.items() if tile[..., 3].any()}
 
@@ -95,21 +113,32 @@ class BaseMap:
         west, south, east, north = transform_bounds(_WGS84, crs_of_epsg(crs), *self.bounds_deg)
         return np.array([west, south]), np.array([east, north])
 
-    def _resampled(self, site_grid: SiteGrid, low_m: PointsM, high_m: PointsM) -> tuple[ImageRGBA, PointsM]:
+    def _resampled(
+        self, site_grid: SiteGrid, low_m: PointsM, high_m: PointsM
+    ) -> tuple[ImageRGBA, PointsM]:
         grid = site_grid.grid
         corners = grid.grid_from_projected(np.array([[low_m[0], high_m[1]], [high_m[0], low_m[1]]]))
         (x0, y0), (x1, y1) = np.floor(corners[0]).astype(int), np.ceil(corners[1]).astype(int)
         width, height = int(x1 - x0 + 1), int(y1 - y0 + 1)
         if max(width, height) > _MOST_PX:
-            raise InputError(f"{self.path}: {width} x {height} pixels of it lie under the flight; give a smaller part")
+            raise InputError(
+                f"{self.path}: {width} x {height} pixels of it lie under the flight; give a smaller part"
+            )
         first_m = grid.projected_from_grid(np.array([[x0, y0]]))[0]
         target = transform_on_grid(grid, int(x0), int(y0))
         with open_raster(self.path, "a GeoTIFF") as source:
-            return _read(source, target, width, height, crs_of_epsg(grid.crs), self.m_per_px / grid.m_per_px), first_m
+            return _read(
+                source, target, width, height, crs_of_epsg(grid.crs), self.m_per_px / grid.m_per_px
+            ), first_m
 
 
 def _read(
-    source: rasterio.DatasetReader, target: Affine, width: int, height: int, crs: CRS, magnified: float
+    source: rasterio.DatasetReader,
+    target: Affine,
+    width: int,
+    height: int,
+    crs: CRS,
+    magnified: float,
 ) -> ImageRGBA:
     """The part of a map under a target raster; thinned first where it has many more pixels."""
     step = max(1, int(1 / max(magnified, 1e-6)))
@@ -122,11 +151,18 @@ def _read(
     bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
     seen = source.dataset_mask(window=window, out_shape=shape)
     rgb = source.read(bands, window=window, out_shape=(3, *shape), resampling=Resampling.average)
-    own = source.window_transform(window) * Affine.scale(window.width / shape[1], window.height / shape[0])
+    own = source.window_transform(window) * Affine.scale(
+        window.width / shape[1], window.height / shape[0]
+    )
     result = np.zeros((4, height, width), np.uint8)
     for band, values in enumerate([*rgb, np.where(seen > 0, 255, 0).astype(np.uint8)]):
         reproject(
-            values, result[band], src_transform=own, src_crs=source.crs, dst_transform=target, dst_crs=crs,
+            values,
+            result[band],
+            src_transform=own,
+            src_crs=source.crs,
+            dst_transform=target,
+            dst_crs=crs,
             resampling=Resampling.nearest if band == 3 else Resampling.bilinear,
         )
     return np.ascontiguousarray(np.moveaxis(result, 0, 2))
@@ -136,7 +172,9 @@ def _metres_a_pixel(source: rasterio.DatasetReader, middle: Geodetic) -> float:
     """On the ground, at its middle."""
     transformer = Transformer.from_crs(source.crs.to_wkt(), "EPSG:4326", always_xy=True)
     column, row = source.width / 2, source.height / 2
-    x, y = zip(*(source.transform * each for each in ((column, row), (column + 1, row), (column, row + 1))))
+    x, y = zip(
+        *(source.transform * each for each in ((column, row), (column + 1, row), (column, row + 1)))
+    )
     longitude, latitude = (np.radians(each) for each in transformer.transform(x, y))
     east = (longitude - longitude[0]) * np.cos(np.radians(middle.latitude_deg)) * 6378137.0
     north = (latitude - latitude[0]) * 6371000.0

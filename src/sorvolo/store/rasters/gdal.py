@@ -18,9 +18,13 @@ from sorvolo.geometry.grid import Grid
 # a small cache keeps memory flat; no directory listing keeps GDAL from opening neighbours of a user's file; a curl name
 # that nothing has keeps /vsicurl/ and its kin from fetching anything
 _ENVIRONMENT = {
-    "GDAL_CACHEMAX": 64, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR", "GDAL_PAM_ENABLED": "NO",
-    "CPL_VSIL_CURL_ALLOWED_FILENAME": "/none", "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".none",
-    "GDAL_HTTP_MAX_RETRY": 0, "GDAL_HTTP_CONNECTTIMEOUT": 1,
+    "GDAL_CACHEMAX": 64,
+    "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR",
+    "GDAL_PAM_ENABLED": "NO",
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "/none",
+    "CPL_VSIL_CURL_ALLOWED_EXTENSIONS": ".none",
+    "GDAL_HTTP_MAX_RETRY": 0,
+    "GDAL_HTTP_CONNECTTIMEOUT": 1,
 }
 
 
@@ -46,7 +50,9 @@ def open_raster(
     if not is_file:
         raise InputError(f"no such file: {path}; {what} was needed")
     if str(whole).startswith("/vsi"):
-        raise InputError(f"{path}: GDAL would take this for one of its virtual files; move it to another folder")
+        raise InputError(
+            f"{path}: GDAL would take this for one of its virtual files; move it to another folder"
+        )
     with quiet_gdal(), _opened(whole, drivers) as source:
         yield source
 
@@ -77,7 +83,11 @@ def why_no_place(crs: CRS | None) -> str:
     "" where they are."""
     if crs is None:
         return "no coordinate reference system"
-    return "" if crs.is_geographic or crs.is_projected else "a local coordinate reference system, of no known place"
+    return (
+        ""
+        if crs.is_geographic or crs.is_projected
+        else "a local coordinate reference system, of no known place"
+    )
 
 
 def crs_of_epsg(code: str) -> CRS:
@@ -88,4 +98,6 @@ def crs_of_epsg(code: str) -> CRS:
     try:
         return CRS.from_epsg(int(match[1]))
     except CRSError as error:
-        raise SettingsError(f"unknown coordinate reference system {code!r}; try one as EPSG:32633") from error
+        raise SettingsError(
+            f"unknown coordinate reference system {code!r}; try one as EPSG:32633"
+        ) from error

@@ -32,22 +32,40 @@ from sorvolo.store.images import shrink
 from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal, transform_on_grid
 
 _BLOCK_PX = 512  # GDAL's own for cloud-optimised GeoTIFFs
-_VERIFIED_BLOCKS = 64  # spread over the map: enough to notice a disk that writes rubbish, at no cost
+_VERIFIED_BLOCKS = (
+    64  # spread over the map: enough to notice a disk that writes rubbish, at no cost
+)
 # zstd is the fastest to write and to read once; deflate is what every reader of the final file understands; its
 # level 6 takes 1.7 times as long as 1, all steps together, for files 4 % smaller
 _SCRATCH = {
-    "driver": "GTiff", "tiled": True, "compress": "zstd", "zstd_level": 1, "sparse_ok": True, "interleave": "band",
+    "driver": "GTiff",
+    "tiled": True,
+    "compress": "zstd",
+    "zstd_level": 1,
+    "sparse_ok": True,
+    "interleave": "band",
 }
 _COG = {
-    "driver": "COG", "blocksize": _BLOCK_PX, "compress": "DEFLATE", "level": 1, "predictor": "YES",
-    "overviews": "FORCE_USE_EXISTING", "bigtiff": "IF_SAFER", "num_threads": "ALL_CPUS",
+    "driver": "COG",
+    "blocksize": _BLOCK_PX,
+    "compress": "DEFLATE",
+    "level": 1,
+    "predictor": "YES",
+    "overviews": "FORCE_USE_EXISTING",
+    "bigtiff": "IF_SAFER",
+    "num_threads": "ALL_CPUS",
     "sparse_ok": True,
 }
 
 
 # of the colours; what was never seen becomes a lossless mask. GDAL makes that mask of the alpha band by a file between,
 # which has none of our overviews: it averages its own
-_JPEG = {"compress": "JPEG", "quality": 90, "overviews": "IGNORE_EXISTING", "overview_resampling": "AVERAGE"}
+_JPEG = {
+    "compress": "JPEG",
+    "quality": 90,
+    "overviews": "IGNORE_EXISTING",
+    "overview_resampling": "AVERAGE",
+}
 _MOST_JPEG_LEVELS = 12.0  # mean difference of a block's colours: noise at quality 90 stays below 6
 COMPRESSIONS = ("deflate", "jpeg")
 """How the map's GeoTIFF may be compressed: without loss, or with a tenth of the size."""
@@ -64,8 +82,13 @@ class Raster:
 
 
 def write_cog(
-    tiles: Mapping[TileIndex, ImageRGBA], site_grid: SiteGrid, path: Path, *, crs: str | None = None,
-    compress: str = "deflate", pass_by: Callable[[TileIndex, ImageRGBA], None] = lambda _index, _tile: None,
+    tiles: Mapping[TileIndex, ImageRGBA],
+    site_grid: SiteGrid,
+    path: Path,
+    *,
+    crs: str | None = None,
+    compress: str = "deflate",
+    pass_by: Callable[[TileIndex, ImageRGBA], None] = lambda _index, _tile: None,
 ) -> None:
     """Write the map as a Cloud Optimized GeoTIFF with alpha and overviews, in place of what was at `path`.
 
@@ -80,7 +103,11 @@ def write_cog(
         raise SettingsError(f"--compress {compress}: choose one of {', '.join(COMPRESSIONS)}")
     is_jpeg = compress == "jpeg"
     lossless = {"level", "predictor"}
-    options = {key: value for key, value in _COG.items() if key not in lossless} | _JPEG if is_jpeg else _COG
+    options = (
+        {key: value for key, value in _COG.items() if key not in lossless} | _JPEG
+        if is_jpeg
+        else _COG
+    )
     grid = site_grid.grid
     target = None if crs is None or crs == grid.crs else parse_crs(crs, grid)
     with (
@@ -103,7 +130,9 @@ def write_cog(
 def parse_crs(crs: str, grid: Grid) -> CRS:
     """The CRS to reproject a map to; raises SettingsError when unknown or when the map is not on Earth."""
     if not grid.crs:
-        raise SettingsError(f"this site has no geo-reference, so its map cannot be in {crs}; leave it out")
+        raise SettingsError(
+            f"this site has no geo-reference, so its map cannot be in {crs}; leave it out"
+        )
     return crs_of_epsg(crs)
 
 
@@ -117,22 +146,36 @@ def read_raster(path: Path, max_px: int) -> Raster:
         with open_raster(path, "a GeoTIFF") as source:
             return _raster(source, path, max_px)
     except RasterioError as error:
-        raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
+        raise InputError(
+            f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again"
+        ) from error
 
 
 def _write_plain(
-    tiles: Mapping[TileIndex, ImageRGBA], grid: Grid, path: Path, pass_by: Callable[[TileIndex, ImageRGBA], None]
+    tiles: Mapping[TileIndex, ImageRGBA],
+    grid: Grid,
+    path: Path,
+    pass_by: Callable[[TileIndex, ImageRGBA], None],
 ) -> None:
     columns, rows = np.array(sorted(tiles)).T
     left, top = columns.min() * grid.tile_px, rows.min() * grid.tile_px
     width, height = (columns.max() + 1) * grid.tile_px - left, (rows.max() + 1) * grid.tile_px - top
     profile = _SCRATCH | {
-        "width": width, "height": height, "count": 4, "dtype": "uint8", "photometric": "RGB", "alpha": "YES",
-        "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "bigtiff": "IF_SAFER",
+        "width": width,
+        "height": height,
+        "count": 4,
+        "dtype": "uint8",
+        "photometric": "RGB",
+        "alpha": "YES",
+        "blockxsize": _BLOCK_PX,
+        "blockysize": _BLOCK_PX,
+        "bigtiff": "IF_SAFER",
         "crs": crs_of_epsg(grid.crs) if grid.crs else None,
         "transform": transform_on_grid(grid, left, top),
     }
-    verified = dict.fromkeys(_spread(sorted(tiles), _VERIFIED_BLOCKS), 0)  # and the CRC-32 of their pixels
+    verified = dict.fromkeys(
+        _spread(sorted(tiles), _VERIFIED_BLOCKS), 0
+    )  # and the CRC-32 of their pixels
     with rasterio.open(path, "w", **profile) as sink:
         sink.colorinterp = [ColorInterp.red, ColorInterp.green, ColorInterp.blue, ColorInterp.alpha]
         by_row = sorted(tiles, key=lambda index: (index[1], index[0]))
@@ -165,15 +208,26 @@ def _warped(plain: Path, target: CRS) -> Path:
         transform, width, height = calculate_default_transform(
             source.crs, target, source.width, source.height, *source.bounds
         )
-        profile = source.profile | _SCRATCH | {
-            "crs": target, "transform": transform, "width": width, "height": height,
-            "photometric": "RGB", "alpha": "YES",
-        }
+        profile = (
+            source.profile
+            | _SCRATCH
+            | {
+                "crs": target,
+                "transform": transform,
+                "width": width,
+                "height": height,
+                "photometric": "RGB",
+                "alpha": "YES",
+            }
+        )
         with rasterio.open(warped, "w", **profile) as sink:
             sink.colorinterp = source.colorinterp
             reproject(
-                rasterio.band(source, bands), rasterio.band(sink, bands),
-                resampling=Resampling.bilinear, src_alpha=4, warp_mem_limit=64,
+                rasterio.band(source, bands),
+                rasterio.band(sink, bands),
+                resampling=Resampling.bilinear,
+                src_alpha=4,
+                warp_mem_limit=64,
             )
     return warped
 
@@ -184,7 +238,10 @@ def _filled_blocks(tiles: Collection[TileIndex], grid: Grid) -> set[TileIndex]:
     found = set()
     for index in tiles:
         x0, y0, x1, y1 = np.array(grid.tile_window(index)) - [left, top, left, top]
-        columns, rows = (range(int(low) // _BLOCK_PX, -(-int(high) // _BLOCK_PX)) for low, high in ((x0, x1), (y0, y1)))
+        columns, rows = (
+            range(int(low) // _BLOCK_PX, -(-int(high) // _BLOCK_PX))
+            for low, high in ((x0, x1), (y0, y1))
+        )
         found |= {(column, row) for column in columns for row in rows}
     return found
 
@@ -221,9 +278,7 @@ def _pyramid(plain: Path, filled: set[TileIndex] | None) -> Path:
 
 
 def _vrt_source(level: Path, band: int) -> str:
-    return (
-        f'<SourceFilename relativeToVRT="1">{level.name}</SourceFilename><SourceBand>{band}</SourceBand>'
-    )
+    return f'<SourceFilename relativeToVRT="1">{level.name}</SourceFilename><SourceBand>{band}</SourceBand>'
 
 
 def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | None:
@@ -234,22 +289,34 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
     with rasterio.open(larger, driver="GTiff") as source:
         if max(source.width, source.height) <= _BLOCK_PX:
             return None
-        profile = source.profile | _SCRATCH | {
-            "width": -(-source.width // 2), "height": -(-source.height // 2),
-            "blockxsize": _BLOCK_PX, "blockysize": _BLOCK_PX, "photometric": "RGB", "alpha": "YES",
-        }
+        profile = (
+            source.profile
+            | _SCRATCH
+            | {
+                "width": -(-source.width // 2),
+                "height": -(-source.height // 2),
+                "blockxsize": _BLOCK_PX,
+                "blockysize": _BLOCK_PX,
+                "photometric": "RGB",
+                "alpha": "YES",
+            }
+        )
         whole = Window(0, 0, source.width, source.height)
         with rasterio.open(path, "w", **profile) as sink:
             sink.colorinterp = source.colorinterp
             for (row, column), small in sink.block_windows(1):
                 if filled is not None and (column, row) not in filled:
                     continue
-                large = Window(2 * small.col_off, 2 * small.row_off, 2 * small.width, 2 * small.height)
+                large = Window(
+                    2 * small.col_off, 2 * small.row_off, 2 * small.width, 2 * small.height
+                )
                 rgba = np.moveaxis(source.read(window=large.intersection(whole)), 0, 2)
                 if not rgba[..., 3].any():
                     continue  # unwritten blocks stay sparse
                 if rgba.shape[0] % 2 or rgba.shape[1] % 2:
-                    rgba = np.pad(rgba, [(0, rgba.shape[0] % 2), (0, rgba.shape[1] % 2), (0, 0)], mode="edge")
+                    rgba = np.pad(
+                        rgba, [(0, rgba.shape[0] % 2), (0, rgba.shape[1] % 2), (0, 0)], mode="edge"
+                    )
                 halved = shrink(np.ascontiguousarray(rgba), small.width, small.height)
                 sink.write(_bands(halved), window=small)
     return path
@@ -257,7 +324,11 @@ def _halved(larger: Path, path: Path, filled: set[TileIndex] | None) -> Path | N
 
 def _verify(path: Path, source: rasterio.DatasetReader, *, is_jpeg: bool) -> None:
     with rasterio.open(path, driver="GTiff") as written:
-        if (written.width, written.height, written.count) != (source.width, source.height, 3 if is_jpeg else 4):
+        if (written.width, written.height, written.count) != (
+            source.width,
+            source.height,
+            3 if is_jpeg else 4,
+        ):
             raise StoreError(_differs(path))
         # the last block lies last in the file: a cut file cannot give it
         windows = [window for _, window in written.block_windows(1)]
@@ -309,10 +380,19 @@ def _demand_readable(source: rasterio.DatasetReader, path: Path) -> None:
             f"{path} has {source.count} bands of {'/'.join(sorted(set(source.dtypes)))}; "
             "8-bit grey, RGB or RGBA was needed: convert it with gdal_translate -ot Byte -scale"
         )
-    if transform.b or transform.d or transform.e >= 0 or not np.isclose(transform.a, -transform.e, rtol=1e-6):
-        raise InputError(f"{path} is not a north-up map with square pixels; warp it with gdalwarp first")
+    if (
+        transform.b
+        or transform.d
+        or transform.e >= 0
+        or not np.isclose(transform.a, -transform.e, rtol=1e-6)
+    ):
+        raise InputError(
+            f"{path} is not a north-up map with square pixels; warp it with gdalwarp first"
+        )
     if source.crs is not None and not source.crs.is_projected:
-        raise InputError(f"{path} is in degrees ({source.crs}); warp it to a CRS in metres, as its UTM zone")
+        raise InputError(
+            f"{path} is in degrees ({source.crs}); warp it to a CRS in metres, as its UTM zone"
+        )
 
 
 def _raster(source: rasterio.DatasetReader, path: Path, max_px: int) -> Raster:
@@ -321,11 +401,17 @@ def _raster(source: rasterio.DatasetReader, path: Path, max_px: int) -> Raster:
     step = -(-max(source.width, source.height) // max_px)
     width, height = source.width // step, source.height // step
     if not width or not height:
-        raise InputError(f"{path} is {source.width}x{source.height} px, too narrow to thin to {max_px} px")
+        raise InputError(
+            f"{path} is {source.width}x{source.height} px, too narrow to thin to {max_px} px"
+        )
     window = Window(0, 0, width * step, height * step)
     bands = [1, 2, 3] if source.count >= 3 else [1, 1, 1]
-    rgb = source.read(bands, window=window, out_shape=(3, height, width), resampling=Resampling.average)
-    alpha = source.dataset_mask(window=window, out_shape=(height, width), resampling=Resampling.average)
+    rgb = source.read(
+        bands, window=window, out_shape=(3, height, width), resampling=Resampling.average
+    )
+    alpha = source.dataset_mask(
+        window=window, out_shape=(height, width), resampling=Resampling.average
+    )
     m_per_px = transform.a * step
     epsg = source.crs.to_epsg() if source.crs is not None else None
     return Raster(

@@ -21,7 +21,10 @@ from sorvolo.geometry.units import FOOT_M, SURVEY_FOOT_M
 from sorvolo.store.rasters.gdal import open_raster, why_no_place
 
 _WGS84 = "EPSG:4326"
-_LOWEST_M, _HIGHEST_M = -1_000.0, 10_000.0  # no ground on Earth lies beyond: a hole that its file does not declare
+_LOWEST_M, _HIGHEST_M = (
+    -1_000.0,
+    10_000.0,
+)  # no ground on Earth lies beyond: a hole that its file does not declare
 _UNITS_M = (
     dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0)
     | dict.fromkeys(("ft", "foot", "feet", "international foot"), FOOT_M)
@@ -42,7 +45,9 @@ class HeightModel:
         """(N,) heights at places of WGS84, between the four pixels around; NaN outside and beside unknown ones."""
         x, y = self._crs_from_wgs84.transform(longitudes_deg, latitudes_deg)
         back = ~self.crs_from_pixels
-        columns, rows = (a * np.asarray(x) + b * np.asarray(y) + c for a, b, c in (back[:3], back[3:6]))
+        columns, rows = (
+            a * np.asarray(x) + b * np.asarray(y) + c for a, b, c in (back[:3], back[3:6])
+        )
         known = np.isfinite(columns) & np.isfinite(rows)
         heights_m = np.full(len(known), np.nan)
         places = np.array([rows[known], columns[known]]) - 0.5
@@ -79,18 +84,29 @@ def read_height_model(path: Path, bounds_deg: tuple[float, float, float, float])
                 )
             step = math.ceil(max(window.width, window.height) / _MOST_PX)
             shape = math.ceil(window.height / step), math.ceil(window.width / step)
-            read = source.read(1, window=window, out_shape=shape, masked=True, resampling=Resampling.average)
-            heights_m = np.where(np.ma.getmaskarray(read), np.nan, np.asarray(read.data, np.float64))
+            read = source.read(
+                1, window=window, out_shape=shape, masked=True, resampling=Resampling.average
+            )
+            heights_m = np.where(
+                np.ma.getmaskarray(read), np.nan, np.asarray(read.data, np.float64)
+            )
             heights_m = (heights_m * source.scales[0] + source.offsets[0]) * to_m
             heights_m[(heights_m < _LOWEST_M) | (heights_m > _HIGHEST_M)] = np.nan
             transform = source.window_transform(window)
             wide, high = window.width / shape[1], window.height / shape[0]
             crs_from_pixels = Affine(
-                transform.a * wide, transform.b * high, transform.c, transform.d * wide, transform.e * high, transform.f
+                transform.a * wide,
+                transform.b * high,
+                transform.c,
+                transform.d * wide,
+                transform.e * high,
+                transform.f,
             )
             return HeightModel(heights_m, crs_from_pixels, source.crs.to_wkt())
     except (RasterioError, CRSError) as error:
-        raise InputError(f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again") from error
+        raise InputError(
+            f"{path} is no readable GeoTIFF ({error}); export it as GeoTIFF again"
+        ) from error
 
 
 def _metres_in_unit(source: rasterio.DatasetReader, path: Path) -> float:
@@ -98,13 +114,17 @@ def _metres_in_unit(source: rasterio.DatasetReader, path: Path) -> float:
     named = (source.units[0] or "").strip().lower()
     if named:
         if named not in _UNITS_M:
-            raise InputError(f"{path} has heights in {named!r}; metres or feet were needed: convert it (gdal_calc)")
+            raise InputError(
+                f"{path} has heights in {named!r}; metres or feet were needed: convert it (gdal_calc)"
+            )
         return _UNITS_M[named]
     vertical = [each for each in CRS.from_user_input(source.crs).sub_crs_list if each.is_vertical]
     return float(vertical[0].axis_info[0].unit_conversion_factor) if vertical else 1.0
 
 
-def _window(source: rasterio.DatasetReader, bounds_deg: tuple[float, float, float, float]) -> Window | None:
+def _window(
+    source: rasterio.DatasetReader, bounds_deg: tuple[float, float, float, float]
+) -> Window | None:
     """The whole pixels that the bounds touch; None where there are none."""
     left, bottom, right, top = transform_bounds(_WGS84, source.crs, *bounds_deg)
     back = ~source.transform

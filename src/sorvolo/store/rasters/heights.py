@@ -15,9 +15,20 @@ from sorvolo.geometry.grid import Grid
 from sorvolo.store.atomic import atomic_path, scratch_folder
 from sorvolo.store.rasters.gdal import crs_of_epsg, open_raster, quiet_gdal, transform_on_grid
 
-_PLAIN = {"driver": "GTiff", "tiled": True, "compress": "zstd", "zstd_level": 1, "bigtiff": "IF_SAFER"}
+_PLAIN = {
+    "driver": "GTiff",
+    "tiled": True,
+    "compress": "zstd",
+    "zstd_level": 1,
+    "bigtiff": "IF_SAFER",
+}
 _COG = {
-    "driver": "COG", "blocksize": 512, "compress": "DEFLATE", "level": 1, "predictor": "YES", "bigtiff": "IF_SAFER",
+    "driver": "COG",
+    "blocksize": 512,
+    "compress": "DEFLATE",
+    "level": 1,
+    "predictor": "YES",
+    "bigtiff": "IF_SAFER",
     "overview_resampling": "AVERAGE",
 }
 
@@ -30,16 +41,23 @@ class HeightBands:
     first: tuple[int, int]
 
 
-def write_height_cog(bands: Sequence[Floats32], names: Sequence[str], first: tuple[int, int], grid: Grid,
-                     path: Path) -> None:
+def write_height_cog(
+    bands: Sequence[Floats32], names: Sequence[str], first: tuple[int, int], grid: Grid, path: Path
+) -> None:
     """Write bands of metres, (H, W) float32, NaN unknown, each with its name, in place of what was at `path`.
 
     Raises StoreError on a full disk or for a file that reads back differently.
     """
     height, width = bands[0].shape
     profile = _PLAIN | {
-        "width": width, "height": height, "count": len(bands), "dtype": "float32", "nodata": float("nan"),
-        "blockxsize": 512, "blockysize": 512, "crs": crs_of_epsg(grid.crs) if grid.crs else None,
+        "width": width,
+        "height": height,
+        "count": len(bands),
+        "dtype": "float32",
+        "nodata": float("nan"),
+        "blockxsize": 512,
+        "blockysize": 512,
+        "crs": crs_of_epsg(grid.crs) if grid.crs else None,
         "transform": transform_on_grid(grid, *first),
     }
     with scratch_folder(path.parent) as scratch, atomic_path(path) as temporary, quiet_gdal():
@@ -52,7 +70,9 @@ def write_height_cog(bands: Sequence[Floats32], names: Sequence[str], first: tup
             with rasterio.open(scratch / "plain.tif") as source:
                 rasterio.shutil.copy(source, temporary, **_COG)
             with rasterio.open(temporary, driver="GTiff") as written:
-                whole = np.array_equal(written.read(1), bands[0].astype(np.float32, copy=False), equal_nan=True)
+                whole = np.array_equal(
+                    written.read(1), bands[0].astype(np.float32, copy=False), equal_nan=True
+                )
         except RasterioError as error:
             raise StoreError(f"{path} could not be written ({error}); is the disk full?") from error
         if not whole:
@@ -63,10 +83,17 @@ def read_height_cog(path: Path, grid: Grid) -> HeightBands:
     """The bands of a file that `write_height_cog` wrote on this grid. Raises InputError for any other."""
     try:
         with open_raster(path, "a height model of `sorvolo heights`") as source:
-            if abs(source.transform.a - grid.m_per_px) > 1e-9 * grid.m_per_px or source.dtypes[0] != "float32":
-                raise InputError(f"{path} is no height model of this site; run sorvolo heights again")
+            if (
+                abs(source.transform.a - grid.m_per_px) > 1e-9 * grid.m_per_px
+                or source.dtypes[0] != "float32"
+            ):
+                raise InputError(
+                    f"{path} is no height model of this site; run sorvolo heights again"
+                )
             corner = np.array([[source.transform.c, source.transform.f]])
             column, row = grid.grid_from_projected(corner)[0] + 0.5
             return HeightBands(tuple(source.read()), (round(column), round(row)))
     except RasterioError as error:
-        raise InputError(f"{path} is no readable GeoTIFF ({error}); run sorvolo heights again") from error
+        raise InputError(
+            f"{path} is no readable GeoTIFF ({error}); run sorvolo heights again"
+        ) from error

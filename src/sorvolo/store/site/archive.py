@@ -23,7 +23,13 @@ from sorvolo.store.site.journal import RunJournal
 from sorvolo.store.site.names import is_plain_name
 from sorvolo.store.site.object_records import StoredObject, StoredSearch
 from sorvolo.store.site.tiles import GrowingTiles, TileView
-from sorvolo.store.site.upkeep import forget_journals, forget_unfinished, remove_unused, repair, stopped_flights
+from sorvolo.store.site.upkeep import (
+    forget_journals,
+    forget_unfinished,
+    remove_unused,
+    repair,
+    stopped_flights,
+)
 from sorvolo.survey.findings import Verdict
 from sorvolo.survey.flight import Site
 
@@ -141,7 +147,9 @@ class Archive:
         """Fix the site for ever; raises StoreError when the folder has one."""
         self._require_writable()
         if self.has_site:
-            raise StoreError(f"{self.folder} holds the site {self.site().name!r}; choose another folder")
+            raise StoreError(
+                f"{self.folder} holds the site {self.site().name!r}; choose another folder"
+            )
         with self._files.catalogue.changing() as connection:
             records.add_site(connection, site)
 
@@ -174,10 +182,14 @@ class Archive:
         known = [entry for entry in complete if entry.moment <= utc]
         if not known:
             earliest = min((entry.moment for entry in complete), default=None)
-            first = ", and has none now" if earliest is None else (
-                f"; its first version shows {earliest.isoformat(timespec='seconds')}"
+            first = (
+                ", and has none now"
+                if earliest is None
+                else (f"; its first version shows {earliest.isoformat(timespec='seconds')}")
             )
-            raise InputError(f"{self.folder} had no map at {utc.isoformat(timespec='seconds')}{first}")
+            raise InputError(
+                f"{self.folder} had no map at {utc.isoformat(timespec='seconds')}{first}"
+            )
         return known[-1]
 
     def tile_difference(self, version: VersionEntry) -> TileDifference:
@@ -219,7 +231,10 @@ class Archive:
     def newest_objects(self, flights: Collection[str] | None = None) -> list[StoredObject]:
         """What stands on the site by the newest look at each piece of ground; as far as these flights know."""
         with self._files.catalogue.reading() as connection:
-            found, searches = object_records.load_objects(connection), object_records.load_searches(connection)
+            found, searches = (
+                object_records.load_objects(connection),
+                object_records.load_searches(connection),
+            )
         return object_records.newest_objects(
             [each for each in found if flights is None or each.flight_id in flights],
             [each for each in searches if flights is None or each.flight_id in flights],
@@ -231,9 +246,10 @@ class Archive:
         A later review replaces an earlier one. Raises InputError, and stores nothing, when an id is unknown.
         """
         wanted = {change_ids} if isinstance(change_ids, str) else set(change_ids)
-        self._change_reviews(wanted, lambda connection, found: change_records.put_reviews(
-            connection, found, verdict, note
-        ))
+        self._change_reviews(
+            wanted,
+            lambda connection, found: change_records.put_reviews(connection, found, verdict, note),
+        )
 
     def withdraw_review(self, change_ids: Iterable[str]) -> None:
         """Withdraw the reviews of changes. Raises InputError, and changes nothing, when an id is unknown."""
@@ -269,7 +285,9 @@ class Archive:
         Raises StoreError for a version that does not exist.
         """
         if version is not None and version not in {entry.id for entry in self.versions()}:
-            raise StoreError(f"{self.folder} has no version {version} of its map; `versions` lists them")
+            raise StoreError(
+                f"{self.folder} has no version {version} of its map; `versions` lists them"
+            )
         with self._files.catalogue.reading() as connection:
             newest = records.newest_version(connection)
         return self._files.tiles(newest if version is None else version)
@@ -277,10 +295,14 @@ class Archive:
     def live_tiles(self) -> TileView:
         """The tiles of the map that is being made, as of its last flush; else of the newest complete one."""
         with self._files.catalogue.reading() as connection:
-            version = records.newest_version(connection, complete=False) or records.newest_version(connection)
+            version = records.newest_version(connection, complete=False) or records.newest_version(
+                connection
+            )
         return self._files.tiles(version)
 
-    def journal(self, flight_id: str, key: str, program: str = "", *, anew: bool = False) -> RunJournal:
+    def journal(
+        self, flight_id: str, key: str, program: str = "", *, anew: bool = False
+    ) -> RunJournal:
         """The journal of a run that is about to begin, with what a killed one of this `key` left in it.
 
         `key` is the same for the same run over the same map, `program` the version of Sorvolo. Journals of other runs
@@ -292,7 +314,9 @@ class Archive:
             newest = records.newest_version(connection)
         journal = RunJournal(path, key, newest, program)
         if not anew and (why_not := journal.why_not):
-            _warn(f"{flight_id}: a run that was stopped cannot continue: {why_not}; it starts again")
+            _warn(
+                f"{flight_id}: a run that was stopped cannot continue: {why_not}; it starts again"
+            )
         self._forget_stopped(path if journal.is_begun and not anew else None, but=flight_id)
         remove_unused(self._files)
         return journal
@@ -311,7 +335,9 @@ class Archive:
         """Forget the runs that were stopped, all but `kept`, with a warning for those of other flights than `but`."""
         for each in stopped_flights(self._files):
             if each != but:
-                _warn(f"a run of {each} was stopped before it was complete, and cannot continue: the map changes now")
+                _warn(
+                    f"a run of {each} was stopped before it was complete, and cannot continue: the map changes now"
+                )
         forget_journals(self._files, kept)
 
     def begin_flight(
@@ -332,20 +358,30 @@ class Archive:
         """
         self._require_writable()
         if self._writer is not None and self._writer.is_open:
-            raise StoreError(f"a flight is being mapped into {self.folder} already; finish it first")
+            raise StoreError(
+                f"a flight is being mapped into {self.folder} already; finish it first"
+            )
         if not is_plain_name(flight_id):
-            raise SettingsError(f"{flight_id!r} cannot name a flight's folder; choose letters and digits")
+            raise SettingsError(
+                f"{flight_id!r} cannot name a flight's folder; choose letters and digits"
+            )
         grid = self.site_grid().grid
         if journal is None:
             self._forget_stopped(None, but=flight_id)
         with self._files.catalogue.changing() as connection:
             run_id, version_id = records.begin_run(
-                connection, flight_id, fingerprint, str(settings.get("method", "")), plain_json(settings)
+                connection,
+                flight_id,
+                fingerprint,
+                str(settings.get("method", "")),
+                plain_json(settings),
             )
             base = records.tile_hashes(connection, version_id)
         self._files.blobs.cache_bytes = min(self._files.blobs.cache_bytes, tiles_mb * _MEGABYTE)
         tiles = GrowingTiles(self._files.blobs, base, grid.tile_px, tiles_mb * _MEGABYTE)
-        self._writer = FlightWriter(self._files, flight_id, run_id, version_id, tiles, images_mb * _MEGABYTE)
+        self._writer = FlightWriter(
+            self._files, flight_id, run_id, version_id, tiles, images_mb * _MEGABYTE
+        )
         return self._writer
 
     def _require_writable(self) -> None:

@@ -136,7 +136,11 @@ class Catalogue:
         """
         self._database = database
         self.reading, self.changing = database.reading, database.changing
-        self.fold_log, self.change_mark, self.close = database.fold_log, database.change_mark, database.close
+        self.fold_log, self.change_mark, self.close = (
+            database.fold_log,
+            database.change_mark,
+            database.close,
+        )
         try:
             database.check()
             self._bring_up_to_date(site, write=write)
@@ -168,7 +172,9 @@ class Catalogue:
                 f"version {SCHEMA_VERSION}; use the Sorvolo that made it, or map into a new folder"
             )
         if write and version < SCHEMA_VERSION:
-            from sorvolo.store.site.migrations.upgrade import upgrade  # Alembic loads slowly, and seldom has work
+            from sorvolo.store.site.migrations.upgrade import (
+                upgrade,
+            )  # Alembic loads slowly, and seldom has work
 
             with self.changing() as connection:
                 upgrade(connection, version)
@@ -200,7 +206,9 @@ def load_site(connection: Connection) -> Site | None:
         origin = Geodetic(row.latitude_deg, row.longitude_deg, row.height_m)
         if not 0 < row.m_per_px < np.inf:
             raise ValueError(f"{row.m_per_px} metres a pixel")
-        return Site(row.name, origin, checked_crs(row.crs), row.m_per_px, row.is_local, row.height_reference)
+        return Site(
+            row.name, origin, checked_crs(row.crs), row.m_per_px, row.is_local, row.height_reference
+        )
 
 
 def created_utc(connection: Connection) -> str:
@@ -211,11 +219,21 @@ def created_utc(connection: Connection) -> str:
 
 def add_site(connection: Connection, site: Site) -> None:
     """Write the site's one row."""
-    connection.execute(insert(schema.site).values(
-        id=1, name=site.name, latitude_deg=site.origin.latitude_deg, longitude_deg=site.origin.longitude_deg,
-        height_m=site.origin.height_m, height_reference=site.height_reference, crs=site.crs,
-        m_per_px=site.m_per_px, is_local=site.is_local, created_utc=utc_now(), derived_version=0,
-    ))
+    connection.execute(
+        insert(schema.site).values(
+            id=1,
+            name=site.name,
+            latitude_deg=site.origin.latitude_deg,
+            longitude_deg=site.origin.longitude_deg,
+            height_m=site.origin.height_m,
+            height_reference=site.height_reference,
+            crs=site.crs,
+            m_per_px=site.m_per_px,
+            is_local=site.is_local,
+            created_utc=utc_now(),
+            derived_version=0,
+        )
+    )
 
 
 def list_flights(connection: Connection) -> list[FlightEntry]:
@@ -226,13 +244,23 @@ def list_flights(connection: Connection) -> list[FlightEntry]:
         # "mapping" before "complete": the last one stays
         .order_by(schema.flights.c.rank, schema.runs.c.status.desc())
     )
-    return list({
-        row.flight_id: FlightEntry(
-            row.flight_id, row.rank, row.fingerprint, row.status, row.started_utc, row.finished_utc,
-            row.method, row.frames, row.settings, tuple(row.notes),
-        )
-        for row in rows
-    }.values())
+    return list(
+        {
+            row.flight_id: FlightEntry(
+                row.flight_id,
+                row.rank,
+                row.fingerprint,
+                row.status,
+                row.started_utc,
+                row.finished_utc,
+                row.method,
+                row.frames,
+                row.settings,
+                tuple(row.notes),
+            )
+            for row in rows
+        }.values()
+    )
 
 
 def list_versions(connection: Connection) -> list[VersionEntry]:
@@ -247,8 +275,15 @@ def list_versions(connection: Connection) -> list[VersionEntry]:
     )
     return [
         VersionEntry(
-            row.id, row.parent_id, row.flight_id, row.created_utc, row.tiles, row.complete,
-            checked_crs(row.export_crs), row.run_id, flown_ns.get(row.id, -1),
+            row.id,
+            row.parent_id,
+            row.flight_id,
+            row.created_utc,
+            row.tiles,
+            row.complete,
+            checked_crs(row.export_crs),
+            row.run_id,
+            flown_ns.get(row.id, -1),
             compressions[row.id],
         )
         for row in rows
@@ -283,7 +318,9 @@ def newest_version(connection: Connection, *, complete: bool = True) -> int:
 
 def tile_hashes(connection: Connection, version_id: int) -> dict[TileIndex, str]:
     """SHA-256 of every tile of a version; empty for a version that does not exist."""
-    rows = connection.execute(select(schema.version_tiles).where(schema.version_tiles.c.version_id == version_id))
+    rows = connection.execute(
+        select(schema.version_tiles).where(schema.version_tiles.c.version_id == version_id)
+    )
     return {(row.tile_column, row.tile_row): row.sha256 for row in rows}
 
 
@@ -296,7 +333,9 @@ def tiles_alike(connection: Connection, version_id: int, other_id: int) -> set[T
 def tile_changes(connection: Connection, version: VersionEntry) -> tuple[list[str], int]:
     """SHA-256 of each tile that differs from the parent's at its place, and the number that only the parent has."""
     now, then = tile_hashes(connection, version.id), tile_hashes(connection, version.parent_id)
-    return [sha256 for index, sha256 in now.items() if then.get(index) != sha256], len(then.keys() - now.keys())
+    return [sha256 for index, sha256 in now.items() if then.get(index) != sha256], len(
+        then.keys() - now.keys()
+    )
 
 
 def used_hashes(connection: Connection, among: Collection[str] | None = None) -> set[str]:
@@ -309,51 +348,86 @@ def used_hashes(connection: Connection, among: Collection[str] | None = None) ->
         sha256
         for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
         for sha256 in connection.execute(
-            query.where(schema.version_tiles.c.sha256.in_(wanted[start:start + 500]))
+            query.where(schema.version_tiles.c.sha256.in_(wanted[start : start + 500]))
         ).scalars()
     }
 
 
 def begin_run(
-    connection: Connection, flight_id: str, fingerprint: str, method: str, settings: Mapping[str, Any]
+    connection: Connection,
+    flight_id: str,
+    fingerprint: str,
+    method: str,
+    settings: Mapping[str, Any],
 ) -> tuple[int, int]:
     """Start a run and its incomplete version over the right earlier one; return both ids."""
-    known = connection.execute(select(schema.flights.c.rank).where(schema.flights.c.id == flight_id)).scalar()
+    known = connection.execute(
+        select(schema.flights.c.rank).where(schema.flights.c.id == flight_id)
+    ).scalar()
     if known is None:
         last = connection.execute(select(func.max(schema.flights.c.rank))).scalar()
-        connection.execute(insert(schema.flights).values(id=flight_id, rank=0 if last is None else last + 1))
-    run_id = _inserted(connection, schema.runs, {
-        "flight_id": flight_id, "fingerprint": fingerprint, "status": "mapping", "started_utc": utc_now(),
-        "finished_utc": "", "method": method, "settings": dict(settings), "frames": {}, "notes": [],
-        "files_written": False,
-    })
+        connection.execute(
+            insert(schema.flights).values(id=flight_id, rank=0 if last is None else last + 1)
+        )
+    run_id = _inserted(
+        connection,
+        schema.runs,
+        {
+            "flight_id": flight_id,
+            "fingerprint": fingerprint,
+            "status": "mapping",
+            "started_utc": utc_now(),
+            "finished_utc": "",
+            "method": method,
+            "settings": dict(settings),
+            "frames": {},
+            "notes": [],
+            "files_written": False,
+        },
+    )
     newest = next((v for v in reversed(list_versions(connection)) if v.complete), None)
-    base_id = 0 if newest is None else newest.parent_id if newest.flight_id == flight_id else newest.id
-    version_id = _inserted(connection, schema.versions, {
-        "parent_id": base_id, "flight_id": flight_id, "run_id": run_id, "created_utc": utc_now(),
-        "complete": False, "export_crs": "",
-    })
+    base_id = (
+        0 if newest is None else newest.parent_id if newest.flight_id == flight_id else newest.id
+    )
+    version_id = _inserted(
+        connection,
+        schema.versions,
+        {
+            "parent_id": base_id,
+            "flight_id": flight_id,
+            "run_id": run_id,
+            "created_utc": utc_now(),
+            "complete": False,
+            "export_crs": "",
+        },
+    )
     tiles = schema.version_tiles
     base = select(literal(version_id), tiles.c.tile_column, tiles.c.tile_row, tiles.c.sha256)
     columns = list(tiles.c.keys())
-    connection.execute(insert(tiles).from_select(columns, base.where(tiles.c.version_id == base_id)))
+    connection.execute(
+        insert(tiles).from_select(columns, base.where(tiles.c.version_id == base_id))
+    )
     return run_id, version_id
 
 
-def change_tiles(connection: Connection, version_id: int, changed: Mapping[TileIndex, str | None]) -> None:
+def change_tiles(
+    connection: Connection, version_id: int, changed: Mapping[TileIndex, str | None]
+) -> None:
     """Give tiles of a version other content; None removes one."""
     tiles = schema.version_tiles
     if changed:
         connection.execute(
             delete(tiles).where(
-                tiles.c.version_id == version_id, tiles.c.tile_column == bindparam("column"),
+                tiles.c.version_id == version_id,
+                tiles.c.tile_column == bindparam("column"),
                 tiles.c.tile_row == bindparam("row"),
             ),
             [{"column": column, "row": row} for column, row in changed],
         )
     painted = [
         {"version_id": version_id, "tile_column": column, "tile_row": row, "sha256": sha256}
-        for (column, row), sha256 in changed.items() if sha256 is not None
+        for (column, row), sha256 in changed.items()
+        if sha256 is not None
     ]
     if painted:
         connection.execute(insert(tiles), painted)
@@ -378,27 +452,43 @@ def complete_run(
         name
         for table in (schema.documents, schema.leftovers)
         for name in connection.execute(
-            select(table.c.name).join(schema.runs, schema.runs.c.id == table.c.run_id).where(*former)
+            select(table.c.name)
+            .join(schema.runs, schema.runs.c.id == table.c.run_id)
+            .where(*former)
         ).scalars()
     } - documents.keys()
     connection.execute(delete(schema.runs).where(*former))
     if gone:
-        connection.execute(insert(schema.leftovers), [{"run_id": run_id, "name": name} for name in sorted(gone)])
-    connection.execute(update(schema.runs).where(this_run).values(
-        status="complete", finished_utc=utc_now(), frames=dict(frames), notes=list(notes)
-    ))
-    connection.execute(update(schema.versions).where(schema.versions.c.id == version_id).values(
-        complete=True, created_utc=utc_now(), export_crs=export_crs
-    ))
+        connection.execute(
+            insert(schema.leftovers), [{"run_id": run_id, "name": name} for name in sorted(gone)]
+        )
+    connection.execute(
+        update(schema.runs)
+        .where(this_run)
+        .values(status="complete", finished_utc=utc_now(), frames=dict(frames), notes=list(notes))
+    )
+    connection.execute(
+        update(schema.versions)
+        .where(schema.versions.c.id == version_id)
+        .values(complete=True, created_utc=utc_now(), export_crs=export_crs)
+    )
     if flown_ns is not None:
         first_ns, last_ns = flown_ns
-        connection.execute(insert(schema.flown).values(version_id=version_id, first_ns=first_ns, last_ns=last_ns))
+        connection.execute(
+            insert(schema.flown).values(version_id=version_id, first_ns=first_ns, last_ns=last_ns)
+        )
     if keyframes:
-        connection.execute(insert(schema.keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes])
+        connection.execute(
+            insert(schema.keyframes), [_row_of(keyframe, run_id) for keyframe in keyframes]
+        )
     if documents:
-        connection.execute(insert(schema.documents), [
-            {"run_id": run_id, "name": name, "content": content} for name, content in documents.items()
-        ])
+        connection.execute(
+            insert(schema.documents),
+            [
+                {"run_id": run_id, "name": name, "content": content}
+                for name, content in documents.items()
+            ],
+        )
 
 
 def drop_unfinished(connection: Connection) -> None:
@@ -411,10 +501,12 @@ def drop_unfinished(connection: Connection) -> None:
     _drop(connection, schema.runs, schema.runs.c.status == "mapping")
     if newest_version(connection) == 0:
         connection.execute(delete(schema.site))
-    connection.execute(delete(schema.flights).where(
-        schema.flights.c.id.not_in(select(schema.runs.c.flight_id)),
-        schema.flights.c.id.not_in(select(schema.versions.c.flight_id)),
-    ))
+    connection.execute(
+        delete(schema.flights).where(
+            schema.flights.c.id.not_in(select(schema.runs.c.flight_id)),
+            schema.flights.c.id.not_in(select(schema.versions.c.flight_id)),
+        )
+    )
 
 
 def _drop(connection: Connection, table: Table, unfinished: ColumnElement[bool]) -> None:
@@ -424,7 +516,9 @@ def _drop(connection: Connection, table: Table, unfinished: ColumnElement[bool])
     if first is not None:
         connection.execute(delete(table).where(unfinished))
         if connection.dialect.name == "sqlite":
-            connection.exec_driver_sql("UPDATE sqlite_sequence SET seq = ? WHERE name = ?", (first - 1, table.name))
+            connection.exec_driver_sql(
+                "UPDATE sqlite_sequence SET seq = ? WHERE name = ?", (first - 1, table.name)
+            )
         else:
             known = update(schema.numbers).where(schema.numbers.c.name == table.name)
             connection.execute(known.values(last=first - 1))
@@ -433,7 +527,9 @@ def _drop(connection: Connection, table: Table, unfinished: ColumnElement[bool])
 def owe_documents(connection: Connection, flight_ids: Collection[str]) -> None:
     """Let the next repair write the files of these flights again."""
     connection.execute(
-        update(schema.runs).where(schema.runs.c.flight_id.in_(list(flight_ids))).values(files_written=False)
+        update(schema.runs)
+        .where(schema.runs.c.flight_id.in_(list(flight_ids)))
+        .values(files_written=False)
     )
 
 
@@ -472,18 +568,24 @@ class OwedFiles:
 def owed_files(connection: Connection) -> list[OwedFiles]:
     """The files of each complete run that were not all written."""
     runs = connection.execute(
-        select(schema.runs.c.flight_id, schema.runs.c.id)
-        .where(schema.runs.c.status == "complete", schema.runs.c.files_written.is_(False))
+        select(schema.runs.c.flight_id, schema.runs.c.id).where(
+            schema.runs.c.status == "complete", schema.runs.c.files_written.is_(False)
+        )
     ).all()
     documents, leftovers = schema.documents, schema.leftovers
     return [
         OwedFiles(
-            flight_id, run_id,
+            flight_id,
+            run_id,
             {
                 row.name: row.content
                 for row in connection.execute(select(documents).where(documents.c.run_id == run_id))
             },
-            tuple(connection.execute(select(leftovers.c.name).where(leftovers.c.run_id == run_id)).scalars()),
+            tuple(
+                connection.execute(
+                    select(leftovers.c.name).where(leftovers.c.run_id == run_id)
+                ).scalars()
+            ),
         )
         for flight_id, run_id in runs
     ]
@@ -491,8 +593,12 @@ def owed_files(connection: Connection) -> list[OwedFiles]:
 
 def mark_written(connection: Connection, run_ids: Sequence[int], derived_version: int) -> None:
     """Note that these runs' files, and the map's files for this version, are on the disk: documents are emptied."""
-    connection.execute(update(schema.runs).where(schema.runs.c.id.in_(run_ids)).values(files_written=True))
-    connection.execute(update(schema.documents).where(schema.documents.c.run_id.in_(run_ids)).values(content=b""))
+    connection.execute(
+        update(schema.runs).where(schema.runs.c.id.in_(run_ids)).values(files_written=True)
+    )
+    connection.execute(
+        update(schema.documents).where(schema.documents.c.run_id.in_(run_ids)).values(content=b"")
+    )
     connection.execute(delete(schema.leftovers).where(schema.leftovers.c.run_id.in_(run_ids)))
     connection.execute(update(schema.site).values(derived_version=derived_version))
 
@@ -516,11 +622,19 @@ def _inserted(connection: Connection, table: Table, values: Mapping[str, Any]) -
 def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
     camera, pose = keyframe.camera, keyframe.site_from_camera
     return {
-        "run_id": run_id, "frame_index": keyframe.index, "name": keyframe.name, "time_ns": keyframe.time_ns,
-        "status": keyframe.status.value, "image_path": keyframe.image_path,
+        "run_id": run_id,
+        "frame_index": keyframe.index,
+        "name": keyframe.name,
+        "time_ns": keyframe.time_ns,
+        "status": keyframe.status.value,
+        "image_path": keyframe.image_path,
         "camera": {
-            "width_px": camera.width_px, "height_px": camera.height_px,
-            "fx_px": camera.fx_px, "fy_px": camera.fy_px, "cx_px": camera.cx_px, "cy_px": camera.cy_px,
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "fx_px": camera.fx_px,
+            "fy_px": camera.fy_px,
+            "cx_px": camera.cx_px,
+            "cy_px": camera.cy_px,
         },
         "site_from_image": keyframe.site_from_image.tolist(),
         "rotation": [] if pose is None else pose.rotation.tolist(),
@@ -535,7 +649,11 @@ def _row_of(keyframe: StoredKeyframe, run_id: int) -> dict[str, Any]:
 def _keyframe_of(row: Row[Any]) -> StoredKeyframe:
     with reading_rows("keyframe"):
         return StoredKeyframe(
-            row.flight_id, row.frame_index, row.name, row.time_ns, Status(row.status),
+            row.flight_id,
+            row.frame_index,
+            row.name,
+            row.time_ns,
+            Status(row.status),
             checked_image_path(row.image_path, row.flight_id),
             Camera(**row.camera),
             np.array(row.site_from_image, np.float64).reshape(3, 3),

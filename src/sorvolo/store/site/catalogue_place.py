@@ -106,7 +106,9 @@ def chosen_catalogues(folder: Path, words: str) -> Catalogues:
     file = catalogue_file(folder)
     if words and file is not None and file.name != (CATALOGUE if chosen.new is None else POINTER):
         lies = "in its folder" if file.name == CATALOGUE else "in PostgreSQL"
-        raise SettingsError(f"the catalogue of {folder} lies {lies} already; --catalogue is for a new site")
+        raise SettingsError(
+            f"the catalogue of {folder} lies {lies} already; --catalogue is for a new site"
+        )
     return chosen
 
 
@@ -127,7 +129,9 @@ def parsed_url(words: str) -> URL | None:
     return url.set(drivername="postgresql+psycopg")
 
 
-def create_pointed(folder: Path, pointer: str, url: URL, name: str, layout: Layout = CATALOGUE_LAYOUT) -> None:
+def create_pointed(
+    folder: Path, pointer: str, url: URL, name: str, layout: Layout = CATALOGUE_LAYOUT
+) -> None:
     """Make a schema of a new name, then the folder's pointer to it: a kill in between leaves an empty schema."""
     from sorvolo.store.site.postgres_database import PostgresDatabase, shown_url
 
@@ -142,7 +146,12 @@ def create_pointed(folder: Path, pointer: str, url: URL, name: str, layout: Layo
 
 
 def pointed_database(
-    folder: Path, pointer: str, *, write: bool, layout: Layout = CATALOGUE_LAYOUT, catalogues: Catalogues | None = None
+    folder: Path,
+    pointer: str,
+    *,
+    write: bool,
+    layout: Layout = CATALOGUE_LAYOUT,
+    catalogues: Catalogues | None = None,
 ) -> Database:
     """The database that a folder's pointer names, if it is one of `catalogues` (None: of the environment).
 
@@ -167,7 +176,15 @@ def _read_pointer(folder: Path, pointer: str) -> tuple[URL, str]:
         url, schema = parsed_url(content["url"]), content["schema"]
         if url is None or not _NAME.fullmatch(schema):
             raise ValueError("no address of a database")
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, SettingsError) as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+        RecursionError,
+        SettingsError,
+    ) as error:
         raise StoreError(
             f"{folder / pointer} does not name a catalogue (schema and url were needed); restore it from a copy"
         ) from error

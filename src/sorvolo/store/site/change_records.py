@@ -82,7 +82,9 @@ def stored_changes(flight_id: str, changes: Sequence[Change]) -> list[StoredChan
         if ids.count(change_id) > 1:
             raise StoreError(f"two changes have the id {change_id!r}; each needs its own")
         if not is_plain_name(change_id):
-            raise StoreError(f"{change_id!r} cannot name a change's pictures; choose letters, digits and dashes")
+            raise StoreError(
+                f"{change_id!r} cannot name a change's pictures; choose letters, digits and dashes"
+            )
     endings = [re.search(r"[0-9]{1,9}$", change_id) for change_id in ids]
     numbers = [int(ending.group()) for ending in endings if ending is not None]
     if len(set(numbers)) < len(ids):
@@ -100,9 +102,13 @@ def add_comparison(
     """
     taken = known_ids(connection, [each.id for each in changes])
     if taken:
-        raise StoreError(f"another flight of this site has a change {min(taken)!r} already; ids must differ")
+        raise StoreError(
+            f"another flight of this site has a change {min(taken)!r} already; ids must differ"
+        )
     kinds = {kind.value: sum(each.kind is kind for each in changes) for kind in ChangeKind}
-    connection.execute(insert(schema.comparisons).values(version_id=version_id, run_id=run_id, kinds=kinds))
+    connection.execute(
+        insert(schema.comparisons).values(version_id=version_id, run_id=run_id, kinds=kinds)
+    )
     if changes:
         connection.execute(insert(schema.changes), [_row_of(each, run_id) for each in changes])
 
@@ -114,7 +120,7 @@ def known_ids(connection: Connection, ids: Iterable[str]) -> set[str]:
         change_id
         for start in range(0, len(wanted), 500)  # SQLite bounds the number of values in a query
         for change_id in connection.execute(
-            select(schema.changes.c.id).where(schema.changes.c.id.in_(wanted[start:start + 500]))
+            select(schema.changes.c.id).where(schema.changes.c.id.in_(wanted[start : start + 500]))
         ).scalars()
     }
 
@@ -144,26 +150,42 @@ def load_reviews(connection: Connection) -> list[StoredReview]:
     """All reviews, oldest first."""
     if _is_older(connection):
         return []
-    rows = connection.execute(select(schema.reviews).order_by(schema.reviews.c.at_utc, schema.reviews.c.change_id))
+    rows = connection.execute(
+        select(schema.reviews).order_by(schema.reviews.c.at_utc, schema.reviews.c.change_id)
+    )
     with reading_rows("review"):
         return [
             StoredReview(
-                row.change_id, row.flight_id, Verdict(row.verdict), row.at_utc, row.note, ChangeKind(row.kind),
+                row.change_id,
+                row.flight_id,
+                Verdict(row.verdict),
+                row.at_utc,
+                row.note,
+                ChangeKind(row.kind),
                 frozen(np.reshape(np.asarray(row.outline_m, np.float64), (-1, 2))),
             )
             for row in rows
         ]
 
 
-def put_reviews(connection: Connection, changes: Sequence[StoredChange], verdict: Verdict, note: str) -> None:
+def put_reviews(
+    connection: Connection, changes: Sequence[StoredChange], verdict: Verdict, note: str
+) -> None:
     """Give each of these changes the same verdict; an earlier one is replaced."""
     now = utc_now()
     for each in changes:
         connection.execute(delete(schema.reviews).where(schema.reviews.c.change_id == each.id))
-        connection.execute(insert(schema.reviews).values(
-            change_id=each.id, flight_id=each.flight_id, verdict=verdict.value, at_utc=now, note=note,
-            kind=each.kind.value, outline_m=each.outline_m.tolist(),
-        ))
+        connection.execute(
+            insert(schema.reviews).values(
+                change_id=each.id,
+                flight_id=each.flight_id,
+                verdict=verdict.value,
+                at_utc=now,
+                note=note,
+                kind=each.kind.value,
+                outline_m=each.outline_m.tolist(),
+            )
+        )
 
 
 def drop_reviews(connection: Connection, changes: Sequence[StoredChange]) -> None:
@@ -181,13 +203,21 @@ def compared_versions(connection: Connection) -> dict[int, Mapping[str, int]]:
 
 def is_compared(connection: Connection, run_id: int) -> bool:
     """Whether the run compared its flight with the map."""
-    query = select(func.count()).select_from(schema.comparisons).where(schema.comparisons.c.run_id == run_id)
+    query = (
+        select(func.count())
+        .select_from(schema.comparisons)
+        .where(schema.comparisons.c.run_id == run_id)
+    )
     return not _is_older(connection) and connection.execute(query).scalar_one() > 0
 
 
 def outlines_meet(one_m: PointsM, other_m: PointsM) -> bool:
     """Whether the boxes around two outlines, (N, 2) each, have a point in common."""
-    return bool(np.all((one_m.min(axis=0) <= other_m.max(axis=0)) & (other_m.min(axis=0) <= one_m.max(axis=0))))
+    return bool(
+        np.all(
+            (one_m.min(axis=0) <= other_m.max(axis=0)) & (other_m.min(axis=0) <= one_m.max(axis=0))
+        )
+    )
 
 
 def _is_older(connection: Connection) -> bool:
@@ -203,28 +233,55 @@ def _stored(flight_id: str, number: int, change: Change) -> StoredChange:
     patch = change.patch
     height_px, width_px = patch.changed.shape
     return StoredChange(
-        change.id, change.kind, change.score, change.outline_m, change.first_seen_ns, change.last_seen_ns,
-        change.views, change.area_m2, change.length_m, change.sigma_m, flight_id, number, change.velocity_m_s,
-        change.class_before, change.class_after, change.announced_ns,
+        change.id,
+        change.kind,
+        change.score,
+        change.outline_m,
+        change.first_seen_ns,
+        change.last_seen_ns,
+        change.views,
+        change.area_m2,
+        change.length_m,
+        change.sigma_m,
+        flight_id,
+        number,
+        change.velocity_m_s,
+        change.class_before,
+        change.class_after,
+        change.announced_ns,
         CropPlace(patch.west_m, patch.north_m, patch.m_per_px, width_px, height_px),
-        sigma_in_map_m=change.sigma_in_map_m, height_change=change.height_change,
+        sigma_in_map_m=change.sigma_in_map_m,
+        height_change=change.height_change,
     )
 
 
 def _row_of(change: StoredChange, run_id: int) -> dict[str, Any]:
     crop, risen = change.crop, change.height_change
     return {
-        "id": change.id, "run_id": run_id, "number": change.number, "kind": change.kind.value,
+        "id": change.id,
+        "run_id": run_id,
+        "number": change.number,
+        "kind": change.kind.value,
         "properties": {
-            "score": float(change.score), "outline_m": change.outline_m.tolist(),
-            "first_seen_ns": int(change.first_seen_ns), "last_seen_ns": int(change.last_seen_ns),
-            "announced_ns": int(change.announced_ns), "views": int(change.views),
-            "area_m2": number_or_null(change.area_m2), "length_m": number_or_null(change.length_m),
-            "sigma_m": number_or_null(change.sigma_m), "sigma_in_map_m": number_or_null(change.sigma_in_map_m),
+            "score": float(change.score),
+            "outline_m": change.outline_m.tolist(),
+            "first_seen_ns": int(change.first_seen_ns),
+            "last_seen_ns": int(change.last_seen_ns),
+            "announced_ns": int(change.announced_ns),
+            "views": int(change.views),
+            "area_m2": number_or_null(change.area_m2),
+            "length_m": number_or_null(change.length_m),
+            "sigma_m": number_or_null(change.sigma_m),
+            "sigma_in_map_m": number_or_null(change.sigma_in_map_m),
             "height_change": None if risen is None else [float(risen.rise_m), float(risen.sigma_m)],
             "velocity_m_s": change.velocity_m_s.tolist(),
-            "class_before": change.class_before, "class_after": change.class_after,
-            "crop": [*map(float, (crop.west_m, crop.north_m, crop.m_per_px)), crop.width_px, crop.height_px],
+            "class_before": change.class_before,
+            "class_after": change.class_after,
+            "crop": [
+                *map(float, (crop.west_m, crop.north_m, crop.m_per_px)),
+                crop.width_px,
+                crop.height_px,
+            ],
         },
     }
 
@@ -238,11 +295,23 @@ def _change_of(row: Row[Any], review: StoredReview | None) -> StoredChange:
             raise ValueError("no outline, or a picture without a scale")
         is_reviewed = review is not None and outlines_meet(outline_m, review.outline_m)
         return StoredChange(
-            checked_name(row.id, "change"), ChangeKind(row.kind), values["score"], outline_m,
-            values["first_seen_ns"], values["last_seen_ns"], values["views"],
-            _number(values["area_m2"]), _number(values["length_m"]), _number(values["sigma_m"]),
-            row.flight_id, row.number, frozen(values["velocity_m_s"]), values["class_before"], values["class_after"],
-            values["announced_ns"], CropPlace(west_m, north_m, m_per_px, width_px, height_px),
+            checked_name(row.id, "change"),
+            ChangeKind(row.kind),
+            values["score"],
+            outline_m,
+            values["first_seen_ns"],
+            values["last_seen_ns"],
+            values["views"],
+            _number(values["area_m2"]),
+            _number(values["length_m"]),
+            _number(values["sigma_m"]),
+            row.flight_id,
+            row.number,
+            frozen(values["velocity_m_s"]),
+            values["class_before"],
+            values["class_after"],
+            values["announced_ns"],
+            CropPlace(west_m, north_m, m_per_px, width_px, height_px),
             review.verdict if review is not None and is_reviewed else None,
             review.note if review is not None and is_reviewed else "",
             _number(values.get("sigma_in_map_m")),  # sites of earlier versions have neither

@@ -25,7 +25,10 @@ from sorvolo.store.site.catalogue import VersionEntry
 from sorvolo.store.site.files import STAGED, SiteFiles
 
 STAGED_FOLDERS = ("changes", "masks", CROPS)
-_PICTURE_PX, _UNCHANGED_PX = 1600, 800  # of the map in changes.html; daily flights without change should cost little
+_PICTURE_PX, _UNCHANGED_PX = (
+    1600,
+    800,
+)  # of the map in changes.html; daily flights without change should cost little
 
 
 def write_map_files(files: SiteFiles, version: VersionEntry) -> None:
@@ -44,12 +47,23 @@ def write_map_files(files: SiteFiles, version: VersionEntry) -> None:
             small.take(index, tile)
             if small.taken == len(tiles):  # while GDAL makes its file
                 kmz = None if site.is_local else files.kmz_path
-                waiting.append(other.submit(
-                    write_small_maps, small, files.site_grid(), site.name, files.preview_path, kmz
-                ))
+                waiting.append(
+                    other.submit(
+                        write_small_maps,
+                        small,
+                        files.site_grid(),
+                        site.name,
+                        files.preview_path,
+                        kmz,
+                    )
+                )
 
         write_cog(
-            tiles, files.site_grid(), files.mosaic_path, crs=version.export_crs or None, compress=version.compress,
+            tiles,
+            files.site_grid(),
+            files.mosaic_path,
+            crs=version.export_crs or None,
+            compress=version.compress,
             pass_by=pass_by,
         )
     for each in waiting:
@@ -59,7 +73,9 @@ def write_map_files(files: SiteFiles, version: VersionEntry) -> None:
 def map_is_there(files: SiteFiles) -> bool:
     """Whether no file of the map is missing."""
     paths = [files.preview_path, files.mosaic_path]
-    return all(path.is_file() for path in paths + ([] if files.site().is_local else [files.kmz_path]))
+    return all(
+        path.is_file() for path in paths + ([] if files.site().is_local else [files.kmz_path])
+    )
 
 
 def take_staged(flight_folder: Path, run_id: int) -> None:
@@ -98,13 +114,22 @@ def write_change_files(files: SiteFiles, flight_id: str, version: VersionEntry |
         changes = change_records.load_changes(connection, flight_id)
     site = files.site()
     placemarks = [] if site.is_local else change_placemarks(changes, site)
-    _write_list(folder, "changes", changes_geojson(changes, site), placemarks, is_local=site.is_local)
+    _write_list(
+        folder, "changes", changes_geojson(changes, site), placemarks, is_local=site.is_local
+    )
     crops = {each.id: _crops(files, flight_id, each.id) for each in changes}
     before, after = _before_and_after(files, version, _PICTURE_PX if changes else _UNCHANGED_PX)
     made = {each.id: each for each in files.versions()}
     page = changes_page(
-        files.report(flight_id), changes, before, after, site, crops, coverage=files.coverage(flight_id),
-        before_words=_words_of(made.get(version.parent_id)), after_words=_words_of(version),
+        files.report(flight_id),
+        changes,
+        before,
+        after,
+        site,
+        crops,
+        coverage=files.coverage(flight_id),
+        before_words=_words_of(made.get(version.parent_id)),
+        after_words=_words_of(version),
     )
     atomic_write_bytes(folder / "changes.html", page.encode())
 
@@ -144,7 +169,12 @@ def site_objects_are_there(files: SiteFiles) -> bool:
 
 
 def _write_list(
-    folder: Path, name: str, collection: Mapping[str, Any], placemarks: Sequence[Placemark], *, is_local: bool
+    folder: Path,
+    name: str,
+    collection: Mapping[str, Any],
+    placemarks: Sequence[Placemark],
+    *,
+    is_local: bool,
 ) -> None:
     """Write a list of places as GeoJSON, KML and GPX; of a local site as plain JSON alone: it has no place on Earth."""
     _remove_list(folder, name, but=features_name(name, is_local=is_local))
@@ -155,7 +185,11 @@ def _write_list(
 
 
 def _remove_list(folder: Path, name: str, but: str = "") -> None:
-    for file in (f"{name}.geojson", f"{name}.json", *((f"{name}.kml", f"{name}.gpx") if not but else ())):
+    for file in (
+        f"{name}.geojson",
+        f"{name}.json",
+        *((f"{name}.kml", f"{name}.gpx") if not but else ()),
+    ):
         if file != but:
             (folder / file).unlink(missing_ok=True)
 
@@ -177,13 +211,21 @@ def _words_of(version: VersionEntry | None) -> tuple[str, str]:
     """A version by its flight, and when that was flown; where nothing of it is dated, when the version was made."""
     if version is None:
         return "no map yet", ""
-    date = f"flown {version.flown_utc[:10]}" if version.flown_utc else f"mapped {version.created_utc[:10]}"
+    date = (
+        f"flown {version.flown_utc[:10]}"
+        if version.flown_utc
+        else f"mapped {version.created_utc[:10]}"
+    )
     return f"version {version.id}: flight {version.flight_id},", date
 
 
-def _crops(files: SiteFiles, flight_id: str, change_id: str) -> tuple[ImageRGBA | None, ImageRGBA | None]:
+def _crops(
+    files: SiteFiles, flight_id: str, change_id: str
+) -> tuple[ImageRGBA | None, ImageRGBA | None]:
     """A change's pictures before and after; None for one that is gone."""
-    before, after = (_crop(files, f"flights/{flight_id}/changes/{name}") for name in crop_names(change_id))
+    before, after = (
+        _crop(files, f"flights/{flight_id}/changes/{name}") for name in crop_names(change_id)
+    )
     return before, after
 
 

@@ -18,7 +18,13 @@ from sorvolo.store.locks import take_lock
 from sorvolo.store.nofollow import read_below, refuse_links
 from sorvolo.store.site import catalogue as records
 from sorvolo.store.site.catalogue import Catalogue, VersionEntry
-from sorvolo.store.site.catalogue_place import CATALOGUE, POINTER, Catalogues, create_database, is_site
+from sorvolo.store.site.catalogue_place import (
+    CATALOGUE,
+    POINTER,
+    Catalogues,
+    create_database,
+    is_site,
+)
 from sorvolo.store.site.names import checked_document, checked_image_path, checked_name
 from sorvolo.store.site.origin import ORIGIN, TILE_SIZES, UNSENT, find_origin
 from sorvolo.store.site.tiles import TileBlobs, TileView
@@ -71,8 +77,12 @@ class SiteFiles:
         """Open a site folder. Raises StoreError as `Archive.open` does; to write, the folder is made and locked."""
         if not write:
             if not is_site(folder):
-                raise StoreError(f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}")
-            _refuse_traps(folder, skipped=frozenset({"tiles", "keyframes"}))  # those are read link by link
+                raise StoreError(
+                    f"no site at {folder}; make one with: sorvolo map INPUT --site {folder}"
+                )
+            _refuse_traps(
+                folder, skipped=frozenset({"tiles", "keyframes"})
+            )  # those are read link by link
             return cls(folder, Catalogue.open(folder, write=False, catalogues=catalogues), None)
         refuse_unfinished(folder)
         _make_folder(folder)
@@ -129,7 +139,11 @@ class SiteFiles:
 
     def flight_folders(self) -> list[Path]:
         """The folders of all flights that have one, whether the catalogue knows them or not."""
-        return [path for path in (self.folder / "flights").glob("*") if path.is_dir() and not path.is_symlink()]
+        return [
+            path
+            for path in (self.folder / "flights").glob("*")
+            if path.is_dir() and not path.is_symlink()
+        ]
 
     def document_path(self, flight_id: str, name: str) -> Path:
         """A text file of a flight; raises StoreError for a name that could lie elsewhere."""
@@ -149,7 +163,9 @@ class SiteFiles:
 
     def image_name(self, flight_id: str, run_id: int, index: int) -> str:
         """The path of a keyframe's image in the site folder, as the catalogue holds it."""
-        return f"flights/{checked_name(flight_id, 'flight')}/keyframes/{int(run_id)}/{index:06d}.jpg"
+        return (
+            f"flights/{checked_name(flight_id, 'flight')}/keyframes/{int(run_id)}/{index:06d}.jpg"
+        )
 
     def image(self, flight_id: str, image_path: str, step: int = 1) -> ImageRGB:
         """A stored keyframe, at a `step`-th (1, 2, 4, 8) of its size.
@@ -160,7 +176,9 @@ class SiteFiles:
         if self._origin is not None and not (self.folder / name).exists():
             self._origin.fetch(name)
         try:
-            return image_from_jpeg(read_below(self.folder, name), str(self.folder / name), step=step)
+            return image_from_jpeg(
+                read_below(self.folder, name), str(self.folder / name), step=step
+            )
         except FileNotFoundError as error:
             raise StoreError(
                 f"the keyframe {self.folder / name} is gone; if its flight was mapped again meanwhile, list the "
@@ -241,7 +259,9 @@ def lock_folder(folder: Path) -> int:
 def refuse_unfinished(folder: Path) -> None:
     """Raise StoreError for a folder into which a site is being copied."""
     if (folder / COPYING).is_file():
-        raise StoreError(f"the copy in {folder} is not finished; run the same `sorvolo site copy` again")
+        raise StoreError(
+            f"the copy in {folder} is not finished; run the same `sorvolo site copy` again"
+        )
 
 
 def _make_folder(folder: Path) -> None:
@@ -255,7 +275,9 @@ def _make_folder(folder: Path) -> None:
         return
     names = (path.name for path in folder.iterdir())
     own = (LOCK, ORIGIN, TILE_SIZES, UNSENT)
-    foreign = sorted(name for name in names if name not in own and not name.startswith(TEMPORARY_PREFIX))
+    foreign = sorted(
+        name for name in names if name not in own and not name.startswith(TEMPORARY_PREFIX)
+    )
     if foreign:
         raise StoreError(
             f"{folder} is no site: it holds {foreign[0]!r} and no {CATALOGUE}; choose a new or empty folder"

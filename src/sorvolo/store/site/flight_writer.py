@@ -13,7 +13,13 @@ from sorvolo.errors import StoreError, UnavailableError, goes_on
 from sorvolo.geometry.arrays import Boxes, ImageGray, ImageRGB, ImageRGBA, Mask
 from sorvolo.geometry.grid import TileIndex
 from sorvolo.store.atomic import TEMPORARY_PREFIX, atomic_write_bytes, sync_file, writing
-from sorvolo.store.exports.change_files import BOXES_FILE, boxes_json, crop_files, mask_name, write_view_masks
+from sorvolo.store.exports.change_files import (
+    BOXES_FILE,
+    boxes_json,
+    crop_files,
+    mask_name,
+    write_view_masks,
+)
 from sorvolo.store.exports.frame_files import frames_geojson
 from sorvolo.store.exports.object_files import CROPS, object_crops
 from sorvolo.store.exports.plain import features_name, geojson_bytes, json_bytes
@@ -65,7 +71,10 @@ class FlightWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._growing.close()
         if not self._is_open:
@@ -122,16 +131,27 @@ class FlightWriter:
     def keyframe(self, frame: PlacedFrame, image_path: str) -> StoredKeyframe:
         """The record of a frame whose picture was saved at this path; raises StoreError where none was."""
         if image_path not in self._sizes:
-            raise StoreError(f"the image {image_path} of frame {frame.name} was never saved; save it first")
+            raise StoreError(
+                f"the image {image_path} of frame {frame.name} was never saved; save it first"
+            )
         width_px, height_px = self._sizes[image_path]
         camera = frame.camera.undistorted()
         sx, sy = camera.width_px / width_px, camera.height_px / height_px
         # centres of pixels lie half a pixel inside: frame = (stored + 1/2) s - 1/2
         frame_from_stored = np.array([[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1]])
         return StoredKeyframe(
-            self._flight_id, frame.index, frame.name, frame.time_ns, frame.status, image_path,
-            camera.resized(width_px, height_px), frame.site_from_image @ frame_from_stored,
-            frame.site_from_camera, np.asarray(frame.gains), frame.sigma_m, frame.residual_px,
+            self._flight_id,
+            frame.index,
+            frame.name,
+            frame.time_ns,
+            frame.status,
+            image_path,
+            camera.resized(width_px, height_px),
+            frame.site_from_image @ frame_from_stored,
+            frame.site_from_camera,
+            np.asarray(frame.gains),
+            frame.sigma_m,
+            frame.residual_px,
             np.asarray(frame.vignette),
         )
 
@@ -235,18 +255,30 @@ class FlightWriter:
         found = change_records.stored_changes(self._flight_id, changes or ())
         texts = {
             **(documents or {}),
-            features_name("frames", is_local=site.is_local): geojson_bytes(frames_geojson(placed, site)),
+            features_name("frames", is_local=site.is_local): geojson_bytes(
+                frames_geojson(placed, site)
+            ),
             "report.json": json_bytes(report),
             "report.html": report_html.encode(),
         }
         flown_ns = _flown_ns(placed)
-        frames = {status.value: sum(frame.status is status for frame in placed) for status in Status}
+        frames = {
+            status.value: sum(frame.status is status for frame in placed) for status in Status
+        }
         self.flush()
         self._stage(changes or (), search)
         self._sync()
         with self._files.catalogue.changing() as connection:
             records.complete_run(
-                connection, self._run_id, self._version_id, keyframes, texts, frames, notes, crs or "", flown_ns
+                connection,
+                self._run_id,
+                self._version_id,
+                keyframes,
+                texts,
+                frames,
+                notes,
+                crs or "",
+                flown_ns,
             )
             if changes is not None:
                 change_records.add_comparison(connection, self._run_id, self._version_id, found)
@@ -280,7 +312,9 @@ class FlightWriter:
         for name, data in object_crops(search.objects if search is not None else ()).items():
             atomic_write_bytes(self._make_staged(CROPS) / name, data, durable=False)
         if self._boxes:
-            atomic_write_bytes(self._staged / "masks" / BOXES_FILE, json_bytes(self._boxes), durable=False)
+            atomic_write_bytes(
+                self._staged / "masks" / BOXES_FILE, json_bytes(self._boxes), durable=False
+            )
 
     def _sync(self) -> None:
         """What the transaction names must reach the disk before it does."""
@@ -289,7 +323,12 @@ class FlightWriter:
             sync_file(self._files.folder / relative)
         if self._sizes:
             images = (self._files.folder / next(iter(self._sizes))).parent
-            for folder in (images, images.parent, images.parent.parent, images.parent.parent.parent):
+            for folder in (
+                images,
+                images.parent,
+                images.parent.parent,
+                images.parent.parent.parent,
+            ):
                 sync_file(folder)
         if self._staged.is_dir():
             for path in (*self._staged.rglob("*"), self._staged, *list(self._staged.parents)[:3]):
@@ -299,7 +338,9 @@ class FlightWriter:
     def _image_path(self, index: int) -> str:
         return self._files.image_name(self._flight_id, self._run_id, index)
 
-    def _keyframes(self, placed: Sequence[PlacedFrame], image_paths: Mapping[int, str]) -> list[StoredKeyframe]:
+    def _keyframes(
+        self, placed: Sequence[PlacedFrame], image_paths: Mapping[int, str]
+    ) -> list[StoredKeyframe]:
         """The frames with a saved picture that the map did not reject."""
         return [
             self.keyframe(frame, image_paths[frame.index])

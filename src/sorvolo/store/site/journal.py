@@ -26,7 +26,14 @@ _MAGIC = b"sorvolo journal 1\n"
 _HEAD = struct.Struct("<QI")  # an entry's bytes, and their CRC-32
 _TEXT = struct.Struct("<I")  # bytes of an entry's JSON
 _MOST_BYTES = 1 << 30  # of one entry: a picture of 20 megapixels takes a sixteenth
-_TYPES = {"<f8": np.float64, "<f4": np.float32, "<i8": np.int64, "<i4": np.int32, "|u1": np.uint8, "|b1": np.bool_}
+_TYPES = {
+    "<f8": np.float64,
+    "<f4": np.float32,
+    "<i8": np.int64,
+    "<i4": np.int32,
+    "|u1": np.uint8,
+    "|b1": np.bool_,
+}
 _MOST_DIMENSIONS = 4  # of an array; pictures have three
 _SYNC_EVERY_S = 1.0  # waiting for the disk after each entry would cost 4 to 5 ms each
 
@@ -120,7 +127,9 @@ class RunJournal:
     def close(self) -> None:
         """Let go of the file, which stays."""
         if self._file is not None:
-            with suppress(OSError):  # on a full disk half an entry may wait to be written, which nobody can read
+            with suppress(
+                OSError
+            ):  # on a full disk half an entry may wait to be written, which nobody can read
                 self._file.close()
             self._file = None
 
@@ -209,7 +218,8 @@ def _packed(entry: Entry) -> bytes:
     if unknown := {array.dtype.str for array in arrays.values()} - _TYPES.keys():
         raise TypeError(f"a journal holds no arrays of {sorted(unknown)}")
     head = {
-        "kind": entry.kind, "values": dict(entry.values),
+        "kind": entry.kind,
+        "values": dict(entry.values),
         "arrays": [[name, array.dtype.str, list(array.shape)] for name, array in arrays.items()],
     }
     text = json.dumps(head).encode()
@@ -230,7 +240,13 @@ def _read(file: Any) -> Entry | None:
         return None
     try:
         return _unpacked(body)
-    except (struct.error, ValueError, TypeError, KeyError, RecursionError):  # whole, but no Sorvolo wrote it
+    except (
+        struct.error,
+        ValueError,
+        TypeError,
+        KeyError,
+        RecursionError,
+    ):  # whole, but no Sorvolo wrote it
         return None
 
 
@@ -253,7 +269,11 @@ def _unpacked(body: bytes) -> Entry:
 
 
 def _count(shape: Any) -> int:
-    whole = isinstance(shape, list) and len(shape) <= _MOST_DIMENSIONS and all(type(each) is int for each in shape)
+    whole = (
+        isinstance(shape, list)
+        and len(shape) <= _MOST_DIMENSIONS
+        and all(type(each) is int for each in shape)
+    )
     if not whole or any(each < 0 for each in shape):
         raise ValueError(f"no array has the shape {shape!r}")
     return math.prod(shape)

@@ -81,7 +81,9 @@ def _read_record(kind: type, value: Any, arrays: Mapping[str, NDArray[Any]]) -> 
     hints = _hints(kind)
     if not isinstance(value, list) or len(value) != len(hints):
         raise ValueError(f"a {kind.__name__} has {len(hints)} values")
-    return kind(**{name: _read(each, part, arrays) for (name, each), part in zip(hints.items(), value)})
+    return kind(
+        **{name: _read(each, part, arrays) for (name, each), part in zip(hints.items(), value)}
+    )
 
 
 def _read_plain(kind: Any, value: Any) -> Any:
@@ -94,10 +96,16 @@ def _read_plain(kind: Any, value: Any) -> Any:
     return value
 
 
-def _read_sequence(parts: tuple[Any, ...], value: Any, arrays: Mapping[str, NDArray[Any]]) -> tuple[Any, ...]:
+def _read_sequence(
+    parts: tuple[Any, ...], value: Any, arrays: Mapping[str, NDArray[Any]]
+) -> tuple[Any, ...]:
     if not isinstance(value, list):
         raise TypeError("a sequence was needed")
-    each = parts if parts[-1:] != (Ellipsis,) and len(parts) == len(value) else (parts[0],) * len(value)
+    each = (
+        parts
+        if parts[-1:] != (Ellipsis,) and len(parts) == len(value)
+        else (parts[0],) * len(value)
+    )
     return tuple(_read(hint, item, arrays) for hint, item in zip(each, value))
 
 
@@ -105,7 +113,12 @@ def _read_array(value: Any, arrays: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
     if isinstance(value, str):
         return arrays[value]
     name, kind, rows, columns = value
-    if not (type(rows) is int and type(columns) is int and min(rows, columns) >= 0 and rows * columns <= _MOST_CELLS):
+    if not (
+        type(rows) is int
+        and type(columns) is int
+        and min(rows, columns) >= 0
+        and rows * columns <= _MOST_CELLS
+    ):
         raise ValueError("no mask is so large")
     is_mask = kind == "|b1"
     size = (rows * columns + 7) // 8 if is_mask else rows * columns

@@ -17,7 +17,9 @@ def is_plain_name(name: str) -> bool:
     return (
         0 < len(name.encode("utf-8", "replace")) <= _MOST_BYTES
         and name[0] not in ".- "
-        and all(letter in _PUNCTUATION or unicodedata.category(letter)[0] in "LMN" for letter in name)
+        and all(
+            letter in _PUNCTUATION or unicodedata.category(letter)[0] in "LMN" for letter in name
+        )
     )
 
 
@@ -55,7 +57,10 @@ def checked_sha256(sha256: str) -> str:
 def checked_image_path(path: str, flight_id: str) -> str:
     """A keyframe's path in the site folder; raises StoreError when it lies elsewhere than its flight's keyframes."""
     folder = f"flights/{checked_name(flight_id, 'flight')}/keyframes/"
-    if not isinstance(path, str) or re.fullmatch(re.escape(folder) + r"[0-9]{1,18}/[0-9]{6,18}\.jpg", path) is None:
+    if (
+        not isinstance(path, str)
+        or re.fullmatch(re.escape(folder) + r"[0-9]{1,18}/[0-9]{6,18}\.jpg", path) is None
+    ):
         raise _refused(path, "keyframe", f"a picture below {folder} was needed")
     return path
 
@@ -63,7 +68,9 @@ def checked_image_path(path: str, flight_id: str) -> str:
 def checked_crs(crs: str) -> str:
     """An EPSG code, or "" for none; raises StoreError for anything else."""
     if crs and not (isinstance(crs, str) and is_epsg(crs)):
-        raise _refused(crs, "coordinate reference system", "an EPSG code such as EPSG:32633 was needed")
+        raise _refused(
+            crs, "coordinate reference system", "an EPSG code such as EPSG:32633 was needed"
+        )
     return crs
 
 

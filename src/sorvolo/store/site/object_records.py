@@ -40,17 +40,24 @@ class StoredObject:
 def add_search(connection: Connection, run_id: int, search: ObjectSearch) -> None:
     """Note that this run's frames were searched for objects, and what was found."""
     searched_for = search.frames.searched_for
-    connection.execute(insert(schema.searches).values(
-        run_id=run_id, model=search.model, outlines_m=np.round(search.frames.outlines_m, 3).tolist(),
-        searched_for=None if searched_for is None else {
-            name: np.asarray(rows, int).tolist() for name, rows in searched_for.items()
-        },
-    ))
+    connection.execute(
+        insert(schema.searches).values(
+            run_id=run_id,
+            model=search.model,
+            outlines_m=np.round(search.frames.outlines_m, 3).tolist(),
+            searched_for=None
+            if searched_for is None
+            else {name: np.asarray(rows, int).tolist() for name, rows in searched_for.items()},
+        )
+    )
     if search.objects:
-        connection.execute(insert(schema.objects), [
-            {"run_id": run_id, "number": number, "id": each.id, "properties": _properties(each)}
-            for number, each in enumerate(search.objects, start=1)
-        ])
+        connection.execute(
+            insert(schema.objects),
+            [
+                {"run_id": run_id, "number": number, "id": each.id, "properties": _properties(each)}
+                for number, each in enumerate(search.objects, start=1)
+            ],
+        )
 
 
 def load_searches(connection: Connection) -> list[StoredSearch]:
@@ -64,7 +71,9 @@ def load_searches(connection: Connection) -> list[StoredSearch]:
     with reading_rows("search"):
         return [
             StoredSearch(
-                row.flight_id, row.rank, row.model,
+                row.flight_id,
+                row.rank,
+                row.model,
                 _frames_of(row.outlines_m, row.searched_for if knows_classes else None),
             )
             for row in rows
@@ -75,7 +84,9 @@ def load_objects(connection: Connection, flight_id: str | None = None) -> list[S
     """The objects of complete runs by flight rank and number; of one flight if its id is given."""
     if _is_older(connection):
         return []
-    query = _of_complete_runs(schema.objects, schema.objects.c).order_by(schema.flights.c.rank, schema.objects.c.number)
+    query = _of_complete_runs(schema.objects, schema.objects.c).order_by(
+        schema.flights.c.rank, schema.objects.c.number
+    )
     if flight_id is not None:
         query = query.where(schema.flights.c.id == flight_id)
     return [
@@ -84,7 +95,9 @@ def load_objects(connection: Connection, flight_id: str | None = None) -> list[S
     ]
 
 
-def newest_objects(objects: Sequence[StoredObject], searches: Sequence[StoredSearch]) -> list[StoredObject]:
+def newest_objects(
+    objects: Sequence[StoredObject], searches: Sequence[StoredSearch]
+) -> list[StoredObject]:
     """What stands on the site by the newest look at each piece of ground.
 
     What an earlier flight found where two frames of a later one looked for its class is replaced by what that one
@@ -95,7 +108,8 @@ def newest_objects(objects: Sequence[StoredObject], searches: Sequence[StoredSea
         own = [each for each in objects if each.flight_id == search.flight_id]
         seen_again = looked_at(
             np.array([each.thing.position_m for each in result]).reshape(-1, 2),
-            [each.thing.label for each in result], [search.frames],
+            [each.thing.label for each in result],
+            [search.frames],
         )
         before = [each for each, again in zip(result, seen_again) if again]
         result = [each for each, again in zip(result, seen_again) if not again]
@@ -114,7 +128,9 @@ def is_searched(connection: Connection, run_id: int) -> bool:
 def _frames_of(outlines_m: Any, searched_for: Any) -> SearchedFrames:
     if searched_for is None:
         return SearchedFrames(outlines_m)
-    return SearchedFrames(outlines_m, {str(name): np.array(rows, bool) for name, rows in searched_for.items()})
+    return SearchedFrames(
+        outlines_m, {str(name): np.array(rows, bool) for name, rows in searched_for.items()}
+    )
 
 
 def _of_complete_runs(table: Table, columns: Iterable[Any]) -> Any:
@@ -140,19 +156,28 @@ def _since(found: StoredObject, before: Sequence[StoredObject]) -> StoredObject:
 
 def _properties(each: MapObject) -> dict[str, Any]:
     return {
-        "label": each.label, "score": each.score, "class_scores": each.class_scores,
-        "position_m": each.position_m.tolist(), "sigma_m": number_or_null(each.sigma_m),
-        "length_m": number_or_null(each.length_m), "width_m": number_or_null(each.width_m),
-        "views": each.views, "possible_views": each.possible_views,
-        "first_seen_ns": int(each.first_seen_ns), "last_seen_ns": int(each.last_seen_ns), "moving": each.moving,
-        "velocity_m_s": each.velocity_m_s.tolist(), "best_frame": each.best_frame,
+        "label": each.label,
+        "score": each.score,
+        "class_scores": each.class_scores,
+        "position_m": each.position_m.tolist(),
+        "sigma_m": number_or_null(each.sigma_m),
+        "length_m": number_or_null(each.length_m),
+        "width_m": number_or_null(each.width_m),
+        "views": each.views,
+        "possible_views": each.possible_views,
+        "first_seen_ns": int(each.first_seen_ns),
+        "last_seen_ns": int(each.last_seen_ns),
+        "moving": each.moving,
+        "velocity_m_s": each.velocity_m_s.tolist(),
+        "best_frame": each.best_frame,
     }
 
 
 def _object_of(object_id: str, values: dict[str, Any]) -> MapObject:
     with reading_rows("object"):
         lengths = {
-            name: np.nan if values[name] is None else values[name] for name in ("sigma_m", "length_m", "width_m")
+            name: np.nan if values[name] is None else values[name]
+            for name in ("sigma_m", "length_m", "width_m")
         }
         return MapObject(checked_name(object_id, "object"), **{**values, **lengths})
 

@@ -39,7 +39,9 @@ def cache_folder() -> Path:
 def find_origin(folder: Path) -> Origin | None:
     """The origin of a working copy; None for any other folder. One that lies elsewhere than working copies has none:
     a stranger's site makes this program ask nobody."""
-    if not (folder / ORIGIN).is_file() or not folder.resolve().is_relative_to(cache_folder().resolve()):
+    if not (folder / ORIGIN).is_file() or not folder.resolve().is_relative_to(
+        cache_folder().resolve()
+    ):
         return None
     from sorvolo.store.copies.working import StoreOrigin
 

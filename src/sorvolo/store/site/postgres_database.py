@@ -23,7 +23,10 @@ _PATIENCE_S = 20.0
 
 _LOOK_AGAIN_S = 0.25  # at a lock that another process holds; by choice
 _WAITS = {  # of libpq, unless the URL has others: a server that is not there is noticed within a minute
-    "connect_timeout": "10", "keepalives_idle": "20", "keepalives_interval": "10", "keepalives_count": "3",
+    "connect_timeout": "10",
+    "keepalives_idle": "20",
+    "keepalives_interval": "10",
+    "keepalives_count": "3",
     "tcp_user_timeout": "60000",
 }
 _LOST = ("08", "53300", "57P01", "57P02", "57P03", "57P05")  # 53300: all its connections are taken
@@ -32,16 +35,29 @@ _FORBIDDEN = ("42501",)
 _ONLY_READS = ("25006",)
 _NOT_OURS = ("3F000", "42P01", "42703", "22P02")
 _PASSWORD = "give the password in ~/.pgpass or PGPASSWORD"
-_ENCRYPTION = "correct sslmode and sslrootcert in the address, or have the server's certificate mended"
+_ENCRYPTION = (
+    "correct sslmode and sslrootcert in the address, or have the server's certificate mended"
+)
 _REFUSALS = (  # by the server's code; by words where no code is known, which are English, as libpq's own always are
     ("28P01", ("password", "authentication failed"), _PASSWORD),
-    ("28000", ("role \"", "pg_hba"), "name another user in the address, or have the server's administrator let this "
-     "user and computer in (pg_hba.conf)"),
+    (
+        "28000",
+        ('role "', "pg_hba"),
+        "name another user in the address, or have the server's administrator let this "
+        "user and computer in (pg_hba.conf)",
+    ),
     ("42501", ("permission denied",), "ask for a role that may connect to this database"),
     ("", ("certificate", "does not support SSL"), _ENCRYPTION),
-    ("3D000", ("does not exist",), "make the database, or correct the address (--catalogue or SORVOLO_CATALOGUE)"),
+    (
+        "3D000",
+        ("does not exist",),
+        "make the database, or correct the address (--catalogue or SORVOLO_CATALOGUE)",
+    ),
 )
-_FULL_WORDS = ("could not write init file", "No space left on device")  # where nobody can connect for that
+_FULL_WORDS = (
+    "could not write init file",
+    "No space left on device",
+)  # where nobody can connect for that
 
 
 class PostgresDatabase:
@@ -51,7 +67,9 @@ class PostgresDatabase:
     meanwhile. Readers' transactions see one state, and cannot write. Threads may share it.
     """
 
-    def __init__(self, url: URL, name: str, *, write: bool, layout: Layout = CATALOGUE_LAYOUT) -> None:
+    def __init__(
+        self, url: URL, name: str, *, write: bool, layout: Layout = CATALOGUE_LAYOUT
+    ) -> None:
         """`url` may have a password; `name` is the schema's, checked: letters, digits and underscores."""
         self._url, self._name, self._write, self._layout = url, name, write, layout
         self._readers = _open_engine(url, name, layout.beside, write=False)
@@ -90,7 +108,11 @@ class PostgresDatabase:
     @contextmanager
     def reading(self) -> Iterator[Connection]:
         """A transaction that sees one state of the catalogue."""
-        with self._naming_faults(), self._patiently(self._readers.connect) as connection, connection.begin():
+        with (
+            self._naming_faults(),
+            self._patiently(self._readers.connect) as connection,
+            connection.begin(),
+        ):
             yield connection
 
     @contextmanager
@@ -176,7 +198,9 @@ class PostgresDatabase:
                 if connection.execute(select(func.pg_try_advisory_lock(key))).scalar_one():
                     return
             if time.monotonic() >= until_s:
-                raise UnavailableError(f"another process is mapping into {self.place}; wait until it has finished")
+                raise UnavailableError(
+                    f"another process is mapping into {self.place}; wait until it has finished"
+                )
             time.sleep(_LOOK_AGAIN_S)
 
     def _drop_writer(self) -> None:
@@ -216,10 +240,14 @@ class PostgresDatabase:
             return damaged(self.place, fault)
         if _is_lost(error):
             return self._lost(" ".join(lines))
-        if isinstance(error, ProgrammingError) and not state:  # an option of the address that libpq does not know
+        if (
+            isinstance(error, ProgrammingError) and not state
+        ):  # an option of the address that libpq does not know
             return self._misspelt(fault)
         if not state:
-            return self._refused(" ".join(lines), refusal_codes(self._url, float(_WAITS["connect_timeout"])))
+            return self._refused(
+                " ".join(lines), refusal_codes(self._url, float(_WAITS["connect_timeout"]))
+            )
         return self._unusable(fault, state)
 
     def _refused(self, fault: str, codes: Sequence[str]) -> StoreError:
@@ -230,13 +258,17 @@ class PostgresDatabase:
                 return StoreError(f"{shown_url(self._url)} refused {user} ({fault}); {advice}")
         if not codes and "invalid" in fault:
             return self._misspelt(fault)
-        if any(code.startswith(_FULL) for code in codes) or any(words in fault for words in _FULL_WORDS):
+        if any(code.startswith(_FULL) for code in codes) or any(
+            words in fault for words in _FULL_WORDS
+        ):
             return self._full(fault)
         unknown = next((code for code in codes if not code.startswith(_LOST)), "")
         return self._unusable(fault, unknown) if unknown else self._lost(fault)
 
     def _misspelt(self, fault: str) -> StoreError:
-        return StoreError(f"{shown_url(self._url)}: {fault}; correct the address (--catalogue or SORVOLO_CATALOGUE)")
+        return StoreError(
+            f"{shown_url(self._url)}: {fault}; correct the address (--catalogue or SORVOLO_CATALOGUE)"
+        )
 
     def _lost(self, fault: str) -> StoreError:
         return ConnectionLostError(
@@ -245,7 +277,9 @@ class PostgresDatabase:
         )
 
     def _unusable(self, fault: str, state: str) -> StoreError:
-        return StoreError(f"cannot use {self.place}: {fault} ({state}); ask the server's administrator")
+        return StoreError(
+            f"cannot use {self.place}: {fault} ({state}); ask the server's administrator"
+        )
 
     def _full(self, fault: str) -> StoreError:
         return DiskFullError(
@@ -262,20 +296,29 @@ def shown_url(url: URL) -> str:
 
 def _open_engine(url: URL, name: str, beside: str, *, write: bool) -> Engine:
     own: dict[str, Any] = {key: value for key, value in _WAITS.items() if key not in url.query}
-    reads = "" if write else " -cdefault_transaction_read_only=on"  # a writer keeps what the server is set to
+    reads = (
+        "" if write else " -cdefault_transaction_read_only=on"
+    )  # a writer keeps what the server is set to
     path = f"{name},{beside}" if beside else name
     asked = url.query.get("options", "")
     own["options"] = f"{asked} -csearch_path={path}{reads}".strip()
     own.setdefault("application_name", "sorvolo")
-    pool: dict[str, Any] = {"poolclass": NullPool} if write else {"poolclass": QueuePool, "pool_pre_ping": True}
+    pool: dict[str, Any] = (
+        {"poolclass": NullPool} if write else {"poolclass": QueuePool, "pool_pre_ping": True}
+    )
     if not write:
         own["cursor_factory"] = _binary_cursor
     try:
         return create_engine(
-            url.difference_update_query(["options"]), connect_args=own, isolation_level="REPEATABLE READ", **pool
+            url.difference_update_query(["options"]),
+            connect_args=own,
+            isolation_level="REPEATABLE READ",
+            **pool,
         )
     except ModuleNotFoundError as error:
-        raise StoreError("a catalogue in PostgreSQL needs psycopg: pip install 'sorvolo[postgres]'") from error
+        raise StoreError(
+            "a catalogue in PostgreSQL needs psycopg: pip install 'sorvolo[postgres]'"
+        ) from error
 
 
 def _binary_cursor(connection: Any, **options: Any) -> Any:

@@ -43,7 +43,10 @@ def _connect(url: URL, trace: int, within_s: float) -> None:
             if status in (PollingStatus.OK, PollingStatus.FAILED):
                 break
             waiting = select.poll()
-            waiting.register(connection.socket, select.POLLIN if status == PollingStatus.READING else select.POLLOUT)
+            waiting.register(
+                connection.socket,
+                select.POLLIN if status == PollingStatus.READING else select.POLLOUT,
+            )
             waiting.poll(1000 * max(0.0, end_s - time.monotonic()))
         connection.untrace()
     finally:

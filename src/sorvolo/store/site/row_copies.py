@@ -42,9 +42,14 @@ def _numbers(connection: Connection) -> Mapping[str, int]:
 def _set_numbers(connection: Connection, numbers: Mapping[str, int]) -> None:
     for name, last in numbers.items():
         if connection.dialect.name == "sqlite":
-            connection.execute(text("DELETE FROM sqlite_sequence WHERE name = :name"), {"name": name})
             connection.execute(
-                text("INSERT INTO sqlite_sequence (name, seq) VALUES (:name, :last)"), {"name": name, "last": last}
+                text("DELETE FROM sqlite_sequence WHERE name = :name"), {"name": name}
+            )
+            connection.execute(
+                text("INSERT INTO sqlite_sequence (name, seq) VALUES (:name, :last)"),
+                {"name": name, "last": last},
             )
         else:
-            connection.execute(update(schema.numbers).where(schema.numbers.c.name == name).values(last=last))
+            connection.execute(
+                update(schema.numbers).where(schema.numbers.c.name == name).values(last=last)
+            )

@@ -23,12 +23,15 @@ SCHEMA_VERSION = 5
 OLDEST_VERSION = 1
 """The oldest format that is still read, and brought up to date when it is opened to be written."""
 
-String = AnyString().with_variant(AnyString(collation="C"), "postgresql")  # ordered by bytes, as SQLite does
+String = AnyString().with_variant(
+    AnyString(collation="C"), "postgresql"
+)  # ordered by bytes, as SQLite does
 Nanoseconds = BigInteger().with_variant(Integer, "sqlite")  # SQLite's integers have 64 bits
 
 metadata = MetaData()
 site = Table(
-    "site", metadata,
+    "site",
+    metadata,
     Column("id", Integer, primary_key=True),  # always 1
     Column("name", String, nullable=False),
     Column("latitude_deg", Float, nullable=False),
@@ -39,15 +42,19 @@ site = Table(
     Column("m_per_px", Float, nullable=False),
     Column("is_local", Boolean, nullable=False),
     Column("created_utc", String, nullable=False),
-    Column("derived_version", Integer, nullable=False),  # the version in mosaic.tif and its kin; 0: none
+    Column(
+        "derived_version", Integer, nullable=False
+    ),  # the version in mosaic.tif and its kin; 0: none
 )
 flights = Table(
-    "flights", metadata,
+    "flights",
+    metadata,
     Column("id", String, primary_key=True),
     Column("rank", Integer, nullable=False, unique=True),
 )
 runs = Table(
-    "runs", metadata,
+    "runs",
+    metadata,
     Column("id", Integer, primary_key=True),
     Column("flight_id", ForeignKey("flights.id"), nullable=False),
     Column("fingerprint", String, nullable=False),
@@ -62,7 +69,8 @@ runs = Table(
     sqlite_autoincrement=True,  # a run's number names its folder: never used twice
 )
 keyframes = Table(
-    "keyframes", metadata,
+    "keyframes",
+    metadata,
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("frame_index", Integer, primary_key=True),
     Column("name", String, nullable=False),
@@ -79,18 +87,21 @@ keyframes = Table(
     Column("residual_px", Float),
 )
 documents = Table(
-    "documents", metadata,  # the text files of a run, verbatim until they are written, then emptied to save room
+    "documents",
+    metadata,  # the text files of a run, verbatim until they are written, then emptied to save room
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("name", String, primary_key=True),
     Column("content", LargeBinary, nullable=False),  # b"": the file is on the disk
 )
 leftovers = Table(
-    "leftovers", metadata,  # text files of the run before that this one has not: to be removed
+    "leftovers",
+    metadata,  # text files of the run before that this one has not: to be removed
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("name", String, primary_key=True),
 )
 versions = Table(
-    "versions", metadata,
+    "versions",
+    metadata,
     Column("id", Integer, primary_key=True),
     Column("parent_id", Integer, nullable=False),  # the version it was painted over; 0: none
     Column("flight_id", ForeignKey("flights.id"), nullable=False),
@@ -101,7 +112,8 @@ versions = Table(
     sqlite_autoincrement=True,
 )
 version_tiles = Table(
-    "version_tiles", metadata,
+    "version_tiles",
+    metadata,
     Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
     Column("tile_column", Integer, primary_key=True),
     Column("tile_row", Integer, primary_key=True),
@@ -109,13 +121,15 @@ version_tiles = Table(
 )
 Index("version_tiles_by_content", version_tiles.c.sha256)
 comparisons = Table(
-    "comparisons", metadata,  # a version that a comparison made; kept when its run is replaced
+    "comparisons",
+    metadata,  # a version that a comparison made; kept when its run is replaced
     Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
     Column("run_id", Integer, nullable=False),
     Column("kinds", JSON, nullable=False),  # kind -> number of changes
 )
 changes = Table(
-    "changes", metadata,
+    "changes",
+    metadata,
     Column("id", String, primary_key=True),
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), nullable=False),
     Column("number", Integer, nullable=False),
@@ -124,7 +138,8 @@ changes = Table(
 )
 Index("changes_by_run", changes.c.run_id)
 reviews = Table(
-    "reviews", metadata,  # no foreign keys: a verdict outlives the run whose change was looked at
+    "reviews",
+    metadata,  # no foreign keys: a verdict outlives the run whose change was looked at
     Column("change_id", String, primary_key=True),
     Column("flight_id", String, nullable=False),
     Column("verdict", String, nullable=False),
@@ -134,29 +149,37 @@ reviews = Table(
     Column("outline_m", JSON, nullable=False),
 )
 searches = Table(
-    "searches", metadata,  # a run whose frames were searched for objects, perhaps without finding any
+    "searches",
+    metadata,  # a run whose frames were searched for objects, perhaps without finding any
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("model", String, nullable=False),
     Column("outlines_m", JSON, nullable=False),  # (N, 4, 2) of the frames that were looked at
-    Column("searched_for", JSON),  # class -> (N,) 0 or 1; NULL where a format before 5 wrote it: not known
+    Column(
+        "searched_for", JSON
+    ),  # class -> (N,) 0 or 1; NULL where a format before 5 wrote it: not known
 )
 objects = Table(
-    "objects", metadata,
+    "objects",
+    metadata,
     Column("run_id", ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
     Column("number", Integer, primary_key=True),
     Column("id", String, nullable=False),
     Column("properties", JSON, nullable=False),
 )
 flown = Table(
-    "flown", metadata,  # when the flight was flown that made a version; kept when its run is replaced
+    "flown",
+    metadata,  # when the flight was flown that made a version; kept when its run is replaced
     Column("version_id", ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
     Column("first_ns", Nanoseconds, nullable=False),  # UTC; from 1970 on where no clock has a date
     Column("last_ns", Nanoseconds, nullable=False),
 )
 postgres_metadata = MetaData()
 numbers = Table(
-    "numbers", postgres_metadata,  # what SQLite keeps by itself: the number given last to a run and to a version
-    Column("name", String, primary_key=True),  # "runs", "versions"; "writes" counts the transactions that wrote
+    "numbers",
+    postgres_metadata,  # what SQLite keeps by itself: the number given last to a run and to a version
+    Column(
+        "name", String, primary_key=True
+    ),  # "runs", "versions"; "writes" counts the transactions that wrote
     Column("last", BigInteger, nullable=False),
 )
 NUMBERED = ("runs", "versions")
@@ -182,7 +205,9 @@ def set_format(connection: Connection, number: int) -> None:
     if connection.dialect.name == "sqlite":
         connection.exec_driver_sql(f"PRAGMA user_version = {number:d}")
         return
-    from sorvolo.store.site.migrations.upgrade import stamp  # only where tables are made: Alembic loads slowly
+    from sorvolo.store.site.migrations.upgrade import (
+        stamp,
+    )  # only where tables are made: Alembic loads slowly
 
     stamp(connection, number)
 

@@ -70,4 +70,6 @@ class FrameOnDisk:
         """The frame as it was; its file is gone."""
         with self.file as file:
             file.seek(0)
-            return replace(self.unseen, image=np.frombuffer(file.read(), np.uint8).reshape(self.shape))
+            return replace(
+                self.unseen, image=np.frombuffer(file.read(), np.uint8).reshape(self.shape)
+            )

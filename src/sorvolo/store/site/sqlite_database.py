@@ -51,9 +51,18 @@ class SqliteDatabase:
     def check(self) -> None:
         """Raise StoreError where the file is no catalogue; to write, also where it is damaged."""
         with self.reading() as connection:
-            if connection.exec_driver_sql("PRAGMA application_id").scalar_one() != self._layout.application_id:
-                raise StoreError(f"{self._path} is not a Sorvolo catalogue; choose another site folder")
-            fault = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one() if self._write else "ok"
+            if (
+                connection.exec_driver_sql("PRAGMA application_id").scalar_one()
+                != self._layout.application_id
+            ):
+                raise StoreError(
+                    f"{self._path} is not a Sorvolo catalogue; choose another site folder"
+                )
+            fault = (
+                connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
+                if self._write
+                else "ok"
+            )
             if fault != "ok":
                 raise damaged(self.place, fault)
 
@@ -76,7 +85,9 @@ class SqliteDatabase:
         try:
             connection.cursor().execute("PRAGMA wal_checkpoint(TRUNCATE)")
         except sqlite3.OperationalError as error:
-            raise DiskFullError(f"disk full: could not tidy {self._path} ({error}); free some space") from error
+            raise DiskFullError(
+                f"disk full: could not tidy {self._path} ({error}); free some space"
+            ) from error
         finally:
             connection.close()
 
@@ -85,7 +96,9 @@ class SqliteDatabase:
         then becomes visible."""
         try:
             with self._watching_lock:
-                if self._watching is None:  # the number counts within one connection, which is kept for it
+                if (
+                    self._watching is None
+                ):  # the number counts within one connection, which is kept for it
                     self._watching = self._engine.raw_connection()
                     self._watching.detach()
                 cursor = self._watching.cursor()
@@ -120,7 +133,11 @@ def _create_tables(path: Path, layout: Layout) -> None:
 
 def _open_engine(path: Path, *, write: bool) -> Engine:
     uri = path.resolve().as_uri() + ("?mode=rw" if write else "?mode=ro")
-    if not write and not os.access(path.parent, os.W_OK) and not path.with_name(path.name + "-wal").exists():
+    if (
+        not write
+        and not os.access(path.parent, os.W_OK)
+        and not path.with_name(path.name + "-wal").exists()
+    ):
         uri += "&immutable=1"  # SQLite cannot put its lock files beside a file on a read-only disk
 
     def connect() -> sqlite3.Connection:
@@ -128,7 +145,9 @@ def _open_engine(path: Path, *, write: bool) -> Engine:
         connection = sqlite3.connect(
             uri, uri=True, timeout=30, isolation_level=None, check_same_thread=False
         )
-        connection.execute("PRAGMA trusted_schema = OFF")  # a stranger's triggers and views call no functions
+        connection.execute(
+            "PRAGMA trusted_schema = OFF"
+        )  # a stranger's triggers and views call no functions
         connection.execute("PRAGMA foreign_keys = ON")
         connection.execute("PRAGMA synchronous = FULL")
         return connection
@@ -146,7 +165,9 @@ def _fault(path: Path, error: Exception) -> StoreError:
     """What to do about a fault of SQLite's."""
     fault = str(error.orig if isinstance(error, DBAPIError) else error)
     if "full" in fault:
-        return DiskFullError(f"disk full: could not write {path} ({fault}); free some space and run it again")
+        return DiskFullError(
+            f"disk full: could not write {path} ({fault}); free some space and run it again"
+        )
     if any(words in fault for words in ("readonly", "locked", "unable to open", "disk I/O")):
         return StoreError(f"cannot use {path}: {fault}; check the disk and its permissions")
     return damaged(str(path), fault)

@@ -18,7 +18,9 @@ from sorvolo.store.nofollow import read_below
 from sorvolo.store.site.names import checked_sha256, is_sha256
 from sorvolo.store.site.origin import Origin
 
-_CACHE_BYTES = 96 << 20  # the tiles of a map of some hectares, which half a dozen exports read one after the other
+_CACHE_BYTES = (
+    96 << 20
+)  # the tiles of a map of some hectares, which half a dozen exports read one after the other
 _WRITERS = 2  # threads that encode tiles
 _WRITTEN_AT_ONCE = 4  # tiles that wait for them beyond the memory's bound, or are with them
 
@@ -78,7 +80,9 @@ class TileBlobs:
         path = self._path(sha256)
         data = self._bytes(f"{self._folder.name}/{path.parent.name}/{path.name}")
         if hashlib.sha256(data).hexdigest() != sha256:
-            raise StoreError(f"the tile {path} is damaged; restore it from a copy of the site, or map again")
+            raise StoreError(
+                f"the tile {path} is damaged; restore it from a copy of the site, or map again"
+            )
         return data
 
     def _bytes(self, name: str) -> bytes:
@@ -169,7 +173,9 @@ class TileView(Mapping[TileIndex, ImageRGBA]):
                     raise _missing(error) from error
             if not sha256:
                 break
-        raise StoreError(f"tile {index} was replaced while the map was being read; read the map again")
+        raise StoreError(
+            f"tile {index} was replaced while the map was being read; read the map again"
+        )
 
     def __iter__(self) -> Iterator[TileIndex]:
         return iter(self._hashes)
@@ -201,7 +207,9 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self._superseded: set[str] = set()
         self._bytes = 0
         self._writers = ThreadPoolExecutor(_WRITERS, thread_name_prefix="tiles")
-        self._writing: dict[TileIndex, tuple[ImageRGBA, Future[str]]] = {}  # with the writers, the oldest first
+        self._writing: dict[
+            TileIndex, tuple[ImageRGBA, Future[str]]
+        ] = {}  # with the writers, the oldest first
 
     def __getitem__(self, index: TileIndex) -> ImageRGBA:
         if index in self._loaded:
@@ -283,7 +291,9 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
     def take_back(self) -> None:
         """Undo every change: the tiles are the earlier version's again."""
         self._settle_all()
-        for index in self._unsaved | {each for each in self if self._hashes.get(each) != self._base.get(each)}:
+        for index in self._unsaved | {
+            each for each in self if self._hashes.get(each) != self._base.get(each)
+        }:
             del self[index]
         for index in self._base.keys() - self._hashes.keys():
             self._replace_hash(index, self._base[index])
@@ -322,7 +332,9 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         try:
             failed = written.exception()
             # where the disk was full, there may be room by now
-            self._replace_hash(index, self._blobs.save(tile) if isinstance(failed, OSError) else written.result())
+            self._replace_hash(
+                index, self._blobs.save(tile) if isinstance(failed, OSError) else written.result()
+            )
         except BaseException:  # a full disk, Ctrl-C: it is still to be written
             if index not in self._loaded:
                 self._loaded[index] = tile
@@ -343,4 +355,6 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
 
 
 def _missing(error: FileNotFoundError) -> StoreError:
-    return StoreError(f"{error.filename} is missing; restore it from a copy of the site, or map again")
+    return StoreError(
+        f"{error.filename} is missing; restore it from a copy of the site, or map again"
+    )

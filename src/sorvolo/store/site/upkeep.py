@@ -75,8 +75,12 @@ def remove_unused(files: SiteFiles) -> None:
     with files.catalogue.reading() as connection:
         runs, used = records.run_ids(connection), records.used_hashes(connection)
     flights = files.flight_folders()
-    over = [each for each in flights if not (each / JOURNAL).exists()]  # else a run that was killed goes on
-    remove_leftovers([files.folder, *flights, *(images for each in over for images in each.glob("keyframes/*"))])
+    over = [
+        each for each in flights if not (each / JOURNAL).exists()
+    ]  # else a run that was killed goes on
+    remove_leftovers(
+        [files.folder, *flights, *(images for each in over for images in each.glob("keyframes/*"))]
+    )
     files.blobs.remove_leftovers()
     files.blobs.remove(files.blobs.stored() - used)
     for path in (files.live_preview_path, files.live_coverage_path):
@@ -130,6 +134,8 @@ def _write_flight_files(files: SiteFiles, owed: OwedFiles) -> None:
     with files.catalogue.reading() as connection:
         is_compared = change_records.is_compared(connection, owed.run_id)
         is_searched = object_records.is_searched(connection, owed.run_id)
-    version = next((each for each in files.versions() if each.run_id == owed.run_id and is_compared), None)
+    version = next(
+        (each for each in files.versions() if each.run_id == owed.run_id and is_compared), None
+    )
     write_change_files(files, owed.flight_id, version)
     write_object_files(files, owed.flight_id, is_searched=is_searched)

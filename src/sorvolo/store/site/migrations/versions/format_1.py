@@ -39,7 +39,12 @@ def upgrade() -> None:
     )
     op.create_table(
         "version_tiles",
-        sa.Column("version_id", sa.Integer, sa.ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+        sa.Column(
+            "version_id",
+            sa.Integer,
+            sa.ForeignKey("versions.id", ondelete="CASCADE"),
+            primary_key=True,
+        ),
         sa.Column("tile_column", sa.Integer, primary_key=True),
         sa.Column("tile_row", sa.Integer, primary_key=True),
         sa.Column("sha256", String, nullable=False),
@@ -70,7 +75,9 @@ def _flights() -> None:
     )
     op.create_table(
         "keyframes",
-        sa.Column("run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+        sa.Column(
+            "run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True
+        ),
         sa.Column("frame_index", sa.Integer, primary_key=True),
         sa.Column("name", String, nullable=False),
         sa.Column("time_ns", Nanoseconds, nullable=False),
@@ -87,7 +94,9 @@ def _flights() -> None:
     )
     op.create_table(
         "documents",
-        sa.Column("run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+        sa.Column(
+            "run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True
+        ),
         sa.Column("name", String, primary_key=True),
         sa.Column("content", sa.LargeBinary, nullable=False),
     )

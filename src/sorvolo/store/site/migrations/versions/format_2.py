@@ -13,19 +13,28 @@ def upgrade() -> None:
     """From format 1, which compared nothing."""
     op.create_table(
         "leftovers",
-        sa.Column("run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True),
+        sa.Column(
+            "run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), primary_key=True
+        ),
         sa.Column("name", String, primary_key=True),
     )
     op.create_table(
         "comparisons",
-        sa.Column("version_id", sa.Integer, sa.ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+        sa.Column(
+            "version_id",
+            sa.Integer,
+            sa.ForeignKey("versions.id", ondelete="CASCADE"),
+            primary_key=True,
+        ),
         sa.Column("run_id", sa.Integer, nullable=False),
         sa.Column("kinds", sa.JSON, nullable=False),
     )
     op.create_table(
         "changes",
         sa.Column("id", String, primary_key=True),
-        sa.Column("run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), nullable=False),
+        sa.Column(
+            "run_id", sa.Integer, sa.ForeignKey("runs.id", ondelete="CASCADE"), nullable=False
+        ),
         sa.Column("number", sa.Integer, nullable=False),
         sa.Column("kind", String, nullable=False),
         sa.Column("properties", sa.JSON, nullable=False),

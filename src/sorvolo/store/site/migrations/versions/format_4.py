@@ -13,7 +13,12 @@ def upgrade() -> None:
     """From format 3; times are those of the flights whose key frames are stored."""
     op.create_table(
         "flown",
-        sa.Column("version_id", sa.Integer, sa.ForeignKey("versions.id", ondelete="CASCADE"), primary_key=True),
+        sa.Column(
+            "version_id",
+            sa.Integer,
+            sa.ForeignKey("versions.id", ondelete="CASCADE"),
+            primary_key=True,
+        ),
         sa.Column("first_ns", Nanoseconds, nullable=False),
         sa.Column("last_ns", Nanoseconds, nullable=False),
     )
@@ -27,4 +32,6 @@ def upgrade() -> None:
             sa.Column("name", String, primary_key=True),
             sa.Column("last", sa.BigInteger, nullable=False),
         )
-        op.bulk_insert(numbers, [{"name": name, "last": 0} for name in ("runs", "versions", "writes")])
+        op.bulk_insert(
+            numbers, [{"name": name, "last": 0} for name in ("runs", "versions", "writes")]
+        )
