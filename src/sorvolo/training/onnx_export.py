@@ -76,8 +76,8 @@ def onnx_from_module(model: nn.Module, info: dict[str, Any]) -> bytes:
         torch.onnx.export(
             model,
             (picture,),
-            buffer,
-            dynamo=False,  # type: ignore[arg-type]
+            buffer,  # type: ignore[arg-type]
+            dynamo=False,
             opset_version=OPSET,
             input_names=["image"],
             output_names=["boxes", "scores", "labels"],
