@@ -22,13 +22,13 @@ from sorvolo.capture.source import open_sources
 from sorvolo.change.alignment import Aligned, Aligner
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.presets import preset
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.selection import every
 from sorvolo.registration.lens import Undistorter
-from sorvolo.simulation.presets import preset
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame
 

@@ -49,11 +49,11 @@ from sorvolo.cluster.orders import Ending, FlightWish, Order
 from sorvolo.cluster.ray_executor import ray_executor
 from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.table import BatchTable, State
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.presets import preset
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.missions.site.copy import verify_copy
-from sorvolo.simulation.presets import preset
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import POINTER, VARIABLE
 

@@ -25,8 +25,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "cluster"))
 from batch_flights import another
 
 from provenance import commit, machine
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.presets import preset
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.presets import preset
 
 WAYS = ("loop", "local 1", "local 2", "ray 1", "ray 2")
 

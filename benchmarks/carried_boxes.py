@@ -30,11 +30,8 @@ from playwright.sync_api import sync_playwright
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.detection.detector import Detector
 from sorvolo.geometry.box_overlap import iou_matrix
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.missions.watch.flights import watch
-from sorvolo.missions.watch.run import WatchUpdate
-from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
     OutputSettings,
@@ -42,6 +39,9 @@ from sorvolo.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.run import WatchUpdate
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.tracking.picture_steps import SMALL_WIDTH_PX, PictureStep, PictureSteps
 
 RESULTS = Path(__file__).parent / "results" / "carried_boxes.json"

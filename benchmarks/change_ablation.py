@@ -46,14 +46,14 @@ from sorvolo.change.pair.flight_tuning import FlightTuning
 from sorvolo.change.pair.shade import shade_of_view
 from sorvolo.change.shape.outlines import overlap
 from sorvolo.change.shape.shadows import without_shadow
+from sorvolo.lab.evaluation import changes as evaluation
+from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.presets import preset
 from sorvolo.missions.compare import run
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate import changes as evaluation
-from sorvolo.missions.evaluate.frame_rows import map_frames
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.presets import preset
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ComparedView
 

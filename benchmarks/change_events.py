@@ -30,13 +30,13 @@ from rich.table import Table
 
 from child import peak_mb, run_child
 from provenance import commit, machine, note_scoring, seeds_or_drawn
+from sorvolo.lab.evaluation.changes import as_json, evaluate_changes
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.settings import ImagingSettings
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.changes import as_json, evaluate_changes
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.settings import ImagingSettings
 
 METHODS = ("thesis", "robust")
 PRESETS = ("compare", "compare-urban", "compare-dirt", "compare-photos", "compare-none")

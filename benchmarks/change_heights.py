@@ -19,13 +19,13 @@ from typing import Any
 
 from heights import _SURVEY
 from provenance import commit, machine, note_scoring, seeds_or_drawn
+from sorvolo.lab.evaluation.changes import as_json, evaluate_changes
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import LaterSettings, RevisitSettings
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.changes import as_json, evaluate_changes
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import LaterSettings, RevisitSettings
 
 RESULTS = Path(__file__).parent / "results" / "change_heights.json"
 

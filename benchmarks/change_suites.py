@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 
 from change_objects import Cutout, Scene, paint_objects
-from sorvolo.simulation.ground import GroundKind, paint_ground
-from sorvolo.simulation.ground_painting import Area
+from sorvolo.lab.simulation.ground import GroundKind, paint_ground
+from sorvolo.lab.simulation.ground_painting import Area
 
 SIZES = ((1280, 720), (960, 540))
 MARGIN_PX = 24  # of ground around the picture, so that warps know what comes in at its rim

@@ -32,14 +32,14 @@ from PIL import Image
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.errors import SorvoloError
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
+from sorvolo.lab.evaluation.changes import as_json, evaluate_changes
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
+from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.settings import SimulationSettings, WeatherSettings
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.changes import as_json, evaluate_changes
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.settings import SimulationSettings, WeatherSettings
 
 RESULTS = Path(__file__).parent / "results" / "change_unfit.json"
 CASES = ("plain", "night", "snow later", "snow on both", "flood", "other place", "broken map")

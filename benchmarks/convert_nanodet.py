@@ -20,9 +20,14 @@ import torch
 
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead, nanodet_from_graph
-from sorvolo.training.onnx_export import onnx_from_module
-from sorvolo.training.tfjs_graph import TfjsGraph, read_graph, run_graph
+from sorvolo.lab.training.nanodet import (
+    CocoDetector,
+    NanoDetBackbone,
+    NanoDetHead,
+    nanodet_from_graph,
+)
+from sorvolo.lab.training.onnx_export import onnx_from_module
+from sorvolo.lab.training.tfjs_graph import TfjsGraph, read_graph, run_graph
 
 WEIGHTS_SHA256 = "5d0e4f8c4eded666287330be03017d494787d35f523fd77ca23f59db984a4ad9"
 COCO_OF_CLASS = {"person": (0,), "car": (2, 5, 7)}  # car, bus, truck

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from sorvolo.training.boxes import giou_loss, iou_matrix
-from sorvolo.training.nanodet import BINS, boxes_from_bins, cells
+from sorvolo.lab.training.boxes import giou_loss, iou_matrix
+from sorvolo.lab.training.nanodet import BINS, boxes_from_bins, cells
 
 _NEAREST = 9  # cells of a level that may stand for a thing (ATSS, Zhang et al. 2020)
 _ANCHOR_STRIDES = 5.0  # side of a cell's anchor

@@ -1,4 +1,4 @@
-"""How long a depthwise convolution takes to learn, torch's own against ours (sorvolo.training.depthwise).
+"""How long a depthwise convolution takes to learn, torch's own against ours (sorvolo.lab.training.depthwise).
 
 python benchmarks/depthwise_speed.py [--repeats 15]
 
@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mosaic_methods import commit, machine
-from sorvolo.training.depthwise import depthwise
+from sorvolo.lab.training.depthwise import depthwise
 
 RESULTS = Path(__file__).parent / "results" / "depthwise_speed.json"
 LAYERS = {  # channels, side of its features, kernel, stride, whether the kernel learns

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
 

@@ -21,17 +21,17 @@ import detection_data
 from mosaic_methods import commit, machine
 from provenance import note_scoring
 from sorvolo.detection.scores import score_set
-from sorvolo.missions.evaluate.detector import (
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.evaluation.detector import (
     EvaluationSettings,
     evaluate_detector,
     write_evaluation,
 )
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.flight import simulate_flight
-from sorvolo.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.truth import coco_boxes
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.flight import simulate_flight
+from sorvolo.lab.simulation.pictures import LEAST_VISIBLE, SMALLEST_PX, PictureSettings
+from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.truth import coco_boxes
 from sorvolo.store.exports.detector_files import FoundSet
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.images import jpeg_from_image

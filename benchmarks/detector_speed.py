@@ -28,9 +28,9 @@ from mosaic_methods import commit, machine
 from sorvolo.capture.source import open_sources
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.quantise import quantise
+from sorvolo.lab.simulation.flight import simulate_flight
+from sorvolo.lab.simulation.presets import preset
 from sorvolo.mosaic.selection import every
-from sorvolo.simulation.flight import simulate_flight
-from sorvolo.simulation.presets import preset
 from sorvolo.store.exports.flight_files import video_writer
 from sorvolo.survey.flight import Frame
 from sorvolo.survey.objects import CLASSES
@@ -173,7 +173,7 @@ def untrained(spec: str) -> Any:
     """The network of "preset" or "preset:regions" with random weights."""
     import torch
 
-    from sorvolo.training.presets import build
+    from sorvolo.lab.training.presets import build
 
     name, _, regions = spec.partition(":")
     torch.manual_seed(SEED)
@@ -209,7 +209,7 @@ def exported(
     """
     import torch
 
-    from sorvolo.training.onnx_export import export_onnx
+    from sorvolo.lab.training.onnx_export import export_onnx
 
     model = untrained(spec)
     norms = [each for each in model.modules() if isinstance(each, torch.nn.BatchNorm2d)]

@@ -28,8 +28,8 @@ from sorvolo.detection.session import Seen
 from sorvolo.detection.tiling import whole_m_per_px
 from sorvolo.geometry.arrays import BoxesPx, ImageRGB
 from sorvolo.geometry.box_overlap import iou_matrix
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,

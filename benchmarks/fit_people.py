@@ -18,11 +18,11 @@ import torch
 from detection_data import tinyperson
 from people_samples import Source, ground, shown
 from rendered_people import Scene, read_scenes
+from sorvolo.lab.training.daylight import Calibration, Daylight
+from sorvolo.lab.training.nanodet import NanoDetHead
+from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.daylight import Calibration, Daylight
-from sorvolo.training.nanodet import NanoDetHead
-from sorvolo.training.samples import Share
 from train_default_model import reader
 from train_judge import LEAST_SCORE, PERSON, Truth, fitted, odds, reliability, tiles, untrained
 

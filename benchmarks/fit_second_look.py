@@ -39,8 +39,8 @@ from sorvolo.detection.second_look import SheetSettings, opinions
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
+from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.training.samples import Share
 from train_default_model import reader
 from train_judge import RIGHT_IOU, UNSURE_IOU, fitted
 

@@ -35,14 +35,9 @@ from sorvolo.change.flight_on_map import FlightOnMap, FlightOnMapSettings, Photo
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.missions.compare.run import view_maker
-from sorvolo.missions.compare.whole_flight import WholeFlight
-from sorvolo.missions.evaluate.frame_rows import map_frames
-from sorvolo.missions.flight.settings import CompareSettings, MapSettings
-from sorvolo.missions.flight.setup import known_flights, known_ground_m, prepare
-from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
+from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,
@@ -50,6 +45,11 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.missions.compare.run import view_maker
+from sorvolo.missions.compare.whole_flight import WholeFlight
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.flight.setup import known_flights, known_ground_m, prepare
+from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Frame, PosedFrame
 

@@ -205,7 +205,7 @@ def main() -> int:
             path for path in {*files, *expected} if files.get(path) != expected.get(path)
         )
         is_different |= bool(differing)
-        print(f"{name}: {'equal' if not differing else differing} ({took_s:.0f} s)", flush=True)
+        print(f"{name}: {differing or 'equal'} ({took_s:.0f} s)", flush=True)
     if wish.act == "record":
         known["seconds"].update(TIMES)
         wish.manifest.write_text(json.dumps(known, indent=1))

@@ -30,15 +30,10 @@ import rasterio
 
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.heights.field import HeightField
-from sorvolo.missions.flight.settings import MapSettings
-from sorvolo.missions.heights.measure import read_field
-from sorvolo.missions.heights.run import HeightSettings, make_heights
-from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
-from sorvolo.simulation.objects import Label
-from sorvolo.simulation.relief import Relief
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
+from sorvolo.lab.simulation.relief import Relief
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,
@@ -46,9 +41,14 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.simulation.truth import ground_heights, surface_heights
-from sorvolo.simulation.view import map_view
-from sorvolo.simulation.world import orthophoto
+from sorvolo.lab.simulation.truth import ground_heights, surface_heights
+from sorvolo.lab.simulation.world import orthophoto
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.heights.measure import read_field
+from sorvolo.missions.heights.run import HeightSettings, make_heights
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.search.drawing.objects import Label
+from sorvolo.search.drawing.view import map_view
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 

@@ -18,7 +18,7 @@ import numpy as np
 from provenance import commit, machine, seeds_or_drawn
 from search_pod import CLASSES, flown, placed, seen_by_map
 from sorvolo.detection.detector import Detector
-from sorvolo.simulation.flight import SimulatedFlight
+from sorvolo.lab.simulation.flight import SimulatedFlight
 from sorvolo.tracking.planted import shown_plant
 from sorvolo.tracking.standing import fuse
 

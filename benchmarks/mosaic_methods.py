@@ -26,12 +26,12 @@ from child import peak_mb, run_child
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
-from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.presets import preset
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.simulate.site import simulate_site
 from sorvolo.mosaic.map_quality import corner_errors
-from sorvolo.simulation.presets import preset
 
 METHODS = ("planar", "thesis", "opencv-scans")
 COLUMNS = {

@@ -24,9 +24,9 @@ from fit_people import people_head
 from pack_default_model import BEST_PX, HOME, TRAINED_ON, measured
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session
+from sorvolo.lab.training.daylight import Calibration, Daylight
+from sorvolo.lab.training.onnx_export import onnx_from_module
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.daylight import Calibration, Daylight
-from sorvolo.training.onnx_export import onnx_from_module
 from train_default_model import reader
 from train_judge import CAR, odds, untrained
 

@@ -24,13 +24,13 @@ import torch
 from detection_data import hituav, in_order, tinyperson
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.metrics import ClassMatch, counts_at, judged_classes, match_pictures
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.pictures import PictureSettings
+from sorvolo.lab.training.onnx_export import check_export, export_onnx
+from sorvolo.lab.training.weights import SOURCES
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.onnx_export import check_export, export_onnx
-from sorvolo.training.weights import SOURCES
 from train_default_model import RUN, network_of, reader
 from training_shares import SIMULATED_PICTURES, SIMULATED_SEED
 

@@ -19,10 +19,10 @@ from provenance import note_scoring
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.quantise import quantise
 from sorvolo.detection.scores import score_set
-from sorvolo.missions.evaluate.detector import LEAST_SCORE
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.evaluation.detector import LEAST_SCORE
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.pictures import PictureSettings
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
 from train_default_model import reader

@@ -23,11 +23,11 @@ from torch.nn import functional
 from pack_daylight_model import half_stored
 from pack_default_model import HOME
 from sorvolo.detection.second_look import SheetSettings
-from sorvolo.training.backbone import EfficientNetLite0
-from sorvolo.training.nanodet import NanoDetBackbone, NanoDetHead, nanodet_from_graph
-from sorvolo.training.onnx_export import onnx_from_module
-from sorvolo.training.tfjs_graph import read_graph
-from sorvolo.training.weights import read_weights
+from sorvolo.lab.training.backbone import EfficientNetLite0
+from sorvolo.lab.training.nanodet import NanoDetBackbone, NanoDetHead, nanodet_from_graph
+from sorvolo.lab.training.onnx_export import onnx_from_module
+from sorvolo.lab.training.tfjs_graph import read_graph
+from sorvolo.lab.training.weights import read_weights
 
 NAME = "second-opinion"
 CELL_PX, LOOK_PX = SheetSettings().cell_px, 60

@@ -20,7 +20,7 @@ from onnx import helper, numpy_helper
 
 from pack_default_model import HOME
 from pack_second_look import with_fields
-from sorvolo.training.daylight import DaylightSettings, Softened
+from sorvolo.lab.training.daylight import DaylightSettings, Softened
 
 VERSION = "12"
 SCALED = "/aerial/backbone/Div_output_0"

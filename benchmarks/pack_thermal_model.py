@@ -29,16 +29,16 @@ from pack_default_model import (
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.session import Session
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.pictures import PictureSettings
+from sorvolo.lab.training.exported import load_exported
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.onnx_export import onnx_from_module
+from sorvolo.lab.training.presets import fast
+from sorvolo.lab.training.together import Together
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.exported import load_exported
-from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.onnx_export import onnx_from_module
-from sorvolo.training.presets import fast
-from sorvolo.training.together import Together
 from train_default_model import reader
 from train_thermal import trained
 from training_shares import SIMULATED_PICTURES, SIMULATED_SEED

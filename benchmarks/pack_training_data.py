@@ -11,10 +11,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sorvolo.missions.train.start import load_weights
-from sorvolo.training.presets import NETS
-from sorvolo.training.samples import Share
-from sorvolo.training.weights import SOURCES, ImageNetWeights, read_weights
+from sorvolo.lab.train.start import load_weights
+from sorvolo.lab.training.presets import NETS
+from sorvolo.lab.training.samples import Share
+from sorvolo.lab.training.weights import SOURCES, ImageNetWeights, read_weights
 from train_default_model import described
 from training_archive import write_archive
 from training_shares import training_shares

@@ -12,9 +12,9 @@ from drawn_meshes import Sprite
 from painted_grounds import painted_ground
 from rendered_people import Scene
 from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.lab.training.samples import Augmentation, Sample, Share, cut_sample
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample
 
 PERSON = 0
 _PLAIN = Augmentation(

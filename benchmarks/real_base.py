@@ -23,7 +23,7 @@ import real_dates
 from provenance import commit, machine
 from sorvolo.errors import InputError
 from sorvolo.geometry.homography import apply_homography
-from sorvolo.missions.evaluate.frame_rows import map_frames
+from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.site.archive import Archive

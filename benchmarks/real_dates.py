@@ -54,13 +54,10 @@ from provenance import commit, machine
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.level_ground import footprint
-from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.frame_rows import map_frames
-from sorvolo.missions.flight.settings import CompareSettings, MapSettings
-from sorvolo.missions.map.flights import map_flights
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
-from sorvolo.simulation.ground import orthophoto_ground
-from sorvolo.simulation.settings import (
+from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.lab.simulation.ground import orthophoto_ground
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
     OutputSettings,
@@ -69,6 +66,9 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.flight.settings import CompareSettings, MapSettings
+from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.exports.flight_files import (
     video_writer,
     write_camera,

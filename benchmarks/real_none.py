@@ -50,8 +50,8 @@ from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.frame_rows import map_frames
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.store.site.archive import Archive

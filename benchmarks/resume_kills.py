@@ -28,9 +28,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from provenance import commit, machine
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.settings import SimulationSettings
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.settings import SimulationSettings
 
 EFFORT = (
     "seconds",

@@ -22,16 +22,16 @@ from torch import nn
 from detection_data import hituav
 from mosaic_methods import commit, machine
 from sorvolo.detection.metrics import judged_classes, match_pictures
+from sorvolo.lab.training.drawing import batches_from
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.feature_pyramid import convolution
+from sorvolo.lab.training.joint import JointSettings, JointTraining
+from sorvolo.lab.training.presets import fast
+from sorvolo.lab.training.samples import Augmentation, Share
+from sorvolo.lab.training.seeing import see
+from sorvolo.lab.training.weights import read_weights
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.drawing import batches_from
-from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.feature_pyramid import convolution
-from sorvolo.training.joint import JointSettings, JointTraining
-from sorvolo.training.presets import fast
-from sorvolo.training.samples import Augmentation, Share
-from sorvolo.training.seeing import see
-from sorvolo.training.weights import read_weights
 from train_default_model import reader
 
 ARMS = ("standard", "extended", "equal-cost", "extended-residual")

@@ -20,18 +20,18 @@ import numpy as np
 
 from provenance import commit, machine, seeds_or_drawn
 from sorvolo.geometry.sun import direction_from_angles
-from sorvolo.search.conditions import look_at
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
-from sorvolo.simulation.objects import Label
-from sorvolo.simulation.rendering import render, render_labels
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.lab.simulation.rendering import render, render_labels
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.simulation.world import Day, build_day
+from sorvolo.lab.simulation.world import Day, build_day
+from sorvolo.search.conditions import look_at
+from sorvolo.search.drawing.objects import Label
 
 RESULTS = Path(__file__).parent / "results" / "search_crowns.json"
 SUN = direction_from_angles(215.0, 48.0)  # of every first day in the simulation

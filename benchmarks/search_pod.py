@@ -32,16 +32,9 @@ from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.sun import direction_from_angles
-from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, measure_flight, reach_m
-from sorvolo.missions.search.settings import SearchSettings
-from sorvolo.search.cells import cell_side_m, cells_over
-from sorvolo.search.conditions import gather, look_at
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
-from sorvolo.simulation.frame_light import frame_light
-from sorvolo.simulation.objects import Thing
-from sorvolo.simulation.planted import new_plant
-from sorvolo.simulation.rendering import render, render_labels
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.lab.simulation.rendering import render, render_labels
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
     OutputSettings,
@@ -49,8 +42,15 @@ from sorvolo.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.simulation.thermal import heat_picture, warm_day
-from sorvolo.simulation.world import build_day, is_free
+from sorvolo.lab.simulation.thermal import heat_picture, warm_day
+from sorvolo.lab.simulation.world import build_day, is_free
+from sorvolo.missions.search.measure import MeasuredFlight, SearchFrame, measure_flight, reach_m
+from sorvolo.missions.search.settings import SearchSettings
+from sorvolo.search.cells import cell_side_m, cells_over
+from sorvolo.search.conditions import gather, look_at
+from sorvolo.search.drawing.frame_light import frame_light
+from sorvolo.search.drawing.objects import Thing
+from sorvolo.search.drawing.planted import new_plant
 from sorvolo.store.pages.plots import stated_and_found
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame, Status

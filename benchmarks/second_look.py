@@ -28,7 +28,7 @@ from sorvolo.detection.models import find_model
 from sorvolo.detection.scores import score_set
 from sorvolo.detection.session import Seen, Session
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.missions.evaluate.detector import LEAST_SCORE
+from sorvolo.lab.evaluation.detector import LEAST_SCORE
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import Detections

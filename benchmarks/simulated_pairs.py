@@ -12,10 +12,10 @@ import numpy as np
 
 from change_suites import Pair
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
+from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.truth import change_mask
 from sorvolo.registration.lens import Undistorter
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.truth import change_mask
 
 GROUNDS = ("countryside", "urban", "dirt", "sand")
 HEIGHTS_M = (14.0, 20.0, 28.0, 40.0)

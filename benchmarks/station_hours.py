@@ -34,8 +34,8 @@ from websockets.exceptions import ConnectionClosed
 
 from provenance import commit, machine
 from sorvolo.capture.live.reconnect import LiveSettings
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,

@@ -32,17 +32,17 @@ from rich.table import Table
 from provenance import commit, machine
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.cluster.shared_detector import SharedDetector
-from sorvolo.missions.flight.map_objects import open_detector
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.missions.watch.flights import watch
-from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,
     SceneSettings,
     SimulationSettings,
 )
+from sorvolo.missions.flight.map_objects import open_detector
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 
 RESULTS = Path(__file__).parent / "results" / "streams_knee.json"
 FPS, UP_WITHIN_S, STEP_S, KEEPS_UP = 10.0, 240.0, 0.1, 0.9

@@ -20,16 +20,16 @@ from typing import Any
 from rich.console import Console
 
 from provenance import commit, machine, note_scoring, seeds_or_drawn
-from sorvolo.missions.reproduce.report import write_reproduction
-from sorvolo.missions.reproduce.rows import Row
-from sorvolo.missions.reproduce.run import reproduce
-from sorvolo.missions.reproduce.settings import (
+from sorvolo.lab.thesis.report import write_reproduction
+from sorvolo.lab.thesis.rows import Row
+from sorvolo.lab.thesis.run import reproduce
+from sorvolo.lab.thesis.settings import (
     DetectorSettings,
     ReproductionSettings,
     SimulatedSize,
 )
-from sorvolo.missions.reproduce.simulated import simulated_dataset
-from sorvolo.missions.reproduce.thesis_tables import tables_of
+from sorvolo.lab.thesis.simulated import simulated_dataset
+from sorvolo.lab.thesis.thesis_tables import tables_of
 from sorvolo.store.exports.plain import plain_json
 from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 

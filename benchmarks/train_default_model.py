@@ -31,19 +31,19 @@ import torch
 
 from sorvolo.errors import InputError, SorvoloError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
+from sorvolo.lab.training.drawing import batches_from
+from sorvolo.lab.training.exported import load_exported
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.joint import JointSettings, JointTraining, Progress, collate
+from sorvolo.lab.training.losses import LossRow
+from sorvolo.lab.training.presets import NETS, accurate, build, fast
+from sorvolo.lab.training.progress import History
+from sorvolo.lab.training.samples import Augmentation, Sample, Share
+from sorvolo.lab.training.starting import device_of
+from sorvolo.lab.training.weights import ImageNetWeights, read_weights
 from sorvolo.store.atomic import atomic_write_bytes, remove_leftovers
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
-from sorvolo.training.drawing import batches_from
-from sorvolo.training.exported import load_exported
-from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.joint import JointSettings, JointTraining, Progress, collate
-from sorvolo.training.losses import LossRow
-from sorvolo.training.presets import NETS, accurate, build, fast
-from sorvolo.training.progress import History
-from sorvolo.training.samples import Augmentation, Sample, Share
-from sorvolo.training.starting import device_of
-from sorvolo.training.weights import ImageNetWeights, read_weights
 from training_archive import TrainingArchive, fingerprint
 
 SETTLING = 12  # batches by which the norms of a started model are settled

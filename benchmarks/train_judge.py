@@ -24,16 +24,16 @@ from scipy.optimize import minimize
 from detection_data import SMALL, aerial_cars, mannequin, tinyperson
 from sorvolo.detection.models import find_model
 from sorvolo.geometry.box_overlap import cover_matrix, iou_matrix
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.pictures import PictureSettings
+from sorvolo.lab.training.daylight import Calibration, Daylight, Judge, one_hot, support
+from sorvolo.lab.training.exported import load_exported
+from sorvolo.lab.training.nanodet import CocoDetector, nanodet_from_graph
+from sorvolo.lab.training.presets import fast
+from sorvolo.lab.training.tfjs_graph import read_graph
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.daylight import Calibration, Daylight, Judge, one_hot, support
-from sorvolo.training.exported import load_exported
-from sorvolo.training.nanodet import CocoDetector, nanodet_from_graph
-from sorvolo.training.presets import fast
-from sorvolo.training.tfjs_graph import read_graph
 
 PERSON, CAR = 0, 1
 SIDE_PX, MOST_TILES, LEAST_SCORE, MOST_CANDIDATES = 768, 3, 0.05, 150

@@ -33,7 +33,7 @@ from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
 from sorvolo.detection.second_look import cut_out, in_position
 from sorvolo.detection.session import Session
-from sorvolo.training.onnx_export import OPSET
+from sorvolo.lab.training.onnx_export import OPSET
 from train_people import Samples, simulated
 
 SAMPLES = (*range(10000, 14000), *range(20000, 24000))  # numbers of the draws, by choice

@@ -30,18 +30,18 @@ from descent import Descent
 from drawn_stones import with_stones
 from people_samples import Shown, Source, shown, sources
 from rendered_people import Scene, read_scenes
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
-from sorvolo.survey.labels import LabelledSet
-from sorvolo.training.nanodet import (
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.pictures import PictureSettings
+from sorvolo.lab.training.nanodet import (
     CocoDetector,
     NanoDetBackbone,
     NanoDetHead,
     head_of_class,
     nanodet_from_graph,
 )
-from sorvolo.training.tfjs_graph import read_graph
+from sorvolo.lab.training.tfjs_graph import read_graph
+from sorvolo.survey.labels import LabelledSet
 from train_default_model import reader
 from train_judge import SIMULATED_SEED
 

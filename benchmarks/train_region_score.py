@@ -23,7 +23,7 @@ from painted_grounds import painted_ground
 from simulated_pairs import simulated_pairs
 from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings
 from sorvolo.change.pair.robust import RobustSettings, examine
-from sorvolo.simulation.ground import GroundKind
+from sorvolo.lab.simulation.ground import GroundKind
 
 TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "pair" / "region_score.json"
 SPLIT, SEED, EACH = "train", 9000, 10

@@ -26,12 +26,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from detection_data import in_order
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
-from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.survey.objects import CLASSES
-from sorvolo.training.nanodet import (
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.pictures import PictureSettings
+from sorvolo.lab.training.nanodet import (
     BINS,
     CocoDetector,
     FinerNanoDetHead,
@@ -40,8 +38,10 @@ from sorvolo.training.nanodet import (
     cells,
     nanodet_from_graph,
 )
-from sorvolo.training.samples import Share, boxes_in_crop
-from sorvolo.training.tfjs_graph import read_graph
+from sorvolo.lab.training.samples import Share, boxes_in_crop
+from sorvolo.lab.training.tfjs_graph import read_graph
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import CLASSES
 from training_shares import frames_of_heat
 
 COCO_ROWS = (0, 2, 32)  # person, car, sports ball: where each of our classes starts

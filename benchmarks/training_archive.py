@@ -17,10 +17,10 @@ import numpy as np
 import safetensors.torch
 
 from sorvolo.errors import InputError
+from sorvolo.lab.training.samples import Share
+from sorvolo.lab.training.weights import ImageNetWeights, Net
 from sorvolo.store.atomic import atomic_path, writing
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.training.samples import Share
-from sorvolo.training.weights import ImageNetWeights, Net
 
 FORMAT = 1
 MANIFEST = "manifest.json"

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 
 from detection_data import SMALL, aerial_cars, hituav, in_order, mannequin, tinyperson
-from sorvolo.missions.simulate.pictures import simulate_pictures
-from sorvolo.simulation.pictures import PictureSettings
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.simulate.pictures import simulate_pictures
+from sorvolo.lab.simulation.pictures import PictureSettings
+from sorvolo.lab.training.samples import Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.samples import Share
 
 SIMULATED_SEED, SIMULATED_PICTURES = 1, 1800
 SIMULATED = "boxes.json"

@@ -26,15 +26,15 @@ from sorvolo.detection.session import Seen
 from sorvolo.detection.suppression import SeenTile, merge_tiles
 from sorvolo.detection.tiling import plan_tiles
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.training.drawing import batches_from
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.joint import JointSettings, JointTraining
+from sorvolo.lab.training.presets import fast
+from sorvolo.lab.training.samples import Augmentation, Share
+from sorvolo.lab.training.seeing import see
 from sorvolo.store.exports.detector_files import FoundSet
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections
-from sorvolo.training.drawing import batches_from
-from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.joint import JointSettings, JointTraining
-from sorvolo.training.presets import fast
-from sorvolo.training.samples import Augmentation, Share
-from sorvolo.training.seeing import see
 from train_default_model import reader
 
 

@@ -32,8 +32,8 @@ from rich.console import Console
 from rich.table import Table
 
 from provenance import commit, machine
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
     OutputSettings,

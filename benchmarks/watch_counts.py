@@ -24,10 +24,8 @@ from scipy.optimize import linear_sum_assignment
 
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.geometry.geodesy import LocalFrame
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.missions.watch.flights import watch
-from sorvolo.missions.watch.settings import WatchOutputs
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     DEFAULT_ORIGIN,
     ImagingSettings,
     LaterSettings,
@@ -37,6 +35,8 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.settings import WatchOutputs
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "missions"))
 from truth_detector import TruthDetector

@@ -40,10 +40,8 @@ from scipy.optimize import linear_sum_assignment
 from detection_data import hituav
 from provenance import commit, machine, note_scoring, seeds_or_drawn
 from sorvolo.detection.detector import Detector
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.missions.watch.flights import watch
-from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
     OutputSettings,
@@ -52,6 +50,8 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 from sorvolo.survey.labels import LabelledPicture
 from sorvolo.survey.objects import CLASSES
 

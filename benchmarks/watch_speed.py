@@ -16,16 +16,16 @@ import numpy as np
 
 from provenance import commit, machine
 from sorvolo.detection.detector import Detector
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.missions.watch.flights import watch
-from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,
     SceneSettings,
     SimulationSettings,
 )
+from sorvolo.missions.watch.flights import watch
+from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 
 RESULTS = Path(__file__).parent / "results" / "watch_speed.json"
 _SIZES = ((640, 640), (1280, 720))

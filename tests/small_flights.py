@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,

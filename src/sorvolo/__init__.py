@@ -14,6 +14,24 @@ if TYPE_CHECKING:
     from sorvolo.change.pair.thesis import ThesisSettings, prepare_reference, thesis_steps
     from sorvolo.detection.detector import Detector
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
+    from sorvolo.lab.datasets import read_dataset
+    from sorvolo.lab.evaluation.changes import evaluate_changes
+    from sorvolo.lab.evaluation.detector import (
+        EvaluationSettings,
+        evaluate_detector,
+        read_sets,
+        write_evaluation,
+    )
+    from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
+    from sorvolo.lab.evaluation.objects import evaluate_objects
+    from sorvolo.lab.simulate.pictures import simulate_pictures
+    from sorvolo.lab.simulate.site import simulate_site
+    from sorvolo.lab.simulation.pictures import PictureSettings
+    from sorvolo.lab.simulation.presets import preset, preset_names
+    from sorvolo.lab.simulation.settings import SimulationSettings
+    from sorvolo.lab.train.detector import train_detector
+    from sorvolo.lab.train.sets import DataOptions
+    from sorvolo.lab.train.settings import TrainSettings
     from sorvolo.missions.calibrate_camera import (
         calibrate_camera,
         find_views,
@@ -21,15 +39,6 @@ if TYPE_CHECKING:
         write_calibration,
     )
     from sorvolo.missions.compare.flights import compare_flights
-    from sorvolo.missions.evaluate.changes import evaluate_changes
-    from sorvolo.missions.evaluate.detector import (
-        EvaluationSettings,
-        evaluate_detector,
-        read_sets,
-        write_evaluation,
-    )
-    from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
-    from sorvolo.missions.evaluate.objects import evaluate_objects
     from sorvolo.missions.flight.settings import CompareSettings, MapSettings
     from sorvolo.missions.heights.run import HeightSettings, make_heights
     from sorvolo.missions.inspect import inspect_input
@@ -43,19 +52,10 @@ if TYPE_CHECKING:
     )
     from sorvolo.missions.search.flights import search_site
     from sorvolo.missions.search.settings import SearchOutputs, SearchSettings
-    from sorvolo.missions.simulate.pictures import simulate_pictures
-    from sorvolo.missions.simulate.site import simulate_site
     from sorvolo.missions.telemetry.doctor import CotReceiver, correct_telemetry
-    from sorvolo.missions.train.detector import train_detector
-    from sorvolo.missions.train.sets import DataOptions
-    from sorvolo.missions.train.settings import TrainSettings
     from sorvolo.missions.watch.flights import watch
     from sorvolo.missions.watch.run import WatchUpdate
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-    from sorvolo.simulation.pictures import PictureSettings
-    from sorvolo.simulation.presets import preset, preset_names
-    from sorvolo.simulation.settings import SimulationSettings
-    from sorvolo.store.datasets import read_dataset
     from sorvolo.store.site.archive import Archive
     from sorvolo.survey.findings import Verdict
     from sorvolo.survey.objects import Detections

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sorvolo.simulation.ground import GroundKind, paint_ground
-from sorvolo.simulation.ground_painting import Area
+from sorvolo.lab.simulation.ground import GroundKind, paint_ground
+from sorvolo.lab.simulation.ground_painting import Area
 
 
 @pytest.fixture(scope="module")

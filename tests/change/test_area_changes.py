@@ -13,8 +13,8 @@ from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSe
 from sorvolo.change.areas.signs import leaning, level_of
 from sorvolo.change.shape.outlines import overlap
 from sorvolo.change.shape.patches import PatchWindow, cut
-from sorvolo.simulation.ground import GroundKind, paint_ground
-from sorvolo.simulation.ground_painting import Area
+from sorvolo.lab.simulation.ground import GroundKind, paint_ground
+from sorvolo.lab.simulation.ground_painting import Area
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
 
 M_PER_PX = 0.05

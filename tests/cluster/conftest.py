@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from small_flights import simulate_into, small_flight
-from sorvolo.simulation.settings import OutputSettings
+from sorvolo.lab.simulation.settings import OutputSettings
 
 
 @pytest.fixture(scope="session")

@@ -28,13 +28,13 @@ from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, 
 from sorvolo.cluster.table import BatchTable, State
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.blocks import prepare_divided
 from sorvolo.missions.map.chosen_frames import choose_frames, frames_again
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.joining import plan_blocks
 from sorvolo.mosaic.selection import Selected
-from sorvolo.simulation.settings import OutputSettings
 from sorvolo.store.site.archive import Archive
 
 

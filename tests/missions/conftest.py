@@ -9,9 +9,9 @@ import pytest
 from truth_detector import TruthDetector
 
 from small_flights import simulate_into, small_flight
+from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.simulation.settings import OutputSettings
 
 _SMALL = small_flight(
     31, length_m=30, spacing_m=6, size_px=(320, 180), fps=6, people=1, cars=1, small_objects=2

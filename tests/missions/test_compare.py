@@ -24,8 +24,9 @@ from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.homography import apply_homography
+from sorvolo.lab.evaluation.changes import evaluate_changes
+from sorvolo.lab.simulation.settings import LaterSettings, OutputSettings, SimulationSettings
 from sorvolo.missions.compare.flights import _begun, compare_flights
-from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.flight.known_camera import known_camera
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.setup import _check_place, prepare
@@ -33,7 +34,6 @@ from sorvolo.missions.heights.flight_views import run_of
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.mosaic.selection import every
-from sorvolo.simulation.settings import LaterSettings, OutputSettings, SimulationSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import CompareUpdate, Verdict, ViewStatus

@@ -16,10 +16,8 @@ from sorvolo.cli.main import main
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
-from sorvolo.missions.map.known_keyframes import KnownKeyframes
-from sorvolo.missions.map.planar_run import PlanarRun
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flights
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flights
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
     OutputSettings,
@@ -28,6 +26,8 @@ from sorvolo.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
+from sorvolo.missions.map.known_keyframes import KnownKeyframes
+from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.store.exports.flight_files import write_camera, write_photo
 from sorvolo.store.site.archive import Archive
 

@@ -15,12 +15,12 @@ from killed_copy import copy_as_killed
 from small_flights import simulate_into, small_flight
 from sorvolo.change.views import ViewMaker
 from sorvolo.errors import DiskFullError, SorvoloWarning, StoreError
+from sorvolo.lab.simulation.settings import LaterSettings
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.compare.run import CompareRun
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.mosaic.planar import PlanarMapper
-from sorvolo.simulation.settings import LaterSettings
 from sorvolo.survey.findings import CompareUpdate
 
 _PAIR = replace(

@@ -18,9 +18,9 @@ from sorvolo.geometry.geodesy import Geodetic, Projection
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
-from sorvolo.missions.evaluate.changes import evaluate_changes
-from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
-from sorvolo.missions.evaluate.objects import evaluate_objects
+from sorvolo.lab.evaluation.changes import evaluate_changes
+from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
+from sorvolo.lab.evaluation.objects import evaluate_objects
 from sorvolo.mosaic.canvas import Canvas
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.store.site.archive import Archive

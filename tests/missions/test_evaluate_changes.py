@@ -13,9 +13,9 @@ from small_flights import simulate_into
 from sorvolo.change.metrics import compared_ground
 from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.missions.evaluate.changes import evaluate_changes
-from sorvolo.missions.evaluate.frame_rows import time_ns_of
-from sorvolo.simulation.settings import (
+from sorvolo.lab.evaluation.changes import evaluate_changes
+from sorvolo.lab.evaluation.frame_rows import time_ns_of
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
     OutputSettings,

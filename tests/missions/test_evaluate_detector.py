@@ -12,7 +12,7 @@ from toy_models import rectangle_model
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.evaluate.detector import (
+from sorvolo.lab.evaluation.detector import (
     FOUND,
     NUMBERS,
     PAGE,
@@ -22,7 +22,7 @@ from sorvolo.missions.evaluate.detector import (
     read_sets,
     write_evaluation,
 )
-from sorvolo.missions.train.holding_out import hold_out
+from sorvolo.lab.train.holding_out import hold_out
 from sorvolo.store.exports.detector_files import FoundSet, FoundSets, read_found, write_found
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
 from sorvolo.survey.objects import CLASSES, Detections

@@ -14,6 +14,14 @@ from real_data import real_data
 from small_flights import simulate_into
 from sorvolo.cli.main import main
 from sorvolo.errors import GeometryError, InputError, SettingsError, StoreError
+from sorvolo.lab.simulation.settings import (
+    ImagingSettings,
+    OutputSettings,
+    PathSettings,
+    SceneSettings,
+    SensorSettings,
+    SimulationSettings,
+)
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.flights import _without_heights
 from sorvolo.missions.compare.run import _earlier_pictures
@@ -28,14 +36,6 @@ from sorvolo.missions.heights.measure import (
 from sorvolo.missions.heights.run import HeightSettings, make_heights
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.search.frames import heights_for
-from sorvolo.simulation.settings import (
-    ImagingSettings,
-    OutputSettings,
-    PathSettings,
-    SceneSettings,
-    SensorSettings,
-    SimulationSettings,
-)
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.findings import ChangeKind

@@ -12,9 +12,9 @@ from real_data import real_data
 from small_flights import simulate_into
 from sorvolo.cli import main as cli
 from sorvolo.errors import SettingsError
-from sorvolo.simulation.path import fly
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.settings import MotionSettings, PathSettings
+from sorvolo.lab.simulation.path import fly
+from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.settings import MotionSettings, PathSettings
 
 
 def report_of(site: Path) -> dict[str, Any]:

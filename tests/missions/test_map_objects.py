@@ -20,16 +20,16 @@ from sorvolo.change.classes import object_at, seen_at
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.camera import Camera
+from sorvolo.lab.evaluation.changes import evaluate_changes
+from sorvolo.lab.evaluation.objects import evaluate_objects
+from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.changes import evaluate_changes
-from sorvolo.missions.evaluate.objects import evaluate_objects
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
 from sorvolo.missions.flight.priority import made_at_low_priority
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.simulation.settings import OutputSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.flight import CameraPrior, Frame, PosedFrame

@@ -11,7 +11,7 @@ from sqlalchemy import select
 from postgres_server import PostgresServer
 from small_flights import simulate_into
 from sorvolo.cli.main import main
-from sorvolo.simulation.presets import preset
+from sorvolo.lab.simulation.presets import preset
 from sorvolo.store.site import schema
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import VARIABLE, is_site

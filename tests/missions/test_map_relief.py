@@ -11,7 +11,7 @@ import pytest
 from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
 from sorvolo.geometry.geodesy import Geodetic, LocalFrame
-from sorvolo.simulation.settings import OutputSettings
+from sorvolo.lab.simulation.settings import OutputSettings
 
 _LEVEL = small_flight(
     6,

@@ -7,12 +7,12 @@ import pytest
 from truth_detector import Knowing
 
 from small_flights import simulate_into, small_flight
+from sorvolo.lab.evaluation.changes import evaluate_changes
+from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions.compare.flight_changes import FlightChanges
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.changes import evaluate_changes
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.simulation.settings import OutputSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import ChangeKind
 

@@ -14,21 +14,21 @@ import pytest
 from sorvolo.change.metrics import Counts
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.evaluate.mask_folders import frames_against_times
-from sorvolo.missions.reproduce.published import TABLE_4_3
-from sorvolo.missions.reproduce.report import MARKDOWN, NUMBERS, PAGE, write_reproduction
-from sorvolo.missions.reproduce.rows import Row
-from sorvolo.missions.reproduce.run import ReproductionUpdate, _Work, reproduce
-from sorvolo.missions.reproduce.settings import (
+from sorvolo.lab.datasets.umcd import read_umcd_metadata
+from sorvolo.lab.datasets.umcd_folder import CHANGES, MOSAICKING, WITH, read_umcd_folder
+from sorvolo.lab.evaluation.mask_folders import frames_against_times
+from sorvolo.lab.thesis.published import TABLE_4_3
+from sorvolo.lab.thesis.report import MARKDOWN, NUMBERS, PAGE, write_reproduction
+from sorvolo.lab.thesis.rows import Row
+from sorvolo.lab.thesis.run import ReproductionUpdate, _Work, reproduce
+from sorvolo.lab.thesis.settings import (
     DetectorSettings,
     ReproductionSettings,
     SimulatedSize,
     quick,
 )
-from sorvolo.missions.reproduce.simulated import simulated_dataset
-from sorvolo.missions.reproduce.thesis_tables import tables_of
-from sorvolo.store.datasets.umcd import read_umcd_metadata
-from sorvolo.store.datasets.umcd_folder import CHANGES, MOSAICKING, WITH, read_umcd_folder
+from sorvolo.lab.thesis.simulated import simulated_dataset
+from sorvolo.lab.thesis.thesis_tables import tables_of
 from sorvolo.store.exports.flight_files import write_mask
 from sorvolo.store.exports.reproduction_sheets import reproduction_sheets
 

@@ -10,11 +10,11 @@ from small_flights import simulate_into, small_flight
 from sorvolo.change.evidence import evidence_map
 from sorvolo.change.evidence.shadow_doubt import ShadowDoubt
 from sorvolo.geometry.geodesy import Geodetic
+from sorvolo.lab.simulation.settings import LaterSettings, WeatherSettings
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.simulation.settings import LaterSettings, WeatherSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 

@@ -27,11 +27,11 @@ from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.simulation.settings import OutputSettings, SensorSettings
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import OutputSettings, SensorSettings
-from sorvolo.store.datasets import read_dataset
 from sorvolo.survey.objects import CLASSES, Detections, no_detections
 
 _FLOWN = replace(

@@ -15,10 +15,10 @@ from killed_copy import copy_as_killed
 from small_flights import simulate_into, small_flight
 from sorvolo.cli.main import main
 from sorvolo.errors import SorvoloWarning
+from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions.watch.flights import watch
 from sorvolo.missions.watch.run import WatchUpdate
 from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
-from sorvolo.simulation.settings import OutputSettings
 from waiting import wait_for
 
 _EFFORT = ("seconds", "latency_s", "frames_per_second", "peak_memory_mb")

@@ -15,11 +15,11 @@ from sorvolo.change.alignment import Aligner, NotAligned
 from sorvolo.change.flight_on_map import FlightOnMap
 from sorvolo.change.map_search import MapSearch
 from sorvolo.errors import InputError
+from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.simulation.settings import OutputSettings
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.evaluate.frame_rows import map_frames
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.simulation.settings import OutputSettings
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.findings import CompareUpdate, ViewStatus
 from sorvolo.survey.frame_rows import FrameRow

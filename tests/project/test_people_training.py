@@ -74,7 +74,7 @@ def test_who_is_laid_on_a_picture_is_boxed_and_who_is_hidden_is_ignored() -> Non
 
 def test_cells_stand_for_the_person_whose_box_they_lie_in() -> None:
     from dense_loss import Wanted, assigned, dense_loss
-    from sorvolo.training.nanodet import BINS, cells
+    from sorvolo.lab.training.nanodet import BINS, cells
 
     outputs = [torch.zeros(1, 1 + 4 * BINS, 96 // stride, 96 // stride) for stride in (8, 16, 32)]
     _, _, places = cells(outputs, (8, 16, 32), 1)
@@ -98,7 +98,7 @@ def test_cells_stand_for_the_person_whose_box_they_lie_in() -> None:
 
 def test_things_are_learnt_by_class_and_unlabelled_classes_teach_nothing() -> None:
     from dense_loss import Wanted, assigned, dense_loss
-    from sorvolo.training.nanodet import BINS, cells
+    from sorvolo.lab.training.nanodet import BINS, cells
 
     def outputs(of_class: int) -> list[torch.Tensor]:
         made = [

@@ -7,15 +7,15 @@ import pytest
 from pictured import HEIGHT, WIDTH, ground, keyframe, photographed, placed
 
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
-from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link, refine
-from sorvolo.simulation.flight import simulate_flight
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import simulate_flight
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     OutputSettings,
     PathSettings,
     SceneSettings,
     SimulationSettings,
 )
+from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link, refine
 from sorvolo.survey.mosaic import Link, NoLink
 
 SCENE = ground(1)

@@ -8,10 +8,10 @@ import pytest
 
 from small_flights import simulate_into
 from sorvolo.errors import SettingsError
-from sorvolo.simulation.flight import has_changed, simulate_flights
-from sorvolo.simulation.presets import preset
-from sorvolo.simulation.rendering import render_labels
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import has_changed, simulate_flights
+from sorvolo.lab.simulation.presets import preset
+from sorvolo.lab.simulation.rendering import render_labels
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
     OutputSettings,
@@ -21,9 +21,9 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
     WeatherSettings,
 )
-from sorvolo.simulation.true_changes import JOINED_GAP_M, event_features, true_events
-from sorvolo.simulation.truth import change_mask
-from sorvolo.simulation.world import World, build_day
+from sorvolo.lab.simulation.true_changes import JOINED_GAP_M, event_features, true_events
+from sorvolo.lab.simulation.truth import change_mask
+from sorvolo.lab.simulation.world import World, build_day
 
 SETTINGS = SimulationSettings(
     seed=11,

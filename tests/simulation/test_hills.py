@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from sorvolo.errors import SettingsError
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
-from sorvolo.simulation.ground_painting import Area
-from sorvolo.simulation.relief import LEVEL, Relief
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.lab.simulation.ground_painting import Area
+from sorvolo.lab.simulation.relief import LEVEL, Relief
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
     OutputSettings,
@@ -17,8 +17,8 @@ from sorvolo.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.simulation.truth import frame_features, ground_heights, surface_heights
-from sorvolo.simulation.view import map_view
+from sorvolo.lab.simulation.truth import frame_features, ground_heights, surface_heights
+from sorvolo.search.drawing.view import map_view
 
 _AREA = Area(-60.0, -40.0, 60.0, 40.0)
 _HILLS = Relief.hills(8.0, 25.0, _AREA, np.random.default_rng(3))

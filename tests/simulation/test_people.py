@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sorvolo.simulation.bodies import build_body
-from sorvolo.simulation.objects import POSES, Label, Light, Limb, Thing, new_size
-from sorvolo.simulation.view import Patch, opaque
+from sorvolo.search.drawing.bodies import build_body
+from sorvolo.search.drawing.objects import POSES, Label, Light, Limb, Thing, new_size
+from sorvolo.search.drawing.view import Patch, opaque
 
 _LIGHT = Light(np.array([0.5, 0.2, 0.84]) / np.linalg.norm([0.5, 0.2, 0.84]))
 _ABOVE, _BESIDE = np.array([0.0, 0, 1, 0]), np.array([0.0, -1, 0, 0])

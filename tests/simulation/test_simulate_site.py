@@ -19,11 +19,11 @@ from sorvolo.capture.telemetry import read_telemetry
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.geodesy import Projection
 from sorvolo.geometry.level_ground import ground_from_pixels
-from sorvolo.missions.simulate.site import simulate_site
-from sorvolo.simulation.flight import simulate_flight, simulate_flights
-from sorvolo.simulation.presets import preset, preset_names
-from sorvolo.simulation.rendering import render_labels
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulate.site import simulate_site
+from sorvolo.lab.simulation.flight import simulate_flight, simulate_flights
+from sorvolo.lab.simulation.presets import preset, preset_names
+from sorvolo.lab.simulation.rendering import render_labels
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     LaterSettings,
     OutputSettings,

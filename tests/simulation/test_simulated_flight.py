@@ -14,13 +14,12 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import site_from_gimbal_rotation
 from sorvolo.geometry.sun import sun_direction
-from sorvolo.simulation.clock import start_ns, sun_of_flight
-from sorvolo.simulation.flight import simulate_flight, simulate_flights
-from sorvolo.simulation.ground import GroundKind, orthophoto_ground, paint_ground
-from sorvolo.simulation.ground_painting import Area
-from sorvolo.simulation.noise import smooth_series
-from sorvolo.simulation.path import fly, planned_waypoints
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.clock import start_ns, sun_of_flight
+from sorvolo.lab.simulation.flight import simulate_flight, simulate_flights
+from sorvolo.lab.simulation.ground import GroundKind, orthophoto_ground, paint_ground
+from sorvolo.lab.simulation.ground_painting import Area
+from sorvolo.lab.simulation.path import fly, planned_waypoints
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
     OutputSettings,
@@ -30,8 +29,9 @@ from sorvolo.simulation.settings import (
     SimulationSettings,
     WeatherSettings,
 )
-from sorvolo.simulation.telemetry import observe
-from sorvolo.simulation.world import needed_area
+from sorvolo.lab.simulation.telemetry import observe
+from sorvolo.lab.simulation.world import needed_area
+from sorvolo.search.drawing.noise import smooth_series
 
 LONG = PathSettings(height_m=30, speed_m_s=5, length_m=100, strips=4, strip_spacing_m=12)
 QUICK = SimulationSettings(

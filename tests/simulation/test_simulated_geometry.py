@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.level_ground import footprint, ground_from_pixels
-from sorvolo.simulation.bodies import build_body
-from sorvolo.simulation.flight import SimulatedFlight, simulate_flight
-from sorvolo.simulation.ground import PaintedGround, orthophoto_ground
-from sorvolo.simulation.ground_painting import GroundRaster
-from sorvolo.simulation.objects import Label, Light, Thing
-from sorvolo.simulation.rendering import render_labels
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import SimulatedFlight, simulate_flight
+from sorvolo.lab.simulation.ground import PaintedGround, orthophoto_ground
+from sorvolo.lab.simulation.ground_painting import GroundRaster
+from sorvolo.lab.simulation.rendering import render_labels
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
     OutputSettings,
@@ -21,7 +19,9 @@ from sorvolo.simulation.settings import (
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.simulation.world import _with_shadows
+from sorvolo.lab.simulation.world import _with_shadows
+from sorvolo.search.drawing.bodies import build_body
+from sorvolo.search.drawing.objects import Label, Light, Thing
 
 GRID_M = 2.0
 RASTER_M = 0.02

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from sorvolo.simulation.bodies import build_body
-from sorvolo.simulation.objects import Label, Light, Thing
-from sorvolo.simulation.truth import surface_heights
-from sorvolo.simulation.view import map_view
+from sorvolo.lab.simulation.truth import surface_heights
+from sorvolo.search.drawing.bodies import build_body
+from sorvolo.search.drawing.objects import Label, Light, Thing
+from sorvolo.search.drawing.view import map_view
 
 
 def test_roofs_have_their_height_and_gables_slope_to_the_eaves() -> None:

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sorvolo.errors import InputError
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
 from sorvolo.store.exports.label_files import (
     coco_document,
     picture_of_detections,

@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 import sorvolo
+from sorvolo.lab.datasets.parsed import FINDINGS
 from sorvolo.missions.watch.notifier import RECEIVERS
-from sorvolo.store.datasets.parsed import FINDINGS
 
 _DOCS = Path(__file__).resolve().parents[2] / "docs"
 

@@ -8,15 +8,15 @@ import pytest
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.level_ground import footprint
 from sorvolo.geometry.pose import Pose, rotation_from_vector, site_from_gimbal_rotation
-from sorvolo.simulation.flight import simulate_flight
-from sorvolo.simulation.settings import (
+from sorvolo.lab.simulation.flight import simulate_flight
+from sorvolo.lab.simulation.settings import (
     ImagingSettings,
     MotionSettings,
     PathSettings,
     SceneSettings,
     SimulationSettings,
 )
-from sorvolo.simulation.truth import coco_boxes
+from sorvolo.lab.simulation.truth import coco_boxes
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M, Detections, no_detections
 from sorvolo.tracking.locate import IMPOSSIBLE_SIZE, LocateSettings, locate

@@ -10,14 +10,14 @@ torch = pytest.importorskip("torch")
 
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import ImageRGB
+from sorvolo.lab.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
+from sorvolo.lab.training.drawing import batches_from, draws
+from sorvolo.lab.training.four_steps import FourStepSettings, FourStepTraining
+from sorvolo.lab.training.joint import JointSettings, JointTraining, Progress
+from sorvolo.lab.training.presets import build
+from sorvolo.lab.training.progress import Check, History, Learner, seconds_left
+from sorvolo.lab.training.samples import Augmentation, Sample, Share
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.training.checkpoint import checkpoint_bytes, read_checkpoint, restore
-from sorvolo.training.drawing import batches_from, draws
-from sorvolo.training.four_steps import FourStepSettings, FourStepTraining
-from sorvolo.training.joint import JointSettings, JointTraining, Progress
-from sorvolo.training.presets import build
-from sorvolo.training.progress import Check, History, Learner, seconds_left
-from sorvolo.training.samples import Augmentation, Sample, Share
 
 _CLASSES = ("person", "car")
 _SETTINGS = {"preset": "fast", "steps": 8, "seed": 3}

@@ -8,8 +8,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sorvolo.detection.session import Session
-from sorvolo.survey.objects import CLASSES
-from sorvolo.training.daylight import (
+from sorvolo.lab.training.daylight import (
     Calibration,
     Daylight,
     DaylightSettings,
@@ -18,10 +17,11 @@ from sorvolo.training.daylight import (
     odds_from_scores,
     one_hot,
 )
-from sorvolo.training.exported import load_exported
-from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
-from sorvolo.training.onnx_export import onnx_from_module
-from sorvolo.training.presets import fast
+from sorvolo.lab.training.exported import load_exported
+from sorvolo.lab.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
+from sorvolo.lab.training.onnx_export import onnx_from_module
+from sorvolo.lab.training.presets import fast
+from sorvolo.survey.objects import CLASSES
 
 INFO = {
     "name": "toy",

@@ -6,9 +6,9 @@ torch = pytest.importorskip("torch")
 
 from torch.nn import functional
 
-from sorvolo.training import depthwise as module
-from sorvolo.training.backbone import SamePadded
-from sorvolo.training.depthwise import Depthwise, depthwise
+from sorvolo.lab.training import depthwise as module
+from sorvolo.lab.training.backbone import SamePadded
+from sorvolo.lab.training.depthwise import Depthwise, depthwise
 
 _CHANNELS = 6
 

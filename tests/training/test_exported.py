@@ -14,12 +14,12 @@ import onnxruntime
 from sorvolo.detection.quantise import quantise
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import ImageRGB
-from sorvolo.training.exported import load_exported
-from sorvolo.training.faster_rcnn import FasterRCNN
-from sorvolo.training.inception import Stem
-from sorvolo.training.onnx_export import check_export, export_onnx
-from sorvolo.training.presets import accurate, fast, thesis
-from sorvolo.training.resnet import ResNet50
+from sorvolo.lab.training.exported import load_exported
+from sorvolo.lab.training.faster_rcnn import FasterRCNN
+from sorvolo.lab.training.inception import Stem
+from sorvolo.lab.training.onnx_export import check_export, export_onnx
+from sorvolo.lab.training.presets import accurate, fast, thesis
+from sorvolo.lab.training.resnet import ResNet50
 
 _CLASSES = ("person", "car")
 

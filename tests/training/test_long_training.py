@@ -16,15 +16,15 @@ from square_pictures import labelled_squares
 
 from real_data import real_data
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.store.datasets import read_dataset
+from sorvolo.lab.datasets import read_dataset
+from sorvolo.lab.training.drawing import batches_from
+from sorvolo.lab.training.joint import JointSettings, JointTraining
+from sorvolo.lab.training.presets import accurate, fast
+from sorvolo.lab.training.samples import Augmentation, Sample, Share
+from sorvolo.lab.training.weights import ImageNetWeights
 from sorvolo.store.exports.label_files import write_coco
 from sorvolo.survey.labels import LabelledSet
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.drawing import batches_from
-from sorvolo.training.joint import JointSettings, JointTraining
-from sorvolo.training.presets import accurate, fast
-from sorvolo.training.samples import Augmentation, Sample, Share
-from sorvolo.training.weights import ImageNetWeights
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 _STEPS, _SIDE_PX = 4, 64

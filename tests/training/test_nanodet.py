@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from sorvolo.detection.session import Session
 from sorvolo.errors import InputError
-from sorvolo.training.nanodet import (
+from sorvolo.lab.training.nanodet import (
     BINS,
     CocoDetector,
     FinerNanoDetHead,
@@ -24,8 +24,8 @@ from sorvolo.training.nanodet import (
     head_of_class,
     nanodet_from_graph,
 )
-from sorvolo.training.onnx_export import onnx_from_module
-from sorvolo.training.tfjs_graph import read_graph, run_graph
+from sorvolo.lab.training.onnx_export import onnx_from_module
+from sorvolo.lab.training.tfjs_graph import read_graph, run_graph
 
 
 def _text(value: str) -> dict[str, str]:

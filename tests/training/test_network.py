@@ -14,32 +14,32 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from sorvolo.errors import SettingsError
-from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.training.backbone import EfficientNetLite0
-from sorvolo.training.boxes import (
+from sorvolo.lab.training.backbone import EfficientNetLite0
+from sorvolo.lab.training.boxes import (
     boxes_from_offsets,
     iou_matrix,
     offsets_from_boxes,
     suppress,
     suppress_all_pairs,
 )
-from sorvolo.training.faster_rcnn import FasterRCNN, Reach
-from sorvolo.training.feature_pyramid import Pyramid
-from sorvolo.training.heads import TwoLayerHead, pooled_levels, roi_align
-from sorvolo.training.inception import ExtendedStack, ResidualStack, proposal_stem
-from sorvolo.training.joint import JointSettings, JointTraining
-from sorvolo.training.losses import (
+from sorvolo.lab.training.faster_rcnn import FasterRCNN, Reach
+from sorvolo.lab.training.feature_pyramid import Pyramid
+from sorvolo.lab.training.heads import TwoLayerHead, pooled_levels, roi_align
+from sorvolo.lab.training.inception import ExtendedStack, ResidualStack, proposal_stem
+from sorvolo.lab.training.joint import JointSettings, JointTraining
+from sorvolo.lab.training.losses import (
     Answer,
     joint_proposal_loss,
     match_boxes,
     region_loss,
     thesis_proposal_loss,
 )
-from sorvolo.training.onnx_export import check_export, export_onnx
-from sorvolo.training.presets import fast
-from sorvolo.training.proposals import AnchorSettings, ProposalNetwork, Proposed
-from sorvolo.training.samples import Augmentation, Sample, Share, cut_sample
-from sorvolo.training.sprites import paste_small_objects
+from sorvolo.lab.training.onnx_export import check_export, export_onnx
+from sorvolo.lab.training.presets import fast
+from sorvolo.lab.training.proposals import AnchorSettings, ProposalNetwork, Proposed
+from sorvolo.lab.training.samples import Augmentation, Sample, Share, cut_sample
+from sorvolo.lab.training.sprites import paste_small_objects
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
 
 _SIDE_PX = 64
 

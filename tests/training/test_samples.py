@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.arrays import Floats
+from sorvolo.lab.training.samples import Augmentation, Share, cut_sample
 from sorvolo.survey.labels import LabelledPicture, LabelledSet
-from sorvolo.training.samples import Augmentation, Share, cut_sample
 
 CLASSES = ("person", "car")
 PLAIN = Augmentation(side_px=96, blur=0, haze=0, grey=0, noise=0)

@@ -8,11 +8,11 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from sorvolo.detection.session import Session
+from sorvolo.lab.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
+from sorvolo.lab.training.onnx_export import onnx_from_module
+from sorvolo.lab.training.presets import fast
+from sorvolo.lab.training.together import Together, TogetherSettings, fused
 from sorvolo.survey.objects import CLASSES
-from sorvolo.training.nanodet import CocoDetector, NanoDetBackbone, NanoDetHead
-from sorvolo.training.onnx_export import onnx_from_module
-from sorvolo.training.presets import fast
-from sorvolo.training.together import Together, TogetherSettings, fused
 
 INFO = {
     "name": "toy",
@@ -130,6 +130,6 @@ def test_of_two_boxes_of_one_score_the_first_networks_stays_whatever_the_roundin
     rounded = all_scores + torch.tensor(
         [0.0, 1e-6, 0.0]
     )  # as another order of the same sums may give
-    monkeypatch.setattr("sorvolo.training.together.fused", lambda *_: (every, rounded, labels))
+    monkeypatch.setattr("sorvolo.lab.training.together.fused", lambda *_: (every, rounded, labels))
     boxes, *_ = Together(first, second)(torch.zeros(1, 3, 96, 96))
     np.testing.assert_allclose(boxes, every[:1])

@@ -18,17 +18,17 @@ from square_pictures import labelled_squares
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.missions.train.detector import TrainingUpdate, train_detector
-from sorvolo.missions.train.sets import (
+from sorvolo.lab.train.detector import TrainingUpdate, train_detector
+from sorvolo.lab.train.sets import (
     DataOptions,
     TrainingSets,
     read_labels,
     simulate_samples,
     training_sets,
 )
-from sorvolo.missions.train.settings import TrainSettings
+from sorvolo.lab.train.settings import TrainSettings
+from sorvolo.lab.training.checkpoint import read_checkpoint
 from sorvolo.store.pages.training import training_page
-from sorvolo.training.checkpoint import read_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -173,7 +173,7 @@ def test_ctrl_c_waits_for_the_step_and_leaves_a_checkpoint(
 def test_checkpoints_come_between_checks_too(
     data: Path, tmp_path: Path, schedule: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sorvolo.missions.train.detector._SAVE_S", 0.0)  # else a minute
+    monkeypatch.setattr("sorvolo.lab.train.detector._SAVE_S", 0.0)  # else a minute
     settings = _settings(schedule=schedule, rpn="standard", steps=400)
     for update in (run := _train(data, tmp_path / "out", settings)):
         if update.step == 2:  # long before the first check, of four steps in the first

@@ -14,21 +14,21 @@ from square_pictures import labelled_squares
 from sorvolo.cli.main import main
 from sorvolo.detection.detector import Detector
 from sorvolo.detection.models import find_model
-from sorvolo.missions.train.start import (
+from sorvolo.lab.train.start import (
     kept_on_request,
     kept_thermal_by,
     load_start,
     part_notices,
     threshold_notices,
 )
-from sorvolo.training.exported import ExportedModel
+from sorvolo.lab.training.exported import ExportedModel
 
 _BRIEFLY = ("--batch", "2", "--side", "64", "--val", "0.25", "--device", "cpu")
 
 
 def _settle_by_a_hundred(patch: pytest.MonkeyPatch) -> None:
     """So many of the pictures settle a model's norms: by a memory of 6 MP it would be 1500 of this size."""
-    patch.setattr("sorvolo.training.starting._SETTLING_PX", 100 * 64 * 64)
+    patch.setattr("sorvolo.lab.training.starting._SETTLING_PX", 100 * 64 * 64)
 
 
 @pytest.fixture(autouse=True)

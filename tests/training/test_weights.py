@@ -16,11 +16,11 @@ torch = pytest.importorskip("torch")
 from safetensors.torch import save_file
 
 from sorvolo.errors import InputError
-from sorvolo.missions.train.start import fetch_weights, load_start, load_weights
-from sorvolo.training import weights as module
-from sorvolo.training.backbone import EfficientNetLite0
-from sorvolo.training.resnet import IMAGENET_STD, ResNet50
-from sorvolo.training.weights import Source, read_weights
+from sorvolo.lab.train.start import fetch_weights, load_start, load_weights
+from sorvolo.lab.training import weights as module
+from sorvolo.lab.training.backbone import EfficientNetLite0
+from sorvolo.lab.training.resnet import IMAGENET_STD, ResNet50
+from sorvolo.lab.training.weights import Source, read_weights
 
 
 @pytest.fixture(scope="module")

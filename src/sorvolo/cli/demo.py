@@ -15,7 +15,7 @@ from sorvolo.cli.progress import ProgressReport
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.simulation.settings import SimulationSettings
+    from sorvolo.lab.simulation.settings import SimulationSettings
 
 _DEFAULT_FOLDER = Path("demo-site")
 _FLIGHT = Path("flight1") / "flight1.mp4"
@@ -31,10 +31,10 @@ def demo(
 
     Example: sorvolo demo
     """
-    from sorvolo.missions.evaluate.changes import evaluate_changes
-    from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+    from sorvolo.lab.evaluation.changes import evaluate_changes
+    from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
+    from sorvolo.lab.simulation.presets import preset
     from sorvolo.missions.flight.settings import CompareSettings, MapSettings
-    from sorvolo.simulation.presets import preset
 
     simulation, site = folder / "simulation", folder / "site"
     console = Console()
@@ -89,7 +89,7 @@ def _next_steps(folder: Path, site: Path) -> list[str]:
 
 
 def _simulate(folder: Path, settings: "SimulationSettings") -> None:
-    from sorvolo.missions.simulate.site import simulate_site
+    from sorvolo.lab.simulate.site import simulate_site
 
     with ProgressReport(Console(stderr=True)) as progress:
         progress.show("simulating the site")
@@ -102,7 +102,7 @@ def _simulate(folder: Path, settings: "SimulationSettings") -> None:
 
 def _is_simulated(folder: Path, settings: "SimulationSettings") -> bool:
     """Whether an earlier run of this version left the very flights that are wanted."""
-    from sorvolo.missions.simulate.simulation_folder import MARK
+    from sorvolo.lab.simulate.simulation_folder import MARK
     from sorvolo.store.exports.plain import plain_json
 
     try:

@@ -15,9 +15,9 @@ from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
     from sorvolo.change.metrics import EventScores
-    from sorvolo.missions.evaluate.changes import FlightChanges
-    from sorvolo.missions.evaluate.mask_folders import MaskScores
-    from sorvolo.missions.evaluate.mosaic import MosaicEvaluation
+    from sorvolo.lab.evaluation.changes import FlightChanges
+    from sorvolo.lab.evaluation.mask_folders import MaskScores
+    from sorvolo.lab.evaluation.mosaic import MosaicEvaluation
     from sorvolo.mosaic.map_quality import Spread
     from sorvolo.tracking.metrics import FlightObjects
 
@@ -49,7 +49,7 @@ def mosaic(
 
     Example: sorvolo evaluate mosaic field-map --reference orthophoto.tif --json
     """
-    from sorvolo.missions.evaluate.mosaic import evaluate_mosaic
+    from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
     from sorvolo.store.exports.plain import plain_json
 
     with opened_site(site) as place:
@@ -85,8 +85,8 @@ def changes(
 
     Example: sorvolo evaluate changes my-masks --truth dataset/masks --json
     """
-    from sorvolo.missions.evaluate.changes import as_json as measures_as_json
-    from sorvolo.missions.evaluate.changes import evaluate_changes
+    from sorvolo.lab.evaluation.changes import as_json as measures_as_json
+    from sorvolo.lab.evaluation.changes import evaluate_changes
 
     with opened_site(found) as place:
         measured = evaluate_changes(place.folder, truth, flight=flight, least_px=least_px)
@@ -109,7 +109,7 @@ def objects(
 
     Example: sorvolo evaluate objects field-map --truth simulated-field
     """
-    from sorvolo.missions.evaluate.objects import evaluate_objects
+    from sorvolo.lab.evaluation.objects import evaluate_objects
     from sorvolo.store.exports.plain import plain_json
 
     with opened_site(site) as place:

@@ -19,7 +19,7 @@ from sorvolo.errors import SettingsError
 if TYPE_CHECKING:
     from sorvolo.detection.intervals import Difference, Interval
     from sorvolo.detection.scores import SetComparison, SetScores
-    from sorvolo.missions.evaluate.detector import DetectorEvaluation, EvaluationSettings
+    from sorvolo.lab.evaluation.detector import DetectorEvaluation, EvaluationSettings
     from sorvolo.survey.labels import LabelledSet
 
 MeasuredModels = Annotated[
@@ -103,7 +103,7 @@ def detector(
 
     Example: sorvolo evaluate detector a1.onnx,a2.onnx data --compare b1.onnx,b2.onnx --out side-by-side
     """
-    from sorvolo.missions.evaluate.detector import (
+    from sorvolo.lab.evaluation.detector import (
         EvaluationSettings,
         evaluation_numbers,
         known_classes,
@@ -152,7 +152,7 @@ def _measured(
     arms: list[list[str]], labelled: "Sequence[LabelledSet]", settings: "EvaluationSettings"
 ) -> "DetectorEvaluation":
     """The evaluation, with progress on stderr."""
-    from sorvolo.missions.evaluate.detector import evaluate_detector
+    from sorvolo.lab.evaluation.detector import evaluate_detector
 
     with ProgressReport(Console(stderr=True)) as progress:
         return evaluate_detector(
@@ -170,7 +170,7 @@ def _notices(labelled: "Sequence[LabelledSet]", measured: "DetectorEvaluation") 
 
 
 def _show_all(measured: "DetectorEvaluation", notices: Sequence[str], out: Path | None) -> None:
-    from sorvolo.missions.evaluate.detector import PAGE
+    from sorvolo.lab.evaluation.detector import PAGE
 
     console = Console()
     for notice in notices:

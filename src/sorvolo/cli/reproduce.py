@@ -18,8 +18,8 @@ from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.missions.reproduce.rows import Row
-    from sorvolo.missions.reproduce.settings import ReproductionSettings, SimulatedSize
+    from sorvolo.lab.thesis.rows import Row
+    from sorvolo.lab.thesis.settings import ReproductionSettings, SimulatedSize
 
 _DEFAULT_OUT = Path("reproduction")
 
@@ -84,13 +84,13 @@ def reproduce(
 
     Example, without the dataset: sorvolo reproduce --simulated --videos 1
     """
-    from sorvolo.missions.reproduce.report import PAGE
-    from sorvolo.missions.reproduce.settings import (
+    from sorvolo.lab.thesis.report import PAGE
+    from sorvolo.lab.thesis.settings import (
         DetectorSettings,
         ReproductionSettings,
         SimulatedSize,
     )
-    from sorvolo.missions.reproduce.settings import quick as quick_sizes
+    from sorvolo.lab.thesis.settings import quick as quick_sizes
 
     settings = ReproductionSettings(
         videos,
@@ -118,7 +118,7 @@ def reproduce(
 
 
 def _simulate(place: Path, size: "SimulatedSize", settings: "ReproductionSettings") -> None:
-    from sorvolo.missions.reproduce.simulated import simulated_dataset
+    from sorvolo.lab.thesis.simulated import simulated_dataset
 
     with ProgressReport(Console(stderr=True)) as progress:
         for name, step in simulated_dataset(place, size, settings):
@@ -136,7 +136,7 @@ def _rows(
     *,
     is_whole: bool,
 ) -> "list[Row]":
-    from sorvolo.missions.reproduce.run import reproduce as reproduced
+    from sorvolo.lab.thesis.run import reproduce as reproduced
 
     console = Console(stderr=True)
     rows = []
@@ -158,7 +158,7 @@ def _written(
     settings: "ReproductionSettings",
     size: "SimulatedSize | None",
 ) -> dict[str, Any]:
-    from sorvolo.missions.reproduce.report import write_reproduction
+    from sorvolo.lab.thesis.report import write_reproduction
 
     return write_reproduction(out, rows, place, settings, size)
 

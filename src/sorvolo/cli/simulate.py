@@ -15,9 +15,9 @@ from sorvolo.errors import SettingsError
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.missions.simulate.site import SimulationProgress
-    from sorvolo.simulation.pictures import PictureSettings
-    from sorvolo.simulation.settings import SimulationSettings
+    from sorvolo.lab.simulate.site import SimulationProgress
+    from sorvolo.lab.simulation.pictures import PictureSettings
+    from sorvolo.lab.simulation.settings import SimulationSettings
 
 SimulationFolder = Annotated[
     Path, typer.Argument(help="Folder to make; an earlier simulation in it is replaced.")
@@ -76,7 +76,7 @@ ThermalShare = Annotated[
 
 
 def _print_presets(wanted: bool) -> None:
-    from sorvolo.simulation.presets import preset_names
+    from sorvolo.lab.simulation.presets import preset_names
 
     if wanted:
         typer.echo("\n".join(preset_names()))
@@ -125,7 +125,7 @@ def simulate(
 
     Example: sorvolo simulate labelled --pictures 500 --thermal 0.3 --seed 7
     """
-    from sorvolo.simulation.presets import preset
+    from sorvolo.lab.simulation.presets import preset
 
     ground_file = _ground_file(ground)
     ground_kind = ground if ground_file is None else "orthophoto"
@@ -171,7 +171,7 @@ def simulate(
 
 def _ground_file(ground: str) -> Path | None:
     """The orthophoto's file; None where `ground` names a kind of ground, or nothing."""
-    from sorvolo.simulation.ground import GroundKind
+    from sorvolo.lab.simulation.ground import GroundKind
 
     if not ground or ground in list(GroundKind):
         return None
@@ -196,7 +196,7 @@ def _refuse_options_of_flights(options: Mapping[str, object]) -> None:
 def _picture_settings(
     pictures: int, seed: int | None, ground_kind: str, thermal: float, height_m: float | None
 ) -> "PictureSettings":
-    from sorvolo.simulation.pictures import PictureSettings
+    from sorvolo.lab.simulation.pictures import PictureSettings
 
     settings = PictureSettings(pictures, 1 if seed is None else seed, ground_kind, thermal)
     return settings if height_m is None else replace(settings, height_m=(height_m, height_m))
@@ -209,7 +209,7 @@ def _simulate_pictures(
     ground_gsd: float | None,
     as_json: bool,
 ) -> None:
-    from sorvolo.missions.simulate.pictures import simulate_pictures
+    from sorvolo.lab.simulate.pictures import simulate_pictures
 
     last = None
     console = Console()
@@ -234,7 +234,7 @@ def _simulate_flights(
     ground_gsd: float | None,
     as_json: bool,
 ) -> None:
-    from sorvolo.missions.simulate.site import simulate_site
+    from sorvolo.lab.simulate.site import simulate_site
 
     steps = simulate_site(folder, settings, ground_file, ground_gsd)
     if not as_json:

@@ -19,7 +19,7 @@ from sorvolo.cli.progress import ProgressReport
 from sorvolo.errors import SettingsError
 
 if TYPE_CHECKING:  # torch is an extra, and slow to import: only this command needs it
-    from sorvolo.missions.train.detector import TrainingUpdate
+    from sorvolo.lab.train.detector import TrainingUpdate
 
 
 class Preset(StrEnum):
@@ -127,7 +127,7 @@ def train(
 
     Example: sorvolo train my-labels --out my-model --resume
     """
-    from sorvolo.missions.train.settings import TrainSettings
+    from sorvolo.lab.train.settings import TrainSettings
 
     chosen = rpn or (Rpn.EXTENDED if preset == Preset.THESIS else Rpn.RESIDUAL)
     settings = TrainSettings(
@@ -143,8 +143,8 @@ def train(
         patience,
     )
     try:
-        from sorvolo.missions.train.detector import CHECKPOINT, train_detector
-        from sorvolo.missions.train.sets import DataOptions
+        from sorvolo.lab.train.detector import CHECKPOINT, train_detector
+        from sorvolo.lab.train.sets import DataOptions
     except ModuleNotFoundError as error:
         raise SettingsError(
             f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"

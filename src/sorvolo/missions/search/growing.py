@@ -22,11 +22,11 @@ from sorvolo.missions.search.measure import (
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells, cells_of
 from sorvolo.search.conditions import AboveGround, FrameLook, gather, look_at
+from sorvolo.search.drawing.frame_light import frame_light
+from sorvolo.search.drawing.objects import Thing
+from sorvolo.search.drawing.planted import new_plant
 from sorvolo.search.outcomes import near_any, rows_of
 from sorvolo.search.plant_places import PlantField, PlantPlace
-from sorvolo.simulation.frame_light import frame_light
-from sorvolo.simulation.objects import Thing
-from sorvolo.simulation.planted import new_plant
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.tracking.laying import pose_of

@@ -16,12 +16,12 @@ from sorvolo.missions.flight.sunlight import sun_over
 from sorvolo.missions.search.settings import SearchSettings
 from sorvolo.search.cells import Cells
 from sorvolo.search.conditions import AboveGround, Conditions, FrameLook, gather, look_at
+from sorvolo.search.drawing.frame_light import FrameLight, frame_light
+from sorvolo.search.drawing.objects import Thing
+from sorvolo.search.drawing.planted import new_plant, plant
 from sorvolo.search.outcomes import Outcomes, any_of, every_label, found_rows
 from sorvolo.search.plant_places import PlantPlace, plant_places, seeded
 from sorvolo.search.recall import Chances, Recall, fit_recall, map_chances
-from sorvolo.simulation.frame_light import FrameLight, frame_light
-from sorvolo.simulation.objects import Thing
-from sorvolo.simulation.planted import new_plant, plant
 from sorvolo.survey.flight import Site
 from sorvolo.survey.mosaic import PlacedFrame
 from sorvolo.survey.objects import CLASSES, TYPICAL_SIZE_M

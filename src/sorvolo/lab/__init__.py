@@ -1,0 +1,1 @@
+"""The laboratory: simulation, training, evaluation and the thesis; the product never imports it."""

@@ -1,0 +1,224 @@
+"""Parsed labels made into records: our classes, boxes within the picture, groups; what is wrong is counted."""
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats
+from sorvolo.lab.datasets.groups import group_of
+from sorvolo.lab.datasets.naming import LOOK_ALIKES, Naming, nothing_maps, of_one_unnamed, plain
+from sorvolo.lab.datasets.parsed import (
+    SHARES,
+    Finding,
+    ParsedBox,
+    ParsedPicture,
+    ParsedSet,
+    findings_in,
+    notices_of,
+)
+from sorvolo.lab.datasets.picture_files import shown_size_px
+from sorvolo.survey.flight import Notice
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+
+_SAME_SHAPE = 0.01  # of the aspect: thumbnails and halved frames are rounded to whole pixels
+_CLIPPED_PX = 1.5  # less is rounding, or counting from 1
+_LEAST_LEFT = (
+    0.1  # share of a box's area within the picture below which it shows nothing of the object
+)
+
+
+def labelled_set(
+    parsed: ParsedSet,
+    place: Path,
+    names: Naming,
+    unlabelled: Iterable[str],
+    pattern: re.Pattern[str] | None,
+) -> LabelledSet:
+    """The set in our classes. Raises InputError when no name maps, or no picture can be opened."""
+    counts = Counter(
+        box.name for picture in parsed.pictures for box in picture.boxes if not box.is_ignored
+    )
+    names, classes = _mapped(parsed, place, names, counts)
+    made = [_labelled(picture, place, names, classes, pattern) for picture in parsed.pictures]
+    pictures = tuple(picture for picture, _ in made if picture is not None)
+    found = notices_of([*parsed.findings, *findings_in(made)])
+    if not pictures:
+        raise InputError(
+            f"{place}: none of its {len(parsed.pictures)} pictures can be used: "
+            + "; ".join(each.text for each in found)
+        )
+    notices = (*found, *_left_out(counts, names), *_look_alikes(counts, names))
+    return LabelledSet(
+        place.stem if place.is_file() else place.name,
+        classes,
+        pictures,
+        frozenset(unlabelled),
+        notices,
+    )
+
+
+def _mapped(
+    parsed: ParsedSet, place: Path, names: Naming, counts: Counter[str]
+) -> tuple[Naming, tuple[str, ...]]:
+    """The naming that holds for this set, and our classes in it. Raises InputError when no name maps."""
+    every = dict.fromkeys([*counts, *parsed.declared])
+    if list(every) == ["0"] and not parsed.declared:
+        names = of_one_unnamed(names)
+    classes = names.classes(every)
+    if not classes:
+        raise nothing_maps(str(place), {name: counts[name] for name in every}, names.targets)
+    return names, classes
+
+
+def _labelled(
+    parsed: ParsedPicture,
+    place: Path,
+    names: Naming,
+    classes: tuple[str, ...],
+    pattern: re.Pattern[str] | None,
+) -> tuple[LabelledPicture | None, list[Finding]]:
+    """The picture in our classes, None where it cannot be used; what was wrong with it or its boxes."""
+    name = parsed.path.name
+    try:
+        width_px, height_px, orientation = shown_size_px(parsed.path)
+    except InputError:
+        return None, [Finding("unreadable_pictures", name)]
+    edges = np.array([box[1:5] for box in parsed.boxes], np.float64).reshape(-1, 4)
+    fitted, scaling = _in_picture_px(
+        edges, parsed.labelled_size, (width_px, height_px), orientation, name
+    )
+    if fitted is None:
+        return None, scaling
+    inside, keep, clipping = _clipped(fitted, width_px, height_px, name)
+    kept = ((box, edge_px) for box, edge_px, is_kept in zip(parsed.boxes, inside, keep) if is_kept)
+    boxes, labels, ignored = _targets_and_ignored(kept, names, classes)
+    if parsed.is_ignored:
+        ignored = [(0.0, 0.0, float(width_px), float(height_px)), *ignored]
+    group = group_of(parsed.path, place, pattern) if pattern or not parsed.group else parsed.group
+    return LabelledPicture(
+        str(parsed.path),
+        width_px,
+        height_px,
+        group,
+        np.array(boxes, np.float32),
+        np.array(labels, np.int64),
+        np.array(list(dict.fromkeys(ignored)), np.float32),
+        parsed.m_per_px,
+    ), scaling + clipping
+
+
+def _targets_and_ignored(
+    kept: Iterable[tuple[ParsedBox, Floats]], names: Naming, classes: tuple[str, ...]
+) -> tuple[list[Floats], list[int], list[tuple[float, ...]]]:
+    """Boxes of our classes with their class numbers, and boxes to ignore; boxes of other names are left out."""
+    boxes, labels, ignored = [], [], []
+    for box, edge_px in kept:
+        if box.is_ignored or names.is_ignored(box.name):
+            ignored.append(tuple(edge_px.tolist()))
+        elif names.is_target(box.name):
+            boxes.append(edge_px)
+            labels.append(classes.index(names.target(box.name)))
+    return boxes, labels, ignored
+
+
+def _in_picture_px(
+    edges: Floats,
+    labelled: tuple[float, float] | None,
+    shown_px: tuple[int, int],
+    orientation: int,
+    name: str,
+) -> tuple[Floats | None, list[Finding]]:
+    """Edges, (N, 4), in pixels of the picture as it is shown; None when the labels are of another shape.
+
+    Labels drawn on a picture as stored, before its EXIF orientation, are turned with it.
+    """
+    if labelled is None or labelled == shown_px:
+        return edges, []
+    is_scaled = labelled != SHARES
+    if is_scaled and not _same_shape(labelled, shown_px):
+        if orientation >= 5 and _same_shape(labelled, shown_px[::-1]):
+            return _in_picture_px(
+                turned(edges, labelled, orientation), labelled[::-1], shown_px, 1, name
+            )
+        return None, [Finding("other_size", name)]
+    fitted = edges * np.tile(np.divide(shown_px, labelled), 2)
+    return fitted, [Finding("scaled_labels", name)] if is_scaled else []
+
+
+def turned(edges: Floats, stored_size: tuple[float, float], orientation: int) -> Floats:
+    """Edges, (N, 4), in a picture as stored, as they lie once its EXIF orientation (5 to 8) is applied."""
+    left, top, right, bottom = edges.T
+    width, height = stored_size
+    columns = {
+        5: (top, left, bottom, right),
+        6: (height - bottom, left, height - top, right),
+        7: (height - bottom, width - right, height - top, width - left),
+        8: (top, width - right, bottom, width - left),
+    }[orientation]
+    return np.column_stack(columns)
+
+
+def _same_shape(size: tuple[float, float], other: tuple[float, float]) -> bool:
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1) <= _SAME_SHAPE
+
+
+def _clipped(
+    edges_px: Floats, width_px: int, height_px: int, name: str
+) -> tuple[Floats, list[bool], list[Finding]]:
+    """Edges within the picture, which boxes are worth keeping, and what was wrong with the others."""
+    with np.errstate(invalid="ignore"):
+        sides = edges_px[:, 2:] - edges_px[:, :2]
+    limits = np.array([width_px, height_px] * 2, np.float64)
+    inside = np.clip(edges_px, 0, limits)
+    left = inside[:, 2:] - inside[:, :2]
+    empty = (sides <= 0).any(axis=1)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        shows_it = (left > 0).all(axis=1) & ((left / sides).prod(axis=1) >= _LEAST_LEFT)
+    outside = ~empty & ~shows_it
+    moved = np.abs(inside - edges_px).max(axis=1, initial=0) > _CLIPPED_PX
+    return (
+        inside,
+        list(~empty & ~outside),
+        [
+            Finding("empty_boxes", name, int(empty.sum())),
+            Finding("outside_boxes", name, int(outside.sum())),
+            Finding("clipped_boxes", name, int((moved & ~empty & ~outside).sum())),
+        ],
+    )
+
+
+def _left_out(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
+    rest = {
+        name: count
+        for name, count in counts.items()
+        if not names.is_target(name) and not names.is_ignored(name)
+    }
+    if not rest:
+        return ()
+    total = sum(rest.values())
+    text = f"{total} boxes of classes that stand for none of ours left out: {_counted(rest)}"
+    return (Notice("unmapped_classes", total, text),)
+
+
+def _look_alikes(counts: Counter[str], names: Naming) -> tuple[Notice, ...]:
+    alike = {
+        name: count
+        for name, count in counts.items()
+        if names.is_ignored(name) and plain(name) in LOOK_ALIKES
+    }
+    if not alike:
+        return ()
+    total = sum(alike.values())
+    text = (
+        f"{total} boxes of look-alikes are neither right nor wrong, as regions to ignore: {_counted(alike)}; "
+        "--classes THEIRS=OURS,... states which of a set's classes count"
+    )
+    return (Notice("look_alikes_ignored", total, text),)
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} ({count})" for name, count in counts.items())

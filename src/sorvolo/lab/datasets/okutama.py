@@ -1,0 +1,97 @@
+"""Okutama-Action: a text file for each video, a line for each person and frame, in pixels of the 4K original."""
+
+import re
+from pathlib import Path
+
+from sorvolo.errors import InputError
+from sorvolo.lab.datasets.pairing import frames_by_video, no_frames, pictures_around
+from sorvolo.lab.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet, findings_in
+from sorvolo.lab.datasets.picture_files import files_below
+from sorvolo.lab.datasets.text_files import read_text
+
+FORM = "Okutama-Action"
+_LINE = re.compile(
+    r"\s*(?P<track>\d+)\s+(?P<left>-?\d+)\s+(?P<top>-?\d+)\s+(?P<right>-?\d+)\s+(?P<bottom>-?\d+)\s+(?P<frame>\d+)"
+    r"\s+(?P<lost>[01])\s+[01]\s+[01]\s+\"?(?P<name>[^\"\s]+)\"?(\s+\"[^\"]*\")*\s*"
+)
+_ORIGINAL_PX = (3840.0, 2160.0)  # Okutama-Action's videos are 4K; labels count these pixels
+_SIZE_IN_PATH = re.compile(r"(\d{3,4})x(\d{3,4})")
+
+
+def read_okutama(place: Path) -> ParsedSet:
+    """A folder with label files (`1.1.1.txt`) and frames in folders of the videos' names (`1.1.1/0.jpg`).
+
+    A line is track, xmin, ymin, xmax, ymax, frame, lost, occluded, generated, "Person" and actions. Lines marked lost
+    are left out: the person is not in view. Edges are in pixels of the 3840x2160 video, or of the size that a folder
+    above the label file names, and scaled to the frames (published at 1280x720). Of a video labelled twice, with single
+    and with multiple actions, the boxes are the same: the first file counts. Raises InputError when no line is of this
+    form, or no frame is there.
+    """
+    files = (
+        [place]
+        if place.is_file()
+        else [path for path in files_below(place, ".txt") if is_okutama_file(path)]
+    )
+    files_of = {path.stem: path for path in reversed(files)}
+    read = {video: _boxes(path) for video, path in sorted(files_of.items())}
+    labelled = {video: by_frame for video, (by_frame, _) in read.items()}
+    findings = findings_in(read.values())
+    if not any(labelled.values()):
+        raise InputError(
+            f'{place}: no line is an {FORM} label (track, four edges, frame, three flags, "Person")'
+        )
+    frames = frames_by_video(pictures_around(place, FORM), labelled)
+    if not any(frames.values()):
+        raise no_frames(place, FORM, labelled)
+    result: list[ParsedPicture] = []
+    for video, by_frame in labelled.items():
+        lonely = set(by_frame) - set(frames[video])
+        findings.append(
+            Finding(
+                "labels_without_picture", f"{video}, frame {min(lonely, default=0)}", len(lonely)
+            )
+        )
+        size = _labelled_size(files_of[video])
+        result += [
+            ParsedPicture(path, tuple(by_frame.get(number, ())), size, video)
+            for number, path in sorted(frames[video].items())
+        ]
+    return ParsedSet(FORM, tuple(result), ("Person",), tuple(findings))
+
+
+def looks_like_okutama(line: str) -> bool:
+    """Whether a line is one of this form."""
+    return _LINE.fullmatch(line) is not None
+
+
+def is_okutama_file(path: Path) -> bool:
+    """Whether the file's first line is of this form."""
+    return looks_like_okutama(
+        next((line for line in read_text(path).splitlines() if line.strip()), "")
+    )
+
+
+def _boxes(path: Path) -> tuple[dict[int, list[ParsedBox]], list[Finding]]:
+    """The file's boxes by frame; frames where all are lost have none. And its lines that are no labels."""
+    found: dict[int, list[ParsedBox]] = {}
+    findings = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        match = _LINE.fullmatch(line) if len(line) < 1000 else None
+        if match is None:
+            if line.strip():
+                findings.append(Finding("malformed_labels", f"{path.name}, line {number}"))
+            continue
+        of_frame = found.setdefault(int(match["frame"]), [])
+        if match["lost"] == "0":
+            left, top, right, bottom = (
+                float(match[edge]) for edge in ("left", "top", "right", "bottom")
+            )
+            of_frame.append(ParsedBox(match["name"], left, top, right, bottom))
+    return found, findings
+
+
+def _labelled_size(path: Path) -> tuple[float, float]:
+    for part in reversed(path.parts[:-1]):
+        if match := _SIZE_IN_PATH.search(part):
+            return float(match[1]), float(match[2])
+    return _ORIGINAL_PX

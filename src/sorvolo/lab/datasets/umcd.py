@@ -1,0 +1,235 @@
+"""UMCD: a metadata text file for each video, a block for each object: what it is and when it is in view."""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from math import inf, isfinite
+from pathlib import Path
+
+from sorvolo.errors import InputError
+from sorvolo.lab.datasets.pairing import frames_by_video, no_frames, pictures_around
+from sorvolo.lab.datasets.parsed import Finding, ParsedBox, ParsedPicture, ParsedSet
+from sorvolo.lab.datasets.picture_files import files_below
+from sorvolo.lab.datasets.text_files import read_text
+
+FORM = "UMCD"
+_OBJECT = re.compile(r"object\b\s*#?\s*\d*\s*[:.=]?\s*", re.IGNORECASE)
+_KNOWN = frozenset(
+    {
+        "type",
+        "shape",
+        "dimension",
+        "dimensions",
+        "size",
+        "color",
+        "colour",
+        "movement",
+        "appearance",
+    }
+)
+_NUMBER = re.compile(r"\d{1,9}(?:\.\d{1,9})?")
+_ROUNDED_S = 1.0  # times of appearance are whole seconds, rounded one way or the other
+
+
+@dataclass
+class _Object:
+    """One block while it is read; `boxes` by frame are left, top, width, height in pixels."""
+
+    name: str = ""
+    keys: set[str] = field(default_factory=set)
+    from_s: float = -inf
+    until_s: float = inf
+    boxes: dict[int, tuple[float, ...]] = field(default_factory=dict)
+
+
+@dataclass
+class _Video:
+    fps: float = 0.0
+    objects: list[_Object] = field(default_factory=list)
+    malformed: list[Finding] = field(default_factory=list)
+
+
+def read_umcd(place: Path) -> ParsedSet:
+    """A folder with metadata files (`path1.txt`) and frames in folders of the videos' names (`path1/000123.jpg`).
+
+    The thesis (section 2.2) lists what a file holds of each object: type, shape, dimension in cm, colour, movement;
+    Table 2.4 adds from which second to which it is in view. It gives no places in the picture. So a frame in which
+    no object is in view is a picture of nothing; one with an object of unknown place is ignored as a whole.
+    Lines `Box: FRAME LEFT TOP WIDTH HEIGHT` in an object's block (ours, in pixels) give its places. Raises InputError
+    when nothing is of this form, times are given without `Fps:`, or no frame is there or of use.
+    """
+    videos = _videos(place)
+    frames = frames_by_video(pictures_around(place, FORM), [path.stem for path in videos])
+    if not any(frames.values()):
+        raise no_frames(place, FORM, frames)
+    result: list[ParsedPicture] = []
+    for path, video in videos.items():
+        _demand_times(path, video)
+        result += _labelled_frames(path.stem, video, frames[path.stem])
+    if all(each.is_ignored and not each.boxes for each in result):
+        raise InputError(
+            f"{place}: {FORM} metadata names what is in its videos but not where in the frames, so nothing can be "
+            "learnt from them; add lines 'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects, or label the frames anew"
+        )
+    names = dict.fromkeys(each.name for video in videos.values() for each in video.objects)
+    return ParsedSet(FORM, tuple(result), tuple(names), tuple(_findings(videos.values(), result)))
+
+
+@dataclass(frozen=True)
+class UmcdMetadata:
+    """What a video's metadata file states: `fps` (0: not stated), and from which second to which objects are in view.
+
+    `boxed` are the numbers of the frames in which objects have places (lines `Box:`).
+    """
+
+    fps: float
+    in_view_s: tuple[tuple[float, float], ...]
+    boxed: frozenset[int]
+
+    def shows_object(self, time_s: float) -> bool | None:
+        """Whether an object is in view at a time; None within a second of where one comes or goes, or unknown."""
+        inside_s = [
+            min(time_s - start, end - time_s) for start, end in self.in_view_s
+        ]  # negative: out of view
+        if not inside_s or not all(map(isfinite, inside_s)):
+            return None
+        if max(inside_s) > _ROUNDED_S:
+            return True
+        return False if max(inside_s) < -_ROUNDED_S else None
+
+
+def read_umcd_metadata(path: Path) -> UmcdMetadata:
+    """One video's metadata file; raises InputError for one that describes no object."""
+    video = _parsed(path)
+    if not video.objects:
+        raise InputError(
+            f"{path}: describes no object as {FORM}'s metadata does (Type:, Shape:, Dimension:, ...)"
+        )
+    return UmcdMetadata(
+        video.fps,
+        tuple((each.from_s, each.until_s) for each in video.objects),
+        frozenset(frame for each in video.objects for frame in each.boxes),
+    )
+
+
+def looks_like_umcd(path: Path) -> bool:
+    """Whether a text file names an object's type and has at least two of the fields of this form."""
+    fields = [_field(line) for line in read_text(path).splitlines()]
+    keys = {key for key, value in fields if value} & _KNOWN
+    return len(keys) >= 2 and (
+        "type" in keys or any(key == "object" and value for key, value in fields)
+    )
+
+
+def _videos(place: Path) -> dict[Path, _Video]:
+    """The videos of all metadata files that describe objects. Raises InputError when none does."""
+    files = (
+        [place]
+        if place.is_file()
+        else [path for path in files_below(place, ".txt") if looks_like_umcd(path)]
+    )
+    videos = {path: _parsed(path) for path in files}
+    videos = {path: video for path, video in videos.items() if video.objects}
+    if not videos:
+        raise InputError(
+            f"{place}: no text file describes objects as {FORM}'s do (Type:, Shape:, Dimension:, ...)"
+        )
+    return videos
+
+
+def _findings(videos: Iterable[_Video], pictures: Iterable[ParsedPicture]) -> Iterator[Finding]:
+    """What was wrong in the metadata files, and the frames that show objects at unknown places."""
+    for video in videos:
+        yield from video.malformed
+    for each in pictures:
+        if each.is_ignored:
+            yield Finding("no_boxes_for_frame", each.path.name)
+
+
+def _labelled_frames(
+    name: str, video: _Video, frames: Mapping[int, Path]
+) -> Iterator[ParsedPicture]:
+    for number, picture in sorted(frames.items()):
+        boxes = [_box(each, number) for each in video.objects if number in each.boxes]
+        unplaced = any(
+            _is_in_view(each, number, video.fps)
+            for each in video.objects
+            if number not in each.boxes
+        )
+        yield ParsedPicture(picture, tuple(boxes), None, name, is_ignored=unplaced)
+
+
+def _field(line: str) -> tuple[str, str]:
+    """A line's key in lower case and its value, such as ("type", "Person"); the key is empty where there is none.
+
+    "Object 1: Person" has the key "object".
+    """
+    bare = line.strip().strip("-*; ")
+    if begun := _OBJECT.match(bare):
+        return "object", bare[begun.end() :]
+    key, mark, value = (
+        bare.replace("=", ":", 1).partition(":") if ":" not in bare else bare.partition(":")
+    )
+    return (key.strip().lower(), value.strip()) if mark else ("", bare)
+
+
+def _parsed(path: Path) -> _Video:
+    video = _Video()
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        key, value = _field(line)
+        numbers = [float(each) for each in _NUMBER.findall(value)]
+        if key == "object":
+            video.objects.append(_Object(value))
+        elif key in ("fps", "frequency"):
+            video.fps = next(iter(numbers), 0.0)
+        elif line.strip() and not (key and _add_field(video, key, value, numbers)):
+            video.malformed.append(Finding("malformed_labels", f"{path.name}, line {number}"))
+    video.objects = [each for each in video.objects if each.name]
+    return video
+
+
+def _add_field(video: _Video, key: str, value: str, numbers: list[float]) -> bool:
+    """Add one field to the last object, or to a new one where the last has its type; whether it was understood."""
+    if key == "type" and (not video.objects or "type" in video.objects[-1].keys):
+        video.objects.append(_Object())
+    if not video.objects:
+        return (
+            key not in _KNOWN and key != "box"
+        )  # what comes before the first object is about the video
+    last = video.objects[-1]
+    last.keys.add(key)
+    return _set_field(last, key, value, numbers)
+
+
+def _set_field(each: _Object, key: str, value: str, numbers: list[float]) -> bool:
+    """Set what a field gives of an object; whether it was understood."""
+    if key == "type":
+        each.name = value or each.name
+    elif key == "appearance":
+        if len(numbers) != 2 or numbers[1] < numbers[0]:
+            return False
+        each.from_s, each.until_s = numbers
+    elif key == "box":
+        if len(numbers) != 5:
+            return False
+        each.boxes[int(numbers[0])] = tuple(numbers[1:])
+    return True
+
+
+def _demand_times(path: Path, video: _Video) -> None:
+    if not video.fps > 0 and any(each.from_s > -inf for each in video.objects):
+        raise InputError(
+            f"{path} states at which second objects are in view but not how many frames make a second; add a line such "
+            "as 'Fps: 25' before the first object"
+        )
+
+
+def _is_in_view(each: _Object, frame: int, fps: float) -> bool:
+    if each.from_s == -inf:
+        return True
+    return each.from_s - _ROUNDED_S <= frame / fps <= each.until_s + _ROUNDED_S
+
+
+def _box(each: _Object, frame: int) -> ParsedBox:
+    left, top, width, height = each.boxes[frame]
+    return ParsedBox(each.name, left, top, left + width, top + height)

@@ -1,0 +1,64 @@
+"""A video's metadata file as the UMCD dataset has one, of a simulated flight whose truth is known."""
+
+from collections.abc import Iterable, Mapping
+from math import ceil, floor
+from typing import Any
+
+from sorvolo.lab.datasets.naming import DEFAULT_CLASSES, plain
+
+_FIRST_AS_BEFORE = 1  # a simulation counts flights from 1
+
+
+def umcd_metadata(
+    fps: float, objects: Iterable[Mapping[str, Any]], boxes: Mapping[str, Any], flight: int
+) -> str:
+    """The text: each object that came with a later flight, when it is in view, and its boxes (ours, `Box:` lines).
+
+    `objects` are the features of a simulation's objects.geojson, `boxes` the COCO content of the flight's boxes.json,
+    `flight` its number. Objects that no picture shows are left out. Sizes are in centimetres, times in whole seconds.
+    """
+    came = {
+        each["properties"]["id"]: each["properties"]
+        for each in objects
+        if _came(each["properties"], flight)
+    }
+    seen: dict[int, list[tuple[int, list[float]]]] = {}
+    for row in boxes["annotations"]:
+        if row["object_id"] in came:
+            seen.setdefault(row["object_id"], []).append((row["image_id"], row["bbox"]))
+    lines = [f"Fps: {fps:g}", ""]
+    for number, (thing, views) in enumerate(seen.items(), start=1):
+        lines += [*_block(number, came[thing], views, fps), ""]
+    return "\n".join(lines)
+
+
+def _came(properties: Mapping[str, Any], flight: int) -> bool:
+    return flight in properties["flights"] and _FIRST_AS_BEFORE not in properties["flights"]
+
+
+def _block(
+    number: int, properties: Mapping[str, Any], views: list[tuple[int, list[float]]], fps: float
+) -> list[str]:
+    name = (
+        properties["subtype"]
+        if plain(properties["subtype"]) in DEFAULT_CLASSES
+        else properties["class"]
+    )
+    sizes_cm = (round(100 * properties[f"{side}_m"]) for side in ("length", "width", "height"))
+    frames = [frame for frame, _ in views]
+    return [
+        f"Object {number}",
+        f"Type: {name}",
+        f"Shape: {_shape(properties)}",
+        f"Dimension: {' x '.join(map(str, sizes_cm))}",
+        "Color: not stated",
+        f"Movement: {'moving' if properties['moving'] else 'static'}",
+        f"Appearance: {floor(min(frames) / fps):02d} to {ceil(max(frames) / fps):02d}",
+        *(f"Box: {frame} {' '.join(f'{edge:g}' for edge in box)}" for frame, box in views),
+    ]
+
+
+def _shape(properties: Mapping[str, Any]) -> str:
+    if properties["class"] == "person":
+        return "person"
+    return "square" if properties["length_m"] == properties["width_m"] else "rectangular"

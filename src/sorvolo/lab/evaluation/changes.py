@@ -1,0 +1,436 @@
+"""Measure what `sorvolo compare` found: its events and masks against a simulation's truth, or masks against masks."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from sorvolo.change.metrics import (
+    ComparedGround,
+    Counts,
+    EventMatch,
+    EventScores,
+    EventSettings,
+    FoundEvent,
+    TrueEvent,
+    compared_ground,
+    match_events,
+    score_events,
+)
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import Matrix3, PointsM, floats
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.level_ground import is_on_ground
+from sorvolo.lab.evaluation.frame_rows import (
+    paired_flights,
+    read_features,
+    refuse_simulation,
+    time_ns_of,
+    truth_file,
+)
+from sorvolo.lab.evaluation.mask_folders import MaskScores, compare_mask_folders, has_masks
+from sorvolo.mosaic.paired_flights import PairedFlights
+from sorvolo.store.exports.plain import features_path, plain_json
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.findings import ChangeKind
+from sorvolo.survey.flight import Site
+
+VIDEO_VIEWS, PHOTO_VIEWS = 3, 2
+"""So many clear views make an event one that must be found; what moves needs three in any case."""
+
+
+@dataclass(frozen=True)
+class ClassCounts:
+    """Found events of the right kind: their classes are right, wrong, or missing."""
+
+    right: int
+    wrong: int
+    unnamed: int
+
+
+@dataclass(frozen=True, eq=False)
+class FlightChanges:
+    """One compared flight against the truth; what could not be measured is None, and `remarks` state why.
+
+    `map_shift_m` is how far the map lies from the truth (rms over frames); it is taken out before events are matched.
+    `classes` is None where no change has a class: nobody looked.
+    """
+
+    flight: str
+    masks: MaskScores | None
+    events: EventScores | None
+    match: EventMatch | None
+    map_shift_m: float
+    remarks: tuple[str, ...]
+    classes: ClassCounts | None = None
+
+
+def evaluate_changes(
+    found: Path, truth: Path, *, flight: str | None = None, least_px: int = 1
+) -> tuple[FlightChanges, ...]:
+    """Measure the compared flights of a site folder, or a folder of masks, against the truth.
+
+    `truth` is a simulation's folder, the truth folder in it, or a folder of masks; `flight` one of the site's flights;
+    `least_px` how many changed pixels make a frame positive. Raises InputError for folders that hold neither, or not
+    the same frames.
+    """
+    refuse_simulation(found)
+    true_flights = _true_flights(truth)
+    if not (found / "flights").is_dir():
+        if not found.is_dir():
+            raise InputError(f"{found}: no such folder; give a site folder, or a folder of masks")
+        return (
+            _masks_alone(found.name, found, _true_masks(truth, true_flights, flight), least_px),
+        )
+    names = _compared_flights(found, flight)
+    if not true_flights:
+        folders = [(name, _own_masks(found, name)) for name in names]
+        return tuple(_masks_alone(name, folder, truth, least_px) for name, folder in folders)
+    return _against_simulation(found, names, truth, true_flights, least_px)
+
+
+def _masks_alone(name: str, found: Path, true: Path, least_px: int) -> FlightChanges:
+    """A folder of masks against another."""
+    return FlightChanges(
+        name, compare_mask_folders(found, true, least_px), None, None, math.nan, ()
+    )
+
+
+def _against_simulation(
+    found: Path, names: Sequence[str], truth: Path, true_flights: Mapping[str, Path], least_px: int
+) -> tuple[FlightChanges, ...]:
+    """The site's compared flights, as far as the truth knows them."""
+    with Archive.open(found, write=False) as archive:
+        described = archive.site()
+    if described.is_local:
+        raise InputError(
+            f"{found}: a map without geo-reference cannot be compared with a simulation's truth"
+        )
+    _check_whole(found, names)
+    flights = paired_flights(found, truth_file(truth), described)
+    known = [name for name in names if flights.true_name(name) in true_flights]
+    if not known:
+        raise InputError(
+            f"{truth}: knows the later flights {', '.join(true_flights)}, the site compared {', '.join(names)}, and no "
+            "frame is in both; give the truth of these flights"
+        )
+    return tuple(
+        _evaluate(found, described, flights, name, true_flights[flights.true_name(name)], least_px)
+        for name in known
+    )
+
+
+def as_json(measured: Sequence[FlightChanges]) -> list[dict[str, Any]]:
+    """The measures with all their rates, as JSON can hold them."""
+    return [
+        {
+            "flight": each.flight,
+            "pixels": None if each.masks is None else rates(each.masks.pixels),
+            "frames": None if each.masks is None else rates(each.masks.frames),
+            "masks": None
+            if each.masks is None
+            else {
+                "compared": each.masks.compared,
+                "only_found": each.masks.only_found,
+                "only_true": each.masks.only_true,
+                "least_px": each.masks.least_px,
+            },
+            "events": None
+            if each.events is None
+            else plain_json(each.events)
+            | plain_json(
+                {
+                    "found_share": each.events.found_share,
+                    "false_per_hectare": each.events.false_per_hectare,
+                }
+            ),
+            "lists": None if each.match is None else _lists(each.match),
+            "classes": None if each.classes is None else plain_json(each.classes),
+            "map_shift_m": plain_json(each.map_shift_m),
+            "remarks": list(each.remarks),
+        }
+        for each in measured
+    ]
+
+
+def rates(counts: Counts) -> dict[str, float | int | None]:
+    """Counts with their rates as in Tables 4.3 to 4.5, a rate that does not exist as None."""
+    values = {
+        "tp": counts.tp,
+        "fp": counts.fp,
+        "fn": counts.fn,
+        "tn": counts.tn,
+        "unknown": counts.unknown,
+        "precision": counts.precision,
+        "recall": counts.recall,
+        "accuracy": counts.accuracy,
+        "f1": counts.f1,
+    }
+    return {name: plain_json(value) for name, value in values.items()}
+
+
+def _lists(match: EventMatch) -> dict[str, Any]:
+    return {
+        "found": [
+            {
+                "true": pair.true.id,
+                "found": pair.found.id,
+                "kind": str(pair.true.kind),
+                "named": str(pair.found.kind),
+                "error_m": round(pair.error_m, 3),
+                "delay_s": plain_json(pair.delay_s),
+            }
+            for pair in match.pairs
+        ],
+        "missed": [{"true": each.id, "kind": str(each.kind)} for each in match.missed],
+        **{
+            name: [{"found": each.id, "kind": str(each.kind)} for each in events]
+            for name, events in (
+                ("twice", match.twice),
+                ("false", match.false),
+                ("optional", match.optional),
+            )
+        },
+    }
+
+
+def _true_flights(truth: Path) -> dict[str, Path]:
+    """The later flights of a simulation and their truth folders; empty where `truth` is a folder of masks."""
+    for folder in (truth / "truth", truth):
+        if (folder / "frames.geojson").is_file() and (folder / "objects.geojson").is_file():
+            later = {
+                path.name: path for path in sorted(folder.iterdir()) if (path / "changes").is_dir()
+            }
+            if not later:
+                raise InputError(
+                    f"{truth}: this simulation has no second flight; simulate one with --flights 2"
+                )
+            return later
+    if not truth.is_dir():
+        raise InputError(
+            f"no such folder: {truth}; give the folder that `sorvolo simulate` made, or a folder with one mask a frame"
+        )
+    if not has_masks(truth):
+        raise InputError(
+            f"{truth}: holds neither the truth of a simulation nor masks; give the folder that `sorvolo simulate` "
+            "made, or a folder with one mask a frame"
+        )
+    return {}
+
+
+def _true_masks(truth: Path, true_flights: Mapping[str, Path], flight: str | None) -> Path:
+    if not true_flights:
+        return truth
+    name = flight or (next(iter(true_flights)) if len(true_flights) == 1 else "")
+    if name not in true_flights:
+        raise InputError(f"{truth}: has masks of {', '.join(true_flights)}; name one with --flight")
+    return true_flights[name] / "changes"
+
+
+def _compared_flights(site: Path, flight: str | None) -> list[str]:
+    names = sorted(path.parent.name for path in (site / "flights").glob("*/changes.*json"))
+    if not names:
+        raise InputError(
+            f"{site}: no flight of it was compared; run `sorvolo compare INPUT --site {site}` first"
+        )
+    if flight is None:
+        return names
+    if flight not in names:
+        raise SettingsError(
+            f"--flight {flight}: the compared flights of {site} are {', '.join(names)}"
+        )
+    return [flight]
+
+
+def _check_whole(site: Path, flights: Sequence[str]) -> None:
+    for path in (features_path(site / "flights" / name, "frames") for name in flights):
+        if not path.is_file():
+            raise InputError(
+                f"{path} is missing: this flight is there only in part; run `sorvolo compare` again"
+            )
+
+
+def _own_masks(site: Path, flight: str) -> Path:
+    folder = site / "flights" / flight / "masks"
+    if not has_masks(folder):
+        raise InputError(
+            f"{site}: no masks of {flight} were written; run `sorvolo compare` again with --masks"
+        )
+    return folder
+
+
+def _evaluate(
+    site: Path,
+    described: Site,
+    flights: PairedFlights,
+    flight: str,
+    true_folder: Path,
+    least_px: int,
+) -> FlightChanges:
+    remarks = []
+    masks = None
+    if has_masks(site / "flights" / flight / "masks"):
+        masks = compare_mask_folders(_own_masks(site, flight), true_folder / "changes", least_px)
+    else:
+        remarks.append(
+            "no masks were written: frames and pixels are judged after `sorvolo compare` with --masks"
+        )
+    makers = _map_makers(site, flights, flight)
+    map_from_truth, shift_m = flights.map_from_truth(makers)
+    if math.isnan(shift_m):
+        remarks.append("no frame of the map is known to the truth: events are compared as they lie")
+    ground = compared_ground(
+        *([row.outline_m for _, row in flights.placed(names)] for names in ([flight], makers))
+    )
+    settings = EventSettings(views=VIDEO_VIEWS)
+    true = _read_true(
+        true_folder / "events.geojson",
+        described,
+        map_from_truth,
+        ground,
+        _least_views(flights, flight),
+    )
+    found = _read_found(
+        features_path(site / "flights" / flight, "changes"), described, flights.clock(flight)
+    )
+    match = match_events(found, true, settings)
+    scores = score_events(match, ground.area_m2, settings)
+    if match.pairs and not scores.judged_late:
+        remarks.append("when events were announced is not known: none is judged late")
+    classes = _class_counts(
+        match, features_path(site / "flights" / flight, "changes"), true_folder / "events.geojson"
+    )
+    return FlightChanges(flight, masks, scores, match, shift_m, tuple(remarks), classes)
+
+
+def _map_makers(site: Path, flights: PairedFlights, flight: str) -> list[str]:
+    """The flights that made the map: those not compared themselves, which may have been laid onto it less well."""
+    others = [name for name in flights.mine if name != flight]
+    return [
+        name for name in others if not features_path(site / "flights" / name, "changes").is_file()
+    ] or others
+
+
+def _least_views(flights: PairedFlights, flight: str) -> int:
+    is_photos = any(not row.name.isdecimal() for row in flights.mine[flight])
+    return PHOTO_VIEWS if is_photos else VIDEO_VIEWS
+
+
+def _class_counts(match: EventMatch, found: Path, true: Path) -> ClassCounts | None:
+    """How many of the pairs of one kind have the truth's classes, before and after as far as the kind has them."""
+    reported = {str(each["properties"]["id"]): _classes_of(each) for each in read_features(found)}
+    if not any(name for classes in reported.values() for name in classes):
+        return None
+    known = {_event_name(each["properties"]): _classes_of(each) for each in read_features(true)}
+    counts = {"right": 0, "wrong": 0, "unnamed": 0}
+    for pair in match.pairs:
+        if pair.found.kind is pair.true.kind:
+            mine = reported[pair.found.id]
+            counts[
+                "right" if mine == known[pair.true.id] else "wrong" if any(mine) else "unnamed"
+            ] += 1
+    return ClassCounts(**counts)
+
+
+def _classes_of(feature: Mapping[str, Any]) -> tuple[str, str]:
+    """What was there, and what is; of what moves only what it is."""
+    properties = feature["properties"]
+    before = "" if properties["kind"] == ChangeKind.MOVING else properties.get("class_before") or ""
+    return before, properties.get("class_after") or ""
+
+
+def _event_name(properties: Mapping[str, Any]) -> str:
+    return f"{properties['number']} {properties['class_before'] or properties['class_after']}"
+
+
+def _read_true(
+    path: Path, described: Site, map_from_truth: Matrix3, ground: ComparedGround, views: int
+) -> list[TrueEvent]:
+    if not path.is_file():
+        raise InputError(f"{path} is missing: an older simulation; run `sorvolo simulate` again")
+    events = []
+    for feature in read_features(path):
+        try:
+            events.append(_true_event(feature, described, map_from_truth, ground, views, path))
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(
+                f"{path}: an event is not as docs/simulation.md has it ({error!r})"
+            ) from error
+    return events
+
+
+def _true_event(
+    feature: Mapping[str, Any],
+    described: Site,
+    map_from_truth: Matrix3,
+    ground: ComparedGround,
+    views: int,
+    path: Path,
+) -> TrueEvent:
+    properties = feature["properties"]
+    true_m = _ring(feature, described, path)
+    outline_m = apply_homography(map_from_truth, true_m)
+    places = properties["path"]
+    path_m = (
+        apply_homography(map_from_truth, described.frame.ground_from_lonlat(places))
+        if places
+        else floats(())
+    )
+    event = TrueEvent(
+        _event_name(properties),
+        ChangeKind(properties["kind"]),
+        outline_m,
+        float(properties["length_m"]),
+        [time_ns_of(text) for text in properties["clear_views"]],
+        path_m,
+        map_off_m=outline_m.mean(axis=0) - true_m.mean(axis=0),
+    )
+    return replace(event, must_find=event.is_shown(ground, views, max(views, VIDEO_VIEWS)))
+
+
+def _read_found(path: Path, described: Site, clock: tuple[int, int]) -> list[FoundEvent]:
+    """The reported events; those reported only in the end were announced with the last frame."""
+    ended_ns, behind_ns = clock
+    events = []
+    for feature in read_features(path):
+        try:
+            properties = feature["properties"]
+            announced_ns = None
+            if "announced" in properties:
+                announced = properties["announced"]
+                announced_ns = behind_ns + (time_ns_of(announced) if announced else ended_ns)
+            world_sigma_m = _known(properties.get("sigma_m"))
+            sigma_m = _known(
+                properties.get("sigma_in_map_m", world_sigma_m)
+            )  # earlier versions stated one for both
+            events.append(
+                FoundEvent(
+                    str(properties["id"]),
+                    ChangeKind(properties["kind"]),
+                    _ring(feature, described, path),
+                    sigma_m,
+                    announced_ns,
+                    world_sigma_m,
+                )
+            )
+        except (KeyError, TypeError, ValueError, IndexError) as error:
+            raise InputError(
+                f"{path}: a change is not as docs/formats.md has it ({error!r})"
+            ) from error
+    return events
+
+
+def _known(stated: float | None) -> float:
+    return math.nan if stated is None else float(stated)
+
+
+def _ring(feature: Mapping[str, Any], described: Site, path: Path) -> PointsM:
+    corners = feature["geometry"]["coordinates"][0][:-1]
+    ring_m = described.frame.ground_from_lonlat(corners)
+    if len(ring_m) < 3 or not is_on_ground(ring_m):
+        raise InputError(
+            f"{path}: an outline needs at least three corners, got {json.dumps(corners)[:80]}"
+        )
+    return ring_m

@@ -1,0 +1,478 @@
+"""Measure detectors on labelled pictures, each by itself and side by side: Table 4.6 of the thesis and more."""
+
+import re
+import time
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from sorvolo.capture.photos import read_picture
+from sorvolo.detection.detector import Detector
+from sorvolo.detection.intervals import DRAWS
+from sorvolo.detection.metrics import Mistake, judged_classes
+from sorvolo.detection.models import find_model
+from sorvolo.detection.scores import Arm, SetComparison, SetScores, compare_arms, score_set
+from sorvolo.detection.session import read_info
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import BoxesPx, ImageRGB
+from sorvolo.lab.datasets import read_datasets
+from sorvolo.lab.train.holding_out import hold_out
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.exports.detector_files import (
+    FoundSet,
+    FoundSets,
+    mistake_picture,
+    read_found,
+    write_found,
+)
+from sorvolo.store.exports.plain import json_bytes
+from sorvolo.store.pages.detector import detector_page
+from sorvolo.survey.flight import Notice
+from sorvolo.survey.labels import LabelledPicture, LabelledSet
+from sorvolo.survey.objects import Detections, no_detections
+from sorvolo.survey.wording import counted
+
+LEAST_SCORE = 1e-4
+"""Candidates from this score on are measured: average precision needs the doubtful ones, which packaged models score
+0.0002 and more."""
+
+PAGE, NUMBERS, FOUND = "detector.html", "detector.json", "detections.json"
+
+_KINDS = ("false alarm", "miss", "confusion")
+_SHOWN = 12  # mistakes of a kind
+_SHOWN_OF_ONE = 2  # of them from one picture
+_NAMED = 5  # damaged pictures
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """`tiles`, `from_above` as Detector.detect takes them; `draws` of the bootstrap; `seed` of whatever is random."""
+
+    tiles: Literal["auto"] | int | None = "auto"
+    draws: int = DRAWS
+    seed: int = 1
+    from_above: bool = False
+
+
+@dataclass(frozen=True)
+class EvaluationProgress:
+    """How many pictures of a set a model has looked at."""
+
+    model: str
+    set_name: str
+    pictures_done: int
+    pictures_total: int
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorEvaluation:
+    """One model's scores on each set, and, with rivals, all of them side by side; of several seeds the first is scored.
+
+    `found` are the first model's detections; `worst` each set's worst mistakes with their pictures; `notices` name what
+    was left out, and what the models report about the pictures.
+    """
+
+    found: FoundSets
+    sets: tuple[SetScores, ...]
+    comparisons: tuple[SetComparison, ...]
+    worst: Mapping[str, tuple[tuple[Mistake, str, ImageRGB], ...]]
+    notices: tuple[str, ...] = ()
+
+
+def read_sets(
+    places: Sequence[Path],
+    *,
+    form: str | None = None,
+    classes: Mapping[str, str] | None = None,
+    ignore: Iterable[str] = (),
+    unlabelled: Iterable[str] = (),
+    group_pattern: str | None = None,
+    videos: str = "",
+    held_out: float = 0.0,
+    seed: int = 1,
+    known: Iterable[str] = (),
+) -> tuple[LabelledSet, ...]:
+    """The labelled sets in these files and folders, all read with the same options (those of `read_datasets`).
+
+    `videos` is a regular expression: only pictures whose video or flight it fits (from its start) are kept. With
+    `held_out` only the share that a training with this share and seed holds out. Raises InputError and SettingsError as
+    `read_datasets`, InputError for a set of which none is kept, SettingsError for a broken expression and a share that
+    cannot be.
+    """
+    try:
+        kept = re.compile(videos)
+    except re.error as error:
+        raise SettingsError(f"--videos {videos!r} is no regular expression: {error}") from error
+    sets = []
+    read = read_datasets(
+        places,
+        form=form,
+        classes=classes,
+        ignore=ignore,
+        unlabelled=unlabelled,
+        group_pattern=group_pattern,
+        known=known,
+    )
+    for place, whole in zip(places, read):
+        fitting = [each for each in whole.pictures if kept.match(each.group)]
+        chosen = replace(whole.only(fitting), notices=whole.notices)
+        if not len(chosen):
+            groups = sorted({each.group for each in whole.pictures})
+            raise InputError(
+                f"{place}: no video or flight fits {videos!r}; there are {', '.join(groups[:8])}"
+            )
+        sets.append(_held_out(chosen, held_out, seed) if held_out else chosen)
+    return tuple(sets)
+
+
+def known_classes(arms: Iterable[Iterable[str]]) -> tuple[str, ...]:
+    """All classes that any model of the arms detects. Raises InputError as `evaluate_detector`."""
+    found = (
+        read_found(Path(place)).classes
+        if Path(place).suffix == ".json"
+        else read_info(find_model(place)).classes
+        for arm in arms
+        for place in arm
+    )
+    return tuple(dict.fromkeys(name for classes in found for name in classes))
+
+
+def evaluate_detector(
+    arms: Sequence[Sequence[str]],
+    labelled: Sequence[LabelledSet],
+    settings: EvaluationSettings | None = None,
+    progress: Callable[[EvaluationProgress], None] = lambda _: None,
+) -> DetectorEvaluation:
+    """Measure `arms[0]` on each set, and the other arms beside it.
+
+    An arm is one model, or the same one trained with several seeds: names or files of models, or detections.json of
+    earlier evaluations, which were made on the same pictures. Measured is the model that was asked for, with the one
+    that it names for thermal frames, if any. Raises InputError for models and files that cannot be
+    used, for sets that label none of a model's classes, and for those of which no picture can be read; one picture
+    that cannot be read is left out for all models, and named in `notices`.
+    """
+    settings = settings or EvaluationSettings()
+    _demand_distinct(labelled)
+    reader = _PictureReader()
+    seen = _seen_by_all(arms, labelled, settings, progress, reader)
+    labelled = [_readable(each, reader.damaged) for each in labelled]
+    first = seen[0][0]
+    scores = tuple(_scores(each, first, settings) for each in labelled)
+    comparisons = tuple(_side_by_side(each, seen, settings) for each in labelled if len(seen) > 1)
+    worst = {
+        each.name: tuple(_worst(each, score, first.sets[each.name]))
+        for each, score in zip(labelled, scores)
+    }
+    notices = (*_damage_notices(reader.damaged), *_model_notices(seen))
+    return DetectorEvaluation(first, scores, comparisons, worst, notices)
+
+
+def _scores(labelled: LabelledSet, found: FoundSets, settings: EvaluationSettings) -> SetScores:
+    mine = found.sets[labelled.name]
+    return score_set(
+        labelled,
+        mine.detections,
+        found.classes,
+        mine.thresholds,
+        draws=settings.draws,
+        seed=settings.seed,
+    )
+
+
+def _seen_by_all(
+    arms: Sequence[Sequence[str]],
+    labelled: Sequence[LabelledSet],
+    settings: EvaluationSettings,
+    progress: Callable[[EvaluationProgress], None],
+    reader: "_PictureReader",
+) -> list[list[FoundSets]]:
+    """What every model of every arm finds in the pictures that can be read."""
+    seen = [[_found(place, labelled, settings, progress, reader) for place in arm] for arm in arms]
+    return [[_without(each, labelled, reader.damaged) for each in arm] for arm in seen]
+
+
+def _demand_distinct(labelled: Sequence[LabelledSet]) -> None:
+    names = [each.name for each in labelled]
+    if len(set(names)) < len(names):
+        raise InputError(f"two data sets have one name ({', '.join(names)}); rename a folder")
+
+
+def _model_notices(seen: Sequence[Sequence[FoundSets]]) -> tuple[str, ...]:
+    """What the models note, each once."""
+    return tuple(dict.fromkeys(text for arm in seen for each in arm for text in each.notices))
+
+
+def write_evaluation(
+    evaluation: DetectorEvaluation, folder: Path, description: Mapping[str, Any]
+) -> None:
+    """Write detector.html, detector.json and detections.json; `description` is what was measured on what.
+
+    Raises StoreError on a full disk.
+    """
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    write_found(folder / FOUND, evaluation.found)
+    atomic_write_bytes(folder / NUMBERS, json_bytes(evaluation_numbers(evaluation, description)))
+    page = detector_page(
+        evaluation.found.name,
+        evaluation.sets,
+        evaluation.comparisons,
+        evaluation.worst,
+        description,
+    )
+    atomic_write_bytes(folder / PAGE, page.encode())
+
+
+def evaluation_numbers(
+    evaluation: DetectorEvaluation, description: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The content of detector.json: all numbers, without the list of every mistake."""
+    return {
+        "made_by": "sorvolo evaluate detector",
+        "format": 1,
+        **description,
+        "model": evaluation.found.name,
+        "classes": list(evaluation.found.classes),
+        "seconds_per_picture": evaluation.found.seconds_per_picture,
+        "sets": [
+            {key: value for key, value in asdict(each).items() if key != "mistakes"}
+            | {"thresholds": dict(evaluation.found.sets[each.name].thresholds)}
+            | {
+                "mistakes": {
+                    kind: sum(row.kind == kind for row in each.mistakes) for kind in _KINDS
+                }
+            }
+            for each in evaluation.sets
+        ],
+        "comparisons": list(evaluation.comparisons),
+    }
+
+
+def _held_out(labelled: LabelledSet, share: float, seed: int) -> LabelledSet:
+    _, kept, remarks = hold_out(labelled, share, seed)
+    if not len(kept):
+        raise InputError("; ".join(remarks))
+    notices = (*labelled.notices, *(Notice("held_out", len(kept), text) for text in remarks))
+    return replace(kept, name=labelled.name, notices=notices)
+
+
+def _found(
+    place: str,
+    labelled: Sequence[LabelledSet],
+    settings: EvaluationSettings,
+    progress: Callable[[EvaluationProgress], None],
+    reader: "_PictureReader",
+) -> FoundSets:
+    """What the model of this name or file finds, or what it found by an earlier file; nothing in damaged pictures."""
+    if Path(place).suffix == ".json":
+        found = read_found(Path(place))
+        return replace(
+            found, sets={each.name: _same_pictures(place, found, each, reader) for each in labelled}
+        )
+    detector = Detector.load(place, stand_in=False)
+    for each in labelled:
+        judged_classes(each, detector.classes)  # before an hour of looking
+    sets: dict[str, FoundSet] = {}
+    mixed: list[str] = []
+    seconds, count = 0.0, 0
+    for each in labelled:
+        detections = []
+        lights: list[Mapping[str, float]] = []
+        for picture in each.pictures:
+            image = reader.read(picture.path)
+            if image is None:
+                detections.append(no_detections(detector.classes))
+            else:
+                started = time.perf_counter()
+                detections.append(
+                    detector.detect(
+                        image,
+                        tiles=settings.tiles,
+                        m_per_px=picture.m_per_px,
+                        least_score=LEAST_SCORE,
+                        from_above=settings.from_above,
+                    )
+                )
+                seconds += time.perf_counter() - started
+                count += 1
+                least = detector.thresholds_for(image, from_above=settings.from_above)
+                lights.append({**detector.info.thresholds, **least})
+            progress(EvaluationProgress(detector.info.name, each.name, len(detections), len(each)))
+        usual = max(lights, key=lights.count, default=detector.info.thresholds)
+        if others := len(lights) - lights.count(usual):
+            mixed.append(
+                f"{each.name}: {others} of {len(lights)} pictures are of another light than most and are reported from "
+                "other scores on; what is reported is counted by the thresholds of most"
+            )
+        sets[each.name] = FoundSet(_names(each), tuple(detections), usual)
+    return FoundSets(
+        _arm_name(place),
+        detector.classes,
+        sets,
+        seconds / max(count, 1),
+        (*(notice.text for notice in detector.notices), *mixed),
+    )
+
+
+class _PictureReader:
+    """Reads pictures. Those that cannot be read are `damaged`, by path with the reason, and are not tried again."""
+
+    def __init__(self) -> None:
+        self.damaged: dict[str, str] = {}
+
+    def read(self, path: str) -> ImageRGB | None:
+        """The picture; None where it cannot be read."""
+        if path in self.damaged:
+            return None
+        try:
+            return read_picture(Path(path))
+        except (InputError, OSError) as error:
+            self.damaged[path] = str(error)
+            return None
+
+
+def _readable(labelled: LabelledSet, damaged: Mapping[str, str]) -> LabelledSet:
+    """The set without damaged pictures. Raises InputError where none is left."""
+    kept = [each for each in labelled.pictures if each.path not in damaged]
+    if not kept:
+        first = labelled.pictures[0].path
+        raise InputError(
+            f"none of the {len(labelled)} pictures of {labelled.name} can be read (first: {first}: {damaged[first]})"
+        )
+    return labelled.only(kept)
+
+
+def _without(
+    found: FoundSets, labelled: Sequence[LabelledSet], damaged: Mapping[str, str]
+) -> FoundSets:
+    """What was found, without the pictures that no model could be shown."""
+    sets = {}
+    for each in labelled:
+        one = found.sets[each.name]
+        rows = [row for row, picture in enumerate(each.pictures) if picture.path not in damaged]
+        sets[each.name] = replace(
+            one,
+            files=tuple(one.files[row] for row in rows),
+            detections=tuple(one.detections[row] for row in rows),
+        )
+    return replace(found, sets=sets)
+
+
+def _damage_notices(damaged: Mapping[str, str]) -> tuple[str, ...]:
+    if not damaged:
+        return ()
+    some = "; ".join(f"{path}: {reason}" for path, reason in list(damaged.items())[:_NAMED])
+    return (f"{counted(len(damaged), 'picture')} left out that cannot be read: {some}",)
+
+
+def _arm_name(place: str) -> str:
+    return Path(place).stem if Path(place).suffix == ".onnx" else place
+
+
+def _names(labelled: LabelledSet) -> tuple[str, ...]:
+    return tuple(Path(picture.path).name for picture in labelled.pictures)
+
+
+def _same_pictures(
+    place: str, found: FoundSets, labelled: LabelledSet, reader: _PictureReader
+) -> FoundSet:
+    """The file's detections in the order of the set's pictures; those that it lacks must be damaged ones."""
+    if labelled.name not in found.sets:
+        raise InputError(
+            f"{place}: holds detections of {', '.join(found.sets)}, none of {labelled.name}"
+        )
+    one = found.sets[labelled.name]
+    wanted = _names(labelled)
+    if one.files == wanted:
+        return one
+    by_name = dict(zip(one.files, one.detections))
+    missing = _readable_beside(labelled, by_name, reader)
+    repeats = len(by_name) < len(one.files) or len(set(wanted)) < len(wanted)
+    if missing or repeats:
+        raise InputError(
+            f"{place}: made on other pictures of {labelled.name}"
+            + (f"; {len(missing)} are missing, such as {missing[0]}" if missing else "")
+        )
+    nothing = no_detections(found.classes)
+    return replace(
+        one, files=wanted, detections=tuple(by_name.get(name, nothing) for name in wanted)
+    )
+
+
+def _readable_beside(
+    labelled: LabelledSet, known: Container[str], reader: _PictureReader
+) -> list[str]:
+    """The set's pictures that are not known by name, and can be read."""
+    return [
+        name
+        for name, picture in zip(_names(labelled), labelled.pictures)
+        if name not in known and reader.read(picture.path) is not None
+    ]
+
+
+def _side_by_side(
+    labelled: LabelledSet, seen: Sequence[Sequence[FoundSets]], settings: EvaluationSettings
+) -> SetComparison:
+    names = [arm[0].name + _more_seeds(len(arm) - 1) for arm in seen]
+    arms = []
+    for place, (name, arm) in enumerate(zip(names, seen), start=1):
+        seeds = [each.sets[labelled.name] for each in arm]
+        arms.append(
+            Arm(
+                name if names.count(name) == 1 else f"{name} ({place})",
+                arm[0].classes,
+                tuple(each.detections for each in seeds),
+                tuple(each.thresholds for each in seeds),
+            )
+        )
+    return compare_arms(labelled, arms, draws=settings.draws, seed=settings.seed)
+
+
+def _more_seeds(count: int) -> str:
+    return f" and {count} more seed{'s' if count > 1 else ''}" if count else ""
+
+
+def _worst(
+    labelled: LabelledSet, scores: SetScores, found: FoundSet
+) -> Iterator[tuple[Mistake, str, ImageRGB]]:
+    """The surest false alarms and confusions and the largest misses, with the picture's name and a crop."""
+    reader = _PictureReader()
+    for kind in _KINDS:
+        mistakes = [each for each in scores.mistakes if each.kind == kind]
+        mistakes.sort(key=_area_px if kind == "miss" else lambda each: each.score, reverse=True)
+        for mistake in _few_of_each_picture(mistakes):
+            picture = labelled.pictures[mistake.picture]
+            reported = _reported(found.detections[mistake.picture], found.thresholds)
+            image = reader.read(picture.path)
+            if image is not None:  # of detections.json the pictures were not needed so far
+                crop = mistake_picture(
+                    image, mistake.box_px, _judged_boxes(picture, labelled, scores), reported
+                )
+                yield mistake, Path(picture.path).name, crop
+
+
+def _area_px(mistake: Mistake) -> float:
+    left, top, right, bottom = mistake.box_px
+    return (right - left) * (bottom - top)
+
+
+def _few_of_each_picture(mistakes: Iterable[Mistake]) -> Iterator[Mistake]:
+    shown: dict[int, int] = {}
+    for mistake in mistakes:
+        shown[mistake.picture] = shown.get(mistake.picture, 0) + 1
+        if shown[mistake.picture] <= _SHOWN_OF_ONE:
+            yield mistake
+        if sum(min(count, _SHOWN_OF_ONE) for count in shown.values()) >= _SHOWN:
+            return
+
+
+def _judged_boxes(picture: LabelledPicture, labelled: LabelledSet, scores: SetScores) -> BoxesPx:
+    judged = {labelled.classes.index(each.label) for each in scores.classes}
+    return picture.boxes_px[[label in judged for label in picture.labels.tolist()]]
+
+
+def _reported(found: Detections, thresholds: Mapping[str, float]) -> BoxesPx:
+    return found.boxes_px[
+        [score >= thresholds[name] for score, name in zip(found.scores, found.names)]
+    ]

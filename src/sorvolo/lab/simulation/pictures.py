@@ -1,0 +1,288 @@
+"""Single pictures of many small sites, each seen once from its own height, angle and light, with the truth."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.level_ground import footprint, ground_from_pixels
+from sorvolo.geometry.polygons import polygon_area
+from sorvolo.geometry.pose import Pose, site_from_body_nadir_rotation
+from sorvolo.lab.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
+from sorvolo.lab.simulation.ground_painting import Area, GroundRaster
+from sorvolo.lab.simulation.photographed import photographed
+from sorvolo.lab.simulation.rendering import render, render_labels
+from sorvolo.lab.simulation.settings import LaterSettings, SimulationSettings, WeatherSettings
+from sorvolo.lab.simulation.thermal import heat_picture, warm_day
+from sorvolo.lab.simulation.truth import box_rows
+from sorvolo.lab.simulation.world import Day, World, build_day, is_free, scenery
+from sorvolo.search.drawing.objects import LYING, POSES, Label, Thing, new_kind, new_size
+from sorvolo.search.drawing.view import camera_view, ray_grid
+
+SMALLEST_PX = 4
+"""An object whose box has no side this long, or of which less than `LEAST_VISIBLE` shows, is a region to ignore."""
+
+LEAST_VISIBLE = 0.3  # share of an object; less is not to be recognised; by choice
+
+_SIZES_PX = ((640, 640), (960, 540), (832, 624), (768, 768))
+_THERMAL_SIZE_PX = (640, 512)  # of the common sensors
+_MARGIN_M = 5.0  # things and shadows just outside the picture reach into it
+_LARGEST_GROUND_PX = 4e6  # pixels of painted ground, which bounds the memory
+_STEEPEST_DEG = 72.0  # no ray is nearer to the horizon: there is no ground painted
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """What single pictures show. The same settings and seed give the same pictures, each whatever their number.
+
+    `ground` is a GroundKind's name, "orthophoto", or empty for all kinds in turn. `m_per_px` and `height_m` are the
+    lowest and the highest ground sampling distance (drawn evenly in its logarithm) and height above ground;
+    `tilt_deg` is how far the camera may look away from straight down.
+    """
+
+    pictures: int = 100
+    seed: int = 1
+    ground: str = ""
+    thermal_share: float = 0.0
+    empty_share: float = 0.06  # of pictures without any person, car or small object
+    m_per_px: tuple[float, float] = (0.015, 0.12)
+    height_m: tuple[float, float] = (10.0, 120.0)
+    tilt_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        if self.ground not in ("", *GroundKind, "orthophoto"):
+            raise SettingsError(
+                f"unknown ground {self.ground!r}; choose {', '.join(GroundKind)}, or an orthophoto's file"
+            )
+        for name, value, low, high in (
+            ("pictures", self.pictures, 1, 10**6),
+            ("seed", self.seed, 0, 2**62),
+            ("thermal_share", self.thermal_share, 0, 1),
+            ("empty_share", self.empty_share, 0, 1),
+            ("m_per_px", self.m_per_px[0], 0.004, self.m_per_px[1]),
+            ("m_per_px", self.m_per_px[1], 0.004, 0.5),
+            ("height_m", self.height_m[0], 4, self.height_m[1]),
+            ("height_m", self.height_m[1], 4, 500),
+            ("tilt_deg", self.tilt_deg, 0, 45),
+        ):
+            if not low <= value <= high:
+                raise SettingsError(f"{name} must lie in [{low}, {high}], got {value}")
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedPicture:
+    """One picture and what is in it; `boxes` are COCO annotations, those to be ignored with `iscrowd` 1.
+
+    `m_per_px` is the ground sampling distance in the middle of the picture, across the line of sight.
+    """
+
+    index: int
+    image: ImageRGB
+    camera: Camera
+    site_from_camera: Pose
+    m_per_px: float
+    ground: str
+    is_thermal: bool
+    boxes: tuple[dict[str, Any], ...]
+
+
+def simulate_picture(
+    settings: PictureSettings, index: int, orthophoto: PaintedGround | None = None
+) -> SimulatedPicture:
+    """The picture of this index, counted from 0; its boxes' ids count from 1.
+
+    Raises SettingsError when the ground is an orthophoto that is missing or too small for any of the heights.
+    """
+    if (settings.ground == "orthophoto") != (orthophoto is not None):
+        raise SettingsError(
+            "an orthophoto was asked for but none given, or given but not asked for"
+        )
+    rng = np.random.default_rng([settings.seed, 20, index])
+    is_thermal = bool(rng.uniform() < settings.thermal_share)
+    largest_m = None if orthophoto is None else min(orthophoto.raster.area.size_m)
+    camera, pose = _new_shot(settings, is_thermal, largest_m, rng)
+    m_per_px = _m_per_px(camera, pose)
+    area = _needed_area(camera, pose)
+    ground = settings.ground or str(rng.choice(list(GroundKind), p=(0.25, 0.35, 0.3, 0.1)))
+    if orthophoto is not None:
+        painted = _cut(orthophoto, area, rng)
+    else:
+        width_m, height_m = area.size_m
+        fine_m = max(0.72 * m_per_px, float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)))
+        painted = paint_ground(GroundKind(ground), area, fine_m, rng)
+    things = scenery(ground, painted.layout, rng) if ground != "orthophoto" else ()
+    if rng.uniform() >= settings.empty_share:
+        things += _targets(things, painted.layout, camera, pose, rng)
+    day = _new_day(painted.raster, things, m_per_px, rng)
+    view = camera_view(camera, pose, ray_grid(camera))
+    if is_thermal:
+        image = heat_picture(render(warm_day(day, painted.raster, rng), view, pose, 0.0), rng)
+    else:
+        image = photographed(render(day, view, pose, 0.0), day.gains, rng)
+    labels, totals = render_labels(things, day.bodies, view, pose, 0.0)
+    boxes = tuple(_judged(row) for row in box_rows(things, labels, totals, index + 1, 1))
+    return SimulatedPicture(index, image, camera, pose, m_per_px, ground, is_thermal, boxes)
+
+
+def _judged(row: dict[str, Any]) -> dict[str, Any]:
+    is_seen = max(row["bbox"][2:]) >= SMALLEST_PX and row["visibility"] >= LEAST_VISIBLE
+    return row | {"iscrowd": 0 if is_seen else 1}
+
+
+def _new_shot(
+    settings: PictureSettings, is_thermal: bool, largest_m: float | None, rng: np.random.Generator
+) -> tuple[Camera, Pose]:
+    """A camera without distortion somewhere above the site's origin; `largest_m` bounds the ground that it needs."""
+    for _ in range(2000):
+        width_px, height_px = (
+            _THERMAL_SIZE_PX if is_thermal else _SIZES_PX[rng.integers(len(_SIZES_PX))]
+        )
+        camera = Camera.from_angle_of_view(width_px, height_px, float(rng.uniform(30, 84)))
+        m_per_px = float(np.exp(rng.uniform(*np.log(settings.m_per_px))))
+        pitch_deg = float(
+            abs(rng.normal(0, 5))
+            if rng.uniform() < 0.55
+            else rng.uniform(0.2, 1.0) * settings.tilt_deg
+        )
+        pitch_deg = min(pitch_deg, settings.tilt_deg)
+        height_m = m_per_px * camera.fx_px * float(np.cos(np.radians(pitch_deg)))
+        rotation = site_from_body_nadir_rotation(
+            float(rng.uniform(0, 360)), pitch_deg, float(rng.normal(0, 2))
+        )
+        pose = Pose(rotation, np.array([0.0, 0.0, height_m]))
+        down = -(camera.rays_from_pixels(camera.corners_px) @ rotation.T)[:, 2]
+        lengths = np.linalg.norm(camera.rays_from_pixels(camera.corners_px), axis=1)
+        if not settings.height_m[0] <= height_m <= settings.height_m[1]:
+            continue
+        if (down / lengths).min() < np.cos(np.radians(_STEEPEST_DEG)):
+            continue
+        if largest_m is None or max(_needed_area(camera, pose).size_m) < largest_m:
+            return camera, pose
+    bound = (
+        ""
+        if largest_m is None
+        else f", nor any that sees no more than {largest_m:.0f} m of the orthophoto"
+    )
+    raise SettingsError(
+        f"no camera sees the ground at {settings.m_per_px[0]:g} to {settings.m_per_px[1]:g} m per pixel from"
+        f" {settings.height_m[0]:g} to {settings.height_m[1]:g} m{bound}; widen one of them"
+    )
+
+
+def _m_per_px(camera: Camera, pose: Pose) -> float:
+    middle = ground_from_pixels(camera, pose, np.array([[camera.cx_px, camera.cy_px]]))[0]
+    return float(np.linalg.norm(pose.translation_m - [*middle, 0.0])) / camera.fx_px
+
+
+def _needed_area(camera: Camera, pose: Pose) -> Area:
+    outline_m = footprint(camera, pose)
+    low, high = outline_m.min(axis=0) - _MARGIN_M, outline_m.max(axis=0) + _MARGIN_M
+    return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def _cut(orthophoto: PaintedGround, area: Area, rng: np.random.Generator) -> PaintedGround:
+    """A random piece of an orthophoto laid where the area is."""
+    raster = orthophoto.raster
+    columns, rows = (round(size / step) for size, step in zip(area.size_m, raster.m_per_px))
+    left = int(rng.integers(max(1, raster.rgb.shape[1] - columns)))
+    top = int(rng.integers(max(1, raster.rgb.shape[0] - rows)))
+    window = slice(top, top + rows), slice(left, left + columns)
+    piece = GroundRaster(
+        raster.rgb[window], raster.vegetation[window], area.west_m, area.north_m, raster.m_per_px
+    )
+    return PaintedGround(piece, orthophoto.layout)
+
+
+def _new_day(
+    ground: GroundRaster, things: tuple[Thing, ...], m_per_px: float, rng: np.random.Generator
+) -> Day:
+    """The site under a light of its own: mostly day, sometimes dusk, street lamps or snow."""
+    sky = rng.uniform()
+    weather = WeatherSettings(
+        has_clouds=False,
+        wind_m=0.0,
+        brightness=float(
+            rng.uniform(0.05, 0.12) if sky < 0.05 else rng.uniform(0.2, 0.6) if sky < 0.15 else 1.0
+        ),
+        snow=float(rng.uniform(0.3, 1.0)) if rng.uniform() < 0.05 else 0.0,
+    )
+    settings = SimulationSettings(
+        seed=int(rng.integers(2**31)), later=LaterSettings(weather=weather)
+    )
+    return build_day(World(ground, (things, things)), settings, 2, m_per_px)
+
+
+def _targets(
+    others: tuple[Thing, ...], layout: Layout, camera: Camera, pose: Pose, rng: np.random.Generator
+) -> tuple[Thing, ...]:
+    """People, cars and small objects in sight, as many as a lonely field, a street or a crowd has."""
+    ground_m2 = polygon_area([footprint(camera, pose)])
+    counts = {
+        label: int(min(rng.poisson(rng.choice(means)), ground_m2 / room_m2))
+        for label, means, room_m2 in (
+            (Label.PERSON, (0.5, 3.0, 9.0), 10.0),
+            (Label.CAR, (0.2, 2.0, 8.0), 45.0),
+            (Label.SMALL, (0.5, 2.0, 6.0), 6.0),
+        )
+    }
+    placed: list[Thing] = []
+    for label in (Label.CAR, Label.PERSON, Label.SMALL):
+        for _ in range(counts[label]):
+            kind = _person(rng) if label is Label.PERSON else new_kind(label, rng)
+            size_m = new_size(label, kind, rng)
+            new = Thing(
+                len(others) + len(placed) + 1,
+                label,
+                kind,
+                0.0,
+                0.0,
+                0.0,
+                size_m,
+                int(rng.integers(2**31)),
+            )
+            for _ in range(20):
+                east, north, yaw_deg = _place(label, placed, layout, camera, pose, rng)
+                new = replace(new, east_m=east, north_m=north, yaw_deg=yaw_deg)
+                if is_free(new, (*others, *placed)):
+                    placed.append(new)
+                    break
+    return tuple(placed)
+
+
+def _person(rng: np.random.Generator) -> str:
+    """A kind of person: mostly one drawn limb by limb, else the plain figures of simulated flights."""
+    if rng.uniform() < 0.25:
+        return LYING if rng.uniform() < 0.2 else str(Label.PERSON)
+    return str(rng.choice(list(POSES), p=(0.28, 0.34, 0.08, 0.08, 0.1, 0.12)))
+
+
+def _place(
+    label: Label,
+    placed: list[Thing],
+    layout: Layout,
+    camera: Camera,
+    pose: Pose,
+    rng: np.random.Generator,
+) -> tuple[float, float, float]:
+    """East, north and yaw of a likely place: anywhere in the picture, on a parking lot, or beside another thing."""
+    if label is Label.CAR and len(layout.parkings) and rng.uniform() < 0.6:
+        east, north, yaw_deg = layout.parkings[rng.integers(len(layout.parkings))]
+        return float(east), float(north), float(yaw_deg + 180 * rng.integers(2) + rng.normal(0, 2))
+    if placed and rng.uniform() < 0.35:
+        near = placed[int(rng.integers(len(placed)))]
+        if label is Label.CAR and near.label is Label.CAR:  # parked side by side
+            side_m = near.turn[:2, 1] * float(rng.choice((-1, 1)) * rng.uniform(3.2, 4.0))
+            return (
+                near.east_m + side_m[0],
+                near.north_m + side_m[1],
+                near.yaw_deg + float(rng.normal(0, 2)),
+            )
+        angle, reach_m = rng.uniform(0, 2 * np.pi), near.reach_m + rng.uniform(0.8, 3.0)
+        east, north = near.east_m + reach_m * np.cos(angle), near.north_m + reach_m * np.sin(angle)
+        return float(east), float(north), float(rng.uniform(0, 360))
+    point_px: Floats = rng.uniform([0, 0], [camera.width_px, camera.height_px])[None]
+    east, north = ground_from_pixels(camera, pose, point_px)[0]
+    return float(east), float(north), float(rng.uniform(0, 360))

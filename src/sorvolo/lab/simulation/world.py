@@ -1,0 +1,460 @@
+"""The simulated site: its ground, what stands on it on each day, and each day's light."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sorvolo.errors import SettingsError
+from sorvolo.geometry.arrays import Floats
+from sorvolo.lab.simulation.clock import sun_of_flight
+from sorvolo.lab.simulation.ground import GroundKind, Layout, PaintedGround, paint_ground
+from sorvolo.lab.simulation.ground_painting import Area, GroundRaster
+from sorvolo.lab.simulation.relief import LEVEL, Relief
+from sorvolo.lab.simulation.settings import SceneSettings, SimulationSettings, WeatherSettings
+from sorvolo.search.drawing.bodies import build_body
+from sorvolo.search.drawing.noise import fractal
+from sorvolo.search.drawing.objects import (
+    SMALL_KINDS,
+    Body,
+    Label,
+    Light,
+    Thing,
+    new_kind,
+    new_size,
+)
+from sorvolo.search.drawing.shadows import SHADOW_TINT, cast_shadow, own_shadow
+from sorvolo.search.drawing.view import Patch, blend, map_view, sample_patches
+
+_LARGEST_GROUND_PX = 26e6  # pixels of painted ground, which bounds the memory
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """The site through all flights: its ground without shadows, its hills, and the things of each flight, in order."""
+
+    ground: GroundRaster
+    days: tuple[tuple[Thing, ...], ...]
+    relief: Relief = LEVEL
+
+    @property
+    def things(self) -> dict[int, list[int]]:
+        """Object id -> the flights, counted from 1, in which it is present."""
+        present: dict[int, list[int]] = {}
+        for flight, day in enumerate(self.days, start=1):
+            for thing in day:
+                present.setdefault(thing.id, []).append(flight)
+        return present
+
+
+@dataclass(frozen=True, eq=False)
+class Day:
+    """The site on the day of one flight: the ground with its static shadows, and all bodies ready to be seen.
+
+    `gains` (3,) is the light's colour and strength; `cloud_shade` (0 = clear) is how dark clouds'
+    shadows are. `shadows` holds the shadow patches of what moves, by object id.
+    """
+
+    ground: GroundRaster
+    things: tuple[Thing, ...]
+    bodies: dict[int, Body]
+    shadows: dict[int, Patch]
+    light: Light
+    gains: Floats
+    cloud_shade: float
+    relief: Relief = LEVEL
+
+
+def needed_area(settings: SimulationSettings, waypoints_m: Floats, margin_m: float = 4.0) -> Area:
+    """The ground that can come into sight from these waypoints, (N, 2), all flights' height and tilt included."""
+    farthest_m = max(_reach_m(settings.of_flight(flight), flight) for flight in (1, 2))
+    reach_m = margin_m + 4 * settings.motion.drift_rms_m + farthest_m
+    low, high = waypoints_m.min(axis=0) - reach_m, waypoints_m.max(axis=0) + reach_m
+    return Area(float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+def _reach_m(settings: SimulationSettings, flight: int) -> float:
+    """How far from the point below it the camera of a flight may see the ground."""
+    camera = settings.imaging.camera
+    height_factor = 1.0 if flight == 1 else settings.later.revisit.height_factor
+    height_m = (
+        settings.path.height_m * height_factor
+        + 4 * settings.motion.height_rms_m
+        + settings.scene.relief_m
+    )
+    across = 0.5 * camera.width_px / camera.fx_px, 0.5 * camera.height_px / camera.fy_px
+    # barrel distortion shows more than the pinhole's angle: its rays are the truth
+    corner = np.abs(camera.rays_from_pixels(camera.corners_px)[:, :2]).max(axis=0)
+    half_angle = np.arctan(float(np.hypot(max(across[0], corner[0]), max(across[1], corner[1]))))
+    tilt = np.radians(4.5 * settings.motion.tilt_rms_deg + settings.motion.camera_pitch_deg + 90)
+    return height_m * float(np.tan(min(half_angle + tilt, np.radians(80))))
+
+
+def build_world(
+    settings: SimulationSettings, plans_m: Sequence[Floats], orthophoto: PaintedGround | None = None
+) -> World:
+    """The site that these flights need, from the settings' seed.
+
+    `plans_m` are the flights' waypoints, (N, 2) each. Things are placed along the first, so that the first
+    flight is the same however many follow. Raises SettingsError when a given orthophoto is missing, or too
+    small for the flights.
+    """
+    area = needed_area(settings, np.concatenate(plans_m))
+    rng = np.random.default_rng([settings.seed, 1])
+    if settings.scene.ground == "orthophoto":
+        if orthophoto is None:
+            raise SettingsError("the ground is an orthophoto, but none was given")
+        painted = orthophoto
+        _demand_cover(painted.raster.area, area)
+    else:
+        width_m, height_m = area.size_m
+        m_per_px = max(
+            min(0.025, 0.72 * settings.m_per_px),
+            float(np.sqrt(width_m * height_m / _LARGEST_GROUND_PX)),
+        )
+        painted = paint_ground(GroundKind(settings.scene.ground), area, m_per_px, rng)
+    relief = Relief.hills(
+        settings.scene.relief_m,
+        settings.path.height_m,
+        area,
+        np.random.default_rng([settings.seed, 10]),
+    )
+    first = _furnish(
+        settings.scene,
+        painted.layout,
+        plans_m[0],
+        settings,
+        np.random.default_rng([settings.seed, 2]),
+    )
+    days = [first]
+    for flight in range(2, settings.flights + 1):
+        days.append(_next_day(days[0], painted.layout, plans_m[0], settings, flight))
+    return World(
+        painted.raster,
+        tuple(tuple(_on_hills(thing, relief) for thing in day) for day in days),
+        relief,
+    )
+
+
+def _on_hills(thing: Thing, relief: Relief) -> Thing:
+    if relief.is_level:
+        return thing
+    places = np.array([thing.place_m(-1.0), thing.place_m(0.0), thing.place_m(1.0)])[:, :2]
+    before_m, here_m, after_m = relief.up_m(places)
+    return replace(thing, up_m=float(here_m), climb_m_s=float(after_m - before_m) / 2)
+
+
+def build_day(world: World, settings: SimulationSettings, flight: int, m_per_px: float) -> Day:
+    """The site as one flight, counted from 1, finds it, fine enough for pictures of `m_per_px` on the ground."""
+    rng = np.random.default_rng([settings.seed, 3, flight])
+    weather = settings.later.weather if flight > 1 else WeatherSettings(False, False, 0.0)
+    light, gains = Light(sun_of_flight(settings, flight)), _gains(weather, rng)
+    things = world.days[flight - 1]
+    ground = world.ground.resampled(0.72 * m_per_px)
+    if weather.snow:
+        ground = _snowed_in(ground, weather.snow, np.random.default_rng([settings.seed, 9, flight]))
+    if weather.wind_m:
+        ground = _blown(ground, weather.wind_m, rng)
+        things = _swayed(things, weather.wind_m, rng)
+    bodies = {thing.id: build_body(thing, light, m_per_px) for thing in things}
+    standing = [thing for thing in things if not thing.is_moving]
+    ground = _with_shadows(ground, standing, bodies, light)
+    shadows = {
+        thing.id: own_shadow(thing, bodies[thing.id], light, m_per_px)
+        for thing in things
+        if thing.is_moving
+    }
+    cloud_shade = 0.38 if weather.has_clouds else 0.0
+    return Day(ground, things, bodies, shadows, light, gains, cloud_shade, world.relief)
+
+
+def _gains(weather: WeatherSettings, rng: np.random.Generator) -> Floats:
+    """The camera's gains, (3,), on a day."""
+    is_other = weather.has_other_light
+    warmth = rng.uniform(-0.06, 0.06) if is_other else 0.0
+    gains = np.array([1 + warmth, 1.0, 1 - warmth]) * (rng.uniform(0.82, 1.12) if is_other else 1.0)
+    return np.asarray(gains * weather.brightness)
+
+
+def _swayed(
+    things: tuple[Thing, ...], wind_m: float, rng: np.random.Generator
+) -> tuple[Thing, ...]:
+    """The things, trees moved by the wind."""
+    return tuple(
+        replace(thing, sway_m=(rng.normal(0, 2.0 * wind_m), rng.normal(0, 2.0 * wind_m)))
+        if thing.label is Label.TREE
+        else thing
+        for thing in things
+    )
+
+
+def scenery(ground: str, layout: Layout, rng: np.random.Generator) -> tuple[Thing, ...]:
+    """The houses, trees and bushes of a layout, ids from 1; towns have flat roofs."""
+    roof = "flat roof" if ground == GroundKind.URBAN else "gable roof"
+    things: list[Thing] = []
+    for kind, label, places in (
+        (roof, Label.HOUSE, layout.houses),
+        ("tree", Label.TREE, layout.trees),
+        ("bush", Label.TREE, layout.bushes),
+    ):
+        for east, north, yaw in places:
+            size = new_size(label, kind, rng)
+            seed = int(rng.integers(2**31))
+            things.append(
+                Thing(
+                    len(things) + 1, label, kind, float(east), float(north), float(yaw), size, seed
+                )
+            )
+    return tuple(things)
+
+
+def is_free(thing: Thing, others: Sequence[Thing]) -> bool:
+    """Whether a thing can stand where it is beside the others, a little air between them."""
+    return all(
+        np.hypot(thing.east_m - other.east_m, thing.north_m - other.north_m)
+        > thing.reach_m * 0.8
+        + other.reach_m * (0.9 if other.label is not Label.HOUSE else 1.05)
+        + 0.6
+        for other in others
+    )
+
+
+def _furnish(
+    scene: SceneSettings,
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    rng: np.random.Generator,
+) -> tuple[Thing, ...]:
+    """The things of the first flight: scenery first, then targets."""
+    things = list(scenery(scene.ground, layout, rng)) if scene.has_scenery else []
+    wanted = (
+        [Label.PERSON] * scene.people
+        + [Label.CAR] * scene.cars
+        + [Label.SMALL] * scene.small_objects
+    )
+    for label in wanted:
+        things.append(_place(label, len(things) + 1, things, layout, waypoints_m, settings, rng))
+    return tuple(things)
+
+
+def _next_day(
+    first: tuple[Thing, ...],
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    flight: int,
+) -> tuple[Thing, ...]:
+    """The things of a later flight: some targets of the first are gone, some moved, some are new, some move."""
+    rng = np.random.default_rng([settings.seed, 4, flight])
+    today = _left_and_moved(first, layout, waypoints_m, settings, rng)
+    next_id = 1000 * flight
+    later = settings.later
+    came = (
+        [Label.PERSON] * later.people
+        + [Label.CAR] * later.cars
+        + [Label.SMALL] * later.small_objects
+    )
+    for i, label in enumerate(came):
+        today.append(_place(label, next_id + i, today, layout, waypoints_m, settings, rng))
+    return tuple(
+        _set_off(thing, today, rng)
+        if thing.label in (Label.PERSON, Label.CAR) and rng.uniform() < settings.scene.moving_share
+        else thing
+        for thing in today
+    )
+
+
+def _left_and_moved(
+    first: tuple[Thing, ...],
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    rng: np.random.Generator,
+) -> list[Thing]:
+    """The first flight's things, some of its targets taken away, some moved."""
+    targets = [thing for thing in first if thing.label.is_target]
+    order = [targets[i].id for i in rng.permutation(len(targets))]
+    removed = set(order[: settings.later.removed])
+    shifted = set(order[settings.later.removed : settings.later.removed + settings.later.moved])
+    today = [thing for thing in first if thing.id not in removed]
+    for i, thing in enumerate(today):
+        if thing.id in shifted:
+            others = [other for other in today if other.id != thing.id]
+            place = _place(thing.label, thing.id, others, layout, waypoints_m, settings, rng)
+            today[i] = replace(
+                thing, east_m=place.east_m, north_m=place.north_m, yaw_deg=place.yaw_deg
+            )
+    return today
+
+
+def _place(
+    label: Label,
+    thing_id: int,
+    others: list[Thing],
+    layout: Layout,
+    waypoints_m: Floats,
+    settings: SimulationSettings,
+    rng: np.random.Generator,
+) -> Thing:
+    """A new target near the flown path, free of what stands there already."""
+    kind = (
+        SMALL_KINDS[int(rng.integers(len(SMALL_KINDS)))]
+        if label is Label.SMALL
+        else new_kind(label, rng)
+    )
+    size = new_size(label, kind, rng)
+    thing = Thing(thing_id, label, kind, 0.0, 0.0, 0.0, size, int(rng.integers(2**31)))
+    half_strip_m = 0.4 * settings.imaging.height_px * settings.m_per_px
+    near_path = (
+        layout.parkings[
+            [_distance_to_path(place[:2], waypoints_m) < half_strip_m for place in layout.parkings]
+        ]
+        if len(layout.parkings)
+        else layout.parkings
+    )
+    for attempt in range(400):
+        if label is Label.CAR and len(near_path) and attempt < 100:
+            east, north, yaw = near_path[int(rng.integers(len(near_path)))]
+            yaw = yaw + 180 * rng.integers(2) + rng.normal(0, 1.5)
+        else:
+            leg = int(rng.integers(len(waypoints_m) - 1))
+            along = waypoints_m[leg] + rng.uniform(0.03, 0.97) * (
+                waypoints_m[leg + 1] - waypoints_m[leg]
+            )
+            east, north = along + rng.uniform(-half_strip_m, half_strip_m, 2)
+            yaw = rng.uniform(0, 360)
+        thing = replace(thing, east_m=float(east), north_m=float(north), yaw_deg=float(yaw))
+        if is_free(thing, others):
+            break
+    return thing  # on a crowded site the last try stands: two boxes may touch
+
+
+def _set_off(thing: Thing, others: list[Thing], rng: np.random.Generator) -> Thing:
+    """The thing on its way: a person walks anywhere, a car drives straight on, where no scenery is in the way."""
+    is_car = thing.label is Label.CAR
+    speed = rng.uniform(2.0, 4.0) if is_car else rng.uniform(0.7, 1.5)
+    for _ in range(30):
+        yaw = thing.yaw_deg if is_car else rng.uniform(0, 360)
+        direction = np.array([np.cos(np.radians(yaw)), np.sin(np.radians(yaw))])
+        ahead = (
+            np.array([[thing.east_m, thing.north_m]])
+            + direction * np.linspace(-12, 12, 13)[:, None] * speed / 1.5
+        )
+        if all(
+            np.hypot(ahead[:, 0] - other.east_m, ahead[:, 1] - other.north_m).min()
+            > thing.reach_m + other.reach_m
+            for other in others
+            if not other.label.is_target
+        ):
+            velocity = (float(direction[0] * speed), float(direction[1] * speed))
+            return replace(thing, yaw_deg=float(yaw), velocity_m_s=velocity)
+    return thing
+
+
+def _distance_to_path(point_m: Floats, waypoints_m: Floats) -> float:
+    start, along = waypoints_m[:-1], np.diff(waypoints_m, axis=0)
+    share = np.clip(((point_m - start) * along).sum(axis=1) / (along**2).sum(axis=1), 0, 1)
+    return float(np.hypot(*(start + share[:, None] * along - point_m).T).min())
+
+
+def _blown(ground: GroundRaster, wind_m: float, rng: np.random.Generator) -> GroundRaster:
+    """The ground after its plants have moved by about `wind_m`, each tuft its own way."""
+    if not ground.vegetation.any():
+        return ground
+    shape = ground.rgb.shape[:2]
+    rows, columns = shape
+    # a kerb beside grass does not bend with it
+    plants = cv2.erode(
+        ground.vegetation,
+        np.ones((3, 3), np.uint8),
+        iterations=max(1, round(0.06 / ground.m_per_px[0])),
+    )
+    weight = cv2.GaussianBlur(plants, (0, 0), 1.5).astype(np.float32) / 255
+    moved = np.empty_like(ground.rgb)
+    push = [
+        weight
+        * fractal(rng, shape, ground.m_per_px[0], (0.4, 1.2), (0.8, 0.6))
+        * np.float32(wind_m / ground.m_per_px[0])
+        for _ in range(2)
+    ]
+    x = np.arange(columns, dtype=np.float32)[None, :]
+    for top in range(0, rows, 512):  # a map of the whole raster would be needlessly large
+        end = min(top + 512, rows)
+        y = np.arange(top, end, dtype=np.float32)[:, None]
+        moved[top:end] = cv2.remap(
+            ground.rgb,
+            x + push[0][top:end],
+            y + push[1][top:end],
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+    return replace(ground, rgb=moved)
+
+
+def _snowed_in(ground: GroundRaster, share: float, rng: np.random.Generator) -> GroundRaster:
+    """The ground with snow on about this share of it, almost without texture; what stands on it stays bare."""
+    shape = ground.rgb.shape[:2]
+    drifts = fractal(rng, shape, ground.m_per_px[0], (0.5, 2.0, 6.0), (0.4, 0.8, 1.0))
+    depth = (
+        np.clip(0.5 + 2.0 * (drifts - np.float32(np.quantile(drifts, 1 - share))), 0, 1)
+        if share < 1
+        else 1.0
+    )
+    white = 226 + 5 * fractal(rng, shape, ground.m_per_px[0], (0.05, 0.3, 1.5), (0.6, 0.8, 1.0))
+    cover = np.broadcast_to(np.float32(depth), shape)[..., None]
+    rgb = ground.rgb * (1 - cover) + white[..., None] * cover
+    return replace(ground, rgb=np.clip(rgb, 0, 255).astype(np.uint8))
+
+
+def _with_shadows(
+    ground: GroundRaster, things: list[Thing], bodies: dict[int, Body], light: Light
+) -> GroundRaster:
+    height, width = ground.rgb.shape[:2]
+    depth = np.zeros((height, width), np.uint8)
+    sun_view = map_view(ground.west_m, ground.north_m, ground.m_per_px, (width, height), light.sun)
+    for thing in things:
+        foot = np.append(
+            thing.place_m(0.0)[:2], 0.0
+        )  # the ground around is as high as it: its shadow begins there
+        cast_shadow(bodies[thing.id].placed(thing.turn, foot, sun_view.eye_m), sun_view, depth)
+    if not depth.any():
+        return ground
+    depth[:] = cv2.GaussianBlur(
+        depth, (0, 0), max(0.6, 0.03 / ground.m_per_px[0])
+    )  # the sun is no point
+    rgb = ground.rgb.copy()
+    for top in range(0, height, 512):
+        part = slice(top, top + 512)
+        share = depth[part, :, None].astype(np.float32) / 255
+        rgb[part] = (rgb[part] * (1 - share * (1 - SHADOW_TINT))).astype(np.uint8)
+    return replace(ground, rgb=rgb)
+
+
+def orthophoto(day: Day) -> GroundRaster:
+    """The day's ground seen straight from above, with everything that stands still on it."""
+    rgb = day.ground.rgb.copy()
+    height, width = rgb.shape[:2]
+    view = map_view(day.ground.west_m, day.ground.north_m, day.ground.m_per_px, (width, height))
+    for thing in sorted(day.things, key=lambda each: each.size_m[2]):
+        if not thing.is_moving:
+            patches = day.bodies[thing.id].placed(thing.turn, thing.place_m(0.0), view.eye_m)
+            for window, sample in sample_patches(view, patches):
+                blend(rgb, window, sample)
+    return replace(day.ground, rgb=rgb)
+
+
+def _demand_cover(given: Area, needed: Area) -> None:
+    if (
+        given.west_m > needed.west_m
+        or given.south_m > needed.south_m
+        or given.east_m < needed.east_m
+        or given.north_m < needed.north_m
+    ):
+        have, need = given.size_m, needed.size_m
+        raise SettingsError(
+            f"the orthophoto covers {have[0]:.0f} x {have[1]:.0f} m, but the flight sees up to"
+            f" {need[0]:.0f} x {need[1]:.0f} m;"
+            " fly lower or a shorter path, or give a larger orthophoto"
+        )

@@ -1,0 +1,226 @@
+"""Section 4.2: change detection videos against the maps of their paths, counted by frame and by pixel, and timed."""
+
+import math
+import os
+import shutil
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from sorvolo.capture.source import open_sources
+from sorvolo.change.metrics import Counts
+from sorvolo.change.pair.thesis import compare_thesis
+from sorvolo.change.pair.thesis_options import thesis_options
+from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, ImageRGB
+from sorvolo.lab.datasets.umcd import read_umcd_metadata
+from sorvolo.lab.datasets.umcd_folder import UmcdVideo
+from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.evaluation.mask_folders import (
+    ComparedMask,
+    compared_masks,
+    frames_against_times,
+)
+from sorvolo.lab.thesis.settings import COMPARISONS, FIGURE_PX
+from sorvolo.lab.thesis.video_input import VideoInput
+from sorvolo.missions.compare.flights import compare_flights
+from sorvolo.missions.flight.settings import CompareSettings
+from sorvolo.mosaic.frame_deviation import MapDeviation
+from sorvolo.store.atomic import writing
+from sorvolo.store.exports.annotated import with_outlines
+from sorvolo.store.images import jpeg_from_image
+from sorvolo.store.mask_pictures import read_mask
+from sorvolo.store.site.archive import Archive
+from sorvolo.survey.flight import Frame
+
+MASKS, TIMES = "change masks", "times of appearance"
+"""What a comparison is judged by: pixels and frames, or frames alone."""
+
+
+def compare_video(
+    later: VideoInput,
+    site: Path,
+    scratch: Path,
+    title: str,
+    truth: UmcdVideo,
+    views_per_second: float,
+) -> tuple[dict[str, Any], dict[str, tuple[bytes, bytes]]]:
+    """A row of Tables 4.3 to 4.5, and pictures of Figures 4.4 and 4.5: the map beside the frame, as JPEGs.
+
+    The map stays as it is: a copy in `scratch` is compared with. Raises InputError and StoreError as `compare_flights`,
+    InputError where nothing states which frames show a change.
+    """
+    _demand_truth(truth)
+    method, written = COMPARISONS[title]
+    with writing(scratch):
+        shutil.rmtree(scratch, ignore_errors=True)
+        shutil.copytree(site, scratch)
+    settings = CompareSettings(
+        method=method,
+        model="none",
+        writes_masks=True,
+        updates_map=False,
+        thesis=thesis_options(written),
+        views_per_second=views_per_second,
+    )
+    started_cpu_s = time.process_time()
+    updates = list(compare_flights([later.video], scratch, settings, **later.options))
+    cpu_s = time.process_time() - started_cpu_s
+    (masks,) = (scratch / "flights").glob("*/masks")
+    judged_by, judged = _judged(masks, truth, later.fps)
+    values = {
+        "judged_by": judged_by,
+        "views": updates[-1].views,
+        "compared": updates[-1].compared,
+        "cpu_seconds_per_view": cpu_s / max(1, updates[-1].views),
+        "frames": _plain(_sum(each.frame for each in judged)),
+        "pixels": _plain(_sum(each.pixels for each in judged)) if judged_by == MASKS else None,
+    }
+    pictures = _examples(judged, later, scratch, masks.parent.name)
+    with writing(scratch):
+        shutil.rmtree(scratch, ignore_errors=True)
+    return values, pictures
+
+
+def time_comparison(first: VideoInput, later: VideoInput, repeats: int) -> dict[str, Any]:
+    """Section 4.2.2: the median seconds of one comparison of two frames, with one thread and with one for each core.
+
+    The frames are the middle ones of both videos, not aligned: what the time depends on is their size.
+    """
+    before, after = (_middle(each) for each in (first, later))
+    if before.shape != after.shape:
+        raise InputError(
+            f"{first.video} and {later.video} differ in size; give videos of one camera"
+        )
+    cores = os.cpu_count() or 1
+    seconds = {}
+    for threads in (1, cores):
+        times = []
+        for _ in range(repeats):
+            started_s = time.perf_counter()
+            compare_thesis(before, after, threads=threads)
+            times.append(time.perf_counter() - started_s)
+        seconds[threads] = median(times)
+    height, width = before.shape[:2]
+    return {
+        "single_thread_s": seconds[1],
+        "multithread_s": seconds[cores],
+        "threads": cores,
+        "repeats": repeats,
+        "width_px": width,
+        "height_px": height,
+    }
+
+
+def rates(counts: Counts) -> dict[str, float | None]:
+    """The rates of section 4.2.1, None where nothing was to divide by."""
+    named = {
+        "precision": counts.precision,
+        "recall": counts.recall,
+        "accuracy": counts.accuracy,
+        "f1": counts.f1,
+    }
+    return {name: None if math.isnan(rate) else round(rate, 4) for name, rate in named.items()}
+
+
+def _demand_truth(truth: UmcdVideo) -> None:
+    if truth.masks is None and truth.metadata is None:
+        raise InputError(
+            f"{truth.video}: neither a folder of change masks ({truth.name}_masks) nor a metadata file lies beside it, "
+            "so what it shows cannot be judged"
+        )
+
+
+def _judged(masks: Path, truth: UmcdVideo, fps: float) -> tuple[str, Sequence[ComparedMask]]:
+    if truth.masks is not None:
+        return MASKS, list(compared_masks(masks, truth.masks))
+    assert truth.metadata is not None
+    stated = read_umcd_metadata(truth.metadata)
+    rate_hz = stated.fps or fps
+    judged = list(frames_against_times(masks, lambda index: stated.shows_object(index / rate_hz)))
+    if not any(each.frame != Counts(unknown=1) for each in judged):
+        raise InputError(
+            f"{truth.metadata}: states for no compared frame whether an object is in view (Appearance: 09 to 18), and "
+            f"there are no change masks ({truth.name}_masks)"
+        )
+    return TIMES, judged
+
+
+def _sum(counts: Iterable[Counts]) -> Counts:
+    return sum(counts, Counts())
+
+
+def _plain(counts: Counts) -> dict[str, int]:
+    return {
+        "tp": counts.tp,
+        "fp": counts.fp,
+        "fn": counts.fn,
+        "tn": counts.tn,
+        "unknown": counts.unknown,
+    }
+
+
+def _examples(
+    judged: Sequence[ComparedMask], later: VideoInput, site: Path, flight: str
+) -> dict[str, tuple[bytes, bytes]]:
+    """The best found change, and the largest false one: the map under the frame, and the frame with the outlines."""
+    wanted = _extremes(judged)
+    frames = _frames(later, {int(each.name) for each in wanted.values()})
+    with Archive.open(site, write=False) as archive:
+        rows = {row.name: row for row in map_frames(site, archive.site())[flight]}
+        under = MapDeviation(archive.tiles(), archive.site_grid())
+        shown = {
+            name: each
+            for name, each in wanted.items()
+            if each.name in rows and int(each.name) in frames
+        }
+        return {
+            name: _side_by_side(frames[int(each.name)], each.path, rows[each.name].outline_m, under)
+            for name, each in shown.items()
+            if rows[each.name].has_outline
+        }
+
+
+def _extremes(judged: Sequence[ComparedMask]) -> dict[str, ComparedMask]:
+    """The view with the most true pixels, and the one without a change that has the most false ones, if any."""
+    found = [each for each in judged if each.frame.tp]
+    false = [each for each in judged if each.frame.fp]
+    wanted = {}
+    if found:
+        wanted["found"] = max(found, key=lambda each: (each.pixels.tp, -each.pixels.fp))
+    if false:
+        wanted["false"] = max(false, key=lambda each: each.pixels.fp)
+    return wanted
+
+
+def _side_by_side(
+    image: ImageRGB, mask: Path, outline_m: Floats, under: MapDeviation
+) -> tuple[bytes, bytes]:
+    changed, _ = read_mask(mask, may_be_unknown=True)
+    height, width = image.shape[:2]
+    shown = under.under(outline_m, width, height), with_outlines(image, changed)
+    return jpeg_from_image(shown[0], FIGURE_PX), jpeg_from_image(shown[1], FIGURE_PX)
+
+
+def _frames(flight: VideoInput, wanted: set[int]) -> dict[int, ImageRGB]:
+    if not wanted:
+        return {}
+    (source,) = open_sources([flight.video], **flight.options)
+    last, found = max(wanted), {}
+    for each in source.frames(lambda index, _: index in wanted):
+        if isinstance(each, Frame):
+            found[each.index] = each.image
+        if each.index >= last:
+            break
+    return found
+
+
+def _middle(flight: VideoInput) -> ImageRGB:
+    (source,) = open_sources([flight.video], **flight.options)
+    middle = max(0, source.frame_count // 2)
+    found = _frames(flight, {middle}) or _frames(flight, {0})
+    if not found:
+        raise InputError(f"{flight.video}: neither its middle nor its first frame can be read")
+    return next(iter(found.values()))

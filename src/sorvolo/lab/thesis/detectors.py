@@ -1,0 +1,172 @@
+"""Section 4.3, Table 4.6: both proposal networks trained on the dataset's labelled frames, and measured on others."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sorvolo.capture.photos import read_picture
+from sorvolo.capture.source import open_sources
+from sorvolo.capture.video import read_video_info
+from sorvolo.detection.detector import Detector
+from sorvolo.errors import InputError
+from sorvolo.lab.datasets.umcd import UmcdMetadata, read_umcd_metadata
+from sorvolo.lab.datasets.umcd_folder import UmcdVideo
+from sorvolo.lab.evaluation.detector import EvaluationSettings, evaluate_detector, read_sets
+from sorvolo.lab.thesis.settings import FIGURE_PX, DetectorSettings
+from sorvolo.lab.train.settings import TrainSettings
+from sorvolo.mosaic.selection import every
+from sorvolo.store.atomic import atomic_write_bytes, writing
+from sorvolo.store.exports.annotated import annotated
+from sorvolo.store.images import jpeg_from_image
+from sorvolo.survey.flight import Frame
+from sorvolo.survey.labels import LabelledSet
+from sorvolo.survey.objects import Detections
+
+HELD_OUT = 0.2
+"""The share of the frames that is tested on, of whole videos where there are enough (thesis: 818 of 4,088 frames)."""
+
+_EXAMPLES = 4  # pictures of a figure
+_DRAWS = 200  # resamplings: the tables show no intervals
+
+
+@dataclass(frozen=True)
+class Labels:
+    """A labelled set: the thesis's name for it, where it lies, and its form as `read_dataset` names it."""
+
+    name: str
+    place: Path
+    form: str
+
+
+def extract_frames(videos: Sequence[UmcdVideo], folder: Path, views_per_second: float) -> int:
+    """Write the videos' frames and metadata as `read_dataset` takes them (a folder for each video); how many frames.
+
+    Of a video whose metadata has `Box:` lines the frames with places and those that clearly show nothing are taken.
+    Raises InputError where none has such lines: UMCD's own metadata has no places (docs/datasets.md).
+    """
+    boxed = [(each, stated) for each, stated in _stated(videos) if stated.boxed]
+    if not boxed:
+        raise InputError(
+            "no metadata file gives the places of objects in the frames, so nothing can be learnt; add lines "
+            "'Box: FRAME LEFT TOP WIDTH HEIGHT' to the objects (docs/datasets.md)"
+        )
+    with writing(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    return sum(_extract(each, stated, folder, views_per_second) for each, stated in boxed)
+
+
+def train_network(
+    labels: Labels, out: Path, rpn: str, settings: DetectorSettings, seed: int
+) -> str:
+    """Train one network of Table 4.6 on what is not held out; the file of the model, which is left in `out`.
+
+    Raises InputError as `train_detector`, and where torch is not installed; SettingsError for a device.
+    """
+    try:
+        from sorvolo.lab.train.detector import MODEL, train_detector
+        from sorvolo.lab.train.sets import DataOptions
+    except ModuleNotFoundError as error:
+        raise InputError(
+            f"training needs packages that are not installed ({error.name}): pip install 'sorvolo[training]'"
+        ) from error
+    wanted = TrainSettings(
+        settings.preset,
+        "extended" if rpn == "extended" else "standard",
+        weights=settings.weights,
+        steps=settings.steps,
+        side_px=settings.side_px,
+        seed=seed,
+        patience=0,
+    )
+    with writing(out):
+        shutil.rmtree(out, ignore_errors=True)
+    options = DataOptions(val=str(HELD_OUT), form=labels.form)
+    for _ in train_detector([labels.place], out, wanted, options, device=settings.device):
+        pass
+    return str(out / MODEL)
+
+
+def held_out(labels: Labels, seed: int) -> LabelledSet:
+    """The pictures that a training with this seed holds out. Raises InputError where they cannot be used."""
+    (labelled,) = read_sets([labels.place], form=labels.form, held_out=HELD_OUT, seed=seed)
+    return labelled
+
+
+def measure_model(model: str, labelled: LabelledSet) -> dict[str, Any]:
+    """The thesis's mAP (eqs 4.3, 4.4) and COCO's AP of a model on labelled pictures, and of each class."""
+    measured = evaluate_detector(
+        [[model]], [labelled], EvaluationSettings(tiles=None, draws=_DRAWS)
+    )
+    (scores,) = measured.sets
+    return {
+        "set": labelled.name,
+        "pictures": scores.pictures,
+        "videos": scores.groups,
+        "thesis_map": scores.thesis_map,
+        "ap50": scores.coco.ap50,
+        "ap": scores.coco.ap,
+        "labels": {row.label: row.labels for row in scores.classes},
+        "recall": {row.label: row.reported.recall for row in scores.classes},
+        "remarks": [*scores.remarks, *measured.notices],
+    }
+
+
+def example_pictures(model: str, labelled: LabelledSet) -> list[bytes]:
+    """Figure 4.6: frames with the most labelled objects and what the model reports in them, one of each video first."""
+    detector = Detector.load(model, stand_in=False)
+    shown: dict[str, Any] = {}
+    for picture in sorted(labelled.pictures, key=lambda each: -len(each.labels)):
+        shown.setdefault(picture.group, picture)
+    found = []
+    for picture in list(shown.values())[:_EXAMPLES]:
+        image = read_picture(Path(picture.path))
+        detections = detector.detect(image, m_per_px=picture.m_per_px)
+        found.append(
+            jpeg_from_image(
+                annotated(
+                    image,
+                    detections.boxes_px,
+                    detections.labels.tolist(),
+                    _words(detections),
+                    [True] * len(detections),
+                ),
+                FIGURE_PX,
+            )
+        )
+    return found
+
+
+def _words(found: Detections) -> list[str]:
+    return [f"{name} {score:.2f}" for name, score in zip(found.names, found.scores)]
+
+
+def _stated(videos: Sequence[UmcdVideo]) -> list[tuple[UmcdVideo, UmcdMetadata]]:
+    return [
+        (each, read_umcd_metadata(each.metadata)) for each in videos if each.metadata is not None
+    ]
+
+
+def _extract(video: UmcdVideo, stated: UmcdMetadata, folder: Path, views_per_second: float) -> int:
+    name = f"{video.environment}-{video.name}".lower()
+    with writing(folder):
+        (folder / name).mkdir()
+    assert video.metadata is not None
+    atomic_write_bytes(folder / f"{name}.txt", video.metadata.read_bytes(), durable=False)
+    rate_hz = stated.fps or read_video_info(video.video).frame_rate_hz
+    steady = every(1 / views_per_second)
+    (source,) = open_sources([video.video])
+    count = 0
+    for each in source.frames(
+        lambda index, time_ns: (
+            index in stated.boxed
+            or (steady(index, time_ns) and stated.shows_object(index / rate_hz) is False)
+        )
+    ):
+        if isinstance(each, Frame):
+            path = folder / name / f"{each.index:06d}.jpg"
+            atomic_write_bytes(path, jpeg_from_image(each.image), durable=False)
+            count += 1
+    return count

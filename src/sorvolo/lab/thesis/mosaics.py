@@ -1,0 +1,113 @@
+"""Section 4.1: videos mapped by each method, how long it takes, how good the map is, and what the figures show."""
+
+import shutil
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+from sorvolo.lab.evaluation.frame_rows import map_frames
+from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
+from sorvolo.lab.thesis.settings import FIGURE_PX
+from sorvolo.lab.thesis.video_input import VideoInput
+from sorvolo.missions.flight.settings import MapSettings
+from sorvolo.missions.map.flights import map_flights
+from sorvolo.mosaic.frame_deviation import MapDeviation
+from sorvolo.mosaic.outline_distortion import outline_distortion
+from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
+from sorvolo.store.atomic import writing
+from sorvolo.store.exports.map_pictures import picture
+from sorvolo.store.images import jpeg_from_image, jpeg_from_rgba
+from sorvolo.store.site.archive import Archive
+
+Transform = Literal["similarity", "homography"]
+
+
+def map_video(
+    flight: VideoInput, site: Path, method: str, transform: Transform = "similarity"
+) -> dict[str, Any]:
+    """A row of Table 4.1: one video mapped into a new site folder, and the deviation of section 4.1.1.
+
+    Raises InputError and StoreError as `map_flights`.
+    """
+    with writing(site):
+        shutil.rmtree(site, ignore_errors=True)
+        site.parent.mkdir(parents=True, exist_ok=True)
+    settings = MapSettings(
+        method="thesis" if method == "thesis" else "planar",
+        model="none",
+        thesis=RoiStitchingSettings(transform=transform),
+    )
+    started_s, started_cpu_s = time.monotonic(), time.process_time()
+    updates = list(map_flights([flight.video], site, settings, **flight.options))
+    minutes, cpu_minutes = (
+        (time.monotonic() - started_s) / 60,
+        (time.process_time() - started_cpu_s) / 60,
+    )
+    deviation = evaluate_mosaic(site).deviation
+    with Archive.open(site, write=False) as archive:
+        headline = archive.report(archive.flights()[0].id).get("headline", {})
+    return {
+        "frames": updates[-1].frames_read,
+        "keyframes": len(updates),
+        "matched": updates[-1].by_vision,
+        "minutes": minutes,
+        "cpu_minutes": cpu_minutes,
+        "seconds_per_keyframe": 60 * cpu_minutes / len(updates),
+        "deviation": deviation.mean,
+        "histogram": deviation.histogram,
+        "quality": headline.get("quality"),
+        "camera": "calibrated" if flight.camera else "guessed",
+    }
+
+
+def map_jpeg(site: Path) -> bytes:
+    """The whole map made small, on grey, as a JPEG."""
+    with Archive.open(site, write=False) as archive:
+        return jpeg_from_rgba(picture(archive.tiles(), 2 * FIGURE_PX).rgba, FIGURE_PX)
+
+
+def example_jpegs(site: Path) -> dict[str, bytes]:
+    """Figure 4.1a: a part of the map, the keyframe in the flight's middle that it was made of, and their difference."""
+    with Archive.open(site, write=False) as archive:
+        keyframes = archive.keyframes()
+        middle = keyframes[len(keyframes) // 2]
+        shown = MapDeviation(archive.tiles(), archive.site_grid()).shown(
+            archive.image(middle), middle.site_from_image
+        )
+    return {
+        "mosaic": jpeg_from_image(shown.mosaic, FIGURE_PX),
+        "frame": jpeg_from_image(shown.frame, FIGURE_PX),
+        "difference": jpeg_from_image(shown.difference, FIGURE_PX),
+    }
+
+
+def distortion_of(site: Path) -> dict[str, Any]:
+    """Figure 3.12 in numbers: how far the frames of a mapped flight are distorted, and their outlines, metres."""
+    with Archive.open(site, write=False) as archive:
+        described = archive.site()
+    (rows,) = map_frames(site, described).values()
+    outlines = [row.outline_m for row in rows if row.has_outline]
+    measured = outline_distortion(outlines)
+    return {
+        "sides": measured.sides,
+        "areas": measured.areas,
+        "bend": measured.bend,
+        "frames": measured.frames,
+        "selected": len(rows),
+        "outlines_m": [each.round(3) for each in outlines],
+    }
+
+
+def correlation_of(site: Path, mosaic: Path) -> dict[str, Any]:
+    """Eq. 4.1 of a flight's map and another mosaic of it, a GeoTIFF, as they lie and after the shift between them.
+
+    Raises InputError as `evaluate_mosaic`.
+    """
+    reference = evaluate_mosaic(site, reference=mosaic).reference
+    assert reference is not None
+    return {
+        "correlation": reference.correlation,
+        "correlation_after_shift": reference.correlation_after_shift,
+        "m_per_px": reference.m_per_px,
+        "area_m2": reference.area_m2,
+    }

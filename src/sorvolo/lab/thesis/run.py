@@ -1,0 +1,378 @@
+"""Chapter 4 of the thesis from a dataset's folder to its tables, one row after another (`sorvolo reproduce`)."""
+
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+
+from sorvolo import __version__
+from sorvolo.errors import GeometryError, InputError, StoreError
+from sorvolo.lab.datasets.npu_folder import ENVIRONMENT, read_npu_folder
+from sorvolo.lab.datasets.umcd_folder import UmcdFolder, UmcdVideo, read_umcd_folder
+from sorvolo.lab.thesis import comparisons, detectors, mosaics
+from sorvolo.lab.thesis.published import VIDEOS
+from sorvolo.lab.thesis.rows import Row, RowStore
+from sorvolo.lab.thesis.settings import (
+    COMPARISONS,
+    MAP_METHODS,
+    PUBLISHED,
+    ReproductionSettings,
+)
+from sorvolo.lab.thesis.video_input import VideoInput, video_input
+from sorvolo.store.site.journal import content_sha256
+
+_Made = tuple[Mapping[str, Any], Mapping[str, bytes]]
+"""A row's values, and its pictures as JPEGs by what they show."""
+
+
+@dataclass(frozen=True)
+class ReproductionUpdate:
+    """A row that is done, was known from an earlier run, or is `missing`; `done` of `total` rows."""
+
+    row: Row
+    is_known: bool
+    done: int
+    total: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A row to be made: of which files, by what; or why it cannot be."""
+
+    id: str
+    kind: str
+    files: tuple[Path, ...] = ()
+    make: Callable[[], _Made] | None = None
+    missing: str = ""
+
+
+def reproduce(
+    place: Path,
+    out: Path,
+    settings: ReproductionSettings,
+    *,
+    okutama: Path | None = None,
+    npu: Path | None = None,
+    is_whole: bool = True,
+) -> Iterator[ReproductionUpdate]:
+    """Do the experiments of chapter 4 on the dataset in `place`, yielding each row of the tables as it is there.
+
+    `okutama` and `npu` are the folders of the other two datasets. Rows, pictures and maps are left in `out`; a row that
+    an earlier run made of the same files and settings is taken from there. What cannot be used costs its rows alone,
+    which come back `missing` with the reason. With `is_whole` the videos of Tables 2.1, 2.3 and 2.4 that are not there
+    are such rows, too. Raises InputError for a folder that is no such dataset, StoreError on a full disk, SettingsError
+    for options.
+    """
+    started_s = time.monotonic()
+    work = _Work(read_umcd_folder(place), out, settings)
+    tasks = [
+        *(work.absent() if is_whole else ()),
+        *work.mosaic_tasks(),
+        *work.npu_tasks(npu),
+        *work.change_tasks(),
+        *work.detector_tasks(okutama),
+    ]
+    for number, task in enumerate(tasks, start=1):
+        row, is_known = work.done(task)
+        yield ReproductionUpdate(row, is_known, number, len(tasks), time.monotonic() - started_s)
+
+
+class _Work:
+    """One run over a dataset: which rows it has, and how each is made."""
+
+    def __init__(self, dataset: UmcdFolder, out: Path, settings: ReproductionSettings) -> None:
+        self._dataset, self._out, self._settings = dataset, out, settings
+        self._rows = RowStore(out)
+        self._input = cache(self._look_into)
+        self._unmapped: dict[Path, str] = {}  # sites of maps that could not be made, and why
+        self._has_frames = False
+
+    def done(self, task: _Task) -> tuple[Row, bool]:
+        """The task's row, and whether an earlier run made it."""
+        if task.make is None:
+            return Row(task.id, task.kind, missing=task.missing), False
+        try:
+            stamp = self._stamp(task)
+            if (known := self._rows.find(task.id, stamp)) is not None:
+                return known, True
+            values, pictures = task.make()
+            named = {
+                name: self._rows.add_picture(f"{task.id}-{name}", jpeg)
+                for name, jpeg in pictures.items()
+            }
+        except (InputError, GeometryError, StoreError) as error:
+            return Row(task.id, task.kind, missing=str(error)), False
+        return self._rows.put(Row(task.id, task.kind, values, named), stamp), False
+
+    def absent(self) -> Iterator[_Task]:
+        """The videos of the thesis's tables that the folder lacks."""
+        lists = (
+            self._dataset.without_telemetry,
+            self._dataset.mosaicking,
+            self._dataset.change_detection,
+        )
+        for (part, wanted), found in zip(VIDEOS.items(), lists):
+            there = {_plain(each.key) for each in found}
+            for environment, names in wanted.items():
+                for name in names[: self._settings.videos]:
+                    if _plain(f"{environment}/{name}") not in there:
+                        where = f"{part}/{environment}/{name}.mp4"
+                        yield _Task(
+                            f"video/{where}",
+                            "video",
+                            missing=f"{where} is not in {self._dataset.place}",
+                        )
+
+    def mosaic_tasks(self) -> Iterator[_Task]:
+        """Section 4.1: Table 4.1 and its text, Figures 3.12 and 4.1 to 4.3."""
+        first = None
+        for each in self._chosen(self._dataset.mosaicking):
+            yield from self._tasks_of_map(each)
+            yield self._task("correlation", each.key, (each,), partial(self._correlate, each))
+            first = first or each
+        if first is not None:
+            for transform in ("similarity", "homography"):
+                yield self._task(
+                    "transform",
+                    f"{first.key}/{transform}",
+                    (first,),
+                    partial(self._transform, first, transform),
+                )
+            yield self._task("example", first.key, (first,), partial(self._example, first))
+        for each in self._chosen(self._dataset.without_telemetry):
+            yield from self._tasks_of_map(each)
+
+    def npu_tasks(self, place: Path | None) -> Iterator[_Task]:
+        """Table 4.1 on its own dataset, and the correlation with the mosaics of Bu et al."""
+        sequences = (
+            {each.video.key: each for each in read_npu_folder(place)} if place is not None else {}
+        )
+        for video in self._chosen([each.video for each in sequences.values()]):
+            yield from self._tasks_of_map(video)
+            mosaic = sequences[video.key].mosaic
+            for method in MAP_METHODS:
+                row_id = f"{PUBLISHED}/{video.key}/{method}"
+                if mosaic is None:
+                    yield _Task(
+                        row_id,
+                        PUBLISHED,
+                        missing=f"{video.video}: no mosaic (.tif) of Bu et al. beside it",
+                    )
+                    continue
+                make = partial(self._correlate_published, video, mosaic, method)
+                yield _Task(row_id, PUBLISHED, (*_files_of(video), mosaic), make)
+
+    def change_tasks(self) -> Iterator[_Task]:
+        """Section 4.2: Tables 4.3 to 4.5, the times, Figures 4.4 and 4.5."""
+        pairs = []
+        for later in self._chosen(self._dataset.change_detection):
+            first = self._dataset.mosaic_of(later)
+            for title in COMPARISONS:
+                row_id = f"{later.key}/{title}"
+                if first is None:
+                    reason = f"{later.video}: no mosaicking video of its path, so there is no map to compare it with"
+                    yield _Task(f"comparison/{row_id}", "comparison", missing=reason)
+                else:
+                    yield self._task(
+                        "comparison",
+                        row_id,
+                        (first, later),
+                        partial(self._compare, first, later, title),
+                    )
+            if first is not None:
+                pairs.append((first, later))
+        if pairs:
+            first, later = pairs[0]
+            yield self._task(
+                "seconds", later.key, (first, later), partial(self._time, first, later)
+            )
+
+    def detector_tasks(self, okutama: Path | None) -> Iterator[_Task]:
+        """Section 4.3: Table 4.6 and Figure 4.6."""
+        videos = self._chosen(self._dataset.change_detection)
+        models = ("standard", "extended") if self._settings.detector.steps else ()
+        for model in (*models, "packaged"):
+            yield self._task(
+                "detector", f"UMCD/{model}", tuple(videos), partial(self._detect, videos, model)
+            )
+        if okutama is not None:
+            for model in (*models, "packaged"):
+                make = partial(self._detect_okutama, okutama, model)
+                yield _Task(f"detector/Okutama/{model}", "detector", (okutama,), make)
+
+    def _chosen(self, videos: Sequence[UmcdVideo]) -> list[UmcdVideo]:
+        """At most this many of each environment."""
+        chosen: dict[str, list[UmcdVideo]] = {}
+        for each in videos:
+            chosen.setdefault(each.environment.lower(), []).append(each)
+        return [each for group in chosen.values() for each in group[: self._settings.videos]]
+
+    def _tasks_of_map(self, each: UmcdVideo) -> Iterator[_Task]:
+        for method in MAP_METHODS:
+            row_id = f"{'with' if each.has_telemetry else 'without'}/{each.key}/{method}"
+            yield self._task("mosaic", row_id, (each,), partial(self._map, each, method))
+
+    def _task(
+        self, kind: str, row_id: str, videos: Sequence[UmcdVideo], make: Callable[[], _Made]
+    ) -> _Task:
+        files = tuple(path for each in videos for path in _files_of(each))
+        camera = (self._dataset.camera,) if self._dataset.camera else ()
+        return _Task(f"{kind}/{row_id}", kind, (*files, *camera), make)
+
+    def _stamp(self, task: _Task) -> str:
+        try:
+            files = [
+                (self._name(path), path.stat().st_size, path.stat().st_mtime_ns)
+                for path in task.files
+            ]
+        except OSError as error:
+            raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from error
+        of_kind = {
+            "comparison": (self._settings.views_per_second,),
+            "seconds": (self._settings.repeats,),
+            "detector": (
+                self._settings.detector,
+                self._settings.views_per_second,
+                self._settings.seed,
+            ),
+        }
+        return content_sha256(__version__, task.id, files, of_kind.get(task.kind, ()))
+
+    def _name(self, path: Path) -> str:
+        """A file's place within the dataset, which may be moved as a whole."""
+        place = self._dataset.place
+        return str(path.relative_to(place) if path.is_relative_to(place) else path)
+
+    def _look_into(self, each: UmcdVideo) -> VideoInput:
+        camera = (
+            None if each.environment == ENVIRONMENT else self._dataset.camera
+        )  # another drone flew those
+        return video_input(each, camera)
+
+    def _site(self, each: UmcdVideo, name: str) -> Path:
+        return self._out / "sites" / each.key.replace("/", "-") / name
+
+    def _map_site(self, each: UmcdVideo, method: str) -> Path:
+        return self._site(each, method if each.has_telemetry else f"bare-{method}")
+
+    def _mapped(self, each: UmcdVideo, method: str) -> Path:
+        """The site of a flight's map, made where it is not there; a killed run's unfinished one is made anew."""
+        site = self._map_site(each, method)
+        if site in self._unmapped:
+            raise InputError(f"the map of {each.key} could not be made: {self._unmapped[site]}")
+        if not (site / "mosaic.tif").is_file():
+            self._map_into(site, each, method)
+        return site
+
+    def _map_into(self, site: Path, each: UmcdVideo, method: str) -> Mapping[str, Any]:
+        try:
+            return mosaics.map_video(self._input(each), site, method)
+        except (InputError, GeometryError, StoreError) as error:
+            self._unmapped[site] = str(error)
+            raise
+
+    def _map(self, each: UmcdVideo, method: str) -> _Made:
+        site = self._map_site(each, method)
+        values = self._map_into(site, each, method)
+        named = {
+            "sequence": each.key,
+            "environment": each.environment,
+            "has_telemetry": each.has_telemetry,
+        }
+        return {**named, "method": method, **values}, {"map": mosaics.map_jpeg(site)}
+
+    def _correlate(self, each: UmcdVideo) -> _Made:
+        one, other = (self._mapped(each, method) for method in MAP_METHODS)
+        return {"sequence": each.key, **mosaics.correlation_of(one, other / "mosaic.tif")}, {}
+
+    def _correlate_published(self, each: UmcdVideo, mosaic: Path, method: str) -> _Made:
+        named = {"sequence": each.key, "method": method}
+        return {**named, **mosaics.correlation_of(self._mapped(each, method), mosaic)}, {}
+
+    def _transform(self, each: UmcdVideo, transform: mosaics.Transform) -> _Made:
+        if transform == "similarity":
+            site = self._mapped(each, "thesis")
+        else:
+            site = self._site(each, "homography")
+            mosaics.map_video(self._input(each), site, "thesis", transform)
+        named = {"sequence": each.key, "transform": transform}
+        return {**named, **mosaics.distortion_of(site)}, {"map": mosaics.map_jpeg(site)}
+
+    def _example(self, each: UmcdVideo) -> _Made:
+        return {"sequence": each.key}, mosaics.example_jpegs(self._mapped(each, "thesis"))
+
+    def _compare(self, first: UmcdVideo, later: UmcdVideo, title: str) -> _Made:
+        values, shown = comparisons.compare_video(
+            self._input(later),
+            self._mapped(first, "planar"),
+            self._out / "sites" / "compared",
+            title,
+            later,
+            self._settings.views_per_second,
+        )
+        pictures = {
+            f"{name}-{side}": jpeg
+            for name, both in shown.items()
+            for side, jpeg in zip(("map", "frame"), both)
+        }
+        return {
+            "sequence": later.key,
+            "environment": later.environment,
+            "method": title,
+            **values,
+        }, pictures
+
+    def _time(self, first: UmcdVideo, later: UmcdVideo) -> _Made:
+        before, after = (
+            self._input(replace(each, has_telemetry=False)) for each in (first, later)
+        )  # it needs none
+        return {
+            "sequence": later.key,
+            **comparisons.time_comparison(before, after, self._settings.repeats),
+        }, {}
+
+    def _detect(self, videos: Sequence[UmcdVideo], model: str) -> _Made:
+        frames = self._out / "frames"
+        if not self._has_frames:
+            detectors.extract_frames(videos, frames, self._settings.views_per_second)
+            self._has_frames = True
+        return self._measured(detectors.Labels("UMCD", frames, "umcd"), model)
+
+    def _detect_okutama(self, place: Path, model: str) -> _Made:
+        return self._measured(detectors.Labels("Okutama Action", place, "okutama"), model)
+
+    def _measured(self, labels: detectors.Labels, model: str) -> _Made:
+        """Train the model, unless it is the packaged one, measure it on what is held out, and show it at work."""
+        wanted, seed = self._settings.detector, self._settings.seed
+        tested = detectors.held_out(labels, seed)
+        file, trained = "default", {}
+        if model != "packaged":
+            out = self._out / "models" / f"{labels.form}-{model}"
+            file = detectors.train_network(labels, out, model, wanted, seed)
+            trained = {"preset": wanted.preset, "steps": wanted.steps}
+        values = {
+            "dataset": labels.name,
+            "model": model,
+            **trained,
+            **detectors.measure_model(file, tested),
+        }
+        shown = (
+            detectors.example_pictures(file, tested)
+            if model == "extended" or not wanted.steps
+            else []
+        )
+        return values, {str(number): jpeg for number, jpeg in enumerate(shown, start=1)}
+
+
+def _files_of(each: UmcdVideo) -> list[Path]:
+    masks = sorted(each.masks.iterdir()) if each.masks is not None else []
+    return [each.video, *each.texts, *([each.metadata] if each.metadata else []), *masks]
+
+
+def _plain(key: str) -> str:
+    """A key whose numbers have no leading zeros, in small letters: path01 is path1."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", key.lower())

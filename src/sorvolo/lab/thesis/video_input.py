@@ -1,0 +1,58 @@
+"""One video of the dataset as the missions take it: its telemetry recognised by content, a camera that fits it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sorvolo.capture.calibration import camera_from_option
+from sorvolo.capture.telemetry import is_telemetry
+from sorvolo.capture.video import read_video_info
+from sorvolo.errors import InputError
+from sorvolo.lab.datasets.umcd_folder import UmcdVideo
+
+
+@dataclass(frozen=True)
+class VideoInput:
+    """A video that can be read. `camera` is None where the dataset's calibration is of another shape of picture."""
+
+    video: Path
+    telemetry: Path | None
+    camera: Path | None
+    fps: float
+    size_px: tuple[int, int]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What `map_flights` and `compare_flights` take besides the video."""
+        return {"telemetry": self.telemetry, "camera": self.camera}
+
+
+def video_input(each: UmcdVideo, camera: Path | None) -> VideoInput:
+    """Look into a video and what lies beside it; raises InputError for one that cannot be used, naming what it lacks.
+
+    A table of telemetry is not read here: the mission that reads it reports what is wrong with it.
+    """
+    info = read_video_info(each.video)
+    telemetry = next((path for path in each.texts if is_telemetry(path)), None)
+    if each.has_telemetry and telemetry is None:
+        beside = ", ".join(path.name for path in each.texts) or "nothing"
+        raise InputError(
+            f"{each.video}: no telemetry beside it (found: {beside}); add the table or the NMEA log under its name"
+        )
+    return VideoInput(
+        each.video,
+        telemetry,
+        _fitting(camera, info.width_px, info.height_px),
+        info.frame_rate_hz,
+        (info.width_px, info.height_px),
+    )
+
+
+def _fitting(camera: Path | None, width_px: int, height_px: int) -> Path | None:
+    if camera is None:
+        return None
+    try:
+        camera_from_option(str(camera), width_px, height_px)
+    except InputError:
+        return None
+    return camera

@@ -1,0 +1,215 @@
+"""People and things planted into a real frame: drawn to scale, in its own light, blur and noise."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, ImageRGBA, Vector3
+from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.pose import Pose
+from sorvolo.search.drawing.bodies import build_body
+from sorvolo.search.drawing.frame_light import FrameLight
+from sorvolo.search.drawing.noise import fractal
+from sorvolo.search.drawing.objects import POSES, Body, Label, Light, Thing, new_kind, new_size
+from sorvolo.search.drawing.shadows import own_shadow
+from sorvolo.search.drawing.view import Patch, View, Window, camera_view, ray_grid, sample_patches
+from sorvolo.search.drawing.warmth import GROUND_LEVEL, warm_body
+
+_Overlay = NDArray[np.float32]
+
+_OVERHEAD: Vector3 = np.array([0.0, 0.0, 1.0])
+_LEAST_SUN = 0.12  # of the sun's height over the horizon, as a sine: lower, shadows are longer than the picture knows
+_DRAWN_SOFT_PX = 0.42  # as soft as patches are drawn without any blur
+_SPARE_PX = 12  # around what is drawn, for the blur
+_MISSING = ("standing", "walking", "waving", "crouching", "sitting", "lying")
+_MISSING_SHARE = (
+    0.2,
+    0.15,
+    0.1,
+    0.1,
+    0.2,
+    0.25,
+)  # how often missing people stand, walk ... or lie: our assumption
+
+
+@dataclass(frozen=True, eq=False)
+class Planted:
+    """A frame with its plants. `boxes_px` (N, 4) has each thing's box where nothing hid it, NaN where it is out of
+    sight."""
+
+    image: ImageRGB
+    boxes_px: BoxesPx
+
+
+def new_plant(number: int, label: str, place_m: Floats, seed: int) -> Thing:
+    """A person, a car or a small object of a random kind, pose and dress; `place_m` (2,) is where it stands."""
+    rng = np.random.default_rng([seed, number, 31])
+    what = Label(label)
+    kind = (
+        str(rng.choice(_MISSING, p=_MISSING_SHARE)) if what is Label.PERSON else new_kind(what, rng)
+    )
+    assert what is not Label.PERSON or kind in POSES
+    return Thing(
+        number,
+        what,
+        kind,
+        float(place_m[0]),
+        float(place_m[1]),
+        float(rng.uniform(0, 360)),
+        new_size(what, kind, rng),
+        int(rng.integers(2**31)),
+    )
+
+
+def plant(
+    image: ImageRGB,
+    camera: Camera,
+    site_from_camera: Pose,
+    things: Sequence[Thing],
+    light: FrameLight,
+    sun: Vector3 | None,
+    shown: Sequence[float],
+    seed: int,
+) -> Planted:
+    """The frame with these things in it, far ones first.
+
+    `camera` is the frame's own, `sun` (3,) the direction to the sun, None for none; `shown` the share of each thing
+    that crowns leave free. Grain and gaps follow from `seed`; a thing looks alike in all frames of one light.
+    """
+    canvas = np.array(image, np.uint8)
+    view = camera_view(camera, site_from_camera, ray_grid(camera) if camera.is_distorted else None)
+    boxes = np.full((len(things), 4), np.nan, np.float32)
+    eye_m = site_from_camera.translation_m
+    order = sorted(
+        range(len(things)), key=lambda k: -float(np.hypot(*(things[k].place_m(0)[:2] - eye_m[:2])))
+    )
+    for k in order:
+        thing = things[k]
+        m_per_px = float(np.linalg.norm(eye_m - thing.place_m(0))) / camera.fx_px
+        body, shadow = _looks(thing, light, sun, m_per_px)
+        patches = body.placed(thing.turn, thing.place_m(0), view.eye_m)
+        drawn = _drawn(view, patches)
+        if drawn is None:
+            continue
+        window, overlay = drawn
+        boxes[k] = _box(window, overlay)
+        rng = np.random.default_rng([seed, thing.id])
+        if shadow is not None and (cast := _drawn(view, [shadow])) is not None:
+            _lay(
+                canvas,
+                cast[0],
+                _gapped(cast[1], shown[k], m_per_px, thing),
+                light,
+                rng,
+                is_shadow=True,
+            )
+        _lay(
+            canvas, window, _gapped(overlay, shown[k], m_per_px, thing), light, rng, is_shadow=False
+        )
+    return Planted(canvas, boxes)
+
+
+def _looks(
+    thing: Thing, light: FrameLight, sun: Vector3 | None, m_per_px: float
+) -> tuple[Body, Patch | None]:
+    """The body and its shadow on the ground, where there is one."""
+    has_sun = sun is not None and float(sun[2]) > _LEAST_SUN and not light.is_thermal
+    towards = sun if has_sun and sun is not None else _OVERHEAD
+    sunlight = Light(towards, 1.0 - 0.58 * light.shadow if has_sun else 1.0)
+    body = build_body(thing, sunlight, m_per_px)
+    if light.is_thermal:
+        return warm_body(thing, body, np.random.default_rng([thing.seed, 3])), None
+    if not has_sun or light.shadow <= 0.05:
+        return body, None
+    shadow = own_shadow(thing, body, sunlight, m_per_px)
+    alpha = shadow.texture[..., 3].astype(np.float32) * light.shadow
+    texture = shadow.texture.copy()
+    texture[..., 3] = alpha.astype(np.uint8)
+    return body, replace(shadow, texture=texture).moved(np.eye(3), thing.place_m(0))
+
+
+def _drawn(view: View, patches: Sequence[Patch]) -> tuple[Window, _Overlay] | None:
+    """Patches painted over nothing: their window with some room around, and (H, W, 4) colours times alpha, 0 to 255."""
+    samples = [
+        (window, sample) for window, sample in sample_patches(view, patches) if sample[..., 3].any()
+    ]
+    if not samples:
+        return None
+    windows = np.array([window for window, _ in samples])
+    size = view.camera.width_px, view.camera.height_px
+    x0, y0 = (max(0, int(each) - _SPARE_PX) for each in windows.min(axis=0)[:2])
+    x1, y1 = (min(most, int(each) + _SPARE_PX) for most, each in zip(size, windows.max(axis=0)[2:]))
+    overlay = np.zeros((y1 - y0, x1 - x0, 4), np.float32)
+    for (left, top, right, bottom), sample in samples:
+        part = overlay[top - y0 : bottom - y0, left - x0 : right - x0]
+        part *= 1 - sample[..., 3:].astype(np.float32) / 255
+        part += sample
+    return (x0, y0, x1, y1), overlay
+
+
+def _box(window: Window, overlay: _Overlay) -> Floats:
+    """(4,) the box around what is more than half opaque; NaN for less than two pixels of it."""
+    rows, columns = np.nonzero(overlay[..., 3] > 127)
+    if len(rows) < 2:
+        return np.full(4, np.nan)
+    x0, y0 = window[:2]
+    return np.array(
+        [x0 + columns.min(), y0 + rows.min(), x0 + columns.max() + 1, y0 + rows.max() + 1],
+        np.float64,
+    )
+
+
+def _gapped(overlay: _Overlay, shown: float, m_per_px: float, thing: Thing) -> _Overlay:
+    """What gaps in a crown leave of it: patches of leaves some decimetres wide hide the rest."""
+    if shown >= 1:
+        return overlay
+    rng = np.random.default_rng([thing.seed, 11])
+    leaves = fractal(rng, overlay.shape[:2], m_per_px, (0.15, 0.4), (0.7, 1.0))
+    gaps = leaves >= np.quantile(leaves, 1 - shown) if shown > 0 else np.zeros(leaves.shape, bool)
+    return overlay * gaps[..., None].astype(np.float32)
+
+
+def _lay(
+    canvas: ImageRGBA | ImageRGB,
+    window: Window,
+    overlay: _Overlay,
+    light: FrameLight,
+    rng: np.random.Generator,
+    *,
+    is_shadow: bool,
+) -> None:
+    """Blur the overlay as the frame is blurred, give it the frame's light and grain, and lay it on, in place."""
+    x0, y0, x1, y1 = window
+    soft = _blurred(np.asarray(overlay, np.float32), light.blur_px2)
+    alpha = soft[..., 3:] / 255
+    base = GROUND_LEVEL if light.is_thermal else 0.0
+    colours = alpha * light.haze.astype(np.float32) + light.gain.astype(np.float32) * (
+        soft[..., :3] - base * alpha
+    )
+    if is_shadow:
+        colours = alpha * 0.15 * light.haze.astype(np.float32)
+    below = canvas[y0:y1, x0:x1].astype(np.float32)
+    grain = np.float32(light.noise) * rng.standard_normal(below.shape, dtype=np.float32)
+    laid = colours + (1 - alpha) * below + np.sqrt(alpha * (2 - alpha)) * grain * (not is_shadow)
+    canvas[y0:y1, x0:x1] = np.clip(np.round(laid), 0, 255).astype(np.uint8)
+
+
+def _blurred(overlay: _Overlay, blur_px2: Floats) -> _Overlay:
+    """By a normal blur of this covariance; a pixel's own area, by which patches are drawn soft already, is left out."""
+    values, vectors = np.linalg.eigh(blur_px2)
+    values = np.maximum(values - _DRAWN_SOFT_PX**2, 1e-4)
+    if values.max() < 0.02:
+        return overlay
+    reach = int(np.ceil(3 * np.sqrt(values.max())))
+    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    inverse = (vectors / values) @ vectors.T
+    kernel = np.exp(
+        -0.5 * (inverse[0, 0] * x * x + 2 * inverse[0, 1] * x * y + inverse[1, 1] * y * y)
+    )
+    return np.asarray(
+        cv2.filter2D(overlay, -1, kernel / kernel.sum(), borderType=cv2.BORDER_REPLICATE),
+        np.float32,
+    )
