@@ -149,7 +149,7 @@ def run_case(
     out = work / "runs" / name
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
-    places = {"in": str(work / "inputs"), "out": str(out), "data": str(data)}
+    places = {"in": str((work / "inputs").resolve()), "out": str(out), "data": str(data)}
     started_s = time.monotonic()
     for number, words in enumerate(CASES[name]):
         command = _command(words, places)
