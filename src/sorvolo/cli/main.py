@@ -87,7 +87,7 @@ class _Wishes:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command. The exit code: 0 success, 1 an error (one line on stderr), 2 wrong usage, 130 stopped."""
-    # before NumPy is loaded: BLAS's threads only wait for each other over our small matrices (decision 0033)
+    # before NumPy is loaded: BLAS's threads only wait for each other over our small matrices
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     share_arenas()
     wishes = _Wishes(debug=os.environ.get("SORVOLO_DEBUG", "") not in ("", "0"))

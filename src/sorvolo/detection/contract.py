@@ -59,7 +59,7 @@ class SecondLook:
 
 @dataclass(frozen=True)
 class Pyramid:
-    """In which sizes a class is looked for where a picture's scale is not known (`pyramid`, decision 0084).
+    """In which sizes a class is looked for where a picture's scale is not known (`pyramid`).
 
     `times`: so many times as large as it is, besides as it is. `known_px`: the side (the root of a box's area) at which
     the model knows the class best; `octaves`: the standard deviation, in powers of two, of the normal curve by which a

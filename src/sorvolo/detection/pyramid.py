@@ -1,4 +1,4 @@
-"""A picture of unknown scale searched in several sizes, an image pyramid: what they agree on (decision 0084).
+"""A picture of unknown scale searched in several sizes, an image pyramid: what they agree on.
 
 A network knows objects of some sizes better than of others. Where the ground that a pixel covers is known, the picture
 is shown at the right size (`tiling`); where it is not, nothing but the boxes themselves shows which look to believe.

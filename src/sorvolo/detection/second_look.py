@@ -1,7 +1,7 @@
 """Reports looked at again: cut out with what is around them, shown at other sizes and turned, to this model or another.
 
-A boulder that looks like a person once seldom does so at other sizes (decision 0049) and turned, nor to a judge that
-learnt what fools the first look (decision 0082). Only what was reported is looked at again, all of a picture side by
+A boulder that looks like a person once seldom does so at other sizes and turned, nor to a judge that
+learnt what fools the first look. Only what was reported is looked at again, all of a picture side by
 side on one sheet a position, so that it costs little.
 """
 
@@ -37,7 +37,7 @@ class SheetSettings:
         96,
     )  # cut-outs of one picture in one position, best first: at least, and at most
     same_iou: float = 0.3  # a box that overlaps the first one so much is the same object
-    surest: float = 0.98  # no first score counts for more, so that the second look can overrule it (decision 0075)
+    surest: float = 0.98  # no first score counts for more, so that the second look can overrule it
     least_sure: float = (
         1e-3  # no score counts for less, nor for more than 1 less this: log-odds stay within 7
     )

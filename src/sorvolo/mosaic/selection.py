@@ -34,7 +34,7 @@ class SelectionSettings:
     usual: int = 25  # frames that show how sharp the flight's usually are
     sparse_share: float = (
         2 / 3
-    )  # of the way between keyframes that decoded frames may lie apart (decision 0033)
+    )  # of the way between keyframes that decoded frames may lie apart
 
     def __post_init__(self) -> None:
         if not 0 < self.least_overlap <= self.overlap < 1:

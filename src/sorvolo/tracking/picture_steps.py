@@ -12,7 +12,7 @@ STEP_S = 0.1
 """Of a flight between two pictures that are compared: steps much longer find too little of the picture again."""
 
 SMALL_WIDTH_PX = 320
-"""Of the pictures that are compared: 3 ms of processor time a step (decision 0057)."""
+"""Of the pictures that are compared: 3 ms of processor time a step."""
 
 _FLOW = replace(FlowSettings(), fit_px=1.0)
 

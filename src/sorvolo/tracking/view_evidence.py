@@ -7,13 +7,13 @@ import numpy as np
 
 USUAL_LOG_ODDS = -1.7
 """Log-odds of whatever a detector shows, however weakly: 0.15 is right. On photos that the packaged ones did not learn
-from it is 0.16 of people by day, 0.31 of cars, thermal 0.19 and 0.12 (decision 0091); one for all, by choice."""
+from it is 0.16 of people by day, 0.31 of cars, thermal 0.19 and 0.12; one for all, by choice."""
 
 
 @dataclass(frozen=True)
 class EvidenceSettings:
     """What a view is worth; the share is that of the things that the packaged detector saw in 29 photos of `caliterra`
-    and the 32 of `fixed_wing`, nearly all of them false (decisions 0039, 0079)."""
+    and the 32 of `fixed_wing`, nearly all of them false."""
 
     least_seen: float = 0.05  # weaker sightings are none, and none counts as this
     usual: float = USUAL_LOG_ODDS  # of whatever a view shows: what is beyond it speaks for the thing, below it against

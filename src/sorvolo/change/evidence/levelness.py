@@ -22,7 +22,7 @@ from sorvolo.survey.findings import ComparedView
 
 @dataclass(frozen=True)
 class LevelSettings:
-    """When two pictures of one date show that a place is level (decision 0040)."""
+    """When two pictures of one date show that a place is level."""
 
     tallest_m: float = 6.0  # 0038: what stands so high (eaves of two storeys) may be anywhere
     most_pictures: int = 3  # of a place and a date, from places apart from each other by ...

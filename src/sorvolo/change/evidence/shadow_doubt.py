@@ -27,7 +27,7 @@ SunAt = Callable[[int], Vector3 | None]
 
 @dataclass(frozen=True)
 class CasterSettings:
-    """What may throw a shadow: people, boxes, bushes; and how far shadows are followed (decision 0045)."""
+    """What may throw a shadow: people, boxes, bushes; and how far shadows are followed."""
 
     radii_m: tuple[float, ...] = (0.15, 0.25, 0.4, 0.6)  # half widths
     heights_m: tuple[float, ...] = (0.3, 0.5, 0.8, 1.2, 1.7, 2.4)
@@ -37,7 +37,7 @@ class CasterSettings:
 
 @dataclass(frozen=True)
 class BrighterSettings:
-    """How pictures of two dates are compared, in octaves of brightness (decision 0045)."""
+    """How pictures of two dates are compared, in octaves of brightness."""
 
     side_m: float = 0.15  # of the cells that are compared, where pixels are no coarser
     black: float = 8.0  # gray levels added before logarithms: below, a camera shows noise
@@ -48,7 +48,7 @@ class BrighterSettings:
 
 @dataclass(frozen=True)
 class ShadowSettings:
-    """When moved shadows explain a difference (decision 0045)."""
+    """When moved shadows explain a difference."""
 
     likeness: float = (
         0.7  # correlation of what differs with both shadows: one of them alone has 0.71 at most

@@ -108,7 +108,7 @@ class NanoDetHead(nn.Module):
 
 
 class FinerNanoDetHead(nn.Module):
-    """A deeper NanoDet head with a level of stride 4 besides, for things of some 10 px (decision 0083).
+    """A deeper NanoDet head with a level of stride 4 besides, for things of some 10 px.
 
     The coarser levels give what `NanoDetHead` gives with the same weights; the fine one sees the finest of them.
     """

@@ -1,4 +1,4 @@
-"""Two detectors in one graph, of different make, so that they err in different places (decision 0081)."""
+"""Two detectors in one graph, of different make, so that they err in different places."""
 
 from dataclasses import dataclass
 

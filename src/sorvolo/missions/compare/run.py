@@ -72,7 +72,7 @@ class ViewSizes:
         0.8  # of a video's frames of which learned differences are gathered, as photos overlap
     )
     fine_m_per_px: float = (
-        0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses (decision 0022)
+        0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses
     )
     cache_bytes: int = 128 * 2**20
 

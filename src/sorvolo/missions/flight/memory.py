@@ -14,7 +14,7 @@ class MemorySettings:
     """What a mission takes where nobody chose, and how it is divided."""
 
     share: float = 0.25  # of the machine's memory, or of the container's limit
-    enough_mb: float = 512.0  # more saves no time (decision 0033)
+    enough_mb: float = 512.0  # more saves no time
     least_mb: float = (
         64.0  # with less, a picture of 12 megapixels and the tiles below it do not fit
     )
