@@ -32,9 +32,7 @@ class SelectionSettings:
         0.6  # of gray, spread at 64 px: one gray 0, with noise 0.5, the barest real field 2.2
     )
     usual: int = 25  # frames that show how sharp the flight's usually are
-    sparse_share: float = (
-        2 / 3
-    )  # of the way between keyframes that decoded frames may lie apart
+    sparse_share: float = 2 / 3  # of the way between keyframes that decoded frames may lie apart
 
     def __post_init__(self) -> None:
         if not 0 < self.least_overlap <= self.overlap < 1:
