@@ -9,8 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo.capture.correction import headings_deg
-from sorvolo.capture.live.klv import ITEMS, UNIVERSAL_KEY, LocalSet, checksum, encode, local_sets
-from sorvolo.capture.live.klv_mux import packet_of
+from sorvolo.capture.live.klv import (
+    ITEMS,
+    UNIVERSAL_KEY,
+    LocalSet,
+    checksum,
+    encode,
+    local_sets,
+    packet_of,
+)
 from sorvolo.capture.live.klv_telemetry import (
     camera_of,
     columns_of,

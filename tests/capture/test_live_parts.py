@@ -17,11 +17,10 @@ from sorvolo.capture.live.addresses import (
     is_live_address,
     live_address,
 )
-from sorvolo.capture.live.backlog import Backlog
-from sorvolo.capture.live.clock import StreamClock, Tie
-from sorvolo.capture.live.frame_queue import Arrived, FrameQueue
 from sorvolo.capture.live.links import SentenceBuffer, is_link
+from sorvolo.capture.live.reader import Backlog
 from sorvolo.capture.live.reconnect import Backoff, LiveSettings, Outages
+from sorvolo.capture.live.stream import Arrived, FrameQueue, StreamClock, Tie
 from sorvolo.capture.live.telemetry_log import TelemetryLog
 from sorvolo.errors import InputError, SettingsError
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sorvolo.capture.containers import top_boxes
 from sorvolo.capture.source import open_sources
 from sorvolo.capture.video import VideoSource, read_video_info
 from sorvolo.capture.video_spans import SparseReading
+from sorvolo.capture.video_stream import top_boxes
 from sorvolo.errors import InputError
 from sorvolo.survey.flight import Frame, LostFrame
 

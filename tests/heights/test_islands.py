@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sorvolo.heights.islands import IslandSettings, islands
+from sorvolo.heights.free_space import IslandSettings, islands
 
 
 def test_lone_pieces_of_one_pair_of_photos_are_found_and_nothing_else() -> None:

@@ -6,10 +6,16 @@ import pytest
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.heights.contours import contours
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import MOST_SIDE, CellSettings, Lattice
-from sorvolo.heights.volumes import VolumeSettings, above_rim, between, height_changes, tie
+from sorvolo.heights.volumes import (
+    VolumeSettings,
+    above_rim,
+    between,
+    contours,
+    height_changes,
+    tie,
+)
 
 GRID = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.2, "EPSG:32615")
 COARSE = SiteGrid.at(Geodetic(46.0, -91.0, 100.0), 0.25, "EPSG:32615")

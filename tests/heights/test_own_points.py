@@ -7,8 +7,8 @@ from scenes import survey_views
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.cameras import Cameras3D
+from sorvolo.heights.figures import OwnPointSettings, judged_by_points
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.own_points import OwnPointSettings, judged_by_points
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface
 

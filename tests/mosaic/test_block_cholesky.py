@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sorvolo.mosaic.block_cholesky import SIDE, Elimination
+from sorvolo.mosaic.normal_equations import SIDE, Elimination
 
 
 def strips(across: int, along: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,8 +7,7 @@ import pytest
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
-from sorvolo.mosaic.canvas import Canvas
-from sorvolo.mosaic.coarse_tiles import CoarseTiles, coarse_grid, coarseness
+from sorvolo.mosaic.canvas import Canvas, CoarseTiles, coarse_grid, coarseness
 from sorvolo.mosaic.placing import canvas_frame
 
 SITE_GRID = SiteGrid.at(Geodetic(46.0, 13.0), 0.05, "EPSG:32633", tile_px=256)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sorvolo.geometry.camera import Camera
-from sorvolo.mosaic.keyframes import Keyframes
+from sorvolo.mosaic.planar import Keyframes
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Features, Keyframe
 

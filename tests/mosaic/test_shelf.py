@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sorvolo.mosaic.exposure import ColourPairs
-from sorvolo.mosaic.linked_colours import LinkedColours
+from sorvolo.mosaic.planar import LinkedColours
 from sorvolo.mosaic.shelf import ShelvedRows
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sorvolo.capture.camera_nodes import read_nodes
 from sorvolo.capture.camera_presets import CameraPreset, find_presets, preset_names
-from sorvolo.capture.intrinsics import OPENCV_ORDER, camera_from_nodes, check_lens
+from sorvolo.capture.intrinsics import OPENCV_ORDER, camera_from_nodes, check_lens, read_nodes
 from sorvolo.capture.photo_xmp import StatedLens
 from sorvolo.errors import GeometryError, InputError
 from sorvolo.geometry.arrays import Floats

@@ -9,7 +9,6 @@ from typing import Any, cast
 import av
 import numpy as np
 
-from sorvolo.capture.containers import ends_early
 from sorvolo.capture.decoding import is_heif
 from sorvolo.capture.picture_sizes import is_same_shape, other_size
 from sorvolo.capture.telemetry.cleaning import notice
@@ -19,6 +18,7 @@ from sorvolo.capture.video_stream import (
     DecodingDamage,
     VideoClock,
     decoded_frames,
+    ends_early,
     opened_video,
     stamp_of,
     video_stream,

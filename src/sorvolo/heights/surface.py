@@ -8,13 +8,11 @@ import numpy as np
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, Mask, PointsM
 from sorvolo.heights.borders import BorderSettings, beyond_borders
-from sorvolo.heights.free_space import FreeSpaceSettings, seen_through
-from sorvolo.heights.islands import IslandSettings, islands
+from sorvolo.heights.free_space import FreeSpaceSettings, IslandSettings, islands, seen_through
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
-from sorvolo.heights.semiglobal import SmoothingSettings
 from sorvolo.heights.smooth_sigma import SmoothSigma
-from sorvolo.heights.sweep import Bounds, SweepSettings, Swept, sweep
+from sorvolo.heights.sweep import Bounds, SmoothingSettings, SweepSettings, Swept, sweep
 from sorvolo.heights.views import View
 
 # a crown is few coarse cells wide

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from sorvolo.geometry.arrays import Floats, Rows
 from sorvolo.geometry.pose import rotation_from_vector
-from sorvolo.mosaic.block_cholesky import Elimination
-from sorvolo.mosaic.normal_equations import NormalEquations
+from sorvolo.mosaic.normal_equations import Elimination, NormalEquations
 
 SHARED = (
     "log_focal",

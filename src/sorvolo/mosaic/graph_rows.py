@@ -1,15 +1,19 @@
 """The pose graph's keyframes and links as arrays that stay stacked while they grow, as the solver wants them."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.geometry.arrays import Floats, Rows
+from sorvolo.geometry.arrays import Floats, Mask, Matrix3, PointsM, Rows
 from sorvolo.geometry.camera import Camera
+from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.bundle import LINKS_AT_ONCE, Nodes, Pairs
+from sorvolo.geometry.summary import SIGMA_PER_MEDIAN_DEVIATION
+from sorvolo.mosaic.bundle import LINKS_AT_ONCE, Linked, Nodes, Pairs, linearise, rotation_vector
+from sorvolo.mosaic.ground_ties import similarity_of_most
 from sorvolo.mosaic.shelf import Shelf, ShelvedRows
 from sorvolo.survey.flight import CameraPrior
 from sorvolo.survey.mosaic import Link
@@ -229,3 +233,192 @@ def _with_twice_the_room(column: NDArray[Any]) -> NDArray[Any]:
 
 def _ideal(camera: Camera, points_px: Floats) -> Floats:
     return (points_px - [camera.cx_px, camera.cy_px]) / [camera.fx_px, camera.fy_px]
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """When a map is moved as a whole; a smaller change is the solve's, which knows more than a similarity."""
+
+    rounds: int = 3  # trimmed: a few wild fixes must not turn the map
+    wild: float = 3.0  # times the median miss: such a fix is left out
+    most_uncertain: float = (
+        0.15  # relative, of scale and turn by these fixes: beyond, they leave them open
+    )
+    least_sigmas: float = 3.0  # of scale or turn, or ...
+    least_scale: float = 0.02  # ... relative, ...
+    least_turn_rad: float = 0.03  # 1.7 degrees
+    times_nearer: float = 3.0  # known ground: the places have to come so much nearer
+
+
+def change_to_fixes(
+    places_m: PointsM,
+    fixes_m: PointsM,
+    sigma_m: Floats,
+    settings: AlignmentSettings = AlignmentSettings(),
+) -> Matrix3 | None:
+    """The similarity (3, 3) of the ground that brings cameras, (N, 2), to their fixes, (N, 2), of sigmas (N,).
+
+    None where the fixes leave it open, or it would change next to nothing.
+    """
+    for _ in range(settings.rounds):
+        spread_m = float(np.sqrt(((fixes_m - fixes_m.mean(0)) ** 2).sum(1).mean()))
+        uncertainty = float(np.median(sigma_m)) / (np.sqrt(len(fixes_m)) * max(spread_m, 1e-9))
+        if (
+            len(fixes_m) < 3
+            or uncertainty > settings.most_uncertain
+            or np.ptp(places_m, axis=0).max() <= 0
+        ):
+            return None
+        change = fit_similarity(fixes_m, places_m)
+        miss_m = np.linalg.norm(places_m @ change[:2, :2].T + change[:2, 2] - fixes_m, axis=1)
+        keep = miss_m <= max(settings.wild * float(np.median(miss_m)), 1e-6)
+        if keep.all():
+            break
+        fixes_m, places_m = fixes_m[keep], places_m[keep]
+    scale, turn = _scale_and_turn(change)
+    least = settings.least_sigmas * uncertainty
+    keeps_scale = abs(np.log(scale)) < max(least, settings.least_scale)
+    return None if keeps_scale and abs(turn) < max(least, settings.least_turn_rad) else change
+
+
+def change_to_ground(
+    places_m: PointsM, known_m: PointsM, settings: AlignmentSettings = AlignmentSettings()
+) -> Matrix3 | None:
+    """The similarity (3, 3) that brings places of the map, (N, 2), to where they are known to lie, wild ones left out.
+
+    None where they leave it open, or it would bring them little nearer.
+    """
+    change = similarity_of_most(known_m, places_m)
+    if change is None:
+        return None
+    before_m = np.median(np.linalg.norm(places_m - known_m, axis=1))
+    after_m = np.median(np.linalg.norm(apply_homography(change, places_m) - known_m, axis=1))
+    return change if before_m > settings.times_nearer * after_m else None
+
+
+def move_all(rows: NodeRows, change: Matrix3) -> None:
+    """Shift, turn and scale all cameras by a similarity of the ground."""
+    scale, turn = _scale_and_turn(change)
+    matrix = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1.0]]
+    )
+    centres_m = rows.centres_m
+    rows.rotations[:] = matrix @ rows.rotations
+    centres_m[:] = np.column_stack(
+        [centres_m[:, :2] @ change[:2, :2].T + change[:2, 2], centres_m[:, 2] * scale]
+    )
+
+
+def _scale_and_turn(change: Matrix3) -> tuple[float, float]:
+    return float(np.hypot(change[0, 0], change[1, 0])), float(
+        np.arctan2(change[1, 0], change[0, 0])
+    )
+
+
+_ENOUGH = 8  # frames from which telemetry's own errors are learnt
+
+
+@dataclass(frozen=True, eq=False)
+class Trust:
+    """Factors on telemetry's stated sigmas, (3,) each, and the nodes whose angles are plainly wrong."""
+
+    place: Floats = field(default_factory=lambda: np.ones(3))
+    attitude: Floats = field(default_factory=lambda: np.ones(3))
+    contradicted: Rows = field(default_factory=lambda: np.zeros(0, int))
+
+
+@dataclass(frozen=True, eq=False)
+class LinkNoise:
+    """What each of L links shows: its noise across the parallax, px, and the relief along it, m; (L,) each."""
+
+    across_px: Floats
+    relief_m: Floats
+
+    def is_false(self, typical_px: float) -> Mask:
+        """(L,) where a link cannot be true, if most links' noise is `typical_px`."""
+        return self.across_px > max(6.0, 8 * typical_px)
+
+
+def link_noise(nodes: Nodes, pairs: Linked, shared: Floats) -> LinkNoise:
+    """The noise of at least one link, by the cameras as they stand."""
+    found = [_noise(nodes, some, shared) for some in pairs.batches()]
+    return LinkNoise(
+        np.concatenate([each.across_px for each in found]),
+        np.concatenate([e.relief_m for e in found]),
+    )
+
+
+def miss_px(nodes: Nodes, pairs: Linked, shared: Floats) -> Iterator[tuple[Rows, Rows, Floats]]:
+    """Of some links after the others their old and new nodes, (l,) each, and how far each pair is transferred amiss,
+    (l, K); NaN where there is none."""
+    for some in pairs.batches():
+        miss = np.linalg.norm(linearise(nodes, some, shared).residual_px, axis=-1)
+        miss[some.weight <= 0] = np.nan
+        yield some.old, some.new, miss
+
+
+def telemetry_trust(rows: NodeRows, tied: Mask, miss_m: Floats) -> Trust:
+    """How good telemetry really is, from how it departs from the pictures, once there are enough of them.
+
+    Fixes and angles scatter more or less than they claim, and both are scaled to what they show. Angles that are
+    plainly wrong are left out one by one. `tied` (N,): the flight's keyframes that have links; `miss_m` (N, 3): their
+    cameras' distance from telemetry's places.
+    """
+    stated_m, stated_rad = rows.stated_sigma_m, rows.stated_sigma_rad
+    error_rad = rotation_vector(rows.prior_rotations.transpose(0, 2, 1) @ rows.rotations)
+    size = np.linalg.norm(error_rad, axis=1)
+    angled = np.isfinite(stated_rad[:, 2])
+    contradicted = np.flatnonzero(
+        tied & angled & (size > np.maximum(5 * stated_rad.max(axis=1), np.radians(15)))
+    )
+    used = tied & angled
+    used[contradicted] = False
+    return Trust(
+        _place_factors(stated_m, tied, miss_m),
+        _attitude_factors(stated_rad, used, error_rad),
+        contradicted,
+    )
+
+
+def _place_factors(stated_m: Floats, tied: Mask, miss_m: Floats) -> Floats:
+    place = np.ones(3)
+    fixed = tied & np.isfinite(stated_m[:, 0])
+    if fixed.sum() >= _ENOUGH:
+        ratio = np.linalg.norm(miss_m[fixed, :2], axis=1) / stated_m[fixed, 0] / 1.1774
+        place[:2] = np.clip(np.median(ratio), 0.5, 20.0)
+    high = tied & np.isfinite(stated_m[:, 2])
+    if high.sum() >= _ENOUGH:
+        times = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(miss_m[high, 2]) / stated_m[high, 2])
+        place[2] = np.clip(times, 0.5, 20.0)
+    return place
+
+
+def _attitude_factors(stated_rad: Floats, used: Mask, error_rad: Floats) -> Floats:
+    if used.sum() < _ENOUGH:
+        return np.ones(3)
+    scatter = error_rad[used] - np.median(error_rad[used], axis=0)
+    spread = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(scatter), axis=0)
+    # pictures see heading well, tilt hardly: a small scatter of tilt only shows that it was believed
+    return np.asarray(np.clip(spread / np.median(stated_rad[used], axis=0), [1.0, 1.0, 0.25], 5.0))
+
+
+def _noise(nodes: Nodes, pairs: Pairs, shared: Floats) -> LinkNoise:
+    line = linearise(nodes, pairs, shared)
+    length = np.linalg.norm(line.parallax, axis=-1)
+    along = line.parallax / np.maximum(length, 1e-9)[..., None]
+    miss_along = np.abs((line.residual_px * along).sum(-1))
+    miss_across = np.abs(
+        line.residual_px[..., 0] * along[..., 1] - line.residual_px[..., 1] * along[..., 0]
+    )
+    unused = pairs.weight <= 0
+    with np.errstate(all="ignore"):
+        across = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(
+            np.where(unused, np.nan, miss_across), axis=1
+        )
+        sigma_along = SIGMA_PER_MEDIAN_DEVIATION * np.nanmedian(
+            np.where(unused, np.nan, miss_along), axis=1
+        )
+        reach = np.nanmedian(np.where(unused, np.nan, length), axis=1)
+    return LinkNoise(
+        across, np.sqrt(np.maximum(sigma_along**2 - across**2, 0)) / np.maximum(reach, 1e-6)
+    )

@@ -1,9 +1,228 @@
 """The normal equations of a solve: gathered camera by camera and link by link, then solved."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.linalg import LinAlgError, cholesky, eigh, qr
+from scipy.linalg.blas import dtrsm
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.linalg import splu
 
 from sorvolo.geometry.arrays import Floats, Mask, Rows
-from sorvolo.mosaic.block_cholesky import SIDE, Elimination
+
+SIDE = 6  # unknowns of a camera
+_AT_ONCE = (
+    20  # cameras that go out together whatever they are tied to: so few are not worth an order
+)
+_FILLED = 0.1  # of a piece's numbers may be zeros that a smaller piece would not hold
+
+
+@dataclass(frozen=True, eq=False)
+class _Front:
+    """Cameras that go out together, `out`, and later ones that they are tied to by then, `rest`; both sorted by when
+    they go out. `into` is the front in which the first of the rest goes out, -1 without any."""
+
+    out: Rows
+    rest: Rows
+    into: int
+
+
+class Elimination:
+    """In which order and in which pieces the unknowns of `count` cameras go out, ties being (L,) between two each."""
+
+    def __init__(self, count: int, one: Rows, other: Rows) -> None:
+        self.count, self.one, self.other = count, one, other
+        self._fronts = _fronts(count, one, other)
+        at = np.empty(count, int)
+        for number, front in enumerate(self._fronts):
+            at[front.out] = number
+        first = np.minimum(
+            at[one], at[other]
+        )  # that front takes a tie in, in which the first of its cameras goes out
+        order = np.argsort(first, kind="stable")
+        self._ties = np.split(order, np.searchsorted(first[order], np.arange(1, len(self._fronts))))
+
+    @property
+    def ties(self) -> int:
+        """How many there are."""
+        return len(self.one)
+
+    def factorised(self, diagonal: Floats, between: Floats) -> "BlockFactors":
+        """The factors of the matrix with `diagonal` (n, 6, 6) and `between` (L, 6, 6), which has the rows of the ties'
+        one and the columns of their other camera.
+
+        Directions that only rounding leaves without weight get as little as rounding leaves.
+        """
+        waiting: dict[int, list[tuple[Rows, Floats]]] = {}
+        pieces = _pieces(self._fronts)
+        place = np.empty(self.count, int)
+        for number, front in enumerate(self._fronts):
+            cameras = np.concatenate([front.out, front.rest])
+            place[cameras] = np.arange(len(cameras))
+            full = np.zeros((len(cameras), SIDE, len(cameras), SIDE))
+            own = np.arange(len(front.out))
+            full[own, :, own, :] = diagonal[front.out]
+            ties = self._ties[number]
+            one, other = place[self.one[ties]], place[self.other[ties]]
+            blocks = full.transpose(0, 2, 1, 3)
+            np.add.at(blocks, (one, other), between[ties])
+            np.add.at(blocks, (other, one), between[ties].transpose(0, 2, 1))
+            matrix = full.reshape(SIDE * len(cameras), SIDE * len(cameras))
+            for rest, update in waiting.pop(number, ()):
+                into = _unknowns(place[rest])
+                matrix[into[:, None], into] += update
+            split = SIDE * len(front.out)
+            corner, below = pieces[number]
+            corner[:] = _corner(matrix[:split, :split])
+            below[:] = dtrsm(1.0, corner.T, matrix[split:, :split], side=1)
+            if front.into >= 0:
+                update = below @ below.T
+                np.subtract(matrix[split:, split:], update, out=update)
+                waiting.setdefault(front.into, []).append((front.rest, update))
+        return BlockFactors(self._fronts, pieces)
+
+
+class BlockFactors:
+    """What `Elimination.factorised` gives: the equations, ready to be solved."""
+
+    def __init__(self, fronts: Sequence[_Front], pieces: Sequence[tuple[Floats, Floats]]) -> None:
+        self._fronts, self._pieces = fronts, pieces
+
+    def solve(self, right: Floats) -> Floats:
+        """(6 n,) or (6 n, k) right-hand sides to as many solutions."""
+        found = right.reshape(len(right), -1).copy()
+        for front, (corner, below) in zip(self._fronts, self._pieces, strict=True):
+            out = _unknowns(front.out)
+            found[out] = dtrsm(1.0, corner.T, found[out], trans_a=1)
+            if len(front.rest):
+                found[_unknowns(front.rest)] -= below @ found[out]
+        for front, (corner, below) in zip(
+            reversed(self._fronts), reversed(self._pieces), strict=True
+        ):
+            out = _unknowns(front.out)
+            known = (
+                found[out] - below.T @ found[_unknowns(front.rest)]
+                if len(front.rest)
+                else found[out]
+            )
+            found[out] = dtrsm(1.0, corner.T, known)
+        return found.reshape(right.shape)
+
+
+def _fronts(count: int, one: Rows, other: Rows) -> list[_Front]:
+    """In the order in which they go out."""
+    if count <= _AT_ONCE:
+        return [_Front(np.arange(count), np.zeros(0, int), -1)]
+    when = _order(count, one, other)
+    tied = _tied_then(when, one, other)
+    camera = np.argsort(when)
+    merged: list[
+        list[int]
+    ] = []  # for each camera the ones that go out with it, itself last, in the order of `when`
+    zeros = [0] * count
+    before: list[list[int]] = [[] for _ in range(count)]  # whose first remaining tie is to this one
+    joined = np.full(count, -1)
+    for at, rest in enumerate(tied):
+        merged.append([at])
+        for child in sorted(before[at], key=lambda each: -len(tied[each])):
+            out, more = len(merged[child]), len(merged[at])
+            empty = zeros[child] + zeros[at] + out * (more + len(rest) - len(tied[child]))
+            if empty <= _FILLED * (out + more) * ((out + more + 1) / 2 + len(rest)):
+                merged[at], zeros[at], joined[child] = merged[child] + merged[at], empty, at
+        if len(rest):
+            before[rest[0]].append(at)
+    ends = _waiting_little([at for at in range(count) if joined[at] < 0], merged, tied)
+    number = np.empty(count, int)
+    for position, end in enumerate(ends):
+        number[merged[end]] = position
+    return [
+        _Front(
+            camera[merged[end]], camera[tied[end]], number[tied[end][0]] if len(tied[end]) else -1
+        )
+        for end in ends
+    ]
+
+
+def _waiting_little(
+    ends: Sequence[int], merged: Sequence[Sequence[int]], tied: Sequence[Rows]
+) -> list[int]:
+    """The fronts, each by its last camera, in the order in which what waits to be taken in by a later one needs the
+    least memory (Liu 1986): of those that one takes in the first are those that need the most for themselves."""
+    front_of = {at: end for end in ends for at in merged[end]}
+    before: dict[int, list[int]] = {end: [] for end in ends}
+    need: dict[int, int] = {}
+    branch: dict[int, list[int]] = {}  # all that go out before a front and it itself
+    for end in ends:  # whatever one takes in stands before it
+        children = sorted(before[end], key=lambda each: len(tied[each]) ** 2 - need[each])
+        waiting, most, order = 0, 0, []
+        for child in children:
+            most, waiting = max(most, waiting + need[child]), waiting + len(tied[child]) ** 2
+            order += branch.pop(child)
+        whole = (len(merged[end]) + len(tied[end])) ** 2
+        need[end], branch[end] = max(most, waiting + whole + len(tied[end]) ** 2), [*order, end]
+        if len(tied[end]):
+            before[front_of[tied[end][0]]].append(end)
+    return [each for order in branch.values() for each in order]
+
+
+def _order(count: int, one: Rows, other: Rows) -> Rows:
+    """(count,) when each camera goes out, so that few ties arise: by least degree, the cameras of a branch together."""
+    ties = coo_matrix((np.full(len(one), -1.0), (one, other)), shape=(count, count))
+    ties = ties + ties.T
+    degree = np.asarray(ties.sum(axis=0)).ravel()
+    regular = csc_matrix(
+        ties - coo_matrix((degree - 1, (np.arange(count), np.arange(count))), shape=(count, count))
+    )
+    return splu(
+        regular, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0
+    ).perm_c.astype(int)
+
+
+def _tied_then(when: Rows, one: Rows, other: Rows) -> list[Rows]:
+    """For each camera, in the order of `when`, the later ones that it is tied to when it goes out, sorted: those that
+    it was tied to from the first, and what those had left that went out before and reached it first."""
+    first, last = np.minimum(when[one], when[other]), np.maximum(when[one], when[other])
+    order = np.argsort(first, kind="stable")
+    parts = [
+        [each]
+        for each in np.split(last[order], np.searchsorted(first[order], np.arange(1, len(when))))
+    ]
+    tied = []
+    for at, some in enumerate(parts):
+        here = np.unique(np.concatenate(some))
+        here = here[here > at]
+        tied.append(here)
+        if len(here):
+            parts[here[0]].append(here)
+    return tied
+
+
+def _pieces(fronts: Sequence[_Front]) -> list[tuple[Floats, Floats]]:
+    """Room for the triangle of each front and for what stands below it, in one stretch of memory: among the matrices
+    that come and go meanwhile they would leave gaps as large as themselves."""
+    shapes = [(SIDE * len(each.out), SIDE * len(each.rest)) for each in fronts]
+    numbers = np.empty(sum(out * (out + rest) for out, rest in shapes))
+    found, at = [], 0
+    for out, rest in shapes:
+        middle, end = at + out * out, at + out * (out + rest)
+        found.append((numbers[at:middle].reshape(out, out), numbers[middle:end].reshape(rest, out)))
+        at = end
+    return found
+
+
+def _unknowns(cameras: Rows) -> Rows:
+    return (SIDE * cameras[:, None] + np.arange(SIDE)).ravel()
+
+
+def _corner(matrix: Floats) -> Floats:
+    """Lower triangular, times its transpose the matrix."""
+    try:
+        return cholesky(matrix, lower=True, check_finite=False)
+    except LinAlgError:
+        weights, axes = eigh(matrix, check_finite=False)
+        weights = np.maximum(weights, np.finfo(float).eps * max(weights[-1], 1.0))
+        return qr((axes * np.sqrt(weights)).T, mode="r", check_finite=False)[0].T
 
 
 class NormalEquations:

@@ -1,7 +1,10 @@
 """`--method planar`: frames to keyframes, keyframes to links, links to the pose graph, one frame at a time."""
 
-from collections.abc import Callable, Mapping, Sequence
+import io
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -11,20 +14,159 @@ from sorvolo.geometry.arrays import Floats, ImageRGB, Matrix3, PointsM
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, site_from_image_homography
 from sorvolo.geometry.pose import Pose
-from sorvolo.mosaic.exposure import Exposure, ExposureSettings, solve_exposure, tie_colours
+from sorvolo.mosaic.exposure import (
+    ColourPairs,
+    Exposure,
+    ExposureSettings,
+    solve_exposure,
+    tie_colours,
+)
 from sorvolo.mosaic.graph_report import GraphReport
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
 from sorvolo.mosaic.ground_ties import GroundTies
-from sorvolo.mosaic.keyframes import Keyframes
-from sorvolo.mosaic.linked_colours import LinkedColours
 from sorvolo.mosaic.overview import Overview, lay_out
 from sorvolo.mosaic.pose_graph import PoseGraph, pose_from_link
-from sorvolo.mosaic.shelf import Shelf
+from sorvolo.mosaic.shelf import Shelf, ShelvedRows
 from sorvolo.registration.features import gray_from_rgb, normalise_contrast, orb_features
 from sorvolo.registration.learned import release_network
 from sorvolo.registration.link import Effort, LinkCache, LinkPrediction, LinkSettings, link
 from sorvolo.survey.flight import CameraPrior
-from sorvolo.survey.mosaic import Keyframe, Link, NoLink, Status
+from sorvolo.survey.mosaic import Features, Keyframe, Link, NoLink, Status
+
+
+class LinkedColours(Mapping[tuple[int, int], ColourPairs]):
+    """Colour pairs by link (frame a, frame b), `points_per_link` at most; `keep` adds those of a link."""
+
+    def __init__(self, points_per_link: int, shelf: Shelf | None = None) -> None:
+        self._most = points_per_link
+        self._places: dict[tuple[int, int], tuple[int, int]] = {}  # row, and pairs in it
+        self._rows = ShelvedRows("colours", (points_per_link, 8), np.float16, shelf)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __iter__(self) -> Iterator[tuple[int, int]]:
+        return iter(self._places)
+
+    def __getitem__(self, link: tuple[int, int]) -> ColourPairs:
+        row, count = self._places[link]
+        found = self._rows.read(np.array([row]))[0, :count]
+        return ColourPairs(found[:, :3], found[:, 3:6], found[:, 6], found[:, 7])
+
+    def keep(self, link: tuple[int, int], pairs: ColourPairs) -> None:
+        """Take the pairs of a link in, in place of earlier ones of it."""
+        kept = pairs.thinned(self._most)
+        row = np.zeros((self._most, 8), np.float16)
+        row[: len(kept)] = np.column_stack(
+            [kept.colours_a, kept.colours_b, kept.radius2_a, kept.radius2_b]
+        )
+        self._places[link] = len(self._rows), len(kept)
+        self._rows.append(row)
+
+    def newest(self, count: int) -> dict[tuple[int, int], ColourPairs]:
+        """Those of the newest links."""
+        return {link: self[link] for link in islice(reversed(self._places), count)}
+
+
+@dataclass(frozen=True, eq=False)
+class _Rest:
+    """What is always in memory of a keyframe."""
+
+    camera: Camera
+    prior: CameraPrior
+    kind: str
+
+
+class Keyframes:
+    """Keyframes and their thumbnails by id, at most `most_bytes` of them in memory where there is a shelf.
+
+    What comes back from the shelf equals what was put there, bit by bit.
+    """
+
+    def __init__(self, shelf: Shelf | None = None, most_bytes: int = 1 << 28) -> None:
+        self._shelf, self._most_bytes = shelf, most_bytes
+        self._rest: dict[int, _Rest] = {}
+        self._near: OrderedDict[int, tuple[Keyframe, ImageRGB]] = OrderedDict()
+        self._shelved: set[int] = set()
+        self._bytes = 0
+
+    def __contains__(self, keyframe_id: int) -> bool:
+        return keyframe_id in self._rest
+
+    def add(self, keyframe: Keyframe, thumbnail: ImageRGB) -> None:
+        """Keep a keyframe, with a small copy of its picture in colour."""
+        self._rest[keyframe.id] = _Rest(keyframe.camera, keyframe.prior, keyframe.features.kind)
+        self._take(keyframe, thumbnail)
+
+    def camera(self, keyframe_id: int) -> Camera:
+        """The camera of the keyframe's picture, as large as it is registered."""
+        return self._rest[keyframe_id].camera
+
+    def keyframe(self, keyframe_id: int) -> Keyframe:
+        """The keyframe, from the shelf if it has to be."""
+        return self._both(keyframe_id)[0]
+
+    def thumbnail(self, keyframe_id: int) -> ImageRGB:
+        """The small copy of the keyframe's picture, from the shelf if it has to be."""
+        return self._both(keyframe_id)[1]
+
+    def release(self) -> None:
+        """Put all on the shelf: nothing is wanted of them for a while. Without a shelf they stay."""
+        while self._shelf is not None and self._near:
+            self._shelve_oldest(self._shelf)
+
+    # ---- inside -----------------------------------------------------------------------------------------------
+
+    def _both(self, keyframe_id: int) -> tuple[Keyframe, ImageRGB]:
+        found = self._near.get(keyframe_id)
+        if found is None:
+            assert self._shelf is not None
+            rest = self._rest[keyframe_id]
+            with np.load(io.BytesIO(self._shelf.get(keyframe_id)), allow_pickle=False) as kept:
+                features = Features(rest.kind, kept["points_px"], kept["descriptors"])
+                found = (
+                    Keyframe(keyframe_id, rest.camera, kept["gray"], features, rest.prior),
+                    kept["thumbnail"],
+                )
+            self._take(*found)
+        self._near.move_to_end(keyframe_id)
+        return found
+
+    def _take(self, keyframe: Keyframe, thumbnail: ImageRGB) -> None:
+        """Into memory; those used longest ago make room."""
+        self._near[keyframe.id] = keyframe, thumbnail
+        self._bytes += _size(keyframe, thumbnail)
+        while self._shelf is not None and self._bytes > self._most_bytes and len(self._near) > 1:
+            self._shelve_oldest(self._shelf)
+
+    def _shelve_oldest(self, shelf: Shelf) -> None:
+        keyframe_id, (oldest, small) = self._near.popitem(last=False)
+        self._bytes -= _size(oldest, small)
+        if keyframe_id not in self._shelved:
+            shelf.put(keyframe_id, _bytes(oldest, small))
+            self._shelved.add(keyframe_id)
+
+
+def _size(keyframe: Keyframe, thumbnail: ImageRGB) -> int:
+    features = keyframe.features
+    return (
+        keyframe.gray.nbytes
+        + features.points_px.nbytes
+        + features.descriptors.nbytes
+        + thumbnail.nbytes
+    )
+
+
+def _bytes(keyframe: Keyframe, thumbnail: ImageRGB) -> bytes:
+    data = io.BytesIO()
+    np.savez(
+        data,
+        gray=keyframe.gray,
+        points_px=keyframe.features.points_px,
+        descriptors=keyframe.features.descriptors,
+        thumbnail=thumbnail,
+    )
+    return data.getvalue()
 
 
 @dataclass(frozen=True)

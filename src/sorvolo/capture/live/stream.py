@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from enum import IntEnum
 from math import isfinite, nan
 from pathlib import Path
 from statistics import median
@@ -16,8 +17,6 @@ import av
 import numpy as np
 
 from sorvolo.capture.live.addresses import StreamAddress
-from sorvolo.capture.live.clock import StreamClock, Tie
-from sorvolo.capture.live.frame_queue import Arrived, FrameQueue
 from sorvolo.capture.live.growing import GrowingFile
 from sorvolo.capture.live.klv import LocalSet
 from sorvolo.capture.live.klv_telemetry import (
@@ -38,7 +37,204 @@ from sorvolo.capture.telemetry.cleaning import notice
 from sorvolo.capture.telemetry.nmea import Epoch
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageGray, TimesNs
+from sorvolo.geometry.units import SECOND_NS
 from sorvolo.survey.flight import CameraModel, Frame, LostFrame, Notice, Telemetry
+
+_WINDOW_NS = 15 * SECOND_NS
+_SLEW = 0.005  # seconds of correction a second of stream: a clock's drift is 1000 times slower
+_JUMP_NS = 2 * SECOND_NS  # a tie that is further off than this was set anew
+_YOUNG_NS = 2 * SECOND_NS  # the first frames come in a burst: until then the offset follows at once
+_STATED_KEPT = 9  # of a stream's newest statements of UTC: their median counts
+
+
+class Tie(IntEnum):
+    """The source of a frame's time, the better the higher."""
+
+    ARRIVAL = 0
+    SENDER_REPORT = 1
+    METADATA = 2
+
+    @property
+    def words(self) -> str:
+        """Where the times come from, for people."""
+        return {
+            Tie.ARRIVAL: "when the first frame arrived, by this computer's clock (the link's delay is in it)",
+            Tie.SENDER_REPORT: "the sender's RTCP reports",
+            Tie.METADATA: "the precision time stamps in the stream's metadata (ST 0601 tag 2)",
+        }[self]
+
+
+class StreamClock:
+    """UTC from a stream's own time stamps. `arrived`, `stated` and `restart` change it.
+
+    `settle` decides once which tie is used. The offset then follows slowly, so that a camera's clock that drifts does
+    not run away from the receiver's, and times stay strictly increasing. Arrivals: the least delayed one of the last
+    15 s counts, as a link only ever delays.
+    """
+
+    def __init__(self) -> None:
+        self.tie: Tie | None = None
+        self._arrivals: deque[tuple[int, int]] = deque()  # stamp, UTC - stamp; the offsets increase
+        self._stated: dict[Tie, deque[int]] = {}
+        self._offset_ns: int | None = None
+        self._bias_ns = 0  # of the tie's clock against this computer's
+        self._began_ns = self._slewed_to_ns = 0
+        self._last_ns = -1
+
+    def arrived(self, stamp_ns: int, utc_ns: int) -> None:
+        """A frame with this time stamp came at this UTC."""
+        offset_ns = utc_ns - stamp_ns
+        while self._arrivals and self._arrivals[-1][1] >= offset_ns:
+            self._arrivals.pop()
+        self._arrivals.append((stamp_ns, offset_ns))
+        while stamp_ns - self._arrivals[0][0] > _WINDOW_NS:
+            self._arrivals.popleft()
+
+    def stated(self, tie: Tie, stamp_ns: int, utc_ns: int) -> None:
+        """The stream states this UTC for this time stamp."""
+        self._stated.setdefault(tie, deque(maxlen=_STATED_KEPT)).append(utc_ns - stamp_ns)
+
+    def settle(self) -> Tie:
+        """Use the best tie that there is by now, for good; it is given back."""
+        if self.tie is None:
+            self.tie = max(self._stated, default=Tie.ARRIVAL)
+        return self.tie
+
+    def restart(self) -> None:
+        """The stream was opened anew: its time stamps begin anew, too."""
+        self._arrivals.clear()
+        self._stated.clear()
+        self._offset_ns = None
+
+    def utc_ns(self, stamp_ns: int) -> int:
+        """A time stamp's UTC, without any claim to be later than the last one's."""
+        return stamp_ns + self._follow(stamp_ns)
+
+    def frame_utc_ns(self, stamp_ns: int) -> int:
+        """A frame's UTC: later than that of all frames before."""
+        self._last_ns = max(self.utc_ns(stamp_ns), self._last_ns + 1)
+        return self._last_ns
+
+    def host_from_tie_ns(self) -> int:
+        """This computer's clock minus the tie's, as far as frames show it (the link's least delay is in it)."""
+        return -self._bias_ns
+
+    def _follow(self, stamp_ns: int) -> int:
+        """The offset for a time stamp, moved a little towards what is known now."""
+        target_ns = self._target_ns()
+        if target_ns is None:
+            return self._offset_ns or 0
+        if self._offset_ns is None:
+            self._began_ns = stamp_ns
+        is_young = stamp_ns - self._began_ns < _YOUNG_NS
+        if self._offset_ns is None or is_young or abs(target_ns - self._offset_ns) > _JUMP_NS:
+            self._offset_ns = target_ns
+        else:
+            most_ns = round(_SLEW * max(0, stamp_ns - self._slewed_to_ns))
+            self._offset_ns += max(-most_ns, min(most_ns, target_ns - self._offset_ns))
+        self._slewed_to_ns = stamp_ns
+        return self._offset_ns
+
+    def _target_ns(self) -> int | None:
+        arrival_ns = self._arrivals[0][1] if self._arrivals else None
+        stated = self._stated.get(self.settle())
+        if stated:
+            target_ns = sorted(stated)[len(stated) // 2]
+            if arrival_ns is not None:
+                self._bias_ns = target_ns - arrival_ns
+            return target_ns
+        return None if arrival_ns is None else arrival_ns + self._bias_ns
+
+
+@dataclass(frozen=True, eq=False)
+class Arrived:
+    """A decoded frame with its number in the stream, its UTC, and when it was there (monotonic clock)."""
+
+    index: int
+    time_ns: int
+    arrived_s: float
+    decoded: av.VideoFrame
+
+    @property
+    def size_bytes(self) -> int:
+        """What the frame takes in memory, about."""
+        return self.decoded.width * self.decoded.height * 3 // 2
+
+
+class FrameQueue:
+    """A bounded queue. `put` and `take` change it, from one thread each; `skipped` counts what nobody looked at.
+
+    `holds_all`: frames wait for their turn until `most_bytes` are held; else only the newest waits. Where `blocks`
+    is set (a file that can wait), a full queue holds up the reader instead of dropping the oldest frame.
+    """
+
+    def __init__(self, *, holds_all: bool, most_bytes: int, blocks: bool) -> None:
+        self._holds_all, self._most_bytes, self._blocks = (
+            holds_all,
+            most_bytes,
+            blocks and holds_all,
+        )
+        self._waiting: deque[Arrived] = deque()
+        self._held_bytes = 0
+        self._changed = threading.Condition()
+        self._is_over = False
+        self.skipped = 0
+
+    def put(self, arrived: Arrived) -> None:
+        """Let a frame wait for its turn; frames that must give way for it are counted."""
+        with self._changed:
+            if self._blocks:
+                self._changed.wait_for(lambda: self._is_over or self._fits(arrived))
+            while self._waiting and not (self._holds_all and self._fits(arrived)):
+                self._drop_oldest()
+            self._waiting.append(arrived)
+            self._held_bytes += arrived.size_bytes
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> Arrived | None:
+        """The frame whose turn it is; None when none came in time, or none will come."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._is_over, timeout_s)
+            if not self._waiting:
+                return None
+            arrived = self._waiting.popleft()
+            self._held_bytes -= arrived.size_bytes
+            self._changed.notify_all()
+            return arrived
+
+    def sift(self, wanted: Callable[[Arrived], bool]) -> None:
+        """Leave out the frames in waiting that are not wanted; they do not count as skipped."""
+        with self._changed:
+            kept = [each for each in self._waiting if wanted(each)]
+            self._waiting = deque(kept)
+            self._held_bytes = sum(each.size_bytes for each in kept)
+            self._changed.notify_all()
+
+    def end(self) -> None:
+        """No more frames come; those that wait can still be taken."""
+        with self._changed:
+            self._is_over = True
+            self._changed.notify_all()
+
+    @property
+    def holds_any(self) -> bool:
+        """Whether a frame waits for its turn."""
+        with self._changed:
+            return bool(self._waiting)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing waits and nothing will come."""
+        with self._changed:
+            return self._is_over and not self._waiting
+
+    def _fits(self, arrived: Arrived) -> bool:
+        return not self._waiting or self._held_bytes + arrived.size_bytes <= self._most_bytes
+
+    def _drop_oldest(self) -> None:
+        self._held_bytes -= self._waiting.popleft().size_bytes
+        self.skipped += 1
+
 
 _HOLD_S = 0.5  # the first frames of a connection come in a burst: only then is their delay known
 _HOLD_FOR_METADATA_S = 2.0  # where the stream has some, it states the frames' time and lens

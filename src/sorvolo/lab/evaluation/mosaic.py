@@ -5,7 +5,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from sorvolo.errors import InputError
+from sorvolo.geometry.arrays import Floats, ImageGray, ImageRGBA, Mask, PointsPx
+from sorvolo.geometry.geodesy import Projection
 from sorvolo.lab.evaluation.frame_rows import (
     map_frames,
     refuse_simulation,
@@ -18,13 +24,182 @@ from sorvolo.mosaic.frame_deviation import (
     frames_to_compare,
     summed_up,
 )
-from sorvolo.mosaic.reference_match import MapPicture, ReferenceMatch, match_reference
-from sorvolo.mosaic.truth_errors import PositionErrors, TruthErrors, table_errors, truth_errors
+from sorvolo.mosaic.map_quality import (
+    CornerErrors,
+    Shift,
+    Spread,
+    corner_errors,
+    correlation,
+    position_errors,
+    residual_shift,
+    spread_of,
+)
+from sorvolo.registration.features import gray_from_rgb
 from sorvolo.store.rasters.geotiff import Raster, read_raster
 from sorvolo.store.site.archive import Archive
 from sorvolo.survey.flight import Site
 from sorvolo.survey.frame_rows import FrameRow
 from sorvolo.survey.mosaic import Status
+
+
+@dataclass(frozen=True)
+class TruthErrors:
+    """A flight's errors against truth ("all" for all together): frames placed by vision, and by GPS alone."""
+
+    flight: str
+    corners: CornerErrors
+    gps_only: Spread
+    cameras: Spread
+
+
+@dataclass(frozen=True)
+class PositionErrors:
+    """Camera positions against a table: as they lie, and after the best similarity."""
+
+    absolute: Spread
+    shape: Spread
+    missing: int
+
+
+def truth_errors(
+    name: str, pairs: Sequence[tuple[FrameRow, FrameRow]], m_per_px: float
+) -> TruthErrors:
+    """The errors of a flight's frames, each given beside the true one."""
+    corners = corner_errors(
+        *_outlines_m(pairs, Status.VISION), m_per_px, *_true_cameras_and_fixes_m(pairs)
+    )
+    by_gps_m = [
+        np.linalg.norm(mine - true, axis=1)
+        for mine, true in zip(*_outlines_m(pairs, Status.GPS_ONLY))
+    ]
+    cameras_m = [
+        float(np.linalg.norm(mine.camera_m - true.camera_m))
+        for mine, true in pairs
+        if mine.has_camera and true.has_camera
+    ]
+    return TruthErrors(
+        name,
+        corners,
+        spread_of(np.array(by_gps_m), m_per_px),
+        spread_of(np.array(cameras_m), m_per_px),
+    )
+
+
+def table_errors(
+    cameras: Sequence[FrameRow], places_m: Sequence[Sequence[float]], missing: int, m_per_px: float
+) -> PositionErrors:
+    """Cameras against a table's places (east, north, height of each); heights count where all are known.
+
+    `missing` of the table's frames have no camera.
+    """
+    mine = np.array([[*each.camera_m, each.camera_height_m] for each in cameras])
+    reference = np.array(places_m, np.float64)
+    if not (np.isfinite(mine).all() and np.isfinite(reference).all()):
+        mine, reference = mine[:, :2], reference[:, :2]
+    return PositionErrors(*position_errors(mine, reference, m_per_px), missing)
+
+
+def _outlines_m(
+    pairs: Sequence[tuple[FrameRow, FrameRow]], status: Status
+) -> tuple[Floats, Floats]:
+    """(N, 4, 2) the estimated and the true outlines of the frames with this status that have both."""
+    both = [
+        pair
+        for pair in pairs
+        if pair[0].status == status and pair[0].has_outline and pair[1].has_outline
+    ]
+    mine = np.array([each.outline_m for each, _ in both]).reshape(-1, 4, 2)
+    return mine, np.array([each.outline_m for _, each in both]).reshape(-1, 4, 2)
+
+
+def _true_cameras_and_fixes_m(pairs: Sequence[tuple[FrameRow, FrameRow]]) -> tuple[Floats, Floats]:
+    """(N, 2) the true camera positions and the GPS fixes of the frames that have both."""
+    fixed = [true for _, true in pairs if true.has_fix and true.has_camera]
+    cameras_m = np.array([true.camera_m for true in fixed]).reshape(-1, 2)
+    return cameras_m, np.array([true.fix_m for true in fixed]).reshape(-1, 2)
+
+
+_LEAST_PX = 1000  # of common ground
+_LATTICE_PX = 64  # between the points that are taken from CRS to CRS
+
+
+@dataclass(frozen=True, eq=False)
+class MapPicture:
+    """A north-up map: `rgba` (H, W, 4), the centre of pixel (0, 0) at `origin_m` in `crs`."""
+
+    rgba: ImageRGBA
+    origin_m: tuple[float, float]
+    m_per_px: float
+    crs: str
+
+
+@dataclass(frozen=True)
+class ReferenceMatch:
+    """Likeness with another map: eq. 4.1, at `m_per_px`, over `area_m2`; how far this map lies from it."""
+
+    correlation: float
+    correlation_after_shift: float
+    shift: Shift
+    shift_east_m: float
+    shift_north_m: float
+    m_per_px: float
+    area_m2: float
+
+
+def match_reference(mine: MapPicture, other: MapPicture) -> ReferenceMatch | None:
+    """A map beside a reference; None where they show hardly any common ground."""
+    gray, known = _resampled(other, mine)
+    mask = known & (mine.rgba[..., 3] > 0)
+    if mask.sum() < _LEAST_PX:
+        return None
+    own = gray_from_rgb(np.ascontiguousarray(mine.rgba[..., :3]))
+    shift = residual_shift(gray, own, mask)
+    moved = np.array([[1, 0, -shift.x_px], [0, 1, -shift.y_px]])
+    size = own.shape[1], own.shape[0]
+    back = np.asarray(cv2.warpAffine(own, moved, size, borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    still = mask & (cv2.warpAffine(mask.astype(np.uint8), moved, size, flags=cv2.INTER_NEAREST) > 0)
+    return ReferenceMatch(
+        correlation(gray, own, mask),
+        correlation(gray, back, still),
+        shift,
+        shift.x_px * mine.m_per_px,
+        -shift.y_px * mine.m_per_px,
+        mine.m_per_px,
+        float(mask.sum()) * mine.m_per_px**2,
+    )
+
+
+def _resampled(raster: MapPicture, onto: MapPicture) -> tuple[ImageGray, Mask]:
+    """A raster's gray in the pixels of another, and where it knows them; CRS to CRS by a lattice of points."""
+    places = _places(raster, onto)
+    source, m_per_px = raster.rgba, raster.m_per_px
+    while onto.m_per_px > 2 * m_per_px and min(source.shape[:2]) > 32:
+        source = cv2.pyrDown(source)  # type: ignore[assignment]
+        places = np.asarray(places / 2, np.float32)
+        m_per_px *= 2
+    moved = cv2.remap(  # type: ignore[call-overload]
+        source, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+    )
+    return gray_from_rgb(np.ascontiguousarray(moved[..., :3])), moved[..., 3] > 254
+
+
+def _places(raster: MapPicture, onto: MapPicture) -> NDArray[np.float32]:
+    """(H, W, 2) where the pixels of `onto` lie in the raster."""
+    height, width = onto.rgba.shape[:2]
+    step = _LATTICE_PX
+    columns, rows = np.arange(0, width + step, step), np.arange(0, height + step, step)
+    x, y = (each.ravel().astype(np.float64) for each in np.meshgrid(columns, rows))
+    points_m = np.column_stack([x, -y]) * onto.m_per_px + onto.origin_m
+    if raster.crs != onto.crs:
+        latitude_deg, longitude_deg = Projection(onto.crs).wgs84_from_projected(points_m)
+        points_m = Projection(raster.crs).projected_from_wgs84(latitude_deg, longitude_deg)
+    lattice: PointsPx = (points_m - raster.origin_m) / raster.m_per_px * [1.0, -1.0]
+    # OpenCV's own enlargements round places to 1/32 of the lattice's step, which is pixels here
+    down = np.maximum(0.0, 1 - abs(np.arange(height)[:, None] - rows) / step)
+    across = np.maximum(0.0, 1 - abs(np.arange(width)[:, None] - columns) / step)
+    places = np.einsum("hr,rcd->hcd", down, lattice.reshape(len(rows), len(columns), 2))
+    return np.einsum("wc,hcd->hwd", across, places, optimize=True).astype(np.float32)
+
 
 _DEVIATION_FRAMES = 120  # at most, spread over the flight: it bounds the time
 _REFERENCE_PX = 2048  # longer side at which maps are compared

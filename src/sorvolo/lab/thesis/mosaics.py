@@ -2,9 +2,15 @@
 
 import shutil
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
+from sorvolo.geometry.arrays import Floats
+from sorvolo.geometry.polygons import signed_area
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.evaluation.mosaic import evaluate_mosaic
 from sorvolo.lab.thesis.settings import FIGURE_PX
@@ -12,12 +18,53 @@ from sorvolo.lab.thesis.video_input import VideoInput
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.mosaic.frame_deviation import MapDeviation
-from sorvolo.mosaic.outline_distortion import outline_distortion
 from sorvolo.mosaic.roi_stitching import RoiStitchingSettings
 from sorvolo.store.atomic import writing
 from sorvolo.store.exports.map_pictures import picture
 from sorvolo.store.images import jpeg_from_image, jpeg_from_rgba
 from sorvolo.store.site.archive import Archive
+
+
+@dataclass(frozen=True)
+class OutlineDistortion:
+    """Over all frames: the largest ratio of two opposite sides (1: none is a trapezium), the largest area over the
+    smallest, and how far the path bends: its largest distance from the chord of its ends, over the chord.
+    """
+
+    sides: float
+    areas: float
+    bend: float
+    frames: int
+
+
+def outline_distortion(outlines_m: Sequence[Floats]) -> OutlineDistortion:
+    """Measure the outlines of the frames that lie on the map, (4, 2) metres each, in the order of the flight.
+
+    NaN where there is no frame; the bend where the ends are closer to each other than half a frame is wide.
+    """
+    known = [each for each in outlines_m if np.isfinite(each).all()]
+    if not known:
+        return OutlineDistortion(np.nan, np.nan, np.nan, 0)
+    corners = np.array(known)
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    pairs = np.stack([lengths[:, :2], lengths[:, 2:]])
+    areas = np.abs([signed_area(each) for each in corners])
+    return OutlineDistortion(
+        float((pairs.max(axis=0) / pairs.min(axis=0)).max()),
+        float(areas.max() / areas.min()),
+        _bend(corners.mean(axis=1), float(np.sqrt(areas[0]))),
+        len(known),
+    )
+
+
+def _bend(centres_m: Floats, width_m: float) -> float:
+    chord = centres_m[-1] - centres_m[0]
+    length = float(np.linalg.norm(chord))
+    if length < width_m / 2:
+        return float("nan")
+    away = centres_m - centres_m[0]
+    return float(np.abs(away[:, 0] * chord[1] - away[:, 1] * chord[0]).max() / length**2)
+
 
 Transform = Literal["similarity", "homography"]
 

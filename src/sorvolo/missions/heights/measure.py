@@ -10,10 +10,9 @@ from typing import Any
 from sorvolo.capture.areas import read_area
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.coordinates import lonlat_from_text
-from sorvolo.heights.contours import contours
 from sorvolo.heights.field import HeightField, along
 from sorvolo.heights.lattice import Lattice
-from sorvolo.heights.volumes import Tie, Volume, VolumeSettings, above_rim, between, tie
+from sorvolo.heights.volumes import Tie, Volume, VolumeSettings, above_rim, between, contours, tie
 from sorvolo.missions.heights.flight_views import run_of
 from sorvolo.missions.heights.run import height_grid, newest_flight
 from sorvolo.store.atomic import atomic_write_bytes

@@ -11,17 +11,17 @@ from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.heights.cameras import Cameras3D, CameraSettings, solve_cameras
 from sorvolo.heights.figures import (
+    OwnPointSettings,
     camera_figures,
     camera_warnings,
+    judged_by_points,
     surface_figures,
     surface_warnings,
 )
 from sorvolo.heights.lattice import CellSettings, Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
-from sorvolo.heights.own_points import OwnPointSettings, judged_by_points
-from sorvolo.heights.relief_picture import relief_picture
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
-from sorvolo.heights.terrain import TerrainSettings, terrain
+from sorvolo.heights.terrain import TerrainSettings, relief_picture, terrain
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.heights.flight_views import flight_views, run_of

@@ -15,9 +15,8 @@ from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.map.journal import StoredPicture
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
 from sorvolo.missions.map.tile_shares import PaintPlan, PaintsElsewhere
-from sorvolo.mosaic.canvas import Canvas
+from sorvolo.mosaic.canvas import Canvas, CoarseTiles, coarse_grid, coarseness
 from sorvolo.mosaic.canvas_frame import CanvasFrame
-from sorvolo.mosaic.coarse_tiles import CoarseTiles, coarse_grid, coarseness
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.placing import canvas_frame
 from sorvolo.mosaic.planar import PlanarMapper
