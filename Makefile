@@ -28,8 +28,7 @@ check: $(TRAINS)
 bench: $(READY)
 	$(BIN)/python benchmarks/quick_tables.py $(TABLES) $(if $(DATA),--data $(DATA)) $(if $(PEERS),--peer-bin $(PEERS))
 
-# dist/: an sdist, and a wheel made from it. The wheel holds the compiled kernels where there is a C++ compiler; an
-# install without one works on their NumPy twins, slower, and warns of it once.
+# dist/: an sdist, and a wheel made from it, which holds the compiled kernels: a C++17 compiler is needed.
 PACKING := build/packing
 wheel: requirements-build.lock
 	$(PYTHON) -m venv $(PACKING)

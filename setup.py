@@ -21,7 +21,6 @@ native = Pybind11Extension(
     extra_compile_args=OPTIONS,
     extra_link_args=LINKING,
 )
-native.optional = True  # without a compiler sorvolo works all the same, on kernels/numpy_*.py
 
 ParallelCompile(default=0).install()  # on all cores
 setup(ext_modules=[native])

@@ -27,7 +27,6 @@ from rich.table import Table
 
 from change_suites import grounds, pairs
 from provenance import commit, machine
-from sorvolo import kernels
 from sorvolo.change.pair.compare import compare_images
 from sorvolo.change.pair.thesis import prepare_reference
 
@@ -82,7 +81,6 @@ def main() -> None:
                 "pairs": options.pairs,
                 "repeats": options.repeats,
                 "ground": "procedural" if places[0].source == "procedural" else "photos",
-                "compiled": kernels.COMPILED,
                 "machine": machine(),
                 "load_1_min": os.getloadavg()[0],
                 "commit": commit(),

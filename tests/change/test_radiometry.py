@@ -2,13 +2,13 @@
 
 import cv2
 import numpy as np
+import numpy_robust
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
 from sorvolo.change.pair.illumination import fit_light, relit
-from sorvolo.kernels import numpy_robust
 
 
 def textured(seed: int) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import cv2
 import numpy as np
+import numpy_robust
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -14,7 +15,6 @@ from sorvolo.change.pair.regions import FEATURES
 from sorvolo.change.pair.residual_alignment import settle
 from sorvolo.change.pair.robust import RobustSettings, compare_robust, examine
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.kernels import numpy_robust
 
 
 def with_box(image: np.ndarray, colour: tuple[int, int, int] = (190, 60, 40)) -> np.ndarray:

@@ -5,6 +5,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy_thesis as twins
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,7 +19,6 @@ from sorvolo.change.pair.thesis import (
     thesis_steps,
 )
 from sorvolo.errors import InputError, SettingsError
-from sorvolo.kernels import numpy_thesis as twins
 
 SMALL = ThesisSettings(
     averaging_px=(4, 3), pattern_px=(5, 4), isolation_px=(6, 7), area_share=0.02, gray_threshold=30
@@ -141,7 +141,6 @@ def test_every_pixel_is_as_the_text_has_it(seed: int, size: tuple[int, int], pri
     assert sorted(map(tuple, found.boxes)) == boxes
 
 
-@pytest.mark.skipif(not kernels.COMPILED, reason="the kernels were not compiled here")
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
@@ -157,7 +156,7 @@ def test_compiled_and_numpy_agree_to_the_last_pixel(
     parameters = SMALL if seed % 2 else ThesisSettings()
     found = compare_thesis(before, after, valid, parameters, threads)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels, "_thesis", twins)
+        patch.setattr(kernels, "_native", twins)
         expected = compare_thesis(before, after, valid, parameters)
     np.testing.assert_array_equal(found.mask, expected.mask)
     np.testing.assert_array_equal(found.boxes, expected.boxes)

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+import numpy_robust
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,7 +12,6 @@ from sorvolo import kernels
 from sorvolo.change.pair.regions import RegionSettings, find_regions
 from sorvolo.change.pair.robust import compare_robust
 from sorvolo.change.pair.scratch import MOST_KEPT_PX, Scratch
-from sorvolo.kernels import numpy_robust
 
 SIDES = st.integers(2, 40)
 

@@ -1,12 +1,12 @@
 """The kernels of light and of last pixels: compiled against their NumPy twins, to the rounding of their sums."""
 
 import numpy as np
+import numpy_light
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.kernels import numpy_light
 
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -4,16 +4,13 @@ from typing import Any
 
 import cv2
 import numpy as np
+import numpy_thesis
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.kernels import numpy_thesis
 
-needs_compiler = pytest.mark.skipif(
-    not kernels.COMPILED, reason="the kernels were not compiled here"
-)
 sizes = st.tuples(st.integers(1, 40), st.integers(1, 170))
 windows = st.tuples(st.integers(1, 19), st.integers(1, 19))
 seeds = st.integers(0, 2**32 - 1)
@@ -36,7 +33,6 @@ def some(seed: int, size: tuple[int, int]) -> Any:
     return (rng.random(size) < rng.choice([0.0, 0.03, 0.5, 1.0])).astype(np.uint8) * 255
 
 
-@needs_compiler
 @settings(max_examples=60, deadline=None)
 @given(seeds, sizes, threads, st.booleans())
 def test_equalising_tables_agree(
@@ -47,7 +43,6 @@ def test_equalising_tables_agree(
     np.testing.assert_array_equal(kernels.equalising_tables(image, known, threads), expected)
 
 
-@needs_compiler
 @settings(max_examples=60, deadline=None)
 @given(seeds, sizes, windows, threads)
 def test_averaged_agrees(
@@ -62,7 +57,6 @@ def test_averaged_agrees(
         np.testing.assert_array_equal(found, right)
 
 
-@needs_compiler
 @settings(max_examples=80, deadline=None)
 @given(seeds, sizes, windows, threads, st.floats(0, 0.7))
 def test_texture_changes_agree(
@@ -78,7 +72,6 @@ def test_texture_changes_agree(
     )
 
 
-@needs_compiler
 @settings(max_examples=60, deadline=None)
 @given(seeds, sizes, st.tuples(st.integers(1, 60), st.integers(1, 60)), threads, st.floats(0, 1))
 def test_isolations_agree(
@@ -91,7 +84,6 @@ def test_isolations_agree(
     )
 
 
-@needs_compiler
 @settings(max_examples=100, deadline=None)
 @given(seeds, sizes, st.floats(0.02, 0.98))
 def test_regions_and_their_histograms_agree(seed: int, size: tuple[int, int], share: float) -> None:

@@ -1,64 +1,46 @@
-"""The few loops that must be fast; numbers in, numbers out. This module is the only door.
+"""The few loops that must be fast, compiled; numbers in, numbers out. This module is the only door.
 
-Each kernel exists twice with one signature: compiled in `_native`, and in NumPy in `numpy_*.py`, which specify what it
-computes. Both give the same numbers, sums of real numbers but for their rounding. Where nothing was compiled the slow
-ones are used, with one warning.
+It checks shapes and ranges, since the compiled code in `_native` reads memory as it is told to. Each kernel has a plain
+twin in `tests/kernels/numpy_*.py`: the specification, where its docstring states what it computes.
 """
 
-import warnings
 from collections.abc import Sequence
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.errors import SorvoloWarning
-from sorvolo.kernels import numpy_light, numpy_robust, numpy_thesis
+from sorvolo.errors import SorvoloError
 
-_native: ModuleType | None
 try:
     from sorvolo.kernels import _native
-except ImportError:
-    _native = None
-    warnings.warn(
-        "the compiled kernels are missing, so change detection will be some 100 times slower; install a C++17 compiler "
-        "and reinstall sorvolo",
-        SorvoloWarning,
-        stacklevel=2,
-    )
+except ImportError as error:
+    raise SorvoloError(
+        f"the compiled kernels are missing ({error}); install Sorvolo from a wheel, or install a C++17 compiler and "
+        "reinstall sorvolo"
+    ) from error
 
-COMPILED = _native is not None
-"""Whether the compiled kernels are in use."""
-
-LARGEST_WINDOW_PX = 127
-"""The longest side of a window that the kernels take."""
-
-MOST_REACH_PX = 32
-"""How far `differences` looks around at most."""
-
-_thesis = numpy_thesis if _native is None else _native
+LARGEST_WINDOW_PX = 127  # the longest side of a window that the kernels take
+MOST_REACH_PX = 32  # how far `differences` looks around at most
 
 Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float64]
 
 
 def equalising_tables(image: Bytes, known: Bytes | None = None, threads: int = 1) -> Bytes:
-    """The tables (3, 256) that equalise an image's channels, (h, w, 3): see numpy_thesis."""
+    """The tables (3, 256) that make the histogram of each channel of an image (h, w, 3) flat."""
     _check_image(image)
-    tables: Bytes = _thesis.equalising_tables(_bytes(image), _known(known, image), threads)
-    return tables
+    return _native.equalising_tables(_bytes(image), _known(known, image), threads)
 
 
 def averaged(
     image: Bytes, tables: Bytes, width: int, height: int, threads: int = 1
 ) -> tuple[Bytes, Bytes]:
-    """An equalised image's window means as planes (3, h, w), and their gray (h, w): see numpy_thesis."""
+    """An image (h, w, 3) through `tables` (3, 256), averaged over a window: planes (3, h, w), and their gray (h, w)."""
     _check_image(image)
-    _check_tables(tables)
+    _check(tables.shape == (3, 256), "averaged", tables=tables)
     _check_window(width, height)
-    result: tuple[Bytes, Bytes] = _thesis.averaged(
-        _bytes(image), _bytes(tables), width, height, threads
-    )
-    return result
+    return _native.averaged(_bytes(image), _bytes(tables), width, height, threads)
 
 
 def texture_changes(
@@ -70,391 +52,277 @@ def texture_changes(
     most: int,
     threads: int = 1,
 ) -> Bytes:
-    """Which of the pixels `asked` (h, w) differ in their patterns, planes being (3, h, w): see numpy_thesis."""
+    """Where the local binary patterns of planes (3, h, w) differ in more than `most` bits, of the pixels `asked` (h, w)."""
     _check_window(width, height)
-    if not reference.shape == query.shape == (3, *asked.shape) or asked.ndim != 2:
-        raise ValueError(
-            f"texture_changes: {reference.shape}, {query.shape} and asked {asked.shape} do not fit"
-        )
-    mask: Bytes = _thesis.texture_changes(
+    fits = reference.shape == query.shape == (3, *asked.shape) and asked.ndim == 2
+    _check(fits, "texture_changes", reference=reference, query=query, asked=asked)
+    return _native.texture_changes(
         _bytes(reference), _bytes(query), _bytes(asked), width, height, most, threads
     )
-    return mask
 
 
 def without_isolations(
     mask: Bytes, width: int, height: int, most_black: int, threads: int = 1
 ) -> Bytes:
-    """A mask (h, w) black wherever the window around has more than `most_black` black, else white: see numpy_thesis."""
+    """A mask (h, w), black wherever the window around has more than `most_black` black pixels, else white."""
     _check_mask(mask)
     _check_window(width, height)
-    kept: Bytes = _thesis.without_isolations(_bytes(mask), width, height, most_black, threads)
-    return kept
+    return _native.without_isolations(_bytes(mask), width, height, most_black, threads)
 
 
 def region_boxes(mask: Bytes) -> NDArray[np.int64]:
-    """The boxes (N, 4) x, y, width, height of a mask's 8-connected regions: see numpy_thesis."""
+    """The boxes (N, 4) x, y, width, height of a mask's 8-connected regions."""
     _check_mask(mask)
-    boxes: NDArray[np.int64] = _thesis.region_boxes(_bytes(mask))
-    return boxes
+    return _native.region_boxes(_bytes(mask))
 
 
 def gray_histograms(
     image: Bytes, tables: Bytes, boxes: NDArray[np.int64], known: Bytes | None = None
 ) -> NDArray[np.int64]:
-    """The gray histograms (N, 256) of boxes of an equalised image: see numpy_thesis."""
+    """The gray histograms (N, 256) of boxes (N, 4) of an image (h, w, 3) put through `tables` (3, 256)."""
     _check_image(image)
-    _check_tables(tables)
+    _check(tables.shape == (3, 256), "gray_histograms", tables=tables)
     boxes = np.ascontiguousarray(boxes, np.int64).reshape(-1, 4)
     height, width = image.shape[:2]
     if (boxes < 0).any() or (boxes[:, :2] + boxes[:, 2:] > [width, height]).any():
         raise ValueError(f"gray_histograms: boxes outside of the {width} x {height} px image")
-    counts: NDArray[np.int64] = _thesis.gray_histograms(
-        _bytes(image), _bytes(tables), boxes, _known(known, image)
-    )
-    return counts
-
-
-_robust = numpy_robust if _native is None else _native
+    return _native.gray_histograms(_bytes(image), _bytes(tables), boxes, _known(known, image))
 
 
 def relight(
-    image: NDArray[np.uint8],
-    curves: NDArray[np.int32],
-    gains: NDArray[np.float32],
-    out: NDArray[np.uint8] | None = None,
-) -> NDArray[np.uint8]:
-    """A picture (h, w, 3) through curves (3, 256) and times lines of gains (H, w, 3) over it: see numpy_robust.
+    image: Bytes, curves: NDArray[np.int32], gains: NDArray[np.float32], out: Bytes | None = None
+) -> Bytes:
+    """A picture (h, w, 3) through curves (3, 256) and times lines of gains (H, w, 3) over it.
 
     `out` (h, w, 3) is written over where it is given, and returned.
     """
-    if image.ndim != 3 or image.shape[2] != 3 or curves.shape != (3, 256):
-        raise ValueError(f"relight: image {image.shape} and curves {curves.shape} do not fit")
+    fits = image.ndim == 3 and image.shape[2] == 3 and curves.shape == (3, 256)
+    fits = fits and len(gains) > 0 and gains.shape == (len(gains), image.shape[1], 3)
+    _check(fits, "relight", image=image, curves=curves, gains=gains)
     height, width = image.shape[:2]
-    if gains.shape != (len(gains), width, 3) or len(gains) == 0:
-        raise ValueError(f"relight: gains are lines (H, {width}, 3), got {gains.shape}")
     out = _target(out, image.shape)
-    image, curves = np.ascontiguousarray(image, np.uint8), np.ascontiguousarray(curves, np.int32)
+    curves = np.ascontiguousarray(curves, np.int32)
     gains = np.ascontiguousarray(gains, np.float32)
-    _robust.relight(image, curves, gains, 0, 0, width, height, out)
+    _native.relight(_bytes(image), curves, gains, 0, 0, width, height, out)
     return out
 
 
 def differences(
-    before: NDArray[np.uint8],
-    after: NDArray[np.uint8],
+    before: Bytes,
+    after: Bytes,
     known: NDArray[np.bool_] | None,
     reach: int,
     weight: int,
-    out: NDArray[np.uint8] | None = None,
-) -> NDArray[np.uint8]:
-    """How far each value of two pictures (h, w, 3) lies outside the other's, planes (6, h, w): see numpy_robust.
+    out: Bytes | None = None,
+) -> Bytes:
+    """How far each value of two pictures (h, w, 3) lies outside the other's within `reach` px, planes (6, h, w).
 
     `out` (6, h, w) is written over where it is given, and returned.
     """
     height, width = before.shape[:2]
-    if before.shape != (height, width, 3) or after.shape != before.shape or min(height, width) < 2:
-        raise ValueError(f"differences: pictures {before.shape} and {after.shape} do not fit")
-    if known is not None and known.shape != (height, width):
-        raise ValueError(f"differences: known {known.shape} does not fit pictures {before.shape}")
+    fits = before.shape == after.shape == (height, width, 3) and min(height, width) >= 2
+    _check(fits, "differences", before=before, after=after)
     if not (0 <= reach <= MOST_REACH_PX and 0 <= weight <= 255):
-        raise ValueError(
-            f"differences: reach {reach} or weight {weight} out of 0 .. {MOST_REACH_PX} and 0 .. 255"
-        )
+        raise ValueError(f"differences: expected reach 0 .. {MOST_REACH_PX}, weight 0 .. 255")
     out = _target(out, (6, height, width))
-    marked = None if known is None else np.ascontiguousarray(known, np.bool_).view(np.uint8)
-    _robust.differences(
-        np.ascontiguousarray(before, np.uint8),
-        np.ascontiguousarray(after, np.uint8),
-        marked,
-        reach,
-        weight,
-        out,
-    )
+    _native.differences(_bytes(before), _bytes(after), _known(known, before), reach, weight, out)
     return out
 
 
 def tint(
-    before: NDArray[np.uint8],
-    after: NDArray[np.uint8],
-    logs: NDArray[np.uint8],
+    before: Bytes,
+    after: Bytes,
+    logs: Bytes,
     boxes: NDArray[np.int32],
     margin: int,
-    out: NDArray[np.uint8] | None = None,
-) -> NDArray[np.uint8]:
-    """How much redder than blue a picture became, (h, w), in boxes and `margin` around only: see numpy_robust.
+    out: Bytes | None = None,
+) -> Bytes:
+    """How much redder than blue a picture became, (h, w), in boxes (N, 4) and `margin` px around only.
 
     `out` (h, w) is written over there where it is given, and returned; elsewhere it keeps what it held.
     """
-    if before.shape != after.shape or before.shape[2:] != (3,) or logs.shape != (256,):
-        raise ValueError(
-            f"tint: pictures {before.shape}, {after.shape} and logs {logs.shape} do not fit"
-        )
-    boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
+    fits = before.shape == after.shape and before.shape[2:] == (3,) and logs.shape == (256,)
+    _check(fits, "tint", before=before, after=after, logs=logs)
     out = _target(out, before.shape[:2])
-    _robust.tint(
-        np.ascontiguousarray(before, np.uint8),
-        np.ascontiguousarray(after, np.uint8),
-        np.ascontiguousarray(logs, np.uint8),
-        boxes,
-        margin,
-        out,
-    )
+    _native.tint(_bytes(before), _bytes(after), _bytes(logs), _boxes(boxes), margin, out)
     return out
 
 
 def rim_balance(
-    labels: NDArray[np.uint8],
-    boxes: NDArray[np.int32],
-    came: NDArray[np.uint8],
-    went: NDArray[np.uint8],
+    labels: Bytes, boxes: NDArray[np.int32], came: Bytes, went: Bytes
 ) -> NDArray[np.int64]:
-    """By how much `came` exceeds `went` along the rims of regions, (N,): see numpy_robust."""
-    boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
-    _check_boxes("rim_balance", boxes, labels.shape)
-    if not labels.shape == came.shape == went.shape or labels.ndim != 2:
-        raise ValueError(
-            f"rim_balance: labels {labels.shape}, came {came.shape}, went {went.shape} do not fit"
-        )
-    _check_labels("rim_balance", labels, len(boxes))
-    balance: NDArray[np.int64] = _robust.rim_balance(
-        np.ascontiguousarray(labels, np.uint8),
-        boxes,
-        np.ascontiguousarray(came, np.uint8),
-        np.ascontiguousarray(went, np.uint8),
-    )
-    return balance
+    """By how much `came` exceeds `went`, both (h, w), along the rims of the regions of `labels` (h, w), (N,)."""
+    boxes = _boxes(boxes, labels.shape)
+    fits = labels.shape == came.shape == went.shape and labels.ndim == 2
+    _check(fits, "rim_balance", labels=labels, came=came, went=went)
+    _check_labels(labels, len(boxes))
+    return _native.rim_balance(_bytes(labels), boxes, _bytes(came), _bytes(went))
 
 
 def tree_margins(
-    rows: NDArray[np.float64],
-    asked: NDArray[np.int32],
-    thresholds: NDArray[np.float64],
-    leaves: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """The sums of trees for rows (N, F), (N,): see numpy_robust."""
+    rows: Floats, asked: NDArray[np.int32], thresholds: Floats, leaves: Floats
+) -> Floats:
+    """The sums (N,) of oblivious trees, asked and thresholds (T, D), leaves (T, 2**D), for rows (N, F)."""
     trees, depth = asked.shape
-    if (
-        thresholds.shape != asked.shape
-        or leaves.shape != (trees, 1 << depth)
-        or trees < 1
-        or rows.ndim != 2
-    ):
-        raise ValueError(
-            f"tree_margins: rows {rows.shape}, asked {asked.shape}, thresholds {thresholds.shape} and leaves "
-            f"{leaves.shape} do not fit"
-        )
-    if int(asked.min()) < 0 or int(asked.max()) >= rows.shape[1]:
-        raise ValueError(
-            f"tree_margins: rows have {rows.shape[1]} columns, asked is one of {int(asked.max())}"
-        )
-    margins: NDArray[np.float64] = _robust.tree_margins(
+    fits = thresholds.shape == asked.shape and leaves.shape == (trees, 1 << depth)
+    fits = fits and trees >= 1 and rows.ndim == 2
+    fits = fits and asked.min() >= 0 and asked.max() < rows.shape[1]
+    _check(fits, "tree_margins", rows=rows, asked=asked, thresholds=thresholds, leaves=leaves)
+    return _native.tree_margins(
         np.ascontiguousarray(rows, np.float64),
         np.ascontiguousarray(asked, np.int32),
         np.ascontiguousarray(thresholds, np.float64),
         np.ascontiguousarray(leaves, np.float64),
     )
-    return margins
 
 
 def core_regions(
-    values: NDArray[np.uint8],
-    thresholds: NDArray[np.uint8],
-    strong: float,
-    core: float,
-    least_area: int,
-    most: int,
-) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """Where values lie over thresholds, both (h, w), each part cut to its core: see numpy_robust."""
+    values: Bytes, thresholds: Bytes, strong: float, core: float, least_area: int, most: int
+) -> tuple[Bytes, NDArray[np.int32]]:
+    """Where values lie over thresholds, both (h, w), each part cut to its core: labels (h, w) and boxes (N, 4)."""
     if not 0 <= most <= 255:
-        raise ValueError(
-            f"core_regions: a byte holds the labels of 0 .. 255 regions, not of {most}"
-        )
-    if values.shape != thresholds.shape or values.ndim != 2:
-        raise ValueError(
-            f"core_regions: values {values.shape} and thresholds {thresholds.shape} do not fit"
-        )
-    found: tuple[NDArray[np.uint8], NDArray[np.int32]] = _robust.core_regions(
-        np.ascontiguousarray(values, np.uint8),
-        np.ascontiguousarray(thresholds, np.uint8),
-        strong,
-        core,
-        least_area,
-        most,
-    )
-    return found
+        raise ValueError(f"core_regions: a byte holds labels of at most 255 regions, not of {most}")
+    fits = values.shape == thresholds.shape and values.ndim == 2
+    _check(fits, "core_regions", values=values, thresholds=thresholds)
+    return _native.core_regions(_bytes(values), _bytes(thresholds), strong, core, least_area, most)
 
 
 def held_parts(mask: Bytes, seeds: Bytes) -> Bytes:
-    """The parts of a mask (h, w) that hold a pixel of `seeds` (h, w), 255 or 0: see numpy_robust."""
+    """The 4-connected parts of a mask (h, w) that hold a pixel of `seeds` (h, w), 255 or 0."""
     _check_mask(mask)
-    if seeds.shape != mask.shape:
-        raise ValueError(f"held_parts: mask {mask.shape} and seeds {seeds.shape} do not fit")
-    parts: Bytes = _robust.held_parts(_bytes(mask), _bytes(seeds))
-    return parts
+    _check(seeds.shape == mask.shape, "held_parts", mask=mask, seeds=seeds)
+    return _native.held_parts(_bytes(mask), _bytes(seeds))
 
 
 def measure_regions(
-    labels: NDArray[np.uint8],
-    boxes: NDArray[np.int32],
-    channels: Sequence[NDArray[np.uint8]],
-    margin: int,
+    labels: Bytes, boxes: NDArray[np.int32], channels: Sequence[Bytes], margin: int
 ) -> NDArray[np.int64]:
-    """Sums over regions and over what is around them, (N, 2, 2 C + 1): see numpy_robust."""
-    shapes = {each.shape for each in channels}
-    if shapes != {labels.shape} or labels.ndim != 2:
-        raise ValueError(f"measure_regions: labels {labels.shape} and channels {shapes} do not fit")
-    _check_labels("measure_regions", labels, len(boxes))
-    sums: NDArray[np.int64] = _robust.measure_regions(
-        np.ascontiguousarray(labels, np.uint8),
-        np.ascontiguousarray(boxes, np.int32).reshape(-1, 4),
-        [np.ascontiguousarray(each, np.uint8) for each in channels],
-        margin,
+    """Count, sums and sums of squares of C channels (h, w) over regions and around them, (N, 2, 2 C + 1)."""
+    fits = {channel.shape for channel in channels} == {labels.shape} and labels.ndim == 2
+    _check(fits, "measure_regions", labels=labels)
+    _check_labels(labels, len(boxes))
+    return _native.measure_regions(
+        _bytes(labels), _boxes(boxes), [_bytes(channel) for channel in channels], margin
     )
-    return sums
 
 
-def match_regions(
-    query: NDArray[np.uint8], searched: NDArray[np.uint8], boxes: NDArray[np.int32], reach: int
-) -> NDArray[np.float64]:
-    """How well boxes of one picture are found again in another, (N, 6): see numpy_robust."""
-    boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
+def match_regions(query: Bytes, searched: Bytes, boxes: NDArray[np.int32], reach: int) -> Floats:
+    """How well boxes (N, 4) of one picture (h, w) are found again within `reach` px in another, (N, 6)."""
     height, width = query.shape
-    if searched.shape != (height + 2 * reach, width + 2 * reach):
-        raise ValueError(
-            f"match_regions: searched {searched.shape}, query {query.shape}, reach {reach} do not fit"
-        )
-    _check_boxes("match_regions", boxes, query.shape)
-    found: NDArray[np.float64] = _robust.match_regions(
-        np.ascontiguousarray(query, np.uint8),
-        np.ascontiguousarray(searched, np.uint8),
-        boxes,
-        reach,
-    )
-    return found
+    fits = searched.shape == (height + 2 * reach, width + 2 * reach)
+    _check(fits, "match_regions", query=query, searched=searched)
+    boxes = _boxes(boxes, query.shape)
+    return _native.match_regions(_bytes(query), _bytes(searched), boxes, reach)
 
 
-_light = numpy_light if _native is None else _native
-
-
-def slopes(
-    before: NDArray[np.float32], after: NDArray[np.float32], prior: float
-) -> NDArray[np.float64]:
-    """By how much one of two (N, C), N > 0, is spread wider than the other, (C,): see numpy_light."""
-    if before.shape != after.shape or before.ndim != 2 or len(before) == 0:
-        raise ValueError(f"slopes: before {before.shape} and after {after.shape} do not fit")
+def slopes(before: NDArray[np.float32], after: NDArray[np.float32], prior: float) -> Floats:
+    """By how much one of two (N, C), N > 0, is spread wider than the other, (C,)."""
+    fits = before.shape == after.shape and before.ndim == 2 and len(before) > 0
+    _check(fits, "slopes", before=before, after=after)
     if not (np.isfinite(before).all() and np.isfinite(after).all()):
         raise ValueError("slopes: before and after must be finite")
-    found: NDArray[np.float64] = _light.slopes(
+    return _native.slopes(
         np.ascontiguousarray(before, np.float32), np.ascontiguousarray(after, np.float32), prior
     )
-    return found
 
 
 def fit_moves(
-    rows_x: NDArray[np.float64],
-    rows_y: NDArray[np.float64],
-    moves: NDArray[np.float64],
-    trust: NDArray[np.float64],
-    ridge: NDArray[np.float64],
+    rows_x: Floats,
+    rows_y: Floats,
+    moves: Floats,
+    trust: Floats,
+    ridge: Floats,
     wide: float,
     high: float,
-) -> tuple[NDArray[np.float64], float]:
-    """A robust linear fit (8,) of displacements (N, 2), and its median rest: see numpy_light."""
+) -> tuple[Floats, float]:
+    """A robust linear fit (8,) of rows (N, 8) to moves (N, 2), trusted (N,), and the median of what remains."""
     count = len(trust)
-    if (
-        not rows_x.shape == rows_y.shape == (count, 8)
-        or moves.shape != (count, 2)
-        or ridge.shape != (8,)
-    ):
-        raise ValueError(
-            f"fit_moves: rows {rows_x.shape}, {rows_y.shape} and moves {moves.shape} do not fit"
-        )
+    fits = rows_x.shape == rows_y.shape == (count, 8) and moves.shape == (count, 2)
+    fits = fits and ridge.shape == (8,)
+    _check(fits, "fit_moves", rows_x=rows_x, rows_y=rows_y, moves=moves, ridge=ridge)
     if not ((trust >= 0).all() and (trust > 0).any() and (ridge >= 0).all()):
         raise ValueError("fit_moves: trust is 0 or more and somewhere more, a ridge 0 or more")
     if not (np.isfinite(rows_x).all() and np.isfinite(rows_y).all() and np.isfinite(moves).all()):
         raise ValueError("fit_moves: rows and moves must be finite")
     x, y, moved, trusted, damping = (
-        np.ascontiguousarray(each, np.float64) for each in (rows_x, rows_y, moves, trust, ridge)
+        np.ascontiguousarray(array, np.float64) for array in (rows_x, rows_y, moves, trust, ridge)
     )
-    found: tuple[NDArray[np.float64], float] = _light.fit_moves(
-        x, y, moved, trusted, damping, wide, high
-    )
-    return found
+    return _native.fit_moves(x, y, moved, trusted, damping, wide, high)
 
 
 def detail_products(
     before: Bytes, after: Bytes, table: NDArray[np.float32], window: int, cell: int
 ) -> NDArray[np.float32]:
-    """What the details of two pictures (h, w) have in common in cells, (3, h / cell, w / cell): see numpy_light."""
-    if before.shape != after.shape or before.ndim != 2 or table.shape != (256,):
-        raise ValueError(
-            f"detail_products: pictures {before.shape}, {after.shape}, table {table.shape} do not fit"
-        )
-    if not (
-        window % 2 == 1 and 1 <= window <= min(before.shape) and 1 <= cell <= min(before.shape)
-    ):
+    """What the details of two pictures (h, w) have in common in cells, (3, h / cell, w / cell)."""
+    fits = before.shape == after.shape and before.ndim == 2 and table.shape == (256,)
+    _check(fits, "detail_products", before=before, after=after, table=table)
+    least = min(before.shape)
+    if not (window % 2 == 1 and 1 <= window <= least and 1 <= cell <= least):
         raise ValueError(
             f"detail_products: window {window}, cell {cell} do not fit pictures {before.shape}"
         )
-    found: NDArray[np.float32] = _light.detail_products(
-        _bytes(before), _bytes(after), np.ascontiguousarray(table, np.float32), window, cell
-    )
-    return found
+    table = np.ascontiguousarray(table, np.float32)
+    return _native.detail_products(_bytes(before), _bytes(after), table, window, cell)
 
 
 def flow_on_grid(
-    flow: NDArray[np.float32], details: NDArray[np.uint8], rows: int, columns: int
+    flow: NDArray[np.float32], details: Bytes, rows: int, columns: int
 ) -> NDArray[np.float32]:
-    """A flow (h, w, 2) and how strong details (h, w) are, on a grid (rows, columns, 3): see numpy_light."""
-    if details.ndim != 2 or flow.shape != (*details.shape, 2):
-        raise ValueError(f"flow_on_grid: flow {flow.shape} and details {details.shape} do not fit")
+    """A flow (h, w, 2) and how strong details (h, w) are, on a grid (rows, columns, 3)."""
+    fits = details.ndim == 2 and flow.shape == (*details.shape, 2)
+    _check(fits, "flow_on_grid", flow=flow, details=details)
     if not (1 <= rows <= details.shape[0] and 1 <= columns <= details.shape[1]):
         raise ValueError(
             f"flow_on_grid: a grid of {rows} x {columns} does not fit details {details.shape}"
         )
-    found: NDArray[np.float32] = _light.flow_on_grid(
-        np.ascontiguousarray(flow, np.float32), _bytes(details), rows, columns
-    )
-    return found
+    flow = np.ascontiguousarray(flow, np.float32)
+    return _native.flow_on_grid(flow, _bytes(details), rows, columns)
 
 
-def _target(out: NDArray[np.uint8] | None, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _target(out: Bytes | None, shape: tuple[int, ...]) -> Bytes:
     if out is None:
         return np.empty(shape, np.uint8)
-    if (
-        out.shape != shape
-        or out.dtype != np.uint8
-        or not (out.flags.c_contiguous and out.flags.writeable)
-    ):
+    is_writeable = out.flags.c_contiguous and out.flags.writeable
+    if out.shape != shape or out.dtype != np.uint8 or not is_writeable:
         raise ValueError(
-            f"out: found {out.dtype} of shape {out.shape}; give writeable uint8 in C order, {shape}"
+            f"out: expected writeable uint8 in C order, {shape}, got {out.dtype} {out.shape}"
         )
     return out
 
 
-def _check_labels(kernel: str, labels: NDArray[np.uint8], count: int) -> None:
+def _check(fits: bool, kernel: str, **arrays: NDArray[Any]) -> None:
+    if not fits:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items())
+        raise ValueError(f"{kernel}: {shapes} do not fit")
+
+
+def _check_labels(labels: Bytes, count: int) -> None:
     if labels.dtype != np.uint8 or count > 255:
         raise ValueError(
-            f"{kernel}: labels are bytes of at most 255 regions, got {labels.dtype} and {count} regions"
+            f"labels are bytes of at most 255 regions, got {labels.dtype} and {count} regions"
         )
 
 
-def _check_boxes(name: str, boxes: NDArray[np.int32], shape: tuple[int, ...]) -> None:
-    height, width = shape[:2]
-    ends = boxes[:, :2] + boxes[:, 2:]
-    if (boxes[:, :2] < 0).any() or (boxes[:, 2:] < 1).any() or (ends > [width, height]).any():
-        raise ValueError(f"{name}: boxes outside of the {width} x {height} px picture")
+def _boxes(boxes: NDArray[np.int32], within: tuple[int, ...] | None = None) -> NDArray[np.int32]:
+    boxes = np.ascontiguousarray(boxes, np.int32).reshape(-1, 4)
+    if within is not None:
+        height, width = within
+        ends = boxes[:, :2] + boxes[:, 2:]
+        if (boxes[:, :2] < 0).any() or (boxes[:, 2:] < 1).any() or (ends > [width, height]).any():
+            raise ValueError(f"boxes outside of the {width} x {height} px picture")
+    return boxes
 
 
 def _bytes(array: Bytes) -> Bytes:
     return np.ascontiguousarray(array, np.uint8)
 
 
-def _known(known: Bytes | None, image: Bytes) -> Bytes | None:
-    if known is not None and known.shape != image.shape[:2]:
+def _known(known: NDArray[Any] | None, image: Bytes) -> Bytes | None:
+    if known is None:
+        return None
+    if known.shape != image.shape[:2]:
         raise ValueError(f"known {known.shape} does not fit the image {image.shape}")
-    return None if known is None else _bytes(known)
+    return _bytes(known.view(np.uint8) if known.dtype == np.bool_ else known)
 
 
 def _check_image(image: Bytes) -> None:
@@ -465,11 +333,6 @@ def _check_image(image: Bytes) -> None:
 def _check_mask(mask: Bytes) -> None:
     if mask.ndim != 2 or mask.size == 0:
         raise ValueError(f"a mask is (height, width) and not empty, got {mask.shape}")
-
-
-def _check_tables(tables: Bytes) -> None:
-    if tables.shape != (3, 256):
-        raise ValueError(f"tables are (3, 256), got {tables.shape}")
 
 
 def _check_window(width: int, height: int) -> None:

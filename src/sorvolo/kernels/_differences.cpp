@@ -1,4 +1,4 @@
-// What two pictures differ by, row by row, so that everything stays in the cache. See numpy_robust.py.
+// What two pictures differ by, row by row, so that everything stays in the cache. See tests/kernels/numpy_robust.py.
 //
 // Columns are counted by std::ptrdiff_t: where whole numbers may wrap (-fwrapv) loops over int are not vectorised.
 #include "_native.hpp"

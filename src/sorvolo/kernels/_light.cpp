@@ -1,4 +1,4 @@
-// Kernels of the light between two pictures and of their last pixels of alignment. See numpy_light.py.
+// Kernels of the light between two pictures and of their last pixels of alignment. See tests/kernels/numpy_light.py.
 #include "_native.hpp"
 
 #include <cmath>

@@ -1,4 +1,4 @@
-"""What the compiled module offers; reference*.py say what it does."""
+"""What the compiled module offers; tests/kernels/numpy_*.py state what it computes."""
 
 from collections.abc import Sequence
 

@@ -2,7 +2,7 @@
 //
 // To add one: write it here in namespace sorvolo, SORVOLO_CLONES before the function with the hot loop, and bind it
 // below with a pybind11::gil_scoped_release around that loop; declare it in _native.pyi, write the same in
-// NumPy in numpy_robust.py, let __init__.py hand it on, test that both agree. Then `pip install --no-deps -e .`.
+// NumPy in tests/kernels/numpy_robust.py, let __init__.py hand it on, test that both agree. Then `pip install --no-deps -e .`.
 #include "_native.hpp"
 
 #include <pybind11/stl.h>
