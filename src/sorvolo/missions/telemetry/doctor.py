@@ -16,7 +16,7 @@ from sorvolo.capture.correction import (
     telemetry_faults,
 )
 from sorvolo.capture.flight_telemetry import FlightTelemetry
-from sorvolo.capture.live.klv import mux_klv
+from sorvolo.capture.live.klv_telemetry import mux_klv
 from sorvolo.capture.source import Source, opened_sources
 from sorvolo.capture.video import VideoSource
 from sorvolo.errors import InputError
