@@ -11,7 +11,12 @@ from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.geometry.grid import SiteGrid
 from sorvolo.geometry.pose import NADIR_CAMERA_NORTH_UP, Pose
 from sorvolo.heights.borders import beyond_borders
-from sorvolo.heights.figures import PointJudgement, surface_figures, surface_warnings
+from sorvolo.heights.figures import (
+    PointJudgement,
+    relief_picture,
+    surface_figures,
+    surface_warnings,
+)
 from sorvolo.heights.free_space import IslandSettings, seen_through
 from sorvolo.heights.lattice import Lattice
 from sorvolo.heights.obstacles import Obstacles
@@ -19,7 +24,7 @@ from sorvolo.heights.orthophoto import OrthophotoSettings, choose_photos, paint_
 from sorvolo.heights.smooth_sigma import SmoothSigma
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
 from sorvolo.heights.sweep import SmoothingSettings, SweepSettings, choose_views, smoothed
-from sorvolo.heights.terrain import TerrainSettings, filled, relief_picture, terrain
+from sorvolo.heights.terrain import TerrainSettings, filled, terrain
 from sorvolo.heights.views import inside
 from sorvolo.registration.features import gray_from_rgb
 

@@ -15,13 +15,14 @@ from sorvolo.heights.figures import (
     camera_figures,
     camera_warnings,
     judged_by_points,
+    relief_picture,
     surface_figures,
     surface_warnings,
 )
 from sorvolo.heights.lattice import CellSettings, Lattice
 from sorvolo.heights.orthophoto import OrthophotoSettings, paint_orthophoto
 from sorvolo.heights.surface import Surface, SurfaceSettings, sweep_surface
-from sorvolo.heights.terrain import TerrainSettings, relief_picture, terrain
+from sorvolo.heights.terrain import TerrainSettings, terrain
 from sorvolo.heights.views import View, ground_outlines_m
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.heights.flight_views import flight_views, run_of
