@@ -16,13 +16,13 @@ from sorvolo.capture.live.klv import (
     checksum,
     encode,
     local_sets,
-    packet_of,
 )
 from sorvolo.capture.live.klv_telemetry import (
     camera_of,
     columns_of,
     ground_elevation_m,
     metadata_of,
+    packet_of,
     site_from_sensor_rotation,
 )
 from sorvolo.errors import InputError
