@@ -15,14 +15,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from batch_flights import another, content, descendants, written_sites
 
 from ended_work import ended
 from sorvolo.cli.main import main
 from sorvolo.cluster import ray_cluster, streams
-from sorvolo.cluster import ray_executor as ray_executor_module
 from sorvolo.cluster.batch import BatchSettings, run_batch
 from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, WatchWish
@@ -31,18 +29,13 @@ from sorvolo.cluster.ray_executor import (
     RayExecutor,
     _demand_fit,
     _LiveTry,
-    _with_detector,
     ray_executor,
 )
-from sorvolo.cluster.shared_detector import SharingSettings
 from sorvolo.cluster.streams import run_streams, streams_of
 from sorvolo.cluster.table import LOCK, State
-from sorvolo.detection.models import find_model
-from sorvolo.detection.sharing import shared_engine
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.map.flights import map_flights
-from waiting import wait_for
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'sorvolo[fleet]'")
 
@@ -83,74 +76,6 @@ def _kill_a_machine_at_work(cluster: Any, root: Path) -> None:
                     cluster.remove_node(node, allow_graceful=False)
                     os.kill(pid, signal.SIGCONT)
                     return
-
-
-@pytest.mark.long
-def test_each_machine_has_one_detector_and_with_a_card_a_share_of_it(
-    cluster: Any, tmp_path: Path
-) -> None:
-    order = Order("in", "site", FlightWish())
-    with ray_executor("ray", None, 60.0, tmp_path, SharingSettings(True, 0.25)) as executor:
-        detectors = executor._detectors
-        assert detectors is not None
-        addresses = detectors.addresses()
-        assert addresses.keys() == {
-            each["NodeID"] for each in ray.nodes() if each["Resources"].get("CPU")
-        }
-        assert len(set(addresses.values())) == 2 and detectors.addresses() == addresses
-        assert ray.available_resources()["GPU"] == 0.75
-        kept = sum(
-            min(1e9, each["Resources"]["memory"])
-            for each in ray.nodes()
-            if each["Resources"].get("CPU")
-        )
-        assert ray.cluster_resources()["memory"] - ray.available_resources()[
-            "memory"
-        ] == pytest.approx(kept, abs=10)
-        for (
-            address
-        ) in addresses.values():  # on the processor: there is no card that anything runs on
-            engine = shared_engine(address, find_model("thermal"))
-            assert "CPU" in engine.provider
-            assert len(engine.run(np.zeros((1, 3, 64, 64), np.uint8))) == 3
-        executor._running = {
-            ("watch", str(number)): None for number in range(8)
-        }  # two cores hold ten of a fifth
-        assert executor.has_room(Cost(0.2, 100.0)) and not executor.has_room(Cost(1.0, 100.0))
-        executor._running = {}
-        given = ray.get(ray.remote(_with_detector).remote(order, addresses))
-        assert given.detector in addresses.values()
-        assert ray.get(ray.remote(_with_detector).remote(order, {"another": "socket"})) == order
-
-
-@pytest.mark.long
-def test_a_detector_whose_actor_hangs_is_ended_and_started_again(
-    cluster: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with ray_executor("ray", None, 60.0, tmp_path, SharingSettings(True)) as executor:
-        detectors = executor._detectors
-        assert detectors is not None
-        before = detectors.addresses()
-        node = next(iter(before))
-        (actor,) = [
-            pid
-            for each in cluster.worker_nodes
-            if each.node_id == node
-            for pid in descendants({each.all_processes["raylet"][0].process.pid})
-            if Path(f"/proc/{pid}/cmdline").read_bytes().startswith(b"ray::_Detector")
-        ]
-        os.kill(actor, signal.SIGSTOP)
-        threading.Timer(120, _let_go, [[actor]]).start()
-        monkeypatch.setattr(ray_executor_module, "WAITS", replace(WAITS, probe_s=20.0))
-        assert detectors.addresses().keys() == before.keys() - {
-            node
-        }  # a flight there has its own meanwhile
-        monkeypatch.undo()
-        wait_for(lambda: not Path(f"/proc/{actor}/cmdline").exists())
-        after = detectors.addresses()
-        assert after.keys() == before.keys() and after[node] != before[node]
-        engine = shared_engine(after[node], find_model("thermal"))
-        assert len(engine.run(np.zeros((1, 3, 64, 64), np.uint8))) == 3
 
 
 def _hold_the_parent_of_a_mission(cluster: Any) -> list[int]:

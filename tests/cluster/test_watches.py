@@ -57,11 +57,11 @@ class Crowded(LocalExecutor):
 
 
 def local(
-    kind: type[LocalExecutor] = LocalExecutor, *, shares_detector: bool = False
+    kind: type[LocalExecutor] = LocalExecutor,
 ) -> Callable[[BatchTable], AbstractContextManager[Executor]]:
     @contextmanager
     def executor(table: BatchTable) -> Iterator[Executor]:
-        with kind(2, 60.0, table.lock, shares_detector=shares_detector) as made:
+        with kind(2, 60.0, table.lock) as made:
             yield made
 
     return executor
@@ -103,7 +103,7 @@ def test_a_stream_whose_watch_dies_goes_on_in_the_same_folder(flown: Path, tmp_p
     settings = wished(flown, alert_command=killing_once(tmp_path / "killed", tmp_path / "alerts"))
     streams = streams_of([f"north=follow:{tmp_path / 'in' / 'one'}"])
     updates: list[BatchUpdate] = []
-    executor = local(Crowded, shares_detector=True)
+    executor = local(Crowded)
     running = run_streams(streams, tmp_path / "out", settings, executor, threading.Event())
     with closing(running):
         while True:
@@ -202,7 +202,6 @@ def test_what_nobody_got_stands_in_the_headline() -> None:
         (["--mission", "watch", "--cot", "tak.local"], "udp://host:port"),
         (["--mission", "watch", "--alert-command", "no-such-program"], "no program"),
         (["--mission", "watch", "--fps", "0"], "frames a second"),
-        (["--mission", "watch", "--blocks", "2"], "--mission watch takes none"),
     ],
 )
 def test_options_that_cannot_be(

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_sharing import sharing
 from toy_models import draw, rectangle_model
 
 from sorvolo.detection.contract import SecondLook
@@ -114,15 +113,11 @@ def test_the_packaged_opinion_answers_for_each_cut_out_in_its_cell() -> None:
         assert len(set(seen.scores.tolist())) == rows * columns
 
 
-def test_lists_tiles_and_a_shared_process_judge_alike(
-    detector: Detector, model: Path, tmp_path: Path
-) -> None:
+def test_lists_and_tiles_judge_alike(detector: Detector) -> None:
     alone = detector.detect(pictured(), least_score=0.0)
-    with sharing(tmp_path) as (address, _):
-        shared = Detector.load(model, shared=address).detect(pictured(), least_score=0.0)
     listed = detector.detect([pictured(), np.zeros((40, 40, 3), np.uint8)], least_score=0.0)[0]
     tiled = detector.detect(pictured(), least_score=0.0, tiles=320)
-    for other in (shared, listed, tiled):
+    for other in (listed, tiled):
         np.testing.assert_allclose(other.boxes_px, alone.boxes_px)
         np.testing.assert_allclose(other.scores, alone.scores)
 

@@ -402,16 +402,3 @@ def test_a_window_shows_what_it_sees_of_a_large_picture_at_the_price_of_that():
     assert (time.process_time() - start) / 5 < 0.1  # 0.6 s where all 48 megapixels are corrected
     assert (seen[100:164, 100:164, 0] > 230).all()
     assert not seen[:90].any()
-
-
-def test_tiles_painted_apart_are_those_painted_together(scene):
-    frames, images = scene
-    grid = Grid((0.0, 0.0), 0.05, 256)
-    together: dict = {}
-    Canvas(grid, together, images.__getitem__).paint(frames)
-    for share in (set(list(together)[::2]), set(list(together)[1::2])):
-        apart: dict = {}
-        Canvas(grid, apart, images.__getitem__, within=share).paint(frames)
-        assert apart.keys() == share
-        for tile in share:
-            assert np.abs(apart[tile].astype(int) - together[tile]).max() <= 2  # of 255: rounding

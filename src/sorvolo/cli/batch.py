@@ -116,24 +116,6 @@ Stall = Annotated[
     float,
     typer.Option(help="End a process that neither answers nor computes for this many seconds."),
 ]
-Blocks = Annotated[
-    int,
-    typer.Option(help="Divide each flight into this many blocks of ground, joined to one map."),
-]
-Shares = Annotated[
-    bool | None,
-    typer.Option(
-        "--share-detector/--own-detectors",
-        help="One detector for all flights of a machine, or one for each.",
-        show_default="shared by live sources",
-    ),
-]
-Gpus = Annotated[
-    float,
-    typer.Option(
-        help="Share of a graphics card that a machine's shared detector takes in a Ray cluster: 0.25, 1."
-    ),
-]
 CopyTo = Annotated[
     str,
     typer.Option(
@@ -160,9 +142,6 @@ def batch(
     stall: Stall = 300.0,
     retry: Retry = False,
     copy_to: CopyTo = "",
-    blocks: Blocks = 1,
-    share_detector: Shares = None,
-    gpus: Gpus = 0.0,
     classes: SearchedClasses = None,
     least_score: LeastScore = None,
     fps: SearchRate = None,
@@ -185,7 +164,7 @@ def batch(
 
     Example: sorvolo batch north=rtsp://192.168.1.10/live south=udp://:5000 --root found --mission watch
 
-    Example: sorvolo batch /mnt/shared/valley --root /mnt/shared/maps --blocks 16 --executor ray://head:10001
+    Example: sorvolo batch /mnt/shared/valley --root /mnt/shared/maps --executor ray://head:10001
     """
     from sorvolo.cluster.batch import BatchSettings
     from sorvolo.cluster.orders import FlightWish, Mission, WatchWish
@@ -206,10 +185,8 @@ def batch(
     wish = FlightWish(
         Mission(mission.value), _absolute(camera), _absolute(model), gsd, give_up, watch, place
     )
-    settings = BatchSettings(wish, _site_by(site_by, mission), tries, stall, retry, blocks)
-    report = _run(
-        places, telemetry or (), root, settings, _Running(executor, workers, share_detector, gpus)
-    )
+    settings = BatchSettings(wish, _site_by(site_by, mission), tries, stall, retry)
+    report = _run(places, telemetry or (), root, settings, _Running(executor, workers))
     if as_json:
         typer.echo(json.dumps(_plain(report, root), indent=1))
     else:
@@ -234,12 +211,10 @@ def _site_by(wished: SiteByName | None, mission: MissionName) -> "SiteBy":
 
 @dataclass(frozen=True)
 class _Running:
-    """Where flights run, how many at once, and with whose detector, as the options have it."""
+    """Where flights run and how many at once, as the options have it."""
 
     executor: str
     workers: int | None
-    shares_detector: bool | None
-    gpus: float
 
 
 def _run(
@@ -257,14 +232,10 @@ def _run(
     if settings.wish.copy_to:  # a store that hangs is given up by the copy, not by the batch
         settings = replace(settings, stall_s=settings.stall_s + _STORE_HANGS_S)
     live = [each for each in places if is_stream(each)]
-    _check_live(live, places, wish.workers, settings.blocks)
+    _check_live(live, places, wish.workers)
     if live:  # one that waits for its drone does nothing, and gives up by itself
         settings = replace(settings, stall_s=settings.stall_s + settings.wish.give_up_s)
-        wish = replace(
-            wish,
-            workers=wish.workers or len(live),
-            shares_detector=len(live) > 1 if wish.shares_detector is None else wish.shares_detector,
-        )
+        wish = replace(wish, workers=wish.workers or len(live))
     executors = _executor_of(wish, settings)
     if receivers and not live:
         raise SettingsError(
@@ -282,16 +253,12 @@ def _run(
             return _show_progress(running, Console(stderr=True))
 
 
-def _check_live(
-    live: Sequence[str], places: Sequence[str], workers: int | None, blocks: int
-) -> None:
+def _check_live(live: Sequence[str], places: Sequence[str], workers: int | None) -> None:
     """Raise SettingsError for live sources beside folders, and for fewer workers than live sources."""
     if live and len(live) < len(places):
         raise SettingsError(
             "give folders of flights or live sources, not both: they are two batches with two roots"
         )
-    if live and blocks > 1:
-        raise SettingsError("--blocks divides recorded flights; live sources are mapped whole")
     if live and workers is not None and workers < len(live):
         raise SettingsError(f"--workers {workers}: {len(live)} live sources need a worker each")
 
@@ -323,25 +290,17 @@ def _executor_of(
     wish: _Running, settings: "BatchSettings"
 ) -> "Callable[[BatchTable], AbstractContextManager[Executor]]":
     from sorvolo.cluster.local_executor import LocalExecutor, default_workers
-    from sorvolo.cluster.shared_detector import SharingSettings
 
     name, workers = wish.executor, wish.workers
-    sharing = SharingSettings(bool(wish.shares_detector), wish.gpus)
     if workers is not None and workers < 1:
         raise SettingsError(f"--workers {workers}: at least 1 is needed")
     if name == "local":
-        if wish.gpus:
-            raise SettingsError(
-                "--gpus divides the graphics cards of a Ray cluster: give --executor ray as well"
-            )
-        count, is_shared = workers or default_workers(), sharing.is_shared
-        return lambda table: LocalExecutor(
-            count, settings.stall_s, table.lock, settings.costs, shares_detector=is_shared
-        )
+        count = workers or default_workers()
+        return lambda table: LocalExecutor(count, settings.stall_s, table.lock, settings.costs)
     if name == "ray" or name.startswith("ray://"):
         from sorvolo.cluster.ray_executor import ray_executor
 
-        return lambda table: ray_executor(name, workers, settings.stall_s, table.root, sharing)
+        return lambda table: ray_executor(name, workers, settings.stall_s, table.root)
     raise SettingsError(f"--executor {name}: give local, ray, or ray://HOST:PORT")
 
 

@@ -4,13 +4,13 @@ import hashlib
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping, Sequence, Set
-from contextlib import AbstractContextManager, closing
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeGuard
+from typing import TypeGuard
 
 import sorvolo
-from sorvolo.cluster.cost import Cost, CostSettings, cost_of
+from sorvolo.cluster.cost import CostSettings, cost_of
 from sorvolo.cluster.executor import Executor, Key
 from sorvolo.cluster.orders import Ending, FlightWish, Mission, Order, Outcome, Scouted, WatchWish
 from sorvolo.cluster.scout import FoundFlight, Unreadable, find_flights, scout
@@ -27,9 +27,6 @@ from sorvolo.detection.models import demand_searching, find_model
 from sorvolo.detection.session import read_info
 from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.software import software
-
-if TYPE_CHECKING:
-    from sorvolo.cluster.divided import Progress
 
 
 @dataclass(frozen=True)
@@ -58,7 +55,6 @@ class BatchSettings:
     most_tries: int = 3  # that end the process of a flight's worker; then it is set aside
     stall_s: float = 300.0  # without an answer or any work: the worker is ended
     retries: bool = False  # flights that were set aside before are tried again
-    blocks: int = 1  # into which each flight is divided
     near_m: float = (
         50.0  # from a site's ground: a drone sees no less than half of that beside its track
     )
@@ -68,12 +64,6 @@ class BatchSettings:
     def __post_init__(self) -> None:
         if self.most_tries < 1:
             raise SettingsError(f"--tries {self.most_tries}: at least 1 is needed")
-        if self.blocks < 1:
-            raise SettingsError(f"--blocks {self.blocks}: at least 1 is needed")
-        if self.blocks > 1 and self.wish.mission is not Mission.MAP:
-            raise SettingsError(
-                f"--blocks divides flights to be mapped; --mission {self.wish.mission} takes none"
-            )
         if not self.stall_s > 0:
             raise SettingsError(f"--stall {self.stall_s:g}: more than 0 seconds are needed")
         self._check_watch()
@@ -203,8 +193,6 @@ class _Run:
             while self._waiting or self._executor.running:
                 if not self._executor.running and not self._due():  # all that wait are out of reach
                     time.sleep(self._late.wait_s or 0.0)
-                elif self._settings.blocks > 1:
-                    yield from self._divided(self._take(self._due()[0]))
                 else:
                     yield from self._side_by_side()
         finally:
@@ -237,41 +225,6 @@ class _Run:
             if site not in busy and self._late.is_due(queue[0].key)
         ]
         return [queue[0] for queue in sorted(free, key=_all_frames, reverse=True)]
-
-    def _divided(self, row: Row) -> Generator[BatchUpdate]:
-        """One flight in blocks, with all workers: another is begun when it is through."""
-        from sorvolo.cluster.divided import SetAside, map_divided  # which takes long to import
-
-        def cost(crashes: int) -> Cost:
-            return cost_of(replace(row, crashes=crashes), self._table, self._settings.costs)
-
-        running = map_divided(
-            row.key,
-            self._order(row),
-            self._settings.blocks,
-            self._executor,
-            cost,
-            self._settings.most_tries,
-        )
-        try:
-            ending = yield from self._shown(running)
-        except SetAside as error:
-            row = replace(row, crashes=self._settings.most_tries - 1)
-            ending = Ending(Outcome.CRASHED, str(error))
-        yield self.update(self._end(row, ending))
-
-    def _shown(
-        self, running: "Generator[Progress, None, Ending]"
-    ) -> Generator[BatchUpdate, None, Ending]:
-        """What becomes of a flight in blocks, as updates of the batch."""
-        with closing(running):
-            while True:
-                try:
-                    task, done, total = next(running)
-                except StopIteration as end:
-                    ending: Ending = end.value
-                    return ending
-                yield replace(self.update(), task=task, done=done, total=total)
 
     def _take(self, row: Row) -> Row:
         """The row, no longer waiting."""

@@ -4,25 +4,21 @@ import os
 import queue
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Self
 
 from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.cluster.cost import Cost, CostSettings
 from sorvolo.cluster.orders import Ending, Order
 from sorvolo.cluster.process import WorkerProcess, most_memory_mb, run_order
-from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
 from sorvolo.missions.flight.memory import MemorySettings, available_bytes, memory_budget_bytes
 
 Key = tuple[str, str]
 
 
 class LocalExecutor:
-    """At most `workers` processes at once, and no more than the memory holds, with the detector that they share. A
-    context manager: leaving ends them.
+    """At most `workers` processes at once, and no more than the memory holds. A context manager: leaving ends them.
 
-    `lock` is the batch's, which the processes keep until they are gone. With `shares_detector` one process holds the
-    detector for all of them.
+    `lock` is the batch's, which the processes keep until they are gone.
     """
 
     def __init__(
@@ -31,14 +27,8 @@ class LocalExecutor:
         stall_s: float,
         lock: int,
         costs: CostSettings = CostSettings(),
-        *,
-        shares_detector: bool = False,
     ) -> None:
         self.workers, self._costs = workers, costs
-        silent_s = min(
-            SharingSettings.silent_s, stall_s / 3
-        )  # before those who wait for it count as hanging
-        self._detector = SharedDetector(silent_s) if shares_detector else None
         self._stall_s, self._lock = stall_s, lock
         self._running: dict[Key, tuple[WorkerProcess, Cost]] = {}
         self._live: set[Key] = set()
@@ -53,8 +43,6 @@ class LocalExecutor:
             worker.kill()
         while self._running:  # each is waited for by its thread
             self.next_ended()
-        if self._detector is not None:
-            self._detector.end()
 
     @property
     def running(self) -> Mapping[Key, object]:
@@ -65,7 +53,7 @@ class LocalExecutor:
         """Whether another try may start."""
         if not self._running:
             return True
-        taken_mb = self._detector_mb + sum(map(self._memory_mb, self._running))
+        taken_mb = sum(map(self._memory_mb, self._running))
         most_mb = self._costs.machine_share * available_bytes() / 1e6
         return len(self._running) < self.workers and taken_mb + cost.memory_mb <= most_mb
 
@@ -77,21 +65,12 @@ class LocalExecutor:
         return self._costs.reserve * most_memory_mb(worker.pid) or cost.memory_mb
 
     @property
-    def _detector_mb(self) -> float:
-        """What the shared detector is budgeted: as much as it had so far and a reserve, or what it usually takes."""
-        if self._detector is None:
-            return 0.0
-        return max(self._costs.detector_mb, self._costs.reserve * self._detector.memory_mb)
-
-    @property
     def cache_mb(self) -> float:
         """Memory for what a worker could also read again: the machine's share of it, divided among the workers."""
         return max(MemorySettings().least_mb, memory_budget_bytes(None) / 1e6 / self.workers)
 
     def start(self, key: Key, order: Order, cost: Cost) -> None:
         """Start a try."""
-        if self._detector is not None and searches(order):
-            order = replace(order, detector=self._detector.address)
         worker = WorkerProcess(order, [self._lock])
         self._running[key] = (worker, cost)
         if is_live_address(order.source):

@@ -83,37 +83,15 @@ class FlightWish:
         return cls(**{**plain, "mission": Mission(plain["mission"]), "watch": watch})
 
 
-class PartKind(StrEnum):
-    """What a part of a flight in blocks is."""
-
-    FRAMES = "frames"  # those of a video that its map is made of, chosen
-    BLOCK = "block"  # some of its pictures, registered
-    TILES = "tiles"  # some of its map's tiles, painted
-
-
-@dataclass(frozen=True)
-class Part:
-    """One of `count` parts of a flight, by its number from 0; its files lie in `folder`. `key` is what is asked for."""
-
-    kind: PartKind
-    number: int
-    count: int
-    folder: str
-    key: str = ""
-
-
 @dataclass(frozen=True)
 class Order:
-    """One try at one flight, or at a `part` of one: the file, folder or address, the folder of the site, or of a
-    watch's results, and how much its caches may take, MB. `detector` is the socket of one that the flights of its
-    machine share; "" for its own. `telemetry` is the receiver's address of a live source; "" for none."""
+    """One try at one flight: the file, folder or address, the folder of the site, or of a watch's results, and how much
+    its caches may take, MB. `telemetry` is the receiver's address of a live source; "" for none."""
 
     source: str
     site: str
     wish: FlightWish
     memory_mb: float | None = None
-    part: Part | None = None
-    detector: str = ""
     telemetry: str = ""
 
     def line(self) -> bytes:
@@ -123,10 +101,7 @@ class Order:
     @classmethod
     def of(cls, plain: Mapping[str, Any]) -> Self:
         """The order that a worker received."""
-        part = plain.get("part")
-        if part is not None:
-            part = Part(**{**part, "kind": PartKind(part["kind"])})
-        return cls(**{**plain, "wish": FlightWish.of(plain["wish"]), "part": part})
+        return cls(**{**plain, "wish": FlightWish.of(plain["wish"])})
 
 
 @dataclass(frozen=True)

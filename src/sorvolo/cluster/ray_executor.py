@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import sorvolo
 from sorvolo.capture.live.addresses import is_live_address
-from sorvolo.cluster.cost import Cost, CostSettings
+from sorvolo.cluster.cost import Cost
 from sorvolo.cluster.orders import Ending, Order, Outcome
 from sorvolo.cluster.process import WorkerProcess, run_order
 from sorvolo.cluster.ray_cluster import (
@@ -34,7 +34,6 @@ from sorvolo.cluster.ray_cluster import (
     unshared,
     working_machines,
 )
-from sorvolo.cluster.shared_detector import SharedDetector, SharingSettings, searches
 from sorvolo.cluster.signs_of_life import SignOfLife, shown_alive
 from sorvolo.cluster.table import LOCK
 from sorvolo.errors import InputError, SettingsError, StoreError
@@ -51,7 +50,6 @@ def ray_executor(
     workers: int | None,
     stall_s: float,
     root: Path,
-    sharing: SharingSettings = SharingSettings(),
 ) -> "Iterator[RayExecutor]":
     """The executor on the cluster at `ray://HOST:PORT`, or for "ray" on this machine's, which is started if need be.
 
@@ -77,7 +75,7 @@ def ray_executor(
 
     try:
         check_machines(root)
-        executor = RayExecutor(name, workers, stall_s, root, sharing)
+        executor = RayExecutor(name, workers, stall_s, root)
         try:
             yield executor
         finally:
@@ -95,7 +93,6 @@ class RayExecutor:
         workers: int | None,
         stall_s: float,
         root: Path,
-        sharing: SharingSettings = SharingSettings(),
     ) -> None:
         import ray
 
@@ -117,7 +114,6 @@ class RayExecutor:
         self._asked_found: dict[Key, Any] = {}  # answers of theirs that are on their way
         self._taken: dict[Key, int] = {}  # how much of what they found was taken
         self._last_found: list[tuple[Key, str]] = []  # by those that have ended since `take_found`
-        self._detectors = MachineDetectors(ray, sharing.gpus) if sharing.is_shared else None
         self._is_gone = False
         # through ray:// the head's own client server is asked, and raises what `_cluster` knows
         self._head = "" if name.startswith(SCHEME) else str(ray.get_runtime_context().gcs_address)
@@ -212,11 +208,7 @@ class RayExecutor:
 
     def _submit(self, key: Key, order: Order, cost: Cost) -> None:
         machines = self._machines()
-        shared = (
-            self._detectors.addresses() if self._detectors is not None and searches(order) else {}
-        )
-        taken = self._detectors.memory_bytes if self._detectors is not None else 0.0
-        most = max(each["memory"] - min(taken, each["memory"]) for each in machines)
+        most = max(each["memory"] for each in machines)
         asked = {
             "num_cpus": min(cost.cpus, max(each["CPU"] for each in machines)),
             "memory": int(min(cost.memory_mb * 1e6, most)),
@@ -224,7 +216,7 @@ class RayExecutor:
         }
         sign = self._begun / secrets.token_hex(6)
         self._signs[key] = SignOfLife(sign)
-        given = (order, self._stall_s, self._root, sorvolo.__version__, shared, str(sign))
+        given = (order, self._stall_s, self._root, sorvolo.__version__, str(sign))
         if is_live_address(order.source):
             actor = (
                 self._ray.remote(_LiveTry)
@@ -336,89 +328,6 @@ class RayExecutor:
             ) from error
 
 
-class MachineDetectors:
-    """One detector for each machine of the cluster, which the flights there share. Only `addresses` changes it.
-
-    Each is an actor that holds the process; it ends with the batch. It asks for `gpus` of a graphics card where its
-    machine has so much of one, and runs on the processor of any other; and for the memory that flights then do without.
-    """
-
-    def __init__(
-        self, ray: Any, gpus: float, memory_mb: float = CostSettings().detector_mb
-    ) -> None:
-        self._ray, self._gpus, self.memory_bytes = ray, gpus, 1e6 * memory_mb
-        self._actors: dict[str, Any] = {}  # by the machine's id
-        self._pids: dict[str, int] = {}  # of those that have answered
-
-    def addresses(self) -> dict[str, str]:
-        """The sockets by machine, of those that are there and answer.
-
-        One that hangs is killed, and the next flight there has another. Raises SettingsError where the card or the
-        memory was not free from the beginning.
-        """
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        there = {each["NodeID"]: each["Resources"] for each in working_machines(self._ray)}
-        self._actors = {node: actor for node, actor in self._actors.items() if node in there}
-        for node in there.keys() - self._actors.keys():
-            self._actors[node] = (
-                self._ray.remote(_Detector)
-                .options(
-                    num_cpus=0,
-                    num_gpus=self._gpus if there[node].get("GPU", 0) >= self._gpus else 0,
-                    memory=int(min(self.memory_bytes, there[node].get("memory", 0.0))),
-                    scheduling_strategy=NodeAffinitySchedulingStrategy(node, soft=False),
-                )
-                .remote()
-            )
-        asked = {node: actor.address.remote() for node, actor in self._actors.items()}
-        return {
-            node: address for node, task in asked.items() if (address := self._answer(node, task))
-        }
-
-    def _answer(self, node: str, task: Any) -> str:
-        """The socket on a machine; "" where its actor was lost or hangs, which the next flight there has anew."""
-        try:
-            address, self._pids[node] = self._ray.get(task, timeout=WAITS.probe_s)
-            return str(address)
-        except self._ray.exceptions.GetTimeoutError as error:
-            if node in self._pids:
-                kill_process(self._ray, node, self._pids[node])
-                del self._actors[node]
-                return ""
-            wanted = f"{self._gpus:g} of its graphics card and " if self._gpus else ""
-            raise SettingsError(
-                f"--share-detector: a machine does not have {wanted}{self.memory_bytes / 1e6:,.0f} MB of memory free "
-                f"within {WAITS.probe_s:.0f} s; another batch may hold it, or it is too busy: wait until that ends, "
-                f"{'give a smaller --gpus, ' if self._gpus else ''}or give --own-detectors"
-            ) from error
-        except self._ray.exceptions.RayActorError:
-            del self._actors[node]
-            return ""
-
-
-class _Detector:
-    """On a machine of the cluster: the process that holds its detector, started again where it died."""
-
-    def __init__(self) -> None:
-        self._shared = SharedDetector()
-
-    def address(self) -> tuple[str, int]:
-        """Its socket, and the process of Ray's that holds it."""
-        return self._shared.address, os.getpid()
-
-
-def _with_detector(order: Order, shared: Mapping[str, str]) -> Order:
-    """The order with the socket of this machine's detector, by machine; with its own where it has none yet."""
-    import ray
-
-    return (
-        replace(order, detector=shared.get(ray.get_runtime_context().get_node_id(), ""))
-        if shared
-        else order
-    )
-
-
 class _LiveTry:
     """On a machine of the cluster: a try at a live flight, which `finish` ends. Ray calls its methods in threads."""
 
@@ -432,7 +341,6 @@ class _LiveTry:
         stall_s: float,
         root: str,
         version: str,
-        shared: Mapping[str, str],
         sign: str,
     ) -> tuple[Ending, list[str]]:
         """The try in a process of its own, which ends with this one: how it ended, and all that its watch found."""
@@ -440,7 +348,7 @@ class _LiveTry:
 
         _demand_fit(root, version)
         with shown_alive(Path(sign), ray.get_runtime_context().get_node_id(), stall_s):
-            self._worker = WorkerProcess(_with_detector(order, shared))
+            self._worker = WorkerProcess(order)
             return run_order(self._worker, stall_s, self._found.append), self._found
 
     def found_after(self, taken: int) -> list[str]:
@@ -454,7 +362,7 @@ class _LiveTry:
 
 
 def _try(
-    order: Order, stall_s: float, root: str, version: str, shared: Mapping[str, str], sign: str
+    order: Order, stall_s: float, root: str, version: str, sign: str
 ) -> tuple[Ending, list[str]]:
     """On a machine of the cluster: a try in a process of its own, which ends with Ray's worker, as of `_LiveTry`.
 
@@ -469,7 +377,7 @@ def _try(
             f"the machine {host} does not have {order.source}; flights need the same path on all machines"
         )
     with shown_alive(Path(sign), ray.get_runtime_context().get_node_id(), stall_s):
-        return run_order(WorkerProcess(_with_detector(order, shared)), stall_s), []
+        return run_order(WorkerProcess(order), stall_s), []
 
 
 def _demand_fit(root: str, version: str) -> None:

@@ -13,7 +13,6 @@ from sorvolo.cluster.orders import Order, WatchWish
 from sorvolo.survey.wording import counted, counted_list
 
 if TYPE_CHECKING:
-    from sorvolo.missions.flight.detector_protocol import ObjectDetector
     from sorvolo.missions.watch.settings import WatchOutputs, WatchSettings
 
 ENDING = "-watch"
@@ -76,7 +75,6 @@ def is_watched(folder: Path, fingerprint: str) -> bool:
 
 def watch_flight(
     order: Order,
-    detector: "ObjectDetector | None",
     alive: Callable[..., None],
     announce: Callable[[str], None],
     until: Event,
@@ -94,7 +92,6 @@ def watch_flight(
         outputs,
         telemetry=order.telemetry or None,
         camera=wish.camera or None,
-        detector=detector,
         live=LiveSettings(give_up_s=wish.give_up_s),
         until=until,
     )

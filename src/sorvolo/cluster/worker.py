@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from sorvolo.capture.live.addresses import is_live_address, without_secret
 from sorvolo.capture.live.reconnect import LiveSettings
@@ -23,15 +23,10 @@ from sorvolo.cluster.orders import (
     Mission,
     Order,
     Outcome,
-    Part,
-    PartKind,
     Scouted,
     answer_line,
 )
 from sorvolo.errors import SorvoloError
-
-if TYPE_CHECKING:
-    from sorvolo.missions.flight.detector_protocol import ObjectDetector
 
 _ALIVE_EVERY_S = 0.5  # far within what counts as standing still; by choice
 _SITE_BUSY_S = 90.0  # a worker of a cluster that is gone holds its site's lock until Ray ends it, after a minute
@@ -91,13 +86,10 @@ def main() -> int:
 
 def _done(order: Order, answers: Answers, until: threading.Event) -> tuple[str, str, bool]:
     """Do the order: the flight's name in the site, words about it, and whether its result is one to use."""
-    if order.part is not None:
-        _PARTS[order.part.kind](order, order.part, answers.alive)
-        return "", "", True
     if order.wish.mission is Mission.WATCH:
         from sorvolo.cluster.watches import watch_flight
 
-        return *watch_flight(order, _detector(order), answers.alive, answers.found, until), True
+        return *watch_flight(order, answers.alive, answers.found, until), True
     _wait_for_site(Path(order.site))
     result = _MISSIONS[order.wish.mission](order, answers.alive, until)
     if order.wish.copy_to:
@@ -105,30 +97,6 @@ def _done(order: Order, answers: Answers, until: threading.Event) -> tuple[str, 
 
         copy_result(Path(order.site), order.wish.copy_to, answers.alive)
     return result
-
-
-def _block(order: Order, part: Part, alive: Callable[..., None]) -> None:
-    """Register the pictures of a block, or choose the frames of a video before its blocks."""
-    from sorvolo.missions.flight.settings import MapSettings
-    from sorvolo.missions.map.blocks import Division, choose_of_video, map_block
-
-    wish = order.wish
-    settings = MapSettings(m_per_px=wish.m_per_px, model=wish.model, memory_mb=order.memory_mb)
-    division = Division(Path(part.folder), part.key, part.count)
-    if part.kind is PartKind.FRAMES:
-        choose_of_video(Path(order.source), wish.camera or None, settings, division, alive)
-    else:
-        map_block(Path(order.source), wish.camera or None, settings, division, part.number, alive)
-
-
-def _tiles(order: Order, part: Part, alive: Callable[..., None]) -> None:
-    """Paint a share of the map's tiles."""
-    from sorvolo.missions.flight.memory import memory_budget_bytes
-    from sorvolo.missions.map.tile_shares import paint_share
-
-    paint_share(
-        Path(part.folder), part.number, part.count, memory_budget_bytes(order.memory_mb), alive
-    )
 
 
 def _follow_input(until: threading.Event) -> None:
@@ -168,13 +136,6 @@ def _scout(source: str, camera: str, answers: Answers) -> None:
     answers.add("scouted", vars(Scouted(flight.fingerprint, flight.frame_count, start_ns, box)))
 
 
-def _detector(order: Order) -> "ObjectDetector | None":
-    """The detector that the flights of this machine share; None where the mission is to open its own."""
-    from sorvolo.missions.flight.map_objects import open_detector
-
-    return open_detector(order.wish.model, order.detector) if order.detector else None
-
-
 def _live(order: Order) -> LiveSettings:
     return LiveSettings(keeps_all=True, give_up_s=order.wish.give_up_s)
 
@@ -193,7 +154,6 @@ def _map(order: Order, alive: Callable[..., None], until: threading.Event) -> tu
         settings,
         telemetry=order.telemetry or None,
         camera=wish.camera or None,
-        detector=_detector(order),
         live=_live(order),
         until=until,
     )
@@ -219,7 +179,6 @@ def _compare(
         CompareSettings(model=wish.model),
         telemetry=order.telemetry or None,
         camera=wish.camera or None,
-        detector=_detector(order),
         live=_live(order),
         until=until,
     )
@@ -244,7 +203,7 @@ def _search(
     outputs = SearchOutputs(site.with_name(f"{site.name}-search") / flight, flights=(flight,))
     report: Mapping[str, Any] = {}
     settings = SearchSettings(model=order.wish.model)
-    with closing(search_site(site, settings, outputs, _detector(order))) as measuring:
+    with closing(search_site(site, settings, outputs)) as measuring:
         for each in measuring:
             alive()
             if isinstance(each, dict):
@@ -253,7 +212,6 @@ def _search(
     return flight, str(head.get("text", "")), bool(head.get("complete"))
 
 
-_PARTS = {PartKind.FRAMES: _block, PartKind.BLOCK: _block, PartKind.TILES: _tiles}
 _MISSIONS = {Mission.MAP: _map, Mission.COMPARE: _compare, Mission.SEARCH: _search}
 
 

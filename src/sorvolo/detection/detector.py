@@ -46,14 +46,8 @@ class Detector:
         provider: Provider = "auto",
         threads: int | None = None,
         stand_in: bool = True,
-        shared: str = "",
     ) -> None:
-        self._session, self._wanted_provider, self._threads, self._shared = (
-            session,
-            provider,
-            threads,
-            shared,
-        )
+        self._session, self._wanted_provider, self._threads = session, provider, threads
         self._any_may_stand_in = stand_in
         self._at_night: Session | None = None
         self._night_was_sought = False
@@ -70,20 +64,18 @@ class Detector:
         provider: Provider = "auto",
         threads: int | None = None,
         stand_in: bool = True,
-        shared: str = "",
     ) -> "Detector":
         """Open an installed model by its name (`sorvolo models list`), or a model file.
 
         `provider` "auto" takes CUDA where there is one, else OpenVINO where it is installed, else the CPU; `threads`
         None takes as many as the process may use. `stand_in`: where a model knows daylight alone and names no other,
-        any installed one that knows thermal frames looks at those; False to measure the model itself. `shared`: the
-        socket of a process that holds the models for several, see `Session`. Raises InputError for a name that is not
+        any installed one that knows thermal frames looks at those; False to measure the model itself. Raises InputError for a name that is not
         installed, for a file that is missing, damaged or no model of Sorvolo's, and for a model that searches no whole
         pictures (`second_only`); SettingsError for a provider that is not there.
         """
-        session = Session(find_model(name_or_path), provider, threads, shared)
+        session = Session(find_model(name_or_path), provider, threads)
         demand_searching(session.info)
-        return cls(session, provider=provider, threads=threads, stand_in=stand_in, shared=shared)
+        return cls(session, provider=provider, threads=threads, stand_in=stand_in)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -398,7 +390,7 @@ class Detector:
             return self._opinions[by]
 
     def _opened(self, path: Path) -> Session:
-        return Session(path, self._wanted_provider, self._threads, self._shared)
+        return Session(path, self._wanted_provider, self._threads)
 
 
 def _together(

@@ -13,7 +13,6 @@ import numpy as np
 from sorvolo.detection.confined import confined_engine, described_confined
 from sorvolo.detection.contract import ModelInfo
 from sorvolo.detection.engine import Engine, Planes, Provider, describe, open_engine
-from sorvolo.detection.sharing import shared_engine
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import BoxesPx, Floats, ImageRGB, Labels, Numbers
 
@@ -40,13 +39,10 @@ class Session:
     letterboxed. Pictures given from several threads are seen one after another.
     """
 
-    def __init__(
-        self, path: Path, provider: Provider = "auto", threads: int | None = None, shared: str = ""
-    ) -> None:
+    def __init__(self, path: Path, provider: Provider = "auto", threads: int | None = None) -> None:
         """Open a model file on `threads` cores, None for as many as this process may use.
 
-        `shared` is the socket of a process that holds the model for several (`sharing`); provider and threads are then
-        its own. Raises InputError for a file that is missing, damaged or none of ours, SettingsError for a provider
+        Raises InputError for a file that is missing, damaged or none of ours, SettingsError for a provider
         that is not installed.
         """
         if provider not in get_args(Provider):
@@ -55,7 +51,7 @@ class Session:
             )
         if threads is not None and threads < 1:
             raise SettingsError(f"a model needs at least one thread, not {threads}")
-        engine = shared_engine(shared, path) if shared else opened_engine(path, provider, threads)
+        engine = opened_engine(path, provider, threads)
         self._run, self.provider, self.info, self.fixed_px = (
             engine.run,
             engine.provider,

@@ -7,7 +7,7 @@ images.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from itertools import pairwise
@@ -71,7 +71,7 @@ class Canvas:
     remember the last few. `painted` are the frames whose picture is in `tiles` already, for a site that is
     opened again. With `keeps_known_ground` every pixel that `tiles` shows now stays byte for byte, whoever painted
     it, but for the ground of a painted frame that is moved or forgotten; and painted frames, of which it may not be
-    known any more which of their pixels exist, show no ground but that. With `within` no other tiles are painted.
+    known any more which of their pixels exist, show no ground but that.
     """
 
     def __init__(
@@ -83,14 +83,12 @@ class Canvas:
         painted: Iterable[CanvasFrame] = (),
         *,
         keeps_known_ground: bool = False,
-        within: Collection[TileIndex] | None = None,
     ) -> None:
         self._grid, self._tiles, self._images, self._settings = grid, tiles, images, settings
         self._frames: dict[int, CanvasFrame] = {}
         self._chunks: dict[TileIndex, _Chunk] = {}
         self._known = KnownGround(grid, tiles) if keeps_known_ground else None
         self._painted_before: set[int] = set()
-        self._within = within
         self._fillings: dict[int, ImageRGB] = {}
         self._warping = ThreadPoolExecutor(1, thread_name_prefix="warping")
         self._bounded: set[TileIndex] = (
@@ -250,8 +248,6 @@ class Canvas:
             x, y = column * _CHUNK_CELLS - low[0], row * _CHUNK_CELLS - low[1]
             cells[y : y + _CHUNK_CELLS, x : x + _CHUNK_CELLS] = mask
         cells = cv2.dilate(cells, np.ones((2 * _REACH_CELLS + 1,) * 2, np.uint8))
-        if self._within is not None:
-            cells = cv2.bitwise_and(cells, self._cells_within(self._within, low, cells.shape))
         left, top, width, height = cv2.boundingRect(cells)
         xs = self._cuts(int(low[0]) + left, width) - low[0]
         ys = self._cuts(int(low[1]) + top, height) - low[1]
@@ -264,21 +260,6 @@ class Canvas:
                 begin = first * CELL_PX // ALIGN_PX * ALIGN_PX
                 end = -(-(first + np.array([w, h])) * CELL_PX // ALIGN_PX) * ALIGN_PX
                 yield int(begin[0]), int(begin[1]), int(end[0]), int(end[1])
-
-    def _cells_within(
-        self, tiles: Collection[TileIndex], low: NDArray[np.int64], shape: tuple[int, ...]
-    ) -> NDArray[np.uint8]:
-        """1 in the cells of these tiles, of a block of cells that begins at `low`; a tile has whole cells."""
-        result = np.zeros(shape, np.uint8)
-        side = self._grid.tile_px // CELL_PX
-        for column, row in tiles:
-            _paste(
-                result,
-                np.ones((side, side), np.uint8),
-                column * side - int(low[0]),
-                row * side - int(low[1]),
-            )
-        return result
 
     def _cuts(self, first: int, count: int) -> NDArray[np.int64]:
         """Where `count` cells from the `first` on are cut into windows.
@@ -394,8 +375,7 @@ class Canvas:
         changed: set[TileIndex] = set()
         for row in range(y // side, (y + rgba.shape[0] - 1) // side + 1):
             for column in range(x // side, (x + rgba.shape[1] - 1) // side + 1):
-                is_ours = self._within is None or (column, row) in self._within
-                if is_ours and self._store_in((column, row), x, y, rgba):
+                if self._store_in((column, row), x, y, rgba):
                     changed.add((column, row))
         return changed
 

@@ -3,7 +3,7 @@
 import io
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import islice
 
 import cv2
@@ -308,22 +308,6 @@ class PlanarMapper:
             and self._known.keys() >= set(new.met)
             and all(each in self._graph or each in new.met for each in others)
         )
-
-    def joined(self, new: Registered) -> Registered:
-        """A picture that another mapper of the flight registered, as it stands in this one's map.
-
-        It keeps the links to pictures that have a place here, and stands where the first of them puts it, else where
-        telemetry does.
-        """
-        keyframe = new.keyframe
-        links = tuple(each for each in new.links if each.old_id in self._graph)
-        guess = self._guess_by_telemetry(keyframe)
-        if links:
-            guess = self._by_link(keyframe, links[0]) or guess
-        elif not self._own and guess is None:
-            guess = Pose(keyframe.prior.rotation, keyframe.prior.position_m)
-        reason = new.reason or ("" if links else "nothing of the map lies under it")
-        return replace(new, links=links, guess=guess, reason=reason)
 
     def place(self, new: Registered) -> Outcome:
         """Add a registered picture to the map."""

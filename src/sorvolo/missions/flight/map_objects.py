@@ -41,10 +41,10 @@ _CROP_PX = 256  # longer side of a picture on a page
 _MOST_CROPS = 60  # of one frame, the surest
 
 
-def open_detector(model: str, shared: str = "", *, is_live: bool = False) -> ObjectDetector | None:
+def open_detector(model: str, *, is_live: bool = False) -> ObjectDetector | None:
     """The detector of this name or file; None for "none", and for "default" where no default model is installed.
 
-    `shared` is the socket of a process that holds it for several, "" for one of its own. Beside an `is_live` flight's
+    Beside an `is_live` flight's
     map it runs at low priority. Raises InputError for any other model that is not there or cannot be used.
     """
     if model == NO_MODEL:
@@ -52,8 +52,8 @@ def open_detector(model: str, shared: str = "", *, is_live: bool = False) -> Obj
     if model == DEFAULT_MODEL and all(each.name != DEFAULT_MODEL for each in installed_models()):
         return None
     if is_live:
-        return made_at_low_priority(lambda: Detector.load(model, shared=shared))
-    return Detector.load(model, shared=shared)
+        return made_at_low_priority(lambda: Detector.load(model))
+    return Detector.load(model)
 
 
 def check_classes(detector: ObjectDetector | None, classes: Sequence[str]) -> None:

@@ -1,12 +1,9 @@
 """A flight's keyframes painted into the site's map: coarsely while they still move, and once when they stand."""
 
-import hashlib
 import time
 from collections.abc import Collection
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
-from sorvolo.errors import StoreError
 from sorvolo.geometry.arrays import ImageRGB, Mask, Matrix3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid, TileIndex
@@ -14,7 +11,6 @@ from sorvolo.geometry.homography import site_from_image_homography
 from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.map.journal import StoredPicture
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
-from sorvolo.missions.map.tile_shares import PaintPlan, PaintsElsewhere
 from sorvolo.mosaic.canvas import Canvas, CoarseTiles, coarse_grid, coarseness
 from sorvolo.mosaic.canvas_frame import CanvasFrame
 from sorvolo.mosaic.exposure import Exposure
@@ -23,7 +19,7 @@ from sorvolo.mosaic.planar import PlanarMapper
 from sorvolo.registration.lens import Undistorter
 from sorvolo.registration.sizes import at_size
 from sorvolo.store.exports.map_pictures import LivePreview
-from sorvolo.store.images import ImageCache, image_from_jpeg
+from sorvolo.store.images import ImageCache
 from sorvolo.store.site.archive import Archive, FlightWriter
 
 
@@ -52,34 +48,11 @@ class _Fineness:
     camera: Camera
 
 
-@dataclass(frozen=True, eq=False)
-class KeptPicture:
-    """A keyframe's picture that another process stored: its file, and what has to be in it."""
-
-    path: Path
-    stored: StoredPicture
-
-    def data(self) -> bytes:
-        """Its JPEG. Raises StoreError where it is not there as it was."""
-        try:
-            data = self.path.read_bytes()
-        except FileNotFoundError:
-            data = b""
-        if hashlib.sha256(data).hexdigest() != self.stored.sha256:
-            raise StoreError(f"{self.path} is missing or damaged; give the same command again")
-        return data
-
-    def image(self) -> ImageRGB:
-        """Its pixels."""
-        return image_from_jpeg(self.data(), str(self.path))
-
-
 class FlightPainter:
     """Stores a flight's pictures and paints them into its site; ground that the map shows already stays as it is.
 
     While the flight goes on, `show` paints small copies of them, enlarged: that is cheap, however often the map moves;
-    of a live flight (`is_live`) the newest at once, for somebody waits for it. `finish` paints the pictures themselves,
-    or has others do it (`elsewhere`, where the site shows nothing yet).
+    of a live flight (`is_live`) the newest at once, for somebody waits for it. `finish` paints the pictures themselves.
 
     `native_m_per_px` is the ground sampling distance of the flight's own pictures. Keyframes have ids from
     `known.count` on, earlier flights' those before.
@@ -97,7 +70,6 @@ class FlightPainter:
         live_s: float,
         *,
         is_live: bool,
-        elsewhere: PaintsElsewhere | None = None,
         settings: PaintSettings = PaintSettings(),
     ) -> None:
         self._settings = settings
@@ -109,7 +81,7 @@ class FlightPainter:
             log,
         )
         self._live_s, self._paint_every = live_s, settings.every if live_s >= 1 else 1
-        self._is_live, self._elsewhere = is_live, elsewhere
+        self._is_live = is_live
         self.shown_s = 0.0
         """When readers could see the newest key frame of a live flight, by the monotonic clock."""
         self.images: dict[int, str] = {}
@@ -154,14 +126,9 @@ class FlightPainter:
         self._paint_again_s = 0.0
         self._show_again_s = time.monotonic() + live_s
 
-    def save(self, keyframe_id: int, picture: "ImageRGB | KeptPicture") -> None:
+    def save(self, keyframe_id: int, image: ImageRGB) -> None:
         """Store a keyframe's picture, no larger than the map needs it."""
         index = keyframe_id - self._known.count
-        size_px = self._stored.width_px, self._stored.height_px
-        if isinstance(picture, KeptPicture) and picture.stored.size_px == size_px:
-            self.images[index] = self._writer.adopt_image(index, picture.data(), size_px)
-            return
-        image = picture.image() if isinstance(picture, KeptPicture) else picture
         small = at_size(image, self._stored.width_px, self._stored.height_px)
         self.images[index] = self._writer.save_image(index, small)
 
@@ -216,11 +183,7 @@ class FlightPainter:
         self._writer.release_memory()
         at = _Fineness(1, self._archive.site_grid(), self._stored)
         with self._log.stage(Stage.PAINT):
-            if self._elsewhere is None:
-                self._paint(self._new_canvas(), self._frames, at)
-                return
-            for tile, data in self._elsewhere(self._plan(at)):
-                self._writer.adopt_tile(tile, data)
+            self._paint(self._new_canvas(), self._frames, at)
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
@@ -297,20 +260,6 @@ class FlightPainter:
         return canvas.paint(
             [frame for frame in painted.values() if frame is not None],
             forget=[each for each, frame in painted.items() if frame is None],
-        )
-
-    def _plan(self, at: "_Fineness") -> PaintPlan:
-        frames = [
-            frame
-            for each in sorted(self._frames)
-            if (frame := self._canvas_frame(each, at)) is not None
-        ]
-        paths = [self._archive.folder / self.images[each.id - self._known.count] for each in frames]
-        return PaintPlan(
-            at.site_grid.grid,
-            tuple(replace(each, valid=None) for each in frames),
-            tuple(str(each.resolve()) for each in paths),
-            self._valid,
         )
 
     def _canvas_frame(self, keyframe_id: int, at: "_Fineness") -> CanvasFrame | None:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from types import TracebackType
 
 from sorvolo.capture.clock_offset import OffsetEstimate
@@ -23,9 +22,8 @@ from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.coverage import FlightCoverage
 from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken
 from sorvolo.missions.map.known_keyframes import KnownKeyframes
-from sorvolo.missions.map.painting import FlightPainter, KeptPicture, site_from_image
+from sorvolo.missions.map.painting import FlightPainter, site_from_image
 from sorvolo.missions.map.run import FlightRun
-from sorvolo.missions.map.tile_shares import PaintsElsewhere
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
 from sorvolo.mosaic.graph_settings import PoseGraphSettings
@@ -64,10 +62,9 @@ class PlanarRun(FlightRun):
         journal: MapJournal | None = None,
         request: str = "",
         coverage: FlightCoverage | None = None,
-        elsewhere: PaintsElsewhere | None = None,
     ) -> None:
         super().__init__(setup, archive, settings, writer, finder, journal, request)
-        self._coverage, self._elsewhere = coverage, elsewhere
+        self._coverage = coverage
         model = setup.source.camera
         self._lens = Undistorter(model.camera)
         self._known = KnownKeyframes.of(archive, setup.source.name)
@@ -85,7 +82,7 @@ class PlanarRun(FlightRun):
         )
         self._times_ns: dict[int, int] = {}  # of the flight's keyframes that have a place
         self._held: dict[
-            int, ImageRGB | bytes | KeptPicture
+            int, ImageRGB | bytes
         ] = {}  # JPEG where all of the flight waits for its place
         self._painter: FlightPainter | None = None
         self._offset: OffsetEstimate | None = None
@@ -160,12 +157,6 @@ class PlanarRun(FlightRun):
         if self._painter is None or not self._painter.take_over(registered.keyframe.id, picture):
             return None
         return *self._take(step, registered, None), 0
-
-    def join(self, step: Step, picture: Path) -> tuple[Status, str]:
-        """Take a frame as a block of the flight took it, and its stored picture from this file."""
-        assert step.taken is not None and isinstance(step.taken.picture, StoredPicture)
-        registered = self._mapper.joined(step.taken.registered)
-        return self._take(step, registered, KeptPicture(picture, step.taken.picture))
 
     def view(self, index: int, time_ns: int) -> FrameView | None:
         """See `FlightRun.view`."""
@@ -281,7 +272,7 @@ class PlanarRun(FlightRun):
         self,
         frame: Frame | Step,
         registered: Registered,
-        picture: ImageRGB | bytes | KeptPicture | None,
+        picture: ImageRGB | bytes | None,
     ) -> tuple[Status, str]:
         """Place a registered frame and keep its picture, if it has not been kept before; what became of it."""
         with self._log.stage(Stage.REGISTER):
@@ -298,7 +289,7 @@ class PlanarRun(FlightRun):
             self._painter.mark(outcome.moved | {keyframe_id})
         return outcome.status, outcome.reason
 
-    def _keep(self, keyframe_id: int, picture: ImageRGB | bytes | KeptPicture) -> None:
+    def _keep(self, keyframe_id: int, picture: ImageRGB | bytes) -> None:
         if self._painter is not None:
             self._painter.save(
                 keyframe_id, image_from_jpeg(picture, "") if isinstance(picture, bytes) else picture
@@ -330,7 +321,6 @@ class PlanarRun(FlightRun):
                 self._log,
                 self._settings.live_s,
                 is_live=isinstance(self._setup.source, LiveSource),
-                elsewhere=self._elsewhere,
             )
             for keyframe_id, held in self._held.items():
                 image = image_from_jpeg(held, "") if isinstance(held, bytes) else held
@@ -381,8 +371,6 @@ class PlanarRun(FlightRun):
         held = self._held.get(keyframe_id)
         if held is None:
             return self.begin().image(keyframe_id - self._known.count)
-        if isinstance(held, KeptPicture):
-            return held.image()
         return image_from_jpeg(held, "") if isinstance(held, bytes) else held
 
     def _find_offset(self) -> OffsetEstimate | None:

@@ -106,23 +106,16 @@ class FlightWriter:
 
         Raises StoreError on a full disk.
         """
-        return self.adopt_image(index, jpeg_from_image(image), (image.shape[1], image.shape[0]))
-
-    def adopt_image(self, index: int, data: bytes, size_px: tuple[int, int]) -> str:
-        """The same for a picture (width, height) that another process encoded as `save_image` does."""
+        data = jpeg_from_image(image)
         relative = self._image_path(index)
         path = self._files.folder / relative
         with writing(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write_bytes(path, data, durable=False)
         self._cache.forget(index)
-        self._sizes[relative] = size_px
+        self._sizes[relative] = (image.shape[1], image.shape[0])
         self._sha256[index] = hashlib.sha256(data).hexdigest()
         return relative
-
-    def adopt_tile(self, index: TileIndex, data: bytes) -> None:
-        """Take a tile of the map as another process painted and encoded it."""
-        self._growing.adopt(index, data)
 
     def stored(self, index: int) -> tuple[tuple[int, int], str]:
         """Size (width, height) and SHA-256 of a picture that this run has stored."""

@@ -242,12 +242,6 @@ class GrowingTiles(MutableMapping[TileIndex, ImageRGBA]):
         self._changed.add(index)
         self._keep(index, frozen(rgba, np.uint8))
 
-    def adopt(self, index: TileIndex, data: bytes) -> None:
-        """Replace a tile by one that another process painted and encoded, as `TileBlobs` keeps them."""
-        self._let_go(index)
-        self._replace_hash(index, self._blobs.keep(data))
-        self._changed.add(index)
-
     def __delitem__(self, index: TileIndex) -> None:
         if index not in self:
             raise KeyError(index)
