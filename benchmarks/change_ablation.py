@@ -38,15 +38,15 @@ from provenance import commit, machine
 from real_strips import FLIGHTS as FLIGHTS_OF_PHOTOS
 from real_strips import photos_of
 from sorvolo.change import views
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.metrics import FoundEvent, match_events, score_events
+from sorvolo.change.corroboration import CorroborationSettings, Difference, believed
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.outlines import overlap
 from sorvolo.change.pair import robust
-from sorvolo.change.pair.corroboration import CorroborationSettings, Difference, believed
-from sorvolo.change.pair.flight_tuning import FlightTuning
-from sorvolo.change.pair.shade import shade_of_view
-from sorvolo.change.shape.outlines import overlap
-from sorvolo.change.shape.shadows import without_shadow
+from sorvolo.change.shade import shade_of_view
+from sorvolo.change.things import without_shadow
+from sorvolo.change.tuning import FlightTuning
 from sorvolo.lab.evaluation import changes as evaluation
+from sorvolo.lab.evaluation.change_metrics import FoundEvent, match_events, score_events
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.simulate.site import simulate_site
 from sorvolo.lab.simulation.presets import preset

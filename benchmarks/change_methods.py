@@ -24,8 +24,8 @@ from rich.table import Table
 
 from change_suites import SUITES, Ground, Pair, grounds, pairs, views
 from provenance import commit, machine, note_scoring, seeds_or_drawn
-from sorvolo.change.pair.robust import compare_robust
 from sorvolo.change.pair.thesis import ThesisSettings, compare_thesis
+from sorvolo.change.robust import compare_robust
 
 RESULTS = Path(__file__).parent / "results" / "change_methods.json"
 VIEWS, NEEDED = 5, 3

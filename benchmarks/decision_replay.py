@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sorvolo.change.evidence.announcing import Announce, Look, Tally, judge
-from sorvolo.change.evidence.candidate import Candidate
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.shape.shadows import without_shadow
+from sorvolo.change.announcing import Announce, Look, Tally, judge
+from sorvolo.change.candidate import Candidate
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.things import without_shadow
 from sorvolo.survey.findings import Change, ComparedView
 
 

@@ -17,9 +17,7 @@ import onnxruntime
 SOURCE = (
     Path(__file__).parent.parent / "src" / "sorvolo" / "detection" / "data" / "second-opinion.onnx"
 )
-OUTPUT = (
-    Path(__file__).parent.parent / "src" / "sorvolo" / "change" / "pair" / "learned_difference.onnx"
-)
+OUTPUT = Path(__file__).parent.parent / "src" / "sorvolo" / "change" / "learned_difference.onnx"
 LAYERS = {
     "finest": ("/looks/lite0/_blocks.2/Add_output_0", 24),
     "fine": ("/looks/lite0/_blocks.4/Add_output_0", 40),

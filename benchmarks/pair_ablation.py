@@ -23,7 +23,7 @@ from change_rules import PAIR_RULES, Rule, switched_off
 from change_suites import SUITES, Ground, Pair, grounds, pairs
 from provenance import commit, machine
 from simulated_pairs import GROUNDS, simulated_pairs
-from sorvolo.change.pair.robust import compare_robust
+from sorvolo.change.robust import compare_robust
 
 RESULTS = Path(__file__).parent / "results" / "pair_ablation.json"
 SEEDS_FROM = "d8c29816f3da932cc58e275308de55135fb002af"

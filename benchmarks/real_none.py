@@ -45,11 +45,11 @@ from shapely.geometry import Point, Polygon
 from photo_cutouts import KINDS, Cutout, Planted, contrast, cutouts, in_light_of
 from provenance import commit, fresh_seeds, machine, note_scoring
 from real_strips import FLIGHTS, crown_area_m2, crowns_m, photos_of, within
-from sorvolo.change.metrics import ComparedGround, compared_ground
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, PointsM
 from sorvolo.geometry.geodesy import LocalFrame
 from sorvolo.geometry.homography import apply_homography, fit_similarity
+from sorvolo.lab.evaluation.change_metrics import ComparedGround, compared_ground
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.missions.compare.flights import compare_flights
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from sorvolo.change.metrics import ComparedGround
 from sorvolo.geometry.geodesy import LocalFrame, Projection
 from sorvolo.geometry.polygons import points_inside
+from sorvolo.lab.evaluation.change_metrics import ComparedGround
 
 
 @dataclass(frozen=True)

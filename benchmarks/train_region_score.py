@@ -2,7 +2,7 @@
 
 Answers are exact: the suites of change_suites.py over the photos of caliterra (CC0), grounds painted over them
 (painted_grounds.py) and procedural ones, and simulated flights (simulated_pairs.py), with random numbers that no score
-uses. Boosted oblivious trees, written to src/sorvolo/change/pair/region_score.json.
+uses. Boosted oblivious trees, written to src/sorvolo/change/region_score.json.
 
 Not reproducible: the packaged trees come from many rounds on older states of the code, each trained `--onto` the trees
 before (the file's `trained` and `onto` list their commands). One run makes a score of the same kind, not the same one.
@@ -21,11 +21,11 @@ import numpy as np
 from change_suites import SUITES, Ground, grounds, pairs, picture
 from painted_grounds import painted_ground
 from simulated_pairs import simulated_pairs
-from sorvolo.change.pair.regions import FEATURES, Regions, RegionSettings
-from sorvolo.change.pair.robust import RobustSettings, examine
+from sorvolo.change.regions import FEATURES, Regions, RegionSettings
+from sorvolo.change.robust import RobustSettings, examine
 from sorvolo.lab.simulation.ground import GroundKind
 
-TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "pair" / "region_score.json"
+TARGET = Path(__file__).parents[1] / "src" / "sorvolo" / "change" / "region_score.json"
 SPLIT, SEED, EACH = "train", 9000, 10
 CROWDING = 3
 EAGER = RegionSettings(reach_px=1, least_difference=6.0, activity_factor=1.0, strong_factor=1.25)

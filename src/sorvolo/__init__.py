@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sorvolo.capture.areas import read_area
     from sorvolo.change.pair.compare import Comparison, compare_images
-    from sorvolo.change.pair.robust import RobustSettings
     from sorvolo.change.pair.thesis import ThesisSettings, prepare_reference, thesis_steps
+    from sorvolo.change.robust import RobustSettings
     from sorvolo.detection.detector import Detector
     from sorvolo.errors import GeometryError, InputError, SettingsError, SorvoloError, StoreError
     from sorvolo.lab.datasets import read_dataset

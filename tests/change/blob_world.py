@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sorvolo.change.pair.shade import shade_between
+from sorvolo.change.shade import shade_between
 from sorvolo.survey.findings import ComparedView
 
 M_PER_PX = 0.05

@@ -7,12 +7,17 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.areas.area_map import AreaMap, AreaMapSettings, with_areas
-from sorvolo.change.areas.connected_areas import AreaSettings, GroundSigns, segments
-from sorvolo.change.areas.ground_pictures import GroundPictures, GroundPictureSettings
-from sorvolo.change.areas.signs import leaning, level_of
-from sorvolo.change.shape.outlines import overlap
-from sorvolo.change.shape.patches import PatchWindow, cut
+from sorvolo.change.areas import (
+    AreaMap,
+    GroundSigns,
+    leaning,
+    level_of,
+    segments,
+    with_areas,
+)
+from sorvolo.change.ground import GroundPictures
+from sorvolo.change.outlines import overlap
+from sorvolo.change.patches import PatchWindow, cut
 from sorvolo.lab.simulation.ground import GroundKind, paint_ground
 from sorvolo.lab.simulation.ground_painting import Area
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Patch
@@ -44,10 +49,9 @@ def changes_of(
     before: Rgb,
     after: Rgb,
     light: Callable[[Rgb, int], Rgb] = same_light,
-    settings: AreaSettings = AreaSettings(),
 ) -> tuple[Change, ...]:
     """The areas that a flight of nine views finds; `light` gives a view's picture its light."""
-    areas, rng = AreaMap(AreaMapSettings(segments=settings)), np.random.default_rng(3)
+    areas, rng = AreaMap(), np.random.default_rng(3)
     for index in range(9):
         x, y = 300 * (index % 3), 220 * (index // 3)
         part = np.s_[y : y + VIEW_PX[1], x : x + VIEW_PX[0]]
@@ -93,7 +97,7 @@ def laid(ground: Rgb, other: Rgb, outline_m: np.ndarray) -> Rgb:
 @pytest.mark.parametrize("deep", [30, 120, 200])
 def test_an_area_keeps_its_inside_however_far_from_unchanged_ground(deep):
     """A band of so many of 260 cells, flooded; light is looked for within 35 cells at first."""
-    rng, settings, shape = np.random.default_rng(1), AreaSettings(), (260, 260)
+    rng, shape = np.random.default_rng(1), (260, 260)
     is_wet = np.arange(shape[0])[:, None] < np.full(shape[1], deep)
     likeness = np.where(is_wet, 0.1, 0.85) + rng.normal(0, 0.03, shape)
     colour = rng.normal(0, 0.02, (*shape, 2)) + np.array([0.5, -0.4]) * is_wet[..., None]
@@ -102,7 +106,7 @@ def test_an_area_keeps_its_inside_however_far_from_unchanged_ground(deep):
         *(each.astype(np.float32) for each in (likeness, colour, detail, colour)),
         known=np.ones(shape, bool),
     )
-    found = np.any([cells for cells, _ in segments(signs, settings)], axis=0)
+    found = np.any([cells for cells, _ in segments(signs)], axis=0)
     assert found[is_wet].mean() > 0.97 and found[~is_wet].mean() < 0.05
 
 
@@ -127,11 +131,10 @@ def test_a_repaved_area_is_one_change_with_its_outline(grass, kind):
 
 
 def test_what_is_no_larger_than_things_are_is_no_area(grass):
-    """4 x 4 m is left to what finds things; with a smaller limit it would be an area."""
+    """4 x 4 m is left to what finds things."""
     square_m = np.array([[22.0, -18.0], [26.0, -18.0], [26.0, -22.0], [22.0, -22.0]])
     after = laid(grass, painted(GroundKind.URBAN, 2), square_m)
     assert changes_of(grass, after) == ()
-    assert len(changes_of(grass, after, settings=AreaSettings(least_m2=5.0))) == 1
 
 
 def test_an_area_far_larger_than_a_view_is_one_change(grass):
@@ -143,7 +146,7 @@ def test_an_area_far_larger_than_a_view_is_one_change(grass):
 @pytest.mark.parametrize(("most_px", "coarser"), [(2048, 1), (200, 2)])
 def test_the_pictures_of_an_area_show_its_ground_where_it_lies(grass, most_px, coarser):
     view = view_of(grass[:480, :640].copy(), painted(GroundKind.SAND, 2)[:480, :640].copy())
-    pictures = GroundPictures(0.1, GroundPictureSettings(side_px=32, most_patch_px=most_px))
+    pictures = GroundPictures(0.1, side_px=32, most_patch_px=most_px)
     west, south, east, north = 3.3, -20.7, 28.1, -2.9
     squares_m = np.stack(
         np.meshgrid(np.arange(1.6, 32, 3.2), np.arange(-1.6, -27, -3.2)), axis=-1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sorvolo
-from sorvolo.change.pair.robust import RobustSettings
+from sorvolo.change.robust import RobustSettings
 from sorvolo.errors import InputError, SettingsError
 
 

@@ -6,19 +6,19 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.coverage.ground_coverage import (
-    CoverageSettings,
+from sorvolo.change.coverage import (
     GroundCoverage,
     coverage_summary,
 )
-from sorvolo.change.coverage.planting import (
+from sorvolo.change.planting import (
+    CONTRASTS,
+    SIZES_PX,
     Planted,
-    PlantingSettings,
     planted_in,
     recall_curve,
     sensitivities,
 )
-from sorvolo.change.pair.robust import RobustSettings, compare_robust
+from sorvolo.change.robust import RobustSettings, compare_robust
 from sorvolo.survey.coverage import CoveredGround, Gap
 from sorvolo.survey.findings import ComparedView
 
@@ -64,11 +64,10 @@ def areas(parts: list[CoveredGround]) -> dict[str, float]:
 
 def plain_things(count: int = 60) -> tuple[Planted, ...]:
     """Things of 10 px and more were found, smaller ones not."""
-    settings = PlantingSettings()
     return tuple(
         Planted(size, contrast, 0.1, size >= 10.0)
-        for size in settings.sizes_px
-        for contrast in settings.contrasts
+        for size in SIZES_PX
+        for contrast in CONTRASTS
         for _ in range(count // 10)
     )
 
@@ -154,11 +153,11 @@ def test_the_smallest_size_is_that_of_four_in_five_and_grows_with_roughness():
     rng = np.random.default_rng(5)
     planted = []
     for _ in range(4000):
-        size = float(rng.choice(PlantingSettings().sizes_px))
+        size = float(rng.choice(SIZES_PX))
         texture = float(rng.choice([0.05, 0.2]))
         chance = 1 / (1 + np.exp(-(4 * np.log(size / 10) - 2 * np.log(texture / 0.1))))
         planted.append(Planted(size, 1.0, texture, bool(rng.random() < chance)))
-    plain, faint = sensitivities(planted, PlantingSettings())
+    plain, faint = sensitivities(planted)
     for texture in (0.05, 0.2):
         true = 10 * np.exp((np.log(4) + 2 * np.log(texture / 0.1)) / 4)
         assert plain.smallest_px(np.array([texture]))[0] == pytest.approx(true, rel=0.12)
@@ -212,7 +211,6 @@ def test_where_nothing_planted_is_found_nothing_is_compared(large_ground):
 
 def test_large_plain_things_are_found_on_real_ground_and_small_faint_ones_are_not(large_ground):
     view = view_of(large_ground)
-    settings = CoverageSettings().planting
     reference = cv2.cvtColor(view.reference, cv2.COLOR_RGB2BGR)
 
     def find(picture: np.ndarray) -> np.ndarray:
@@ -222,26 +220,24 @@ def test_large_plain_things_are_found_on_real_ground_and_small_faint_ones_are_no
         )
 
     planted = [
-        each
-        for seed in range(3)
-        for each in planted_in(view, find, settings, np.random.default_rng(seed))
+        each for seed in range(3) for each in planted_in(view, find, np.random.default_rng(seed))
     ]
-    curve = {(each["contrast"], each["size_px"]): each for each in recall_curve(planted, settings)}
+    curve = {(each["contrast"], each["size_px"]): each for each in recall_curve(planted)}
     assert sum(each["planted"] for each in curve.values()) == len(planted) >= 50
-    plain = [curve[1.0, size] for size in settings.sizes_px]
+    plain = [curve[1.0, size] for size in SIZES_PX]
     assert sum(each["found"] for each in plain[-3:]) >= 0.8 * sum(
         each["planted"] for each in plain[-3:]
     )
-    faint = [curve[0.35, size] for size in settings.sizes_px]
+    faint = [curve[0.35, size] for size in SIZES_PX]
     assert sum(each["found"] for each in faint[:2]) <= 0.5 * sum(
         each["planted"] for each in faint[:2]
     )
-    smallest = [each.smallest_px(np.array([0.1]))[0] for each in sensitivities(planted, settings)]
+    smallest = [each.smallest_px(np.array([0.1]))[0] for each in sensitivities(planted)]
     assert smallest[0] < 28 and not smallest[1] < smallest[0]
 
 
 def test_a_view_in_its_turn_is_planted(large_ground):
-    from sorvolo.change.coverage.planting import Planting
+    from sorvolo.change.planting import Planting
 
     planting, taken = Planting(), []
     for index in range(60):

@@ -19,14 +19,13 @@ from blob_world import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sorvolo.change.announcing import Reason
+from sorvolo.change.candidate import Candidate, KeptView
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
-from sorvolo.change.evidence.announcing import AnnounceSettings, Reason
-from sorvolo.change.evidence.candidate import Candidate, KeptView
-from sorvolo.change.evidence.cells import CellWindow, LaidView
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.shape.outlines import Measures
-from sorvolo.change.shape.place_sigma import area_sigma_m, thing_sigma_m
-from sorvolo.change.shape.reported import reported
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.ground import CellWindow, LaidView
+from sorvolo.change.outlines import Measures, area_sigma_m, thing_sigma_m
+from sorvolo.change.reconcile import reported
 from sorvolo.errors import SettingsError
 from sorvolo.geometry.camera import Camera
 from sorvolo.survey.findings import Change, ChangeKind
@@ -45,12 +44,8 @@ def earlier_pictures(eyes, things):
     )
 
 
-def collect(
-    views, rules: AnnounceSettings | None = None, **how
-) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
-    evidence = EvidenceMap(
-        M_PER_PX, EvidenceSettings(announcing=rules or AnnounceSettings(), **how), "f"
-    )
+def collect(views, **how) -> tuple[EvidenceMap, list[tuple[int, Change]]]:
+    evidence = EvidenceMap(M_PER_PX, EvidenceSettings(**how), "f")
     return evidence, [(view.index, change) for view in views for change in evidence.add(view)]
 
 
@@ -419,18 +414,10 @@ def test_every_well_seen_thing_is_found_once_and_nothing_else(seed):
         assert kind == (ChangeKind.APPEARED if thing.in_flight else ChangeKind.DISAPPEARED)
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"k": 6}, {"k": 0}, {"n": 9}, {"least_views": 4}, {"join_m": -1}]
-)
+@pytest.mark.parametrize("wrong", [{"k": 6}, {"k": 0}, {"n": 9}])
 def test_settings_that_contradict_themselves_are_refused(wrong):
     with pytest.raises(SettingsError):
         EvidenceSettings(**wrong)
-
-
-def test_a_least_score_beyond_one_is_refused():
-    for wrong in ({"least_score": 2.0}, {"least_score": -0.1}):
-        with pytest.raises(SettingsError):
-            AnnounceSettings(**wrong)
 
 
 def test_a_view_without_any_known_ground_is_harmless():
@@ -452,11 +439,9 @@ def seldom(thing: Thing, others: int) -> list:
 
 
 def test_a_thing_that_two_early_photos_show_is_not_forgotten_for_many_uncertain_ones_after_it():
-    few = replace(EvidenceSettings().gathering.candidates, most_seeds=3)
     views = seldom(Thing(2, 0), 6)
-    for settings_, ids in ((few, ["f-1"]), (replace(few, most_seeds_px=0), [])):
-        gathering = replace(EvidenceSettings().gathering, candidates=settings_)
-        evidence, reported = collect(views, gathering=gathering)
+    for most_px, ids in ((8_000_000, ["f-1"]), (0, [])):
+        evidence, reported = collect(views, most_seeds=3, most_seeds_px=most_px)
         assert not reported and [each.id for each in evidence.conclude()] == ids
 
 

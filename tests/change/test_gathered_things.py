@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.areas.gathered_things import GatheredThings
-from sorvolo.change.pair.learned_difference import learned_difference
-from sorvolo.change.shape.shadows import without_shadow
+from sorvolo.change.gathered import GatheredThings
+from sorvolo.change.learned import learned_difference
+from sorvolo.change.things import without_shadow
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.geometry.sun import direction_from_angles, slide_of
 from sorvolo.survey.findings import Change, ChangeKind, ComparedView, Shade

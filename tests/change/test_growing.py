@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from sensor_noise import camera
 
-from sorvolo.change.pair.region_extent import with_weak_ground
-from sorvolo.change.pair.regions import Regions
-from sorvolo.change.pair.robust import RobustResult, compare_robust
+from sorvolo.change.regions import Regions
+from sorvolo.change.robust import RobustResult, compare_robust, with_weak_ground
 
 SIZE = (360, 480)
 THING = np.zeros(SIZE, bool)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.shape.kinds import kind_of, stands_out
+from sorvolo.change.kinds import kind_of, stands_out
 from sorvolo.survey.findings import ChangeKind, Patch
 
 SIZE = 60

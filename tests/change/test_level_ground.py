@@ -1,24 +1,20 @@
 """Two pictures of one date show whether the ground is level on which a camera of the other date could see something."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
 from blob_world import HEIGHT, M_PER_PX, WIDTH, Thing, picture, site_from_image, view_of
 
-from sorvolo.change.evidence.levelness import (
+from sorvolo.change.levelness import (
     LaidPicture,
-    LevelSettings,
     Sights,
     is_level,
     seen_at_m,
     surroundings,
 )
 
-SETTINGS = replace(LevelSettings(), tallest_m=4.0)
 OUTLINE = Thing(0, 0).outline_m()
-WINDOW = surroundings(OUTLINE.min(axis=0), OUTLINE.max(axis=0), M_PER_PX, SETTINGS)
+WINDOW = surroundings(OUTLINE.min(axis=0), OUTLINE.max(axis=0), M_PER_PX)
 OTHER = np.array([0.0, 5.0, 15.0])
 
 
@@ -57,13 +53,11 @@ WALL = {"colour": (90, 90, 140)}
     ],
 )
 def test_ground_is_level_where_pictures_of_one_date_agree_and_nowhere_else(things, level):
-    assert is_level([laid(each, things) for each in CAMERAS], OUTLINE, OTHER, SETTINGS) is level
+    assert is_level([laid(each, things) for each in CAMERAS], OUTLINE, OTHER) is level
 
 
 def test_pictures_of_one_date_may_lie_a_little_off_each_other():
-    assert is_level(
-        [laid(CAMERAS[0], []), laid(CAMERAS[1], [], off_px=2)], OUTLINE, OTHER, SETTINGS
-    )
+    assert is_level([laid(CAMERAS[0], []), laid(CAMERAS[1], [], off_px=2)], OUTLINE, OTHER)
 
 
 @pytest.mark.parametrize(
@@ -76,7 +70,7 @@ def test_pictures_of_one_date_may_lie_a_little_off_each_other():
     ids=["one", "beside", "even"],
 )
 def test_nothing_is_known_of_heights_from_one_place_or_without_texture(pictures):
-    assert not is_level(pictures, OUTLINE, OTHER, SETTINGS)
+    assert not is_level(pictures, OUTLINE, OTHER)
 
 
 def test_where_one_camera_sees_what_another_sees_higher_up():
@@ -88,7 +82,7 @@ def test_where_one_camera_sees_what_another_sees_higher_up():
 
 
 def test_sights_are_those_from_nearest_above_and_apart_and_anew_where_the_ground_has_grown():
-    sights = Sights(SETTINGS)
+    sights = Sights()
     low, high = OUTLINE.min(axis=0), OUTLINE.max(axis=0)
     for number, east_m in enumerate((-6.0, -5.5, -3.0, -1.0, 0.0, 3.0, 6.0)):
         sights.show(

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.shape.kinds import middle_and_deviation
+from sorvolo.change.kinds import middle_and_deviation
 
 
 @settings(max_examples=60, deadline=None)

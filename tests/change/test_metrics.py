@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sorvolo.change.metrics import (
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.lab.evaluation.change_metrics import (
     Counts,
     EventSettings,
     FoundEvent,
@@ -19,7 +20,6 @@ from sorvolo.change.metrics import (
     pixel_counts,
     score_events,
 )
-from sorvolo.errors import InputError, SettingsError
 from sorvolo.survey.findings import ChangeKind
 
 APPEARED, GONE, REPLACED, _, MOVING = ChangeKind

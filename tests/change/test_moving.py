@@ -8,11 +8,14 @@ from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, flight, view_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.motion.blob_tracker import BlobTracker, MovingSettings
-from sorvolo.change.motion.blobs import Blob
-from sorvolo.change.motion.parallax import ParallaxSettings, TrackPoint, motion, shown_alone
-from sorvolo.errors import SettingsError
+from sorvolo.change.blobs import Blob
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.motion import (
+    BlobTracker,
+    TrackPoint,
+    motion,
+    shown_alone,
+)
 from sorvolo.survey.findings import ChangeKind
 
 
@@ -134,12 +137,12 @@ def test_one_view_of_a_walker_joined_with_another_thing_is_no_view_of_the_walker
         replace(each, blob=replace(each.blob, length_m=length_m))
         for length_m, each in zip(lengths_m, (point(0.2 * i, (i, 0), (0, 0)) for i in range(6)))
     ]
-    assert shown_alone(points, ParallaxSettings()) == (*points[:2], *points[3:])
+    assert shown_alone(points) == (*points[:2], *points[3:])
     grows = [
         replace(each, blob=replace(each.blob, length_m=0.5 * 1.5**i))
         for i, each in enumerate(points)
     ]
-    assert shown_alone(grows, ParallaxSettings()) == tuple(grows)
+    assert shown_alone(grows) == tuple(grows)
 
 
 def test_a_mover_seen_again_for_one_view_stays_where_it_was_seen_to_move():
@@ -221,13 +224,6 @@ def test_a_walker_straight_against_three_photos_way_moves_and_what_leans_does_no
     (mover,) = [each for each in final if each.kind is ChangeKind.MOVING]
     assert mover.velocity_m_s[0] == pytest.approx(-0.9, abs=0.2)
     assert mover.outline_m[:, 1].mean() > 3
-
-
-def test_settings_are_checked():
-    with pytest.raises(SettingsError):
-        MovingSettings(least_views=2)
-    with pytest.raises(SettingsError):
-        MovingSettings(forget_s=0)
 
 
 @pytest.mark.parametrize("north_m", [-3.5, -3])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sorvolo.change.object_changes import SearchedGround, on_one_date
+from sorvolo.change.reconcile import SearchedGround, on_one_date
 from sorvolo.survey.findings import ChangeKind
 from sorvolo.survey.map_objects import MapObject, SearchedFrames, looked_at
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.change.pair.illumination import fit_light, relit
+from sorvolo.change.light import fit_light, relit
 
 
 def textured(seed: int) -> np.ndarray:

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from sensor_noise import camera
 
-from sorvolo.change.pair.regions import FEATURES
-from sorvolo.change.pair.robust import RobustSettings, compare_robust, examine
+from sorvolo.change.regions import FEATURES
+from sorvolo.change.robust import RobustSettings, compare_robust, examine
 
 
 def signs(reference: np.ndarray, query: np.ndarray) -> dict[str, float]:

@@ -8,8 +8,8 @@ from blob_world import CAMERA_HEIGHT_M, Thing, view_of
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sorvolo.change.evidence.cells import CellGrid, CellWindow, LaidView, lay
-from sorvolo.change.shape.outlines import (
+from sorvolo.change.ground import CellGrid, CellWindow, LaidView, lay
+from sorvolo.change.outlines import (
     KnownPlace,
     is_known,
     mask_of,
@@ -17,7 +17,7 @@ from sorvolo.change.shape.outlines import (
     outline_of,
     overlap,
 )
-from sorvolo.change.shape.patches import PatchWindow, cut, moved
+from sorvolo.change.patches import PatchWindow, cut, moved
 from sorvolo.survey.findings import ChangeKind
 
 SITE_FROM_MASK = np.array([[0.1, 0, 5], [0, -0.1, 9], [0, 0, 1.0]])

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 from blob_world import CAMERA_HEIGHT_M, M_PER_PX, Thing, view_of
 
-from sorvolo.change.evidence.announcing import AnnounceSettings, Tally, sureness
-from sorvolo.change.evidence.cells import CellGrid, CellWindow, LaidView
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings, restlessness
+from sorvolo.change.announcing import Tally, sureness
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings, restlessness
+from sorvolo.change.ground import CellGrid, CellWindow, LaidView
 
 CELL_M = 0.1
 GROUND = CellWindow(-100, -100, 100, 100)
@@ -63,7 +63,7 @@ def test_calm_ground_leaves_a_score_as_it_is_and_restless_ground_hardly_anything
     def score(restless: float) -> float:
         far_apart = {"camera_low_m": (0, 0, 10), "camera_high_m": (20, 0, 10)}
         tally = Tally(0, 0, views=4, asked=8, score_sum=2.8, whole=4, **far_apart)
-        return sureness(replace(tally, restless=restless), AnnounceSettings())
+        return sureness(replace(tally, restless=restless))
 
     assert score(0.01) > 0.9 * score(0.0)
     assert score(0.15) < 0.2 * score(0.0)

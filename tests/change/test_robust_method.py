@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from sensor_noise import camera
 
 from sorvolo import kernels
-from sorvolo.change.pair.flight_tuning import FlightTuning, PairMeasures
-from sorvolo.change.pair.region_score import Trees, how_sure
-from sorvolo.change.pair.regions import FEATURES
-from sorvolo.change.pair.residual_alignment import settle
-from sorvolo.change.pair.robust import RobustSettings, compare_robust, examine
+from sorvolo.change.regions import FEATURES
+from sorvolo.change.robust import RobustSettings, Trees, compare_robust, examine, how_sure
+from sorvolo.change.settling import settle
+from sorvolo.change.tuning import FlightTuning, PairMeasures
 from sorvolo.errors import InputError, SettingsError
 
 

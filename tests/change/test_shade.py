@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.change.pair.shade import shade_between, shade_of_view
+from sorvolo.change.shade import shade_between, shade_of_view
 from sorvolo.survey.findings import Shade
 
 SHADOW, THING = np.s_[160:190, 60:120], np.s_[160:190, 260:290]

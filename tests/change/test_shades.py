@@ -4,9 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sorvolo.change.pair.illumination import fit_light, relit
-from sorvolo.change.pair.moved_shadows import STEPS, moved_shades
-from sorvolo.change.pair.robust import compare_robust
+from sorvolo.change.light import STEPS, fit_light, moved_shades, relit
+from sorvolo.change.robust import compare_robust
 
 SUN_OVER_SHADE = np.array([0.52, 0.45, 0.4])  # blue green red: a shadow is a little blue
 

@@ -5,8 +5,8 @@ import pytest
 from blob_world import M_PER_PX, START_NS, Thing, flight
 from test_evidence import earlier_pictures
 
-from sorvolo.change.evidence.announcing import Reason
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.announcing import Reason
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
 from sorvolo.geometry.sun import direction_from_angles
 
 DARK = (50, 50, 55)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from blob_world import M_PER_PX, START_NS, Thing, flight
 
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
-from sorvolo.change.pair.shade import shade_between
-from sorvolo.change.shape.shadows import ThingSettings, thing_of, things_of
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.shade import shade_between
+from sorvolo.change.things import thing_of, things_of
 from sorvolo.survey.findings import ChangeKind, Patch
 
 SHADOW = (58, 58, 58)  # of ground as bright as 110
@@ -41,16 +41,6 @@ def test_specks_at_the_rim_of_a_shadow_do_not_stretch_the_thing():
     shadow[50:52, 13:15] = False
     assert np.array_equal(thing_of(changed, shadow), clean)
     assert 100 <= np.count_nonzero(clean) <= 130
-
-
-def test_specks_that_count_as_well_do_not_make_the_shadow_part_of_the_thing():
-    changed = np.zeros((60, 20), bool)
-    changed[5:55, 5:15] = True
-    shadow = changed.copy()
-    shadow[5:15] = False
-    assert np.array_equal(
-        thing_of(changed, shadow, ThingSettings(least_piece=0.0)), thing_of(changed, shadow)
-    )
 
 
 def test_two_things_joined_by_a_shadow_are_two_with_kinds_of_their_own():

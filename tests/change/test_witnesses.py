@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sorvolo.change.pair.corroboration import Difference, believed, is_whole, unwitnessed
-from sorvolo.change.pair.robust import RobustSettings, compare_robust
+from sorvolo.change.corroboration import Difference, believed, is_whole, unwitnessed
+from sorvolo.change.robust import RobustSettings, compare_robust
 
 SHAPE = (60, 80)
 ALL = np.ones(SHAPE, bool)

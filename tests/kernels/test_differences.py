@@ -9,9 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sorvolo import kernels
-from sorvolo.change.pair.regions import RegionSettings, find_regions
-from sorvolo.change.pair.robust import compare_robust
-from sorvolo.change.pair.scratch import MOST_KEPT_PX, Scratch
+from sorvolo.change.regions import MOST_KEPT_PX, RegionSettings, Scratch, find_regions
+from sorvolo.change.robust import compare_robust
 
 SIDES = st.integers(2, 40)
 

@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from small_flights import simulate_into
-from sorvolo.change.metrics import compared_ground
 from sorvolo.cli.evaluate import evaluate_app
 from sorvolo.errors import InputError, SettingsError, StoreError
+from sorvolo.lab.evaluation.change_metrics import compared_ground
 from sorvolo.lab.evaluation.changes import evaluate_changes
 from sorvolo.lab.evaluation.frame_rows import time_ns_of
 from sorvolo.lab.simulation.settings import (

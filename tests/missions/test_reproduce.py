@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sorvolo.change.metrics import Counts
 from sorvolo.cli.main import main
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.lab.datasets.umcd import read_umcd_metadata
 from sorvolo.lab.datasets.umcd_folder import CHANGES, MOSAICKING, WITH, read_umcd_folder
+from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.lab.evaluation.mask_folders import frames_against_times
 from sorvolo.lab.thesis.published import TABLE_4_3
 from sorvolo.lab.thesis.report import MARKDOWN, NUMBERS, PAGE, write_reproduction

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from small_flights import simulate_into, small_flight
-from sorvolo.change.evidence import evidence_map
-from sorvolo.change.evidence.shadow_doubt import ShadowDoubt
+from sorvolo.change import evidence as evidence_map
+from sorvolo.change.shadows import ShadowDoubt
 from sorvolo.geometry.geodesy import Geodetic
 from sorvolo.lab.simulation.settings import LaterSettings, WeatherSettings
 from sorvolo.missions.compare.flights import compare_flights

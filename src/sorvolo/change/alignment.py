@@ -1,7 +1,7 @@
 """A frame laid over the known map: by telemetry and the frames before, then by features, then to a part of a pixel."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property, partial
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from sorvolo.change.local_fit import LocalFit, fit_locally
-from sorvolo.change.map_search import MapSearch, SearchSettings
+from sorvolo.change.map_search import MapSearch
 from sorvolo.change.reference import HeldWindow, ReferenceMap, normalised, resized
 from sorvolo.errors import GeometryError
 from sorvolo.geometry.arrays import (
@@ -48,54 +48,30 @@ _UNKNOWN = CameraPrior(np.zeros(3), np.full(3, np.inf), np.eye(3), np.full(3, np
 _NO_FEATURES = Features("orb", np.zeros((0, 2)), np.zeros((0, 32), np.uint8))
 
 
-@dataclass(frozen=True)
-class MovingSettings:
-    """How a local fit moves a camera, and how the last fits predict the next one."""
-
-    side_px: int = 960  # longest side of the pictures that a local fit is made from
-    rounds: int = 2  # of local fits, where a place moves by ...
-    far_m: float = 0.6  # ... this or more
-    place_sigma_m: float = 2.0  # by axis: what a local fit moves a camera by, ...
-    turn_sigma_deg: float = 2.0  # ... and turns it by
-    predicts_s: float = 2.0  # a fit older than this predicts nothing
-    shrink: int = 4  # times smaller are the copies that are shifted onto each other
+# How a local fit moves a camera, and how the last fits predict the next one.
+_MOVING_SIDE_PX = 960  # longest side of the pictures that a local fit is made from
+_ROUNDS = 2  # of local fits, where a place moves by ...
+_FAR_M = 0.6  # ... this or more
+_PLACE_SIGMA_M = 2.0  # by axis: what a local fit moves a camera by, ...
+_TURN_SIGMA_DEG = 2.0  # ... and turns it by
+_PREDICTS_S = 2.0  # a fit older than this predicts nothing
+_SHRINK = 4  # times smaller are the copies that are shifted onto each other
 
 
-@dataclass(frozen=True)
-class AlignmentSettings:
-    """How a frame is laid over the map, and when that counts."""
-
-    side_px: int = 640  # longest side at which frames are aligned
-    least_known: float = 0.1  # share of the frame that must lie on known ground
-    most_residual_px: float = (
-        2.2  # of the registered image: worse, and what differs is the fit, not the ground
-    )
-    doubtful_px: float = (
-        1.5  # a fit that leaves more is checked: a predicted one by features, others by the search
-    )
-    least_spread: float = (
-        0.6  # share of a frame's cells with points: with less a homography may swing
-    )
-    cells: tuple[int, int] = (4, 3)  # across and down
-    searched_misses: int = (
-        8  # frames in a row that fit nowhere: of later ones every fifth is searched for
-    )
-    confirms_rest: float = (
-        0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
-    )
-    settled_px: float = 1.2  # a fit that leaves more is followed by a local one
-    most_features: int = (
-        60_000  # of the whole map, to look for a frame whose place is not known at all
-    )
-    links: LinkSettings = field(
-        default_factory=lambda: LinkSettings(
-            FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150
-        )
-    )
-    search: SearchSettings = field(
-        default_factory=SearchSettings
-    )  # for frames that no homography places
-    moving: MovingSettings = MovingSettings()
+# How a frame is laid over the map, and when that counts.
+_ALIGNMENT_SIDE_PX = 640  # longest side at which frames are aligned
+_LEAST_KNOWN = 0.1  # share of the frame that must lie on known ground
+# of the registered image: worse, and what differs is the fit, not the ground
+_MOST_RESIDUAL_PX = 2.2
+# a fit that leaves more is checked: a predicted one by features, others by the search
+_DOUBTFUL_PX = 1.5
+_LEAST_SPREAD = 0.6  # share of a frame's cells with points: with less a homography may swing
+_CELLS = (4, 3)  # across and down
+_SEARCHED_MISSES = 8  # frames in a row that fit nowhere: of later ones every fifth is searched for
+_CONFIRMS_REST = 0.42  # of a local fit: less confirms a place in doubt; other ground had 0.53 once
+_SETTLED_PX = 1.2  # a fit that leaves more is followed by a local one
+_MOST_FEATURES = 60_000  # of the whole map, to look for a frame whose place is not known at all
+_LINKS = LinkSettings(FeatureSettings(orb_count=900), min_inliers=20, max_pairs=150)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,15 +191,10 @@ class _Share:
 class Aligner:
     """Lays the frames of one flight over a map, in order of time. Only `align` and `recall` change it."""
 
-    def __init__(
-        self,
-        reference: ReferenceMap,
-        site_grid: SiteGrid,
-        settings: AlignmentSettings = AlignmentSettings(),
-    ) -> None:
-        self._reference, self._site_grid, self._settings = reference, site_grid, settings
+    def __init__(self, reference: ReferenceMap, site_grid: SiteGrid) -> None:
+        self._reference, self._site_grid = reference, site_grid
         self._fits: list[_Fit] = []
-        self.search = MapSearch(reference, site_grid, settings.search, settings.links.features)
+        self.search = MapSearch(reference, site_grid, _LINKS.features)
         """What looks for frames that no homography places."""
         self._count = 0
         self._misses = 0  # frames since the last fit
@@ -243,7 +214,7 @@ class Aligner:
         """Where an undistorted frame, (H, W, 3), of the distortion-free `camera` lies on the map. `place` is where its
         flight has it, where that is known: only a local fit moves it then."""
         size, gray = self._small(image)
-        scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
+        scale = min(1.0, _ALIGNMENT_SIDE_PX / max(image.shape[:2]))
         small_camera = camera.resized(*size)
         new = self._keyframe(small_camera, normalise_contrast(gray))
         by_telemetry = self._telemetry_pose(prior)
@@ -259,7 +230,7 @@ class Aligner:
         )
 
         def telemetry_inside() -> Matrix3 | None:
-            return telemetry_homography if share.known >= self._settings.least_known else None
+            return telemetry_homography if share.known >= _LEAST_KNOWN else None
 
         frame = _Frame(image, camera, gray, new, prior)
         placed: Place | NotAligned
@@ -278,7 +249,7 @@ class Aligner:
                     or placed
                 )
         if isinstance(placed, NotAligned):
-            is_outside = share.known < self._settings.least_known
+            is_outside = share.known < _LEAST_KNOWN
             reason = self._beside() if is_outside else placed.reason
             self.step = AlignStep(None, self._misses, self._reference.windows)
             return NotAligned(
@@ -314,7 +285,7 @@ class Aligner:
 
     def _small(self, image: ImageRGB) -> tuple[tuple[int, int], ImageGray]:
         """The size (width, height) at which a frame is aligned, and its gray there."""
-        scale = min(1.0, self._settings.side_px / max(image.shape[:2]))
+        scale = min(1.0, _ALIGNMENT_SIDE_PX / max(image.shape[:2]))
         size = max(16, round(image.shape[1] * scale)), max(16, round(image.shape[0] * scale))
         return size, np.asarray(
             cv2.resize(gray_from_rgb(image), size, interpolation=cv2.INTER_AREA), np.uint8
@@ -352,7 +323,7 @@ class Aligner:
             found = self._fit(
                 new,
                 guess,
-                self._settings.doubtful_px if followed else self._settings.most_residual_px,
+                _DOUBTFUL_PX if followed else _MOST_RESIDUAL_PX,
             )
             if isinstance(found, NotAligned):
                 nearest = _nearer(nearest, found)
@@ -374,7 +345,7 @@ class Aligner:
 
     def _may_search(self) -> bool:
         """Whether the dear search is worth its time: a flight that fits nowhere is asked every fifth frame."""
-        return self._misses < self._settings.searched_misses or self._misses % 5 == 1
+        return self._misses < _SEARCHED_MISSES or self._misses % 5 == 1
 
     def _by_search(
         self, frame: "_Frame", by_telemetry: Pose | None, *, is_inside: bool
@@ -397,37 +368,32 @@ class Aligner:
         if found.is_sure and not self.search.is_odd(place.pose, frame.prior):
             return place
         local = self._local(frame, place)
-        return place if local is not None and local.rest <= self._settings.confirms_rest else None
+        return place if local is not None and local.rest <= _CONFIRMS_REST else None
 
     def _settled(self, frame: "_Frame", placed: Place) -> "_Moved":
         """The place moved as a camera by what a local fit finds where the last fit leaves much, and what is left."""
         moved = _Moved(placed, None, 0.0)
-        if placed.residual_px <= self._settings.settled_px and (
-            placed.followed or np.isinf(placed.ratio)
-        ):
+        if placed.residual_px <= _SETTLED_PX and (placed.followed or np.isinf(placed.ratio)):
             return moved
-        moving = self._settings.moving
-        for _ in range(moving.rounds):
+        for _ in range(_ROUNDS):
             local = self._local(frame, moved.place)
             if local is None:
                 break
-            fine = _fine(frame.camera, moving.side_px)
+            fine = _fine(frame.camera, _MOVING_SIDE_PX)
             size_m = float(local.median_px * moved.place.pose.translation_m[2] / fine.fx_px)
-            place, left = _as_camera(
-                moved.place, local, fine, _small_from(fine, frame.even.camera), moving
-            )
+            place, left = _as_camera(moved.place, local, fine, _small_from(fine, frame.even.camera))
             moved = _Moved(
                 place,
                 left.resized(frame.camera.width_px / fine.width_px),
                 max(size_m, moved.size_m),
             )
-            if size_m < moving.far_m:
+            if size_m < _FAR_M:
                 break
         return moved
 
     def _local(self, frame: "_Frame", placed: Place) -> LocalFit | None:
         """The local fit of a frame at its place, in pixels of the `_fine` camera."""
-        fine = _fine(frame.camera, self._settings.moving.side_px)
+        fine = _fine(frame.camera, _MOVING_SIDE_PX)
         size = fine.width_px, fine.height_px
         seen = self._seen(placed.site_from_image @ _small_from(fine, frame.even.camera), fine)
         if seen is None:
@@ -465,7 +431,7 @@ class Aligner:
         if predicted is not None:
             yield self._shifted(new, predicted), True
         by_telemetry = telemetry_inside()
-        features = orb_features(new.gray, self._settings.links.features)
+        features = orb_features(new.gray, _LINKS.features)
         self._misses += 1
         for attempt in self._tries(
             new, features, prior, predicted, by_telemetry, is_cheap=is_cheap
@@ -500,7 +466,7 @@ class Aligner:
 
     def _predicted(self, camera: Camera, prior: CameraPrior, time_ns: int) -> Matrix3 | None:
         """The last fit moved on at the flight's velocity, turned as telemetry has the camera turned."""
-        longest_ns = self._settings.moving.predicts_s * 1e9
+        longest_ns = _PREDICTS_S * 1e9
         if not self._fits or not 0 <= time_ns - self._fits[-1].time_ns <= longest_ns:
             return None
         last = self._fits[-1]
@@ -558,8 +524,8 @@ class Aligner:
 
     def _shifted(self, new: Keyframe, site_from_image: Matrix3) -> Matrix3:
         """The guess moved to where phase correlation of small copies puts it: refinement reaches a few pixels only."""
-        seen = self._seen(site_from_image, new.camera, shrink=self._settings.moving.shrink)
-        if seen is None or seen[1].mean() < self._settings.least_known:
+        seen = self._seen(site_from_image, new.camera, shrink=_SHRINK)
+        if seen is None or seen[1].mean() < _LEAST_KNOWN:
             return site_from_image
         old = normalised(*seen).astype(np.float32)
         size = old.shape[1], old.shape[0]
@@ -607,7 +573,7 @@ class Aligner:
         seen = self._seen(site_from_image, new.camera)
         if seen is None:
             return None
-        settings = self._settings.links.features
+        settings = _LINKS.features
         old, found = sift_features(normalised(*seen), settings), sift_features(new.gray, settings)
         pairs = match(found, old, None, 0.0)
         return self._corrected(
@@ -617,7 +583,7 @@ class Aligner:
     def _anywhere(self, features: Features) -> Matrix3 | None:
         """A frame of unknown place, looked for in the whole map at the frame's own scale and those beside it."""
         for level in range(3):
-            old = self._reference.all_features(level, self._settings.most_features)
+            old = self._reference.all_features(level, _MOST_FEATURES)
             if not len(old):
                 continue
             centre_px = old.points_px.mean(axis=0)
@@ -657,16 +623,16 @@ class Aligner:
         self, new_px: PointsPx, guessed_px: PointsPx, site_from_image: Matrix3
     ) -> Matrix3 | None:
         """The guess corrected by points where they are and where it put them; None where no plane fits them."""
-        if len(new_px) < self._settings.links.min_inliers // 2:
+        if len(new_px) < _LINKS.min_inliers // 2:
             return None
-        fitted = fit_homography(new_px, guessed_px, self._settings.links.threshold_px)
-        if fitted is None or fitted[1].sum() < self._settings.links.min_inliers // 2:
+        fitted = fit_homography(new_px, guessed_px, _LINKS.threshold_px)
+        if fitted is None or fitted[1].sum() < _LINKS.min_inliers // 2:
             return None
         return site_from_image @ np.linalg.inv(fitted[0])
 
     def _beside(self) -> str:
         """The reason of frames beside the map: the same words for all, for reports count them."""
-        return f"less than {self._settings.least_known:.0%} of it lies on the map"
+        return f"less than {_LEAST_KNOWN:.0%} of it lies on the map"
 
     def _share_known(self, site_from_image: Matrix3, camera: Camera) -> float:
         seen = self._seen(site_from_image, camera)
@@ -681,10 +647,10 @@ class Aligner:
         if seen is None:
             return NotAligned("it would look at the horizon", np.nan)
         share = float(seen[1].mean())
-        if share < self._settings.least_known:
+        if share < _LEAST_KNOWN:
             return NotAligned(self._beside(), np.nan)
         old = self._keyframe(new.camera, normalised(*seen))
-        links = self._settings.links
+        links = _LINKS
         found = refine(new, old, np.eye(3), links, LinkCache(links.features, 2))
         if not isinstance(found, Link):
             return NotAligned(f"it does not fit the map: {found}", np.nan)
@@ -692,8 +658,8 @@ class Aligner:
         if residual_px > most_residual_px:
             return NotAligned("its points fit the map badly", residual_px)
         fit: Matrix3 = guess @ np.linalg.inv(found.new_from_old)
-        is_held = residual_px <= self._settings.doubtful_px and (
-            _spread_of(found.new_px, seen[1], self._settings.cells) >= self._settings.least_spread
+        is_held = residual_px <= _DOUBTFUL_PX and (
+            _spread_of(found.new_px, seen[1], _CELLS) >= _LEAST_SPREAD
         )
         return _stiffened(fit, found, guess, new.camera), residual_px, is_held
 
@@ -779,11 +745,7 @@ def _small_from(fine: Camera, small: Camera) -> Matrix3:
 
 
 def _as_camera(
-    placed: Place,
-    local: LocalFit,
-    camera: Camera,
-    small_from_image: Matrix3,
-    settings: MovingSettings,
+    placed: Place, local: LocalFit, camera: Camera, small_from_image: Matrix3
 ) -> tuple[Place, LocalFit]:
     """The place moved as a local fit in this camera's pixels has it, as far as a camera over level ground can; and what
     is left of the fit. `small_from_image` leads to the place's own pixels."""
@@ -793,8 +755,8 @@ def _as_camera(
     known = local.is_known.ravel()
     prior = PosePrior(
         placed.pose,
-        np.full(3, settings.place_sigma_m),
-        np.radians(np.full(3, settings.turn_sigma_deg)),
+        np.full(3, _PLACE_SIGMA_M),
+        np.radians(np.full(3, _TURN_SIGMA_DEG)),
     )
     found = fit_camera(new_px[known], ground_m[known], camera, prior, start_px=6.0, band_px=3.0)
     if found is None:

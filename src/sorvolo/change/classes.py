@@ -2,7 +2,6 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -12,38 +11,25 @@ from sorvolo.survey.findings import Change, ChangeKind, Patch
 from sorvolo.survey.map_objects import MapObject
 from sorvolo.survey.objects import Detections, Sighting
 
-
-@dataclass(frozen=True)
-class ClassSettings:
-    """When an object, a sighting or a detection names what a change is."""
-
-    beside_m: float = 0.4  # an object's place may lie so far outside of the outline, beside a part of its own length
-    longest_s: float = (
-        5.0  # before or after the time at which a moving change was where its outline is
-    )
-    turn: float = 0.4  # of the way it goes meanwhile: people turn
-    least_side_px: int = 160  # of a picture that a detector is shown
-    least_share: float = (
-        0.5  # of the box or of the change, whichever is smaller, that both have in common
-    )
-    like_lengths: float = 1.6  # times the other's, at most
-    lenient: float = 0.4  # times each class's score: that something is there is known already
+# When an object, a sighting or a detection names what a change is.
+# an object's place may lie so far outside of the outline, beside a part of its own length
+_BESIDE_M = 0.4
+_LONGEST_S = 5.0  # before or after the time at which a moving change was where its outline is
+_TURN = 0.4  # of the way it goes meanwhile: people turn
+_LEAST_SIDE_PX = 160  # of a picture that a detector is shown
+_LEAST_SHARE = 0.5  # of the box or of the change, whichever is smaller, that both have in common
+_LIKE_LENGTHS = 1.6  # times the other's, at most
+LENIENT = 0.4  # times each class's score: that something is there is known already
 
 
-def stands_in(change: Change, thing: MapObject, settings: ClassSettings = ClassSettings()) -> bool:
+def stands_in(change: Change, thing: MapObject) -> bool:
     """Whether an object that does not move stands in a change's outline and is about as long."""
     if thing.moving or _outside_m(change.outline_m, thing.position_m) > 0:
         return False
-    return (
-        change.length_m / settings.like_lengths
-        <= thing.length_m
-        <= change.length_m * settings.like_lengths
-    )
+    return change.length_m / _LIKE_LENGTHS <= thing.length_m <= change.length_m * _LIKE_LENGTHS
 
 
-def object_at(
-    change: Change, objects: Sequence[MapObject], settings: ClassSettings = ClassSettings()
-) -> str:
+def object_at(change: Change, objects: Sequence[MapObject]) -> str:
     """The class of the object that stands in a change's outline, or nearly, and is nearest to it in place and size.
 
     "" where there is none; what moves is left out.
@@ -54,7 +40,7 @@ def object_at(
         if each.moving:
             continue
         length_m = each.length_m if np.isfinite(each.length_m) else change.length_m
-        reach_m = settings.beside_m + length_m / 4
+        reach_m = _BESIDE_M + length_m / 4
         outside_m = _outside_m(change.outline_m, each.position_m)
         if outside_m > reach_m:
             continue
@@ -67,9 +53,7 @@ def object_at(
     return best
 
 
-def seen_at(
-    change: Change, sightings: Sequence[Sighting], settings: ClassSettings = ClassSettings()
-) -> str:
+def seen_at(change: Change, sightings: Sequence[Sighting]) -> str:
     """The class of a flight's sightings in a change's outline, by their summed scores; "" where there is none.
 
     What moves is looked for where it was at each sighting's time.
@@ -78,12 +62,10 @@ def seen_at(
     speed_m_s = float(np.hypot(*change.velocity_m_s))
     for each in sightings:
         after_s = (each.time_ns - change.last_seen_ns) / 1e9
-        if change.kind is ChangeKind.MOVING and abs(after_s) > settings.longest_s:
+        if change.kind is ChangeKind.MOVING and abs(after_s) > _LONGEST_S:
             continue
         meanwhile_m: Floats = change.velocity_m_s * after_s if speed_m_s else np.zeros(2)
-        reach_m = (
-            settings.beside_m + each.size_m[0] / 4 + settings.turn * float(np.hypot(*meanwhile_m))
-        )
+        reach_m = _BESIDE_M + each.size_m[0] / 4 + _TURN * float(np.hypot(*meanwhile_m))
         outside_m = _outside_m(change.outline_m, each.position_m - meanwhile_m)
         if outside_m <= reach_m:
             sums[each.label] += each.score / (1.0 + max(outside_m, 0.0))
@@ -95,9 +77,7 @@ def can_show(patch: Patch, rgba: ImageRGBA) -> bool:
     return bool(patch.changed.any()) and bool((rgba[..., 3] > 0).any())
 
 
-def enlarged(
-    rgba: ImageRGBA, settings: ClassSettings = ClassSettings()
-) -> tuple[ImageRGB, tuple[int, int]]:
+def enlarged(rgba: ImageRGBA) -> tuple[ImageRGB, tuple[int, int]]:
     """The picture without alpha, wide enough for a detector; how far it begins to the right of and below its corner.
 
     What is unknown gets the mean colour of what is known, what lies around is mirrored.
@@ -106,17 +86,13 @@ def enlarged(
     rgb = rgba[..., :3].copy()
     rgb[~known] = rgb[known].mean(axis=0).astype(np.uint8)
     height, width = known.shape
-    top, left = (max(0, settings.least_side_px - side + 1) // 2 for side in (height, width))
+    top, left = (max(0, _LEAST_SIDE_PX - side + 1) // 2 for side in (height, width))
     padded = cv2.copyMakeBorder(rgb, top, top, left, left, cv2.BORDER_REFLECT)
     return np.asarray(padded, np.uint8), (left, top)
 
 
 def class_of_change(
-    patch: Patch,
-    seen: Detections,
-    thresholds: Mapping[str, float],
-    offset_px: tuple[int, int],
-    settings: ClassSettings = ClassSettings(),
+    patch: Patch, seen: Detections, thresholds: Mapping[str, float], offset_px: tuple[int, int]
 ) -> str:
     """The class of the surest detection that covers the patch's change, in a picture that begins `offset_px` right of
     and below the patch's corner; "" where none does."""
@@ -127,7 +103,7 @@ def class_of_change(
     best, best_score = "", 0.0
     for box_px, name, score in zip(seen.boxes_px, seen.names, seen.scores):
         share = _common_share(np.asarray(box_px, np.float64), changed_px)
-        if score < settings.lenient * thresholds[name] or share < settings.least_share:
+        if score < LENIENT * thresholds[name] or share < _LEAST_SHARE:
             continue
         if share * score > best_score:
             best, best_score = name, share * float(score)

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sorvolo.change.evidence.levelness import LaidPicture, LevelSettings, apart
+from sorvolo.change.levelness import MOST_PICTURES, LaidPicture, apart
+from sorvolo.change.patches import PatchWindow
 from sorvolo.change.relief import Relief
-from sorvolo.change.shape.patches import PatchWindow
 from sorvolo.geometry.arrays import ImageBGR, ImageRGB, ImageRGBA, Mask, Matrix3, PointsM, Vector3
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.homography import apply_homography, pose_from_homography
@@ -110,11 +110,11 @@ class EarlierPictures:
         )
 
     def laid(
-        self, vantage: Vantage, window: PatchWindow, settings: LevelSettings
+        self, vantage: Vantage, window: PatchWindow, most: int = MOST_PICTURES
     ) -> list[LaidPicture]:
-        """A few of the pictures that show a place, taken apart from each other, laid on a window of level ground."""
+        """At most so many pictures that show a place, taken apart from each other, laid on a window of level ground."""
         found: list[LaidPicture] = []
-        for index in apart(self._cameras_m, vantage.shows, settings):
+        for index in apart(self._cameras_m, vantage.shows, most):
             picture = self._as_coarse(index, window.site_from_patch)
             if picture is not None:
                 rgba, site_from_picture = picture

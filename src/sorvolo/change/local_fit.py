@@ -9,28 +9,19 @@ from cv2.typing import MatLike
 
 from sorvolo.geometry.arrays import Floats, Floats32, ImageGray, ImageRGB, Mask, PointsPx, Rows
 
-
-@dataclass(frozen=True)
-class LocalFitSettings:
-    """How a displacement is searched; cells and pixels are those of the small copies of the pictures."""
-
-    side_px: int = 480  # longest side of the copies: fine texture is what two dates share
-    most_m: float = 1.5  # relief and errors of maps move ground by so much
-    most_px: int = 6  # no displacement is searched beyond
-    cell_px: int = 15  # agreement is gathered in cells of this side
-    window_cells: float = (
-        3.0  # sigma of the window that looks for its displacement: things are much smaller
-    )
-    smooth_cells: float = 2.5  # sigma over which displacements are made smooth
-    band_px: float = 0.7  # windows that differ more from those around them have little weight
-    flat_levels2: float = (
-        1.0  # grey levels squared: gradients of the sensor's noise get no full voice
-    )
-    even_px: int = 31  # window in which gradients are made even
-    hardly: float = 1e-3  # of the largest weight: pulls to no displacement where nothing is known
-    most_rest: float = (
-        0.65  # of what cells held back moved by, squared, is left; 0.8 to 1.4 over other ground
-    )
+# How a displacement is searched; cells and pixels are those of the small copies of the pictures.
+_SIDE_PX = 480  # longest side of the copies: fine texture is what two dates share
+_MOST_M = 1.5  # relief and errors of maps move ground by so much
+_MOST_PX = 6  # no displacement is searched beyond
+_CELL_PX = 15  # agreement is gathered in cells of this side
+_WINDOW_CELLS = 3.0  # sigma of the window that looks for its displacement: things are much smaller
+_SMOOTH_CELLS = 2.5  # sigma over which displacements are made smooth
+_BAND_PX = 0.7  # windows that differ more from those around them have little weight
+_FLAT_LEVELS2 = 1.0  # grey levels squared: gradients of the sensor's noise get no full voice
+_EVEN_PX = 31  # window in which gradients are made even
+_HARDLY = 0.001  # of the largest weight: pulls to no displacement where nothing is known
+# of what cells held back moved by, squared, is left; 0.8 to 1.4 over other ground
+_MOST_REST = 0.65
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +73,7 @@ class LocalFit:
 
 
 def fit_locally(
-    reference: ImageGray,
-    query: ImageGray,
-    known: Mask,
-    m_per_px: float,
-    settings: LocalFitSettings = LocalFitSettings(),
+    reference: ImageGray, query: ImageGray, known: Mask, m_per_px: float
 ) -> LocalFit | None:
     """The displacement between two aligned pictures (H, W) of one size, None where it is not confirmed.
 
@@ -96,11 +83,11 @@ def fit_locally(
     a displacement made of the others must be what they have, too. `m_per_px` is the ground's size of a pixel.
     """
     height, width = known.shape
-    scale = min(1.0, settings.side_px / max(height, width))
+    scale = min(1.0, _SIDE_PX / max(height, width))
     size = round(width * scale), round(height * scale)
-    most_px = settings.most_m / m_per_px * scale
-    reach = int(np.clip(np.ceil(most_px), 1, settings.most_px))
-    cells = max(1, round(size[0] / settings.cell_px)), max(1, round(size[1] / settings.cell_px))
+    most_px = _MOST_M / m_per_px * scale
+    reach = int(np.clip(np.ceil(most_px), 1, _MOST_PX))
+    cells = max(1, round(size[0] / _CELL_PX)), max(1, round(size[1] / _CELL_PX))
     if min(cells) < 4 or min(size) < 4 * reach:
         return None
     share = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
@@ -108,25 +95,23 @@ def fit_locally(
         (share > 0.99).astype(np.float32), np.ones((5, 5), np.uint8)
     )  # no gradients of the map's rim
     on_map = np.asarray(cv2.resize(seen, cells, interpolation=cv2.INTER_AREA), np.float32)
-    still, moving = (_even_gradients(image, size, settings) for image in (reference, query))
+    still, moving = (_even_gradients(image, size) for image in (reference, query))
     agreement = _agreement((still[0] * seen, still[1] * seen), moving, reach, cells)
     checks = np.indices(cells[::-1]).sum(axis=0) % 2 == 0
-    rest = _rest(agreement, (on_map * checks, on_map * ~checks), reach, settings)
-    if rest > settings.most_rest:
+    rest = _rest(agreement, (on_map * checks, on_map * ~checks), reach)
+    if rest > _MOST_REST:
         return None
-    moved, _, _ = _field(agreement, on_map, reach, settings)
+    moved, _, _ = _field(agreement, on_map, reach)
     return LocalFit(_bounded(moved, most_px) / scale, on_map > 0.5, rest)
 
 
-def _even_gradients(
-    image: ImageGray, size: tuple[int, int], settings: LocalFitSettings
-) -> tuple[MatLike, MatLike]:
+def _even_gradients(image: ImageGray, size: tuple[int, int]) -> tuple[MatLike, MatLike]:
     """Gradients in x and y, (h, w) each, of a small copy, of like strength everywhere: light falls out of them."""
     gray = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     across, down = (cv2.Scharr(gray, cv2.CV_32F, 1 - axis, axis, scale=1 / 16) for axis in (0, 1))
     strength = cv2.add(cv2.multiply(across, across), cv2.multiply(down, down))
-    around = cv2.blur(strength, (settings.even_px, settings.even_px))
-    even = cv2.sqrt(np.asarray(strength) + np.asarray(around) + np.float32(settings.flat_levels2))
+    around = cv2.blur(strength, (_EVEN_PX, _EVEN_PX))
+    even = cv2.sqrt(np.asarray(strength) + np.asarray(around) + np.float32(_FLAT_LEVELS2))
     return cv2.divide(across, even), cv2.divide(down, even)
 
 
@@ -153,19 +138,17 @@ def _agreement(
     return result
 
 
-def _rest(
-    agreement: Floats32, halves: tuple[Floats32, Floats32], reach: int, settings: LocalFitSettings
-) -> float:
+def _rest(agreement: Floats32, halves: tuple[Floats32, Floats32], reach: int) -> float:
     """The share of the second half's displacements that is left by the smooth one of the first; 1 where it is none.
 
     Each half's cells have windows of their own, so that the noise of one half is independent of the other's.
     """
-    field, _, _ = _field(agreement, halves[0], reach, settings)
-    _, moved, sure = _field(agreement, halves[1], reach, settings)
+    field, _, _ = _field(agreement, halves[0], reach)
+    _, moved, sure = _field(agreement, halves[1], reach)
     if not sure.any():
         return 1.0
     before, after = (
-        float(_capped(each, settings.band_px) @ sure.ravel()) for each in (moved, moved - field)
+        float(_capped(each, _BAND_PX) @ sure.ravel()) for each in (moved, moved - field)
     )
     return after / max(before, 1e-9)
 
@@ -177,14 +160,12 @@ def _capped(moved: Floats, band: float) -> Floats:
     return capped
 
 
-def _field(
-    agreement: Floats32, counts: Floats32, reach: int, settings: LocalFitSettings
-) -> tuple[Floats, Floats, Floats]:
+def _field(agreement: Floats32, counts: Floats32, reach: int) -> tuple[Floats, Floats, Floats]:
     """The smooth displacement, x and y, that cells agree on, (rows, columns, 2); each window's own, and how sure that
     is, (rows, columns). `counts` (rows, columns) is what each cell counts, 0 to 1."""
     side = 2 * reach + 1
-    gathered = _smooth(agreement * counts, settings.window_cells)
-    gathered /= np.maximum(_smooth(counts[None], settings.window_cells), np.float32(1e-3))
+    gathered = _smooth(agreement * counts, _WINDOW_CELLS)
+    gathered /= np.maximum(_smooth(counts[None], _WINDOW_CELLS), np.float32(1e-3))
     best = gathered.argmax(axis=0)
     y, x = np.divmod(best, side)
     top, spread = gathered.max(axis=0), gathered.std(axis=0) + 1e-6
@@ -198,16 +179,14 @@ def _field(
     )
     weight, field = sure, moved
     for _ in range(5):
-        total = (
-            _smooth(weight[None], settings.smooth_cells)[0] + settings.hardly * sure.max() + 1e-12
-        )
+        total = _smooth(weight[None], _SMOOTH_CELLS)[0] + _HARDLY * sure.max() + 1e-12
         field = np.moveaxis(
-            _smooth(np.moveaxis(moved * weight[..., None], 2, 0), settings.smooth_cells) / total,
+            _smooth(np.moveaxis(moved * weight[..., None], 2, 0), _SMOOTH_CELLS) / total,
             0,
             2,
         )
         apart = np.linalg.norm(moved - field, axis=2)
-        weight = sure / (1 + (apart / settings.band_px) ** 2) ** 2
+        weight = sure / (1 + (apart / _BAND_PX) ** 2) ** 2
     return field, moved, sure
 
 

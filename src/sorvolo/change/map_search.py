@@ -36,35 +36,27 @@ _FEATURES = FeatureSettings()
 _QUARTERS_DEG = (0.0, 90.0, -90.0, 180.0)  # headings that are tried where none is known
 
 
-@dataclass(frozen=True)
-class SearchSettings:
-    """How far frames are searched around their telemetry, and what counts as found; pixels are those of the search."""
-
-    margin: float = 0.25  # of the frame's size: map searched beyond each side
-    frame_points: int = 2048  # learned features of a frame, the strongest ...
-    map_points: int = 4096  # ... and of the map around, which shows more ground
-    rim_px: int = 15  # window of known ground that a point of the map stands in
-    most_scale: float = 1.35  # heights of consumer drones err by a fifth
-    coarse_px: float = 6.0  # band of the first fit
-    near_px: float = 24.0  # pairs around the first fit that compete for the second
-    band_px: float = 5.0  # band of the final fit: 1 m from 100 m, what maps differ by locally
-    least_pairs: int = 20  # that agree; chance leaves fewer
-    weak_pairs: int = 10  # of a place that something else must confirm ...
-    weak_ratio: float = 1.6  # ... and its least ratio
-    first_ratio: float = (
-        4.0  # times the pairs that chance leaves in the band; other ground leaves 0.3 to 2.8
-    )
-    least_ratio: float = 2.5  # the same once the flight is known to lie on this map
-    least_surplus: float = (
-        3.0  # beside a neighbour, whose place is known: standard deviations above chance
-    )
-    neighbours: int = 3  # placed frames nearest in time, beside which a frame is tried
-    most_kept: int = 200  # frames remembered: 0.2 MB each
-    strong_ratio: float = (
-        5.0  # frames that correct the flight's telemetry have so many times chance's pairs
-    )
-    least_strong: int = 3  # frames; by choice
-    odd: float = 4.0  # sigmas off telemetry: a homography that swings
+# How far frames are searched around their telemetry, and what counts as found; pixels are those of
+# the search.
+_MARGIN = 0.25  # of the frame's size: map searched beyond each side
+_FRAME_POINTS = 2048  # learned features of a frame, the strongest ...
+_MAP_POINTS = 4096  # ... and of the map around, which shows more ground
+_RIM_PX = 15  # window of known ground that a point of the map stands in
+_MOST_SCALE = 1.35  # heights of consumer drones err by a fifth
+_COARSE_PX = 6.0  # band of the first fit
+_NEAR_PX = 24.0  # pairs around the first fit that compete for the second
+_BAND_PX = 5.0  # band of the final fit: 1 m from 100 m, what maps differ by locally
+_LEAST_PAIRS = 20  # that agree; chance leaves fewer
+_WEAK_PAIRS = 10  # of a place that something else must confirm ...
+_WEAK_RATIO = 1.6  # ... and its least ratio
+_FIRST_RATIO = 4.0  # times the pairs that chance leaves in the band; other ground leaves 0.3 to 2.8
+_LEAST_RATIO = 2.5  # the same once the flight is known to lie on this map
+_LEAST_SURPLUS = 3.0  # beside a neighbour, whose place is known: standard deviations above chance
+_NEIGHBOURS = 3  # placed frames nearest in time, beside which a frame is tried
+_MOST_KEPT = 200  # frames remembered: 0.2 MB each
+_STRONG_RATIO = 5.0  # frames that correct the flight's telemetry have so many times chance's pairs
+_LEAST_STRONG = 3  # frames
+_ODD = 4.0  # sigmas off telemetry: a homography that swings
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,18 +116,9 @@ class MapSearch:
     """Searches one flight's frames on a map; knows where earlier ones were placed. Only `remember` changes it."""
 
     def __init__(
-        self,
-        reference: ReferenceMap,
-        site_grid: SiteGrid,
-        settings: SearchSettings = SearchSettings(),
-        features: FeatureSettings = _FEATURES,
+        self, reference: ReferenceMap, site_grid: SiteGrid, features: FeatureSettings = _FEATURES
     ) -> None:
-        self._reference, self._site_grid, self._settings, self._features = (
-            reference,
-            site_grid,
-            settings,
-            features,
-        )
+        self._reference, self._site_grid, self._features = reference, site_grid, features
         self._placed: list[_Placed] = []
         self._orb: dict[int, Features] = {}
 
@@ -151,11 +134,11 @@ class MapSearch:
         """Note a frame that was placed; `even` is its gray, contrast normalised, `ratio` how sure, infinite by ORB."""
         off_m = pose.translation_m - prior.position_m if prior.knows_place else np.full(3, np.nan)
         turn, _ = cv2.Rodrigues(prior.rotation.T @ pose.rotation)
-        is_strong = ratio >= self._settings.strong_ratio
+        is_strong = ratio >= _STRONG_RATIO
         place = _Placed(
             even, camera, site_from_image, pose.translation_m, off_m, float(turn[2, 0]), is_strong
         )
-        self._placed = [*self._placed[1 - self._settings.most_kept :], place]
+        self._placed = [*self._placed[1 - _MOST_KEPT :], place]
 
     def find(
         self,
@@ -172,7 +155,7 @@ class MapSearch:
         turned as frames before were, then as telemetry has it, then by quarters: a compass may be off by any angle.
         """
         sought = _Sought(gray, even, camera, prior, by_telemetry)
-        features = learned_features(gray, self._settings.frame_points)
+        features = learned_features(gray, _FRAME_POINTS)
         best = None
         for found in self._tries(sought, features):
             if found.is_sure:
@@ -184,16 +167,13 @@ class MapSearch:
     def is_odd(self, pose: Pose, prior: CameraPrior) -> bool:
         """Whether a camera lies far from where telemetry, less what it was off by so far, has it."""
         off_m = self._strong_off_m()
-        if len(off_m) < self._settings.least_strong or not prior.knows_place:
+        if len(off_m) < _LEAST_STRONG or not prior.knows_place:
             return False
         usual_m = np.median(off_m, axis=0)
         spread_m = SIGMA_PER_MEDIAN_DEVIATION * np.median(np.abs(off_m - usual_m), axis=0)
         sigma_m = np.maximum(np.clip(prior.position_sigma_m, 1.0, 1e3), spread_m)
         return bool(
-            (
-                np.abs(pose.translation_m - prior.position_m - usual_m)
-                > self._settings.odd * sigma_m
-            ).any()
+            (np.abs(pose.translation_m - prior.position_m - usual_m) > _ODD * sigma_m).any()
         )
 
     # ---- inside -----------------------------------------------------------------------------------------------
@@ -222,12 +202,12 @@ class MapSearch:
 
     def _prior(self, sought: _Sought, pose: Pose) -> PosePrior:
         """What is known of the camera: telemetry, less what it was off by where this flight's frames were placed."""
-        settings, prior = self._settings, sought.prior
+        prior = sought.prior
         off_m = self._strong_off_m()
         sigma_m = np.clip(prior.position_sigma_m, 1.5, 1e3)
         sigma_rad = np.radians(np.clip(prior.attitude_sigma_deg, 1.0, 15.0))
         place_m = sought.pose.translation_m
-        if len(off_m) >= settings.least_strong and prior.knows_place:
+        if len(off_m) >= _LEAST_STRONG and prior.knows_place:
             place_m = place_m + np.median(off_m, axis=0)
         else:
             sigma_m[2] += 0.03 * place_m[2]  # heights are above a ground that may lie elsewhere
@@ -242,13 +222,13 @@ class MapSearch:
 
     def _around(self, sought: _Sought, features: Features, turn_rad: float) -> Found | None:
         """The frame looked for around telemetry's place with the heading turned."""
-        settings, prior = self._settings, sought.prior
+        prior = sought.prior
         start = self._prior(sought, sought.pose).pose
         start = Pose(
             start.rotation @ rotation_from_vector(np.array([0.0, 0.0, turn_rad])),
             start.translation_m,
         )
-        seen = self.map_features(sought.camera, start, settings.margin)
+        seen = self.map_features(sought.camera, start, _MARGIN)
         if seen is None:
             return None
         site_from_start, old = seen
@@ -262,8 +242,8 @@ class MapSearch:
         coarse = similar(
             features.points_px[pairs[:, 0]],
             old.points_px[pairs[:, 1]],
-            settings.coarse_px,
-            settings.most_scale,
+            _COARSE_PX,
+            _MOST_SCALE,
         )
         if coarse is None:
             return None
@@ -277,15 +257,14 @@ class MapSearch:
             sought.camera,
             self._prior(sought, pose),
             start_px=20.0,
-            band_px=settings.band_px,
+            band_px=_BAND_PX,
         )
-        is_known = len(self._strong_off_m()) >= settings.least_strong
-        least_ratio = settings.least_ratio if is_known else settings.first_ratio
+        is_known = len(self._strong_off_m()) >= _LEAST_STRONG
+        least_ratio = _LEAST_RATIO if is_known else _FIRST_RATIO
         return None if fit is None else self._judged(fit, near, least_ratio)
 
     def _near_neighbours(self, sought: _Sought, features: Features, beside: _Pairs) -> Found | None:
         """The frame placed by what it shares with placed frames and with the map around there."""
-        settings = self._settings
         found = fit_homography(beside.image_px, beside.ground_m, 3.0)
         if found is None:
             return None
@@ -300,7 +279,7 @@ class MapSearch:
             sought.camera,
             prior,
             start_px=10.0,
-            band_px=settings.band_px,
+            band_px=_BAND_PX,
         )
         seen = None if first is None else self.map_features(sought.camera, first.pose, 0.1)
         if first is None or seen is None:
@@ -313,28 +292,28 @@ class MapSearch:
             sought.camera,
             self._prior(sought, first.pose),
             start_px=10.0,
-            band_px=settings.band_px,
+            band_px=_BAND_PX,
         )
         if fit is None:
             return None
         of_map = CameraFit(fit.pose, fit.site_from_image, fit.agree[: len(near)], fit.residual_px)
-        chance = len(near) * (settings.band_px / settings.near_px) ** 2
-        return self._judged(of_map, near, 1 + settings.least_surplus / max(np.sqrt(chance), 1.0))
+        chance = len(near) * (_BAND_PX / _NEAR_PX) ** 2
+        return self._judged(of_map, near, 1 + _LEAST_SURPLUS / max(np.sqrt(chance), 1.0))
 
     def _judged(self, fit: CameraFit, pairs: _Pairs, least_ratio: float) -> Found | None:
         """The fit where more pairs agree than chance leaves in the band; none where hardly any do."""
-        settings, agree = self._settings, fit.agree
-        chance = len(pairs) * (settings.band_px / settings.near_px) ** 2
+        agree = fit.agree
+        chance = len(pairs) * (_BAND_PX / _NEAR_PX) ** 2
         ratio = float(agree.sum() / max(chance, 1.0))
-        if agree.sum() < settings.weak_pairs or ratio < settings.weak_ratio:
+        if agree.sum() < _WEAK_PAIRS or ratio < _WEAK_RATIO:
             return None
-        is_sure = bool(agree.sum() >= settings.least_pairs and ratio >= least_ratio)
+        is_sure = bool(agree.sum() >= _LEAST_PAIRS and ratio >= least_ratio)
         return Found(fit, pairs.image_px[agree], pairs.ground_m[agree], ratio, is_sure)
 
     def _near(
         self, features: Features, old: Features, site_from_old: Matrix3, new_from_old: Matrix3
     ) -> _Pairs:
-        pairs = match_learned(features, old, new_from_old, self._settings.near_px)
+        pairs = match_learned(features, old, new_from_old, _NEAR_PX)
         return _Pairs(
             features.points_px[pairs[:, 0]],
             apply_homography(site_from_old, old.points_px[pairs[:, 1]]),
@@ -362,8 +341,8 @@ class MapSearch:
         )
         if not known.any():
             return None
-        found = learned_features(filled(gray_from_rgb(rgb), known), self._settings.map_points)
-        found = known_only(found, known, self._settings.rim_px)
+        found = learned_features(filled(gray_from_rgb(rgb), known), _MAP_POINTS)
+        found = known_only(found, known, _RIM_PX)
         return site_from_image, Features(LEARNED, found.points_px - spare, found.descriptors)
 
     def _beside(self, sought: _Sought) -> _Pairs:
@@ -374,7 +353,7 @@ class MapSearch:
             old = self._orb_of(near)
             both = match(own, old, None, 0.0)
             fitted = fit_homography(own.points_px[both[:, 0]], old.points_px[both[:, 1]], 3.0)
-            if fitted is None or fitted[1].sum() < 2 * self._settings.least_pairs:
+            if fitted is None or fitted[1].sum() < 2 * _LEAST_PAIRS:
                 continue
             agree = np.flatnonzero(fitted[1])[:: max(1, int(fitted[1].sum()) // 40)]
             ground_m = apply_homography(near.site_from_image, old.points_px[both[agree, 1]])
@@ -392,7 +371,7 @@ class MapSearch:
             ]
         )
         reach_m = sought.camera.width_px / sought.camera.fx_px * sought.pose.translation_m[2]
-        for index in np.argsort(away_m, kind="stable")[: self._settings.neighbours]:
+        for index in np.argsort(away_m, kind="stable")[:_NEIGHBOURS]:
             if away_m[index] < reach_m:
                 yield self._placed[index]
 

@@ -1,29 +1,21 @@
 """The map brought up to date: changes' later pictures painted into its tiles; by how much it grew."""
 
 from collections.abc import Iterable, Mapping, MutableMapping
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sorvolo.geometry.arrays import ImageRGBA, Matrix3, PointsM
+from sorvolo.geometry.arrays import Floats32, ImageRGBA, Matrix3, PointsM
 from sorvolo.geometry.grid import SiteGrid, TileIndex
 from sorvolo.geometry.homography import apply_homography
 from sorvolo.survey.findings import Change, ChangeKind, Patch
 
-
-@dataclass(frozen=True)
-class PaintSettings:
-    """How a change is mixed into the map. Lengths in px of the tile."""
-
-    grown_px: int = 6  # beyond the outline: covers the thing's blurred rim
-    feather_px: int = 4  # over which old and new mix: no seam
-    most_gain: float = (
-        1.6  # times brighter or darker, each channel: more is another surface, not another light
-    )
-    least_ring_px: int = (
-        50  # of unchanged ground around, in px of the patch: of fewer no gain is taken
-    )
+# How a change is mixed into the map. Lengths in px of the tile.
+_GROWN_PX = 6  # beyond the outline: covers the thing's blurred rim
+_FEATHER_PX = 4  # over which old and new mix: no seam
+# times brighter or darker, each channel: more is another surface, not another light
+_MOST_GAIN = 1.6
+_LEAST_RING_PX = 50  # of unchanged ground around, in px of the patch: of fewer no gain is taken
 
 
 def is_painted(change: Change) -> bool:
@@ -70,7 +62,6 @@ def patched(
     tile_window: tuple[int, int, int, int],
     grid_from_site: Matrix3,
     patch: Patch,
-    settings: PaintSettings = PaintSettings(),
 ) -> ImageRGBA:
     """The tile with the patch's changed region as the flight saw it; the very same tile if nothing of it changes.
 
@@ -83,8 +74,8 @@ def patched(
     tile_from_grid = np.array([[1, 0, -x0], [0, 1, -y0], [0, 0, 1.0]])
     tile_from_patch = (tile_from_grid @ grid_from_site @ patch.site_from_patch)[:2]
     scale = float(np.sqrt(abs(np.linalg.det(tile_from_patch[:, :2]))))
-    grow = max(1, round(settings.grown_px / scale))
-    weight = _weight(patch, grow, max(1, round(settings.feather_px / scale)))
+    grow = max(1, round(_GROWN_PX / scale))
+    weight = _weight(patch, grow, max(1, round(_FEATHER_PX / scale)))
     size = (x1 - x0, y1 - y0)
     laid_weight = cv2.warpAffine(weight, tile_from_patch, size, flags=cv2.INTER_LINEAR)
     known = (
@@ -100,7 +91,7 @@ def patched(
         flags=cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     ).astype(np.float32)
-    laid *= _gains(patch, grow, settings)
+    laid *= _gains(patch, grow)
     share = laid_weight[..., None].copy()
     share[tile_rgba[..., 3] == 0] = 1.0  # nothing there to mix with
     mixed = tile_rgba[..., :3] * (1 - share) + laid * share
@@ -114,9 +105,7 @@ def _seen_px(tiles: Mapping[TileIndex, ImageRGBA], index: TileIndex) -> int:
     return int(np.count_nonzero(tiles[index][..., 3])) if index in tiles else 0
 
 
-def _weight(
-    patch: Patch, grow: int, feather: int
-) -> np.ndarray[tuple[int, int], np.dtype[np.float32]]:
+def _weight(patch: Patch, grow: int, feather: int) -> Floats32:
     """(height, width) 1 in the changed region and a little around, falling to 0 over the feather."""
     outside = np.where(patch.changed, 0, 1).astype(np.uint8)
     if outside.all():
@@ -128,15 +117,13 @@ def _weight(
     return weight
 
 
-def _gains(
-    patch: Patch, grow: int, settings: PaintSettings
-) -> np.ndarray[tuple[int], np.dtype[np.float32]]:
+def _gains(patch: Patch, grow: int) -> Floats32:
     """(3,) what the later picture's channels are multiplied with to look like the map's ground around the change."""
     size = 2 * grow + 1
     near = cv2.dilate(patch.changed.astype(np.uint8), np.ones((size, size), np.uint8)) > 0
     ring = ~near & (patch.before[..., 3] > 0) & (patch.after[..., 3] > 0)
-    if np.count_nonzero(ring) < settings.least_ring_px:
+    if np.count_nonzero(ring) < _LEAST_RING_PX:
         return np.ones(3, np.float32)
     before = np.median(patch.before[ring][:, :3], axis=0) + 1.0
     after = np.median(patch.after[ring][:, :3], axis=0) + 1.0
-    return np.clip(before / after, 1 / settings.most_gain, settings.most_gain).astype(np.float32)
+    return np.clip(before / after, 1 / _MOST_GAIN, _MOST_GAIN).astype(np.float32)

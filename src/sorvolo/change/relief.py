@@ -8,15 +8,11 @@ import numpy as np
 from sorvolo.geometry.arrays import Floats, Floats32, Mask, Matrix3, PointsM, Vector3, frozen
 from sorvolo.geometry.homography import apply_homography
 
-
-@dataclass(frozen=True)
-class ReliefSettings:
-    """How finely rays are followed to what stands on the ground."""
-
-    coarser: int = 4  # pixels of a picture, either way, for which one ray is followed
-    most_steps: int = 60  # of a ray through the surface; by choice
-    least_m: float = 0.3  # lower things move by less than the comparison's own reach
-    same_m: float = 0.5  # heights that differ by less are the same surface
+# How finely rays are followed to what stands on the ground.
+_COARSER = 4  # pixels of a picture, either way, for which one ray is followed
+_MOST_STEPS = 60  # of a ray through the surface
+_LEAST_M = 0.3  # lower things move by less than the comparison's own reach
+_SAME_M = 0.5  # heights that differ by less are the same surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +26,6 @@ class Relief:
 
     above_m: Floats32
     cells_from_site: Matrix3
-    settings: ReliefSettings = ReliefSettings()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "above_m", frozen(self.above_m))
@@ -40,10 +35,10 @@ class Relief:
         """(h, w) how high a camera's rays to ground places, (h, w, 2), first meet what stands there; 0: the ground."""
         highest = min(float(self.above_m.max(initial=0)), 0.5 * float(camera_m[2]))
         found = np.zeros(ground_m.shape[:2], np.float32)
-        if highest < self.settings.least_m:
+        if highest < _LEAST_M:
             return found
         cell_m = 1 / np.sqrt(abs(np.linalg.det(self.cells_from_site[:2, :2])))
-        step_m = max(float(cell_m), highest / self.settings.most_steps)
+        step_m = max(float(cell_m), highest / _MOST_STEPS)
         for up_m in np.arange(highest, 0, -step_m):
             stands = self._at(_raised(ground_m, camera_m, float(up_m)))
             meets = (stands >= up_m) & (found == 0)
@@ -64,12 +59,12 @@ class Relief:
 
         `site_from_image` and `picture_from_site` hold for level ground; `size` is the image's width and height.
         """
-        coarser = self.settings.coarser
+        coarser = _COARSER
         small = max(2, size[0] // coarser), max(2, size[1] // coarser)
         coarse_m = _grounds(site_from_image, size, small)
         up_m = self.meet_m(coarse_m, camera_m)
         earlier_ground_m = _lowered(_raised(coarse_m, camera_m, up_m), earlier_m, up_m)
-        hidden = self.meet_m(earlier_ground_m, earlier_m) > up_m + self.settings.same_m
+        hidden = self.meet_m(earlier_ground_m, earlier_m) > up_m + _SAME_M
         if not hidden.any() and not up_m.any():
             return None
         fine_up_m = np.asarray(cv2.resize(up_m, size, interpolation=cv2.INTER_LINEAR), np.float32)

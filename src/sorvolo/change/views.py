@@ -1,59 +1,215 @@
 """Frames of a later flight to views compared with the map: aligned, resampled, searched for differences."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
+from cv2.typing import MatLike
 
 from sorvolo.change.alignment import Aligned, Aligner, AlignStep, Caution, FlightPlace
-from sorvolo.change.areas.signs import leaning, level_of
-from sorvolo.change.coverage.planting import Planted, Planting
-from sorvolo.change.earlier_pictures import EarlierPictures
-from sorvolo.change.frame_pixels import FramePixels, comparison_camera
-from sorvolo.change.map_search import MapSearch
-from sorvolo.change.pair.corroboration import (
-    CorroborationSettings,
+from sorvolo.change.areas import leaning, level_of
+from sorvolo.change.corroboration import (
+    LEAST_SCORE,
+    SURE,
     Difference,
     believed,
     is_whole,
     unwitnessed,
 )
-from sorvolo.change.pair.flight_tuning import FlightTuning, PairMeasures
-from sorvolo.change.pair.robust import RobustSettings, compare_robust
-from sorvolo.change.pair.shade import shade_of_view
+from sorvolo.change.earlier_pictures import EarlierPictures
+from sorvolo.change.map_search import MapSearch
 from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import ThesisOptions
+from sorvolo.change.planting import Planted, Planting
 from sorvolo.change.reference import ReferenceMap
-from sorvolo.geometry.arrays import Boxes, Floats, ImageBGR, ImageRGB, Mask, Matrix3
+from sorvolo.change.robust import RobustSettings, compare_robust
+from sorvolo.change.shade import shade_of_view
+from sorvolo.change.tuning import FlightTuning, PairMeasures
+from sorvolo.geometry.arrays import (
+    Boxes,
+    Floats,
+    ImageBGR,
+    ImageGray,
+    ImageRGB,
+    Mask,
+    Matrix3,
+    PointsM,
+    Vector3,
+)
 from sorvolo.geometry.camera import Camera
 from sorvolo.geometry.grid import SiteGrid
+from sorvolo.geometry.homography import apply_homography, pose_from_homography
+from sorvolo.geometry.level_ground import footprint
+from sorvolo.geometry.pose import Pose
 from sorvolo.registration.lens import Undistorter
 from sorvolo.survey.findings import ComparedView, ViewStatus
 from sorvolo.survey.flight import Frame, PosedFrame
-from sorvolo.survey.mosaic import PlacedFrame
+from sorvolo.survey.mosaic import PlacedFrame, Status
+
+_LEAST_SIDE_PX = 480  # longer side of a frame, however coarse the map; by choice
+_NO_PLACE_M: Vector3 = np.full(3, np.nan)
+
+
+class FramePixels:
+    """The pixels of frames as taken (`full`, with the lens's distortion) and as compared (`small`, without)."""
+
+    def __init__(self, full: Camera, small: Camera) -> None:
+        self.full, self.small = full, small
+        self._maps: tuple[MatLike, MatLike] | None = None
+        sx, sy = small.width_px / full.width_px, small.height_px / full.height_px
+        self.small_from_full: Matrix3 = np.array(
+            [[sx, 0, (sx - 1) / 2], [0, sy, (sy - 1) / 2], [0, 0, 1.0]]
+        )
+        """(3, 3) from undistorted pixels of the full size."""
+
+    def outline_m(self, site_from_image: Matrix3) -> PointsM:
+        """(4, 2) the frame's corners on the ground, site metres."""
+        return apply_homography(site_from_image, self.full.undistort_points(self.full.corners_px))
+
+    def ground_m(self, posed: PosedFrame, site_from_image: Matrix3 | None) -> PointsM | None:
+        """(4, 2) the frame's corners on the ground: as it fits the map, else by telemetry; None where neither gives
+        all four."""
+        if site_from_image is not None:
+            outline_m = self.outline_m(site_from_image)
+        elif posed.prior.knows_place:
+            outline_m = footprint(self.full, Pose(posed.prior.rotation, posed.prior.position_m))
+        else:
+            return None
+        return outline_m if np.isfinite(outline_m).all() else None
+
+    def pose(self, site_from_image: Matrix3 | None) -> Pose | None:
+        """The camera over level ground that sees a frame there, by undistorted pixels of the full size; None where it
+        lies nowhere or no camera sees it so."""
+        return (
+            None
+            if site_from_image is None
+            else pose_from_homography(site_from_image, self.full.undistorted())
+        )
+
+    def masks(self, view: ComparedView) -> tuple[ImageGray, Mask]:
+        """The change mask and the valid mask in the frame's own pixels, with the lens's distortion."""
+        if self._maps is None:
+            x, y = np.meshgrid(np.arange(self.full.width_px), np.arange(self.full.height_px))
+            ideal = self.full.undistort_points(
+                np.column_stack([x.ravel(), y.ravel()]).astype(float)
+            )
+            small = (
+                apply_homography(self.small_from_full, ideal)
+                .astype(np.float32)
+                .reshape(*x.shape, 2)
+            )
+            self._maps = cv2.convertMaps(
+                small[..., 0], small[..., 1], cv2.CV_16SC2, nninterpolation=True
+            )
+        x_map, y_map = self._maps
+        changed = np.asarray(cv2.remap(view.changed, x_map, y_map, cv2.INTER_NEAREST), np.uint8)
+        valid = cv2.remap(view.valid.view(np.uint8), x_map, y_map, cv2.INTER_NEAREST)
+        return changed, np.asarray(valid > 0)
+
+    def boxes(self, view: ComparedView) -> Boxes:
+        """The view's boxes in the frame's own pixels."""
+        result = []
+        full_from_small = np.linalg.inv(self.small_from_full)
+        for x, y, width, height in view.boxes:
+            around = (
+                np.array(
+                    [
+                        [x, y],
+                        [x + width / 2, y],
+                        [x + width, y],
+                        [x + width, y + height / 2],
+                        [x + width, y + height],
+                        [x + width / 2, y + height],
+                        [x, y + height],
+                        [x, y + height / 2],
+                    ],
+                    float,
+                )
+                - 0.5
+            )
+            ideal = apply_homography(full_from_small, around)
+            corners = self.full.pixels_from_points(self.full.undistorted().rays_from_pixels(ideal))
+            limit = [self.full.width_px - 1, self.full.height_px - 1]
+            low = np.clip(np.floor(corners.min(axis=0) + 0.5), 0, limit).astype(int)
+            high = np.clip(np.ceil(corners.max(axis=0) + 0.5), low + 1, np.array(limit) + 1).astype(
+                int
+            )
+            result.append([*low, *(high - low)])
+        return np.array(result, np.int64).reshape(-1, 4)
+
+    def placed(
+        self,
+        posed: PosedFrame,
+        time_ns: int,
+        site_from_image: Matrix3 | None,
+        reason: str,
+        residual_px: float,
+        map_sigma_m: float,
+    ) -> PlacedFrame:
+        """The frame's record: where it fits the map, by pixels of the full size, or rejected with the reason."""
+        frame = posed.frame
+        if site_from_image is None:
+            return PlacedFrame.rejected(
+                frame.index, frame.name, time_ns, reason, self.full, residual_px
+            )
+        pose = self.pose(site_from_image)
+        outline_m = self.outline_m(site_from_image)
+        if pose is None or not np.isfinite(outline_m).all():
+            return PlacedFrame.rejected(
+                frame.index, frame.name, time_ns, "the camera looks at the horizon", self.full
+            )
+        gps_m = (
+            pose.translation_m - posed.prior.position_m if posed.prior.knows_place else _NO_PLACE_M
+        )
+        m_per_px = pose.translation_m[2] / self.full.fx_px
+        return PlacedFrame(
+            frame.name,
+            frame.index,
+            time_ns,
+            Status.VISION,
+            "",
+            self.full,
+            pose,
+            site_from_image,
+            outline_m,
+            residual_px,
+            float(np.hypot(map_sigma_m, residual_px * m_per_px)),
+            gps_residual_m=gps_m,
+        )
+
+
+def comparison_camera(
+    full: Camera, height_m: float, map_m_per_px: float, side_px: int, finer: float = 1.0
+) -> Camera:
+    """The camera at the size at which its frames are compared: no longer than `side_px`, and at most `finer` times as
+    fine as the frame and as the map.
+
+    `height_m` is the flight's usual height above the ground, NaN where it is not known. Pictures are looked at in half
+    of their size: with `finer` 2 nothing that both show is lost.
+    """
+    side = max(full.width_px, full.height_px)
+    share = min(finer, side_px / side)
+    if height_m > 1.0:
+        share = min(share, max(finer * height_m / full.fx_px / map_m_per_px, _LEAST_SIDE_PX / side))
+    return (
+        full.resized(round(full.width_px * share), round(full.height_px * share))
+        if share != 1
+        else full
+    )
+
 
 _ALL_CHANGED_REASON = "more than half of it looks changed (water, snow, ploughing?)"
 
 
-@dataclass(frozen=True)
-class ViewSettings:
-    """Which frames are compared, and with how many earlier pictures (0007, 0009)."""
-
-    least_known: float = (
-        0.1  # share of a frame on known ground: with less there is nothing to compare
-    )
-    witnesses: int = 2  # earlier pictures asked about a difference: one from each side
-    further: int = 3  # pictures asked besides where those do not show all of it
-    coarser: float = 1.25  # times the map's pixels: views less coarse than that have its pixels
-    all_changed: float = (
-        0.5  # share of a view: more is snow, a flood or another place, not a list of changes
-    )
-    turned_sigma_deg: float = (
-        3.0  # of a camera's angles as it fits the map: tilt and place are seen together
-    )
-    corroboration: CorroborationSettings = field(default_factory=CorroborationSettings)
+# Which frames are compared, and with how many earlier pictures.
+_LEAST_KNOWN = 0.1  # share of a frame on known ground: with less there is nothing to compare
+_WITNESSES = 2  # earlier pictures asked about a difference: one from each side
+_FURTHER = 3  # pictures asked besides where those do not show all of it
+_COARSER = 1.25  # times the map's pixels: views less coarse than that have its pixels
+_ALL_CHANGED = 0.5  # share of a view: more is snow, a flood or another place, not a list of changes
+_TURNED_SIGMA_DEG = 3.0  # of a camera's angles as it fits the map: tilt and place are seen together
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,9 +316,7 @@ class ViewMaker:
         site_grid: SiteGrid,
         thesis: ThesisOptions | None,
         pictures: EarlierPictures | None,
-        settings: ViewSettings = ViewSettings(),
     ) -> None:
-        self._settings = settings
         self._flight, self._reference, self._site_grid = flight, reference, site_grid
         small = comparison_camera(
             flight.full, flight.height_m, site_grid.grid.m_per_px, flight.side_px, flight.finer
@@ -204,8 +358,8 @@ class ViewMaker:
         site_from_full = aligned.site_from_image @ self.pixels.small_from_full
         reference, known = self._map_under(aligned)
         share = np.count_nonzero(known) / np.count_nonzero(self._lens_sees)
-        if share < self._settings.least_known:
-            reason = f"less than {self._settings.least_known:.0%} of it lies on the map"
+        if share < _LEAST_KNOWN:
+            reason = f"less than {_LEAST_KNOWN:.0%} of it lies on the map"
             return ViewOutcome(
                 ViewStatus.OUTSIDE,
                 reason,
@@ -245,10 +399,10 @@ class ViewMaker:
         )
         found, leans = self._corroborated(compared)
         changed = np.count_nonzero(found.mask) / max(1, int(np.count_nonzero(valid)))
-        if changed > self._settings.all_changed:
+        if changed > _ALL_CHANGED:
             return replace(outcome, status=ViewStatus.ALL_CHANGED, reason=_ALL_CHANGED_REASON)
         view = self._view(frame, aligned, (compared.image, compared.reference, valid), found)
-        doubted = _doubted(compared.found, found, self._settings.corroboration.sure)
+        doubted = _doubted(compared.found, found, SURE)
         planted = self._plant(view, compared)
         return replace(outcome, view=view, doubted=doubted, leans=leans, planted=planted)
 
@@ -303,7 +457,7 @@ class ViewMaker:
         pose = self.pixels.pose(outcome.site_from_image)
         if pose is None:
             return posed
-        sigma_deg = np.full(3, self._settings.turned_sigma_deg)
+        sigma_deg = np.full(3, _TURNED_SIGMA_DEG)
         return replace(
             posed, prior=replace(posed.prior, rotation=pose.rotation, attitude_sigma_deg=sigma_deg)
         )
@@ -319,11 +473,7 @@ class ViewMaker:
         """
         map_m_per_px = self._site_grid.grid.m_per_px
         views_m_per_px = float(np.fmin(self._m_per_px, first.m_per_px))
-        return (
-            views_m_per_px
-            if views_m_per_px > self._settings.coarser * map_m_per_px
-            else map_m_per_px
-        )
+        return views_m_per_px if views_m_per_px > _COARSER * map_m_per_px else map_m_per_px
 
     def brightness_beside_map(self, posed: PosedFrame, outcome: ViewOutcome) -> float:
         """How many times as bright as the map a frame is. Where no ground was compared in its light yet (and method
@@ -396,7 +546,7 @@ class ViewMaker:
         ground (h, w) that leans another way in them."""
         if self._pictures is None or compared.settings is None:
             return compared.found, None
-        settings, (height, width) = self._settings, compared.valid.shape
+        (height, width) = compared.valid.shape
         leans, level = np.zeros((height, width), bool), level_of(as_bgr(compared.reference))
         earlier: list[tuple[Difference, Mask]] = []
         pictures = self._pictures.seen_from(
@@ -404,14 +554,12 @@ class ViewMaker:
             compared.aligned.camera_m,
             width,
             height,
-            settings.witnesses + settings.further,
+            _WITNESSES + _FURTHER,
         )
-        for number in range(settings.witnesses + settings.further):
-            is_further = number >= settings.witnesses
+        for number in range(_WITNESSES + _FURTHER):
+            is_further = number >= _WITNESSES
             seen = [each for _, each in earlier]
-            open_parts = (
-                unwitnessed(compared.found, seen, settings.corroboration) if is_further else []
-            )
+            open_parts = unwitnessed(compared.found, seen) if is_further else []
             if is_further and not open_parts:
                 break
             picture, sees = next(
@@ -421,20 +569,18 @@ class ViewMaker:
                 break
             sees &= self._lens_sees
             mask = compared.found.mask
-            if is_further and not any(
-                is_whole(mask, each, sees, settings.corroboration) for each in open_parts
-            ):
+            if is_further and not any(is_whole(mask, each, sees) for each in open_parts):
                 continue
             found = compare_robust(picture, compared.query, sees, compared.settings)
             earlier.append((Difference(found.mask, found.boxes, found.scores), sees))
             leans |= leaning(level, picture, sees & compared.valid)
-        return believed((compared.found, compared.valid), earlier, settings.corroboration), leans
+        return believed((compared.found, compared.valid), earlier), leans
 
     def _plant(self, view: ComparedView, compared: OneSided) -> tuple[Planted, ...]:
         """What is found of things drawn into a view, if it is its turn; nothing by method thesis."""
         if compared.settings is None:
             return ()
-        sure, reference = self._settings.corroboration.sure, as_bgr(compared.reference)
+        sure, reference = SURE, as_bgr(compared.reference)
         settings = replace(compared.settings, least_score=sure)
         return self._planting.plant(
             view,
@@ -460,7 +606,7 @@ class ViewMaker:
 
     def _settings_now(self) -> RobustSettings | None:
         """Those of the robust method as the flight has set them so far; None for method thesis."""
-        least_score = self._settings.corroboration.least_score
+        least_score = LEAST_SCORE
         return (
             None
             if self._tuning is None

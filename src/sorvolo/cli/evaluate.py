@@ -14,7 +14,7 @@ from sorvolo.cli.places_of_sites import SiteArgument, opened_site
 from sorvolo.survey.wording import counted
 
 if TYPE_CHECKING:
-    from sorvolo.change.metrics import EventScores
+    from sorvolo.lab.evaluation.change_metrics import EventScores
     from sorvolo.lab.evaluation.changes import FlightChanges
     from sorvolo.lab.evaluation.mask_folders import MaskScores
     from sorvolo.lab.evaluation.mosaic import MosaicEvaluation

@@ -14,6 +14,12 @@ Floats16: TypeAlias = NDArray[np.float16]
 Floats32: TypeAlias = NDArray[np.float32]
 """Any float32 array; the docstring gives its shape."""
 
+Ints32: TypeAlias = NDArray[np.int32]
+"""int32, of any shape."""
+
+Bytes: TypeAlias = NDArray[np.uint8]
+"""uint8, of any shape."""
+
 PointsPx: TypeAlias = NDArray[np.float64]
 """(N, 2) image or grid points, x right then y down, px; (0, 0) is the centre of the top-left pixel."""
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sorvolo.change.pair.robust import RobustSettings, compare_robust
 from sorvolo.change.pair.thesis import ThesisReference, ThesisSettings, compare_thesis
+from sorvolo.change.robust import RobustSettings, compare_robust
 from sorvolo.errors import InputError, SettingsError
 from sorvolo.geometry.arrays import Boxes, ImageGray, Mask
 

@@ -7,7 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from sorvolo.change.metrics import (
+from sorvolo.errors import InputError, SettingsError
+from sorvolo.geometry.arrays import Matrix3, PointsM, floats
+from sorvolo.geometry.homography import apply_homography
+from sorvolo.geometry.level_ground import is_on_ground
+from sorvolo.lab.evaluation.change_metrics import (
     ComparedGround,
     Counts,
     EventMatch,
@@ -19,10 +23,6 @@ from sorvolo.change.metrics import (
     match_events,
     score_events,
 )
-from sorvolo.errors import InputError, SettingsError
-from sorvolo.geometry.arrays import Matrix3, PointsM, floats
-from sorvolo.geometry.homography import apply_homography
-from sorvolo.geometry.level_ground import is_on_ground
 from sorvolo.lab.evaluation.frame_rows import (
     paired_flights,
     read_features,

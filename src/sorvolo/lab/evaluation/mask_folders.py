@@ -4,8 +4,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sorvolo.change.metrics import Counts, frame_counts, pixel_counts
 from sorvolo.errors import InputError
+from sorvolo.lab.evaluation.change_metrics import Counts, frame_counts, pixel_counts
 from sorvolo.store.mask_pictures import MASK_ENDINGS, read_mask
 
 

@@ -10,13 +10,13 @@ from statistics import median
 from typing import Any
 
 from sorvolo.capture.source import open_sources
-from sorvolo.change.metrics import Counts
 from sorvolo.change.pair.thesis import compare_thesis
 from sorvolo.change.pair.thesis_options import thesis_options
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Floats, ImageRGB
 from sorvolo.lab.datasets.umcd import read_umcd_metadata
 from sorvolo.lab.datasets.umcd_folder import UmcdVideo
+from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.lab.evaluation.frame_rows import map_frames
 from sorvolo.lab.evaluation.mask_folders import (
     ComparedMask,

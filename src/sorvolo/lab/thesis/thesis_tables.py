@@ -3,8 +3,8 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from sorvolo.change.metrics import Counts
 from sorvolo.lab.datasets.npu_folder import ENVIRONMENT
+from sorvolo.lab.evaluation.change_metrics import Counts
 from sorvolo.lab.thesis.comparisons import MASKS, TIMES, rates
 from sorvolo.lab.thesis.published import (
     DIFFERENCES,

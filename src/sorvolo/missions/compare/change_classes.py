@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from sorvolo.change.classes import (
-    ClassSettings,
+    LENIENT,
     can_show,
     class_of_change,
     enlarged,
@@ -33,7 +33,6 @@ class ChangeClasses:
         self, detector: ObjectDetector, known: Sequence[MapObject], classes: Sequence[str] = ()
     ) -> None:
         self._detector, self._known, self._wanted = detector, known, tuple(classes) or None
-        self._settings = ClassSettings()
 
     def preliminary(self, change: Change) -> Change:
         """The change with its classes by its own pictures and the known objects alone: while the flight goes on."""
@@ -51,21 +50,15 @@ class ChangeClasses:
         others = {ChangeKind.DISAPPEARED: found, ChangeKind.APPEARED: self._known}.get(
             change.kind, ()
         )
-        if any(stands_in(change, each, self._settings) for each in others):
+        if any(stands_in(change, each) for each in others):
             change = replace(change, kind=ChangeKind.REPLACED)
         before = after = ""
         if change.kind in _HAS_BEFORE:
-            before = object_at(change, self._known, self._settings) or self._in_picture(
-                change, change.patch.before
-            )
+            before = object_at(change, self._known) or self._in_picture(change, change.patch.before)
         if change.kind in _HAS_AFTER:
+            after = "" if change.kind is ChangeKind.MOVING else object_at(change, found)
             after = (
-                "" if change.kind is ChangeKind.MOVING else object_at(change, found, self._settings)
-            )
-            after = (
-                after
-                or seen_at(change, sightings, self._settings)
-                or self._in_picture(change, change.patch.after)
+                after or seen_at(change, sightings) or self._in_picture(change, change.patch.after)
             )
         return replace(change, class_before=before, class_after=after)
 
@@ -73,14 +66,14 @@ class ChangeClasses:
         """The class that the detector finds where a picture of the change shows it; "" where it finds none."""
         if not can_show(change.patch, rgba):
             return ""
-        picture, offset_px = enlarged(rgba, self._settings)
+        picture, offset_px = enlarged(rgba)
         thresholds = self._detector.thresholds_for(picture)
         seen = self._detector.detect(
             picture,
             tiles="auto",
             m_per_px=change.patch.m_per_px,
-            least_score=self._settings.lenient * min(thresholds.values(), default=0.5),
+            least_score=LENIENT * min(thresholds.values(), default=0.5),
             classes=self._wanted,
             is_part=True,
         )
-        return class_of_change(change.patch, seen, thresholds, offset_px, self._settings)
+        return class_of_change(change.patch, seen, thresholds, offset_px)

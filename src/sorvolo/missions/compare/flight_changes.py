@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from sorvolo.change.areas.area_map import AreaMap, with_areas
-from sorvolo.change.areas.gathered_things import GatheredThings
-from sorvolo.change.evidence.evidence_map import EvidenceMap, EvidenceSettings
+from sorvolo.change.areas import AreaMap, with_areas
+from sorvolo.change.evidence import EvidenceMap, EvidenceSettings
+from sorvolo.change.gathered import GatheredThings
 from sorvolo.change.views import ViewMaker
 from sorvolo.geometry.arrays import Mask
 from sorvolo.geometry.sun import slide_of

@@ -17,7 +17,7 @@ from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
 from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import Again, CompareRun, Pending
-from sorvolo.missions.compare.whole_flight import WholeFlightSettings
+from sorvolo.missions.compare.whole_flight import MANY, OVERLAP
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.frames_ahead import read_ahead
@@ -281,9 +281,9 @@ def _ended(
     whole flight where that can be read again: each photo, and of a video, which shows the same ground again anyway,
     frames that overlap as photos do. Until one of its frames was found beyond doubt all of a video wait: where none is,
     single frames are found in wrong places. Frames that come again are named until then."""
-    whole, is_photos = WholeFlightSettings(), source.kind == "photos"
+    is_photos = source.kind == "photos"
     can_whole = setup.track is not None and not isinstance(source, LiveSource)
-    overlapping = StretchSelection(whole.overlap, keep_all=False)
+    overlapping = StretchSelection(OVERLAP, keep_all=False)
     caution = Caution.NEVER
     if can_whole:
         caution = Caution.ALWAYS if is_photos else Caution.AT_FIRST
@@ -311,7 +311,7 @@ def _ended(
     if not again:
         return
     places: Mapping[int, FlightPlace] = {}
-    if can_whole and (is_photos or len(again & chosen) > whole.many * len(chosen)):
+    if can_whole and (is_photos or len(again & chosen) > MANY * len(chosen)):
         frames = source.frames(lambda index, _: index in chosen)
         places = yield from run.places_with_flight(_posed(frames, setup, inside), len(chosen))
     if places and not is_photos:

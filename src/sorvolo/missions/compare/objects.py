@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from sorvolo.capture.source import LiveSource
-from sorvolo.change.object_changes import SearchedGround, on_one_date
+from sorvolo.change.reconcile import SearchedGround, on_one_date
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.flight.detector_protocol import ObjectDetector

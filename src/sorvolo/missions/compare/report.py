@@ -4,13 +4,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sorvolo.change.coverage.ground_coverage import (
-    CoverageSettings,
+from sorvolo.change.coverage import (
     GroundCoverage,
     coverage_summary,
 )
-from sorvolo.change.coverage.planting import recall_curve
 from sorvolo.change.flight_on_map import FlightFit
+from sorvolo.change.planting import recall_curve
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.geometry.arrays import PointsM
 from sorvolo.geometry.summary import median_of_known, percentile_of_known
@@ -126,8 +125,7 @@ def comparison_summary(
         "suppressed": suppressed,
         "compared_area_m2": coverage["compared_m2"],
         "headline": comparison_headline(len(changes), coverage, is_local=is_local),
-        "coverage": coverage
-        | {"planted": recall_curve(counts.ground.planted, CoverageSettings().planting)},
+        "coverage": coverage | {"planted": recall_curve(counts.ground.planted)},
         "unknown_share": counts.ground.unknown_share,
         "votes": settings.votes,
         "voters": settings.voters,

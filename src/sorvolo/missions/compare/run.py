@@ -13,11 +13,11 @@ from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.change.earlier_pictures import EarlierPicture, EarlierPictures, with_known_pixels
 from sorvolo.change.flight_on_map import FlightFit, FlightOnMap
 from sorvolo.change.map_update import paint_changes
+from sorvolo.change.outlines import KnownPlace
 from sorvolo.change.pair.thesis import thesis_steps
+from sorvolo.change.reconcile import reported
 from sorvolo.change.reference import ReferenceMap
 from sorvolo.change.relief import Relief
-from sorvolo.change.shape.outlines import KnownPlace
-from sorvolo.change.shape.reported import reported
 from sorvolo.change.views import FlightCamera, ViewMaker, ViewOutcome, ViewRecord, as_bgr
 from sorvolo.errors import InputError
 from sorvolo.geometry.arrays import Mask, PointsM
@@ -58,23 +58,17 @@ from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
 from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
-
-@dataclass(frozen=True)
-class ViewSizes:
-    """How large frames are compared where nothing else is asked for; how much of earlier pictures is kept at hand."""
-
-    video_px: int = (
-        1280  # longest side; a video's frames come faster than photos, and show a place more often
-    )
-    photo_px: int = 1600  # photos are fewer and show more ground
-    finer: float = 2.0  # times a photo's and the map's own pixels, at most: the robust method sees half of them
-    video_overlap: float = (
-        0.8  # of a video's frames of which learned differences are gathered, as photos overlap
-    )
-    fine_m_per_px: float = (
-        0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses
-    )
-    cache_bytes: int = 128 * 2**20
+# How large frames are compared where nothing else is asked for; how much of earlier pictures is
+# kept at hand.
+# longest side; a video's frames come faster than photos, and show a place more often
+_VIDEO_PX = 1280
+_PHOTO_PX = 1600  # photos are fewer and show more ground
+# times a photo's and the map's own pixels, at most: the robust method sees half of them
+_FINER = 2.0
+# of a video's frames of which learned differences are gathered, as photos overlap
+_VIDEO_OVERLAP = 0.8
+_FINE_M_PER_PX = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses
+_CACHE_BYTES = 128 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,52 +436,38 @@ class CompareRun:
         }
 
 
-def _finer(archive: Archive, settings: CompareSettings, sizes: ViewSizes) -> float:
+def _finer(archive: Archive, settings: CompareSettings) -> float:
     """How many times as fine as the map its ground is looked at: 1 where things have pixels enough, or by method
     thesis. Over coarser maps learned features are compared as well."""
     m_per_px = archive.site_grid().grid.m_per_px
-    return (
-        1.0
-        if settings.method == "thesis"
-        else min(max(m_per_px / sizes.fine_m_per_px, 1.0), sizes.finer)
-    )
+    return 1.0 if settings.method == "thesis" else min(max(m_per_px / _FINE_M_PER_PX, 1.0), _FINER)
 
 
-def _gathering(
-    setup: FlightSetup, archive: Archive, settings: CompareSettings, sizes: ViewSizes = ViewSizes()
-) -> Gathering | None:
+def _gathering(setup: FlightSetup, archive: Archive, settings: CompareSettings) -> Gathering | None:
     """Of which views learned differences are gathered; a stream leaves no time for them."""
-    finer = _finer(archive, settings, sizes)
+    finer = _finer(archive, settings)
     if finer <= 1.0:
         return None
     if setup.source.kind == "photos":
         return Gathering()
-    return None if isinstance(setup.source, LiveSource) else Gathering(sizes.video_overlap, finer)
+    return None if isinstance(setup.source, LiveSource) else Gathering(_VIDEO_OVERLAP, finer)
 
 
 def view_maker(
-    setup: FlightSetup,
-    archive: Archive,
-    settings: CompareSettings,
-    base_version: int,
-    sizes: ViewSizes = ViewSizes(),
+    setup: FlightSetup, archive: Archive, settings: CompareSettings, base_version: int
 ) -> ViewMaker:
     """What compares a flight's frames with a version of the map of a site."""
     source, site_grid = setup.source, archive.site_grid()
-    side_px = settings.side_px or (sizes.video_px if source.kind == "video" else sizes.photo_px)
-    finer = _finer(archive, settings, sizes) if source.kind == "photos" else 1.0
+    side_px = settings.side_px or (_VIDEO_PX if source.kind == "video" else _PHOTO_PX)
+    finer = _finer(archive, settings) if source.kind == "photos" else 1.0
     flight = FlightCamera(source.camera.camera, setup.usual_height_m, side_px, setup.utc_ns, finer)
     reference = ReferenceMap(archive.tiles(base_version), site_grid.grid)
     if settings.method == "thesis":
         return ViewMaker(flight, reference, site_grid, settings.thesis, None)
-    return ViewMaker(
-        flight, reference, site_grid, None, _earlier_pictures(archive, source.name, sizes)
-    )
+    return ViewMaker(flight, reference, site_grid, None, _earlier_pictures(archive, source.name))
 
 
-def _earlier_pictures(
-    archive: Archive, superseded: str, sizes: ViewSizes = ViewSizes()
-) -> EarlierPictures:
+def _earlier_pictures(archive: Archive, superseded: str) -> EarlierPictures:
     """The keyframes of earlier flights, rendered over the newest heights; not those of a flight that the map does not
     show any more."""
     keyframes = [
@@ -507,7 +487,7 @@ def _earlier_pictures(
         )
     )
     images = ImageCache(
-        lambda index: with_known_pixels(archive.image(keyframes[index])), sizes.cache_bytes
+        lambda index: with_known_pixels(archive.image(keyframes[index])), _CACHE_BYTES
     )
     return EarlierPictures(
         [

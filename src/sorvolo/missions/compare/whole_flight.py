@@ -1,7 +1,6 @@
 """Photos that are not found on the map by themselves, placed there with all others of their flight (0087)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
@@ -19,14 +18,12 @@ from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.flight import PosedFrame
 from sorvolo.survey.mosaic import Status
 
-
-@dataclass(frozen=True)
-class WholeFlightSettings:
-    """When a recorded flight is looked for as a whole, and by which of its frames; by choice, none measured alone."""
-
-    overlap: float = 0.8  # of a video's frames that are laid on each other, as a first flight's are
-    many: float = 0.3  # share of these that is not found by itself, from which on the whole flight is looked for
-    most_sought: int = 150  # photos that are looked for on the map, evenly spread over the flight
+# When a recorded flight is looked for as a whole, and by which of its frames; by choice, none
+# measured alone.
+OVERLAP = 0.8  # of a video's frames that are laid on each other, as a first flight's are
+# share of these that is not found by itself, from which on the whole flight is looked for
+MANY = 0.3
+_MOST_SOUGHT = 150  # photos that are looked for on the map, evenly spread over the flight
 
 
 class WholeFlight:
@@ -42,7 +39,6 @@ class WholeFlight:
         views: ViewMaker,
         on_map: FlightOnMap,
         count: int,
-        settings: WholeFlightSettings = WholeFlightSettings(),
     ) -> None:
         """`count` photos will be added."""
         model, track = setup.source.camera, setup.track
@@ -51,7 +47,7 @@ class WholeFlight:
         offset_sigma_m = None if track is None else track.altitude_offset_sigma_m
         graph = PoseGraphSettings.of_flight(model.focal_sigma, offset_sigma_m, joins_map=False)
         self._mapper = PlanarMapper(graph, shelf=self._spill)
-        self._step, self._added = max(1, -(-count // settings.most_sought)), 0
+        self._step, self._added = max(1, -(-count // _MOST_SOUGHT)), 0
         self._sought: dict[int, PhotoFeatures] = {}
         self.fit: FlightFit | None = None
         """Where the flight lies on the map, once `places` found it."""

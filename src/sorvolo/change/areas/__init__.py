@@ -1,1 +1,0 @@
-"""Ground that changed as an area: paved, ploughed, heaped, flooded, built over."""

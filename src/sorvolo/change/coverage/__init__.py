@@ -1,1 +1,0 @@
-"""What a comparison could see of the ground: where, how often, and how small a thing."""

@@ -1,1 +1,0 @@
-"""What moves: regions followed over views."""

@@ -1,1 +1,0 @@
-"""What a change looks like: its kind, outline, parts, shadows and pictures."""

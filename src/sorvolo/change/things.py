@@ -1,0 +1,185 @@
+"""Things without the shadows they throw: a shadow is part of what changed, but not where the thing is."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import cv2
+import numpy as np
+
+from sorvolo.change.kinds import kind_of
+from sorvolo.change.outlines import hull_of, measures, outline_of
+from sorvolo.geometry.arrays import Bytes, Floats32, Ints32, Mask
+from sorvolo.survey.findings import Change, ChangeKind, Patch, Shade
+
+_CONTRARY = {
+    ChangeKind.APPEARED: ChangeKind.DISAPPEARED,
+    ChangeKind.DISAPPEARED: ChangeKind.APPEARED,
+}
+
+
+# What is a thing in changed ground, and when there are several.
+_LEAST_PX = 6  # bare of shadow: with fewer, or less than ...
+_LEAST_SHARE = 0.02  # ... this of the change, all of it is a dark thing
+_LEAST_PIECE = 0.15  # of the largest lit piece: smaller ones are specks of the shadow's rim
+_APART_M = 0.5  # things so far from each other are two ...
+_LEAST_M2 = 0.035  # ... if each is as large as a football at least ...
+_SOLID = 0.45  # ... fills so much of its hull, for specks of a dark thing scatter, ...
+_CAR_M = (1.2, 6.0)  # ... and all is not as wide and as long as one dark car with bright parts
+_GAP_M = 0.4  # pieces that lie so far apart are not one
+
+
+def without_shadow(change: Change) -> Change:
+    """The change with its outline, area and length drawn around the thing alone, where its picture shows which part
+    that is.
+
+    The outline is what the convex hull of the pixels that are no shadow holds of the change, so that a dark thing with
+    a few bright parts stays whole. The patch keeps the shadow: it belongs into the map.
+    """
+    patch = change.patch
+    thing = thing_of(patch.changed, shadow_of(patch, change.kind))
+    if thing is patch.changed:
+        return change
+    outline_m = outline_of(thing, patch.site_from_patch, tolerance_px=0.7, join_px=3.0)
+    if outline_m is None:
+        return change
+    size = measures(outline_m)
+    return replace(change, outline_m=outline_m, area_m2=size.area_m2, length_m=size.length_m)
+
+
+def shadow_of(patch: Patch, kind: ChangeKind) -> Mask:
+    """Where (h, w) it is dark as a shadow is: on the later date where something came, on the earlier where it went."""
+    bits = {ChangeKind.DISAPPEARED: Shade.EARLIER, ChangeKind.REPLACED: Shade.LATER | Shade.EARLIER}
+    return np.asarray((patch.shade & np.uint8(bits.get(kind, Shade.LATER))) > 0)
+
+
+def _is_dark(patch: Patch) -> Mask:
+    return np.asarray((patch.shade & np.uint8(Shade.LATER_DARK | Shade.EARLIER_DARK)) > 0)
+
+
+def thing_of(changed: Mask, shadow: Mask) -> Mask:
+    """The part of the change that is the thing, not its shadow; `changed` itself where hardly anything would stay."""
+    lit = changed & ~shadow
+    opened = cv2.morphologyEx(lit.view(np.uint8), cv2.MORPH_OPEN, np.ones((2, 2), np.uint8))
+    if np.count_nonzero(opened) < max(_LEAST_PX, _LEAST_SHARE * np.count_nonzero(changed)):
+        return changed
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=8)
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = -1  # the ground: no piece, however small pieces may be
+    kept = (areas >= _LEAST_PIECE * areas.max())[labels].view(np.uint8)
+    return np.asarray(
+        (cv2.dilate(_hull(kept).view(np.uint8), np.ones((3, 3), np.uint8)) > 0) & changed
+    )
+
+
+def things_of(patch: Patch, kind: ChangeKind, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
+    """The things in a change, each with its own kind and the part of `changed` that lies nearest to it, the largest
+    first; the shadow of what came does not go to what left.
+
+    They are separated by the ground or the shadow between them, what left from what came also where they touch;
+    `changed` alone where it is but one thing. A dark car has bright parts far from each other: what fills a rectangle
+    of about its size stays whole, unless something left beside what came.
+    """
+    groups = _groups(patch, changed) or [(changed, kind)]
+    found = [each for group, own in groups for each in _things_of_group(patch, own, group)]
+    return sorted(found, key=lambda each: -np.count_nonzero(each[0]))
+
+
+def _groups(patch: Patch, changed: Mask) -> list[tuple[Mask, ChangeKind]]:
+    """The pieces of a change that lie apart, with their kinds; nothing where it is but one piece. What is all shadow is
+    no piece of its own."""
+    count, labels = cv2.connectedComponents(changed.view(np.uint8))
+    if count < 3 or _may_be_a_car(changed, patch.m_per_px):
+        return []
+    bare_m2 = np.bincount(labels[~_is_dark(patch)], minlength=count) * patch.m_per_px**2
+    pieces = [labels == each for each in range(1, count) if bare_m2[each] >= _LEAST_M2]
+    if len(pieces) < 2:
+        return []
+    distances = [_distance(each) * patch.m_per_px for each in pieces]
+    group = _group_of_pieces(patch, pieces, distances, _GAP_M)
+    if len(set(group)) < 2:
+        return []
+    nearest = np.array(group)[np.argmin(distances, axis=0)]
+    found = [changed & (nearest == each) for each in dict.fromkeys(group)]
+    return [(each, kind_of(replace(patch, changed=each))) for each in found]
+
+
+def _group_of_pieces(
+    patch: Patch, pieces: Sequence[Mask], distances_m: Sequence[Floats32], gap_m: float
+) -> list[int]:
+    """The group of each piece: those near each other are one, unless one came and the other left."""
+    kinds = [kind_of(replace(patch, changed=each)) for each in pieces]
+    group = list(range(len(pieces)))
+    for first, second in combinations(range(len(pieces)), 2):
+        is_contrary = _CONTRARY.get(kinds[first]) is kinds[second]
+        if not is_contrary and float(distances_m[first][pieces[second]].min()) < gap_m:
+            group = [group[first] if each == group[second] else each for each in group]
+    return group
+
+
+def _things_of_group(
+    patch: Patch, kind: ChangeKind, changed: Mask
+) -> list[tuple[Mask, ChangeKind]]:
+    """The things in one piece of a change, as `things_of` gives them."""
+    if _may_be_a_car(changed, patch.m_per_px):
+        return [(changed, kind)]
+    shadow = changed & shadow_of(patch, kind)
+    things = _lit_things(changed & ~shadow, patch.m_per_px)
+    if len(things) < 2:
+        return [(changed, kind)]
+    distances = [_distance(each) for each in things]
+    contrary = _CONTRARY.get(kind)
+    kinds = [kind_of(replace(patch, changed=_hull(each) & changed)) for each in things]
+    if contrary is not None and any(each is not contrary for each in kinds):
+        distances = [
+            np.where(shadow & (own is contrary), np.inf, each)
+            for own, each in zip(kinds, distances)
+        ]
+    nearest = np.argmin(distances, axis=0)
+    return [(changed & (nearest == index), own) for index, own in enumerate(kinds)]
+
+
+def _lit_things(bare: Mask, m_per_px: float) -> list[Mask]:
+    """The solid things, the largest first, in the part of a change that is no shadow."""
+    lit = cv2.morphologyEx(bare.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    labels = _joined(np.asarray(lit > 0), m_per_px, _APART_M)
+    areas_m2 = np.bincount(labels[lit > 0]) * m_per_px**2
+    large = [
+        (labels == each) & (lit > 0)
+        for each in np.argsort(-areas_m2)
+        if areas_m2[each] >= _LEAST_M2
+    ]
+    return [
+        each for each in large if np.count_nonzero(each) >= _SOLID * np.count_nonzero(_hull(each))
+    ]
+
+
+def _distance(mask: Mask) -> Floats32:
+    """(h, w) how far each pixel lies from a mask, pixels."""
+    return np.asarray(cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, 5), np.float32)
+
+
+def _hull(mask: Mask | Bytes) -> Mask:
+    hull = np.zeros(mask.shape, np.uint8)
+    cv2.fillConvexPoly(hull, hull_of(mask), (1,))
+    return hull.view(bool)
+
+
+def _joined(mask: Mask, m_per_px: float, apart_m: float) -> Ints32:
+    """The number from 1 on of the thing that each pixel of a mask (h, w) belongs to, and those near it; else 0."""
+    reach = 2 * round(apart_m / 2 / m_per_px) + 1
+    padded = cv2.copyMakeBorder(
+        mask.view(np.uint8), reach, reach, reach, reach, cv2.BORDER_CONSTANT, value=0
+    )
+    joined = cv2.dilate(padded, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+    return np.asarray(
+        cv2.connectedComponents(joined[reach:-reach, reach:-reach], connectivity=8)[1], np.int32
+    )
+
+
+def _may_be_a_car(changed: Mask, m_per_px: float) -> bool:
+    short_m, long_m = sorted(
+        float(each) * m_per_px for each in cv2.minAreaRect(hull_of(changed))[1]
+    )
+    narrowest_m, longest_m = _CAR_M
+    return short_m >= narrowest_m and long_m <= longest_m
