@@ -116,3 +116,13 @@ def test_imprecise_boxes_are_counted_once() -> None:
         doubled += len(overlap) - int((overlap.max(axis=0) >= 0.5).sum())
     assert lost == 0
     assert doubled <= 0.01 * 20 * len(true)
+
+
+@pytest.mark.parametrize(("right", "count"), [(90.0, 2), (96.0, 1)])
+def test_a_piece_goes_only_where_another_tiles_box_covers_most_of_it(
+    right: float, count: int
+) -> None:
+    """The piece (80 to 100 px) lies to a half, or to four fifths, within the whole box of another class."""
+    piece = _tile(_RIGHT, (80, 10, 100, 30, 0.4, 1))
+    whole = _tile((0, 0, 140, 100), (50, 8, right, 60, 0.9, 0))
+    assert len(merge_tiles([whole, piece], _SIZE).scores) == count

@@ -458,3 +458,16 @@ def test_a_pattern_that_repeats_fits_at_several_heights_and_is_a_hole() -> None:
         holes.append(np.isnan(found.up_m).mean())
         wrong.append((np.abs(found.up_m) > 1).mean())
     assert holes[0] > 0.2 and holes[1] < 0.1 and wrong[0] < 0.7 * wrong[1], (holes, wrong)
+
+
+@pytest.mark.parametrize(
+    "step", [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (1, -1), (-1, 1), (-1, -1)]
+)
+def test_what_one_cell_knows_reaches_its_neighbours_in_all_eight_directions(step) -> None:
+    """Semi-global matching: among cells that know nothing one is sure; straight paths from it carry its level."""
+    cost = np.full((9, 6, 9), 0.5, np.float32)
+    cost[4, :, 4], cost[4, 2, 4] = 1.0, 0.0
+    best = smoothed(cost, SmoothingSettings(0.1, 0.5))
+    row, column = 4 + 3 * step[0], 4 + 3 * step[1]
+    assert best[row, :, column].argmin() == 2
+    assert np.ptp(best[row, :, column]) > 0.2

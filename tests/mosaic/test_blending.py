@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sorvolo.mosaic.blending import Layer, blend, fill_invalid, winners_from_shares
+from sorvolo.mosaic.blending import Layer, blend, coarse_fill, fill_invalid, winners_from_shares
 
 
 def noise(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -66,3 +66,16 @@ def test_invalid_pixels_continue_their_surroundings():
     assert np.abs(filled[45, :20].astype(int) - 50).max() < 20
     assert np.abs(filled[45, 100:].astype(int) - 200).max() < 20
     assert fill_invalid(image, np.zeros_like(valid)).shape == image.shape
+
+
+def test_a_coarse_fill_continues_a_slope_and_darkens_nothing():
+    slope = np.linspace(60, 180, 160)[None].repeat(96, axis=0)
+    image = np.dstack([slope] * 3).astype(np.uint8)
+    valid = np.zeros((96, 160), dtype=bool)
+    valid[16:80, 24:136] = True
+    image[~valid] = 0
+    filled = coarse_fill(image, valid).astype(int)[..., 0]
+    assert filled.shape == (12, 20)
+    assert filled.min() >= slope[0, 24] - 1 and filled.max() <= slope[0, 135]
+    assert np.abs(filled[6, 3:17] - slope[0, 28:136:8]).max() <= 4
+    assert np.abs(filled[0] - filled[6]).max() <= 5

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from shapely.geometry import shape
 from starlette.testclient import TestClient
 
 COG = "/api/sites/field/cogs/mosaic"
@@ -116,6 +117,9 @@ def test_stac_leads_from_the_station_to_each_version(client: TestClient) -> None
     assert [each["id"] for each in items] == ["field-1", "field-2"]
     for each in items:
         west, south, east, north = each["bbox"]
+        ground = shape(each["geometry"])
+        assert ground.is_valid and ground.bounds == pytest.approx(each["bbox"])
+        assert ground.area == pytest.approx((east - west) * (north - south))
         assert west < 13.25 < east and south < 46.51 and north > 46.49
         assert each["properties"]["datetime"] == "2023-11-14T22:13:20Z"
         assert "{z}" in each["assets"]["tiles"]["href"]

@@ -195,6 +195,22 @@ def test_what_is_taken_now_for_this_and_now_for_that_is_one():
     assert track.label == "person"
 
 
+@pytest.mark.parametrize("which", [0, 1])
+def test_size_shows_which_of_two_neighbours_a_sighting_is(which):
+    """A bicycle and a lorry 2 m apart; then one of them alone is seen halfway between their places."""
+    sizes_m = np.array([[1.8, 0.6], [9.0, 2.5]])
+    places_m = np.array([[0.0, 0.0], [2.0, 0.0]])
+    tracker = Tracker()
+    for frame in range(10):
+        seen = [
+            replace(sighting(frame, place), size_m=size) for place, size in zip(places_m, sizes_m)
+        ]
+        update = tracker.update(seen, time_ns=int(frame * 2e8), footprint_m=AROUND_M)
+    between = replace(sighting(10, [1.0, 0.0]), size_m=sizes_m[which])
+    last = tracker.update([between], time_ns=int(2e9), footprint_m=AROUND_M)
+    assert last.track_ids == (update.track_ids[which],)
+
+
 def test_what_is_not_seen_where_it_should_be_ends_and_what_is_out_of_view_does_not():
     tracker = Tracker()
     follow(tracker, [[[0.0, 0.0]]] * 5)
