@@ -37,7 +37,6 @@ PARTS = (
     (PlanarMapper, "place"),
     (PlanarMapper, "recent_exposure"),
     (FlightPainter, "save"),
-    (FlightPainter, "_show_now"),
     (FlightPainter, "show"),
     (FlightWriter, "flush"),
     (map_pictures, "picture"),

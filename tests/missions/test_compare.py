@@ -32,7 +32,7 @@ from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.flight.setup import _check_place, prepare
 from sorvolo.missions.heights.flight_views import run_of
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.map.known_keyframes import KnownKeyframes
+from sorvolo.missions.map.painting import KnownKeyframes
 from sorvolo.mosaic.selection import every
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.files import HeightFile

@@ -26,7 +26,7 @@ from sorvolo.lab.simulation.settings import (
     SensorSettings,
     SimulationSettings,
 )
-from sorvolo.missions.map.known_keyframes import KnownKeyframes
+from sorvolo.missions.map.painting import KnownKeyframes
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.store.exports.flight_files import write_camera, write_photo
 from sorvolo.store.site.archive import Archive

@@ -207,21 +207,3 @@ def test_another_flight_names_whose_run_it_ends(
         )
         next(updates)
         updates.close()
-
-
-def test_method_thesis_begins_anew_and_reports_it(flown: Path, tmp_path: Path) -> None:
-    settings = MapSettings(method="thesis", model="none")
-    updates = map_flights(
-        [flown / "flight1"], tmp_path / "site", settings, camera=flown / "camera.xml"
-    )
-    next(updates)
-    copy_as_killed(tmp_path / "site", tmp_path / "amid")
-    updates.close()
-    with pytest.warns(
-        SorvoloWarning, match="flight1: a stopped run begins again from the start: --method thesis"
-    ):
-        again = map_flights(
-            [flown / "flight1"], tmp_path / "amid", settings, camera=flown / "camera.xml"
-        )
-        assert not next(again).is_resumed
-        again.close()

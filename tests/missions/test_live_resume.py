@@ -23,7 +23,7 @@ from sorvolo.capture.source import open_sources
 from sorvolo.errors import SorvoloWarning
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.compare.flights import compare_flights
-from sorvolo.missions.flight.live_journal import SourceNotes, flight_so_far, go_on
+from sorvolo.missions.flight.result_cache import flight_so_far, go_on, note_flight
 from sorvolo.missions.flight.settings import CompareSettings, MapSettings
 from sorvolo.missions.map.flights import map_flights
 from sorvolo.missions.watch.flights import watch
@@ -307,7 +307,7 @@ def test_a_stream_that_returns_late_is_another_flight(flight: FilmedFlight, tmp_
         is_reread=True,
     )
     journal = RunJournal(tmp_path / "run.journal", "key", 0)
-    SourceNotes(journal, begun, 0).keep()  # type: ignore[arg-type]
+    note_flight(journal, begun)  # type: ignore[arg-type]
     assert flight_so_far(RunJournal(tmp_path / "run.journal", "key", 0)) is None  # no frame yet
     journal.append(Entry("step", {"index": 7, "name": "7", "time_ns": 50 * 10**9}))
     late = SimpleNamespace(name="new", start_ns=1_000 * 10**9, is_stream=True)
@@ -315,7 +315,7 @@ def test_a_stream_that_returns_late_is_another_flight(flight: FilmedFlight, tmp_
         SorvoloWarning,
         match="was stopped 950 s ago, more than 900 s: the stream is another flight now",
     ):
-        assert go_on(late, RunJournal(tmp_path / "run.journal", "key", 0), 900.0) is None  # type: ignore[arg-type]
+        assert not go_on(late, RunJournal(tmp_path / "run.journal", "key", 0), 900.0)  # type: ignore[arg-type]
     journal.append(
         Entry("telemetry", {}, {"times_ns": np.zeros(2, np.int64), "samples": np.zeros(3)})
     )

@@ -3,7 +3,6 @@
 import json
 import shutil
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from sorvolo.geometry.homography import apply_homography, fit_similarity
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import prepare
 from sorvolo.missions.map.flights import map_flights
-from sorvolo.missions.map.painting import FlightPainter, PaintSettings
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.missions.site.history import site_history
 from sorvolo.store.exports.plain import features_path
@@ -549,8 +547,8 @@ def test_the_map_does_not_depend_on_when_it_was_shown_while_it_grew(
     )  # without telemetry, whose offsets would move every frame at last
     maps = []
     for paint_every in (1, 1000):  # keyframes
-        painter = partial(FlightPainter, settings=PaintSettings(every=paint_every, rest=0))
-        monkeypatch.setattr("sorvolo.missions.map.planar_run.FlightPainter", painter)
+        monkeypatch.setattr("sorvolo.missions.map.painting._EVERY", paint_every)
+        monkeypatch.setattr("sorvolo.missions.map.painting.REST", 0)
         run_map(tmp_path / f"every {paint_every}", film, "--camera", filmed / "camera.xml")
         maps.append((tmp_path / f"every {paint_every}" / "mosaic.tif").read_bytes())
     assert maps[0] == maps[1]

@@ -47,7 +47,7 @@ def searched(scores: list[float]) -> ObjectFinder:
         seen = Detections(
             np.array([[470.0, 260.0, 486.0, 274.0]]), np.array([score]), np.array([0]), CLASSES
         )
-        finder.take_over(FrameDetections(index, seen, (b"",), 0.1, LEAST))
+        finder._seen[index] = FrameDetections(index, seen, (b"",), 0.1, LEAST)
     return finder
 
 

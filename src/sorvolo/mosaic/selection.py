@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -64,22 +64,11 @@ class FramePlan:
 
 
 @dataclass(frozen=True, eq=False)
-class SelectionMemory:
-    """What the choice of the next keyframe depends on: the texture (h, w) of the last one, and how sharp the latest of
-    the `count` frames were that came before."""
-
-    last: ImageGray | None = None
-    usual: tuple[float, ...] = ()
-    count: int = 0
-
-
-@dataclass(frozen=True, eq=False)
 class Selected:
-    """A selected frame; `reason` is empty, or why it cannot be used after all. `memory` is what to go on with."""
+    """A selected frame; `reason` is empty, or why it cannot be used after all."""
 
     posed: PosedFrame
     reason: str
-    memory: SelectionMemory
 
 
 def interval_s(camera: Camera, height_m: float, speed_m_s: float, overlap: float) -> float:
@@ -155,37 +144,37 @@ def select_keyframes(
     *,
     keep_all: bool,
     inside: Callable[[PosedFrame], bool],
-    memory: SelectionMemory = SelectionMemory(),
     small: "SmallCopies | None" = None,
 ) -> Iterator[Selected | LostFrame]:
     """The frames that the map needs, in order; lost ones pass through.
 
     `inside` is True for frames in the area of interest (UAV_path, eq. 3.1); the others are dropped. `keep_all`: photos,
     each of which was meant. The shift since the last keyframe is measured in the pictures by phase correlation of
-    small copies, so it needs no telemetry; where that fails (a turn, water) each candidate is taken. `memory` is that
-    of the last frame selected, to go on after it; `small` has copies of the frames that were looked at before.
+    small copies, so it needs no telemetry; where that fails (a turn, water) each candidate is taken. `small` has copies
+    of the frames that were looked at before.
     """
     small = SmallCopies() if small is None else small
-    for each in frames:
-        if isinstance(each, LostFrame):
-            yield each
+    last: ImageGray | None = None  # texture of the last frame selected
+    latest: tuple[float, ...] = ()  # sharpness of the latest frames
+    count = 0
+    for posed in frames:
+        if isinstance(posed, LostFrame):
+            yield posed
             continue
-        if not inside(each):
+        if not inside(posed):
             continue
-        gray = small.of(each.frame)
+        gray = small.of(posed.frame)
         clarity = sharpness(gray)
-        typical = float(np.median(memory.usual)) if memory.usual else clarity
+        typical = float(np.median(latest)) if latest else clarity
         texture = normalise_contrast(gray)
-        overlap = 0.0 if memory.last is None or keep_all else _overlap(memory.last, texture)
-        memory = SelectionMemory(
-            memory.last, (*memory.usual, clarity)[-settings.usual :], memory.count + 1
-        )
-        reason = _reason_if_selected(overlap, clarity, typical, memory.count, settings)
+        overlap = 0.0 if last is None or keep_all else _overlap(last, texture)
+        latest, count = (*latest, clarity)[-settings.usual :], count + 1
+        reason = _reason_if_selected(overlap, clarity, typical, count, settings)
         if reason is None:
             continue
         if not reason:
-            memory = replace(memory, last=texture)
-        yield Selected(each, reason, memory)
+            last = texture
+        yield Selected(posed, reason)
 
 
 def shows_all_between(old: ImageGray, new: ImageGray, settings: SelectionSettings) -> bool:

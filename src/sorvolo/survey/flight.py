@@ -124,9 +124,9 @@ class Frame:
     image: ImageRGB
 
     @classmethod
-    def unseen(cls, index: int, name: str, time_ns: int) -> "Frame":
-        """One whose picture is not there any more: it has no pixel."""
-        return cls(index, name, time_ns, np.zeros((0, 0, 3), np.uint8))
+    def unseen(cls, index: int, name: str, time_ns: int, size_px: tuple[int, int]) -> "Frame":
+        """One of this height and width whose picture is not there any more: its image has no channel, (H, W, 0)."""
+        return cls(index, name, time_ns, np.zeros((*size_px, 0), np.uint8))
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,9 @@ from collections.abc import Mapping, Sequence
 
 from sorvolo.change.map_update import grown_m2
 from sorvolo.change.views import ViewMaker, ViewOutcome
-from sorvolo.missions.compare.journal import ComparedFrame
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.map.journal import Step, Taken
 from sorvolo.missions.map.planar_run import PlanarRun
 from sorvolo.mosaic.selection import StretchSelection
 from sorvolo.store.site.archive import Archive, FlightWriter
@@ -33,7 +32,9 @@ class MapExtension:
         settings: CompareSettings,
         writer: FlightWriter,
         views: ViewMaker,
+        memo: ResultCache,
     ) -> None:
+        self._memo = memo
         self._setup, self._archive, self._settings, self._writer = setup, archive, settings, writer
         self._views = views
         self._selection = StretchSelection(_OVERLAP, keep_all=setup.source.kind != "video")
@@ -54,28 +55,25 @@ class MapExtension:
         """The frames that extend the map, once that is complete."""
         return self._frames
 
-    def add(
-        self, posed: PosedFrame, outcome: ViewOutcome, earlier: ComparedFrame | None = None
-    ) -> Taken | None:
-        """Take a frame that shows new ground; those that do not, or that show what the last one did, are left.
-
-        `earlier` is the frame as a killed run compared and registered it; returned is how it is registered now, None
-        where it is not.
-        """
+    def add(self, posed: PosedFrame, outcome: ViewOutcome) -> None:
+        """Take a frame that shows new ground; those that do not, or that show what the last one did, are left."""
         if not self._is_wanted(posed, outcome):
-            return None
+            return
         if not self._selection.take(self._views.pixels.ground_m(posed, outcome.site_from_image)):
             self._shown_by[posed.frame.index] = self._last
-            return None
+            return
         self._last = posed.frame.index
         if self._run is None:
             self._run = PlanarRun(
-                self._setup, self._archive, self._settings.mapping, writer=self._writer
+                self._setup,
+                self._archive,
+                self._settings.mapping,
+                writer=self._writer,
+                memo=self._memo,
             )
-        taken = _taken_again(self._run, self._views.turned_as_found(posed, outcome), earlier)
+        self._run.add(self._views.turned_as_found(posed, outcome))
         if outcome.site_from_image is not None:
             self._run.note_found(posed.frame.index, outcome.site_from_image, outcome.residual_px)
-        return taken
 
     def _is_wanted(self, posed: PosedFrame, outcome: ViewOutcome) -> bool:
         """Whether a frame shows new ground, in a light that the map may have."""
@@ -112,19 +110,3 @@ class MapExtension:
             self._writer.tiles,
             self._archive.site_grid(),
         )
-
-
-def _taken_again(run: PlanarRun, posed: PosedFrame, earlier: ComparedFrame | None) -> Taken | None:
-    """Have a frame placed as a killed run registered it, or anew where that cannot be; as it is registered now."""
-    frame = posed.frame
-    if earlier is not None and earlier.taken is not None:
-        step = Step(frame.index, frame.name, frame.time_ns, "", None, earlier.taken, False)
-        if run.again(step) is not None:
-            return earlier.taken
-    if earlier is not None and not earlier.is_whole:
-        run.lose(
-            frame.index, frame.name, frame.time_ns, "its picture was lost when a run was stopped"
-        )
-        return None
-    run.add(posed)
-    return run.taken

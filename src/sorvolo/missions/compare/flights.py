@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.addresses import is_live_address
@@ -15,7 +16,6 @@ from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
 from sorvolo.change.alignment import Caution, FlightPlace
 from sorvolo.errors import InputError, SettingsError, StoreError
-from sorvolo.missions.compare.journal import CompareJournal
 from sorvolo.missions.compare.run import Again, CompareRun, Pending
 from sorvolo.missions.compare.whole_flight import MANY, OVERLAP
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
@@ -23,9 +23,10 @@ from sorvolo.missions.flight.disk import check_room
 from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.headline import contradicts_itself
 from sorvolo.missions.flight.known_camera import known_camera
-from sorvolo.missions.flight.live_journal import SourceNotes
 from sorvolo.missions.flight.map_objects import check_classes, open_detector
-from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
+from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
+from sorvolo.missions.flight.request import AlreadyDone
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import (
     FlightSetup,
@@ -35,7 +36,6 @@ from sorvolo.missions.flight.setup import (
     repeated,
 )
 from sorvolo.missions.heights.measure import damaged_heights, heights_stamp, own_heights_stamp
-from sorvolo.missions.map.journal import begun_journal, go_on_live
 from sorvolo.mosaic.selection import StretchSelection, every
 from sorvolo.registration.opencv_threads import single_threaded_opencv
 from sorvolo.store.site.archive import Archive
@@ -92,15 +92,17 @@ def compare_flights(
     )
     with Archive.open(site, write=True) as archive, opened as sources, single_threaded_opencv():
         known = []
-        for source in sources:
-            base, is_newest = _base_version(archive, source)
+
+        def asked(source: Source) -> tuple[Any, ...]:
+            base, _ = _base_version(archive, source)
             stamps = (
                 heights_stamp(archive, but=source.name),
                 own_heights_stamp(archive, source.name),
             )
-            asked = settings, wanted, looks, base, _reviews(archive), stamps, steps
-            samples = go_on_live(source, archive, asked, live.same_flight_s, anew=again)
-            setup = prepare(
+            return settings, wanted, looks, base, _reviews(archive), stamps, steps
+
+        def prepared(source: Source) -> FlightSetup:
+            return prepare(
                 source,
                 settings.mapping,
                 archive.site(),
@@ -108,26 +110,17 @@ def compare_flights(
                 finds_itself=True,
                 ground_m=known_ground_m(archive),
             )
-            request = request_of(setup, *asked)
-            compared = already_done(archive, setup, request)
-            if compared and not again:
-                known.append(compared)
+
+        for flight in opened_flights(
+            sources, archive, asked, prepared, most_gap_s=live.same_flight_s, again=again
+        ):
+            if isinstance(flight, AlreadyDone):
+                known.append(flight)
                 continue
-            own = (
-                settings if is_newest else replace(settings, updates_map=False)
-            )  # what later flights painted stays
-            yield from _compare_one(
-                setup,
-                archive,
-                own,
-                wanted,
-                steps,
-                looks,
-                base,
-                request,
-                anew=again and compared is None,
-                samples=samples,
-            )
+            base, is_newest = _base_version(archive, flight.setup.source)
+            # what later flights painted stays
+            own = settings if is_newest else replace(settings, updates_map=False)
+            yield from _compare_one(flight, archive, own, wanted, steps, looks, base)
         return tuple(known)
 
 
@@ -180,34 +173,25 @@ def _without_heights(archive: Archive, flight: str) -> tuple[Notice, ...]:
 
 
 def _compare_one(
-    setup: FlightSetup,
+    flight: OpenedFlight,
     archive: Archive,
     settings: CompareSettings,
     area: Area | None,
     steps: Path | None,
     detector: ObjectDetector | None,
     base: int,
-    request: str,
-    *,
-    anew: bool,
-    samples: int,
 ) -> Generator[CompareUpdate]:
-    started_s, source = time.monotonic(), setup.source
-    notices = (
-        *setup.notices,
-        *repeated(archive, source, "compared"),
-        *_without_heights(archive, source.name),
+    started_s, source = time.monotonic(), flight.setup.source
+    flight = flight.noting(
+        *repeated(archive, source, "compared"), *_without_heights(archive, source.name)
     )
-    setup = replace(setup, notices=notices)
+    setup = flight.setup
     if settings.updates_map:
         check_room(setup, archive, archive.site().m_per_px, keeps_pictures=False)
     inside = setup.inside(area)
     step_s = 0.0 if source.kind == "photos" else 1.0 / settings.views_per_second
-    file, notes, keeps_pictures = begun_journal(setup, archive, request, anew=anew), None, False
-    if isinstance(source, LiveSource):
-        notes, keeps_pictures = SourceNotes(file, source, samples), not source.is_reread
-    journal = CompareJournal(file, notes, keeps_pictures=keeps_pictures)
-    with CompareRun(setup, archive, settings, base, steps, detector, request, journal) as run:
+    memo = flight.cache(archive)
+    with CompareRun(setup, archive, settings, base, steps, detector, flight.request, memo) as run:
 
         def ahead() -> (
             int
@@ -243,7 +227,7 @@ def _compare_one(
                 comes_again,
             )
 
-        for each in _ended(source, step_s, setup, inside, run, ahead):
+        for each in _ended(source, step_s, setup, inside, run, memo, ahead):
             if isinstance(each, LostFrame):
                 run.lose(each)
                 yield updated(each, ViewStatus.LOST, each.reason)
@@ -264,7 +248,7 @@ def _compare_one(
                     outcome.residual_px,
                     announced,
                     run.view(each.posed),
-                    is_resumed=each.earlier is not None,
+                    is_resumed=each.is_resumed,
                 )
         run.finish(source.notices(), started_s)
 
@@ -275,6 +259,7 @@ def _ended(
     setup: FlightSetup,
     inside: Callable[[PosedFrame], bool],
     run: CompareRun,
+    memo: ResultCache,
     ahead: Callable[[], int],
 ) -> Iterator[Pending | LostFrame | Again]:
     """The frames as their comparisons end. What was not found on the map is tried again after the others, with the
@@ -296,7 +281,9 @@ def _ended(
 
     chosen: set[int] = set()
     again: set[int] = set()
-    yield from run.recalled()
+    for kept in memo.kept_frames():
+        assert kept.prior is not None
+        yield run.begin(PosedFrame(kept.frame, kept.prior))
     for each in _begun(_frames(source, step_s), setup, inside, run, ahead, caution=caution):
         if isinstance(each, Pending):
             index, is_one = each.posed.frame.index, is_chosen(each.posed)
@@ -305,7 +292,7 @@ def _ended(
             if each.is_unplaced and (is_one or each.comes_again):
                 again.add(index)
                 run.put_off(each)
-                yield Again(each.posed, is_resumed=each.earlier is not None)
+                yield Again(each.posed, is_resumed=each.is_resumed)
                 continue
         yield each
     if not again:
@@ -318,7 +305,13 @@ def _ended(
         run.leave_out(len(again - chosen))  # those that overlap show their ground
         again &= chosen
     yield from _begun(
-        source.frames(lambda index, _: index in again), setup, inside, run, ahead, places
+        source.frames(lambda index, _: index in again),
+        setup,
+        inside,
+        run,
+        ahead,
+        places,
+        is_again=True,
     )
 
 
@@ -351,6 +344,8 @@ def _begun(
     ahead: Callable[[], int],
     places: Mapping[int, FlightPlace] = MappingProxyType({}),
     caution: Caution = Caution.NEVER,
+    *,
+    is_again: bool = False,
 ) -> Iterator[Pending | LostFrame]:
     """The frames inside of the area in order, each with its comparison begun, and that of up to `ahead()` after it."""
     waiting: deque[Pending | LostFrame] = deque()
@@ -358,7 +353,7 @@ def _begun(
         if isinstance(each, LostFrame):
             waiting.append(each)
         elif inside(posed := PosedFrame(each, setup.prior(each, first=False))):
-            waiting.append(run.begin(posed, places.get(each.index), caution))
+            waiting.append(run.begin(posed, places.get(each.index), caution, is_again=is_again))
         while len(waiting) > ahead():
             yield waiting.popleft()
     yield from waiting

@@ -1,6 +1,6 @@
 """Objects beside a comparison: frames that fit the map are searched for them, and they name what changes are."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from sorvolo.capture.source import LiveSource
@@ -8,12 +8,8 @@ from sorvolo.change.reconcile import SearchedGround, on_one_date
 from sorvolo.change.views import ViewMaker, ViewOutcome
 from sorvolo.missions.compare.change_classes import ChangeClasses
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
-from sorvolo.missions.flight.map_objects import (
-    FrameDetections,
-    ObjectFinder,
-    search_summary,
-    why_not_searched,
-)
+from sorvolo.missions.flight.map_objects import ObjectFinder, search_summary, why_not_searched
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.mosaic.selection import StretchSelection
@@ -36,6 +32,7 @@ class ComparisonObjects:
         archive: Archive,
         base_version: int,
         settings: CompareSettings,
+        memo: ResultCache,
     ) -> None:
         """`settings.classes` are looked for, in frames as in the changes' own pictures."""
         self._name, self._model = setup.source.name, settings.model
@@ -59,7 +56,11 @@ class ComparisonObjects:
             self._classes = ChangeClasses(detector, known, settings.classes)
             live_folder = archive.folder if isinstance(setup.source, LiveSource) else None
             self._finder = ObjectFinder(
-                detector, setup.source.camera.camera, settings.classes, live_folder=live_folder
+                detector,
+                setup.source.camera.camera,
+                settings.classes,
+                live_folder=live_folder,
+                memo=memo,
             )
 
     def close(self) -> None:
@@ -72,25 +73,12 @@ class ComparisonObjects:
         """What the detector would have a user know of the frames."""
         return () if self._finder is None else self._finder.notices
 
-    def take_over(self, seen: Iterable[FrameDetections]) -> None:
-        """Take what a killed run's detector found."""
-        if self._finder is not None:
-            for each in seen:
-                self._finder.take_over(each)
-
-    def news(self) -> Sequence[FrameDetections]:
-        """What was found in frames since this was asked last."""
-        return () if self._finder is None else self._finder.news()
-
-    def search(
-        self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker, *, may_look: bool = True
-    ) -> None:
-        """Have a frame that fits the map searched, each stretch of ground in a few of them; not unless it `may_look`."""
+    def search(self, posed: PosedFrame, outcome: ViewOutcome, views: ViewMaker) -> None:
+        """Have a frame that fits the map searched, each stretch of ground in a few of them."""
         if self._finder is None or outcome.site_from_image is None:
             return
         outline_m = views.pixels.ground_m(posed, outcome.site_from_image)
-        is_due = outline_m is not None and self._selection.take(outline_m)
-        if is_due and may_look and not self._finder.has_seen(posed.frame.index):
+        if outline_m is not None and self._selection.take(outline_m):
             self._finder.look(posed)
 
     def named(self, announced: Sequence[Change]) -> tuple[Change, ...]:

@@ -1,7 +1,7 @@
 """One later flight on its way into a site: views to evidence, evidence to changes, changes into the map."""
 
 import time
-from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,7 +26,6 @@ from sorvolo.heights.field import standing
 from sorvolo.missions.compare.area_heights import with_height_changes
 from sorvolo.missions.compare.extension import MapExtension
 from sorvolo.missions.compare.flight_changes import FlightChanges, Gathering
-from sorvolo.missions.compare.journal import ComparedFrame, CompareJournal, KeptFrame
 from sorvolo.missions.compare.objects import ComparisonObjects
 from sorvolo.missions.compare.report import (
     ViewCounts,
@@ -41,21 +40,21 @@ from sorvolo.missions.flight.log import FlightLog, Stage
 from sorvolo.missions.flight.map_objects import crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.request import REQUEST
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import CompareSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.heights.measure import flight_with_heights, read_field
-from sorvolo.missions.map.journal import Taken
 from sorvolo.store.exports.change_files import write_pictures
 from sorvolo.store.exports.coverage_files import COVERAGE, coverage_geojson
 from sorvolo.store.exports.map_pictures import Picture, picture
 from sorvolo.store.exports.plain import features_name, geojson_bytes
-from sorvolo.store.images import ImageCache, array_from_bytes, image_from_jpeg, jpeg_from_image
+from sorvolo.store.images import ImageCache
 from sorvolo.store.pages.flight import report_page
 from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.files import HeightFile
 from sorvolo.survey.coverage import CoveredGround
 from sorvolo.survey.findings import Change, ComparedView, Verdict, ViewStatus
-from sorvolo.survey.flight import Frame, LostFrame, Notice, PosedFrame
+from sorvolo.survey.flight import LostFrame, Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 # How large frames are compared where nothing else is asked for; how much of earlier pictures is
@@ -70,14 +69,22 @@ _VIDEO_OVERLAP = 0.8
 _FINE_M_PER_PX = 0.07  # a car has 60 px: finer gains nothing, and large smooth ground loses
 _CACHE_BYTES = 128 * 2**20
 
+VIEW, VIEW_AGAIN = "view", "view again"
+"""Stages of a comparison's results."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pending:
-    """A frame and how its comparison will have ended; `earlier` is how it ended in a run that was killed."""
+    """A frame and how its comparison will have ended.
+
+    `stage` names the comparison's result in the cache: a frame that is looked for again has two. `is_resumed`: a run
+    that was killed has compared it.
+    """
 
     posed: PosedFrame
     outcome: "Future[ViewOutcome]"
-    earlier: ComparedFrame | None = None
+    stage: str
+    is_resumed: bool
 
     @property
     def is_unplaced(self) -> bool:
@@ -101,7 +108,7 @@ class Again:
 class CompareRun:
     """A later flight on its way into a site. A context manager: leaving without `finish` leaves the site as it was.
 
-    `journal` notes what becomes of each frame, and has what a killed run noted; None: a kill loses it.
+    `memo` has what a killed run computed.
     """
 
     def __init__(
@@ -113,18 +120,18 @@ class CompareRun:
         steps: Path | None,
         detector: ObjectDetector | None = None,
         request: str = "",
-        journal: CompareJournal | None = None,
+        memo: ResultCache | None = None,
     ) -> None:
         self._setup, self._archive, self._settings, self._steps = setup, archive, settings, steps
         self._base_version = base_version
+        self._memo = ResultCache() if memo is None else memo
         source = setup.source
         self._writer: FlightWriter = archive.begin_flight(
             source.name,
             source.fingerprint,
             {**vars(settings), "method": f"compare-{settings.method}", REQUEST: request},
-            journal=None if journal is None else journal.file,
+            journal=self._memo.journal,
         )
-        self._journal = journal
         self._views = view_maker(setup, archive, settings, base_version)
         self._changes = FlightChanges(
             source.name, self._views, archive.site(), settings, _gathering(setup, archive, settings)
@@ -134,10 +141,12 @@ class CompareRun:
             for each in archive.reviews()
             if each.verdict is Verdict.REJECTED and each.flight_id != source.name
         ]
-        self._objects = ComparisonObjects(detector, setup, archive, base_version, settings)
-        if journal is not None:
-            self._objects.take_over(journal.detections)
-        self._extension = MapExtension(setup, archive, settings, self._writer, self._views)
+        self._objects = ComparisonObjects(
+            detector, setup, archive, base_version, settings, self._memo
+        )
+        self._extension = MapExtension(
+            setup, archive, settings, self._writer, self._views, self._memo
+        )
         self._log = FlightLog()
         self._counts = ViewCounts()
         self._placed: dict[int, PlacedFrame] = {}
@@ -164,8 +173,7 @@ class CompareRun:
             self._objects.close()
         finally:  # also when Ctrl-C strikes again meanwhile
             self._writer.__exit__(kind, error, trace)
-            if self._journal is not None:
-                self._journal.file.end(error)
+            self._memo.end(error)
 
     @property
     def views(self) -> int:
@@ -187,49 +195,39 @@ class CompareRun:
         )
 
     def begin(
-        self, posed: PosedFrame, place: FlightPlace | None = None, caution: Caution = Caution.NEVER
+        self,
+        posed: PosedFrame,
+        place: FlightPlace | None = None,
+        caution: Caution = Caution.NEVER,
+        *,
+        is_again: bool = False,
     ) -> Pending:
         """Begin to compare a frame, in threads beside what `add` does with those before it. `place` and `caution`
-        are those of `Aligner.align`."""
-        earlier = None if self._journal is None else self._journal.next_frame(posed.frame.index)
-        if earlier is not None:
-            record = earlier.record
+        are those of `Aligner.align`; `is_again`: it was put off."""
+        index, stage = posed.frame.index, VIEW_AGAIN if is_again else VIEW
+        record = self._memo.known(index, stage, ViewRecord)
+        if record is not None:
             recalled = self._comparing.submit(
                 lambda: self._views.recall(posed, self._views.undistorted(posed), record)
             )
-            return Pending(posed, recalled, earlier)
+            return Pending(posed, recalled, stage, is_resumed=True)
         compared = self._comparing.submit(self._views.compare_with_map, posed, place, caution)
-        return Pending(
-            posed, self._corroborating.submit(lambda: self._views.corroborate(compared.result()))
-        )
-
-    def recalled(self) -> Iterator[Pending]:
-        """The frames of a run that was killed which nobody can read again."""
-        for each in () if self._journal is None else self._journal.kept_frames():
-            assert each.kept is not None
-            image = image_from_jpeg(bytes(each.kept.jpeg), each.kept.name)
-            posed = PosedFrame(
-                Frame(each.index, each.kept.name, each.kept.time_ns, image), each.kept.prior
-            )
-            yield Pending(
-                posed, self._comparing.submit(self._views.recall, posed, image, each.record), each
-            )
+        outcome = self._corroborating.submit(lambda: self._views.corroborate(compared.result()))
+        return Pending(posed, outcome, stage, is_resumed=False)
 
     def add(self, pending: Pending) -> tuple[ViewOutcome, tuple[Change, ...]]:
         """Take one frame's comparison in; how that ended, and the changes that it was the last missing proof of."""
-        posed, earlier = pending.posed, pending.earlier
+        posed = pending.posed
         with self._log.stage(Stage.COMPARE):
             outcome = pending.outcome.result()
         self._counts.take(outcome, self._views.pixels.ground_m(posed, outcome.site_from_image))
         self._placed[posed.frame.index] = self._views.placed(posed, outcome, self._map_sigma_m)
         with self._log.stage(Stage.DETECT):
-            self._objects.search(
-                posed, outcome, self._views, may_look=earlier is None or earlier.is_whole
-            )
+            self._objects.search(posed, outcome, self._views)
         announced = () if outcome.view is None else self._add_view(outcome.view, outcome.leans)
         with self._log.stage(Stage.REGISTER):
-            taken = self._extension.add(posed, outcome, earlier)
-        self._keep(pending, taken)
+            self._extension.add(posed, outcome)
+        self._keep(pending)
         return outcome, announced
 
     def outline_m(self, posed: PosedFrame) -> PointsM | None:
@@ -254,7 +252,7 @@ class CompareRun:
 
     def put_off(self, pending: Pending) -> None:
         """A frame that was not found on the map is tried again after the others."""
-        self._keep(pending, None)
+        self._keep(pending)
 
     def leave_out(self, frames: int) -> None:
         """So many frames were put off and are not tried again: others that overlap them show their ground."""
@@ -329,19 +327,11 @@ class CompareRun:
 
     # ---- inside -----------------------------------------------------------------------------------------------
 
-    def _keep(self, pending: Pending, taken: Taken | None) -> None:
-        """Note a frame, and what the detector found meanwhile; nothing while those of a killed run are taken over."""
-        if self._journal is None or pending.earlier is not None:
-            return
-        posed, kept = pending.posed, None
-        if self._journal.keeps_pictures:
-            jpeg = array_from_bytes(jpeg_from_image(self._views.undistorted(posed)))
-            kept = KeptFrame(posed.frame.name, posed.frame.time_ns, posed.prior, jpeg)
-        record = ViewRecord.of(pending.outcome.result())
-        compared = ComparedFrame(posed.frame.index, record, taken, kept)
-        self._journal.keep_frame(compared, posed.frame.name, posed.frame.time_ns)
-        for seen in self._objects.news():
-            self._journal.keep_detections(seen)
+    def _keep(self, pending: Pending) -> None:
+        if not pending.is_resumed:
+            frame, record = pending.posed.frame, ViewRecord.of(pending.outcome.result())
+            self._memo.keep(frame, pending.stage, record, compresses=True)
+            self._memo.end_frame(frame, pending.posed.prior)
 
     def _add_view(self, view: ComparedView, leans: Mask | None) -> tuple[Change, ...]:
         """Add a compared view to the evidence; the changes announced by it."""

@@ -18,6 +18,7 @@ from sorvolo.geometry.camera import Camera
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.memory import MemorySettings
 from sorvolo.missions.flight.priority import lower_priority, made_at_low_priority
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.registration.sizes import at_most
 from sorvolo.store.exports.detection_files import crop_around
 from sorvolo.store.exports.plain import plain_json
@@ -84,7 +85,8 @@ class ObjectFinder:
 
     A context manager: leaving it ends the thread. No `classes` means those that the detector usually reports; raises
     SettingsError for one that it does not know. `live_folder` is given for a live flight, whose map must not wait for
-    the detector: this works at low priority then, and pictures that memory does not hold wait in files there.
+    the detector: this works at low priority then, and pictures that memory does not hold wait in files there. What
+    `memo` has of a killed run is not searched again.
     """
 
     def __init__(
@@ -94,8 +96,10 @@ class ObjectFinder:
         classes: Sequence[str] = (),
         *,
         live_folder: Path | None = None,
+        memo: ResultCache | None = None,
     ) -> None:
         check_classes(detector, classes)
+        self._memo = ResultCache() if memo is None else memo
         self._detector, self._camera = detector, camera
         self._live_folder = live_folder
         self._classes = tuple(classes) or detector.info.usual_classes
@@ -104,7 +108,6 @@ class ObjectFinder:
         )
         self._waiting: deque[Future[FrameDetections]] = deque()
         self._seen: dict[int, FrameDetections] = {}
-        self._news: list[FrameDetections] = []
         self._sightings: tuple[Sighting, ...] = ()
 
     def close(self) -> None:
@@ -131,6 +134,10 @@ class ObjectFinder:
 
         Raises StoreError when a picture has to wait on a disk that is full.
         """
+        known = self._memo.known(posed.frame.index, "seen", FrameDetections)
+        if known is not None:
+            self._seen[known.index] = known
+            return
         height_m, sigma_m = posed.prior.position_m[2], posed.prior.position_sigma_m[2]
         knows_height = math.isfinite(sigma_m) and height_m > 1.0
         m_per_px = float(height_m) / self._camera.fx_px if knows_height else None
@@ -144,24 +151,10 @@ class ObjectFinder:
         self._waiting.append(self._thread.submit(self._look, given, m_per_px, from_above))
         self._take(min(_AHEAD, in_memory) if self._live_folder is None else memory.waiting_on_disk)
 
-    def news(self, *, waits: bool = False) -> list[FrameDetections]:
-        """What was found since this was asked last, in the frames' order; `waits`: in all frames so far."""
-        self._take(0 if waits else len(self._waiting))
-        news, self._news = self._news, []
-        return news
-
     def rest(self) -> None:
         """Wait until all frames so far are searched, and have the detector give its memory back."""
         self._take(0)
         self._detector.rest()
-
-    def take_over(self, seen: FrameDetections) -> None:
-        """Take what an earlier process found in a frame."""
-        self._seen[seen.index] = seen
-
-    def has_seen(self, index: int) -> bool:
-        """Whether the frame of this index was searched."""
-        return index in self._seen
 
     def conclude(
         self, placed: Sequence[PlacedFrame], flight_id: str, *, has_metres: bool
@@ -214,7 +207,6 @@ class ObjectFinder:
         while self._waiting and (len(self._waiting) > left or self._waiting[0].done()):
             seen = self._waiting.popleft().result()
             self._seen[seen.index] = seen
-            self._news.append(seen)
 
     def _look(
         self, given: "Frame | FrameOnDisk", m_per_px: float | None, from_above: bool
@@ -233,9 +225,10 @@ class ObjectFinder:
         )
         surest = found.surest(_MOST_CROPS)
         crops = tuple(_crop(frame.image, box) for box in surest.boxes_px)
-        return FrameDetections(
-            frame.index, surest, crops, time.monotonic() - started_s, dict(least)
-        )
+        seconds = time.monotonic() - started_s
+        seen = FrameDetections(frame.index, surest, crops, seconds, dict(least))
+        self._memo.keep(frame, "seen", seen)
+        return seen
 
 
 def search_summary(

@@ -8,7 +8,7 @@ from typing import Any
 
 from sorvolo.errors import GeometryError
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.map.painting import PaintSettings
+from sorvolo.missions.map.painting import REST
 from sorvolo.missions.plan_flight import ReflySettings, fly_again
 from sorvolo.mosaic.seen_ground import PictureOnGround, coverage_figures, seen_ground
 from sorvolo.store.atomic import atomic_write_bytes
@@ -35,9 +35,8 @@ class FlightCoverage:
         refly: Sequence[Path],
         live_s: float,
         settings: ReflySettings = ReflySettings(),
-        pace: PaintSettings = PaintSettings(),
     ) -> None:
-        self._settings, self._rest = settings, pace.rest
+        self._settings = settings
         self._setup, self._archive, self._refly, self._live_s = setup, archive, tuple(refly), live_s
         is_known = area is not None and setup.telemetry is not None
         self._area_m = area.polygons_m(setup.frame) if area is not None and is_known else ()
@@ -53,9 +52,7 @@ class FlightCoverage:
         ground = seen_ground(placed, self._area_m)
         atomic_write_bytes(self._archive.live_coverage_path, self._geojson(ground), durable=False)
         self._plan(ground, placed)
-        self._again_s = time.monotonic() + max(
-            self._live_s, self._rest * (time.monotonic() - started_s)
-        )
+        self._again_s = time.monotonic() + max(self._live_s, REST * (time.monotonic() - started_s))
 
     def conclude(
         self, placed: Sequence[PictureOnGround]

@@ -1,10 +1,10 @@
 """Mode 1, first flight: sources to a map in a site folder, frame by frame."""
 
+import itertools
 import threading
 import time
-import warnings
-from collections.abc import Generator, Sequence
-from contextlib import nullcontext
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,14 +13,18 @@ from sorvolo.capture.areas import read_area
 from sorvolo.capture.live.addresses import is_live_address
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.source import LiveSource, Source, opened_sources
-from sorvolo.errors import SettingsError, SorvoloWarning
+from sorvolo.capture.video import VideoSource
+from sorvolo.capture.video_spans import SparseReading
+from sorvolo.errors import SettingsError
 from sorvolo.missions.flight.base_map import open_base
 from sorvolo.missions.flight.control import open_control
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.disk import LiveRoom, check_room
-from sorvolo.missions.flight.live_journal import SourceNotes
+from sorvolo.missions.flight.frames_ahead import read_ahead
 from sorvolo.missions.flight.map_objects import ObjectFinder, open_detector
-from sorvolo.missions.flight.request import AlreadyDone, already_done, request_of
+from sorvolo.missions.flight.opened import OpenedFlight, opened_flights
+from sorvolo.missions.flight.request import AlreadyDone
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.sample_frames import refuse_without_texture
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import (
@@ -33,22 +37,29 @@ from sorvolo.missions.flight.setup import (
     repeated,
 )
 from sorvolo.missions.map.coverage import FlightCoverage
-from sorvolo.missions.map.journal import Earlier, MapJournal, Step, begun_journal, go_on_live
 from sorvolo.missions.map.planar_run import PlanarRun
-from sorvolo.missions.map.reader import FrameReader
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.missions.map.thesis_run import ThesisRun
 from sorvolo.mosaic.control import ControlSettings
-from sorvolo.mosaic.selection import SelectionSettings, select_keyframes
+from sorvolo.mosaic.selection import (
+    Selected,
+    SelectionSettings,
+    SmallCopies,
+    every,
+    select_keyframes,
+    shows_all_between,
+)
 from sorvolo.store.exports.waypoints import check_waypoint_files
 from sorvolo.store.site.archive import Archive
 from sorvolo.store.site.catalogue_place import Catalogues
 from sorvolo.survey.area import Area
-from sorvolo.survey.flight import Frame, LostFrame
+from sorvolo.survey.flight import LostFrame, PosedFrame
 from sorvolo.survey.mosaic import MosaicUpdate, Status
 
 if TYPE_CHECKING:  # `map` alone has no use for what plants and searches
     from sorvolo.missions.search.while_flying import SearchWhileFlying
+
+_AHEAD = 2  # decoded frames that wait to be placed
 
 
 def map_flights(
@@ -90,16 +101,16 @@ def map_flights(
     wanted = None if area is None else read_area(area)
     is_live = any(is_live_address(str(each)) for each in inputs)
     looks = open_detector(settings.model, is_live=is_live) if detector is None else detector
+    asked = replace(settings, live_s=0.0, memory_mb=None), wanted, looks
     opened = opened_sources(
         inputs, telemetry, camera, known_flights(site, catalogues), live=live, until=until
     )
+    known = []
     with opened as sources, Archive.open(site, write=True, catalogues=catalogues) as archive:
         ground = _known_ground(control, base, sources, settings)
-        known = []
-        asked = replace(settings, live_s=0.0, memory_mb=None), wanted, looks
-        for source in sources:
-            samples = go_on_live(source, archive, asked, live.same_flight_s, anew=again)
-            setup = prepare(
+
+        def prepared(source: Source) -> FlightSetup:
+            return prepare(
                 source,
                 settings,
                 archive.site() if archive.has_site else None,
@@ -108,30 +119,28 @@ def map_flights(
                 known_ground=ground,
                 founds_site=founds_site(archive, source.name),
             )
-            request = request_of(setup, *asked)
-            mapped = already_done(archive, setup, request)
-            if mapped and not again:
-                known.append(mapped)
+
+        for flight in opened_flights(
+            sources,
+            archive,
+            lambda _: asked,
+            prepared,
+            most_gap_s=live.same_flight_s,
+            again=again,
+        ):
+            if isinstance(flight, AlreadyDone):
+                known.append(flight)
                 continue
-            coverage = FlightCoverage(setup, archive, wanted, refly, settings.live_s)
-            yield from _map_one(
-                setup,
-                archive,
-                settings,
-                wanted,
-                looks,
-                request,
-                coverage,
-                anew=again and mapped is None,
-                samples=samples,
-                search=search if isinstance(source, LiveSource) else None,
-            )
-        return tuple(known)
+            coverage = FlightCoverage(flight.setup, archive, wanted, refly, settings.live_s)
+            measuring = search if isinstance(flight.setup.source, LiveSource) else None
+            yield from _map_one(flight, archive, settings, wanted, looks, coverage, measuring)
+    return tuple(known)
 
 
 def _known_ground(
     control: Path | None, base: Path | None, sources: Sequence[Source], settings: MapSettings
 ) -> KnownGround | None:
+    """Open what a map is tied to; None without any. Raises SettingsError where that cannot be."""
     if control is not None and base is not None:
         raise SettingsError(
             "a map is tied to control points (--gcp) or to a base map (--base), not to both"
@@ -142,7 +151,12 @@ def _known_ground(
         )
     if control is None and base is None:
         return None
-    _refuse_ties(len(sources), settings)
+    if settings.method != "planar":
+        raise SettingsError("--gcp and --base tie maps of method planar only; leave --method out")
+    if len(sources) != 1:
+        raise SettingsError(
+            f"--gcp and --base tie one flight, not {len(sources)}; map the flights one by one"
+        )
     if control is not None:
         return open_control(
             control, sources[0], ControlSettings(settings.control_sigma_m, checks=settings.checks)
@@ -151,121 +165,104 @@ def _known_ground(
     return open_base(base, sources[0])
 
 
-def _refuse_ties(flights: int, settings: MapSettings) -> None:
-    """Raise SettingsError where a map cannot be tied to known ground."""
-    if settings.method != "planar":
-        raise SettingsError("--gcp and --base tie maps of method planar only; leave --method out")
-    if flights != 1:
-        raise SettingsError(
-            f"--gcp and --base tie one flight, not {flights}; map the flights one by one"
-        )
-
-
 def _map_one(
-    setup: FlightSetup,
+    flight: OpenedFlight,
     archive: Archive,
     settings: MapSettings,
     area: Area | None,
     detector: ObjectDetector | None,
-    request: str,
     coverage: FlightCoverage,
-    *,
-    anew: bool,
-    samples: int,
     search: "SearchWhileFlying | None",
 ) -> Generator[MosaicUpdate]:
-    started_s, source = time.monotonic(), setup.source
+    started_s, source = time.monotonic(), flight.setup.source
     refuse_without_texture(source)
     m_per_px = archive.site().m_per_px if archive.has_site else settings.m_per_px
-    check_room(setup, archive, m_per_px)
-    room = LiveRoom(setup, archive.folder, m_per_px)
-    setup = replace(setup, notices=(*setup.notices, *repeated(archive, source, "mapped")))
-    live_folder = archive.folder if isinstance(source, LiveSource) else None
-    finder = (
-        None
-        if detector is None
-        else ObjectFinder(detector, source.camera.camera, settings.classes, live_folder=live_folder)
+    check_room(flight.setup, archive, m_per_px)
+    room = LiveRoom(flight.setup, archive.folder, m_per_px)
+    flight = flight.noting(*repeated(archive, source, "mapped"))
+    setup, is_planar = flight.setup, settings.method == "planar"
+    memo = flight.cache(archive) if is_planar else ResultCache()
+    finder = None
+    if detector is not None:
+        live_folder = archive.folder if isinstance(source, LiveSource) else None
+        finder = ObjectFinder(
+            detector, source.camera.camera, settings.classes, live_folder=live_folder, memo=memo
+        )
+    begun: FlightRun = (
+        PlanarRun(setup, archive, settings, None, finder, memo, flight.request, coverage)
+        if is_planar
+        else ThesisRun(setup, archive, settings, finder, flight.request)
     )
-    begun = _begun(setup, archive, settings, finder, request, coverage, anew=anew, samples=samples)
     with begun as run, nullcontext() if search is None else search:
-
-        def update(
-            frame: Step | LostFrame | Frame, ended: tuple[Status, str, int], read: int
-        ) -> MosaicUpdate:
-            view = None if isinstance(frame, LostFrame) else run.view(frame.index, frame.time_ns)
-            if search is not None and ended[0] is not Status.REJECTED:
+        for selected in itertools.chain(_kept(memo), _selected(setup, settings, area)):
+            frame = selected if isinstance(selected, LostFrame) else selected.posed.frame
+            status, reason, painted = run.take(selected)
+            room.look(run.selected)
+            coverage.show(run.pictures_on_ground)
+            if search is not None and status is not Status.REJECTED:
                 search.take(run, archive, frame.index)
-            return MosaicUpdate(
+            is_lost = isinstance(frame, LostFrame)
+            yield MosaicUpdate(
                 source.name,
                 frame.name,
-                ended[0],
-                ended[1],
-                read,
+                status,
+                reason,
+                frame.index + 1,
                 source.frame_count,
                 run.selected,
                 max(setup.plan.expected, run.selected),
                 run.by_vision,
-                ended[2],
+                painted,
                 time.monotonic() - started_s,
-                view,
-                isinstance(frame, Step),
-            )
-
-        before = Earlier()
-        for step, ended in run.take_over():
-            before.take(step)
-            yield update(step, ended, step.index + 1)
-        before.search(run.is_unsearched)
-        selection = SelectionSettings(
-            overlap=settings.overlap, least_overlap=min(0.5, settings.overlap)
-        )
-        reader = FrameReader(setup, before, selection if settings.method == "planar" else None)
-        selected = select_keyframes(
-            reader.posed(run.look),
-            selection,
-            keep_all=source.kind == "photos"
-            or (settings.method == "thesis" and setup.track is not None),
-            inside=setup.inside(area),
-            memory=before.memory,
-            small=reader.small,
-        )
-        for each in selected:
-            ended = run.take(each)
-            room.look(run.selected)
-            coverage.show(run.pictures_on_ground)
-            yield update(
-                each if isinstance(each, LostFrame) else each.posed.frame, ended, reader.read
+                None if is_lost else run.view(frame.index, frame.time_ns),
+                memo.has_ended(frame.index),
             )
         if search is not None:
             search.land()
         run.finish(source.notices(), started_s)
 
 
-def _begun(
-    setup: FlightSetup,
-    archive: Archive,
-    settings: MapSettings,
-    finder: ObjectFinder | None,
-    request: str,
-    coverage: FlightCoverage,
-    *,
-    anew: bool,
-    samples: int,
-) -> FlightRun:
-    """The run of one flight, which notes how far it is, and goes on where a killed one was.
+def _kept(memo: ResultCache) -> Iterator[Selected | LostFrame]:
+    """Yield the frames that a killed run had selected of a stream."""
+    for kept in memo.kept_frames():
+        if kept.prior is None:
+            yield LostFrame(kept.index, kept.name, kept.time_ns, kept.reason)
+        else:
+            yield Selected(PosedFrame(kept.frame, kept.prior), kept.reason)
 
-    `samples` of a live flight's telemetry are noted already.
-    """
-    file, source = begun_journal(setup, archive, request, anew=anew), setup.source
-    if settings.method == "thesis":
-        if file.is_begun:
-            text = f"{source.name}: a stopped run begins again from the start: --method thesis cannot continue one"
-            warnings.warn(text, SorvoloWarning, stacklevel=2)
-            file = begun_journal(setup, archive, request, anew=True)
-        return ThesisRun(setup, archive, settings, finder, MapJournal(file), request)
-    journal = MapJournal(
-        file, SourceNotes(file, source, samples) if isinstance(source, LiveSource) else None
+
+def _selected(
+    setup: FlightSetup, settings: MapSettings, area: Area | None
+) -> Iterator[Selected | LostFrame]:
+    """Yield a flight's keyframes. Of a recorded video no more is decoded than they need."""
+    source, small = setup.source, SmallCopies()
+    selection = SelectionSettings(
+        overlap=settings.overlap, least_overlap=min(0.5, settings.overlap)
     )
-    return PlanarRun(
-        setup, archive, settings, finder=finder, journal=journal, request=request, coverage=coverage
-    )
+    is_planar = settings.method == "planar"
+    wanted = every(setup.plan.step_s)
+    if isinstance(source, VideoSource) and is_planar:
+        sparse = SparseReading(
+            setup.plan.step_s,
+            lambda *_: True,
+            lambda before, after: shows_all_between(small.of(before), small.of(after), selection),
+        )
+        frames = source.frames(wanted, sparse)
+    else:
+        frames = source.frames(wanted)
+    with ExitStack() as stack:
+        # photos and live sources have threads of their own
+        if not isinstance(source, LiveSource) and source.kind != "photos":
+            frames = stack.enter_context(closing(read_ahead(frames, _AHEAD)))
+        yield from select_keyframes(
+            (
+                frame
+                if isinstance(frame, LostFrame)
+                else PosedFrame(frame, setup.prior(frame, first=frame.index == 0))
+                for frame in frames
+            ),
+            selection,
+            keep_all=source.kind == "photos" or (not is_planar and setup.track is not None),
+            inside=setup.inside(area),
+            small=small,
+        )

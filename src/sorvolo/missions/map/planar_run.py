@@ -1,8 +1,9 @@
 """One flight by `--method planar`: keyframes into the graph, the canvas and the store."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache, partial
 from types import TracebackType
 
 from sorvolo.capture.clock_offset import OffsetEstimate
@@ -17,12 +18,11 @@ from sorvolo.missions.flight.log import Ending, Stage, nothing_placed
 from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.memory import memory_budget_bytes
 from sorvolo.missions.flight.report import FlightResult, build_report
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.map.coverage import FlightCoverage
-from sorvolo.missions.map.journal import MapJournal, Step, StoredPicture, Taken
-from sorvolo.missions.map.known_keyframes import KnownKeyframes
-from sorvolo.missions.map.painting import FlightPainter, site_from_image
+from sorvolo.missions.map.painting import FlightPainter, KnownKeyframes, site_from_image
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.base_ties import BaseReport, FoundFrame, tie_to_base
 from sorvolo.mosaic.exposure import Exposure
@@ -39,7 +39,7 @@ from sorvolo.store.site.archive import Archive, FlightWriter
 from sorvolo.store.site.catalogue import StoredKeyframe
 from sorvolo.store.site.spill import SpillFile
 from sorvolo.survey.control import ControlReport
-from sorvolo.survey.flight import Frame, Notice, PosedFrame
+from sorvolo.survey.flight import Notice, PosedFrame
 from sorvolo.survey.mosaic import FrameView, PlacedFrame, Status
 
 _WAIT_FOR_HEIGHT = 12  # keyframes held back until the height above ground is seen in them
@@ -59,22 +59,22 @@ class PlanarRun(FlightRun):
         settings: MapSettings,
         writer: FlightWriter | None = None,
         finder: ObjectFinder | None = None,
-        journal: MapJournal | None = None,
+        memo: ResultCache | None = None,
         request: str = "",
         coverage: FlightCoverage | None = None,
     ) -> None:
-        super().__init__(setup, archive, settings, writer, finder, journal, request)
+        super().__init__(setup, archive, settings, writer, finder, memo, request)
         self._coverage = coverage
         model = setup.source.camera
         self._lens = Undistorter(model.camera)
-        self._known = KnownKeyframes.of(archive, setup.source.name)
+        self._known = KnownKeyframes(archive, setup.source.name)
         offset_sigma_m = None if setup.track is None else setup.track.altitude_offset_sigma_m
         self._spill = SpillFile(archive.folder)
         self._mapper = PlanarMapper(
             PoseGraphSettings.of_flight(
                 model.focal_sigma,
                 offset_sigma_m,
-                joins_map=self._known.count > 0 or setup.known_ground is not None,
+                joins_map=len(self._known) > 0 or setup.known_ground is not None,
             ),
             known=self._known.for_graph(),
             shelf=self._spill,
@@ -121,46 +121,42 @@ class PlanarRun(FlightRun):
 
     def add(self, posed: PosedFrame) -> tuple[Status, str, int]:
         """Place one frame; what became of it and how many tiles were painted meanwhile."""
-        frame, self._taken = posed.frame, None
+        frame = posed.frame
         if sees_horizon(self._setup.source.camera.camera, posed.prior):
-            return self.lose(frame.index, frame.name, frame.time_ns, HORIZON)
-        with self._log.stage(Stage.UNDISTORT):
-            image = self._lens.undistort(frame.image)
+            return self.lose(frame, HORIZON)
+
+        @cache
+        def image() -> ImageRGB:
+            with self._log.stage(Stage.UNDISTORT):
+                return self._lens.undistort(frame.image)
+
+        def register() -> Registered:
+            picture = image()
+            with self._log.stage(Stage.REGISTER):
+                return self._mapper.register(keyframe_id, self._lens.camera, picture, posed.prior)
+
+        keyframe_id = len(self._known) + frame.index
+        registered = self._memo.of(frame, "registered", Registered, register)
         with self._log.stage(Stage.REGISTER):
-            registered = self._mapper.register(
-                self._known.count + frame.index, self._lens.camera, image, posed.prior
-            )
-        has_place = self._painter is not None
-        picture = jpeg_from_image(image) if self._setup.is_placed_late and not has_place else image
-        ended = self._take(frame, registered, picture)
-        if has_place and ended[0] is not Status.REJECTED:
-            self._taken = Taken(registered, StoredPicture(*self.begin().stored(frame.index)))
-            painter = self._started_painter()
-            painted = painter.show(registered.keyframe.id)
+            outcome = self._mapper.place(registered)
+        self._log.end(frame.index, frame.name, frame.time_ns, outcome.status, outcome.reason)
+        if outcome.status is Status.REJECTED:
+            return outcome.status, outcome.reason, 0
+        self._times_ns[keyframe_id] = frame.time_ns
+        painter, painted = self._painter, 0
+        with self._log.stage(Stage.STORE):
+            self._keep(keyframe_id, image)
+        if self._painter is not None:
+            self._painter.mark(outcome.moved | {keyframe_id})
+        if painter is not None and not self._memo.has_ended(frame.index):
+            painted = painter.show(keyframe_id)
             if isinstance(self._setup.source, LiveStream):
                 self._log.delays_s.append(painter.shown_s - self._setup.source.arrived_s)
-            return *ended, painted
-        self._taken = Taken(registered, b"" if ended[0] is Status.REJECTED else picture)
-        return *ended, 0
-
-    def again(self, step: Step) -> tuple[Status, str, int] | None:
-        """See `FlightRun.again`."""
-        if step.taken is None:
-            return super().again(step)
-        registered, picture = step.taken.registered, step.taken.picture
-        if registered.keyframe.id != self._known.count + step.index or not self._mapper.can_place(
-            registered
-        ):
-            return None
-        if not isinstance(picture, StoredPicture):
-            return *self._take(step, registered, picture), 0
-        if self._painter is None or not self._painter.take_over(registered.keyframe.id, picture):
-            return None
-        return *self._take(step, registered, None), 0
+        return outcome.status, outcome.reason, painted
 
     def view(self, index: int, time_ns: int) -> FrameView | None:
         """See `FlightRun.view`."""
-        keyframe_id = self._known.count + index
+        keyframe_id = len(self._known) + index
         if keyframe_id not in self._times_ns:
             return None
         camera = self._refined(self._setup.source.camera.camera)
@@ -179,7 +175,7 @@ class PlanarRun(FlightRun):
 
     def stored_frame(self, index: int) -> StoredKeyframe | None:
         """See `FlightRun.stored_frame`."""
-        if self._known.count + index not in self._times_ns or index not in self.images:
+        if len(self._known) + index not in self._times_ns or index not in self.images:
             return None
         frame = self._on_ground(
             self._log.endings[index], self._refined(self._setup.source.camera.camera)
@@ -191,7 +187,7 @@ class PlanarRun(FlightRun):
 
         `complete` ties the flight to it, for across dates its features may join none of the map's keyframes.
         """
-        keyframe_id, camera = self._known.count + index, self._lens.camera
+        keyframe_id, camera = len(self._known) + index, self._lens.camera
         if keyframe_id in self._times_ns:
             self._found[keyframe_id] = FoundFrame.of(
                 keyframe_id, camera, site_from_image, residual_px
@@ -210,7 +206,9 @@ class PlanarRun(FlightRun):
                 self._mapper.settle()
                 self._offset = self._find_offset()
                 self._tie_to_ground()
-            self._end_search()
+            if self._finder is not None:  # the detector's memory is free then for painting
+                with self._log.stage(Stage.DETECT):
+                    self._finder.rest()
             self._started_painter().finish()
         return self._placed()
 
@@ -231,7 +229,7 @@ class PlanarRun(FlightRun):
             self._exposure.spread,
             control=self._control,
             base=self._base,
-            pieces=[[each - self._known.count for each in ids] for ids in self._mapper.pieces()],
+            pieces=[[each - len(self._known) for each in ids] for ids in self._mapper.pieces()],
         )
         report = build_report(
             self._setup,
@@ -268,39 +266,16 @@ class PlanarRun(FlightRun):
     def _exposure(self) -> Exposure:
         return Exposure({}, {}, 0.0) if self._painter is None else self._painter.exposure
 
-    def _take(
-        self,
-        frame: Frame | Step,
-        registered: Registered,
-        picture: ImageRGB | bytes | None,
-    ) -> tuple[Status, str]:
-        """Place a registered frame and keep its picture, if it has not been kept before; what became of it."""
-        with self._log.stage(Stage.REGISTER):
-            outcome = self._mapper.place(registered)
-        self._log.end(frame.index, frame.name, frame.time_ns, outcome.status, outcome.reason)
-        if outcome.status is Status.REJECTED:
-            return outcome.status, outcome.reason
-        keyframe_id = registered.keyframe.id
-        self._times_ns[keyframe_id] = frame.time_ns
-        with self._log.stage(Stage.STORE):
-            if picture is not None:
-                self._keep(keyframe_id, picture)
+    def _keep(self, keyframe_id: int, image: Callable[[], ImageRGB]) -> None:
+        """Store a keyframe's picture, or hold it until it is known how large it is on the map."""
         if self._painter is not None:
-            self._painter.mark(outcome.moved | {keyframe_id})
-        return outcome.status, outcome.reason
-
-    def _keep(self, keyframe_id: int, picture: ImageRGB | bytes) -> None:
-        if self._painter is not None:
-            self._painter.save(
-                keyframe_id, image_from_jpeg(picture, "") if isinstance(picture, bytes) else picture
-            )
+            self._painter.save(self._log.endings[keyframe_id - len(self._known)], image)
             return
-        self._held[keyframe_id] = picture
-        if self._setup.is_placed_late:
-            return
+        is_late = self._setup.is_placed_late
+        self._held[keyframe_id] = jpeg_from_image(image()) if is_late else image()
         telemetry = self._setup.telemetry
         known = telemetry is None or telemetry.knows_ground
-        if (
+        if not is_late and (
             self._archive.has_site
             or (known and len(self._held) >= 2)
             or len(self._held) >= _WAIT_FOR_HEIGHT
@@ -320,11 +295,12 @@ class PlanarRun(FlightRun):
                 self._native_m_per_px(),
                 self._log,
                 self._settings.live_s,
+                self._memo,
                 is_live=isinstance(self._setup.source, LiveSource),
             )
-            for keyframe_id, held in self._held.items():
-                image = image_from_jpeg(held, "") if isinstance(held, bytes) else held
-                self._painter.save(keyframe_id, image)
+            for keyframe_id in self._held:
+                ending = self._log.endings[keyframe_id - len(self._known)]
+                self._painter.save(ending, partial(self._picture, keyframe_id))
             self._painter.mark(self._times_ns.keys())
             self._held.clear()
         return self._painter
@@ -349,7 +325,7 @@ class PlanarRun(FlightRun):
         if isinstance(ground, FlightControl):
             endings = self._log.endings
             keyframe_of = {
-                endings[each - self._known.count].name: each for each in self._mapper.placed()
+                endings[each - len(self._known)].name: each for each in self._mapper.placed()
             }
             self._control = ground.tie(self._mapper, keyframe_of, self._setup.frame)
         elif ground is None and self._found:
@@ -370,7 +346,7 @@ class PlanarRun(FlightRun):
         """A keyframe's undistorted picture, from wherever it is kept."""
         held = self._held.get(keyframe_id)
         if held is None:
-            return self.begin().image(keyframe_id - self._known.count)
+            return self.begin().image(keyframe_id - len(self._known))
         return image_from_jpeg(held, "") if isinstance(held, bytes) else held
 
     def _find_offset(self) -> OffsetEstimate | None:
@@ -403,7 +379,7 @@ class PlanarRun(FlightRun):
             sigmas, gps = self._mapper.sigmas_m(), self._mapper.gps_residuals_m()
         result = []
         for ending in list(self._log.endings.values()):
-            keyframe_id = self._known.count + ending.index
+            keyframe_id = len(self._known) + ending.index
             if keyframe_id not in self._times_ns:
                 result.append(self._rejected(ending, ending.reason, camera))
                 continue
@@ -425,7 +401,7 @@ class PlanarRun(FlightRun):
 
     def _on_ground(self, ending: Ending, camera: Camera) -> PlacedFrame | None:
         """A frame as it lies by now, how well being unknown; None where it shows more than the ground."""
-        keyframe_id, unknown = self._known.count + ending.index, float("nan")
+        keyframe_id, unknown = len(self._known) + ending.index, float("nan")
         pose = self._mapper.pose(keyframe_id)
         outline_m = footprint(camera, pose)
         if not is_on_ground(outline_m):

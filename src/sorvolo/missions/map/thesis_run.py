@@ -11,7 +11,6 @@ from sorvolo.missions.flight.map_objects import ObjectFinder, crops_of
 from sorvolo.missions.flight.report import FlightResult, build_report
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup
-from sorvolo.missions.map.journal import MapJournal
 from sorvolo.missions.map.run import FlightRun
 from sorvolo.mosaic.roi_stitching import RoiStitcher, Stitched
 from sorvolo.mosaic.stitched_map import (
@@ -39,10 +38,9 @@ class ThesisRun(FlightRun):
         archive: Archive,
         settings: MapSettings,
         finder: ObjectFinder | None = None,
-        journal: MapJournal | None = None,
         request: str = "",
     ) -> None:
-        super().__init__(setup, archive, settings, finder=finder, journal=journal, request=request)
+        super().__init__(setup, archive, settings, finder=finder, request=request)
         self._lens = Undistorter(setup.source.camera.camera)
         full = self._lens.camera
         scale = min(1.0, settings.thesis.side_px / max(full.width_px, full.height_px))
@@ -68,7 +66,7 @@ class ThesisRun(FlightRun):
         elif posed.prior.knows_place:
             status, reason = Status.GPS_ONLY, found.reason
         else:
-            return self.lose(frame.index, frame.name, frame.time_ns, found.reason)
+            return self.lose(frame, found.reason)
         self._log.end(frame.index, frame.name, frame.time_ns, status, reason)
         self._frames[frame.index] = posed
         self._pictures[frame.index] = image

@@ -99,39 +99,31 @@ class WatchFiles:
         self.close()
 
     def add(self, seen: SeenFrame) -> None:
-        """Write one frame's part soon. Raises what went wrong with an earlier one (StoreError on a full disk)."""
+        """Write one frame's part soon; of one whose picture is gone, what does without it.
+
+        Raises what went wrong with an earlier one (StoreError on a full disk).
+        """
         self._raise_earlier()
         self.segments |= dict.fromkeys(seen.track_ids, seen.segment)
-        for sighting in seen.sightings:
+        for sighting in seen.sightings if seen.frame.image.size else ():
             if sighting is not None:
                 self._keep_crop(sighting, crop_around(seen.frame.image, sighting.box_px))
         self._queue.put(seen)
 
-    def recall(self, seen: SeenFrame, size_px: tuple[int, int]) -> None:
-        """Write the lines of a frame of this height and width that an earlier process searched, whose picture is not
-        there any more; its crops, pictures and labels are as that process left them."""
-        self.segments |= dict.fromkeys(seen.track_ids, seen.segment)
-        self._lines.append(_rows(seen, self._site))
-        if self._outputs.labels and seen.time_ns >= self._label_due_ns:
-            self._label_due_ns = seen.time_ns + _LABELS_EVERY_NS
-            name = self._label_name(seen)
-            if (self.folder / LABELS / "images" / name).is_file():
-                self._labelled.append(self._label_of(seen, name, size_px))
-                self._classes = seen.detections.classes
-
-    def recall_crops(self, tracks: Iterable[Track]) -> None:
-        """Take the crops of tracks that an earlier process wrote."""
-        for track in tracks:
-            if (name := written_crop(self.folder, track.id)) is not None:
-                self.crop_names[track.id] = name
-                self._best[track.id] = track.best
-
     def crop_of(self, track: Track) -> str | None:
-        """Write the crop of the track's best view if that is new; its file's name within the folder."""
+        """Write the crop of the track's best view if that is new; its file's name within the folder.
+
+        Where the view's picture is gone, the crop is the one that was written when it was there.
+        """
         if self._best.get(track.id) is not track.best:
             crop = self._crops.get(_key(track.best))
-            if crop is not None:
-                self.crop_names[track.id] = write_crop(self.folder, track.id, crop)
+            name = (
+                written_crop(self.folder, track.id)
+                if crop is None
+                else write_crop(self.folder, track.id, crop)
+            )
+            if name is not None:
+                self.crop_names[track.id] = name
                 self._best[track.id] = track.best
         return self.crop_names.get(track.id)
 
@@ -204,9 +196,10 @@ class WatchFiles:
 
     def _write(self, seen: SeenFrame) -> None:
         self._lines.append(_rows(seen, self._site))
-        if self._video is not None:
+        has_picture = seen.frame.image.size > 0
+        if self._video is not None and has_picture:
             self._video.add(_drawn(seen), seen.time_ns)
-        elif self._outputs.save == "pictures" and len(seen.detections):
+        elif self._outputs.save == "pictures" and has_picture and len(seen.detections):
             write_annotated(self.folder / ANNOTATED_PICTURES, _file_name(seen.frame), _drawn(seen))
         if self._outputs.labels and seen.time_ns >= self._label_due_ns:
             self._label_due_ns = seen.time_ns + _LABELS_EVERY_NS
@@ -215,24 +208,19 @@ class WatchFiles:
     def _label(self, seen: SeenFrame) -> None:
         """Keep a frame as a picture, and what was seen in it for the files of labels."""
         images = self.folder / LABELS / "images"
-        with writing(images):
-            images.mkdir(parents=True, exist_ok=True)
-        name = self._label_name(seen)
-        atomic_write_bytes(images / name, jpeg_from_image(seen.frame.image), durable=False)
-        self._labelled.append(self._label_of(seen, name, seen.frame.image.shape[:2]))
-        self._classes = seen.detections.classes
-
-    def _label_name(self, seen: SeenFrame) -> str:
-        return f"{self._site.name}_{_file_name(seen.frame)}.jpg"
-
-    def _label_of(
-        self, seen: SeenFrame, name: str, size_px: tuple[int, int]
-    ) -> tuple[LabelledPicture, Floats]:
-        height, width = size_px
+        name = f"{self._site.name}_{_file_name(seen.frame)}.jpg"
+        if seen.frame.image.size:
+            with writing(images):
+                images.mkdir(parents=True, exist_ok=True)
+            atomic_write_bytes(images / name, jpeg_from_image(seen.frame.image), durable=False)
+        elif not (images / name).is_file():
+            return
+        height, width = seen.frame.image.shape[:2]
         picture = picture_of_detections(
             f"images/{name}", width, height, self._site.name, seen.detections
         )
-        return picture, seen.detections.scores
+        self._labelled.append((picture, seen.detections.scores))
+        self._classes = seen.detections.classes
 
     def _write_labels(self) -> None:
         if not self._labelled:

@@ -2,44 +2,40 @@
 
 import threading
 import time
-from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, replace
+import warnings
+from collections.abc import Callable, Generator
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import sorvolo
 from sorvolo.capture.live.reconnect import LiveSettings
 from sorvolo.capture.live.stream import LiveStream
 from sorvolo.capture.source import LiveSource, Source, open_sources
 from sorvolo.detection.detector import Detector
-from sorvolo.errors import InputError, SettingsError
+from sorvolo.errors import InputError, SettingsError, SorvoloWarning
 from sorvolo.geometry.arrays import ImageGray
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
 from sorvolo.missions.flight.frames_ahead import read_ahead
-from sorvolo.missions.flight.live_journal import SourceNotes
+from sorvolo.missions.flight.request import live_request, request_of
+from sorvolo.missions.flight.result_cache import ResultCache, go_on
 from sorvolo.missions.flight.settings import MapSettings
 from sorvolo.missions.flight.setup import FlightSetup, prepare
 from sorvolo.missions.watch.cot_sender import check_host, cot_place
 from sorvolo.missions.watch.ground_height import over_heights
-from sorvolo.missions.watch.journal import StoppedWatch, WatchJournal, WatchOrder
 from sorvolo.missions.watch.places import Places, places_of
 from sorvolo.missions.watch.run import EarlyFound, WatchRun, WatchUpdate, utc_ns
 from sorvolo.missions.watch.settings import DEFAULT_FRAMES_PER_SECOND, WatchOutputs, WatchSettings
 from sorvolo.mosaic.selection import every
 from sorvolo.store.exports.cursor_on_target import COT_TYPES
-from sorvolo.store.exports.detection_files import claimed_folder
+from sorvolo.store.exports.detection_files import JOURNAL, claimed_folder
+from sorvolo.store.site.journal import RunJournal, content_sha256
 from sorvolo.survey.flight import Frame, LostFrame
 from sorvolo.tracking.picture_steps import SMALL_WIDTH_PX, STEP_S, PictureStep, PictureSteps
 
 _AHEAD = 4  # decoded frames that wait for the detector
 _STOPPED = "stopped on demand"
-
-
-@dataclass(frozen=True)
-class _Heard:
-    """Who is given what is known of a live source before its frames' updates."""
-
-    moved: Callable[[PictureStep], None] | None = None
-    early: Callable[[EarlyFound], None] | None = None
 
 
 def watch(
@@ -84,25 +80,53 @@ def watch(
         for each in sources:
             if until.is_set():
                 return
-            order = WatchOrder(settings, outputs, finder)
-            goes_on = (
-                order.go_on_live(each, live.same_flight_s) if isinstance(each, LiveSource) else None
-            )
-            folder = (
-                _folder_of(each, outputs, is_only=len(sources) == 1)
-                if goes_on is None
-                else goes_on.folder
-            )
-            heard = _Heard(moved, early) if isinstance(each, LiveSource) else _Heard()
+            is_live = isinstance(each, LiveSource)
+            stopped = _stopped_watch(each, settings, outputs, finder, live.same_flight_s)
+            folder = stopped or _folder_of(each, outputs, is_only=len(sources) == 1)
             yield from _watch_one(
                 each,
-                WatchOrder(settings, replace(outputs, folder=folder), finder),
-                folder,
-                goes_on,
+                settings,
+                replace(outputs, folder=folder),
+                finder,
                 until,
-                heard,
+                moved if is_live else None,
+                early if is_live else None,
+                goes_on=stopped is not None,
                 telemetry_named=telemetry is not None,
             )
+
+
+def _stopped_watch(
+    source: Source,
+    settings: WatchSettings,
+    outputs: WatchOutputs,
+    detector: ObjectDetector,
+    most_gap_s: float,
+) -> Path | None:
+    """Have a live source go on with the flight of a killed watch that was asked for the same; that watch's folder."""
+    if not isinstance(source, LiveSource):
+        return None
+    request = live_request(source, settings, None, detector, *_asked(settings, outputs))
+    named, below = outputs.folder, outputs.below
+    names = Path().glob(f"*-watch/{JOURNAL}") if below is None else below.glob(f"*/{JOURNAL}")
+    for folder in sorted(each.parent for each in names) if named is None else [named]:
+        journal = _journal(folder, request)
+        if journal.is_begun and go_on(source, journal, most_gap_s):
+            return folder
+    return None
+
+
+def _asked(settings: WatchSettings, outputs: WatchOutputs) -> tuple[Any, ...]:
+    """Return what a watch is asked for besides its settings."""
+    stamp: tuple[int, ...] = ()
+    if settings.height_model:
+        stat = Path(settings.height_model).stat()
+        stamp = stat.st_size, stat.st_mtime_ns
+    return replace(outputs, folder=None, below=None), stamp
+
+
+def _journal(folder: Path, request: str) -> RunJournal:
+    return RunJournal(folder / JOURNAL, content_sha256(request), 0, sorvolo.__version__)
 
 
 def _folder_of(source: Source, outputs: WatchOutputs, *, is_only: bool) -> Path:
@@ -148,28 +172,59 @@ def _demand_known_classes(
 
 def _watch_one(
     source: Source,
-    order: WatchOrder,
-    folder: Path,
-    goes_on: StoppedWatch | None,
+    settings: WatchSettings,
+    outputs: WatchOutputs,
+    detector: ObjectDetector,
     until: threading.Event,
-    heard: _Heard,
+    moved: Callable[[PictureStep], None] | None,
+    early: Callable[[EarlyFound], None] | None,
     *,
+    goes_on: bool,
     telemetry_named: bool,
 ) -> Generator[WatchUpdate]:
-    settings, outputs, detector = order.settings, order.outputs, order.detector
-    setup, places = _prepared(source, order, telemetry_named=telemetry_named)
-    with (
-        _begun(source, order, setup, folder, goes_on) as journal,
-        WatchRun(setup, places, detector, settings, outputs, folder, journal, heard.early) as run,
-    ):
-        for searched in journal.frames() if goes_on is not None else ():
-            yield run.recall(searched)
-        if heard.moved is not None and isinstance(source, LiveStream):
-            _give_steps(source, setup, heard.moved)
+    folder, is_live = outputs.folder, isinstance(source, LiveSource)
+    assert folder is not None
+    setup, places = _prepared(source, settings, detector, telemetry_named=telemetry_named)
+    request = request_of(setup, settings, None, detector, *_asked(settings, outputs))
+    journal = _journal(folder, request)
+    if why_not := journal.why_not:
+        text = f"{folder}: a watch that was stopped cannot continue: {why_not}"
+        warnings.warn(text, SorvoloWarning, stacklevel=2)
+    wanted, passed = _wanted(source, settings), 0
+
+    def is_wanted(index: int, time_ns: int) -> bool:
+        nonlocal passed
+        passed = index + 1
+        return wanted(index, time_ns)
+
+    with ExitStack() as stack:
+        goes = goes_on if is_live else journal.is_begun
+        stack.enter_context(
+            claimed_folder(
+                folder, source.name, source.fingerprint, replaces=not is_live, goes_on=goes
+            )
+        )
+        stack.callback(journal.close)
+        memo = ResultCache(journal, source)
+        run = stack.enter_context(
+            WatchRun(setup, places, detector, settings, outputs, folder, memo, early)
+        )
+        if moved is not None and isinstance(source, LiveStream):
+            _give_steps(source, setup, moved)
         ended = _STOPPED
         try:
-            first = 0 if goes_on is None else goes_on.next_index
-            ended = yield from _search(run, source, settings, until, first)
+            with closing(_arrivals(source, is_wanted, memo)) as arrivals:
+                for arrived_s, frame in arrivals:
+                    if isinstance(frame, Frame):
+                        yield run.add(frame, arrived_s)
+                    else:
+                        run.lose(frame)
+                    if until.is_set():
+                        break
+            if not until.is_set():
+                ended = "the source ended"
+                if not is_live:
+                    run.log.read = passed  # also those after the last one that was searched
         except KeyboardInterrupt:
             pass  # the usual way to end a live watch: what was found is written below
         except Exception as error:
@@ -177,11 +232,13 @@ def _watch_one(
             raise
         finally:
             if run.log.detected or ended == _STOPPED:
-                run.finish(
-                    ended=ended, skipped=source.skipped if isinstance(source, LiveSource) else 0
-                )
-        if ended != _STOPPED:
-            _demand_searched(run, source)
+                skipped = source.skipped if isinstance(source, LiveSource) else 0
+                run.finish(ended=ended, skipped=skipped)
+        if ended != _STOPPED and not run.log.detected:
+            reason = next(iter(run.log.lost), "the source holds none")
+            raise InputError(
+                f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`"
+            )
 
 
 def _give_steps(
@@ -198,19 +255,10 @@ def _give_steps(
     source.glance(STEP_S, SMALL_WIDTH_PX, compare)
 
 
-def _demand_searched(run: WatchRun, source: Source) -> None:
-    if not run.log.detected:
-        reason = next(iter(run.log.lost), "the source holds none")
-        raise InputError(
-            f"no frame of {source.name} could be searched: {reason}; see `sorvolo inspect`"
-        )
-
-
 def _prepared(
-    source: Source, order: WatchOrder, *, telemetry_named: bool
+    source: Source, settings: WatchSettings, detector: ObjectDetector, *, telemetry_named: bool
 ) -> tuple[FlightSetup, Places]:
     """The flight as it is set up, and where what is found in it will lie."""
-    settings = order.settings
     mapping = MapSettings(
         offset_s=settings.offset_s, ground_elevation_m=settings.ground_elevation_m
     )
@@ -222,7 +270,7 @@ def _prepared(
         setup, ground = over_heights(prepared, mapping, Path(settings.height_model))
     else:
         setup, ground = prepared(mapping), None
-    thresholds = order.detector.info.thresholds
+    thresholds = detector.info.thresholds
     least = (
         thresholds
         if settings.least_score is None
@@ -231,69 +279,16 @@ def _prepared(
     return setup, places_of(setup, least, ground)
 
 
-@contextmanager
-def _begun(
-    source: Source,
-    order: WatchOrder,
-    setup: FlightSetup,
-    folder: Path,
-    goes_on: StoppedWatch | None,
-) -> Iterator[WatchJournal]:
-    """The journal of a watch, whose folder is claimed: as a killed watch left it where that goes on, else empty."""
-    file, is_live = order.journal(setup, folder), isinstance(source, LiveSource)
-    goes = goes_on is not None if is_live else file.is_begun
-    with (
-        claimed_folder(folder, source.name, source.fingerprint, replaces=not is_live, goes_on=goes),
-        closing(file),
-    ):
-        if isinstance(source, LiveSource):
-            yield WatchJournal(
-                file, SourceNotes(file, source, 0 if goes_on is None else goes_on.samples)
-            )
-        else:
-            yield WatchJournal(file)
-
-
-def _search(
-    run: WatchRun, source: Source, settings: WatchSettings, until: threading.Event, first: int
-) -> Generator[WatchUpdate, None, str]:
-    """Search the wanted frames from index `first` on, yielding an update for each; why it ended, in words."""
-    wanted = _wanted(source, settings)
-    asked = _Asked(lambda index, time_ns: index >= first and wanted(index, time_ns))
-    with closing(_arrivals(source, asked)) as arrivals:
-        for arrived_s, each in arrivals:
-            if isinstance(each, Frame):
-                yield run.add(each, arrived_s)
-            else:
-                run.lose(each)
-            if until.is_set():
-                break
-    if until.is_set():
-        return _STOPPED
-    if not isinstance(source, LiveSource):
-        run.log.read = asked.frames  # also those after the last one that was searched
-    return "the source ended"
-
-
-class _Asked:
-    """Which frames are wanted; `frames` counts how many a source has come to when it asks."""
-
-    def __init__(self, wanted: Callable[[int, int], bool]) -> None:
-        self._wanted = wanted
-        self.frames = 0
-
-    def __call__(self, index: int, time_ns: int) -> bool:
-        self.frames = index + 1
-        return self._wanted(index, time_ns)
-
-
 def _arrivals(
-    source: Source, wanted: Callable[[int, int], bool]
+    source: Source, wanted: Callable[[int, int], bool], memo: ResultCache
 ) -> Generator[tuple[float, Frame | LostFrame]]:
     """The frames, each with when it came, or when its turn came, by the monotonic clock.
 
-    A live source has a thread of its own, in which newer frames take the place of older ones.
+    First those that a killed watch searched of a stream. A live source has a thread of its own, in which newer frames
+    take the place of older ones.
     """
+    for kept in memo.kept_frames():
+        yield time.monotonic(), kept.frame
     if isinstance(source, LiveSource):
         yield from source.arrivals(wanted)
     else:

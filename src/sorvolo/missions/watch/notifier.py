@@ -5,9 +5,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.watch.alerts import Outbox, Pace, alert_command, alert_url
 from sorvolo.missions.watch.cot_sender import CotSender, cot_place
-from sorvolo.missions.watch.journal import Sent, WatchJournal
 from sorvolo.missions.watch.settings import WatchOutputs
 from sorvolo.store.exports.cursor_on_target import cot_event, cot_removal, cot_type
 from sorvolo.store.exports.detection_files import track_properties
@@ -20,7 +20,7 @@ _COT, _COMMAND, _URL = RECEIVERS = ("cot", "alert_command", "alert_url")
 class Notifier:
     """Sends alerts of new tracks, and keeps a TAK server's map up to date.
 
-    `journal` has what a killed watch sent, which is not sent again, and notes what is sent.
+    `memo` has what a killed watch sent, which is not sent again, and notes what is sent.
     """
 
     def __init__(
@@ -30,14 +30,18 @@ class Notifier:
         site: Site,
         outputs: WatchOutputs,
         folder: Path,
-        journal: WatchJournal,
+        memo: ResultCache,
     ) -> None:
-        self._journal = journal
+        self._memo = memo
+        self._sent = {
+            (note.values.get("receiver"), note.values.get("track"))
+            for note in memo.notes
+            if note.kind == "sent"
+        }
         self._flight, self._uid = flight, f"sorvolo.{flight}.{fingerprint[:8]}"
         self._site, self._outputs, self._folder = site, outputs, folder
         self._pace = Pace(outputs.cot_every_s)
         self._sent_types: dict[int, str] = {}
-        self._caught_up: dict[int, Track] = {}  # tracks of frames that a killed watch searched
         self._cot: Outbox[bytes] | None = None
         self._sender: CotSender | None = None
         self._broken_end: tuple[Notice, ...] = ()
@@ -58,25 +62,15 @@ class Notifier:
         seen: Sequence[Track],
         crops: Mapping[int, str],
         segments: Mapping[int, int],
-        *,
-        is_resumed: bool = False,
     ) -> None:
         """Send one alert for each new track, and the TAK server all tracks that are seen, each at its pace.
 
         `crops` are their pictures' names, `segments` their stretches of the flight (`tracking.following.Taken`), by
         track.
-
-        Of frames that a killed watch searched (`is_resumed`) only alerts that it did not send are sent; the TAK server
-        gets each of their tracks once, with the first frame after them.
         """
         for track in new:
             self._alert(track, crops.get(track.id), segments.get(track.id, 0))
-        if is_resumed:
-            self._caught_up |= {track.id: track for track in seen}
-            return
-        shown = {**self._caught_up, **{track.id: track for track in seen}}
-        self._caught_up = {}
-        for track in shown.values():
+        for track in seen:
             if self._cot is not None and self._pace.allows(track.id):
                 self._sent_types[track.id] = cot_type(track.label, self._outputs.cot_types)
                 self._cot.put(self._event(track))
@@ -84,8 +78,6 @@ class Notifier:
     def withdraw(self, track_ids: Iterable[int]) -> None:
         """Tracks that turned out to be others leave the TAK server's map."""
         for track_id in track_ids:
-            if (earlier := self._caught_up.pop(track_id, None)) is not None:
-                self._sent_types[track_id] = cot_type(earlier.label, self._outputs.cot_types)
             if self._cot is not None and track_id in self._sent_types:
                 uid, kind = f"{self._uid}.{track_id}", self._sent_types.pop(track_id)
                 self._cot.put(cot_removal(uid, type_=kind, now_ns=time.time_ns()))
@@ -134,7 +126,7 @@ class Notifier:
         }
         alert["time"] = alert["last_seen"]
         for receiver, outbox in self._alerts.items():
-            if Sent(receiver, track.id) not in self._journal.sent:
+            if (receiver, track.id) not in self._sent:
                 outbox.put(alert)
 
     def _add_receiver(
@@ -144,7 +136,7 @@ class Notifier:
 
         def noted(alert: Mapping[str, Any]) -> None:
             send(alert)
-            self._journal.keep_sent(code, alert["id"])
+            self._memo.note("sent", receiver=code, track=alert["id"])
 
         self._alerts[code] = Outbox(noted, code=code, what=what)
 

@@ -54,11 +54,10 @@ class Places(Protocol):
     def view(self, frame: Frame) -> FrameView | None:
         """What ground the frame shows by telemetry; None where that is not known."""
 
-    def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
-        """Place a frame's detections and give them to their tracks."""
-
-    def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
-        """Give detections to their tracks that an earlier process placed in a frame of this height and width."""
+    def take(
+        self, frame: Frame, time_ns: int, found: Detections, located: Located | None = None
+    ) -> Taken:
+        """Place a frame's detections and give them to their tracks; `located` is where a killed run placed them."""
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
@@ -138,8 +137,12 @@ class GroundPlaces:
         pose = Pose(prior.rotation, prior.position_m) if prior.knows_place else None
         return self._setup.view(frame.time_ns, self._setup.source.camera.camera, pose)
 
-    def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
-        """Place a frame's detections on the ground and give them to their tracks."""
+    def take(
+        self, frame: Frame, time_ns: int, found: Detections, located: Located | None = None
+    ) -> Taken:
+        """See `Places.take`."""
+        if located is not None:
+            return self._follower.recall(located)
         prior = self._prior(frame)
         if self._headings is not None:
             if self._taken is None and not isinstance(self._setup.source, LiveSource):
@@ -147,10 +150,6 @@ class GroundPlaces:
             prior = self._headings.take(frame.image, prior)
         self._taken = frame.index, prior
         return self._follower.take(frame, time_ns, found, prior)
-
-    def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
-        """See `Places.recall`."""
-        return self._follower.recall(located)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""
@@ -265,13 +264,13 @@ class ImagePlaces:
         """Nothing is known of the ground."""
         return None
 
-    def take(self, frame: Frame, time_ns: int, found: Detections) -> Taken:
+    def take(
+        self, frame: Frame, time_ns: int, found: Detections, located: Located | None = None
+    ) -> Taken:
         """Take the camera's motion out of a frame's detections and give them to their tracks."""
+        if located is not None:
+            return self._follower.recall(located, found, frame.image.shape[:2])
         return self._follower.take(frame, time_ns, found)
-
-    def recall(self, located: Located, found: Detections, size_px: tuple[int, int]) -> Taken:
-        """See `Places.recall`."""
-        return self._follower.recall(located, found, size_px)
 
     def tracks(self) -> Sequence[Track]:
         """All tracks as they are known now."""

@@ -1,22 +1,24 @@
 """One watch while it runs: each frame is searched, detections are placed and tracked, new objects reported."""
 
+import itertools
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from sorvolo.capture.sync import DATED_NS
 from sorvolo.detection.scene import SceneMagnifier
 from sorvolo.detection.tiling import whole_m_per_px
 from sorvolo.geometry.arrays import ImageRGB
 from sorvolo.missions.flight.detector_protocol import ObjectDetector
+from sorvolo.missions.flight.result_cache import ResultCache
 from sorvolo.missions.flight.setup import FlightSetup
 from sorvolo.missions.watch.alerts import interpreted_placeholder, interpreted_words
 from sorvolo.missions.watch.files import SeenFrame, WatchFiles
-from sorvolo.missions.watch.journal import LookedModel, SearchedFrame, WatchJournal
 from sorvolo.missions.watch.notifier import Notifier
 from sorvolo.missions.watch.places import Places
 from sorvolo.missions.watch.report import (
@@ -35,7 +37,7 @@ from sorvolo.survey.flight import Frame, LostFrame, Site
 from sorvolo.survey.mosaic import FrameView
 from sorvolo.survey.objects import Detections, Sighting, Track
 from sorvolo.survey.wording import counted_list
-from sorvolo.tracking.following import Taken
+from sorvolo.tracking.following import Located, Taken
 
 _LAST_ALERTS_S, _LAST_EVENTS_S = 35.0, 5.0  # how long the end waits for what is still on its way
 
@@ -111,8 +113,7 @@ class _Tracks:
 class WatchRun:
     """One watch. A context manager; `finish` writes what is known at the end, however the watch ended.
 
-    `journal` notes what is detected and sent, and has what a killed watch noted. `early` is given what is found in a
-    frame before the frame's update.
+    `memo` has what a killed watch found and sent. `early` is given what is found in a frame before the frame's update.
     """
 
     def __init__(
@@ -123,17 +124,17 @@ class WatchRun:
         settings: WatchSettings,
         outputs: WatchOutputs,
         folder: Path,
-        journal: WatchJournal,
+        memo: ResultCache,
         early: Callable[[EarlyFound], None] | None = None,
     ) -> None:
-        self._journal, self._early = journal, early
+        self._memo, self._early = memo, early
         self._setup, self._places, self._detector = setup, places, detector
         self._settings, self._outputs, self._folder = settings, outputs, folder
         self._classes = settings.classes or detector.info.usual_classes
         self._magnifier = SceneMagnifier(detector.info, self._classes)
-        self._others = list(
-            journal.models
-        )  # that looked besides it, in the order of their first looks
+        self._others: dict[
+            str, dict[str, Any]
+        ] = {}  # facts of models that looked besides it, by name
         self._looks_before = {
             info.name: count for info, count in detector.others
         }  # at another flight's pictures
@@ -141,7 +142,7 @@ class WatchRun:
         self._stack = ExitStack()
         self._files = self._stack.enter_context(WatchFiles(folder, outputs, places.site))
         self._notifier = Notifier(
-            setup.source.name, setup.source.fingerprint, places.site, outputs, folder, journal
+            setup.source.name, setup.source.fingerprint, places.site, outputs, folder, memo
         )
         self._stack.callback(self._notifier.close, 0.0, 0.0)
 
@@ -156,56 +157,44 @@ class WatchRun:
     ) -> None:
         self._stack.close()
 
-    def _found(self, frame: Frame, arrived_s: float) -> tuple[SearchedFrame, bool]:
-        """What is detected in a frame, and whether a watch that was killed had detected it."""
-        earlier = self._journal.next_frame(frame.index)
-        with self.log.stage("detect"):
-            return self._searched(frame, earlier, arrived_s), earlier is not None
-
-    def _searched(
-        self, frame: Frame, earlier: SearchedFrame | None, arrived_s: float
-    ) -> SearchedFrame:
-        """What the detector finds in a frame; where nothing places the flight, at the scale that its scene shows.
-
-        `earlier` is what it found in a watch that was killed, which is taken in its place.
-        """
-        settings, classes = self._settings, self._classes
-        magnifier = (
-            self._magnifier if settings.tiles == "auto" and self._places.site.is_local else None
-        )
-        m_per_px = self._places.m_per_px(frame)
-        looks: list[Detections] = []
+    def _found(self, frame: Frame, arrived_s: float) -> Detections:
+        """Return what the detector finds in a frame; where nothing places the flight, at the scale its scene shows."""
+        settings, classes, memo = self._settings, self._classes, self._memo
+        is_scaled = settings.tiles == "auto" and self._places.site.is_local and frame.image.size > 0
+        m_per_px, looks = self._places.m_per_px(frame), itertools.count()
 
         def look(part: ImageRGB) -> Detections:
-            known = None if earlier is None else earlier.looks[len(looks)]
-            looks.append(
-                self._detector.detect(part, classes=classes, is_part=True)
-                if known is None
-                else known
+            return memo.of(
+                frame,
+                f"look {next(looks)}",
+                Detections,
+                lambda: self._detector.detect(part, classes=classes, is_part=True),
             )
-            return looks[-1]
 
-        def known(names: tuple[str, ...], found: Detections) -> None:
-            if self._early is not None:
-                self._early(
-                    EarlyFound(
-                        frame.name,
-                        utc_ns(self._setup, frame.time_ns),
-                        names,
-                        found,
-                        time.monotonic() - arrived_s,
-                        frame.image.shape[1::-1],
-                        frame.time_ns - self._setup.source.start_ns,
-                    )
+        def early(names: tuple[str, ...], found: Detections) -> None:
+            assert self._early is not None
+            self._early(
+                EarlyFound(
+                    frame.name,
+                    utc_ns(self._setup, frame.time_ns),
+                    names,
+                    found,
+                    time.monotonic() - arrived_s,
+                    frame.image.shape[1::-1],
+                    frame.time_ns - self._setup.source.start_ns,
                 )
+            )
 
-        if magnifier is not None:
-            m_per_px = magnifier.m_per_px(frame.image, look)
+        if is_scaled:
+            m_per_px = self._magnifier.m_per_px(frame.image, look)
         overlapping = self._setup.source.kind != "photos"
         if m_per_px is not None and overlapping:
             m_per_px = whole_m_per_px(self._detector.info, classes, m_per_px, frame.image.shape[:2])
-        found = (
-            self._detector.detect(
+        found = memo.of(
+            frame,
+            "found",
+            Detections,
+            lambda: self._detector.detect(
                 frame.image,
                 tiles=settings.tiles,
                 m_per_px=m_per_px,
@@ -213,16 +202,22 @@ class WatchRun:
                 classes=classes,
                 from_above=self._places.is_from_above(frame),
                 overlapping=overlapping,
-                early=None if self._early is None else known,
-            )
-            if earlier is None
-            else earlier.found
+                early=None if self._early is None else early,
+            ),
         )
-        if magnifier is not None:
-            magnifier.see(found, frame.image)
-        size_px = frame.image.shape[0], frame.image.shape[1]
-        return SearchedFrame(
-            frame.index, frame.name, frame.time_ns, found, tuple(looks), None, size_px
+        if is_scaled:
+            self._magnifier.see(found, frame.image)
+        for facts in memo.of(frame, "other models", tuple[str, ...], self._looked_first):
+            model = json.loads(facts)
+            self._others.setdefault(model["name"], model)
+        return found
+
+    def _looked_first(self) -> tuple[str, ...]:
+        """Return the facts, as JSON, of models that looked at a picture for the first time."""
+        return tuple(
+            json.dumps(model_facts(info))
+            for info, count in self._detector.others
+            if info.name not in self._others and count > self._looks_before.get(info.name, 0)
         )
 
     def lose(self, lost: LostFrame) -> None:
@@ -232,55 +227,25 @@ class WatchRun:
 
     def add(self, frame: Frame, arrived_s: float) -> WatchUpdate:
         """Search one frame, whose turn came at `arrived_s` of the monotonic clock, and take in what it shows."""
-        self.log.read = frame.index + 1
-        time_ns = utc_ns(self._setup, frame.time_ns)
-        searched, is_resumed = self._found(frame, arrived_s)
-        with self.log.stage("track"):
-            taken = self._places.take(frame, time_ns, searched.found)
+        log, memo, source = self.log, self._memo, self._setup.source
+        log.read = frame.index + 1
+        is_resumed = memo.has_ended(frame.index)
+        with log.stage("detect"):
+            found = self._found(frame, arrived_s)
+        # a stream's pictures are not there any more, so where its detections lie is kept as well
+        located = memo.known(frame.index, "located", Located) if memo.is_of_stream else None
+        time_ns = utc_ns(self._setup, frame.time_ns) if located is None else located.time_ns
+        with log.stage("track"):
+            taken = self._places.take(frame, time_ns, found, located)
         if not is_resumed:
-            self._note_others()
-            self._journal.keep_frame(
-                replace(searched, located=taken.located if self._journal.is_live else None)
-            )
-        return self._update(frame, time_ns, searched, taken, arrived_s, is_resumed=is_resumed)
-
-    def _note_others(self) -> None:
-        """Note each model that looked at a picture for the first time."""
-        known = {each.facts["name"] for each in self._others}
-        for info, count in self._detector.others:
-            if info.name not in known and count > self._looks_before.get(info.name, 0):
-                each = LookedModel(model_facts(info))
-                self._journal.keep_model(each)
-                self._others.append(each)
-
-    def recall(self, searched: SearchedFrame) -> WatchUpdate:
-        """Take in a frame of a live source that a watch that was killed had searched, as far as its picture is not
-        needed."""
-        assert searched.located is not None  # of a live source they are noted
-        self.log.read = searched.index + 1
-        taken = self._places.recall(searched.located, searched.found, searched.size_px)
-        frame = Frame.unseen(searched.index, searched.name, searched.time_ns)
-        return self._update(
-            frame, searched.located.time_ns, searched, taken, time.monotonic(), is_resumed=True
-        )
-
-    def _update(
-        self,
-        frame: Frame,
-        time_ns: int,
-        searched: SearchedFrame,
-        taken: Taken,
-        arrived_s: float,
-        *,
-        is_resumed: bool,
-    ) -> WatchUpdate:
-        """Hand over what a frame brought."""
-        log, found, size_px = self.log, searched.found, searched.size_px
+            if memo.is_of_stream:
+                memo.keep(frame, "located", taken.located)
+            memo.end_frame(frame, keeps_picture=False)
         sighted = [each for each in taken.sightings if each is not None]
         tracks = self._tracks_after(taken)
         log.searched(time_ns, found, 0 if self._places.site.is_local else len(sighted))
         with log.stage("hand over"):
-            self._write(
+            self._files.add(
                 SeenFrame(
                     frame,
                     time_ns,
@@ -290,15 +255,12 @@ class WatchRun:
                     frozenset(each.id for each in tracks.confirmed),
                     f"frame {frame.name}, counted so far: {counted_list(tracks.counts)}",
                     taken.segment,
-                ),
-                size_px,
-                [*tracks.seen, *tracks.new],
+                )
             )
-            self._hand_over(taken, tracks, is_resumed=is_resumed)
+            self._hand_over(taken, tracks)
         latency_s = time.monotonic() - arrived_s
         if not is_resumed:
             log.latency_s.append(latency_s)
-        source = self._setup.source
         return WatchUpdate(
             frame.name,
             time_ns,
@@ -315,7 +277,7 @@ class WatchRun:
             self._folder,
             self._places.site,
             taken.segment,
-            size_px[::-1],
+            frame.image.shape[1::-1],
             frame.time_ns - source.start_ns,
             self._places.view(frame),
             is_resumed,
@@ -329,15 +291,7 @@ class WatchRun:
             known, confirmed, seen, [each for each in confirmed if each.id in taken.new_ids]
         )
 
-    def _write(self, written: SeenFrame, size_px: tuple[int, int], shown: Sequence[Track]) -> None:
-        """Write a frame's part of the files; of one whose picture is not there any more, what does without it."""
-        if written.frame.image.size:
-            self._files.add(written)
-        else:
-            self._files.recall(written, size_px)
-            self._files.recall_crops(shown)
-
-    def _hand_over(self, taken: Taken, tracks: "_Tracks", *, is_resumed: bool) -> None:
+    def _hand_over(self, taken: Taken, tracks: "_Tracks") -> None:
         """Crops, reports and withdrawals of one frame, and the files that show all tracks so far."""
         for track in (*tracks.seen, *tracks.new):
             self._files.crop_of(track)
@@ -348,7 +302,6 @@ class WatchRun:
             tracks.seen,
             self._files.crop_names,
             self._files.segments,
-            is_resumed=is_resumed,
         )
         self._notifier.withdraw(taken.merged)
         self._files.show(tracks.confirmed)
@@ -386,7 +339,7 @@ class WatchRun:
             notices,
             self._warnings(tracks),
             looked_for=self._classes,
-            others=[each.facts for each in self._others],
+            others=list(self._others.values()),
             ended=ended,
             skipped=skipped,
             set_aside=self._places.set_aside,
@@ -398,7 +351,7 @@ class WatchRun:
         atomic_write_bytes(self._folder / "report.json", json_bytes(report))
         page = watch_page(report, rows, crops, self._places.path_m())
         atomic_write_bytes(self._folder / "report.html", page.encode())
-        self._journal.file.remove()
+        self._memo.end(None)
 
     def _warnings(self, tracks: Sequence[Track]) -> list[str]:
         warnings = []

@@ -10,7 +10,7 @@ import time
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from io import BufferedRandom
 from pathlib import Path
 from types import MappingProxyType
@@ -40,11 +40,15 @@ _SYNC_EVERY_S = 1.0  # waiting for the disk after each entry would cost 4 to 5 m
 
 @dataclass(frozen=True, eq=False)
 class Entry:
-    """One entry: values as JSON holds them (NaN and infinities, too), and arrays by name, none of objects."""
+    """One entry: values as JSON holds them (NaN and infinities, too), and arrays by name, none of objects.
+
+    `at` is where it begins in the file that it was read from.
+    """
 
     kind: str
     values: Mapping[str, Any]
     arrays: Mapping[str, NDArray[Any]] = field(default_factory=lambda: MappingProxyType({}))
+    at: int = 0
 
 
 class RunJournal:
@@ -99,18 +103,14 @@ class RunJournal:
             self._end = file.tell()
             while (entry := _read(file)) is not None:
                 end = file.tell()
-                yield entry
+                yield replace(entry, at=self._end)
                 self._end = end
 
-    def taken(self) -> Iterator[Entry]:
-        """The entries that were taken before the first `append`, once more, also while new ones are appended."""
-        end = self._end
-        if not end:
-            return
+    def entry(self, at: int) -> Entry | None:
+        """Return the entry that begins there, also while new ones are appended; None where none does."""
         with open(self._path, "rb", opener=_no_link) as file:
-            _read_run(file)
-            while file.tell() < end and (entry := _read(file)) is not None:
-                yield entry
+            file.seek(at)
+            return _read(file)
 
     def append(self, entry: Entry) -> None:
         """Add an entry; nothing once the run is over. Raises StoreError when the disk is full."""

@@ -64,7 +64,9 @@ class FrameOnDisk:
         with writing(folder):
             file.write(np.ascontiguousarray(frame.image).data)
             file.flush()
-        return cls(Frame.unseen(frame.index, frame.name, frame.time_ns), frame.image.shape, file)
+        size_px = (frame.image.shape[0], frame.image.shape[1])
+        unseen = Frame.unseen(frame.index, frame.name, frame.time_ns, size_px)
+        return cls(unseen, frame.image.shape, file)
 
     def taken(self) -> Frame:
         """The frame as it was; its file is gone."""
